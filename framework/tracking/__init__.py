@@ -1,1 +1,1 @@
-"""Recording a run: the local journal, and the store that gets a copy of it."""
+"""Recording of a run: the local journal, and the store that receives a copy of it."""

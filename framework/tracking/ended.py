@@ -1,4 +1,4 @@
-"""What others do for a run whose process has ended: close it, and send what its store lacks."""
+"""Closing a run whose process has ended, and sending the missing part of its journal to the store."""
 
 import logging
 from pathlib import Path
@@ -15,16 +15,16 @@ _log = logging.getLogger(__name__)
 
 
 def sync(folder: Path, uri: str | None = None) -> int:
-    """Send what the store lacks of a run whose process has ended; return how many lines of its journal that were.
+    """Send the journal lines that the store lacks of a run whose process has ended, and return their number.
 
     Args:
-        folder: of the run; it may be a stranger's.
-        uri: the store that the user names (`stores.confirmed`).
+        folder: Folder of the run; it may come from an untrusted source.
+        uri: Address of the store that the user names (`stores.confirmed`).
 
     Raises:
-        ConfigError: the user names no such store as the run's.
-        DataError: no run with a store is there, its process is alive, or the folder holds links.
-        UserError: the store did not take everything; what it took is not sent again.
+        ConfigError: The user does not name the store of the run.
+        DataError: The folder holds no run with a store, or holds links, or the run's process is alive.
+        UserError: The store did not accept everything; lines that it accepted are not sent again.
     """
     folder = folder.absolute()
     require_enclosed(folder)
@@ -33,7 +33,7 @@ def sync(folder: Path, uri: str | None = None) -> int:
         raise DataError(f"{folder} holds no run that goes to a store: it has no {SIDECAR}, or logger=none.")
     info = info.at_store(confirmed(info.uri, uri, folder, folder / SIDECAR), folder)
     journal = Journal(folder / JOURNAL)
-    journal.open(after=info.sent)  # and so nobody else sends
+    journal.open(after=info.sent)  # so that no other process sends
     try:
         return send_all(folder, journal, Sidecar(folder, info), mlflow_store())
     finally:
@@ -41,17 +41,19 @@ def sync(folder: Path, uri: str | None = None) -> int:
 
 
 def mark_dead(folder: Path, status: Status = "KILLED", uri: str | None = None, *, send: bool = True) -> bool:
-    """Close a run whose process died without closing it; False where there is nothing to close.
+    """Close a run whose process died without closing it; return False where there is nothing to close.
 
-    Sends what the store lacks, too. Where the store is away, or is none that the user names, the journal and `run.json`
-    hold the status, and a later `sync` tells the store.
+    The function also sends the lines that the store lacks. If the store cannot be reached, or the user does not name
+    it, the status is kept in the journal and in `run.json`, and a later `sync` sends it.
 
     Args:
-        folder, uri: as of `sync`.
-        send: whether to tell the store; without, this does not wait for anything.
+        folder: Folder of the run; it may come from an untrusted source.
+        status: Status to record.
+        uri: Address of the store that the user names (`stores.confirmed`).
+        send: Whether to contact the store; if False, the function waits for nothing.
 
     Raises:
-        DataError: the process is alive, or the folder holds links.
+        DataError: The process is alive, or the folder holds links.
     """
     folder = folder.absolute()
     require_enclosed(folder)
@@ -80,10 +82,10 @@ def mark_dead(folder: Path, status: Status = "KILLED", uri: str | None = None, *
 
 
 def close_and_send(folder: Path, uri: str | None = None) -> None:
-    """As `mark_dead`; where the run was closed in its folder alone (`watch`), tell the store.
+    """Close a run as `mark_dead` does; if it was already closed in its folder only (`watch`), send that to the store.
 
     Raises:
-        DataError: as of `mark_dead`.
+        DataError: The process is alive, or the folder holds links.
     """
     info = read_run_info(folder)
     if mark_dead(folder, uri=uri) or info is None or not info.uri:

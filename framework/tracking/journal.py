@@ -1,4 +1,4 @@
-"""The local journal of a run: every number stands on disk here before anything else sees it."""
+"""The local journal of a run, to which every number is written before anything else receives it."""
 
 import json
 import logging
@@ -18,18 +18,18 @@ from framework.storage.plain_values import is_number
 from framework.storage.reading import guarded
 
 _log = logging.getLogger(__name__)
-# json.dumps with options builds its encoder anew at each call; this one is built once.
+# json.dumps with options builds a new encoder at each call; this encoder is built once.
 _encode = json.JSONEncoder(separators=(",", ":"), allow_nan=False).encode
 _NO_NUMBERS = ("nan", "inf", "-inf")
-_BLOCK = 1 << 20  # bytes read at a time: bounds the memory of a reader that is far behind
-_PATIENCE = 2.0  # seconds, for which who closes the run of a killed process (`ended`) may write
+_BLOCK = 1 << 20  # bytes read at a time, which limits the memory of a reader that is far behind
+_PATIENCE = 2.0  # seconds to wait for a process that is closing the run of a killed process (`ended`)
 LARGEST, LONGEST = 1 << 30, 1 << 24
-"""Bytes of a journal (about seven million lines), and of a line of it; what has more was not written here."""
+"""Largest size in bytes of a journal (about seven million lines) and of one line; `Journal` never writes more."""
 
 
 @dataclass(frozen=True)
 class Line:
-    """What one call of `Journal.write` left; `time` in seconds since 1970."""
+    """Metrics that one call of `Journal.write` recorded, with `time` in seconds since 1970."""
 
     time: float
     step: int
@@ -38,19 +38,19 @@ class Line:
 
 
 class Journal:
-    """An append-only file of JSON lines that outlives its process.
+    """An append-only file of JSON lines that survives a crash of its process.
 
-    Every line has a number `n`, which grows by one and is never given twice, not even after `drop_after`: so
-    "everything up to n is stored elsewhere" stays true whatever happens to the file. Lines of metrics hold
-    `time`, `step`, `epoch` and `values`, where a value that is not finite is the string "nan", "inf" or
-    "-inf"; other lines hold what `append` was given.
+    Every line has a number `n`, which grows by one and is never used twice, not even after `drop_after`. The
+    statement "everything up to n is stored elsewhere" therefore stays true whatever happens to the file. Lines of
+    metrics hold `time`, `step`, `epoch` and `values`; a value that is not finite is the string "nan", "inf" or "-inf".
+    Other lines hold the arguments of `append`.
 
-    A line is with the operating system when `write` returns, and so survives SIGKILL; a thread syncs it to
-    the disk within about a second, and from then on it survives a power cut. A full disk stops nobody: lines
-    wait in memory until there is room again.
+    A line is with the operating system when `write` returns, so it survives SIGKILL. A thread syncs it to the disk
+    within about a second, and from then on it survives a power cut. A full disk does not stop the run: lines wait in
+    memory until there is room again.
 
-    The first `write`, `append` or `drop_after` makes this process the only writer until `close`, and cuts off
-    a last line that a crash has torn. Reading changes nothing and may happen at any time, from any process.
+    The first `write`, `append` or `drop_after` makes this process the only writer until `close`, and removes an
+    incomplete last line that a crash has left. Reading changes nothing and is possible at any time, from any process.
     """
 
     def __init__(self, path: Path) -> None:
@@ -58,11 +58,11 @@ class Journal:
         self.last = 0
         """Number of the newest line; 0 until the file is open for writing."""
         self._lock = threading.RLock()
-        self._file = -1  # descriptor; -1: not open for writing
-        self._owner = -1  # descriptor of the file that says who writes
-        self._waiting = bytearray()  # what the disk had no room for
-        self._place = (0, 0)  # (n, byte offset behind line n): where the last read ended
-        self._rewritten = 0  # how often an offset has lost its meaning
+        self._file = -1  # descriptor of the journal; -1 while it is not open for writing
+        self._owner = -1  # descriptor of the lock file, which holds the number of the writing process
+        self._waiting = bytearray()  # bytes for which the disk had no room
+        self._place = (0, 0)  # (n, byte offset behind line n) at which the last read ended
+        self._rewritten = 0  # how often the file was replaced, which makes earlier offsets invalid
         self._unsynced = threading.Event()
         self._closing = threading.Event()
         self._syncer: threading.Thread | None = None
@@ -71,12 +71,12 @@ class Journal:
         """Append one line of metrics.
 
         Raises:
-            DataError: the file cannot be opened, or another process writes it; at the first call only.
+            DataError: The file cannot be opened, or another process writes it; only the first call raises this.
         """
         with self._lock:
             self.open()
             self.last += 1
-            # By hand, as it stands in the training loop: half the time of the JSON encoder.
+            # Formatted here because the training loop calls it: this takes half the time of the JSON encoder.
             pairs = ",".join([f"{_quoted(name)}:{_number_or_name(value)}" for name, value in values.items()])
             self._put(
                 f'{{"n":{self.last},"time":{time.time():.3f},"step":{int(step)},"epoch":{int(epoch)},'
@@ -84,10 +84,10 @@ class Journal:
             )
 
     def append(self, **record: Any) -> None:
-        """Append a line that holds something else than metrics: plain JSON values.
+        """Append a line that holds plain JSON values other than metrics.
 
         Raises:
-            DataError: as `write`.
+            DataError: The file cannot be opened, or another process writes it; only the first call raises this.
         """
         with self._lock:
             self.open()
@@ -95,10 +95,10 @@ class Journal:
             self._put(_encode({"n": self.last, "time": round(time.time(), 3), **record}))
 
     def read(self, after: int = 0) -> list[dict[str, Any]]:
-        """The next lines with a number greater than `after`, about a mebibyte at most; empty at the end.
+        """Return the next lines with a number greater than `after`, at most about a mebibyte; empty at the end.
 
-        A torn last line is left out; a damaged one before it is skipped, and said. Reading on from the last
-        number returned costs only the new lines.
+        An incomplete last line is left out. A damaged line before it is skipped with a warning. A call with the last
+        number returned reads only the new lines.
         """
         with self._lock:
             found, offset = self._place
@@ -108,7 +108,9 @@ class Journal:
             if not os.path.lexists(self.path):
                 return []
             with guarded(self.path, "a journal"):
-                file = read_stream(self.path)  # stays the file it is, should drop_after replace it now
+                file = read_stream(
+                    self.path
+                )  # stays open on the old file if drop_after replaces it meanwhile
         records: list[dict[str, Any]] = []
         with file:
             file.seek(offset)
@@ -121,7 +123,7 @@ class Journal:
         return records
 
     def lines(self) -> Iterator[Line]:
-        """All metrics in order, NaN and infinities as floats again."""
+        """Yield all metrics in order, with NaN and infinities converted back to floats."""
         after = 0
         while records := self.read(after):
             for record in records:
@@ -131,13 +133,13 @@ class Journal:
             after = records[-1]["n"]
 
     def drop_after(self, step: int) -> int:
-        """Remove the metrics of later steps, which a run resumed from `step` will repeat; how many lines.
+        """Remove the metrics of later steps, which a run resumed from `step` will repeat; return the number of lines.
 
-        The file is replaced at once or not at all, and tells of it in a line `{"resumed_after": step}`.
+        The file is replaced atomically, and a line `{"resumed_after": step}` records the removal.
 
         Raises:
-            DataError: as `write`.
-            OSError: the disk is full; the file is as it was.
+            DataError: The file cannot be opened, or another process writes it; only the first call raises this.
+            OSError: The disk is full; the file is unchanged.
         """
         with self._lock:
             self.open()
@@ -150,7 +152,9 @@ class Journal:
                     if record is not None and record.get("step", step) > step:
                         dropped += 1
                     else:
-                        kept.write(line)  # a damaged one too: nothing goes that was not understood
+                        kept.write(
+                            line
+                        )  # damaged lines are kept too: only lines that were understood are removed
                 kept.write(_encode(marker).encode() + b"\n")
             self.last += 1
             self._reopen()
@@ -160,7 +164,7 @@ class Journal:
         """Rename the file to `path` and begin a new one.
 
         Raises:
-            DataError: as `write`.
+            DataError: The file cannot be opened, or another process writes it; only the first call raises this.
         """
         with self._lock:
             self.open()
@@ -170,13 +174,13 @@ class Journal:
             self._reopen()
 
     def open(self, after: int = 0) -> None:
-        """Become the only writer; nothing happens where this is so already.
+        """Make this process the only writer; do nothing if it already is.
 
         Args:
-            after: a number known to be given; a power cut can have taken lines that were stored elsewhere.
+            after: Line number known to be used. A power cut can remove lines from the file that are stored elsewhere.
 
         Raises:
-            DataError: the file cannot be opened, or another process writes it.
+            DataError: The file cannot be opened, or another process writes it.
         """
         if self._file >= 0:
             return
@@ -199,7 +203,7 @@ class Journal:
             self._syncer.start()
 
     def close(self) -> None:
-        """Sync to the disk and let other processes write; a later `write` opens the file again."""
+        """Sync the file to the disk and let other processes write; a later `write` opens the file again."""
         with self._lock:
             syncer, self._syncer = self._syncer, None
         if syncer is None:
@@ -258,7 +262,7 @@ class Journal:
         while not self._closing.is_set():
             self._unsynced.wait()
             self._unsynced.clear()
-            with self._lock:  # a descriptor of its own, since a rewriting closes the other
+            with self._lock:  # a separate descriptor, since replacing the file closes the first
                 descriptor = os.dup(self._file)
             self._sync(descriptor)
             os.close(descriptor)
@@ -271,7 +275,7 @@ class Journal:
             _log.warning("%s could not be synced to its disk: %s.", self.path, error.strerror)
 
     def _mend(self) -> int:
-        """Cut off a torn last line; the number of the last whole one."""
+        """Remove an incomplete last line, and return the number of the last complete line."""
         if not os.path.lexists(self.path):
             return 0
         with os.fdopen(open_plain(self.path, os.O_RDWR), "r+b") as file:
@@ -324,10 +328,10 @@ def _append_to(path: Path) -> int:
 
 
 def _claim(path: Path) -> int:
-    """A descriptor that makes this process the only writer of `path`, until it is closed or the process dies.
+    """Return a descriptor that makes this process the only writer of `path` until it is closed or the process dies.
 
-    A POSIX record lock: unlike flock, it is not inherited by data-loading processes, which outlive a killed
-    parent by seconds. It stands on a file of its own, since closing any descriptor of a file ends it.
+    The lock is a POSIX record lock. Unlike flock, data-loading processes do not inherit it, and these outlive a killed
+    parent by seconds. It is held on a separate file, since closing any descriptor of a file releases its record lock.
     """
     owner = open_plain(path.with_name(f".{path.name}.lock"), os.O_RDWR | os.O_CREAT)
     try:
@@ -347,7 +351,7 @@ def _claim(path: Path) -> int:
 
 
 def _whole_lines(file: BinaryIO) -> bytes:
-    """The next block of about a mebibyte that ends with a line; empty where there is no whole one."""
+    """Return the next block of complete lines, about a mebibyte; empty where there is no complete line."""
     block = file.read(_BLOCK)
     if not block.endswith(b"\n"):
         block += file.readline(LONGEST)
@@ -355,7 +359,7 @@ def _whole_lines(file: BinaryIO) -> bytes:
 
 
 def _number(line: bytes) -> int:
-    """A line's number without parsing the rest; a large one where it has none."""
+    """Return a line's number without parsing the rest; a number above all others where it has none."""
     digits = line[5 : line.find(b",", 5)] if line.startswith(b'{"n":') else b""
     return int(digits) if digits.isdigit() and len(digits) < 19 else 1 << 62
 
@@ -384,5 +388,5 @@ def _quoted(name: str) -> str:
 
 def _number_or_name(value: float) -> str:
     number = float(value)
-    # JSON knows no NaN and no infinity.
+    # JSON has no NaN and no infinity.
     return repr(number) if number - number == 0 else f'"{number}"'

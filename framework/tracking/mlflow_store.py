@@ -1,4 +1,4 @@
-"""A run in an MLflow store. Imports MLflow, so it is imported only when a store is opened."""
+"""Run in an MLflow store; this module imports MLflow, so it is imported only when a store is opened."""
 
 import getpass
 import hashlib
@@ -23,10 +23,10 @@ from framework.tracking.sender import Record, Store, reason
 from framework.tracking.stores import address, require_own_files, sqlite_path, sqlite_uri, without_password
 
 os.environ["MLFLOW_DISABLE_TELEMETRY"] = "true"
-# One retry instead of minutes of them: who calls this tries again by itself, and has to notice its end.
+# One retry instead of minutes of retries: the caller tries again itself, and must notice when it is told to end.
 os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "1")
 with warnings.catch_warnings():
-    warnings.simplefilter("ignore", DeprecationWarning)  # MLflow's, about its own dependencies
+    warnings.simplefilter("ignore", DeprecationWarning)  # MLflow warns about its own dependencies
     from mlflow import MlflowClient, artifacts
     from mlflow.entities import Dataset, DatasetInput, InputTag, LoggedModelOutput, Metric, Param, Run, RunTag
     from mlflow.exceptions import MlflowException
@@ -36,27 +36,29 @@ with warnings.catch_warnings():
 _log = logging.getLogger(__name__)
 logging.getLogger("alembic").setLevel(logging.WARNING)
 logging.getLogger("mlflow").setLevel(logging.WARNING)
-# These tell each failed attempt at length; the sender says it once.
+# These loggers report each failed attempt at length; the sender reports the failure once.
 logging.getLogger("mlflow.store.db.utils").setLevel(logging.CRITICAL)
 logging.getLogger("urllib3.connectionpool").setLevel(logging.ERROR)
 
 _KEY, _FOLDER = "framework.key", "framework.folder"  # tags
 _LONGEST_NAME = 250  # characters
-_DIGEST = 16  # letters that are shown
+_DIGEST = 16  # characters of a digest that MLflow shows
 _LOADER = "framework.deployment.served"
-"""The module by which MLflow loads a model: written here, since what a run folder says may be a stranger's."""
+"""Module by which MLflow loads a model; it is a constant because a run folder may come from an untrusted source."""
 
 
 @final
 class MlflowStore(Store):
-    """A run in an MLflow store; it is created if it is not there.
+    """Run in an MLflow store; it is created there if it does not exist.
 
     Args:
-        folder: of the run.
-        info: of the run; its id is looked for first, then its key. If it says RUNNING, MLflow does so too.
+        folder: Folder of the run.
+        info: Description of the run. The run is searched by its id first, then by its key. If the status is RUNNING,
+            it is set in MLflow too.
 
     Raises:
-        Exception: whatever MLflow, SQLAlchemy or the network raise when the store is locked, full or away.
+        Exception: MLflow, SQLAlchemy and the network raise various kinds when the store is locked, full or cannot be
+            reached.
     """
 
     def __init__(self, folder: Path, info: RunInfo) -> None:
@@ -72,7 +74,7 @@ class MlflowStore(Store):
             raise RuntimeError(f"run {run.info.run_id} was deleted there; restore it in MLflow")
         elif info.status == "RUNNING":
             self._client.update_run(run.info.run_id, status="RUNNING")
-            self._client.set_tag(run.info.run_id, _FOLDER, spelled(folder))  # it may have been moved
+            self._client.set_tag(run.info.run_id, _FOLDER, spelled(folder))  # the folder may have been moved
         self.identity = {
             "run_id": run.info.run_id,
             "experiment_id": run.info.experiment_id,
@@ -85,17 +87,17 @@ class MlflowStore(Store):
         self._files: str | None = run.info.artifact_uri
         self._model_name = re.sub(r"[^\w-]", "_", info.run_name.partition(",")[0])[:_LONGEST_NAME] or "model"
         self._params: dict[str, str] = dict(run.data.params)
-        # The last step of each metric; RunData itself gives the values alone.
+        # The last step of each metric; RunData itself holds only the values.
         self._stored = {metric.key: metric.step for metric in run.to_proto().data.metrics}
         self._renamed: set[str] = set()
 
     def _require_own_files(self, location: str | None) -> None:
-        """Refuse to write files where a store that nobody named wants them, but in its own folder."""
+        """Refuse to write files outside the folder of a store that the user did not name."""
         if not self._info.named:
             require_own_files(self._info.uri, (location or "",))
 
     def send(self, batch: Sequence[Record]) -> None:
-        """As in `Store`: SQL stores know a metric by key, time, step and value, and keep it once."""
+        """Store a batch; SQL stores identify a metric by key, time, step and value, so a repeated one is kept once."""
         if "status" in batch[0]:
             status, end = batch[0]["status"], round(batch[0]["time"] * 1000)
             if status == "RUNNING":
@@ -117,9 +119,9 @@ class MlflowStore(Store):
             self._params |= {param.key: param.value for param in params}
 
     def send_file(self, path: str, place: str) -> None:
-        """As in `Store`; a file that is gone, or leads out of the run folder, is said and passed over."""
+        """Store a file or directory; one that is missing or leads out of the run folder is skipped with a warning."""
         file = self._folder / path
-        # a journal may be a stranger's: what lies elsewhere is not the run's to give away
+        # a journal may come from an untrusted source, so files outside the run folder must not be sent
         try:
             if not file.is_relative_to(self._folder) or ".." in file.parts:
                 raise DataError("it names a file elsewhere")
@@ -144,7 +146,7 @@ class MlflowStore(Store):
             _log.warning("%s is gone before it could be stored.", shown(file))
 
     def _send_model(self, file: Path) -> None:
-        """Make the checkpoint a model of MLflow, which serves it; what was sent before is replaced."""
+        """Store the checkpoint as a model that MLflow can serve; it replaces a model sent before."""
         found = self._client.search_logged_models(
             [self._experiment_id], f"source_run_id = '{self._run_id}'", max_results=1
         )
@@ -168,7 +170,7 @@ class MlflowStore(Store):
         if info.run_id is not None:
             try:
                 run = self._client.get_run(info.run_id)
-                # an id that a file names may be that of another run of the user's
+                # the id in a file may belong to another run of the user
                 if run.data.tags.get(_KEY, info.key) == info.key:
                     return run
             except MlflowException as error:
@@ -208,7 +210,7 @@ class MlflowStore(Store):
                 before = self._params.get(key, params.get(key))
                 if before is None:
                     params[key] = value
-                elif before != value:  # MLflow lets no parameter change
+                elif before != value:  # MLflow lets no parameter change, so the new value becomes a tag
                     tags[f"changed.{key}"[:_LONGEST_NAME]] = value
         texts = [RunTag(key, value) for key, value in tags.items() if value is not None]
         removed = [key for key, value in tags.items() if value is None]
@@ -230,7 +232,7 @@ class MlflowStore(Store):
             deleted = self._client.get_run(self._run_id).info.lifecycle_stage == "deleted"
             if error.error_code != "INVALID_PARAMETER_VALUE" or deleted:
                 raise
-            # One entry is refused for good. Find it, lest everything behind it wait for ever.
+            # One entry is refused permanently. Find it, so that the entries behind it do not wait for ever.
             singles = [([entry], [], []) for entry in metrics]
             singles += [([], [entry], []) for entry in params] + [([], [], [entry]) for entry in tags]
             for single in singles:
@@ -251,7 +253,7 @@ class MlflowStore(Store):
 
 
 def _dataset(record: Record) -> DatasetInput:
-    """What the column `Dataset` of MLflow shows: name and digest, and on a click all that is known of the data."""
+    """Return the content of MLflow's column `Dataset`: name, digest, and all facts about the data as the profile."""
     facts: dict[str, str] = {key: encodable(fact) for key, fact in record["facts"].items()}
     digest = facts.get("sha256") or hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
     dataset = Dataset(
@@ -269,19 +271,19 @@ def _models(run: Run) -> list[str]:
 
 
 def run_folder(run_id: str, uri: str | None = None) -> Path:
-    """The folder a run was made in, or else a copy, in the cache, of the checkpoints in its store.
+    """Return the folder in which a run was made, or else a copy of its stored checkpoints in the cache.
 
     Args:
-        run_id: of MLflow.
-        uri: of the store; None: outputs/mlflow.db in the working directory.
+        run_id: Id of the run in MLflow.
+        uri: Address of the store; None means outputs/mlflow.db in the working directory.
 
     Raises:
-        CheckpointError: the store has no such run, or the run has no checkpoints.
+        CheckpointError: The store has no such run, or the run has no checkpoints.
     """
     store = address(uri, Path.cwd() / "outputs" / "any")
     told = without_password(store.uri)
     path = sqlite_path(store.uri)
-    if path is not None and not path.is_file():  # MLflow would make one
+    if path is not None and not path.is_file():  # MLflow would create the file
         raise CheckpointError(f"There is no tracking store {path}. Give its address (logger.uri=...).")
     if not store.named:
         require_own_files(store.uri)
@@ -289,7 +291,7 @@ def run_folder(run_id: str, uri: str | None = None) -> Path:
     try:
         run = client.get_run(run_id)
         made = path_of(run.data.tags.get(_FOLDER, ""))
-        # a store that nobody named may have come with somebody's folder, and says nothing of other folders
+        # a store that the user did not name may have come with a run folder, so it is trusted for its own folder only
         trusted = store.named or (path is not None and made.resolve().is_relative_to(path.parent.resolve()))
         if _FOLDER in run.data.tags and trusted and _holds(made, run_id):
             return made
@@ -303,18 +305,22 @@ def run_folder(run_id: str, uri: str | None = None) -> Path:
         copy = cache_folder("runs") / run_id
         copy.mkdir(exist_ok=True)
         if models:
-            place = client.get_logged_model(models[0]).artifact_location  # "models:/" asks another store
+            place = client.get_logged_model(
+                models[0]
+            ).artifact_location  # an address "models:/" would ask another store
             if not store.named:
                 require_own_files(store.uri, (place or "",))
             return Path(artifacts.download_artifacts(place, dst_path=str(copy), tracking_uri=store.uri))
-        client.download_artifacts(run_id, "checkpoints", str(copy))  # a run of version 0.1
+        client.download_artifacts(
+            run_id, "checkpoints", str(copy)
+        )  # runs of version 0.1 keep checkpoints as files
     except MlflowException as error:
         raise CheckpointError(f"Run {run_id} cannot be had from {told}: {reason(error)}.") from error
     return copy
 
 
 def _holds(folder: Path, run_id: str) -> bool:
-    """Whether the run in this folder is that one still: another may have been made there since."""
+    """Return whether a folder still holds the run with this id; another run may have been made there since."""
     try:
         info = read_run_info(folder)
     except DataError:
@@ -323,7 +329,7 @@ def _holds(folder: Path, run_id: str) -> bool:
 
 
 def _opened(info: RunInfo) -> tuple[MlflowClient, str]:
-    """A client of the run's store, and the id of its experiment; both made where they are not."""
+    """Return a client of the run's store and the id of the run's experiment; both are created if missing."""
     path = sqlite_path(info.uri)
     if path is None:
         client = MlflowClient(tracking_uri=info.uri)
@@ -331,7 +337,7 @@ def _opened(info: RunInfo) -> tuple[MlflowClient, str]:
     path.parent.mkdir(parents=True, exist_ok=True)
     if not info.named:
         require_own_files(info.uri)
-    # MLflow's own migrations and get-or-create fail when several processes begin at once.
+    # MLflow's own migrations and get-or-create fail when several processes begin at the same time.
     with alone(path.with_name(f".{path.name}.lock")):
         if not path.exists() or path.stat().st_size == 0:
             _make_database(path, info)
@@ -340,11 +346,11 @@ def _opened(info: RunInfo) -> tuple[MlflowClient, str]:
 
 
 def _make_database(path: Path, info: RunInfo) -> None:
-    """Make an SQLite store aside and rename it: MLflow cannot mend one whose making was cut short."""
+    """Create an SQLite store under a temporary name and rename it, since MLflow cannot repair an incomplete one."""
     remove_leftovers(path.parent)
     with replacing(path) as partial:
         SqlAlchemyStore(sqlite_uri(partial), info.artifacts).engine.dispose()
-    # MLflow keeps its connections by address: they may lead to a deleted file that was there before.
+    # MLflow caches connections by address; a cached one may lead to a deleted file of the same name.
     SqlAlchemyStore(info.uri, info.artifacts).engine.dispose()
 
 
@@ -359,7 +365,7 @@ def _experiment(client: MlflowClient, info: RunInfo) -> str:
         except MlflowException as error:
             if error.error_code != "RESOURCE_ALREADY_EXISTS":
                 raise
-        found = client.get_experiment_by_name(info.experiment)  # somebody was faster
+        found = client.get_experiment_by_name(info.experiment)  # another process created it first
     if found is None or found.lifecycle_stage == "deleted":
         raise RuntimeError(
             f"experiment {info.experiment!r} was deleted there; restore it, or choose another name"
@@ -368,9 +374,9 @@ def _experiment(client: MlflowClient, info: RunInfo) -> str:
 
 
 def _view(experiment_id: str) -> dict[str, str]:
-    """Tags of an experiment: a view with both losses in one chart, and its link as the description.
+    """Return tags of an experiment: a view that shows both losses in one chart, and a link to it as the description.
 
-    MLflow itself draws each metric apart; a view is what its button `Share` makes.
+    MLflow itself draws each metric in a separate chart. A view is the object that its button `Share` creates.
     """
     losses = ["train/loss", "validation/loss"]
     chart = {"uuid": "losses", "metricSectionId": "losses", "type": "LINE", "metricKey": losses[0]}
@@ -387,5 +393,5 @@ def _view(experiment_id: str) -> dict[str, str]:
 def _user() -> str:
     try:
         return getpass.getuser()
-    except (KeyError, OSError):  # a container may have no name for its user
+    except (KeyError, OSError):  # the user of a container may have no name
         return "unknown"

@@ -1,4 +1,4 @@
-"""What is known of a run beside its numbers: where it is stored, how far, how it ended. Kept in run.json."""
+"""Record of a run in `run.json`: its store, how much of the journal was sent, and how the run ended."""
 
 import json
 import logging
@@ -22,19 +22,19 @@ _log = logging.getLogger(__name__)
 
 SIDECAR = "run.json"
 MODEL = "model:"
-"""The place of a checkpoint that the store keeps as the run's model, and not in a folder of its files."""
+"""Place of a checkpoint that the store keeps as the run's model instead of in a folder of files."""
 
 
 @dataclass(frozen=True)
 class Destination:
-    """A run in a store.
+    """Place of a run in a store.
 
     Attributes:
-        uri: an MLflow tracking URI that the user names; None: see `stores.address`.
-        experiment: its name in MLflow; made if new.
-        run_name: shown in MLflow.
-        parent: run id under which MLflow shows this one.
-        run_id: of the run to go on with; None: a new run, or the one in the folder if that has no id yet.
+        uri: MLflow tracking URI that the user names; None means the default of `stores.address`.
+        experiment: Name of the experiment in MLflow, which is created if it is new.
+        run_name: Name of the run in MLflow.
+        parent: Id of the run under which MLflow shows this one.
+        run_id: Id of the run to continue; None means a new run, or the run in the folder if that has no id yet.
     """
 
     uri: str | None
@@ -46,43 +46,43 @@ class Destination:
 
 @dataclass(frozen=True)
 class RunInfo:
-    """What `run.json` in the run folder holds: enough to go on with the run from another process."""
+    """Content of `run.json` in the run folder, which suffices to continue the run from another process."""
 
     run_id: str | None
-    """The store's id; None while the store has not been reached."""
+    """Id of the run in the store; None while the store has not been reached."""
     uri: str
-    """The store, in the file without a password; empty where only the journal is kept."""
+    """Address of the store, written to the file without a password; empty where only the journal is kept."""
     experiment: str
     run_name: str
     parent: str | None
-    """The store's id of the run this one belongs to, such as a sweep."""
+    """Id, in the store, of the run to which this one belongs, such as a sweep."""
     artifacts: str | None
-    """Where a new experiment keeps its files; None: the store decides."""
+    """Folder in which a new experiment keeps its files; None lets the store decide."""
     key: str
-    """Our own id, by which a run whose creation was cut short is found again in the store."""
+    """The framework's own id, by which a run whose creation was interrupted is found again in the store."""
     started: float
-    """Seconds since 1970."""
+    """Start of the run, in seconds since 1970."""
     status: str
-    """RUNNING, FINISHED, FAILED or KILLED."""
+    """Status of the run: RUNNING, FINISHED, FAILED or KILLED."""
     experiment_id: str | None = None
     sent: int = 0
-    """Lines of the journal up to this number are in the store."""
+    """Number of the journal line up to which all lines are in the store."""
     replay_after: int | None = None
-    """The step the run was last resumed from, and repeats what came after."""
+    """Step from which the run was last resumed; the run repeats the steps after it."""
     replay_until: dict[str, int] = field(default_factory=dict)
-    """Up to which step each metric was in the store by then, and need not be sent again."""
+    """Step up to which each metric was in the store when the run was resumed, and need not be sent again."""
     owed: tuple[tuple[str, str], ...] = ()
-    """Files (path, folder in the store) that the store has still to take."""
+    """Files (path, folder in the store) that must still be sent to the store."""
     named: bool = False
-    """Whether the user named the store (`stores.Address`); never read from a file."""
+    """True if the user named the store (`stores.Address`); this value is never read from a file."""
 
     @classmethod
     def at(cls, place: Destination, folder: Path) -> "RunInfo":
-        """Of a run in `folder` that begins now.
+        """Return the record of a run in `folder` that begins now.
 
         Raises:
             ConfigError: MLflow cannot keep runs in that store.
-            DataError: the default store leads out of its folder.
+            DataError: The default store leads out of its folder.
         """
         store = address(place.uri, folder)
         if not store.named:
@@ -101,15 +101,15 @@ class RunInfo:
         )
 
     def at_store(self, store: Address, folder: Path) -> "RunInfo":
-        """Return the same run, to be sent to the user's own address of its store."""
+        """Return the record with the address of its store replaced by the user's own address."""
         return replace(self, uri=store.uri, named=store.named, artifacts=artifact_folder(store.uri, folder))
 
 
 def read_run_info(folder: Path) -> RunInfo | None:
-    """What `run.json` in a run folder says; None where there is none.
+    """Return the content of `run.json` in a run folder, or None where there is no such file.
 
     Raises:
-        DataError: it is not what a tracker wrote.
+        DataError: The content was not written by a tracker.
     """
     path = folder / SIDECAR
     if not os.path.lexists(path):
@@ -120,7 +120,7 @@ def read_run_info(folder: Path) -> RunInfo | None:
 
 
 class Sidecar:
-    """`run.json`, in memory and on disk."""
+    """The file `run.json`, in memory and on disk."""
 
     def __init__(self, folder: Path, info: RunInfo) -> None:
         self.info = info
@@ -128,7 +128,7 @@ class Sidecar:
         self._lock = threading.Lock()
 
     def update(self, **changes: Any) -> None:
-        """Change fields of `info`; on disk when this returns, if the disk has room."""
+        """Change fields of `info`; the file is on disk when this returns, if the disk has room."""
         with self._lock:
             self.info = replace(self.info, **changes)
             stored = asdict(self.info)
@@ -136,7 +136,5 @@ class Sidecar:
             del stored["named"]
             try:
                 write_whole(self._path, json.dumps(stored, indent=1).encode())
-            except (
-                OSError
-            ) as error:  # an old one costs only that lines are sent again, which the store ignores
+            except OSError as error:  # with an old file, lines are sent again, which the store ignores
                 _log.warning("%s could not be written: %s.", self._path, error.strerror)

@@ -1,4 +1,4 @@
-"""Carries a journal to a store, in batches, for as long as that takes."""
+"""Sending of a journal to a store, in batches, with retries for as long as needed."""
 
 import logging
 import threading
@@ -15,44 +15,48 @@ from framework.tracking.stores import without_password
 
 _log = logging.getLogger(__name__)
 
-_BATCH = 1000  # metrics, parameters and tags that a store takes at once
-_LINES = 50  # waiting lines that are worth a call of the store
-_SECONDS = 2.0  # no line waits longer while the store answers
-_PAUSE = 0.5  # seconds between calls at least: a fast training is not to be slowed by its own numbers
-_FIRST_RETRY, _LAST_RETRY = 1.0, 30.0  # seconds between attempts, doubled each time
+_BATCH = 1000  # metrics, parameters and tags that a store accepts in one call
+_LINES = 50  # number of waiting lines that triggers a call of the store
+_SECONDS = 2.0  # longest time that a line waits while the store answers
+_PAUSE = 0.5  # shortest time between calls, so that a fast training is not slowed by its own numbers
+_FIRST_RETRY, _LAST_RETRY = (
+    1.0,
+    30.0,
+)  # first and longest time between attempts, in seconds; it doubles each time
 
 Record = dict[str, Any]
 
 
 class Store(ABC):
-    """One run in a store. Whatever a method raises is taken for a store that is away: it is called again."""
+    """Contract of one run in a store; if a method raises any exception, the store counts as away and is retried."""
 
     identity: Mapping[str, Any]
-    """Fields of `RunInfo` as they are once the store is open."""
+    """Fields of `RunInfo` with their values after the store was opened."""
     replay: Mapping[str, Any]
-    """The fields `replay_...` of `RunInfo`, after what was sent so far."""
+    """Fields `replay_...` of `RunInfo` with their values after the batches sent so far."""
 
     @abstractmethod
     def send(self, batch: Sequence[Record]) -> None:
-        """Store one of `batches`; the same one may come twice, and is stored once."""
+        """Store one batch from `batches`; a batch that is sent twice is stored once."""
 
     @abstractmethod
     def send_file(self, path: str, place: str) -> None:
-        """Store a file or a directory, its path absolute or in the run folder, under the folder `place`.
+        """Store a file or a directory under the folder `place`; `path` is absolute or relative to the run folder.
 
         Raises:
-            DataError: this store may not take files; another call would not help.
+            DataError: This store may not accept files; another call would not help.
         """
 
 
 OpenStore = Callable[[Path, RunInfo], Store]
-"""From a run folder and what is known of the run to the run in its store."""
+"""Type of a function that opens the run in its store, given the run folder and the content of `run.json`."""
 
 
 def batches(records: Sequence[Record]) -> Iterator[list[Record]]:
-    """Records in order, put together for few calls of the store.
+    """Yield the records in order, grouped so that few calls of the store are needed.
 
-    Metrics, parameters and tags go together; files, changes of status and resumptions go one by one.
+    Metrics, parameters and tags share a batch. A file, a change of status, a data set or a resumption is a batch of its
+    own.
     """
     batch: list[Record] = []
     size = 0
@@ -72,9 +76,9 @@ def batches(records: Sequence[Record]) -> Iterator[list[Record]]:
 
 
 def send_new(journal: Journal, sidecar: Sidecar, store: Store, stop: Callable[[], bool]) -> int:
-    """Send what the journal has by now and the store lacks, or as much until `stop()`; how many lines.
+    """Send the journal lines that the store lacks until `stop()` returns True, and return the number of lines sent.
 
-    What is logged meanwhile waits for the next call, or a training would be followed line by line.
+    Lines that are logged meanwhile wait for the next call; otherwise each line of a training would be sent on its own.
     """
     count, last_line = 0, journal.last
     while sidecar.info.sent < last_line and (records := journal.read(sidecar.info.sent)):
@@ -83,7 +87,7 @@ def send_new(journal: Journal, sidecar: Sidecar, store: Store, stop: Callable[[]
                 return count
             last = batch[-1]["n"]
             if "artifact" in batch[0]:
-                # Owed now and sent afterwards: files that cannot be stored must not hold up the numbers.
+                # Files are only noted here and sent afterwards, so that a file that fails does not delay the numbers.
                 owed = (*sidecar.info.owed, (batch[0]["artifact"], batch[0]["folder"]))
                 sidecar.update(sent=last, owed=owed)
             else:
@@ -99,10 +103,14 @@ def send_owed(
     stop: Callable[[], bool],
     refused: Callable[[DataError], None] | None = None,
 ) -> None:
-    """Send the files that wait, in order.
+    """Send the waiting files in order.
 
     Args:
-        refused: told of a file that may not be sent, which is then left out; None: the error is raised.
+        sidecar: Record of the run, which lists the files.
+        store: Run in the store.
+        stop: Function that returns whether to stop before the next file.
+        refused: Function that is called with the error if a file may not be sent, which is then left out; None raises
+            the error.
     """
     while sidecar.info.owed and not stop():
         try:
@@ -115,10 +123,10 @@ def send_owed(
 
 
 def send_all(folder: Path, journal: Journal, sidecar: Sidecar, open_store: OpenStore) -> int:
-    """Send everything once, of a run whose process has ended; how many lines of the journal that were.
+    """Send everything of a run whose process has ended, and return the number of journal lines sent.
 
     Raises:
-        UserError: the store did not take everything.
+        UserError: The store did not accept everything.
     """
     try:
         store = open_store(folder, sidecar.info)
@@ -134,12 +142,12 @@ def send_all(folder: Path, journal: Journal, sidecar: Sidecar, open_store: OpenS
 
 
 class Sender(threading.Thread):
-    """Sends a growing journal until told to finish; no failure of the store ends it."""
+    """Thread that sends a growing journal until it is told to finish; no failure of the store ends it."""
 
     def __init__(self, folder: Path, journal: Journal, sidecar: Sidecar, open_store: OpenStore) -> None:
         super().__init__(name="tracking", daemon=True)  # a store that hangs does not keep the process alive
         self.tried = threading.Event()
-        """The store has answered once, or has failed once."""
+        """Event that is set once the store has answered or failed for the first time."""
         self._folder = folder
         self._journal = journal
         self._sidecar = sidecar
@@ -153,13 +161,13 @@ class Sender(threading.Thread):
         self._told_refusal = False
 
     def notice(self) -> None:
-        """One more line waits."""
+        """Note that one more line waits."""
         self._waiting_lines += 1
         if self._waiting_lines >= _LINES:
             self._wake.set()
 
     def warn(self, why: str) -> None:
-        """Say that the store is away, unless that was said."""
+        """Log a warning that the store is away, unless it was logged before."""
         if self._away_since is None:
             self._away_since = time.monotonic()
             _log.warning(
@@ -171,7 +179,7 @@ class Sender(threading.Thread):
             )
 
     def finish(self, patience: float) -> bool:
-        """Send the rest and stop; whether everything was sent within `patience` seconds."""
+        """Send the rest and stop; return whether everything was sent within `patience` seconds."""
         self._finishing.set()
         self._wake.set()
         self.join(patience)
@@ -188,10 +196,10 @@ class Sender(threading.Thread):
             try:
                 self._send()
             except Exception as error:
-                self._store = None  # looked for anew, as it may be another one then
+                self._store = None  # opened again, as it may be another store by then
                 self.warn(reason(error))
                 self.tried.set()
-                # Once finishing there is little time: it is spent on trying.
+                # Little time is left after `finish`, so attempts follow each other quickly.
                 if finishing:
                     time.sleep(_FIRST_RETRY)
                 else:
@@ -223,8 +231,8 @@ class Sender(threading.Thread):
 
 
 def reason(error: BaseException) -> str:
-    """What an exception of a store says, or rather the one it came from, in a line that can be shown."""
+    """Return the message of the root cause of a store's exception as one line, without passwords."""
     while (cause := error.__cause__ or error.__context__) is not None:
-        error = cause  # "Connection refused" and "database is locked" stand at the bottom
+        error = cause  # "Connection refused" and "database is locked" are at the end of the chain
     line = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
     return without_password(line if len(line) <= 200 else line[:199] + "…").rstrip(". ")

@@ -1,4 +1,4 @@
-"""Ctrl-C, SIGTERM, a closed terminal, a parent that dies: stop where it is safe, and say so in the exit code."""
+"""Handling of Ctrl-C, SIGTERM, a closed terminal and a dead parent: stop at a safe point with a matching exit code."""
 
 import ctypes
 import os
@@ -10,21 +10,21 @@ from types import FrameType
 from typing import NoReturn
 
 CLOSED = getattr(signal, "SIGHUP", None)
-"""That the terminal was closed; None on a system that has none."""
+"""Signal for a closed terminal; None on a system without it."""
 SIGNALS = (signal.SIGINT, signal.SIGTERM, *([CLOSED] if CLOSED else []))
 ENDING = 6.0
-"""Seconds that a process has to end by itself once its parent has died, or once it can no longer go on."""
+"""Seconds in which a process must end by itself after its parent has died or after it can no longer continue."""
 _LIBRARY = ctypes.CDLL(None) if sys.platform == "linux" else None  # not loaded between fork and exec
-_SET_PARENT_DEATH, _GET_PARENT_DEATH = 1, 2  # of prctl.h
+_SET_PARENT_DEATH, _GET_PARENT_DEATH = 1, 2  # constants of prctl.h
 
 
 def handled() -> tuple[signal.Signals, ...]:
-    """All of them, but for the closing of a terminal where that is ignored, as under nohup."""
+    """Return the signals to handle: all of `SIGNALS`, except the closed terminal if it is ignored, as under nohup."""
     return tuple(one for one in SIGNALS if one != CLOSED or signal.getsignal(one) is not signal.SIG_IGN)
 
 
 class Stopped(SystemExit):
-    """The run was told to stop; exits with 128 + the signal's number, as shells do."""
+    """Exception for a run that was told to stop; the process exits with 128 + the signal's number, as in shells."""
 
     def __init__(self, number: int) -> None:
         super().__init__(128 + number)
@@ -32,9 +32,10 @@ class Stopped(SystemExit):
 
 
 class Stopper:
-    """Turns SIGINT, SIGTERM and SIGHUP into `Stopped`: at once, or, while `wait` is set, where the code calls `stop`.
+    """Handler that turns SIGINT, SIGTERM and SIGHUP into `Stopped`.
 
-    A second signal never waits.
+    The exception is raised immediately or, while `wait` is set, when the code calls `stop`. A second signal raises it
+    immediately in any case.
     """
 
     def __init__(self) -> None:
@@ -53,12 +54,12 @@ class Stopper:
                 signal.signal(number, handler)
 
     def install(self) -> None:
-        """Handle the signals, whoever has handled them since."""
+        """Install the handlers, also where other code has replaced them since."""
         for number in handled():
             signal.signal(number, self._handle)
 
     def stop(self) -> NoReturn:
-        """Stop now for the signal received, by this process or by another rank of it."""
+        """Raise `Stopped` for the received signal; SIGTERM where only another rank has received one."""
         raise Stopped(self.received or signal.SIGTERM)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
@@ -69,16 +70,17 @@ class Stopper:
 
 
 def ending_with_parent(number: int = signal.SIGTERM) -> Callable[[], None]:
-    """Return what a new child of this process calls before anything else, to get a signal when this one dies.
+    """Return a function that a new child process calls first, so that it gets a signal when this process dies.
 
-    Linux; elsewhere the child runs on. Start the child in the main thread: the signal comes when that thread ends.
+    This works on Linux only; elsewhere the child continues to run. Start the child in the main thread, because the
+    signal is sent when the starting thread ends.
     """
     parent = os.getpid()
 
     def begin() -> None:
         if _LIBRARY is not None:
             _LIBRARY.prctl(_SET_PARENT_DEATH, number)
-            if os.getppid() != parent:  # it died before that could be asked for
+            if os.getppid() != parent:  # the parent died before the call
                 os.kill(os.getpid(), number)
 
     return begin

@@ -1,4 +1,4 @@
-"""The tracker of processes whose record another one keeps."""
+"""Tracker for processes whose run is recorded by another process."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,7 +10,7 @@ from framework.tracking.tracker import JOURNAL, Status, Tracker
 
 @final
 class SilentTracker(Tracker):
-    """Records nothing: of several ranks that train together the first keeps the record."""
+    """Tracker that records nothing, because the first of several ranks that train together records the run."""
 
     def __init__(self, folder: Path) -> None:
         self.journal = Journal(folder / JOURNAL)  # read, never written

@@ -1,6 +1,7 @@
-"""A store in a process of its own, so that the process that trains never imports MLflow.
+"""Store in a separate process, so that the process that trains never imports MLflow.
 
-Questions and answers are lines of JSON. The process ends with its input: when it is closed, or when whoever asks died.
+Requests and answers are lines of JSON. The process ends when its input ends, that is, when the input is closed or the
+requesting process has died.
 """
 
 import json
@@ -22,16 +23,16 @@ from framework.tracking.sender import Record, Store, reason
 
 _log = logging.getLogger(__name__)
 _COMMAND = (sys.executable, "-P", "-m", __name__)
-_ENDING = 5.0  # seconds that the process has to end by itself
+_ENDING = 5.0  # seconds in which the process must end by itself
 
 
 class StoreAway(Exception):
-    """What the process says of a store that is locked, full or away, or that the process has ended."""
+    """Error for a store that is locked, full or away, or for a store process that has ended."""
 
 
 @final
 class StoreProcess:
-    """Opens runs in MLflow (`sender.OpenStore`), in a process that starts with the first; it is kept for the next."""
+    """Function object (`sender.OpenStore`) that opens runs in MLflow in one process, started at the first call."""
 
     def __init__(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None
@@ -40,18 +41,18 @@ class StoreProcess:
         if self._process is not None and self._process.poll() is not None:
             self.end()
         if self._process is None:
-            # in a session of its own: a Ctrl-C is for those who train, and they say when it is to end
+            # a session of its own, because Ctrl-C is meant for the training, which then tells this process to end
             self._process = subprocess.Popen(
                 _COMMAND, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True
             )
         return _DistantStore(self, folder, info)
 
     def ask(self, **question: Any) -> Mapping[str, Any]:
-        """What the process answers; what it has to say on the way is said here.
+        """Send a request to the process and return its answer; its log messages are logged here.
 
         Raises:
-            DataError: the store may not take a file.
-            StoreAway: the store failed, or the process has ended.
+            DataError: The store may not accept a file.
+            StoreAway: The store failed, or the process has ended.
         """
         process = self._process
         assert process is not None and process.stdin is not None and process.stdout is not None
@@ -69,14 +70,14 @@ class StoreProcess:
         return answer
 
     def end(self, *, at_once: bool = False) -> None:
-        """End the process; `at_once`, also in the middle of a question."""
+        """End the process; with `at_once`, even while it handles a request."""
         process, self._process = self._process, None
         if process is None:
             return
         assert process.stdin is not None and process.stdout is not None
         if at_once:
             process.kill()
-        with suppress(OSError):  # it has ended already, with part of a question
+        with suppress(OSError):  # the process has ended already, before it read the whole request
             process.stdin.close()
         try:
             process.wait(_ENDING)
@@ -91,7 +92,9 @@ class _DistantStore(Store):
     def __init__(self, process: StoreProcess, folder: Path, info: RunInfo) -> None:
         self._process = process
         answer = process.ask(open=str(folder), info=asdict(info))
-        owed = tuple((path, place) for path, place in answer["identity"]["owed"])  # JSON has lists alone
+        owed = tuple(
+            (path, place) for path, place in answer["identity"]["owed"]
+        )  # JSON turns tuples into lists
         self.identity, self.replay = {**answer["identity"], "owed": owed}, answer["replay"]
 
     def send(self, batch: Sequence[Record]) -> None:
@@ -102,7 +105,7 @@ class _DistantStore(Store):
 
 
 class _Said(logging.Handler):
-    """Keeps what is logged for the next answer."""
+    """Log handler that keeps the messages for the next answer."""
 
     def __init__(self) -> None:
         logging.Handler.__init__(self, logging.WARNING)
@@ -113,7 +116,7 @@ class _Said(logging.Handler):
 
 
 def serve(questions: BinaryIO, answers: BinaryIO) -> None:
-    """Answer until the questions end."""
+    """Read requests and write answers until the requests end."""
     said = _Said()
     logging.getLogger().addHandler(said)
     store: Store | None = None
@@ -121,7 +124,7 @@ def serve(questions: BinaryIO, answers: BinaryIO) -> None:
         question = json.loads(line)
         try:
             if "open" in question:
-                # takes seconds, for which whoever asks waits
+                # the import takes seconds, for which the requesting process waits
                 from framework.tracking.mlflow_store import MlflowStore
 
                 info = TypeAdapter(RunInfo).validate_python(question["info"])
@@ -139,12 +142,12 @@ def serve(questions: BinaryIO, answers: BinaryIO) -> None:
         try:
             answers.write(json.dumps(answer).encode() + b"\n")
             answers.flush()
-        except BrokenPipeError:  # whoever asked has died
+        except BrokenPipeError:  # the requesting process has died
             return
 
 
 def main() -> None:
-    """Serve standard input; what MLflow prints goes to the standard error, and not among the answers."""
+    """Answer requests from standard input; redirect what MLflow prints to standard error, away from the answers."""
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
     serve(sys.stdin.buffer, answers)

@@ -1,8 +1,9 @@
-"""Which tracking store a command may contact, and what its address looks like in a file.
+"""Choice of the tracking store that a command may contact, and the form of its address in files.
 
-A run folder may be a stranger's, so an address in one of its files is never contacted. The user names a store in the
-command (`logger.uri=`), in the settings (MLFLOW_TRACKING_URI), or not at all: then it is the SQLite file `mlflow.db` of
-the `outputs` folder. An address that a file records is only compared with these; the user's own text is contacted.
+A run folder may come from an untrusted source, so an address in one of its files is never contacted. The user names a
+store in the command (`logger.uri=`) or in the environment (MLFLOW_TRACKING_URI). If neither is set, the store is the
+SQLite file `mlflow.db` in the `outputs` folder. An address that a file records is only compared with these addresses,
+and the program contacts the address that the user gave.
 """
 
 import os
@@ -15,25 +16,25 @@ from framework.errors import ConfigError, DataError, shown
 from framework.storage.enclosed import require_enclosed, require_plain_within
 
 SETTING = "MLFLOW_TRACKING_URI"
-"""Environment variable that names a store, its password included; MLflow's own."""
+"""MLflow's environment variable for the address of a store, which may include a password."""
 _SQLITE = "sqlite:///"
 _BESIDE = ("", "-wal", "-shm", "-journal")
-"""Endings of the files that SQLite opens with a database."""
+"""Suffixes of the files that SQLite opens together with a database."""
 _MEANING = r"[%?\x00-\x1f\x7f]"
-"""Letters of a path that mean something else in an address of SQLAlchemy."""
+"""Pattern of characters in a path that have a special meaning in an address of SQLAlchemy."""
 _ESCAPED = r"[%?#'\"\\\x00-\x1f\x7f]"
-"""Letters of a path that mean something else where MLflow keeps files: it decodes paths, and quotes them in SQL."""
+"""Pattern of characters in a path that have a special meaning to MLflow, which decodes paths and quotes them in SQL."""
 _SECRET = r"([?&][^=&\s]*(?:pass|pwd|token|secret)[^=&\s]*=)[^&\s]*"
 
 
 @dataclass(frozen=True)
 class Address:
-    """Where a store is.
+    """Address of a store.
 
     Attributes:
-        uri: an MLflow tracking URI; it may hold a password, and is kept in memory alone.
-        named: whether the user named it. The default store may have come with somebody's folder, so its files stay in
-            its own folder.
+        uri: MLflow tracking URI; it may contain a password and is kept in memory only.
+        named: Whether the user named it. The default store may have come with a folder from an untrusted source, so
+            its files must stay in its own folder.
     """
 
     uri: str
@@ -41,13 +42,14 @@ class Address:
 
 
 def address(named: str | None, folder: Path) -> Address:
-    """Return the store for a run that this command begins in `folder`.
+    """Return the address of the store for a run that this command begins in `folder`.
 
     Args:
         named: `logger.uri` of this command.
+        folder: Folder of the run.
 
     Raises:
-        ConfigError: MLflow cannot keep runs there, or in a folder of such a name.
+        ConfigError: MLflow cannot keep runs there, or cannot use a folder of such a name.
     """
     given = named or os.environ.get(SETTING)
     uri = store_uri(given) if given else default_uri(folder)
@@ -64,12 +66,13 @@ def confirmed(recorded: str, named: str | None, folder: Path, source: Path) -> A
     """Return the user's own address of the store that a file records for the run in `folder`.
 
     Args:
-        recorded: what the file says.
+        recorded: Address in the file.
         named: `logger.uri` of this command.
-        source: the file.
+        folder: Folder of the run.
+        source: Path of the file, for the message.
 
     Raises:
-        ConfigError: the user names no such store.
+        ConfigError: The user does not name the recorded store.
     """
     own = [Address(store_uri(uri), True) for uri in (named, os.environ.get(SETTING)) if uri]
     own += [Address(default_uri(place), False) for place in (folder, Path.cwd() / "outputs" / "run")]
@@ -84,12 +87,12 @@ def confirmed(recorded: str, named: str | None, folder: Path, source: Path) -> A
 
 
 def default_uri(folder: Path) -> str:
-    """Return the SQLite store for a run folder: mlflow.db in the `outputs` folder around it, else beside it."""
+    """Return the address of the default store: mlflow.db in the enclosing `outputs` folder, else beside the folder."""
     return sqlite_uri(_outputs(folder) / "mlflow.db")
 
 
 def store_uri(uri: str) -> str:
-    """Return a tracking URI that means the same from every working directory.
+    """Return a tracking URI in a form that does not depend on the working directory.
 
     Raises:
         ConfigError: MLflow keeps no runs there.
@@ -108,22 +111,22 @@ def store_uri(uri: str) -> str:
 
 
 def sqlite_uri(path: Path) -> str:
-    """Return the address of an SQLite store, escaped where a letter of its path would mean something else there.
+    """Return the address of an SQLite store, escaped if its path contains a character with a special meaning there.
 
-    Then its slashes are escaped, too: MLflow makes the folder that it reads in an address, before it is decoded.
+    Slashes are then escaped too, because MLflow creates the folder that it reads in the address before decoding it.
     """
     return _SQLITE + (quote(os.fsencode(path), safe="") if re.search(_MEANING, str(path)) else str(path))
 
 
 def sqlite_path(uri: str) -> Path | None:
-    """Return the file of an SQLite store; None for any other."""
+    """Return the file of an SQLite store; None for any other store."""
     return Path(unquote(uri.removeprefix(_SQLITE).partition("?")[0])) if uri.startswith(_SQLITE) else None
 
 
 def artifact_folder(uri: str, folder: Path) -> str | None:
-    """Return where a new experiment keeps its files; None for servers, which know themselves.
+    """Return the folder in which a new experiment keeps its files; None for servers, which choose it themselves.
 
-    Absolute, since MLflow's own default depends on the working directory.
+    The path is absolute, since MLflow's own default depends on the working directory.
     """
     path = sqlite_path(uri)
     if path is None and uri.startswith(("http", "databricks")):
@@ -133,14 +136,14 @@ def artifact_folder(uri: str, folder: Path) -> str | None:
 
 
 def require_own_files(uri: str, locations: tuple[str, ...] = ()) -> None:
-    """Refuse a store that nobody named, if it leads out of its folder.
+    """Refuse a store that the user did not name if it leads out of its own folder.
 
     Args:
-        uri: of an SQLite store.
-        locations: folders in which it says that files of an experiment, a run or a model are.
+        uri: Address of an SQLite store.
+        locations: Folders that the store records for the files of an experiment, a run or a model.
 
     Raises:
-        DataError: the store's file or one of the locations is a link, or lies elsewhere.
+        DataError: The store's file or one of the locations is a link or lies outside the folder.
     """
     path = sqlite_path(uri)
     assert path is not None
@@ -157,7 +160,7 @@ def require_own_files(uri: str, locations: tuple[str, ...] = ()) -> None:
                 f"folder in {home}. If the store is yours, name it: add logger.uri={sqlite_uri(path)}"
             )
         require_plain_within(place, path.parent)
-        if place != home:  # that holds the files of every run
+        if place != home:  # `home` itself holds the files of every run
             require_enclosed(place)
 
 
@@ -169,12 +172,12 @@ def without_password(text: str) -> str:
 
 
 def require_no_password(uri: str) -> None:
-    """Refuse an address that holds a password where it would be stored or be seen by others.
+    """Refuse an address that contains a password in a place where it would be stored or seen by others.
 
     Raises:
-        ConfigError: it holds one.
+        ConfigError: The address contains a password.
     """
-    # of a server with http a name alone may be a token
+    # the user name of an http address may be a token
     if re.search(r"^https?://[^\s/]*@|^\w[\w+]*://[^\s/@]*:[^\s@]*@", uri) or re.search(_SECRET, uri):
         raise ConfigError(
             f"logger.uri={shown(without_password(uri))} came with a password; wanted none, since commands and configs "
@@ -184,7 +187,7 @@ def require_no_password(uri: str) -> None:
 
 
 def _same(one: str, other: str) -> bool:
-    """Whether two addresses name the same store, whatever their passwords, and whichever letters they escape."""
+    """Return whether two addresses name the same store, whatever passwords and escaped characters they contain."""
     one, other = without_password(one), without_password(other)
     same_file = sqlite_path(one) == sqlite_path(other) is not None
     return one == other or (same_file and one.partition("?")[2] == other.partition("?")[2])

@@ -1,4 +1,4 @@
-"""Recording a run: what it logs stands in the local journal at once, and in a store when that can take it."""
+"""Recording of a run: it logs to the local journal immediately, and to a store as soon as the store accepts it."""
 
 import importlib
 import json
@@ -28,81 +28,83 @@ _log = logging.getLogger(__name__)
 Status = Literal["FINISHED", "FAILED", "KILLED"]
 
 JOURNAL = "journal.jsonl"
-ELSEWHERE = "elsewhere"  # copies of files that were logged from outside of the run folder
-LONGEST_PARAMETER = 250  # characters; some servers cut off the rest without a word
+ELSEWHERE = "elsewhere"  # folder for copies of logged files that lie outside the run folder
+LONGEST_PARAMETER = 250  # characters; some servers cut off the rest silently
 
 
 class Tracker(ABC):
-    """Records one run. One process per run folder: the others of a distributed training use no tracker.
+    """Contract of the object that records one run.
 
-    `open` comes first and `close` last. Between them nothing here raises or waits for the sake of a store:
-    what is logged is in the journal when the call returns, within a tenth of a millisecond for metrics, and
-    reaches the store later. Steps are optimiser steps; names are like "validation/loss".
+    Only one process records a run folder; the other processes of a distributed training record nothing. `open` is
+    called first and `close` last. Between them, no method raises an error or waits because of a store: an entry is in
+    the journal when the call returns, within a tenth of a millisecond for metrics, and reaches the store later. Steps
+    are optimiser steps; names have the form "validation/loss".
     """
 
     journal: Journal
 
     @abstractmethod
     def open(self) -> None:
-        """Begin the run, or go on with it: its status is RUNNING from here on.
+        """Begin or continue the run, and set its status to RUNNING.
 
         Raises:
-            DataError: the run folder cannot be written, or another process writes there.
+            DataError: The run folder cannot be written, or another process writes there.
         """
 
     @abstractmethod
     def log_params(self, flat: Mapping[str, object]) -> None:
-        """Record the config, keys dotted. A value stays; another one later becomes a tag `changed.<key>`."""
+        """Record the config by dotted keys; a different value given later is recorded as the tag `changed.<key>`."""
 
     @abstractmethod
     def set_tags(self, tags: Mapping[str, str | None]) -> None:
-        """Record texts that describe the run; the last value of a tag counts, and None removes it."""
+        """Record texts that describe the run; the last value of a tag counts, and None removes the tag."""
 
     @abstractmethod
     def log_metrics(self, values: Mapping[str, float], step: int, epoch: int) -> None:
-        """Record numbers, NaN and infinities among them."""
+        """Record numbers, which may be NaN or infinite."""
 
     @abstractmethod
     def log_dataset(self, name: str, context: str, facts: Mapping[str, str]) -> None:
-        """Record what the run reads; `context` says for what, "training" say, `facts` are of `Data.fingerprint`."""
+        """Record a data set with its use, such as "training", and the facts that `Data.fingerprint` returns."""
 
     @abstractmethod
     def log_artifact(self, path: Path, folder: str = "") -> None:
-        """Record a file or a directory, under `folder` in the store. Leave it there: it is read later.
+        """Record a file or a directory under `folder` in the store; it is read later, so it must stay in place.
 
         A checkpoint under `MODEL` (`run_info`) becomes the model of the run, which the store can serve.
         """
 
     @abstractmethod
     def drop_after(self, step: int) -> None:
-        """Forget the metrics after `step`, from which the run is resumed and which it will repeat."""
+        """Remove the metrics after `step`, because the run is resumed from there and will repeat them."""
 
     @abstractmethod
     def close(self, status: Status) -> None:
-        """End the run. Waits, within bounds, for the store to take what is still on its way."""
+        """End the run, after waiting a limited time for the store to accept the remaining entries."""
 
     @abstractmethod
     def leave_open(self) -> None:
-        """As `close`, but the run goes on: another tracker will open it again."""
+        """Release the run as `close` does without ending it, because another tracker will open it again."""
 
     @property
     @abstractmethod
     def run_id(self) -> str | None:
-        """The store's id of the run; None without a store, or as long as it was not reached."""
+        """Return the id of the run in the store; None without a store, or before the store was reached."""
 
     @property
     @abstractmethod
     def url(self) -> str:
-        """What to type or to open in order to see the run."""
+        """Return the command or the address that shows the run."""
 
 
 @final
 class NoTracker(Tracker):
-    """Keeps the journal of metrics and nothing else.
+    """Tracker that keeps the journal of metrics and nothing else.
 
     Args:
-        folder: of the run.
-        resumed: go on with the journal in the folder, rather than set it aside; None: if its run did not end.
+        folder: Folder of the run.
+        resumed: Whether to continue the journal in the folder instead of setting it aside; None continues it if its
+            run has not finished.
     """
 
     def __init__(self, folder: Path, *, resumed: bool | None = None) -> None:
@@ -116,19 +118,19 @@ class NoTracker(Tracker):
         self._sidecar = _begin(self.folder, self.journal, wanted, self._resumed)
 
     def log_params(self, flat: Mapping[str, object]) -> None:
-        """Nothing: the config is in the run folder."""
+        """Do nothing, because the config is in the run folder."""
 
     def set_tags(self, tags: Mapping[str, str | None]) -> None:
-        """Nothing: nobody could search them."""
+        """Do nothing, because tags serve for searching in a store."""
 
     def log_metrics(self, values: Mapping[str, float], step: int, epoch: int) -> None:
         self.journal.write(values, step, epoch)
 
     def log_dataset(self, name: str, context: str, facts: Mapping[str, str]) -> None:
-        """Nothing: nobody could search them."""
+        """Do nothing, because data sets serve for searching in a store."""
 
     def log_artifact(self, path: Path, folder: str = "") -> None:
-        """Nothing: the file is where it is."""
+        """Do nothing, because the file stays in its place."""
 
     def drop_after(self, step: int) -> None:
         self.journal.drop_after(step)
@@ -152,27 +154,28 @@ class NoTracker(Tracker):
 
 @final
 class MlflowTracker(Tracker):
-    """Sends a run to an MLflow store in batches, from a process of its own, however long that takes.
+    """Tracker that sends a run to an MLflow store in batches, from a separate process.
 
-    Everything logged is a line of the journal, and the store is a copy of it. A thread sends what is new when 50
-    lines wait or two seconds have passed; when the store is locked, full or away it tries again, for ever and ever
-    less often. What the process could not send before it ended, `sync` sends. What the store has is not sent again:
-    a resumed run repeats the steps after its checkpoint, and of these the store keeps what it got first.
+    Every entry is a line of the journal, and the store holds a copy of the journal. A thread sends new lines when 50 of
+    them wait or two seconds have passed. When the store is locked, full or away, the thread tries again at growing
+    intervals (up to 30 s) without limit. `sync` sends the lines that the process could not send before it ended. Lines
+    that the store has are not sent again: a resumed run repeats the steps after its checkpoint, and the store keeps
+    the first values of these steps.
 
-    A short run that somebody else will `sync` when it has ended (a sweep, which has MLflow at hand already) need not
-    pay for MLflow's import, several seconds: with `wait` nothing is sent before that time is over.
+    The import of MLflow takes several seconds. A short run can avoid it if another process will `sync` it afterwards,
+    such as a sweep, which has imported MLflow already: with `wait`, nothing is sent before that time is over.
 
     Args:
-        folder: of the run.
-        destination: which run of which store.
-        resumed: whether to go on with the run in the folder, or to set that aside; None: as the destination tells.
-        wait: seconds after opening before the first line is sent; a run that ends sooner sends nothing.
-        opening_patience: seconds `open` waits for the store, for those who need the run's id at once.
-        patience: seconds `close` waits for the store.
-        open_store: what opens the run in the store; None: a process of its own.
+        folder: Folder of the run.
+        destination: Run and store to send to.
+        resumed: Whether to continue the run in the folder or to set it aside; None follows the destination.
+        wait: Seconds after opening before the first line is sent; a run that ends sooner sends nothing.
+        opening_patience: Seconds that `open` waits for the store, for a caller that needs the run's id immediately.
+        patience: Seconds that `close` waits for the store.
+        open_store: Function that opens the run in the store; None uses a separate process.
 
     Raises:
-        ConfigError: the destination is a store that MLflow cannot keep runs in.
+        ConfigError: MLflow cannot keep runs in the store of the destination.
     """
 
     def __init__(
@@ -234,7 +237,7 @@ class MlflowTracker(Tracker):
         path = path.absolute()
         if not path.is_relative_to(
             self.folder
-        ):  # a run folder may be moved, and gives away nothing but its own
+        ):  # a run folder may be moved, and only files inside it are sent
             copy = self.folder / ELSEWHERE / path.name
             copy.parent.mkdir(exist_ok=True)
             shutil.copytree(path, copy, dirs_exist_ok=True) if path.is_dir() else shutil.copy2(path, copy)
@@ -283,7 +286,7 @@ class MlflowTracker(Tracker):
         self._notice()
 
     def _notice(self) -> None:
-        """One more line waits; start sending when it is time."""
+        """Note that one more line waits, and start sending when it is time."""
         if self._sender is None and self._sidecar is not None and not self._closed:
             if time.monotonic() >= self._sends_from:
                 self._start_sending(self._sidecar)
@@ -304,7 +307,7 @@ class MlflowTracker(Tracker):
 
 
 def _begin(folder: Path, journal: Journal, wanted: RunInfo, resumed: bool | None) -> Sidecar:
-    """Take hold of a run folder: go on with the run in it, or set that aside."""
+    """Open a run folder for writing: continue the run in it or set that run aside; return its `run.json`."""
     earlier = read_run_info(folder)
     journal.open(after=earlier.sent if earlier else 0)
     if earlier is not None and _continues(earlier, wanted, resumed):
@@ -316,7 +319,7 @@ def _begin(folder: Path, journal: Journal, wanted: RunInfo, resumed: bool | None
             experiment_id=earlier.experiment_id,
         )
         here = (without_password(known.uri), known.run_id)
-        if (without_password(earlier.uri), earlier.run_id) == here:  # another store gets everything
+        if (without_password(earlier.uri), earlier.run_id) == here:  # a different store would get all lines
             known = replace(
                 known,
                 sent=earlier.sent,
@@ -345,5 +348,5 @@ def _continues(earlier: RunInfo, wanted: RunInfo, resumed: bool | None) -> bool:
 
 
 def mlflow_store() -> OpenStore:
-    """What opens a run in MLflow; MLflow is imported here and nowhere else."""
+    """Return the class that opens a run in MLflow, importing MLflow, which happens nowhere else."""
     return importlib.import_module("framework.tracking.mlflow_store").MlflowStore

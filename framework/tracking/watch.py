@@ -1,7 +1,7 @@
-"""A small process beside a run, which closes the run where its own process is killed and cannot do so itself.
+"""Small process beside a run that closes the run when the run's own process was killed and cannot do so.
 
-Its arguments are the run folder, the process of the run, and the parent with which that one is to end (a sweep, for
-one of its jobs), or 0. It ends with the run.
+Its arguments are the run folder, the id of the run's process, and the id of the parent process with which the run must
+end (for a job, its sweep) or 0. It ends with the run.
 """
 
 import os
@@ -17,16 +17,16 @@ from framework.tracking.signals import ENDING, ends_with_parent
 
 _COMMAND = (sys.executable, "-P", "-m", __name__)
 _PAUSE = 0.25
-"""Seconds between two looks at the process."""
+"""Seconds between two checks of the process."""
 
 
 @contextmanager
 def watched(folder: Path) -> Iterator[None]:
-    """Inside the block, a process of its own watches this one, whose run is in `folder`.
+    """Watch this process, whose run is in `folder`, from a separate process during the block.
 
-    If this process dies, the run is closed as KILLED, in the folder alone: a later `sync` tells the store. If this
-    process is one that ends with its parent, and that dies, it has `ENDING` seconds to close the run; then it is
-    killed, with all processes of its group.
+    If this process dies, the run is closed as KILLED in its folder only; a later `sync` sends the status to the store.
+    If this process must end with its parent and the parent dies, it has `ENDING` seconds to close the run. After that
+    it is killed together with all processes of its group.
     """
     parent = os.getppid() if ends_with_parent() else 0
     watcher = subprocess.Popen(
@@ -34,7 +34,7 @@ def watched(folder: Path) -> Iterator[None]:
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
-        start_new_session=True,  # what is sent to the group of the run is not for the watcher
+        start_new_session=True,  # signals to the process group of the run must not reach the watcher
     )
     try:
         yield
@@ -44,7 +44,7 @@ def watched(folder: Path) -> Iterator[None]:
 
 
 def watch(folder: Path, run: int, parent: int) -> None:
-    """Wait until the process of a run ends; close the run where it has not."""
+    """Wait until the process of a run ends, and close the run if that process has not closed it."""
     orphaned_at: float | None = None
     while os.getppid() == run:
         if parent and orphaned_at is None and _parent_of(run) not in (parent, None):
@@ -53,15 +53,15 @@ def watch(folder: Path, run: int, parent: int) -> None:
             _kill(run)
         time.sleep(_PAUSE)
 
-    from framework.errors import DataError  # imported for this alone
+    from framework.errors import DataError  # imported only when it is needed
     from framework.tracking.ended import mark_dead
 
-    with suppress(DataError):  # another process goes on with the run
+    with suppress(DataError):  # another process continues the run
         mark_dead(folder, send=False)
 
 
 def _parent_of(process: int) -> int | None:
-    """The process that waits for another one; None where that cannot be known."""
+    """Return the id of the parent of a process; None where it cannot be found out."""
     try:
         state = Path(f"/proc/{process}/stat").read_text(encoding="utf-8", errors="replace")
     except OSError:
@@ -70,7 +70,10 @@ def _parent_of(process: int) -> int | None:
 
 
 def _kill(run: int) -> None:
-    """Kill the process, with its group where it leads one; the watcher is its child, so no other has its number."""
+    """Kill the process, and its group if it leads one.
+
+    The watcher is a child of that process, so no other process can have taken over its id.
+    """
     with suppress(ProcessLookupError):
         if os.getpgid(run) == run:
             os.killpg(run, signal.SIGKILL)
