@@ -41,7 +41,7 @@ class Finding:
     @property
     def holds(self) -> bool:
         """Return whether the error is within the limit; NaN is not."""
-        return self.error <= self.limit  # NaN does not
+        return self.error <= self.limit  # false for NaN
 
     def __str__(self) -> str:
         verdict = "holds" if self.holds else "FAILS"

@@ -520,5 +520,5 @@ def _images(build: Make, some: Slices, worst: Worst) -> None:
     """Check that exactly the images of `reads` are drawn, each once and alone, as the prediction announces none."""
     metric, prediction = build(), some(torch.arange(SAMPLES), build().splits[0])
     metric.update(prediction)
-    asked = prediction.density.asked  # density is a Ball
+    asked = prediction.density.asked  # type: ignore[attr-defined]  # a Ball
     worst.same("images drawn", sorted(map(sorted, asked)), sorted([name] for name in metric.reads))

@@ -69,7 +69,7 @@ class Plain(Predictor):
     def calibrate(self, batches: Iterable[Batch]) -> None:
         rows = sum(
             len(batch["target"]) for batch in batches
-        )  # batches that come only once are used up if they were read before
+        )  # an iterator that was read before yields no rows
         self.calibrated.fill_(float(rows > 0))
 
 
