@@ -54,7 +54,7 @@ class Boxes:
     high: Tensor
 
     def mean(self, of: Tensor) -> Tensor:
-        """Return ∫ p f for a function f with values (node, rows)."""
+        """Return ∫ p f, (rows,), for a function f with values (node, rows)."""
         share = self.weight * self.log_prob.exp()
         return torch.where(share > 0, share * of, 0.0).sum(0)
 
@@ -66,7 +66,7 @@ class Boxes:
         """Return a bound on the error of ∫ p f for a function f of values, (rows,).
 
         The boxes are cut for p rather than for f, and they end at a finite distance. The bound is the difference of the
-        two rules, plus what a tail that falls like a power has beyond the ends.
+        two rules, plus a bound on the part beyond the ends for tails that fall like a power.
         """
         shares = []
         for points in RULES[self.low.shape[-1]]:

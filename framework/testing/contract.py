@@ -48,8 +48,8 @@ class Contract:
     """Rows of one plugin and the checks of its group.
 
     Attributes:
-        group, name: group and name of the plugin.
-        rows: parametrisations of the plugin to check.
+        group, name: Group and name of the plugin.
+        rows: Parametrisations of the plugin to check.
     """
 
     group: str
@@ -120,8 +120,8 @@ def _shipped(group: str, name: str) -> tuple[Row, ...]:
     """Return the rows of the `rows.py` beside the plugin's class, else those of a `rows.py` in a folder above it.
 
     A family of plugins keeps its rows in its folder, `plugins/<group>/<family>`. The search goes up to the folder of
-    the registry and stops there. In a package without a folder of that name, as of another author, it goes up to the
-    top.
+    the registry and stops there. In a third-party package, which may have no folder of that name, the search goes up to
+    the top.
     """
     package = load(group, name).__module__.rpartition(".")[0]
     while package:

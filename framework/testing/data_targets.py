@@ -9,7 +9,7 @@ from framework.testing.data_samples import batches, numbers, parts, trimmed
 from framework.testing.finding import SEED, Worst
 
 LEAST, MOST = 192, 960
-"""Smallest number of samples of a split that is checked, and largest number that is used."""
+"""Smallest number of samples of a split that is checked, and number of its first samples that are used."""
 BLOCK = 48
 NEIGHBOURS = 7
 SIZE = 64

@@ -202,11 +202,12 @@ def integral(density: Distribution, worst: Worst) -> None:
 
 
 def integral_by_draws(density: Distribution, worst: Worst) -> None:
-    """Check by draws that the density p is normalised, where q is a normal fitted to other draws; in standard errors.
+    """Check by draws that the density integrates to 1, in standard errors.
 
-    The check compares E_p[q/(p + q)] with E_q[p/(p + q)]. Both are ∫ pq/(p + q) if p is normalised and draws follow it.
-    The averaged quantities lie in [0, 1], however heavy the tails are. If q were fitted to the draws that are averaged,
-    it would be too high there, which for ten numbers amounts to some standard errors.
+    The check compares E_p[q/(p + q)] with E_q[p/(p + q)], where p is the density and q a normal fitted to other draws
+    of it. Both are ∫ pq/(p + q) if p is normalised and draws follow it. The averaged quantities lie in [0, 1], however
+    heavy the tails are. If q were fitted to the draws that are averaged, it would be too high there, which for ten
+    numbers amounts to some standard errors.
     """
     others, drawn = density.sample(torch.Size((2 * DRAWS,))).double().chunk(2)
     support = density.support

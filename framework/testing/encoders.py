@@ -329,7 +329,10 @@ def _against_differences(make: Make, inputs: Callable[[int], Tensor], worst: Wor
 
 
 def _extremes(make: Make, inputs: Callable[[int], Tensor], worst: Worst) -> None:
-    """Check finite features at constant inputs, and large ones for vectors; NaN must stay in its row or be refused."""
+    """Check that features are finite at constant inputs, which for vectors are also large.
+
+    NaN must not affect other rows, or it must be refused.
+    """
     encoder, like = make(), inputs(3)
     sizes = (0.0, 1.0) if like.dim() == 4 else (0.0, 1e-30, 1.0, 1e6)
     with torch.no_grad():

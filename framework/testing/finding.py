@@ -40,7 +40,7 @@ class Finding:
 
     @property
     def holds(self) -> bool:
-        """Return whether the error is within the limit; NaN is not."""
+        """Return whether the error is within the limit, which NaN is not."""
         return self.error <= self.limit  # false for NaN
 
     def __str__(self) -> str:

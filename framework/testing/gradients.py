@@ -14,7 +14,7 @@ from framework.testing.heads import HeadSubject, as_type, seeded
 STEPS = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9)
 """Steps of central differences, relative to distribution parameters above 1.
 
-Steps after the third are used where none of the first three agrees.
+Steps after the third are used where none of the first three agrees with the derivative.
 """
 
 

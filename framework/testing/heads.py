@@ -285,7 +285,7 @@ def _repeatable(subject: HeadSubject, worst: Worst) -> None:
 
 
 def _rows_apart(subject: HeadSubject, worst: Worst) -> None:
-    """Check that a row's results do not depend on other rows, nor has its loss a gradient in them.
+    """Check that a row's results do not depend on other rows, and that its loss has no gradient in them.
 
     Where nothing is drawn, results must not depend on the number of rows either.
     """

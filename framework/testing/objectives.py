@@ -312,7 +312,10 @@ def _mean(build: Make, row: ObjectiveRow, worst: Worst) -> None:
 
 
 def _different_members(build: Make, row: ObjectiveRow, worst: Worst) -> None:
-    """Check that penalty and gradients of different members are the mean of their own; without dropout."""
+    """Check that the penalty of different members is the mean of their penalties; without dropout.
+
+    The gradient of each member must be that of its own penalty.
+    """
     objective, together, batch = build(1.0), predictor_of(row, 3).eval(), batch_of(row, SAMPLES)
     whole = gradients(objective, together, batch)
     found, each = penalty(objective, together, batch).item(), []
@@ -403,7 +406,7 @@ def _number_types(build: Make, row: ObjectiveRow, worst: Worst) -> None:
 
 
 def _extreme(build: Make, row: ObjectiveRow, worst: Worst) -> None:
-    """Check distribution parameters up to ±1e4, as of an overconfident network."""
+    """Check that penalty and gradients are finite at parameters up to ±1e4, as of an overconfident network."""
     for kind in (torch.float32, torch.float64):
         for size in (1e2, 1e4):
             predictor = predictor_of(row).to(kind)

@@ -123,7 +123,7 @@ def powers(density: Distribution, worst: Worst) -> None:
 
 
 def powers_of(density: Distribution, worst: Worst, check: Callable[[Distribution, Worst], None]) -> None:
-    """Apply a check to the density at each of TEMPERATURES."""
+    """Apply a check to the density tempered with each of TEMPERATURES."""
     for temperature in TEMPERATURES:
         try:
             power = tempered(density, torch.tensor(temperature, dtype=torch.float64))
@@ -167,7 +167,7 @@ def two_samples(density: Distribution, first: Tensor, second: Tensor, worst: Wor
 
 
 def slopes(density: Distribution, worst: Worst) -> None:
-    """Check that slope(density, value) equals log_prob and its gradient at the value and is a lower bound elsewhere."""
+    """Check that slope(density, value) has the value and gradient of log_prob and is a lower bound elsewhere."""
     value = some_values(density).requires_grad_()
     with torch.enable_grad():
         log_prob = density.log_prob(value)
@@ -222,7 +222,7 @@ def known_widths(density: Distribution) -> Tensor:
 
 
 def normal_forms(density: Distribution, worst: Worst) -> None:
-    """Check that `normals` gives the density and `mahalanobis` -2 log p up to a constant, where they are known."""
+    """Check that `normals` gives log p and that `mahalanobis` is -2 log p plus a constant, where they are known."""
     worst.count(False, "not known")
     value = some_values(density)
     log_prob = density.log_prob(value).double()
@@ -331,9 +331,10 @@ def mixed(components: Distribution) -> Mixture:
 def every_question(
     density: Distribution, index: Tensor, temperature: Tensor
 ) -> Iterator[tuple[str, Callable[[], Any]]]:
-    """Yield every function of the protocol by name, as a call on densities (rows,); a density may refuse some.
+    """Yield every function of the protocol by name, as a call on the densities; a density may refuse some.
 
     Args:
+        density: Densities, batch_shape (rows,).
         index: Numbers of rows, (draw, 1).
         temperature: Temperature above 0, a tensor without dimensions.
     """

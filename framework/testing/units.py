@@ -24,9 +24,10 @@ TOLERANCE = 1e-5
 
 
 def units(subject: HeadSubject, worst: Worst) -> None:
-    """Check that the density of a target of location l and scale s is p((y - l)/s)/s, with p the density without them.
+    """Check that a target of location l and scale s has the density p((y - l)/s)/s.
 
-    A head may ignore location and scale and give the same density as without them; that passes.
+    Here p is the density of the standardised target. A head may ignore location and scale and return the same density
+    as without them; that passes.
     """
     head = subject.make()
     if head.direct or isinstance(head, Fitted):
