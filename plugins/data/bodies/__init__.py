@@ -1,1 +1,1 @@
-"""Registered bodies: scans of synthetic people, and FAUST."""
+"""Data sets of registered bodies: scans of synthetic people, and FAUST."""

@@ -1,4 +1,4 @@
-"""`python -m plugins.data.bodies <checkpoint> <scan> ...` registers meshes to scans: PLY files and pictures."""
+"""`python -m plugins.data.bodies <checkpoint> <scan> ...` registers meshes to scans: PLY files and figures."""
 
 import argparse
 import sys
@@ -21,10 +21,10 @@ from plugins.data.bodies.result import figure, write_ply
 
 
 def main(arguments: list[str]) -> None:
-    """Write `<folder>/<scan>_registered.ply` and `.png` for each scan: metres, as the scan lies.
+    """Write `<folder>/<scan>_registered.ply` and `.png` for each scan, in metres and in the coordinates of the scan.
 
     Raises:
-        UserError: a checkpoint of another data set, or a file that cannot be read.
+        UserError: the checkpoint is of another data set, or a file cannot be read.
     """
     parser = argparse.ArgumentParser(prog="python -m plugins.data.bodies", description=__doc__)
     parser.add_argument("checkpoint", help="run folder, checkpoint file or MLflow run id")
@@ -43,7 +43,10 @@ def main(arguments: list[str]) -> None:
 def register(
     checkpoint: str, scans: list[Path], folder: Path, paths: Mapping[str, str] | None = None
 ) -> list[Path]:
-    """The files written, two a scan; `paths` as of `framework.load`."""
+    """Register a mesh to each scan and return the paths of the written files, two for each scan.
+
+    `paths` is the argument of the same name of `framework.load`.
+    """
     predictor, description = load_with_description(checkpoint, paths=paths)
     part = description.config["data"]
     if part["name"] != "registration":

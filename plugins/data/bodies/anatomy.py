@@ -1,7 +1,7 @@
-"""Where on a person each vertex lies: along an arm or a leg, how high on the trunk, where on the head.
+"""Anatomical coordinates of each vertex of a person: along an arm or a leg, height on the trunk, position on the head.
 
-Everything is measured on the body's template in its rest pose, so that garments, hair and skin of all people, in
-whatever pose, are painted and cut by the same few numbers.
+All of them are measured on the body's template in its rest pose. Garments, hair and skin of all people in all poses are
+therefore painted and cut by the same few numbers.
 """
 
 from collections.abc import Callable
@@ -15,21 +15,22 @@ from plugins.data.bodies.body import Body
 from plugins.data.bodies.poses import Skeleton, skeleton
 
 AWAY = -1.0
-"""Metres along a limb for vertices of another part."""
+"""Coordinate along a limb, metres, of vertices of another part of the body."""
 
 
 @dataclass(frozen=True)
 class Anatomy:
-    """Measures of each vertex of a sheet (`plugins.data.bodies.topologies`), metres, float32.
+    """Measures of each vertex of a `Sheet` (`plugins.data.bodies.topologies`), metres, float32.
 
     Attributes:
-        place: in the template: x to the left, y up, z to the front.
-        arms, legs, head: shares of the skin that follows these parts.
-        along_arm, along_leg: from shoulder and hip along the bones; below 0 before the joint, AWAY on other parts.
+        place: position in the template: x to the left, y up, z to the front.
+        arms, legs, head: share of the skinning weights that belongs to the joints of these parts.
+        along_arm, along_leg: distance from shoulder and hip along the bones; below 0 before the joint, AWAY on other
+            parts.
         on_head: x in half widths of the head, y from 0 (under the chin) to 1 (crown), z from -1 (back) to 1 (nose).
-        elbow, wrist, knee, ankle: where along arm and leg they are.
-        waist, hips, chest, neck: heights of the trunk.
-        neck_place: of the neck's lowest joint.
+        elbow, wrist, knee, ankle: positions of these joints along arm and leg.
+        waist, hips, chest, neck: heights on the trunk.
+        neck_place: position of the lowest joint of the neck.
     """
 
     place: Float[np.ndarray, "vertices 3"]
@@ -51,11 +52,12 @@ class Anatomy:
 
     @property
     def on_arm(self) -> Bool[np.ndarray, "vertices"]:
+        """Return which vertices belong to an arm."""
         return self.arms > 0.5
 
 
 def anatomy(body: Body, carried: Callable[[np.ndarray], np.ndarray]) -> Anatomy:
-    """The measures of a body; `carried` takes numbers of its vertices to those of the sheet."""
+    """Return the measures of a body; `carried` interpolates values of the body's vertices to those of the sheet."""
     where = skeleton(body)
     place = body.template.astype(np.float64)
     shares = {name: body.weights[:, of].sum(1) for name, of in _parts(body, where).items()}
@@ -93,7 +95,7 @@ def anatomy(body: Body, carried: Callable[[np.ndarray], np.ndarray]) -> Anatomy:
 
 
 def _parts(body: Body, where: Skeleton) -> dict[str, list[int]]:
-    """Joints of arms, legs and head: those of a role and all below."""
+    """Return the joints of arms, legs and head: the topmost joints of each part and all joints below them."""
     tops = {"arms": where.arm, "legs": where.hip, "head": where.neck[-1:]}
     found: dict[str, list[int]] = {name: [] for name in tops}
     for joint in range(len(body.parents)):
@@ -108,7 +110,7 @@ def _parts(body: Body, where: Skeleton) -> dict[str, list[int]]:
 
 
 def _along(body: Body, chain: list[tuple[int, int]], share: np.ndarray) -> Float[np.ndarray, "vertex"]:
-    """Metres from the chain's first joint along its bones, of the side on which a vertex lies."""
+    """Return metres from the chain's first joint along its bones, on the side of the body to which a vertex belongs."""
     place, joints = body.template.astype(np.float64), body.joints.astype(np.float64)
     found = np.full(len(place), AWAY)
     for side in (0, 1):
@@ -125,6 +127,6 @@ def _along(body: Body, chain: list[tuple[int, int]], share: np.ndarray) -> Float
 
 
 def _from(place: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Distance from a bone."""
+    """Return the distance of points from the bone between two points."""
     along = ((place - start) @ (end - start)) / ((end - start) @ (end - start))
     return np.linalg.norm(place - (start + along.clip(0, 1)[:, None] * (end - start)), axis=1)

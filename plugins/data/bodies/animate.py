@@ -1,8 +1,8 @@
-"""`python -m plugins.data.bodies.animate <run> [<who>]` lets somebody turn, or walk as a motion file says.
+"""`python -m plugins.data.bodies.animate <run> [<who>]` animates a person who turns, or who moves as in a motion file.
 
-Side by side: the registered mesh with its vertices' colours, what the trained network paints, and of generated people
-photographs. <run> is one of smplpix/quick or its like; <who> a test subject of its data, or a coloured mesh of its
-topology (metres, y up, facing z).
+Each frame shows side by side the registered mesh with its vertex colours, the image that the trained network renders,
+and, for generated people, the photograph. <run> is a run of smplpix/quick or of a similar experiment. <who> is a test
+subject of its data, or a coloured mesh of its topology (metres, y up, facing z).
 """
 
 import argparse
@@ -31,15 +31,15 @@ from plugins.data.bodies.scan_layout import read_registration, read_splits
 
 KINDS = (".gif", ".webp", ".mp4")
 SPEED = 20
-"""Pictures a second."""
-NEARLY_WHITE = 248  # of 255: is the ground in a GIF's palette
+"""Frames per second."""
+NEARLY_WHITE = 248  # of 255: colours of a GIF's palette from here on become the white background
 
 
 def main(arguments: list[str]) -> None:
-    """Write the file, frame by frame.
+    """Write the animation, frame by frame.
 
     Raises:
-        UserError: a run of other data, somebody who is not there, or a file that cannot be read or written.
+        UserError: the run is of other data, the person does not exist, or a file cannot be read or written.
     """
     parser = argparse.ArgumentParser(
         prog="python -m plugins.data.bodies.animate",
@@ -89,7 +89,10 @@ def animated(
     azimuth: float = 35.0,
     paths: Mapping[str, str] | None = None,
 ) -> list[Image.Image]:
-    """The pictures; arguments as those of the command, `paths` as of `framework.load`."""
+    """Return the frames of the animation.
+
+    The arguments are those of the command; `paths` is the argument of the same name of `framework.load`.
+    """
     description, _ = stored(run, paths=paths)
     data = data_of(description)
     mesh: Renderer = build("renderer", resolve("renderer", {"name": "rasterizer", "supersampling": 4}))
@@ -106,7 +109,7 @@ def animated(
 
 
 def data_of(description: Description) -> HumanScans:
-    """The data set that a model was trained on, not prepared."""
+    """Return the data set that a model was trained on, without preparing it."""
     part = description.config["data"]
     if part["name"] != "human_scans":
         raise ConfigError(
@@ -120,7 +123,7 @@ def data_of(description: Description) -> HumanScans:
 def cast(
     data: HumanScans, who: str | None, file: Path | None, frames: int, start: float = 0.0
 ) -> tuple[Actor, list[Moment]]:
-    """Who is seen, and as what from picture to picture."""
+    """Return the person to be drawn, and the person's state in each frame."""
     if who is not None and Path(who).suffix:
         registration = read_registration(Path(who))
     elif data.root is None:
@@ -138,7 +141,7 @@ def cast(
 
 
 def generated(data: HumanScans, who: str | None) -> Generated:
-    """A test subject of generated data."""
+    """Return a test subject of generated data."""
     crowd = Crowd(data.renderer, data.counts, data.drawing, data.data_seed)
     names = [f"test_{number:04}" for number in range(data.counts["test"])]
     return Generated(crowd, "test", names.index(_chosen(who, names)), data.topology)  # pyright: ignore[reportArgumentType]
@@ -147,7 +150,7 @@ def generated(data: HumanScans, who: str | None) -> Generated:
 def moving(
     person: Generated, file: Path | None, frames: int, start: float = 0.0
 ) -> tuple[Actor, list[Moment]]:
-    """Somebody at SPEED pictures a second of a motion file; without one always in the same pose."""
+    """Return a generated person who follows a motion file at SPEED frames per second, or keeps one pose without it."""
     if file is None:
         return actor(person.registration), [person.first()] * frames
     found = motion.read(file)
@@ -172,16 +175,16 @@ def _chosen(who: str | None, names: Sequence[str]) -> str:
 
 
 def write(file: Path, frames: Sequence[Image.Image]) -> None:
-    """Pictures that follow one another SPEED times a second.
+    """Write the frames as an animation of SPEED frames per second.
 
     Raises:
-        DataError: an MP4 without the program ffmpeg, or one that it cannot make.
+        DataError: an MP4 is wanted and the program ffmpeg is missing, or fails to write it.
     """
     kind = file.suffix.lower()
     if kind == ".mp4":
         _film(file, frames)
         return
-    if kind == ".gif":  # one palette for all and no dithering, or the ground would flicker
+    if kind == ".gif":  # one palette for all frames and no dithering: the background must not flicker
         some = frames[:: max(len(frames) // 8, 1)]
         every = np.concatenate([np.asarray(frame) for frame in some])
         palette = Image.fromarray(every).quantize(256)

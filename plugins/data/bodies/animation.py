@@ -1,4 +1,4 @@
-"""A generated person in many poses, cameras that go around, and what is drawn of both side by side."""
+"""Generated people in many poses, cameras that orbit them, and rendered images of both side by side."""
 
 import copy
 import math
@@ -23,13 +23,13 @@ from plugins.data.bodies.topologies import Name
 
 LOOK_DOWN = math.radians(8)
 FREE = 0.92
-"""Share of an image's height or width that a person fills at most."""
+"""Largest share of an image's height or width that a person fills."""
 CAPTION = 16  # pixels
 SAYS = "synthetic"
 
 
 class Moment(NamedTuple):
-    """A person at one time: the registration's vertices, metres, and the scan, where it is known."""
+    """State of a person at one time: the registration's vertices, metres, and the scan, or None without one."""
 
     vertices: Float[Tensor, "vertices 3"]
     scan: Scan | None
@@ -37,24 +37,26 @@ class Moment(NamedTuple):
 
 @dataclass(frozen=True)
 class Actor:
-    """Somebody who is drawn again and again: triangles and light of each vertex."""
+    """Person who is drawn repeatedly: triangles, and the linear RGB of each vertex."""
 
     faces: Int[Tensor, "faces 3"]
     colors: Float[Tensor, "vertices 3"]
 
     def scene(self, moment: Moment, camera: Camera) -> Scene:
+        """Return the scene in which the camera sees the person at this moment."""
         return Scene(moment.vertices, self.faces, self.colors, camera)
 
 
 class Generated:
-    """A person of a generated data set, who can take any pose.
+    """Person of a generated data set, who can take any pose.
 
-    The registration is that to the scan in the first pose, reposed: as far off the body everywhere, its colours as they
-    were. The scan is generated anew in each pose: the same clothes, hair and light, with the shading of the pose.
+    The registration is the one to the scan in the first pose, reposed: its distances from the body and its colours do
+    not change. The scan is generated anew in each pose, with the same clothes, hair and light, and with the shading of
+    the pose.
 
     Attributes:
         stood: the pose that photographs of the data set show.
-        registration: on the topology, as the data set has it.
+        registration: the mesh on the topology, as the data set has it.
     """
 
     def __init__(self, crowd: Crowd, split: str, number: int, name: Name) -> None:
@@ -76,11 +78,11 @@ class Generated:
         self._floor = float(self.registration.vertices[:, 1].min())
 
     def first(self) -> Moment:
-        """As the data set shows them."""
+        """Return the person in the pose of the data set."""
         return self._first
 
     def at(self, pose: Float[np.ndarray, "joint 3"]) -> Moment:
-        """In a pose, on the floor."""
+        """Return the person in a pose, moved vertically so that the feet are on the floor."""
         bare = self.crowd.posed(self.shape, torch.from_numpy(pose)[None])
         scan, _ = self.wardrobe.scanned(bare, self.worn, copy.deepcopy(self._random))
         vertices = self.wardrobe.reposed(self._registered.vertices, self._bare, bare)[self._rows]
@@ -90,14 +92,16 @@ class Generated:
 
 
 def actor(registration: Registration) -> Actor:
+    """Return the person whose mesh a registration is, with colours in linear RGB."""
     return Actor(registration.faces, linear(registration.colors))
 
 
 def orbit(moments: Sequence[Moment], azimuths: Sequence[float], size: tuple[int, int]) -> list[Camera]:
-    """Cameras that look at the middle of all moments, from the one distance at which each sees all of them whole.
+    """Return cameras that look at the middle of all moments, at the smallest common distance that shows each whole.
 
     Args:
-        azimuths: radians; 0 is in front (z), more goes to the subject's left (x).
+        moments: the states that all cameras have to show whole.
+        azimuths: radians; 0 is in front (z), larger angles turn to the subject's left (x).
         size: (height, width), pixels.
     """
     every = torch.cat(
@@ -105,7 +109,7 @@ def orbit(moments: Sequence[Moment], azimuths: Sequence[float], size: tuple[int,
     ).double()
     middle = (every.amin(0) + every.amax(0)) / 2
     plain = canonical_camera(*size)
-    # a point is whole in view where focal |x| / (z + distance) is at most half the free width
+    # a point is in view if focal |x| / (z + distance) is at most half the free width
     steep = torch.tensor(plain.focal, dtype=torch.float64) * 2 / FREE / torch.tensor(size[::-1])
     rotations = [_towards(azimuth) for azimuth in azimuths]
     away = 0.0
@@ -120,7 +124,7 @@ def orbit(moments: Sequence[Moment], azimuths: Sequence[float], size: tuple[int,
 
 
 def _towards(azimuth: float) -> Float[Tensor, "3 3"]:
-    """World to camera: x right, y down, z forward; the camera looks down by LOOK_DOWN."""
+    """Return the rotation from world to camera (x right, y down, z forward) of a camera looking down by LOOK_DOWN."""
     sine, cosine = math.sin(azimuth), math.cos(azimuth)
     level = math.cos(LOOK_DOWN)
     back = torch.tensor([level * sine, math.sin(LOOK_DOWN), level * cosine], dtype=torch.float64)
@@ -129,11 +133,11 @@ def _towards(azimuth: float) -> Float[Tensor, "3 3"]:
 
 
 def on_white(renderer: Renderer, scene: Scene) -> UInt8[np.ndarray, "height width 3"]:
-    """A picture as a file holds it, whatever ground the renderer paints on."""
+    """Return an 8-bit sRGB image of the scene on white, for any background colour of the renderer."""
     if renderer.background == 1:
         return eight_bit(renderer(scene)["color"]).numpy()
     assert scene.colors is not None
-    cover = torch.ones(len(scene.vertices), 1)  # a fourth channel: how much of a pixel is the subject
+    cover = torch.ones(len(scene.vertices), 1)  # a fourth channel: share of a pixel that is covered
     drawn = renderer(Scene(scene.vertices, scene.faces, torch.cat([scene.colors, cover], 1), scene.camera))[
         "color"
     ]
@@ -141,7 +145,7 @@ def on_white(renderer: Renderer, scene: Scene) -> UInt8[np.ndarray, "height widt
 
 
 def photograph(renderer: Renderer, scan: Scan, camera: Camera) -> UInt8[np.ndarray, "height width 3"]:
-    """What photographs of the data set show, on white."""
+    """Return a photograph of the scan as those of the data set, 8-bit sRGB, on white."""
     scene = Scene(
         torch.from_numpy(scan.vertices).float(),
         torch.from_numpy(scan.faces),
@@ -160,7 +164,7 @@ def columns(
     renderers: Mapping[str, Renderer],
     camera_of_truth: Renderer,
 ) -> Iterator[dict[str, UInt8[np.ndarray, "height width 3"]]]:
-    """Frame by frame what each renderer draws, by its name, and "photograph" where the scan is known."""
+    """Yield for each frame the image of each renderer by its name, and the "photograph" if the scan is known."""
     for moment, camera in zip(moments, cameras, strict=True):
         scene = actor.scene(moment, camera)
         found = {name: on_white(renderer, scene) for name, renderer in renderers.items()}
@@ -170,7 +174,7 @@ def columns(
 
 
 def side_by_side(pictures: Mapping[str, UInt8[np.ndarray, "height width 3"]], synthetic: bool) -> Image.Image:
-    """With their names below, and said beside the first what is synthetic."""
+    """Return one image of all images in a row with their names below, and with a note if they are synthetic."""
     height, width = next(iter(pictures.values())).shape[:2]
     sheet = Image.new("RGB", (width * len(pictures), height + CAPTION), "white")
     pen, font = ImageDraw.Draw(sheet), ImageFont.load_default(11)

@@ -1,4 +1,4 @@
-"""What the data sets of bodies share: clouds normalised robustly, and every vertex of a mesh in the same frame."""
+"""Base class of the data sets of bodies: clouds normalised robustly, with all vertices of a mesh in the same frame."""
 
 from abc import abstractmethod
 from collections.abc import Sequence
@@ -22,11 +22,11 @@ from framework.target import Target
 
 
 class Bodies(Data):
-    """Scans of bodies, with every vertex of a registered mesh for target.
+    """Scans of bodies, whose target is every vertex of a registered mesh.
 
-    Inputs are clouds about the origin, normalised robustly (geometry.clouds); targets are in the same frame, x, y, z of
-    vertex 0, then of vertex 1, ...; "centre" (batch, 3) and "scale" (batch,), metres, lead back. A data set of the
-    family adds its constructor, what to cite, `prepare`, `fingerprint` and `cloud`.
+    Inputs are clouds around the origin, normalised robustly (geometry.clouds). Targets are in the same frame: x, y, z
+    of vertex 0, then of vertex 1, and so on. "centre" (batch, 3) and "scale" (batch,), metres, are the inverse of the
+    normalisation. A subclass adds its constructor, its citation, `prepare`, `fingerprint` and `cloud`.
     """
 
     suffixes = tuple(READERS)
@@ -36,10 +36,10 @@ class Bodies(Data):
 
     @abstractmethod
     def cloud(self, file: Path) -> Float[Tensor, "points 3"]:
-        """The points of a scan that are read, metres, float32.
+        """Return the points of a scan that a model reads, metres, float32.
 
         Raises:
-            DataError: it cannot be read.
+            DataError: the file cannot be read.
         """
 
     def splits(self) -> Splits:
@@ -52,7 +52,7 @@ class Bodies(Data):
         return Fields(**normalised(found), index=torch.arange(len(files)))
 
     def asked(self, given: Any) -> Batch:
-        """Of scans in metres: files, or an array of one cloud or of a batch, padded with NaN."""
+        """Return the batch of scans in metres: files, or an array of one cloud or of a batch, padded with NaN."""
         files = [given] if isinstance(given, str | Path) else given
         if isinstance(files, Sequence) and files and all(isinstance(file, str | Path) for file in files):
             return fetched(self.read([Path(file) for file in files]), range(len(files)))
@@ -64,7 +64,7 @@ class Bodies(Data):
         return self.asked(given)["input"]
 
     def frame(self, batch: Batch) -> Frame:
-        """Metres, as the scan lies."""
+        """Return the transform of targets into metres, in the coordinates of the scan."""
         vertices = len(self.target.names) // 3
         location = batch["centre"].repeat(1, vertices)
         return Frame(location, batch["scale"][:, None].expand_as(location))
@@ -73,18 +73,18 @@ class Bodies(Data):
         return batch
 
     def picture(self, inputs: Tensor) -> np.ndarray:
-        return cloud_picture.picture(inputs[..., [2, 0, 1]])  # its third axis is up
+        return cloud_picture.picture(inputs[..., [2, 0, 1]])  # the third axis of the figure points up
 
 
 def target_of(vertices: int) -> Target:
-    """The coordinates of so many vertices."""
+    """Return the target of a mesh with this number of vertices: their coordinates."""
     return Target("real", tuple(f"{axis}{vertex}" for vertex in range(vertices) for axis in XYZ))
 
 
 def normalised(
     batch: Float[Tensor, "batch points columns"], vertices: Float[Tensor, "batch vertex 3"] | None = None
 ) -> Batch:
-    """The fields "input", "centre" and "scale" of clouds in metres, and with vertices, metres, "target"."""
+    """Return the fields "input", "centre" and "scale" of clouds in metres, and "target" of vertices in metres."""
     found = clouds.normalised(batch[..., :3], "robust")
     centre, scale = found.centre.float(), found.scale.float()
     fields = {"input": found.clouds, "centre": centre, "scale": scale}

@@ -1,4 +1,4 @@
-"""Bodies that bend at joints: linear blend skinning with shape and pose blend shapes (thesis eq. 7.1-7.2)."""
+"""Articulated bodies: linear blend skinning with shape and pose blend shapes (thesis eq. 7.1-7.2)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -11,33 +11,35 @@ from torch import Tensor, nn
 from framework.errors import ConfigError, DataError, did_you_mean
 
 SLACK = 1e-3
-"""How far the skinning weights of a vertex may be from a sum of 1 before the file is called wrong."""
+"""Largest difference of a vertex's sum of skinning weights from 1; beyond it the file is refused."""
 ROUNDING = 1e-6
-"""How far before they are divided by it."""
+"""Smallest difference of a sum of skinning weights from 1 at which the weights are divided by that sum."""
 
 
 @dataclass(frozen=True)
 class Body:
-    """What a body model is made of; float32 or float64 arrays, metres.
+    """Arrays of a body model, float32 or float64, metres.
 
     Attributes:
-        source: where it comes from, for messages.
+        source: origin of the body, for messages.
         template: the vertices of the mean shape in the rest pose.
         faces: rows of `template`, corners counter-clockwise seen from outside.
-        weights: how much of each joint's motion a vertex follows, ≥ 0, of sum 1 (divided by their sum here).
-        parents: of each joint the one it hangs on, -1 for the only root.
-        joints: positions in the rest pose of the mean shape.
+        weights: skinning weights: share of each joint's motion that a vertex follows, ≥ 0, of sum 1 (the constructor
+            divides them by their sum).
+        parents: parent of each joint, -1 for the only root.
+        joints: positions of the joints in the rest pose of the mean shape.
         shapes, joint_shapes: displacement of vertices and joints by each shape coefficient.
-        pose_shapes: displacement of vertices by each pose feature; None for a body without. There are either 9
-            features a joint but the root, rotation matrix less identity, row by row (Loper et al. 2015, eq. 9); or 4,
-            unit quaternion (x, y, z, w) less identity, and the second shape coefficient (Osman et al. 2020, eq. 4).
-        names: of the joints; empty where they have none.
-        uv, uv_faces: places in a texture, u to the right and v upwards, and three rows of them a face; None for a body
-            without.
+        pose_shapes: displacement of vertices by each pose feature; None for a body without them. There are either 9
+            features for each joint except the root, rotation matrix less identity, row by row (Loper et al. 2015, eq.
+            9); or 4, unit quaternion (x, y, z, w) less identity, and the second shape coefficient (Osman et al. 2020,
+            eq. 4).
+        names: names of the joints; empty if they have none.
+        uv, uv_faces: texture coordinates, u to the right and v upwards, and three rows of them for each face; None for
+            a body without them.
 
     Raises:
-        DataError: parts that do not fit together, a number that is not finite, weights that are no shares, parents
-            that are no tree, faces that name vertices that are not there.
+        DataError: arrays do not fit together, a number is not finite, weights are negative or do not sum to 1, parents
+            form no tree, or faces name vertices that do not exist.
     """
 
     source: str
@@ -119,7 +121,7 @@ class Body:
 
 
 def _depths(parents: Sequence[int]) -> list[int]:
-    """Steps from each joint up to a root; -1 where none is reached."""
+    """Return the number of steps from each joint up to a root; -1 if no root is reached."""
     found = []
     for joint in range(len(parents)):
         depth, at = 0, joint
@@ -130,12 +132,13 @@ def _depths(parents: Sequence[int]) -> list[int]:
 
 
 def with_joints(body: Body, names: Sequence[str]) -> Body:
-    """The same body with these joints alone; the others never bend: each moves with the next joint above it.
+    """Return the body with these joints alone.
 
-    Poses of the joints kept give the same vertices, for less work. Without pose shapes only: those count all joints.
+    The other joints never bend: each moves with the nearest kept joint above it. Poses of the kept joints give the same
+    vertices, for less work. A body with pose shapes is refused, because pose shapes count all joints.
 
     Raises:
-        ConfigError: a joint of no such name, the root not among them, or a body with pose shapes.
+        ConfigError: no joint has such a name, the root is not among them, or the body has pose shapes.
     """
     for name in names:
         if name not in body.names:
@@ -172,14 +175,14 @@ def _kept_above(parents: Sequence[int], joint: int, kept: dict[int, int]) -> int
 
 
 class BodyModel(nn.Module):
-    """Vertices of a body from shape coefficients and joint rotations, batched and differentiable in all of them.
+    """Differentiable model that returns the vertices of bodies from shape coefficients and joint rotations, in batches.
 
     X = W(T + B_S(β) + B_P(θ), J(β), θ) (eq. 7.1, 7.2; Loper et al. 2015). A joint's rotation is relative to its parent,
-    about axes that are those of the world in the rest pose. With a pose of zeros the result is template plus shapes, to
-    the last bit where there are no pose shapes.
+    about axes that are those of the world in the rest pose. With a pose of zeros the result is template plus shapes,
+    equal to the last bit if there are no pose shapes.
 
     Args:
-        body: its arrays; they become buffers, so that `.to` changes their type and device.
+        body: arrays of the model; they become buffers, so that `.to` changes their type and device.
     """
 
     template: Tensor
@@ -204,7 +207,7 @@ class BodyModel(nn.Module):
         ]
         self.levels = [(level, [body.parents[joint] for joint in level]) for level in levels]
         arrays = {
-            # coordinates first: all x, all y, all z, which is how they are read; one row a coefficient
+            # one row for each coefficient: all x, then all y, then all z, in the order in which they are read
             "template": _rows(body.template[..., None])[0],
             "weights": body.weights.T,
             "joints": body.joints,
@@ -226,21 +229,21 @@ class BodyModel(nn.Module):
         translation: Float[Tensor, "_batch 3"] | None = None,
         offsets: Float[Tensor, "_batch vertex 3"] | None = None,
     ) -> Float[Tensor, "batch vertex 3"]:
-        """Posed vertices, metres, of the model's dtype.
+        """Return the posed vertices, metres, of the model's dtype.
 
         Args:
             shape: coefficients β; fewer than the model has are the first of them.
-            pose: θ, axis times angle of each joint, radians; any number of turns.
-            translation: of the whole body, metres.
-            offsets: of one person's vertices from the model's in the rest pose, metres: clothes, hair.
+            pose: θ, axis times angle of each joint, radians; angles above 2π are allowed.
+            translation: translation of the whole body, metres.
+            offsets: displacements of one person's vertices from the model's in the rest pose, metres: clothes, hair.
 
         Raises:
-            ValueError: other shapes, or numbers that are not finite; names the first such row.
+            ValueError: other shapes, or numbers that are not finite; the message names the first such row.
         """
         self._check(shape, pose, translation)
         count = shape.shape[1]
         rest = torch.addmm(self.template, shape, self.shapes[:count])
-        # rotations in float64: an angle of many turns has no digits to lose, and there are few of them
+        # rotations in float64, because angles of many turns lose digits otherwise; there are few of them
         turns = turns_less_identity(pose.double())
         if self.pose_shapes is not None:
             rest = rest + self._features(turns, pose, shape) @ self.pose_shapes
@@ -248,7 +251,7 @@ class BodyModel(nn.Module):
         if offsets is not None:
             rest = rest + offsets.transpose(1, 2)
         blended = self._blended(shape, turns)
-        # Σ_j w_j (R_j x + t_j) = x + Σ_j w_j ((R_j - 1) x + t_j), which is x where nothing turns
+        # Σ_j w_j (R_j x + t_j) = x + Σ_j w_j ((R_j - 1) x + t_j), which is exactly x if no joint rotates
         moved = (blended[:, :9].unflatten(1, (3, 3)) * rest[:, None]).sum(2)
         posed = rest + (moved + blended[:, 9:])
         if translation is not None:
@@ -258,19 +261,19 @@ class BodyModel(nn.Module):
     def skinning(
         self, shape: Float[Tensor, "batch shape"], pose: Float[Tensor, "batch joint 3"]
     ) -> Float[Tensor, "batch vertex 3 3"]:
-        """Of each vertex Σ_j w_j R_j, the matrix that skinning turns it by: W of eq. 7.1 without what it moves."""
+        """Return Σ_j w_j R_j of each vertex, the linear part of its skinning transform (W of eq. 7.1)."""
         self._check(shape, pose, None)
         blended = self._blended(shape, turns_less_identity(pose.double()))[:, :9]
         return blended.mT.unflatten(2, (3, 3)) + torch.eye(3).to(blended)
 
     def rest_joints(self, shape: Float[Tensor, "batch shape"]) -> Float[Tensor, "batch joint 3"]:
-        """J(β), joint positions in the rest pose, metres."""
+        """Return J(β), joint positions in the rest pose, metres."""
         return self.joints + torch.einsum("bs,sjk->bjk", shape, self.joint_shapes[: shape.shape[1]])
 
     def posed_joints(
         self, shape: Float[Tensor, "batch shape"], pose: Float[Tensor, "batch joint 3"]
     ) -> Float[Tensor, "batch joint 3"]:
-        """Where the joints are in a pose, metres."""
+        """Return the positions of the joints in a pose, metres."""
         self._check(shape, pose, None)
         joints = self.rest_joints(shape).double()
         found = self._transforms(shape, turns_less_identity(pose.double()))
@@ -278,23 +281,23 @@ class BodyModel(nn.Module):
         return (joints + moved + found[..., 9:]).to(self.template.dtype)
 
     def _blended(self, shape: Tensor, turns: Tensor) -> Float[Tensor, "batch 12 vertex"]:
-        """Of each vertex Σ_j w_j (R_j - 1, t_j)."""
+        """Return Σ_j w_j (R_j - 1, t_j) of each vertex."""
         return self._transforms(shape, turns).to(self.weights.dtype).transpose(1, 2) @ self.weights
 
     def _transforms(self, shape: Tensor, turns: Tensor) -> Float[Tensor, "batch joint 12"]:
-        """Of each joint (R - 1, t), such that x becomes R x + t: the chain of the rotations up to the root, float64."""
+        """Return (R - 1, t) of each joint, float64, such that x becomes R x + t: all rotations up to the root."""
         joints = self.rest_joints(shape).double()
         rotations = list(turns.unbind(1))
         shifts = list(joints.unbind(1))
         for level, above in self.levels:
-            if above[0] < 0:  # the root turns about itself: R j + t = j
+            if above[0] < 0:  # the root rotates about its own position: R j + t = j
                 rotation = turns[:, level]
                 shift = -(rotation @ joints[:, level, :, None])[..., 0]
             else:
                 up = torch.stack([rotations[joint] for joint in above], 1)
                 local = turns[:, level]
                 rotation = up + local + up @ local  # (1 + U)(1 + L) - 1
-                # a joint stays where its parent takes it: R j + t = R_up j + t_up
+                # a joint's own rotation does not move it: R j + t = R_up j + t_up
                 shift = torch.stack([shifts[joint] for joint in above], 1)
                 shift = shift + ((up - rotation) @ joints[:, level, :, None])[..., 0]
             for number, joint in enumerate(level):
@@ -319,19 +322,19 @@ class BodyModel(nn.Module):
                 f"{joints}, 3) and (batch, 3)."
             )
         for name, values in (("shape", shape), ("pose", pose), ("translation", translation)):
-            # also refused: angles whose squares are infinite in float64
+            # angles whose squares are infinite in float64 are also refused
             if values is not None and not (finite := values.double().square().isfinite()).all():
                 row = int((~finite.flatten(1).all(1)).nonzero()[0])
                 raise ValueError(f"{name} is not finite in batch row {row}; wanted numbers below 1e150.")
 
 
 def _rows(values: np.ndarray) -> np.ndarray:
-    """(vertex, 3, row) as (row, 3 · vertex)."""
+    """Return an array of shape (vertex, 3, row) as (row, 3 · vertex)."""
     return np.moveaxis(values, 0, 2).transpose(1, 0, 2).reshape(values.shape[2], -1)
 
 
 def turns_less_identity(vectors: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """R - 1 of rotations about an axis by an angle, axis times angle in radians; tiny angles keep their digits.
+    """Return R - 1 of rotations given as axis times angle, radians; tiny angles keep their digits.
 
     R - 1 = (sin θ / θ) K + ((1 - cos θ) / θ²) K² with K x = v × x (Rodrigues; Murray, Li & Sastry 1994, eq. 2.14).
     """
@@ -345,7 +348,7 @@ def turns_less_identity(vectors: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*b
 
 
 def quaternions_less_identity(vectors: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4"]:
-    """(x, y, z, w) of unit quaternions with 1 taken from w, of rotations given as axis times angle, radians."""
+    """Return unit quaternions (x, y, z, w - 1) of rotations given as axis times angle, radians."""
     square = vectors.square().sum(-1, keepdim=True)
     quarter = sine_over_angle(square / 16)
     # cos(θ/2) - 1 = -2 sin²(θ/4)
@@ -353,10 +356,10 @@ def quaternions_less_identity(vectors: Float[Tensor, "*batch 3"]) -> Float[Tenso
 
 
 def sine_over_angle(square: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-    """sin θ / θ from θ², smooth in it, also at 0."""
+    """Return sin θ / θ as a function of θ², smooth also at 0."""
     small = square < 1e-2
     root = square.where(~small, 1).sqrt()
-    # the series of sin θ / θ; what is left out is below 1e-20 up to 1e-2
+    # the series of sin θ / θ; its remainder is below 1e-20 up to θ² = 1e-2
     t = square.where(small, 0)
     series = 1 - t / 6 * (1 - t / 20 * (1 - t / 42 * (1 - t / 72 * (1 - t / 110))))
     return series.where(small, root.sin() / root)

@@ -1,9 +1,9 @@
-"""Body models in their usual layout, and in our own: `v_template`, `shapedirs` and so on in an .npz or a .pkl.
+"""Files of body models: the published layout (`v_template`, `shapedirs` and so on) in .npz or .pkl, and our own.
 
-The layout of the published body models with linear blend skinning: `v_template` (V, 3), `shapedirs` (V, 3, B),
-`J_regressor` (J, V), `weights` (V, J), `kintree_table` (2, J) whose first row holds parents, `f` (F, 3), and for most
-`posedirs` (V, 3, 9 (J - 1)), or with 4 (J - 1) + 1 features. Other keys are left alone. Pickles go through
-plugins.data.bodies.restricted_pickle: nothing that a file names is run.
+The published models with linear blend skinning use this layout: `v_template` (V, 3), `shapedirs` (V, 3, B),
+`J_regressor` (J, V), `weights` (V, J), `kintree_table` (2, J) whose first row holds parents, `f` (F, 3), and in most
+files `posedirs` (V, 3, 9 (J - 1)), or with 4 (J - 1) + 1 features. Other keys are not read. Pickles are read by
+plugins.data.bodies.restricted_pickle, which runs nothing that a file names.
 """
 
 import math
@@ -28,11 +28,11 @@ WANTED = f"Wanted: {', '.join(NEEDED)}, and posedirs for a body with pose blend 
 
 
 def read(file: Path) -> Body:
-    """A body model from a file in the usual layout.
+    """Read a body model from a file in the published layout.
 
     Raises:
-        DataError: no such file, another format, something in it that is neither arrays nor plain values, an array
-            missing or of another shape. Says which.
+        DataError: the file does not exist, has another format, holds something other than arrays and plain values, or
+            an array is missing or has another shape. The message names the cause.
     """
     with guarded(file, "a body model", missing="wanted a body model. Mend the path."):
         if file.suffix == ".npz":
@@ -57,7 +57,7 @@ def save(body: Body, file: Path) -> None:
 
 
 def load(file: Path) -> Body:
-    """A body that `save` wrote.
+    """Read a body that `save` wrote.
 
     Raises:
         DataError: the file is missing or damaged.
@@ -90,7 +90,7 @@ def _body(file: Path, found: Mapping[str, Any]) -> Body:
     posedirs = found.get("posedirs")
     arrays = {name: _numbers(file, name, found[name]) for name in NEEDED}
     template, shapes, regressor = arrays["v_template"], arrays["shapedirs"], arrays["J_regressor"]
-    if shapes.ndim == 2:  # of a single coefficient
+    if shapes.ndim == 2:  # a model with a single coefficient
         shapes = shapes[..., None]
     table = arrays["kintree_table"]
     if (
@@ -109,11 +109,11 @@ def _body(file: Path, found: Mapping[str, Any]) -> Body:
         template=template,
         faces=arrays["f"].astype(np.int64),
         weights=arrays["weights"].astype(wanted),
-        # the root's parent is -1, or what that becomes as an unsigned number
+        # the root's parent is -1, which reads as a large number if it was stored unsigned
         parents=tuple(
             -1 if not 0 <= parent < table.shape[1] else int(parent) for parent in table[0].tolist()
         ),
-        # joints are linear in the vertices (Loper et al. 2015, eq. 10), so each coefficient displaces them too
+        # joints are linear in the vertices (Loper et al. 2015, eq. 10), so each coefficient displaces them as well
         joints=(regressor @ template).astype(wanted),
         shapes=shapes.astype(wanted),
         joint_shapes=np.einsum("jv,vcs->jcs", regressor, shapes).astype(wanted),
@@ -122,7 +122,7 @@ def _body(file: Path, found: Mapping[str, Any]) -> Body:
 
 
 def _numbers(file: Path, name: str, value: Any) -> np.ndarray:
-    # no lists: of nested ones that hold each other twice an array would be without end
+    # lists are refused: nested lists that repeat one another would expand into an array of unlimited size
     if not isinstance(value, np.ndarray | np.generic | int | float | str):
         raise DataError(f"{file}: {name} is {type(value).__name__}; wanted an array. {WANTED}")
     array = np.asarray(value)

@@ -1,4 +1,4 @@
-"""`python -m plugins.data.bodies.correspond <run> [<FAUST>]` answers FAUST's challenges, in the form that they ask for.
+"""`python -m plugins.data.bodies.correspond <run> [<FAUST>]` writes results for FAUST's challenges in their format.
 
 Without a folder people are generated in FAUST's layout (synthetic), whose true correspondences are known.
 """
@@ -30,16 +30,16 @@ from plugins.data.bodies.faust import CHALLENGES, Challenge, pairs, test_registr
 from plugins.data.bodies.faust_generator import people_root
 
 Registered = Callable[[Path], Float[np.ndarray, "vertex 3"]]
-"""A scan's file to the vertices registered to it, metres."""
+"""Function from a scan's file to the vertices registered to it, metres."""
 
 
 class Answered(NamedTuple):
-    """Of one challenge.
+    """Result of one challenge.
 
     Attributes:
-        file: a text file of each pair, zipped: x, y, z, metres, on the second scan for each vertex of the first.
-        pairs: how many.
-        error_cm: of each pair whose true registrations are there, the mean over their vertices.
+        file: a zip of one text file for each pair: x, y, z, metres, on the second scan for each vertex of the first.
+        pairs: number of pairs.
+        error_cm: mean error over the vertices, centimetres, of each pair whose true registrations exist.
     """
 
     file: Path
@@ -48,10 +48,10 @@ class Answered(NamedTuple):
 
 
 def main(arguments: list[str]) -> None:
-    """Write `<out>/intra.zip` and `inter.zip`; print errors where the truth is known.
+    """Write `<out>/intra.zip` and `inter.zip`; print errors if the truth is known.
 
     Raises:
-        UserError: a checkpoint of another data set, or a file that cannot be read.
+        UserError: the checkpoint is of another data set, or a file cannot be read.
     """
     parser = argparse.ArgumentParser(prog="python -m plugins.data.bodies.correspond", description=__doc__)
     parser.add_argument("checkpoint", help="run folder, checkpoint file or MLflow run id")
@@ -73,13 +73,13 @@ def main(arguments: list[str]) -> None:
 
 
 def model(checkpoint: str, paths: Mapping[str, str] | None = None) -> tuple[Registered, Callable[[], Path]]:
-    """A trained model, and what gives the root of people in FAUST's layout: they are generated, once, of its body.
+    """Return the registration function of a trained model, and a function that returns the root of generated people.
 
-    Args:
-        checkpoint, paths: as of `framework.load`.
+    The second function generates people of the model's body in FAUST's layout on its first call. `checkpoint` and
+    `paths` are the arguments of the same names of `framework.load`.
 
     Raises:
-        ConfigError: a checkpoint of another data set.
+        ConfigError: the checkpoint is of another data set.
     """
     predictor, description = load_with_description(checkpoint, paths=paths)
     part = description.config["data"]
@@ -104,16 +104,14 @@ def model(checkpoint: str, paths: Mapping[str, str] | None = None) -> tuple[Regi
 
 
 def answered(registered: Registered, root: Path, challenge: Challenge, out: Path) -> Answered:
-    """Correspondences of every pair through registered meshes.
+    """Compute the correspondences of every pair through registered meshes, and write them to `<out>/<challenge>.zip`.
 
-    A vertex of the first scan goes to the nearest vertex of the mesh registered to it, and from there to the same
-    vertex of the mesh registered to the second scan (thesis §6.5.2).
-
-    Args:
-        registered: asked once for each scan.
+    A vertex of the first scan is mapped to the nearest vertex of the mesh registered to it, and from there to the
+    vertex of the same number of the mesh registered to the second scan (thesis §6.5.2). `registered` is called once for
+    each scan.
 
     Raises:
-        DataError: no pairs, or a scan that cannot be read.
+        DataError: the challenge has no pairs, or a scan cannot be read.
     """
     mesh_of = cache(registered)
     given = pairs(root, challenge)
@@ -134,7 +132,7 @@ def answered(registered: Registered, root: Path, challenge: Challenge, out: Path
 
 
 def _nearest(vertices: np.ndarray, points: np.ndarray) -> Int[np.ndarray, "points"]:
-    """Of each point the vertex that is nearest."""
+    """Return the number of the vertex nearest to each point."""
     reference, asked = (torch.from_numpy(part).float()[None] for part in (vertices, points))
     return nearest(reference, asked).index[0].numpy()
 

@@ -1,4 +1,4 @@
-"""Scans of synthetic people, and FAUST, with all vertices of each body for target; the contract is framework.data's."""
+"""Data sets `registration` (scans of synthetic people) and `faust`, whose target is all vertices of each body."""
 
 import hashlib
 from collections.abc import Mapping, Sequence
@@ -27,7 +27,7 @@ from plugins.data.bodies.scanner import KINDS, Kinds, Scanner
 from plugins.data.bodies.scans import Scans
 
 VERSION = 1
-"""Of what is drawn; a change takes a new number."""
+"""Version of the random draws; any change of them takes a new number."""
 Size = Annotated[int, Field(ge=1, le=10_000_000)]
 Points = Annotated[int, Field(ge=100, le=1_000_000)]
 Seed = Annotated[int, Field(ge=0, lt=2**31)]
@@ -36,7 +36,7 @@ Subjects = Annotated[list[Annotated[int, Field(ge=0, lt=SUBJECTS)]], Field(min_l
 
 @dataclass(frozen=True, kw_only=True)
 class Sizes:
-    """Bodies of each split."""
+    """Number of bodies in each split."""
 
     train: Size = 48_000
     validation: Size = 400
@@ -46,18 +46,18 @@ class Sizes:
 class Registration(Bodies):
     """Synthetic scans of people of random shape and pose; the target is every vertex of the body (thesis §6.5.2).
 
-    A body is drawn (people; adults of random traits), posed by linear blend skinning and scanned (scanner). Nothing of
-    that is kept: a sample is a function of (`data_seed`, split, number), made when it is fetched.
+    A body is drawn (people; adults of random traits), posed by linear blend skinning and scanned (scanner). Nothing is
+    stored: a sample is a function of (`data_seed`, split, number), computed when it is fetched.
 
     Args:
-        sizes: of the splits.
-        scanner, kinds: of every scan, and how many scans are of which kind.
+        sizes: numbers of bodies of the splits.
+        scanner, kinds: settings of every scan, and the shares of the kinds of scans.
         body: file of a body model of the SMPL family (.npz, .pkl); None: the default body, extracted on first use.
         shape_spread: standard deviation of the first ten shape coefficients of a body from a file.
-        data_seed: of the draws, whatever the seed of the run.
+        data_seed: seed of the draws, independent of the seed of the run.
 
     Raises:
-        DataError: the body cannot be had or read.
+        DataError: the body is not available or cannot be read.
     """
 
     bibtex = """@inproceedings{prokudin2019efficient,
@@ -107,7 +107,7 @@ class Registration(Bodies):
         random = np.random.default_rng(seed)
         people = self.people.draw(self.sizes[name], random)
         kind = torch.from_numpy(random.choice(len(KINDS), self.sizes[name], p=self.kinds.shares()))
-        # a quarter of a millimetre is nothing to learn from, and targets of all training bodies may be kept at once
+        # float16 rounds by a quarter of a millimetre, too little to matter; all training targets may be kept at once
         precision = torch.float16 if name == "train" else torch.float32
         return Scans(self.model, people, kind, self.scanner, seed, precision)
 
@@ -133,20 +133,20 @@ class Registration(Bodies):
 class Faust(Bodies):
     """FAUST's training scans and their registrations, split by person (Bogo et al. 2014).
 
-    Inputs are points drawn from a scan's vertices, targets the registration's vertices; "subject" (batch,) is the
-    person, 0 to 9. The scans of the test set have no registrations and are for `mode=predict` and for
+    Inputs are points drawn from a scan's vertices, targets are the registration's vertices; "subject" (batch,) is the
+    person, 0 to 9. The scans of the test set have no registrations; they are for `mode=predict` and for
     plugins.data.bodies.correspond.
 
     Args:
         root: the folder that holds `training` (and `test`); None: people are generated in its layout.
-        body: of generated people, see `Registration`.
-        points: of a cloud; scans have some 170,000.
+        body: body of generated people, see `Registration`.
+        points: number of points of a cloud; scans have some 170,000.
         validation, test: people of these splits; all others are for training.
-        data_seed: of the points, whatever the seed of the run.
+        data_seed: seed of the choice of points, independent of the seed of the run.
 
     Raises:
-        DataError: a scan without its registration or the other way round, a file that cannot be read, registrations of
-            different meshes, a split without scans.
+        DataError: a scan has no registration or a registration no scan, a file cannot be read, registrations are of
+            different meshes, or a split has no scans.
     """
 
     bibtex = """@inproceedings{bogo2014faust,
@@ -212,7 +212,7 @@ class Faust(Bodies):
         )
 
     def cloud(self, file: Path) -> Tensor:
-        """Points of a scan, without replacement where it has enough; which depends on its name and the seed alone."""
+        """Return points of a scan, without replacement if there are enough; its name and the seed decide which."""
         vertices = read(file).vertices
         if len(vertices) > self.points:
             kept = stream(self.data_seed, file.name).choice(len(vertices), self.points, replace=False)

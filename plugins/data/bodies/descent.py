@@ -1,10 +1,11 @@
-"""Fits a figure to a picture by gradient descent through a differentiable renderer, from coarse to fine.
+"""Fit of a body to an image by gradient descent through a differentiable renderer, from coarse to fine.
 
-The loss is the squared difference of two pictures, colours and silhouette, drawn at a fraction of the size and blurred
-(both make far-away edges feel one another), plus a weak pull to the usual pose. Its gradient is the renderer's. Steps
-are quasi-Newton (BFGS with Powell's damping; Nocedal & Wright 2006, procedure 18.2), started from the curvature that
-the optical flow of the drawn picture gives: a pixel changes by its slope along rows and columns times the motion of the
-surface there (Lucas & Kanade 1981), of which the body model knows the slopes in closed form.
+The loss is the squared difference of two images, colours and silhouette, plus a weak prior on the pose. The images are
+drawn at a fraction of the size and blurred, so that edges that are far apart also have a gradient. The gradient is the
+renderer's. Steps are quasi-Newton (BFGS with Powell's damping; Nocedal & Wright 2006, procedure 18.2). The Hessian
+approximation starts from the optical flow of the rendered image: the change of a pixel is its gradient along rows and
+columns times the motion of the surface there (Lucas & Kanade 1981). The body model gives the derivatives of that motion
+in closed form.
 """
 
 import time
@@ -26,12 +27,13 @@ from plugins.data.bodies.figure import Figure
 
 
 class Stage(NamedTuple):
-    """One picture of the pyramid.
+    """Settings of one level of the image pyramid.
 
     Attributes:
-        part: its size is 1/part of the whole picture's.
-        blur: standard deviation, its own pixels.
-        pull: to the usual pose, by squared standard deviations; the loss sums over pixels of the whole picture.
+        part: its size is 1/part of the whole image's.
+        blur: standard deviation, in its own pixels.
+        pull: weight of the prior: of the squared parameters, in units of their standard deviations, in a loss that sums
+            over pixels of the whole image.
     """
 
     part: int
@@ -49,27 +51,27 @@ STAGES = (
     Stage(1, 0.8, 0.0),
 )
 AGAIN_FROM = 2
-"""The stage at which a second try from another pose starts."""
+"""Stage at which a restart from another pose begins."""
 AFRESH = 6
-"""Steps after which the curvature is made anew from the optical flow."""
+"""Number of steps after which the Hessian approximation is computed anew from the optical flow."""
 DAMPING, LEAST = 0.01, 1e-3
-"""Added to the curvature: this share of its diagonal, and this much."""
+"""Damping of the Hessian approximation: this share of its diagonal plus this constant is added to the diagonal."""
 LONGEST = (0.2, 0.08)
-"""Longest step of a rotation (radians) and a translation (metres); of other numbers it is their spread."""
+"""Longest step of a rotation (radians) and a translation (metres); for other parameters it is their spread."""
 SHORTER, TRIES = 0.4, 6
-"""By how much a step that raises the loss is shortened, and how often."""
+"""Factor by which a step that raises the loss is shortened, and the largest number of trials."""
 CONVERGED, IN_A_ROW = 5e-4, 3
-"""A stage ends with this many steps in a row that lower the loss by less than this share."""
+"""Relative decrease of the loss below which a step is small, and number of small steps in a row that end a stage."""
 
 
 @dataclass(frozen=True)
 class Fit:
-    """Where a descent ended and how it went.
+    """Result of a descent and its course.
 
     Attributes:
-        numbers: of the figure.
-        difference: root mean square of the last stage's pictures' difference.
-        path: of each step taken, in order: loss, processor time since the start (seconds), numbers.
+        numbers: parameters of the figure.
+        difference: root mean square difference of the images of the last stage.
+        path: one row for each accepted step, in order: loss, processor time since the start (seconds), parameters.
     """
 
     numbers: Float[Tensor, "number"]
@@ -78,15 +80,15 @@ class Fit:
 
 
 class Descent:
-    """Fits numbers of a figure to pictures.
+    """Estimator of a figure's parameters from images.
 
     Args:
-        figure: what is seen.
-        renderer: draws it, differentiably.
-        camera: from where.
-        steps: most steps of a stage.
-        restarts: how often the descent is tried from other poses while the pictures differ by more than `enough`.
-        enough: root mean square difference of colours.
+        figure: body that the images show.
+        renderer: differentiable renderer that draws it.
+        camera: camera of the images.
+        steps: largest number of steps of a stage.
+        restarts: largest number of restarts from other poses while the images differ by more than `enough`.
+        enough: root mean square difference of colours at which no restart is needed.
     """
 
     def __init__(
@@ -100,7 +102,7 @@ class Descent:
         )
 
     def __call__(self, picture: Float[Tensor, "height width 4"]) -> Fit:
-        """The best of all tries; a picture's fit depends on nothing but the picture."""
+        """Return the best fit of all starts; an image's fit depends on nothing but the image."""
         began = time.process_time()
         random = torch.Generator().manual_seed(0)
         best = self._once(picture, torch.zeros_like(self.stiffness), STAGES, began)
@@ -161,7 +163,7 @@ class Descent:
     def _loss(
         self, numbers: Tensor, stage: Stage, camera: Camera, aim: Tensor
     ) -> tuple[float, Float[Tensor, "number"]]:
-        """The loss of a stage and its gradient."""
+        """Return the loss of a stage and its gradient."""
         with torch.enable_grad():
             given = numbers.detach().requires_grad_()
             drawn = self.renderer(self.figure.scene(given, camera))["color"]
@@ -175,14 +177,17 @@ class Descent:
         return torch.minimum(torch.maximum(numbers, least), most)
 
     def _curvature(self, numbers: Tensor, stage: Stage) -> Float[Tensor, "number number"]:
-        """Of the loss, damped: twice the sum of outer products of the slopes of its blurred pixels (Gauss-Newton)."""
+        """Return the damped Gauss-Newton approximation of the Hessian of the loss.
+
+        It is twice the sum of outer products of the derivatives of the stage's blurred pixels.
+        """
         slopes = self._flow(numbers, stage)
         found = 2 * stage.part**2 * (slopes.T @ slopes).double() + (2 * stage.pull * self.stiffness).diag()
         return found + (DAMPING * found.diag() + LEAST).diag()
 
     @torch.no_grad()
     def _flow(self, numbers: Tensor, stage: Stage) -> Float[Tensor, "pixel number"]:
-        """Of every colour of a stage's pixels the slope in every number, by the optical flow of the whole picture."""
+        """Return the derivatives of every colour of a stage's pixels by every parameter, from the optical flow."""
         camera, figure = self.camera, self.figure
         drawn = self.renderer(figure.scene(numbers, camera), ("color", "face"))
         color, face = drawn["color"], drawn["face"].numpy()
@@ -192,7 +197,7 @@ class Descent:
         across, down = torch.zeros_like(color), torch.zeros_like(color)
         across[:, 1:-1] = (color[:, 2:] - color[:, :-2]) / 2
         down[1:-1] = (color[2:] - color[:-2]) / 2
-        # what changes in a pixel beside the body is the nearest part of the body
+        # a pixel beside the body changes with the nearest part of the body
         nearest = distance_transform_edt(face < 0, return_distances=False, return_indices=True)
         assert isinstance(nearest, np.ndarray)
         shown = torch.from_numpy(face[tuple(nearest)])
@@ -206,7 +211,7 @@ class Descent:
         return blurred(small.view(height, width, -1), stage.blur).reshape(-1, len(numbers))
 
     def _motion(self, numbers: Tensor, vertex: Tensor) -> Float[Tensor, "vertex 2 number"]:
-        """Slopes of the pixels at which some vertices are seen."""
+        """Return the derivatives of the pixel coordinates of some vertices by every parameter."""
         camera = self.camera
         rotation = camera.rotation
         seen = self.figure.placed(numbers, vertex) @ rotation.T + camera.translation
@@ -219,7 +224,7 @@ class Descent:
 def updated(
     curvature: Float[Tensor, "number number"], step: Float[Tensor, "number"], change: Float[Tensor, "number"]
 ) -> Float[Tensor, "number number"]:
-    """A curvature with what a step taught of it: `change` is that of the slope; stays positive definite."""
+    """Return the Hessian approximation after a step; `change` is that of the gradient. It stays positive definite."""
     expected = curvature @ step
     square = float(step @ expected)
     if not square > 0:
@@ -234,7 +239,7 @@ def updated(
 
 
 def smaller(camera: Camera, part: int) -> Camera:
-    """The same view with 1/part of the pixels along each axis, each the mean of part × part."""
+    """Return a camera of the same view whose pixels are each the mean of part × part pixels."""
     (x, y), (column, row) = camera.focal, camera.principal
     return replace(
         camera,
@@ -248,14 +253,17 @@ def smaller(camera: Camera, part: int) -> Camera:
 def reduced(
     picture: Float[Tensor, "height width channels"], part: int
 ) -> Float[Tensor, "_height _width channels"]:
-    """Means of part × part pixels."""
+    """Return the means of part × part pixels."""
     return avg_pool2d(picture.movedim(-1, 0), part).movedim(0, -1)
 
 
 def blurred(
     picture: Float[Tensor, "height width channels"], deviation: float
 ) -> Float[Tensor, "height width channels"]:
-    """Convolved with a Gaussian of this standard deviation, pixels, cut at three of them; black beyond the picture."""
+    """Return the image convolved with a Gaussian that is cut at three standard deviations; `deviation` is in pixels.
+
+    The image is taken to be black beyond its border.
+    """
     height, width, _ = picture.shape
     rows = (gaussian(height, deviation) @ picture.flatten(1)).view_as(picture)
     return gaussian(width, deviation) @ rows
@@ -263,7 +271,7 @@ def blurred(
 
 @cache
 def gaussian(length: int, deviation: float) -> Float[Tensor, "length length"]:
-    """The convolution of so many pixels as a matrix, which is faster for few pixels than a convolution."""
+    """Return the convolution of this many pixels as a matrix, which is faster than a convolution for few pixels."""
     apart = torch.arange(length)[:, None] - torch.arange(length)
     weights = (-0.5 * (apart / deviation).square()).exp().where(apart.abs() <= round(3 * deviation), 0.0)
     reach = torch.arange(-round(3 * deviation), round(3 * deviation) + 1)

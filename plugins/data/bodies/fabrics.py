@@ -1,4 +1,4 @@
-"""Cloth by procedure: noise of a band of wavelengths, folds, and patterns finer than a mesh's vertices carry."""
+"""Procedural cloth: band-limited noise, folds, and patterns that are finer than the spacing of a mesh's vertices."""
 
 from collections.abc import Callable
 
@@ -7,19 +7,19 @@ from jaxtyping import Float
 from numpy.random import Generator
 
 Color = Float[np.ndarray, "3"]
-"""Linear light in [0, 1]."""
+"""Linear RGB in [0, 1]."""
 WAVES = 10
-"""Plane waves of a noise."""
+"""Number of plane waves of a noise."""
 
 
 def hue(degrees: float | int, saturation: float | int, value: float | int) -> Color:
-    """Linear light of a colour by hue, saturation and value of its sRGB numbers."""
+    """Return the linear RGB of a colour given by hue, saturation and value of its sRGB numbers."""
     sector = (np.array([5.0, 3.0, 1.0]) + degrees / 60) % 6
     return (value * (1 - saturation * np.minimum(sector, 4 - sector).clip(0, 1))) ** 2.2
 
 
 def dye(random: Generator) -> Color:
-    """A colour that clothes are of: muted ones mostly, black, white and grey often."""
+    """Return a random colour typical of clothes: mostly muted, often black, white or grey."""
     kind = random.random()
     if kind < 0.2:
         return hue(220, 0.1, random.uniform(0.1, 0.25))
@@ -37,9 +37,9 @@ def noise(
     squeezed: tuple[float, float, float] = (1.0, 1.0, 1.0),
     waves: int = WAVES,
 ) -> Float[np.ndarray, "points"]:
-    """Smooth noise of standard deviation 1 whose waves are within a factor 1.5 of a wavelength, metres.
+    """Return smooth noise of standard deviation 1, a sum of waves within a factor 1.5 of a wavelength, metres.
 
-    `squeezed`: along x, y and z the wavelength is this many times as short.
+    Along x, y and z the wavelength is divided by `squeezed`.
     """
     direction = random.normal(size=(3, waves))
     direction /= np.linalg.norm(direction, axis=0)
@@ -54,7 +54,7 @@ def folds(
     across: tuple[float, float, float],
     random: Generator,
 ) -> Float[np.ndarray, "points"]:
-    """Wrinkles that run across a direction, narrow ridges between wide valleys, about 0 and 1 high."""
+    """Return random wrinkles across a direction: ridges about 1 high between wide valleys, with a mean near 0."""
     direction = np.array(across)[:, None] + 0.35 * random.normal(size=(3, 5))
     direction /= np.linalg.norm(direction, axis=0)
     number = 2 * np.pi / (wavelength * 1.4 ** random.uniform(-1, 1, 5))
@@ -66,7 +66,7 @@ def folds(
 
 
 def _summed(place: np.ndarray, waves: Float[np.ndarray, "3 waves"], phases: np.ndarray) -> np.ndarray:
-    """Sines along some directions, added up one after the other: what is worked on stays in the processor's cache."""
+    """Return the sum of sine waves; adding them one after the other keeps the arrays in the processor's cache."""
     points = np.ascontiguousarray(place, np.float32)
     found, one = np.zeros((2, len(points)), np.float32)
     for wave, phase in zip(waves.T.astype(np.float32), phases.astype(np.float32), strict=True):
@@ -77,11 +77,11 @@ def _summed(place: np.ndarray, waves: Float[np.ndarray, "3 waves"], phases: np.n
 
 
 Pattern = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""From across and along a piece of cloth (points,), metres, to colours (points, 3)."""
+"""Function from coordinates across and along a piece of cloth (points,), metres, to colours (points, 3)."""
 
 
 def pattern(random: Generator) -> Pattern:
-    """A piece of cloth, drawn."""
+    """Return a random pattern of cloth."""
     first, second, third = dye(random), dye(random), dye(random)
     if np.abs(first - second).max() < 0.15:
         second = (1 - first) * 0.8

@@ -1,4 +1,4 @@
-"""Finds FAUST's scans and the pairs of its challenges, and reads registrations."""
+"""FAUST's file layout: paths of scans and registrations, and the pairs of its challenges."""
 
 import re
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from framework.storage.text import decoded
 
 SUBJECTS, POSES = 10, 10
 TEST = 200
-"""Test scans that there may be."""
+"""Largest number of test scans."""
 Challenge = Literal["intra", "inter"]
 CHALLENGES: tuple[Challenge, ...] = ("intra", "inter")
 WANTED = (
@@ -33,6 +33,7 @@ class Scan:
 
     @property
     def subject(self) -> int:
+        """Return the number of the person, 0 to 9."""
         return self.number // POSES
 
 
@@ -47,31 +48,35 @@ class Pair(NamedTuple):
 
 
 def training_scan(folder: Path, number: int) -> Path:
+    """Return the path of a training scan."""
     return folder / "training" / "scans" / f"tr_scan_{number:03}.ply"
 
 
 def training_registration(folder: Path, number: int) -> Path:
+    """Return the path of the registration of a training scan."""
     return folder / "training" / "registrations" / f"tr_reg_{number:03}.ply"
 
 
 def test_scan(folder: Path, number: int) -> Path:
+    """Return the path of a test scan."""
     return folder / "test" / "scans" / f"test_scan_{number:03}.ply"
 
 
 def test_registration(folder: Path, number: int) -> Path:
-    """FAUST keeps these to itself; generated people have them."""
+    """Return the path of the registration of a test scan; FAUST does not publish them, generated people have them."""
     return folder / "test" / "registrations" / f"test_reg_{number:03}.ply"
 
 
 def pairs_file(folder: Path, challenge: Challenge) -> Path:
+    """Return the path of the list of pairs of a challenge."""
     return folder / "test" / "challenge_pairs" / f"{challenge}_challenge.txt"
 
 
 def pairs(folder: Path, challenge: Challenge) -> list[Pair]:
-    """Of which correspondences are asked for: of one person, or of two.
+    """Return the pairs of scans of a challenge: of one person ("intra") or of two ("inter").
 
     Raises:
-        DataError: no such list, a line that is no pair, or a pair of a scan that is not there.
+        DataError: the list does not exist, a line is no pair, or a scan of a pair does not exist.
     """
     file = pairs_file(folder, challenge)
     with guarded(file, "pairs of a challenge", "Wanted: two test scans a line, such as 000_001."):
@@ -92,10 +97,10 @@ def pairs(folder: Path, challenge: Challenge) -> list[Pair]:
 
 
 def scans(folder: Path) -> list[Scan]:
-    """Every training scan that is there, with its registration.
+    """Return every training scan that exists, with its registration.
 
     Raises:
-        DataError: no such layout, or one of a pair missing.
+        DataError: the folder has another layout, or a scan or a registration is missing.
     """
     found = []
     for number in range(SUBJECTS * POSES):
@@ -112,10 +117,10 @@ def scans(folder: Path) -> list[Scan]:
 
 
 def registered(scan: Scan, vertices: int | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices, metres, and faces of a scan's registration.
+    """Return the vertices, metres, and the faces of a scan's registration.
 
     Raises:
-        DataError: it cannot be read, or has another number of vertices than wanted.
+        DataError: the file cannot be read, or has another number of vertices than wanted.
     """
     mesh = read(scan.registration)
     if vertices not in (None, len(mesh.vertices)):

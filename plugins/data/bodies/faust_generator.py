@@ -1,4 +1,4 @@
-"""Generates people, each scanned in several poses, in FAUST's layout."""
+"""Generator of synthetic people, each scanned in several poses, in FAUST's layout."""
 
 import hashlib
 from pathlib import Path
@@ -18,24 +18,24 @@ from plugins.data.bodies.scan_layout import write_mesh
 from plugins.data.bodies.scanner import KINDS, Kinds, Scanner, scan
 
 VERSION, SEED = 1, 0
-"""Of what is drawn; a change takes a new number."""
+"""Version and seed of the random draws; any change of the draws takes a new version."""
 TEST_POSES = 3
-"""Test scans of each person; FAUST has twenty."""
+"""Number of test scans of each person; FAUST has twenty."""
 SCANNER, SHARES = Scanner(points=20_000, noise=0.002), Kinds(partial=0.3, outliers=0.0)
 NO_FACES = np.empty((0, 3), np.int64)
 
 
 def people_root(body: str | None) -> Path:
-    """Where generated people lie in the cache; drawn now where they are not there.
+    """Return the folder of generated people in the cache; they are generated if they are not there.
 
-    Ten people in the ten poses of the training set and in three others, which are the test set. Its registrations are
-    there too, which FAUST keeps to itself.
+    There are ten people in the ten poses of the training set and in three others, which are the test set. The folder
+    also has the registrations of the test set, which FAUST does not publish.
 
     Args:
         body: file of a body model of the SMPL family (.npz, .pkl); None: the default body.
 
     Raises:
-        DataError: the body cannot be had or read.
+        DataError: the body is not available or cannot be read.
     """
     people = People(*chosen_body(body), spread=1.0)
     digest = hashlib.sha256(people.body.template.tobytes() + people.body.faces.tobytes()).hexdigest()[:16]
@@ -80,7 +80,7 @@ def _write(folder: Path, people: People) -> None:
 
 
 def _pairs(same: bool) -> list[Pair]:
-    """Of one person in two poses, or of two people one after the other in two poses."""
+    """Return pairs of two poses of one person, or of two poses of two people who follow one another."""
     found = []
     for person in range(SUBJECTS):
         other = person if same else (person + 1) % SUBJECTS

@@ -1,4 +1,4 @@
-"""A coloured body with few free numbers: its place, movements of its main joints, its shape; differentiable in all."""
+"""A coloured body with few parameters (position, movements of its main joints, shape), differentiable in all."""
 
 import math
 from dataclasses import replace
@@ -20,7 +20,7 @@ from plugins.data.bodies.people import chosen_body
 
 
 class Turn(NamedTuple):
-    """Which joint (a role of plugins.data.bodies.poses.Skeleton) a movement turns, about which axis."""
+    """Rotation that a movement makes: joint (a role of plugins.data.bodies.poses.Skeleton), axis and sign."""
 
     movement: str
     role: str
@@ -45,36 +45,41 @@ SIDED = (
     Turn("spread", "hip", "z"),
     Turn("knee", "knee", "x"),
 )
-"""Of the left side; about y and z the right one turns the other way. Of one joint the last movement comes first."""
+"""Rotations of the left side; about y and z the right side rotates the other way.
+
+The last movement of a joint is applied first.
+"""
 PLACE = tuple(f"{what}_{axis}" for what in ("rotation", "translation") for axis in "xyz")
 TRAITS = {"gender": 0.29, "muscle": 0.22, "weight": 0.22, "proportions": 0.22}
-"""Free traits of the default body with their standard deviations. Height is not among them: a picture tells size over
-distance, and hardly either alone."""
+"""Free traits of the default body with their standard deviations.
+
+Height is not among them: an image determines the ratio of size and distance, but hardly either of them alone.
+"""
 FURTHEST = 4.0
-"""Standard deviations by which a movement may be off its usual value, at most."""
+"""Largest difference of a movement from its mean, in standard deviations."""
 STEP = 1e-5
-"""Of central differences at joints: radians, metres, standard deviations."""
+"""Step of central differences at joints: radians, metres, standard deviations."""
 SHAPES = 4
-"""Free shape coefficients of a body from a file."""
+"""Number of free shape coefficients of a body from a file."""
 
 
 class Figure:
-    """Vertices of a coloured body from its free numbers; where all are 0 an average person in the usual pose.
+    """Coloured body whose vertices are a function of free parameters.
 
-    Numbers, in the order of `names`: rotation of the whole body about its root (axis times angle, radians, world axes)
-    and translation (metres); movements of plugins.data.bodies.poses less their usual values (radians); shape (standard
-    deviations). The usual pose is the one from which skin is blended, so that a free joint turns by its movements
-    alone; joints that are not free keep it.
+    The parameters are, in the order of `names`: rotation of the whole body about its root (axis times angle, radians,
+    world axes) and translation (metres); movements of plugins.data.bodies.poses less their means (radians); shape
+    (standard deviations). Parameters of 0 give an average person in the mean pose. Skin is blended from the mean pose,
+    so that a free joint rotates by its movements alone. Joints that are not free keep the mean pose.
 
     Args:
-        file: of a body model of the SMPL family; None: the default body.
+        file: file of a body model of the SMPL family; None: the default body.
 
     Attributes:
-        spread: how far each number is from 0 in people drawn, as a standard deviation; 1 for the place.
-        limits: least and most of each number.
+        spread: standard deviation of each parameter among people that are drawn; 1 for rotation and translation.
+        limits: smallest and largest value of each parameter.
 
     Raises:
-        DataError: the body cannot be had or read.
+        DataError: the body is not available or cannot be read.
     """
 
     template: Tensor
@@ -129,7 +134,7 @@ class Figure:
             setattr(self, name, torch.from_numpy(np.ascontiguousarray(values)))
 
     def camera(self, height: int, width: int) -> Camera:
-        """In front of the body in its nominal place, as far away as 1.2 times its height, which it sees whole."""
+        """Return a camera in front of the nominal body, 1.2 body heights away, which sees the whole body."""
         low, high = float(self.template[1].min()), float(self.template[1].max())
         return Camera(
             rotation=torch.tensor([1.0, -1.0, -1.0]).diag(),
@@ -141,15 +146,15 @@ class Figure:
         )
 
     def scene(self, numbers: Float[Tensor, "number"], camera: Camera) -> Scene:
-        """The body as the camera sees it; colours are red, green, blue and 1, the silhouette."""
+        """Return the scene of body and camera; the colours are red, green, blue and a constant 1 for the silhouette."""
         return Scene(self(numbers), self.faces, self.colors, camera)
 
     def __call__(self, numbers: Float[Tensor, "number"]) -> Float[Tensor, "vertex 3"]:
-        """Vertices, metres, float32."""
+        """Return the vertices, metres, float32."""
         return self.placed(numbers, slice(None))
 
     def placed(self, numbers: Float[Tensor, "number"], chosen: slice | Tensor) -> Float[Tensor, "vertex 3"]:
-        """Some of the vertices alone."""
+        """Return the chosen vertices alone, metres, float32."""
         numbers = numbers.double()
         rest = self._rest(numbers, chosen)
         blended = self._transforms(numbers).to(rest.dtype).T @ self.weights[:, chosen]
@@ -159,9 +164,10 @@ class Figure:
     def slopes(
         self, numbers: Float[Tensor, "number"], chosen: Int[Tensor, "chosen"]
     ) -> Float[Tensor, "chosen 3 number"]:
-        """Of the places of some vertices in every number, float32.
+        """Return the derivatives of the positions of some vertices by every parameter, float32.
 
-        The joints' slopes are central differences in float64, all at once; what they blend is linear in the rest.
+        The derivatives of the joints' transforms are central differences in float64, all at once. Skinning is linear in
+        them.
         """
         numbers = numbers.double()
         steps = STEP * torch.eye(len(numbers), dtype=torch.float64, device=numbers.device)
@@ -177,12 +183,12 @@ class Figure:
         return found
 
     def _rest(self, numbers: Tensor, chosen: slice | Tensor) -> Float[Tensor, "3 chosen"]:
-        """Vertices of the shape in the usual pose."""
+        """Return the chosen vertices of the shape in the mean pose."""
         shape = numbers[6 + len(self.slots) :].to(self.template.dtype)
         return (self.template + (shape @ self.shapes).unflatten(0, (3, -1)))[:, chosen]
 
     def _transforms(self, numbers: Float[Tensor, "*batch number"]) -> Float[Tensor, "*batch joint 12"]:
-        """Of each joint (R, t), such that x becomes R x + t: the chain of the rotations up to the root."""
+        """Return (R, t) of each joint, such that x becomes R x + t: the product of the rotations up to the root."""
         count = len(self.slots)
         joints = self.joints + torch.einsum("...s,sjk->...jk", numbers[..., 6 + count :], self.joint_shapes)
         about = torch.cat([numbers[..., None, :3], self.axes * numbers[..., 6 : 6 + count, None]], -2)
@@ -208,7 +214,7 @@ class Figure:
 
 
 def _in_usual_pose(body: Body, traits: Traits | None, where: poses.Skeleton) -> tuple[Body, tuple[str, ...]]:
-    """The body with the usual pose for its rest pose, and its few shape coefficients with their names."""
+    """Return the body with the mean pose as its rest pose and a few shape coefficients, and the names of these."""
     usual = [limits[0] for limits in (*poses.CENTRAL.values(), *2 * (*poses.SIDED.values(),))]
     pose = torch.from_numpy(poses.rotations(body, where, np.array([usual], float))).to(torch.float64)
     if traits is None:
@@ -246,7 +252,7 @@ def _in_usual_pose(body: Body, traits: Traits | None, where: poses.Skeleton) -> 
 def _moves(
     body: Body, place: dict[str, int]
 ) -> tuple[list[tuple[int, np.ndarray, str]], dict[str, poses.Range]]:
-    """Of every free movement the joint, the axis and the name; and the limits of all movements."""
+    """Return joint, axis and name of every free movement, and the limits of all movements."""
     axes = dict(zip("xyz", np.eye(3), strict=True))
     found = [(place[turn.role], turn.sign * axes[turn.axis], turn.movement) for turn in CENTRAL]
     for side, mirror in (("left", 1.0), ("right", -1.0)):
@@ -254,7 +260,7 @@ def _moves(
         for turn in SIDED:
             if turn.axis == "hinge":
                 upper = (elbow - shoulder) / np.linalg.norm(elbow - shoulder)
-                hinge = np.cross(upper, axes["z"])  # about which a forearm comes to the front
+                hinge = np.cross(upper, axes["z"])  # rotation about it moves a forearm to the front
                 axis = hinge / np.linalg.norm(hinge)
             else:
                 axis = axes[turn.axis] * turn.sign * (1.0 if turn.axis == "x" else mirror)
@@ -265,7 +271,7 @@ def _moves(
 def _bounds(
     usual: poses.Degrees, deviation: poses.Degrees, least: poses.Degrees, most: poses.Degrees
 ) -> tuple[float, float]:
-    """Of a movement less its usual value, radians: within FURTHEST deviations, and within its limits."""
+    """Return the bounds of a movement less its mean, radians: within FURTHEST deviations and within its limits."""
     far = FURTHEST * deviation
     return math.radians(max(least - usual, -far)), math.radians(min(most - usual, far))
 
@@ -278,12 +284,12 @@ def _parents_first(parents: tuple[int, ...]) -> list[int]:
 
 
 def painted(body: Body) -> Float[np.ndarray, "vertex 4"]:
-    """Linear colours that tell every side of every part, changing smoothly, and 1 for the silhouette."""
+    """Return smooth linear RGB colours that distinguish all parts and sides of the body, and 1 for the silhouette."""
     random = np.random.default_rng(3)
     parts = random.uniform(0.25, 0.75, (len(body.parents), 3))
     found = body.weights @ parts
     place = (body.template - body.template.mean(0)).astype(np.float64)
-    # stripes of some 30 cm in each colour, in directions of its own, and front against back
+    # each colour channel has stripes of some 30 cm in its own direction, and a difference of front and back
     for channel, (frequency, phase) in enumerate(
         zip(((9, 6, 7), (-6, 8, 10), (5, -10, 8)), (0.3, 1.4, 2.6), strict=True)
     ):
@@ -293,8 +299,11 @@ def painted(body: Body) -> Float[np.ndarray, "vertex 4"]:
 
 
 def figure_of(file: str | None) -> Figure:
-    """The figure of a body; read once, since data and whatever fits it want the same, and again where the file changed.
-    Nobody writes to it."""
+    """Return the figure of a body.
+
+    It is read once and shared, because data and density head use the same figure, and is read again if the file
+    changed. It must not be modified.
+    """
     known = None if file is None else Path(file).expanduser()
     return _read(file, known.stat().st_mtime_ns if known is not None and known.is_file() else None)
 

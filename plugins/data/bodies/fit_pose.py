@@ -1,4 +1,4 @@
-"""A density head that fits a body to the picture itself; the contract is framework.density_head's."""
+"""Density head `fit_pose`: fits a body to the image itself."""
 
 from collections.abc import Collection, Mapping
 from dataclasses import replace
@@ -24,20 +24,20 @@ from plugins.data.bodies.figure import Figure, figure_of
 from plugins.data.bodies.pose_images import Side
 
 FLOOR, WIDEST = 1e-5, 1e9
-"""Least standard deviation of a number."""
+"""Bounds on the standard deviation of a parameter."""
 SLACK = 1e-3
-"""By how much a picture's numbers may be outside of [0, 1]."""
+"""Largest excess of an image's values over [0, 1]."""
 NEEDED = frozenset(("vertices",))
-"""In what a renderer must be differentiable."""
+"""Inputs in which a renderer must be differentiable."""
 
 
 class PoseDensity(Independent):
-    """Normal densities of a figure's numbers, independent of one another, about where each descent ended.
+    """Independent normal densities of a figure's parameters, with the end of each descent as their mean.
 
     Args:
-        mean, scale: (*batch, number).
-        fits: how each descent went, in the order of the flattened batch; None where there was nothing to fit.
-        figure, renderer, camera: what the numbers mean, and how it looks.
+        mean, scale: (*batch, parameter).
+        fits: course of each descent, in the order of the flattened batch; None if the input was no image of a body.
+        figure, renderer, camera: body that the parameters describe, and how it is drawn.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class PoseDensity(Independent):
 @images.register
 @torch.no_grad()
 def _(density: PoseDensity, channels: Collection[str]) -> dict[str, Tensor]:
-    """The bodies at the mode."""
+    """Return rendered images of the bodies at the mode."""
     shape, figure = density.batch_shape, density.figure
     scenes = [
         figure.scene(numbers, density.camera) for numbers in density.mode.reshape(-1, *density.event_shape)
@@ -77,32 +77,32 @@ def _(density: PoseDensity, channels: Collection[str]) -> dict[str, Tensor]:
 
 @median.register
 def _(density: PoseDensity, samples: int) -> Tensor:
-    # each is symmetric about its mean
+    # each normal density is symmetric about its mean
     return density.mean
 
 
 class FitPoseHead(DensityHead, Fitted):
-    """Descends from the nominal pose to the picture through a differentiable renderer (plugins.data.bodies.descent).
+    """Fit of a body's pose to an image by gradient descent through a differentiable renderer.
 
-    Reads pictures of `data=pose_from_image` as they are, without an encoder. The density is normal about the descent's
-    end; `calibrate` measures how wide, from its errors on the validation set, apart for descents whose picture differs
-    from the given one by more than `enough` and for those that agree. Before that, and of what is no picture of a body
-    (numbers outside of [0, 1], no silhouette), the density is that of the training set: about
-    0, as wide as its targets.
-    The density's gradient in the picture is said to be 0.
+    The descent (plugins.data.bodies.descent) starts from the nominal pose. The head reads images of
+    `data=pose_from_image` unchanged, without an encoder. The density is normal, with the end of the descent as its
+    mean. `calibrate` measures its standard deviations from the errors on the validation split, separately for descents
+    whose image differs from the given one by more than `enough` and for those that agree. Before calibration, and for
+    inputs that are no images of a body (numbers outside of [0, 1], no silhouette), the density is that of the training
+    set: mean 0, and the spread of the targets. The gradient of the density by the image is declared to be 0.
 
     Attributes:
-        steps: most steps of a stage (a knob).
+        steps: largest number of steps of a stage (a knob).
 
     Args:
-        renderer: draws what is compared with the picture; differentiable.
-        steps: most steps of a stage; there are seven.
-        restarts: how often another pose is tried while pictures differ by more than `enough`.
-        enough: root mean square difference of colours.
-        height, width, body: those of the data.
+        renderer: differentiable renderer that draws what is compared with the image.
+        steps: largest number of steps of a stage; there are seven stages.
+        restarts: largest number of restarts from other poses while the images differ by more than `enough`.
+        enough: root mean square difference of colours below which images agree.
+        height, width, body: settings of the same names of the data.
 
     Raises:
-        ConfigError: a renderer without gradients, or a target that is no such body's.
+        ConfigError: a renderer without gradients, or a target that is not this body's.
     """
 
     knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {"steps": (1, 3, 10, 30)}
@@ -160,7 +160,7 @@ class FitPoseHead(DensityHead, Fitted):
     def forward(self, raw: Float[Tensor, "*batch size"]) -> Distribution:
         raw = require_finite(raw, self.size)
         fits = self._fits(raw)
-        # a descent's end is piecewise constant in what a picture's rounding shows: no gradient is claimed
+        # the end of a descent is piecewise constant at the scale of an image's rounding: its gradient is declared 0
         zero = (raw * 0).sum(-1, keepdim=True)
         mean = self._rows([self.prior * 0 if fit is None else fit.numbers for fit in fits], raw) + zero
         scale = self._rows([self._width(fit) for fit in fits], raw)
@@ -183,7 +183,7 @@ class FitPoseHead(DensityHead, Fitted):
                 self.spread[int(agrees)] = square.sqrt().clamp(min=FLOOR).to(self.spread)
 
     def _fits(self, raw: Tensor) -> list[Fit | None]:
-        """Of each picture of a flattened batch; None of what is none."""
+        """Return the fit of each image of a flattened batch; None for inputs that are no images of a body."""
         descent = Descent(
             self.figure,
             self.renderer,
@@ -212,5 +212,5 @@ class FitPoseHead(DensityHead, Fitted):
 
 
 def is_picture(picture: Float[Tensor, "4 height width"]) -> bool:
-    """Whether it may be the picture of a body: numbers in [0, 1] but for rounding, and a silhouette."""
+    """Return whether an input may be the image of a body: values in [0, 1] up to rounding, and a silhouette."""
     return bool((picture >= -SLACK).all() and (picture <= 1 + SLACK).all() and (picture[3] > 0.5).any())

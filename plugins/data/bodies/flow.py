@@ -1,4 +1,4 @@
-"""Where each point of a moving mesh was a picture before: flow known exactly, and pictures brought along by it."""
+"""Exact optical flow between two images of a moving mesh, and images warped by it."""
 
 from collections.abc import Mapping
 
@@ -10,9 +10,9 @@ from torch.nn.functional import grid_sample, max_pool2d
 from framework.renderer import Scene
 
 CHANNELS = ("face", "barycentric", "depth")
-"""What a renderer has to draw of each scene."""
+"""Channels that a renderer has to draw of each scene."""
 STEEPEST = 2.0
-"""Depths of neighbouring pixels of one surface differ by this many widths of a pixel there, at most."""
+"""Largest difference in depth of neighbouring pixels of one surface, in widths of a pixel at that depth."""
 
 Drawn = Mapping[str, Tensor]
 
@@ -20,15 +20,12 @@ Drawn = Mapping[str, Tensor]
 def flow(
     before: Scene, after: Scene, drawn_before: Drawn, drawn_after: Drawn
 ) -> tuple[Float[Tensor, "height width 2"], Bool[Tensor, "height width"]]:
-    """Of each pixel of the second picture the place (column, row) in the first of the same point of the mesh, float64,
-    and whether it is seen in both.
+    """Return the optical flow from the second image back to the first, and which points are seen in both.
 
-    A point is seen in a picture where the pixels around it show the mesh, at its depth: not at an outline, and not
-    where something hides it. The place of what is not seen means nothing.
-
-    Args:
-        before, after: of one mesh, with the same faces.
-        drawn_before, drawn_after: `CHANNELS` of each.
+    For each pixel of the second image the flow is the position (column, row), float64, of the same point of the mesh in
+    the first. A point is seen in an image if the pixels around it show the mesh at its depth: it lies neither at an
+    outline nor behind something. The position of a point that is not seen in both has no meaning. `before` and `after`
+    are scenes of one mesh with the same faces; `drawn_before` and `drawn_after` are their `CHANNELS`.
     """
     face = drawn_after["face"].long()
     corners = before.vertices.double()[after.faces.long()[face.clamp(min=0)]]
@@ -56,7 +53,7 @@ def _focal(scene: Scene) -> float:
 def _inside(
     depth: Float[Tensor, "height width"], slack: Float[Tensor, "height width"]
 ) -> Bool[Tensor, "height width"]:
-    """Pixels whose neighbours, all of them, show the same surface; none at the border."""
+    """Return the pixels whose neighbours all show the same surface; pixels at the border are not among them."""
     far = torch.nn.functional.pad(depth, (1, 1, 1, 1), value=torch.inf)[None]
     highest, lowest = (sign * max_pool2d(sign * far, 3, 1)[0] for sign in (1, -1))
     return depth.isfinite() & ((highest - lowest) < 2 * slack)
@@ -65,7 +62,7 @@ def _inside(
 def warped(
     picture: Float[Tensor, "height width channels"], place: Float[Tensor, "height width 2"]
 ) -> Float[Tensor, "height width channels"]:
-    """The first picture at these places, interpolated between pixel centres."""
+    """Return the first image at these positions, interpolated between pixel centres."""
     height, width = picture.shape[:2]
     share = 2 * place / (torch.tensor([width, height]) - 1).clamp(min=1) - 1
     found = grid_sample(

@@ -1,4 +1,4 @@
-"""What generated people wear: cloth over a body, with thickness, wrinkles, patterns, hems, buttons and prints."""
+"""Clothes of generated people: cloth over a body, with thickness, wrinkles, patterns, hems, buttons and prints."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -11,9 +11,9 @@ from plugins.data.bodies.anatomy import Anatomy
 from plugins.data.bodies.fabrics import Pattern, dye, folds, hue, noise, pattern
 
 FAR = 9.0
-"""Metres: deep inside or far outside of a garment."""
+"""Distance, metres, that stands for deep inside or far outside of a garment."""
 EDGE = 0.012
-"""Metres over which a hem rises from the skin."""
+"""Width, metres, over which a hem rises from the skin."""
 SEAM = 0.011
 """Width of the stitched border, metres."""
 
@@ -22,10 +22,10 @@ class Garment(NamedTuple):
     """One piece of clothing.
 
     Attributes:
-        inside: metres from its border, above 0 where it covers a vertex.
-        thickness: metres from the skin (or from what it is worn over).
-        wrinkles: metres outwards, about 0.
-        colors: linear light of every vertex, meaningful inside.
+        inside: signed distance from its border, metres, above 0 if it covers a vertex.
+        thickness: distance from the skin (or from the garment under it), metres.
+        wrinkles: displacement outwards, metres, with a mean near 0.
+        colors: linear RGB of every vertex; it has a meaning only inside the garment.
     """
 
     inside: Float[np.ndarray, "vertices"]
@@ -34,19 +34,19 @@ class Garment(NamedTuple):
     colors: Float[np.ndarray, "vertices 3"]
 
     def raised(self) -> Float[np.ndarray, "vertices"]:
-        """How far it is from what is under it, metres."""
+        """Return the distance of the garment from the surface under it, metres."""
         return _step(self.inside / EDGE) * (self.thickness + self.wrinkles).clip(0.001, None)
 
 
 @dataclass(frozen=True)
 class Skirt:
-    """A piece that hangs from the waist and touches no leg; plugins.data.bodies.hanging makes its mesh.
+    """Piece that hangs from the waist and touches no leg; plugins.data.bodies.hanging makes its mesh.
 
     Attributes:
-        top, length: height of its upper border in the rest pose, and how long it is, metres.
-        flare: metres that it widens each metre down.
-        pleats, depth: how many folds go round, and how deep the hem's are, metres.
-        cloth: from across and along to colours.
+        top, length: height of its upper border in the rest pose, and its length, metres.
+        flare: metres by which it widens per metre downwards.
+        pleats, depth: number of folds around, and their depth at the hem, metres.
+        cloth: function from coordinates across and along the cloth to colours.
     """
 
     top: float
@@ -58,14 +58,14 @@ class Skirt:
 
 
 class Outfit(NamedTuple):
-    """Garments from the innermost outwards, and perhaps a skirt."""
+    """Garments from the innermost outwards, and a skirt or None."""
 
     garments: list[Garment]
     skirt: Skirt | None
 
 
 def outfit(body: Anatomy, random: Generator) -> Outfit:
-    """Clothes of one person, drawn."""
+    """Return the random clothes of one person."""
     below = random.choice(["trousers", "shorts", "skirt", "dress"], p=[0.64, 0.16, 0.12, 0.08])
     skirt = None
     garments = []
@@ -197,7 +197,7 @@ def _top(body: Anatomy, random: Generator, kind: str, cloth: Pattern, hem: float
         * bends
         * folds(body.place, random.uniform(0.06, 0.1), (random.uniform(-1, 1), 1.0, 0.3), random)
     )
-    if hem < body.waist - 0.05:  # it hangs loose below the waist
+    if hem < body.waist - 0.05:  # the garment hangs loose below the waist
         thickness = thickness + 0.004
         wrinkles = wrinkles + 0.008 * np.exp(-((body.place[:, 1] - hem) / 0.1).clip(0, None)) * ~body.on_arm
     return Garment(inside, thickness, wrinkles, _worn(body, found, wrinkles, inside, random))
@@ -227,7 +227,7 @@ def _jacket(body: Anatomy, random: Generator) -> Garment:
 
 
 def _trunk(body: Anatomy, hem: float, opening: float) -> Float[np.ndarray, "vertices"]:
-    """Metres from the borders of what covers the trunk from a hem to a round opening about the neck."""
+    """Return the metres from the borders of a garment on the trunk, from a hem to a round opening about the neck."""
     down = np.where(body.on_arm, FAR, body.place[:, 1] - hem)
     # the opening is deeper in front
     centre = body.neck_place + np.array([0, 0.015, 0.03])
@@ -247,7 +247,7 @@ def _buttoned(body: Anatomy, found: np.ndarray, front: np.ndarray, random: Gener
 
 
 def _printed(body: Anatomy, found: np.ndarray, front: np.ndarray, random: Generator) -> np.ndarray:
-    """A figure on the chest: a disc, a diamond, a star, or lines like words."""
+    """Return colours with a print on the chest: a disc, a diamond, a star, or lines like words."""
     x, y = body.place[:, 0], body.place[:, 1] - (body.chest - 0.04)
     size, ink, other = random.uniform(0.05, 0.1), dye(random), dye(random)
     radius, angle = np.hypot(x, y), np.arctan2(y, x)
@@ -269,7 +269,7 @@ def _printed(body: Anatomy, found: np.ndarray, front: np.ndarray, random: Genera
 def _worn(
     body: Anatomy, found: np.ndarray, wrinkles: np.ndarray, inside: np.ndarray, random: Generator
 ) -> Float[np.ndarray, "vertices 3"]:
-    """With the weave's noise, darker valleys, and stitches along the border."""
+    """Return colours with the weave's noise, darker valleys, and stitches along the border."""
     weave = 1 + 0.04 * noise(body.place, 0.008, random) + 0.04 * noise(body.place, 0.05, random)
     depth = 1 + 0.18 * np.tanh(wrinkles / 0.004)
     border = np.where(np.abs(inside - SEAM) < 0.002, 0.75, 1.0)
@@ -277,14 +277,17 @@ def _worn(
 
 
 def _on_trunk(body: Anatomy) -> tuple[np.ndarray, np.ndarray]:
-    """Across and along upper garments: round the trunk and up, or round an arm and down it."""
+    """Return coordinates across and along upper garments: around the trunk and up, or around an arm and down it."""
     x, y, z = body.place.T
-    across = 0.22 * np.arctan2(x, np.abs(z) + 0.15)  # nearly x in front and behind, and round the sides
+    across = 0.22 * np.arctan2(x, np.abs(z) + 0.15)  # nearly x in front and behind, an angle at the sides
     return np.where(body.on_arm, 1.3 * z, across), np.where(body.on_arm, -body.along_arm, y)
 
 
 def _on_legs(body: Anatomy) -> tuple[np.ndarray, np.ndarray]:
-    """Across and along trousers, metres; across is 0 in front and behind, and below 0 on the inner side of a leg."""
+    """Return coordinates across and along trousers, metres.
+
+    The coordinate across is 0 in front and behind, and below 0 on the inner side of a leg.
+    """
     x, y, z = body.place.T
     legs = body.legs > 0.5
     middle = np.polyval(np.polyfit(y[legs], np.abs(x)[legs], 1), y) if legs.any() else 0.0
@@ -298,6 +301,6 @@ def _near(values: np.ndarray, centre: float, width: float) -> np.ndarray:
 
 
 def _step(values: np.ndarray) -> np.ndarray:
-    """0 below 0, 1 above 1, smooth between (Hermite)."""
+    """Return a smooth step (Hermite): 0 below 0, 1 above 1."""
     share = values.clip(0, 1)
     return share * share * (3 - 2 * share)

@@ -1,4 +1,4 @@
-"""Hair of generated people: volume over the scalp with strands, and what hangs or is tied: long hair, tails, buns."""
+"""Hair of generated people: volume over the scalp with strands, and separate meshes of long hair, tails and buns."""
 
 from typing import Literal, NamedTuple
 
@@ -13,20 +13,20 @@ Style = Literal["none", "short", "full", "round", "long", "tail", "bun"]
 STYLES: tuple[Style, ...] = ("none", "short", "full", "round", "long", "tail", "bun")
 SHARES = (0.06, 0.26, 0.16, 0.1, 0.2, 0.12, 0.1)
 LINE = ((-1, -0.35, -0.2, 0.1, 0.35, 0.7, 1), (0.16, 0.2, 0.52, 0.62, 0.7, 0.8, 0.83))
-"""The hairline of the side of a head: z and y of `Anatomy.on_head`."""
+"""Hairline at the side of a head: z and y of `Anatomy.on_head`."""
 HEAD = 0.23
-"""Metres of a head's height, to measure from the hairline."""
+"""Height of a head, metres, which converts distances from the hairline."""
 
 
 class Hair(NamedTuple):
     """Hair that grows on the scalp.
 
     Attributes:
-        style: how it is worn.
-        color: linear light.
+        style: name of the hairstyle.
+        color: linear RGB.
         share: 1 where hair covers the skin, 0 elsewhere, between at its border.
-        raised: metres above the scalp.
-        colors: linear light of every vertex.
+        raised: height above the scalp, metres.
+        colors: linear RGB of every vertex.
     """
 
     style: Style
@@ -37,7 +37,7 @@ class Hair(NamedTuple):
 
 
 class Piece(NamedTuple):
-    """A mesh of its own beside the body: metres, corners counter-clockwise seen from outside, linear light."""
+    """Separate mesh beside the body: metres, corners counter-clockwise seen from outside, linear RGB."""
 
     vertices: Float[np.ndarray, "vertices 3"]
     faces: np.ndarray
@@ -45,12 +45,12 @@ class Piece(NamedTuple):
 
 
 def hair(body: Anatomy, random: Generator) -> Hair:
-    """Hair of one person, drawn."""
+    """Return the random hair of one person."""
     style: Style = STYLES[int(random.choice(len(STYLES), p=SHARES))]
     color = _shade(random)
     x, y, z = body.on_head.T
     low = {"full": 0.12, "long": 0.12, "round": 0.05}.get(style, 0.0)
-    # hair that is long enough covers the ears, not the face
+    # hair that is long enough covers the ears, but not the face
     line = np.interp(z, *LINE) - low * ((z > -0.3) & (z < 0.32))
     line = line - random.uniform(-0.02, 0.03)
     inside = np.where(body.head > 0.5, (y - line) * HEAD, -1.0)
@@ -105,11 +105,10 @@ def tied(
     lie_of_head: Float[np.ndarray, "3 2"],
     random: Generator,
 ) -> Piece | None:
-    """What hangs from the head or is tied to it; None for styles without.
+    """Return the mesh of hair that hangs from the head or is tied to it; None for styles without such hair.
 
-    Args:
-        head: takes (x, y, z, 1) of the template to where the head is.
-        lie_of_head: least and greatest x, y, z of the head in the template.
+    `head` is the affine transform from (x, y, z, 1) of the template to the posed head. `lie_of_head` holds the smallest
+    and largest x, y, z of the head in the template.
     """
     middle, half = lie_of_head.mean(1), (lie_of_head[:, 1] - lie_of_head[:, 0]) / 2
     if style == "long":
@@ -131,7 +130,7 @@ def tied(
 
 
 def grid(rows: int, columns: int) -> np.ndarray:
-    """Triangles of a grid of vertices, row by row; closed round where the first column is also the last."""
+    """Return the triangles of a grid of vertices, row by row; it is closed if the first and last columns coincide."""
     corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
     halves = [(0, 1, columns), (1, columns + 1, columns)]
     return np.concatenate([corner[:, None] + half for half in halves])
@@ -140,13 +139,13 @@ def grid(rows: int, columns: int) -> np.ndarray:
 def _curtain(
     middle: np.ndarray, half: np.ndarray, random: Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Long hair: round the back of the head from ear to ear, and down."""
+    """Return long hair, around the back of the head from ear to ear, and down."""
     length, reach = random.uniform(0.2, 0.42), random.uniform(1.5, 1.9)
     angle, down = np.meshgrid(np.linspace(-reach, reach, 120), np.linspace(0, 1, 60))
     lock = 0.006 * np.sin(9 * angle + 3 * np.sin(2 * angle) + random.uniform(0, 6))
     out = 0.022 + lock + 0.004 * np.sin(14 * down + 5 * angle)
     wide, deep = half[0] + out, 0.75 * half[2] + out
-    # narrower at the neck, and closed towards its end
+    # the hair is narrower at the neck and closes towards its end
     taper = 1 - 0.18 * np.exp(-(((down - 0.45) / 0.25) ** 2)) - 0.35 * (down - 0.75).clip(0, None)
     ends = 1 - 0.12 * np.abs(np.sin(7 * angle + 1.3)) * (down > 0.8)
     height = middle[1] + 0.35 * half[1] - length * 1.2 * down * ends
@@ -164,7 +163,7 @@ def _curtain(
 def _tail(
     middle: np.ndarray, half: np.ndarray, random: Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A tail: out of the back of the head, and down."""
+    """Return a tail that leaves the back of the head and hangs down."""
     length, thick, high = random.uniform(0.18, 0.36), random.uniform(0.022, 0.034), random.uniform(-0.1, 0.5)
     angle, down = np.meshgrid(np.linspace(0, 2 * np.pi, 49), np.linspace(0, 1, 48))
     radius = thick * (0.45 + 1.1 * np.sqrt(down.clip(0, 1))) * np.sqrt((1 - down).clip(0.002, None)) * 1.35
@@ -185,7 +184,7 @@ def _tail(
 def _bun(
     middle: np.ndarray, half: np.ndarray, random: Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A bun: a ball at the back of the head, or on top of it."""
+    """Return a bun: a ball at the back of the head, or on top of it."""
     size, lift = random.uniform(0.032, 0.05), random.uniform(0.2, 1.3)
     angle, down = np.meshgrid(np.linspace(0, 2 * np.pi, 49), np.linspace(0, np.pi, 32))
     radius = size * (1 + 0.07 * np.sin(5 * angle + 6 * down))

@@ -1,4 +1,4 @@
-"""The mesh of a skirt: rings about both legs, from the waist down, as wide as what they hold and wider."""
+"""Mesh of a skirt: rings around both legs, from the waist down, at least as wide as the legs inside."""
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -9,21 +9,19 @@ from plugins.data.bodies.garments import Skirt
 from plugins.data.bodies.hair import Piece, grid
 
 RINGS, AROUND = 90, 241
-"""Vertices from the waist down, and round; the first of a ring is also its last."""
+"""Number of rings from the waist down, and of vertices of a ring; its last vertex coincides with its first."""
 SLICE = 0.035
-"""Half the height of the slice of a body that a ring has to hold, metres."""
+"""Half the height of the slice of a body that a ring has to enclose, metres."""
 OFF = 0.012
-"""Metres from what it hangs on."""
+"""Distance of the skirt from the body inside, metres."""
 
 
 def hung(
     skirt: Skirt, held: Float[np.ndarray, "vertices 3"], top: Bool[np.ndarray, "vertices"], random: Generator
 ) -> Piece:
-    """A skirt on a posed body.
+    """Return the mesh of a skirt on a posed body.
 
-    Args:
-        held: vertices of trunk and legs, where they are.
-        top: which of them lie at its upper border.
+    `held` are the posed vertices of trunk and legs; `top` says which of them lie at the skirt's upper border.
     """
     waist = held[top].mean(0)
     angle = np.linspace(0, 2 * np.pi, AROUND)
@@ -33,11 +31,11 @@ def hung(
     reach = np.zeros((RINGS, AROUND))
     for ring, height in enumerate(heights):
         near = np.abs(held[:, 1] - height) < SLICE
-        # the farthest of the slice in every direction: what a cloth pulled tight round it would touch, or more
+        # the farthest extent of the slice in every direction: at least the outline of a cloth pulled tight around it
         reach[ring] = (flat[near] @ directions.T).max(0) if near.any() else 0.0
     reach = np.maximum(_smooth(reach), 0.0) + OFF
     step = skirt.length / (RINGS - 1)
-    for ring in range(1, RINGS):  # it falls no further inwards than a little
+    for ring in range(1, RINGS):  # the radius decreases downwards by a little at most
         reach[ring] = np.maximum(reach[ring], reach[ring - 1] + (skirt.flare - 0.08) * step)
     down = np.linspace(0, 1, RINGS)[:, None]
     wave = np.sin(skirt.pleats * angle + 1.5 * np.sin(2 * angle + random.uniform(0, 6)) + 2 * down)
@@ -62,7 +60,7 @@ def hung(
 
 
 def _smooth(values: np.ndarray) -> np.ndarray:
-    """Of rings, over neighbours round and up."""
+    """Return the radii of the rings, smoothed over neighbours around the ring and along the height."""
     for _ in range(4):
         inner = values[:, :-1]
         inner = (np.roll(inner, 1, 1) + 2 * inner + np.roll(inner, -1, 1)) / 4

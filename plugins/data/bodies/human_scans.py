@@ -1,4 +1,4 @@
-"""Photographs of scanned people, with registered meshes of one colour a vertex; the contract is framework.data's."""
+"""Data set `human_scans`: photographs of scanned people, with registered meshes of one colour per vertex."""
 
 import hashlib
 from collections.abc import Mapping, Sequence
@@ -31,7 +31,7 @@ from plugins.data.bodies.scan_generator import Crowd, Drawing, scans_root
 from plugins.data.bodies.scan_layout import Subject, View
 
 VERSION = 1
-"""Of how the files are read; a change takes a new number."""
+"""Version of the reading code; any change of what it returns takes a new number."""
 Number = Annotated[int, Field(ge=1, le=100_000)]
 Seed = Annotated[int, Field(ge=0, lt=2**31)]
 Shows = Literal["photograph", "subject"]
@@ -40,7 +40,7 @@ Word = Annotated[str, Field(pattern=r"^[A-Za-z0-9._-]{1,40}$")]
 
 @dataclass(frozen=True, kw_only=True)
 class Counts:
-    """Subjects of each split, where they are generated."""
+    """Number of generated subjects of each split."""
 
     train: Number = 40
     validation: Number = 4
@@ -48,29 +48,29 @@ class Counts:
 
 
 class HumanScans(Data):
-    """Photographs of people, each with the mesh that was registered to the person's scan (thesis §7.3.1, §7.4.1).
+    """Photographs of people, each with the mesh registered to the person's scan (thesis §7.3.1, §7.4.1).
 
     An input is (points, 6): each vertex in the axes of the canonical camera of the image
     (`framework.geometry.camera.canonical_camera`: x right, y down, z forward, metres) and its red, green and blue as
-    files hold them, sRGB in [0, 1]. The target is the photograph, (height, width, 3), sRGB in [0, 1], put on white by
-    its mask, in light. Batches also hold "color", the same in light; "mask" (height, width), bool, where half of a
-    pixel or more is the subject; "subject", int64, its number in the split.
+    files hold them, sRGB in [0, 1]. The target is the photograph, (height, width, 3), sRGB in [0, 1], composited on
+    white with its mask in linear RGB. Batches also hold "color", the photograph in linear RGB; "mask" (height, width),
+    bool, true for pixels of which the subject covers half or more; "subject", int64, its number in the split.
 
     Args:
         renderer: draws the photographs of generated people.
-        root: a folder laid out as plugins.data.bodies.scan_layout says; None: people are generated into the cache once.
-        topology: which of the registered meshes; generated are 7k (6,890 vertices) and 27k (27,578).
-        shows: what the target is: "photograph", or "subject", one number a pixel, 1 where half of it or more is the
-            subject and else 0, for a network that segments (thesis §7.3.1).
-        counts, drawing: of generated people.
-        data_seed: of their draws, whatever the seed of the run.
-        mirrored: whether half of the pictures to train on are seen in a mirror, points and photograph.
-        recoloured: share of them whose red, green and blue change places, in points and photograph alike: light that is
-            white knows no colour, and people wear any.
+        root: a folder in the layout of plugins.data.bodies.scan_layout; None: people are generated into the cache once.
+        topology: name of the registered meshes to read; 7k (6,890 vertices) and 27k (27,578) are generated.
+        shows: what the target is: "photograph", or "subject", one number per pixel, 1 where the subject covers half of
+            it or more and else 0, for a network that segments (thesis §7.3.1).
+        counts, drawing: settings of generated people.
+        data_seed: seed of their draws, independent of the seed of the run.
+        mirrored: whether half of the training images are mirrored, points and photograph.
+        recoloured: share of the training images whose red, green and blue are permuted, in points and photograph alike:
+            white light prefers no colour, and clothes have any colour.
 
     Raises:
-        DataError: a file is missing or damaged, images differ in size, meshes in their number of vertices.
-        ConfigError: the renderer draws no colours; a topology that is not generated.
+        DataError: a file is missing or damaged, or images differ in size, or meshes in their number of vertices.
+        ConfigError: the renderer draws no colours, or the topology is not generated.
     """
 
     bibtex = """@inproceedings{prokudin2021smplpix,
@@ -120,7 +120,7 @@ class HumanScans(Data):
 
     @property
     def place(self) -> Path:
-        """The folder, which need not be there. Raises as `prepare`."""
+        """Return the folder of the data set, which need not exist; raises as `prepare`."""
         if self.root is not None:
             return Path(self.root).expanduser()
         return Crowd(self.renderer, self.counts, self.drawing, self.data_seed).root
@@ -156,7 +156,10 @@ class HumanScans(Data):
         return self._splits
 
     def read(self, files: Sequence[Path]) -> Dataset[Batch]:
-        """Coloured meshes as a camera in front sees them whole, or as those of a cameras.json beside the file do."""
+        """Return coloured meshes as cameras see them.
+
+        The cameras are those of a cameras.json beside the file, else one in front that sees the mesh whole.
+        """
         if not files:
             raise DataError("No file was given; wanted a mesh with vertex colours, or several.")
         inputs = [points for file in files for points in self._seen(Path(file))]
@@ -193,7 +196,7 @@ class HumanScans(Data):
         self.size = (height, width)
 
     def augment(self, batch: Batch) -> Batch:
-        """Seen in a mirror, and with other colours, as drawn for each sample."""
+        """Return the batch with random mirroring and permuted colours, drawn for each sample."""
         count = len(batch["input"])
         mirrored = torch.rand(count) < (0.5 if self.mirrored else 0.0)
         orders = torch.rand(count, 3).argsort(1)
@@ -202,10 +205,10 @@ class HumanScans(Data):
         for name in ("target", "color", "mask"):
             if name in batch:
                 found[name] = _turned(batch[name], mirrored)
-                if batch[name].shape[-1:] == (3,) and batch[name].dim() == 4:  # a silhouette has no colours
+                if batch[name].shape[-1:] == (3,) and batch[name].dim() == 4:  # silhouettes have no colours
                     found[name] = _reordered(found[name], orders)
         points = batch["input"].clone()
-        points[mirrored.to(points.device), :, 0] *= -1  # the canonical camera looks through the middle
+        points[mirrored.to(points.device), :, 0] *= -1  # the canonical camera's centre is the image's
         points[..., 3:6] = _reordered(points[..., 3:6], orders)
         return found | {"input": points}
 
@@ -221,7 +224,7 @@ class HumanScans(Data):
         }
 
     def picture(self, inputs: Tensor) -> np.ndarray:
-        """The points that the canonical camera sees, a pixel each, on white; nearer ones hide those behind."""
+        """Return an image of the points that the canonical camera sees, on white: one pixel each, nearest in front."""
         height, width = self.size
         points = inputs.detach().cpu().float()
         points = points[points.isfinite().all(1)]
@@ -231,13 +234,13 @@ class HumanScans(Data):
         column, row = place[order].round().T
         seen = (depth[order] > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
         pixel = (row[seen] * width + column[seen]).long().numpy()
-        # of several points of one pixel NumPy keeps the last
+        # if several points share a pixel, NumPy keeps the last
         image.numpy()[pixel] = points[order][seen][:, 3:].numpy()
         return (image.clamp(0, 1) * 255).round().byte().view(height, width, 3).numpy()
 
 
 class Photographs(Dataset[Batch]):
-    """Photographs of one split, read when they are fetched; subject after subject, each in the order of its views."""
+    """Photographs of one split, read when they are fetched, in the order of subjects and of each subject's views."""
 
     def __init__(self, subjects: Sequence[Subject], shows: Shows) -> None:
         self.shows = shows
@@ -264,17 +267,17 @@ class Photographs(Dataset[Batch]):
 
 
 def photograph(view: View) -> tuple[Float[Tensor, "height width 3"], Float[Tensor, "height width"]]:
-    """Light of a photograph on white, and how much of each pixel is the subject."""
+    """Return a photograph on white in linear RGB, and the share of each pixel that the subject covers."""
     pixels, mask = scan_layout.read_photograph(view)
     cover = torch.from_numpy(mask).float() / 255
     return linear(torch.from_numpy(pixels)) * cover[..., None] + (1 - cover[..., None]), cover
 
 
 def in_front(vertices: Float[Tensor, "vertices 3"], height: int, width: int) -> Camera:
-    """Sees a mesh whole from the front (its z axis), y up, upright; as a canonical camera does."""
+    """Return an upright camera that sees a mesh whole from the front (its z axis), y up, with the canonical lens."""
     low, high = vertices.min(0).values, vertices.max(0).values
     middle, extent = (low + high) / 2, high - low
-    # the nearest side fills nine tenths of the image at most; focal length: height pixels
+    # the front of the mesh fills nine tenths of the image at most; the focal length is `height` pixels
     away = float(torch.stack([extent[1], extent[0] * height / width]).max()) / 0.9 + float(extent[2]) / 2
     rotation = torch.tensor([1.0, -1.0, -1.0]).diag()
     ahead = torch.tensor([0.0, 0.0, max(away, 1e-3)])
@@ -283,13 +286,13 @@ def in_front(vertices: Float[Tensor, "vertices 3"], height: int, width: int) -> 
 
 
 def _turned(images: Tensor, which: Tensor) -> Tensor:
-    """Some of (image, height, width, ...) with left and right exchanged."""
+    """Return images (image, height, width, ...), some of them with left and right exchanged."""
     chosen = which.to(images.device).view(-1, *[1] * (images.dim() - 1))
     return torch.where(chosen, images.flip(2), images)
 
 
 def _reordered(colors: Float[Tensor, "batch ... 3"], orders: Tensor) -> Tensor:
-    """Each sample's three colours in its order."""
+    """Return the colours with each sample's three channels permuted by its order."""
     places = orders.to(colors.device).view(-1, *[1] * (colors.dim() - 2), 3)
     return colors.gather(-1, places.expand(colors.shape))
 
@@ -299,7 +302,7 @@ def _input(vertices: Tensor, colors: Tensor, camera: Camera) -> Float[Tensor, "p
 
 
 def _common(root: Path, subjects: Sequence[Subject]) -> tuple[tuple[int, int], int]:
-    """The size of all images, and the number of all meshes' vertices."""
+    """Return the size of all images, and the number of vertices of all meshes."""
     first = subjects[0]
     size = (first.views[0].camera.height, first.views[0].camera.width)
     points = len(first.registration.vertices)
@@ -319,7 +322,7 @@ def _common(root: Path, subjects: Sequence[Subject]) -> tuple[tuple[int, int], i
 
 
 def _digest(subjects: Mapping[str, Sequence[Subject]]) -> str:
-    """Hash of names, meshes, cameras, and the checksums that photographs and masks end with."""
+    """Return a hash of names, meshes, cameras, and the checksums at the ends of photographs and masks."""
     digest = hashlib.sha256()
     for split, some in subjects.items():
         for subject in some:

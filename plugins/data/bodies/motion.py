@@ -1,7 +1,7 @@
-"""Motions from BVH files (Biovision hierarchy, as of the CMU motion capture), for any body: poses of each frame.
+"""Motions from BVH files (Biovision hierarchy, as of the CMU motion capture) as poses of any body.
 
-A body's bones take the directions that the file's have. Where somebody walks to is left out, and so are fingers, toes
-and what only some skeletons have.
+A body's bones take the directions of the file's bones. The translation of the person is not read, and neither are
+fingers, toes and joints that only some skeletons have.
 """
 
 from pathlib import Path
@@ -29,23 +29,25 @@ BONES = {
     "knee": ("{side}leg", "{side}lowleg"),
     "ankle": ("{side}foot",),
 }
-"""What a role of plugins.data.bodies.poses.Skeleton is called, in small letters, without what ends with a colon; of two
-in one file the first."""
+"""Names of each role of plugins.data.bodies.poses.Skeleton, in lower case, without a prefix that ends with a colon.
+
+If a file has several names of one role, the first name of the tuple counts.
+"""
 ENDS = {"arm": "elbow", "elbow": "wrist", "hip": "knee", "knee": "ankle"}
-"""Where bones end whose direction is taken; the others turn as they do in the file."""
+"""Joint at the end of each bone whose direction is taken; the other joints rotate as in the file."""
 CHANNELS = {f"{axis}{kind}" for axis in "XYZ" for kind in ("position", "rotation")}
 SLOWEST = 1_000
-"""Seconds of a frame, less than."""
+"""Exclusive upper limit of the duration of a frame, seconds."""
 
 
 class Motion(NamedTuple):
-    """What a BVH file says.
+    """Content of a BVH file.
 
     Attributes:
-        names, parents: of its joints; -1 is the root's parent.
-        offsets: from the parent, where nothing turns, in the file's unit.
-        rotations: of each joint relative to its parent.
-        seconds: of a frame.
+        names, parents: names and parents of its joints; the root's parent is -1.
+        offsets: position relative to the parent if no joint rotates, in the file's unit.
+        rotations: rotation of each joint relative to its parent.
+        seconds: duration of a frame.
     """
 
     names: tuple[str, ...]
@@ -56,10 +58,10 @@ class Motion(NamedTuple):
 
 
 def read(file: Path) -> Motion:
-    """A BVH file, angles in degrees, y up.
+    """Read a BVH file, angles in degrees, y up.
 
     Raises:
-        DataError: it cannot be read, or is no BVH file.
+        DataError: the file cannot be read, or is no BVH file.
     """
     with guarded(file, "a motion in BVH format", missing="wanted a motion in BVH format. Mend the path."):
         text = decoded(read_bytes(file))
@@ -88,7 +90,7 @@ def read(file: Path) -> Motion:
             turning = [place for place, kind in enumerate(kinds) if kind.endswith("rotation")]
             axes = "".join(kinds[place][0] for place in turning).upper()
             turns[:, joint] = np.eye(3)
-            if axes:  # in capitals about axes that turn along: the first channel is the outermost
+            if axes:  # capitals denote intrinsic rotations: the first channel is the outermost
                 turns[:, joint] = Rotation.from_euler(
                     axes, values[:, [first + place for place in turning]], degrees=True
                 ).as_matrix()
@@ -105,11 +107,11 @@ def _whole(word: str, text: str, place: int) -> int:
 def _hierarchy(
     words: list[str], text: str
 ) -> tuple[list[str], list[int], list[list[float]], list[list[str]]]:
-    """Names, parents, offsets and channels of the joints; ends of the last bones are left out.
+    """Return names, parents, offsets and channels of the joints, without the end sites of the last bones.
 
     Args:
-        words: of the hierarchy, without the first.
-        text: the file, for messages.
+        words: words of the hierarchy, without the first.
+        text: content of the file, for messages.
     """
     names, parents, offsets, channels = [], [], [], []
     above, place = [-1], 0
@@ -157,17 +159,17 @@ def _hierarchy(
 
 
 def poses_of(body: Body, motion: Motion, frames: list[int]) -> Float[np.ndarray, "pose joint 3"]:
-    """Joint rotations for plugins.data.bodies.body, axis times angle in radians, in which the body's upper arms,
-    forearms, thighs and shanks point as the motion's do, and everything else turns as it does there.
+    """Return joint rotations for plugins.data.bodies.body, axis times angle in radians, of frames of a motion.
 
-    A bend of the back and of the neck is shared equally by the body's joints there. In the file's own rest pose the
-    trunk is taken to be upright and to face z.
+    The body's upper arms, forearms, thighs and shanks take the directions of the motion's bones, and all other joints
+    rotate as in the file. A bend of the back or of the neck is shared equally by the body's joints there. In the file's
+    own rest pose the trunk is taken to be upright and to face z.
 
     Raises:
-        DataError: the file has no joint that could be one of the body's.
+        DataError: the file has no joint for one of the body's roles.
     """
     where, roles = skeleton(body), _roles(motion)
-    whole: list[Rotation] = []  # of the file's joints, from its rest pose
+    whole: list[Rotation] = []  # global rotation of each joint of the file, from its rest pose
     for joint, parent in enumerate(motion.parents):
         local = Rotation.from_matrix(motion.rotations[frames, joint])
         whole.append(local if parent < 0 else whole[parent] * local)
@@ -184,7 +186,7 @@ def poses_of(body: Body, motion: Motion, frames: list[int]) -> Float[np.ndarray,
             joint, theirs = getattr(where, role)[number], roles[f"{side} {role}"]
             if role in ("clavicle", "hip"):
                 direction = Rotation.identity()
-            if role in ENDS:  # the smallest turn from our bone's direction to theirs, each in its rest pose
+            if role in ENDS:  # the smallest rotation from our bone's rest direction to the file's
                 end = getattr(where, ENDS[role])[number]
                 ours = (body.joints[end] - body.joints[joint]).astype(np.float64)
                 direction = _turn(ours, places[roles[f"{side} {ENDS[role]}"]] - places[theirs])
@@ -214,7 +216,7 @@ def _roles(motion: Motion) -> dict[str, int]:
 
 
 def _places(motion: Motion) -> Float[np.ndarray, "joint 3"]:
-    """Of the joints where nothing turns."""
+    """Return the positions of the joints if no joint rotates."""
     found = motion.offsets.copy()
     for joint, parent in enumerate(motion.parents):
         found[joint] += found[parent] if parent >= 0 else 0
@@ -222,16 +224,16 @@ def _places(motion: Motion) -> Float[np.ndarray, "joint 3"]:
 
 
 def _turn(one: np.ndarray, other: np.ndarray) -> Rotation:
-    """The smallest rotation from one direction to another."""
+    """Return the smallest rotation from one direction to another."""
     axis = np.cross(one, other)
     angle = np.arctan2(np.linalg.norm(axis), one @ other)
-    if np.linalg.norm(axis) < 1e-9 * np.linalg.norm(one) * np.linalg.norm(other):  # the same, or the opposite
+    if np.linalg.norm(axis) < 1e-9 * np.linalg.norm(one) * np.linalg.norm(other):  # parallel directions
         axis = np.cross(one, np.eye(3)[np.abs(one).argmin()])
     return Rotation.from_rotvec(angle * axis / np.linalg.norm(axis))
 
 
 def _downwards(parents: tuple[int, ...]) -> list[int]:
-    """All joints, each after its parent."""
+    """Return all joints, each after its parent."""
     found = [joint for joint, parent in enumerate(parents) if parent < 0]
     for joint in found:
         found += [child for child, parent in enumerate(parents) if parent == joint]

@@ -1,4 +1,4 @@
-"""Draws people of random shape and pose, with the default body or one from a file."""
+"""Random people: draws of shape and pose, for the default body or a body from a file."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from plugins.data.bodies.default_body import Traits, default_body
 
 
 class Drawn(NamedTuple):
-    """Shape coefficients and joint rotations of each person, as BodyModel takes them."""
+    """Shape coefficients and joint rotations of each person, in the form that BodyModel takes."""
 
     shape: Float[Tensor, "person shape"]
     pose: Float[Tensor, "person joint 3"]
@@ -24,11 +24,11 @@ class Drawn(NamedTuple):
 
 @dataclass(frozen=True)
 class People:
-    """Whom to draw.
+    """Distribution of random people.
 
     Attributes:
-        body: what bends.
-        traits: of the default body; None for a body from a file.
+        body: body model of all people.
+        traits: traits of the default body; None for a body from a file.
         spread: standard deviation of the first ten shape coefficients of a body from a file.
     """
 
@@ -37,7 +37,7 @@ class People:
     spread: float
 
     def draw(self, count: int, random: np.random.Generator) -> Drawn:
-        """So many people, of the body's dtype."""
+        """Return `count` random people, of the body's dtype."""
         if self.traits is None:
             shape = random.normal(0, self.spread, (count, min(10, self.body.shapes.shape[2])))
         else:
@@ -50,7 +50,7 @@ class People:
 
 
 def chosen_body(file: str | None) -> tuple[Body, Traits | None]:
-    """The body of a file, as it is; or the default body with the joints that poses turn, and its traits."""
+    """Return the body of a file unchanged; or the default body with the joints that poses rotate, and its traits."""
     if file is not None:
         return body_files.read(Path(file).expanduser()), None
     body, traits = default_body()
@@ -60,7 +60,7 @@ def chosen_body(file: str | None) -> tuple[Body, Traits | None]:
 def adults(
     labels: Sequence[str], count: int, random: np.random.Generator
 ) -> Float[np.ndarray, "person trait"]:
-    """Random traits of adults: gender and age uniform (2/3 is young, 1 old), else normal within 0.05…0.95."""
+    """Return random traits of adults: gender and age uniform (2/3 is young, 1 old), else normal within 0.05…0.95."""
     found = random.random((count, len(labels)))
     for place, label in enumerate(labels):
         if label == "age":

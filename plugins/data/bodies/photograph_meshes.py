@@ -1,7 +1,7 @@
 """`python -m plugins.data.bodies.photograph_meshes <meshes> <root>` makes a root of `human_scans` from coloured meshes.
 
-<meshes> holds the folders train, validation and test, each with `<name>_scan.ply` (.obj, ...), what photographs show,
-and `<name>_registration.ply`, what renderers get, all of one topology. Metres, y up, facing z, colours of vertices.
+<meshes> holds the folders train, validation and test. Each of them has `<name>_scan.ply` (.obj, ...), which photographs
+show, and `<name>_registration.ply`, which renderers get, all of one topology. Metres, y up, facing z, vertex colours.
 """
 
 import argparse
@@ -26,14 +26,14 @@ from plugins.data.bodies.photographs import photographed, rig
 from plugins.data.bodies.scan_layout import Registration
 
 Pair = tuple[Path, Path]
-"""Of a scan and its registration."""
+"""Paths of a scan and of its registration."""
 
 
 def main(arguments: list[str]) -> None:
     """Write the root, whole or not at all.
 
     Raises:
-        UserError: a mesh is missing, cannot be read or has no colours; the root is there already.
+        UserError: a mesh is missing, cannot be read or has no colours; the root exists already.
     """
     parser = argparse.ArgumentParser(
         prog="python -m plugins.data.bodies.photograph_meshes", description=__doc__
@@ -78,7 +78,7 @@ def main(arguments: list[str]) -> None:
 
 
 def pairs(folder: Path) -> Mapping[str, Mapping[str, Pair]]:
-    """Scan and registration of everybody, by split and name.
+    """Return the paths of scan and registration of each person, by split and name.
 
     Raises:
         DataError: a split has no scans, a scan no registration, or two people have one name.
@@ -109,7 +109,7 @@ def pairs(folder: Path) -> Mapping[str, Mapping[str, Pair]]:
 def write_person(
     folder: Path, pair: Pair, topology: str, renderer: Renderer, views: int, size: tuple[int, int]
 ) -> None:
-    """Photographs of a scan from places that its name alone decides, and its registration."""
+    """Write photographs of a scan from camera positions that depend on its name alone, and its registration."""
     scan, registration = (meshes.read(file) for file in pair)
     scan_layout.write_registration(
         folder / f"registration_{topology}.ply",

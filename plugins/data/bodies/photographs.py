@@ -1,4 +1,4 @@
-"""Photographs of a scan: a rig of cameras round the person, anti-aliased pictures with masks, and a texture."""
+"""Photographs of a scan: a rig of cameras around the person, anti-aliased images with masks, and a texture."""
 
 import math
 from collections.abc import Sequence
@@ -17,24 +17,24 @@ from framework.renderer import Renderer, Scene
 from plugins.data.bodies.scan_layout import Photograph
 
 SAMPLES = 4
-"""Of a pixel along each axis."""
+"""Number of samples of a pixel along each axis."""
 AROUND, HEIGHTS = 20, (-8.0, 6.0, 22.0)
-"""Places of the rig: so many round the person, at each of these elevations in degrees."""
+"""Camera positions of the rig: a number of positions around the person at each of these elevations, degrees."""
 TOGETHER = 4
-"""Photographs that are drawn at once; before they are pooled each takes some 30 MB."""
+"""Number of photographs that are drawn at once; each takes some 30 MB before pooling."""
 FOCAL = 1.25
 """Focal length in heights of the image."""
 MARGIN = 0.03
-"""Share of the image's height and width that stays free on each side, at least."""
+"""Smallest share of the image's height and width that stays free on each side."""
 
 
 def rig(
     vertices: Float[np.ndarray, "vertices 3"], count: int, size: tuple[int, int], random: Generator
 ) -> list[Camera]:
-    """Cameras at different places that see all of a person; fewer places than `count` are used twice.
+    """Return cameras at different positions that see all of a person; if positions are too few, they are used again.
 
-    Each looks at the middle of the person from as near as shows it whole, or a little further away, rolled by a degree
-    or two, with a principal point a little off the middle.
+    Each camera looks at the middle of the person from the smallest distance that shows it whole, or a little farther
+    away. It is rolled by a degree or two, and its principal point is a little off the middle.
     """
     places = AROUND * len(HEIGHTS)
     order = np.concatenate([random.permutation(places) for _ in range(-(-count // places))])[:count]
@@ -63,7 +63,7 @@ def _camera(
     focal = FOCAL * height
     off = random.uniform(-0.02, 0.02, 2) * height
     x, y, z = (around @ rotation.T).T
-    # whole where focal |x| / (z + distance) stays within half the width less the margin and what is off the middle
+    # in view if focal |x| / (z + distance) is within half the width less the margin and the principal point's shift
     free = np.array([width / 2 - np.abs(off[0]), height / 2 - np.abs(off[1])]) - MARGIN * height
     nearest = max((focal * np.abs(x) / free[0] - z).max(), (focal * np.abs(y) / free[1] - z).max())
     distance = nearest * random.uniform(1.0, 1.06)
@@ -78,8 +78,10 @@ def _camera(
 
 
 def photographed(renderer: Renderer, scene: Scene, cameras: Sequence[Camera]) -> list[Photograph]:
-    """The scene, whose colours are red, green and blue, from each camera; every pixel the mean light of SAMPLES² points
-    that lie on the subject."""
+    """Return a photograph of the scene, whose colours are red, green and blue, from each camera.
+
+    Every pixel is the mean linear RGB of those of its SAMPLES² samples that lie on the subject.
+    """
     larger = [
         Scene(scene.vertices, scene.faces, _with_cover(scene.colors), _finer(camera)) for camera in cameras
     ]
@@ -90,13 +92,13 @@ def photographed(renderer: Renderer, scene: Scene, cameras: Sequence[Camera]) ->
 
 
 def _with_cover(colors: Tensor | None) -> Float[Tensor, "vertices 4"]:
-    """A fourth channel of ones: what is drawn of it is how much of a pixel is the subject."""
+    """Return the colours with a fourth channel of ones: it renders as the share of a pixel that the subject covers."""
     assert colors is not None
     return torch.cat([colors, torch.ones_like(colors[:, :1])], 1)
 
 
 def _finer(camera: Camera) -> Camera:
-    """Of an image SAMPLES times as large: the middle of pixel p becomes S p + (S - 1) / 2."""
+    """Return the camera of an image SAMPLES times as large: the centre of pixel p becomes S p + (S - 1) / 2."""
     (fx, fy), (cx, cy) = (tuple(map(float, pair)) for pair in (camera.focal, camera.principal))
     shift = (SAMPLES - 1) / 2
     return Camera(
@@ -114,7 +116,7 @@ def _pooled(drawn: Float[Tensor, "height width 4"]) -> Photograph:
     cover = found[..., 3]
     light = torch.where(
         cover[..., None] > 0, found[..., :3] / cover.clamp(min=1e-6)[..., None], 0.5
-    )  # a grey studio
+    )  # grey background
     return Photograph(eight_bit(light).numpy(), (cover * 255).round().byte().numpy())
 
 
@@ -125,7 +127,7 @@ def texture(
     colors: Float[Tensor, "places 3"],
     side: int,
 ) -> UInt8[np.ndarray, "side side 3"]:
-    """A square texture from linear light at places, v upwards; what no triangle covers is as what lies nearest."""
+    """Return a square texture from linear RGB at texture coordinates, v upwards; uncovered texels copy the nearest."""
     place = np.stack([uv[:, 0] * side - 0.5, (1 - uv[:, 1]) * side - 0.5, np.ones(len(uv))], 1)
     camera = Camera(torch.eye(3), torch.zeros(3), (1.0, 1.0), (0.0, 0.0), side, side)
     scene = Scene(torch.from_numpy(place).float(), torch.from_numpy(uv_faces), _with_cover(colors), camera)

@@ -1,4 +1,4 @@
-"""How far predicted bodies are from where they were, and pictures of how they got there."""
+"""Metric `pose_error`: errors of predicted bodies' rotation and translation, and figures of the descents."""
 
 from typing import TYPE_CHECKING, ClassVar, Literal, NamedTuple
 
@@ -20,16 +20,16 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 NEAR = (2.0, 1.0)
-"""Degrees and centimetres within which a body counts as found."""
+"""Errors in degrees and centimetres up to which a body counts as found."""
 
 
 class Shown(NamedTuple):
-    """What the picture says of one sample.
+    """Content of the figure for one sample.
 
     Attributes:
-        start, target, end: pictures, (height, width, 3), linear.
+        start, target, end: images, (height, width, 3), linear RGB.
         degrees, centimetres: error of rotation and translation at the end.
-        path: of each step taken: loss, processor time (seconds), degrees, centimetres.
+        path: one row for each accepted step: loss, processor time (seconds), degrees, centimetres.
     """
 
     start: Tensor
@@ -41,11 +41,11 @@ class Shown(NamedTuple):
 
 
 class PoseError(Metric, Pictured):
-    """Errors of a body's rotation (geodesic, degrees) and translation (centimetres), and the share within 2° and 1 cm.
+    """Errors of a body's rotation (geodesic, degrees) and translation (cm), and the share within 2° and 1 cm.
 
-    Medians, 95th percentiles and worst cases, since a descent either arrives or ends somewhere else. Where the density
-    says how it was found (`fit_pose`), the picture shows start, target and end of the best, the middle and the worst
-    sample, and the errors against steps and time.
+    Medians, 95th percentiles and worst cases are reported, because a descent either succeeds or ends in another
+    minimum. If the density holds its descent (`fit_pose`), the figure shows start, target and end of the best, the
+    middle and the worst sample, and the errors against steps and time.
 
     Raises:
         ConfigError: the target does not begin with a rotation and a translation.
@@ -130,7 +130,7 @@ _KEYS = (
 def place_errors(
     found: Float[Tensor, "*batch number"], wanted: Float[Tensor, "*#batch number"]
 ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
-    """Degrees between two rotations and centimetres between two translations, float64."""
+    """Return the degrees between two rotations and the centimetres between two translations, float64."""
     found, wanted = found.double(), wanted.double().expand_as(found)
     one, other = (
         turns_less_identity(numbers[..., :3]) + torch.eye(3, dtype=torch.float64, device=numbers.device)
@@ -141,7 +141,7 @@ def place_errors(
 
 
 def quantile(values: Float[Tensor, "sample"]) -> Float[Tensor, "3"]:
-    """Median, 95th percentile and largest."""
+    """Return median, 95th percentile and maximum."""
     return torch.quantile(values, values.new_tensor([0.5, 0.95, 1.0]))
 
 

@@ -1,4 +1,4 @@
-"""Pictures of a coloured body in a random pose, with its numbers for target; the contract is framework.data's."""
+"""Data set `pose_from_image`: images of a coloured body in a random pose, with its parameters as target."""
 
 import hashlib
 import math
@@ -26,14 +26,14 @@ from framework.target import Target
 from plugins.data.bodies.figure import Figure, figure_of
 
 VERSION = 1
-"""Of what is drawn; a change takes a new number."""
+"""Version of the random draws; any change of them takes a new number."""
 Count = Annotated[int, Field(ge=1, le=1_000_000)]
 Side = Annotated[int, Field(ge=8, le=1024, multiple_of=4)]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Counts:
-    """Pictures of each split."""
+    """Number of images of each split."""
 
     train: Count = 32
     validation: Count = 8
@@ -42,13 +42,13 @@ class Counts:
 
 @dataclass(frozen=True, kw_only=True)
 class Apart:
-    """How far people are from the nominal one: to the degree and centimetre for the place, at random for the rest.
+    """Distance of people from the nominal pose: exact for rotation and translation, random for pose and shape.
 
     Attributes:
-        turned_deg: angle of the whole body's rotation, about an axis of any direction.
-        moved: metres, in any direction.
-        pose_spread: of the movements, in usual standard deviations.
-        shape_spread: of the shape, in standard deviations of people.
+        turned_deg: angle of the whole body's rotation, about an axis of random direction.
+        moved: length of the translation, metres, in a random direction.
+        pose_spread: spread of the movements, in their usual standard deviations.
+        shape_spread: spread of the shape, in standard deviations of people.
     """
 
     turned_deg: Annotated[float, Field(ge=0, le=180)] = 30.0
@@ -58,23 +58,23 @@ class Apart:
 
 
 class PoseFromImage(Data):
-    """Synthetic pictures of one body each; the target is where it is, how it stands and what shape it has.
+    """Synthetic images of one body each; the target is the body's position, pose and shape.
 
     An input is (4, height, width): red, green, blue, linear and black beyond the body, and the share of each pixel that
-    the body covers. Targets are the numbers of a `Figure`, of which 0 is the nominal place, pose and shape. A sample is
-    a function of (`data_seed`, split, number), drawn when it is fetched. Batches also hold the picture as "color"
-    (batch, height, width, 3), and "mask" (batch, height, width), bool, where half of a pixel or more is body.
+    the body covers. Targets are the parameters of a `Figure`; 0 is the nominal position, pose and shape. A sample is a
+    function of (`data_seed`, split, number), drawn when it is fetched. Batches also hold the image as "color" (batch,
+    height, width, 3), and "mask" (batch, height, width), bool, true for pixels of which the body covers half or more.
 
     Args:
-        renderer: draws the pictures.
-        counts: of the splits.
-        apart: how far the bodies are from the nominal one.
+        renderer: draws the images.
+        counts: numbers of images of the splits.
+        apart: distance of the bodies from the nominal one.
         height, width: pixels, multiples of 4.
         body: file of a body model of the SMPL family (.npz, .pkl); None: the default body, extracted on first use.
-        data_seed: of the draws, whatever the seed of the run.
+        data_seed: seed of the draws, independent of the seed of the run.
 
     Raises:
-        DataError: the body cannot be had or read.
+        DataError: the body is not available or cannot be read.
         ConfigError: the renderer draws no colours.
     """
 
@@ -127,7 +127,7 @@ class PoseFromImage(Data):
         return self._splits
 
     def _spread(self) -> Float[np.ndarray, "number"]:
-        """Standard deviation of each number; that of movements before they are folded into their limits."""
+        """Return the standard deviation of each parameter; for movements, before they are clipped to their limits."""
         spread, apart = self.figure.spread.numpy().copy(), self.apart
         shape = 6 + len(self.figure.slots)
         spread[:3], spread[3:6] = math.radians(apart.turned_deg) / 3**0.5, apart.moved / 3**0.5
@@ -191,7 +191,7 @@ class PoseFromImage(Data):
 
 
 class Poses(Dataset[Batch]):
-    """Bodies that are drawn when they are fetched."""
+    """Bodies of one split, drawn when they are fetched."""
 
     def __init__(
         self, figure: Figure, renderer: Renderer, camera: Camera, numbers: Float[Tensor, "sample number"]

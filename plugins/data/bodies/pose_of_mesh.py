@@ -1,4 +1,4 @@
-"""Finds pose and shape of a registered mesh, whose vertices are those of the body: nonlinear least squares."""
+"""Pose and shape of a registered mesh, whose vertices are those of the body, by nonlinear least squares."""
 
 from dataclasses import replace
 from typing import NamedTuple
@@ -14,24 +14,29 @@ from plugins.data.bodies.body import Body, BodyModel
 OFF = 0.01
 """Standard deviation of vertices from the model's, metres: clothes, hair, errors of the registration."""
 INDEPENDENT = 35
-"""What lies under one garment is off alike: a mesh counts for so many vertices that are off independently, however many
-it has."""
+"""Number of independent vertex errors of a mesh of any size: errors of vertices under one garment are alike."""
 BENT = 0.7
-"""Standard deviation of the angles of joints but the root, radians; it shares a bend among joints that lie close."""
+"""Standard deviation of the angles of joints except the root, radians; it shares a bend among neighbouring joints."""
 STEPS = 60
 ENOUGH = 1e-6
-"""Metres and radians: a step below ends the search."""
+"""Step, metres and radians, below which the search ends."""
 MOST = 2_500
-"""Vertices that are looked at: evenly spread ones of a finer mesh do."""
+"""Largest number of vertices that are used; evenly spread vertices of a finer mesh suffice."""
 STEP = 1e-5
-"""Of differences: radians, metres, standard deviations of shape."""
+"""Step of the differences: radians, metres, standard deviations of shape."""
 TOGETHER = 24
-"""Numbers in which the model is differentiated at once."""
+"""Number of parameters by which the model is differentiated at once."""
 
 
 class Found(NamedTuple):
-    """Shape coefficients, joint rotations and translation as BodyModel takes them, float64, a batch of one; and the
-    root mean square distance of vertices, metres."""
+    """Fit of a body to a mesh, in the form that BodyModel takes, float64, a batch of one.
+
+    Attributes:
+        shape: shape coefficients.
+        pose: joint rotations, axis times angle, radians.
+        translation: translation of the whole body, metres.
+        error: root mean square distance of vertices, metres.
+    """
 
     shape: Float[Tensor, "1 shape"]
     pose: Float[Tensor, "1 joint 3"]
@@ -40,7 +45,7 @@ class Found(NamedTuple):
 
 
 class _Problem(NamedTuple):
-    """Numbers are pose, translation and shape, in this order."""
+    """Least-squares problem; its parameters are pose, translation and shape, in this order."""
 
     model: BodyModel
     vertices: Float[Tensor, "vertex 3"]
@@ -58,7 +63,7 @@ class _Problem(NamedTuple):
         return float(self.apart(numbers).square().sum() + (self.prior * numbers.square()).sum())
 
     def derivatives(self, numbers: Float[Tensor, "number"]) -> Float[Tensor, "coordinate number"]:
-        """Central differences, a row of a batch for each number: some ten digits in float64."""
+        """Return central differences, one row of a batch for each parameter: some ten digits in float64."""
         found = []
         for steps in (STEP * torch.eye(len(numbers)).to(numbers)).split(TOGETHER):
             after, before = (self.model(*self.parts(numbers + sign * steps)) for sign in (1, -1))
@@ -68,16 +73,14 @@ class _Problem(NamedTuple):
 
 @torch.no_grad()
 def pose_of(body: Body, vertices: Float[Tensor, "vertex 3"], usual: float = 1.0) -> Found:
-    """The most probable pose, shape and translation of a mesh, metres (Levenberg-Marquardt; Moré 1978).
+    """Return the most probable pose, shape and translation of a mesh, metres (Levenberg-Marquardt; Moré 1978).
 
-    It starts from how the vertices of each joint are turned, so that any pose is found, also of somebody upside down.
-
-    Args:
-        body: whose shape coefficients have standard deviation 1.
-        usual: how much what is usual of people counts; 0: nothing but the vertices.
+    The search starts from the rotations of each joint's vertices, so that any pose is found, also of a person upside
+    down. The shape coefficients of `body` have standard deviation 1. `usual` is the weight of the prior on pose and
+    shape; with 0 only the vertices count.
 
     Raises:
-        DataError: another number of vertices, or numbers that are not finite.
+        DataError: the mesh has another number of vertices, or numbers that are not finite.
     """
     if len(vertices) != len(body.template) or not vertices.isfinite().all():
         raise DataError(
@@ -94,7 +97,7 @@ def pose_of(body: Body, vertices: Float[Tensor, "vertex 3"], usual: float = 1.0)
     vertices = vertices[::step].double()
     joints, shapes = len(body.parents), body.shapes.shape[-1]
     prior = vertices.new_full((joints + 1, 3), BENT**-2)
-    prior[[body.parents.index(-1), -1]] = 0  # where somebody stands, and faces, is free
+    prior[[body.parents.index(-1), -1]] = 0  # rotation and translation of the whole body are free
     prior = torch.cat([prior.flatten(), vertices.new_ones(shapes)]) * (
         usual * OFF**2 * len(vertices) / INDEPENDENT
     )
@@ -113,7 +116,7 @@ def _least(problem: _Problem, numbers: Float[Tensor, "number"]) -> Float[Tensor,
         curvature = slopes.T @ slopes + problem.prior.diag()
         uphill = slopes.T @ problem.apart(numbers).flatten() + problem.prior * numbers
         while True:
-            # numbers that change nothing have no curvature of their own
+            # parameters without influence have no curvature of their own
             scaled = curvature + (damping * curvature.diagonal() + 1e-9).diag()
             step = -torch.linalg.solve(scaled, uphill)
             tried = problem.cost(numbers + step)
@@ -129,9 +132,12 @@ def _least(problem: _Problem, numbers: Float[Tensor, "number"]) -> Float[Tensor,
 
 
 def rotations_of(model: BodyModel, vertices: Float[Tensor, "vertex 3"]) -> Float[Tensor, "joint 3"]:
-    """Of each joint the rotation, relative to its parent's, that best takes the template's vertices that follow it to
-    where they are (Kabsch 1976): axis times angle, radians. The root's is that of all vertices. Joints with too few
-    vertices to tell turn as their parents do."""
+    """Return the rotation of each joint relative to its parent's: axis times angle, radians.
+
+    It is the rotation that best maps the template's vertices that follow the joint to their positions in the mesh
+    (Kabsch 1976). The root's is that of all vertices. Joints with too few vertices to determine a rotation follow their
+    parents.
+    """
     template = model.template.unflatten(0, (3, -1)).T
     upright = torch.eye(3).to(vertices)
     turned = [upright] * len(model.parents)
@@ -146,7 +152,7 @@ def rotations_of(model: BodyModel, vertices: Float[Tensor, "vertex 3"]) -> Float
                 continue
             one, other = (points - weights @ points / total for points in (template, vertices))
             left, values, right = torch.linalg.svd(other.T @ (weights[:, None] * one))
-            if values[1] < 1e-3 * values[0]:  # on a line: a turn about it is not seen
+            if values[1] < 1e-3 * values[0]:  # vertices on a line do not determine the rotation about it
                 continue
             mirror = torch.ones_like(values)
             mirror[2] = torch.linalg.det(left @ right).sign()

@@ -1,4 +1,4 @@
-"""Pictures of descents: start, target and end, and errors against steps and time."""
+"""Figures of descents: start, target and end, and errors against steps and time."""
 
 from collections.abc import Mapping
 
@@ -14,7 +14,7 @@ from plugins.data.bodies.pose_error import Shown
 
 
 def descents(samples: Mapping[str, Shown], title: str, *, synthetic: bool) -> Figure:
-    """A row for each sample: start, target, end, what is left between them, and the errors against steps."""
+    """Return a figure with a row for each sample: start, target, end, their difference, and errors against steps."""
     figure = titled_figure((11.0, 3.2 * len(samples)), title, synthetic)
     axes = figure.subplots(len(samples), 5, squeeze=False, width_ratios=(1, 1, 1, 1, 2.2))
     for row, (name, sample) in zip(axes, samples.items(), strict=True):
@@ -31,7 +31,7 @@ def descents(samples: Mapping[str, Shown], title: str, *, synthetic: bool) -> Fi
 
 
 def error_curves(axis: Axes, path: Float[Tensor, "step 4"]) -> None:
-    """Degrees and centimetres after each step."""
+    """Plot the errors in degrees and centimetres after each step."""
     for column, (name, colour, near) in enumerate(
         (("rotation, degrees", COLOURS[0], 2.0), ("translation, cm", COLOURS[1], 1.0)), start=2
     ):
@@ -45,7 +45,7 @@ def error_curves(axis: Axes, path: Float[Tensor, "step 4"]) -> None:
 
 
 def errors(found: Float[Tensor, "sample 2"], title: str, *, synthetic: bool) -> Figure:
-    """Both errors of every sample, of predictions that tell nothing of how they were found."""
+    """Return a figure of both errors of every sample, for predictions without a descent to show."""
     figure = titled_figure((5.0, 4.2), title, synthetic)
     axis = figure.subplots()
     degrees, centimetres = found.clamp(min=1e-3).T

@@ -1,7 +1,7 @@
-"""Random poses within plausible limits, and which joint of a body each movement turns.
+"""Random poses within plausible limits, and the joints of a body that each movement rotates.
 
-Movements are angles in degrees that mean the same for every body, whatever its rest pose: an arm raised by 90° is
-horizontal, an elbow bent by 0° straight. Axes: x to the body's left, y up, z to the front.
+Movements are angles in degrees that mean the same for every body in any rest pose: an arm raised by 90° is horizontal,
+an elbow bent by 0° is straight. Axes: x to the body's left, y up, z to the front.
 """
 
 from collections.abc import Sequence
@@ -17,31 +17,31 @@ from plugins.data.bodies.body import Body
 
 Degrees = float | int
 Range = tuple[Degrees, Degrees, Degrees, Degrees]
-"""Mean, standard deviation, least and most."""
+"""Mean, standard deviation, smallest and largest value."""
 Kinds = dict[str, tuple[float, dict[str, tuple[Degrees, Degrees]]]]
-"""Of each kind of pose its share, and mean and standard deviation of the movements that differ from the usual."""
+"""Share of each kind of pose, and mean and standard deviation of the movements that differ from the usual ones."""
 CENTRAL: dict[str, Range] = {
-    "pitch": (0, 4, -15, 15),  # of the whole body, about x, y and z
+    "pitch": (0, 4, -15, 15),  # pitch, yaw, roll: the whole body about x, y and z
     "yaw": (0, 12, -40, 40),
     "roll": (0, 3, -12, 12),
-    "lean": (2, 6, -20, 50),  # of the spine, forwards
+    "lean": (2, 6, -20, 50),  # lean, bend, turn: the spine; lean is forwards
     "bend": (0, 5, -22, 22),
     "turn": (0, 8, -35, 35),
-    "nod": (0, 8, -30, 35),  # of the head
+    "nod": (0, 8, -30, 35),  # nod, tilt, look: the head
     "tilt": (0, 5, -20, 20),
     "look": (0, 14, -60, 60),
 }
 SIDED: dict[str, Range] = {
     "shrug": (0, 4, -8, 18),
-    "raise": (45, 8, 4, 165),  # of the arm from hanging, sidewards
-    "forward": (0, 6, -30, 100),  # of a raised arm, towards the front
-    "swing": (0, 10, -60, 40),  # of the arm about x; below 0 to the front
+    "raise": (45, 8, 4, 165),  # the arm sidewards, from hanging
+    "forward": (0, 6, -30, 100),  # a raised arm towards the front
+    "swing": (0, 10, -60, 40),  # the arm about x; below 0 to the front
     "twist": (0, 12, -60, 60),
     "elbow": (15, 10, 0, 140),
     "pronate": (0, 20, -80, 80),
     "wrist": (0, 8, -45, 45),
-    "hip": (0, 5, -25, 100),  # of the thigh, forwards
-    "spread": (4, 4, -8, 45),  # of the thigh, sidewards
+    "hip": (0, 5, -25, 100),  # the thigh forwards
+    "spread": (4, 4, -8, 45),  # the thigh sidewards
     "hip_turn": (0, 6, -30, 35),
     "knee": (3, 4, 0, 130),
     "ankle": (0, 5, -35, 25),
@@ -65,15 +65,15 @@ LEGS: Kinds = {
     "lifted": (0.08, {"hip": (50, 28), "knee": (55, 30), "spread": (8, 8)}),
 }
 ALIKE = 0.6
-"""How often both arms do the same; legs are always drawn from one kind."""
+"""Share of poses in which both arms have the same kind; the kind of the legs is always common to both."""
 TAIL, WIDER = 0.1, 1.8
-"""Share of poses from a heavier tail, whose standard deviations are this many times as large (thesis §6.5.2)."""
+"""Share of poses from a heavier tail, and the factor of their standard deviations (thesis §6.5.2)."""
 MOVEMENTS = (*CENTRAL, *(f"{side} {name}" for side in ("left", "right") for name in SIDED))
 
 
 @dataclass(frozen=True)
 class Skeleton:
-    """Which joints a movement turns, each by an equal share."""
+    """Joints that each movement rotates, each by an equal share."""
 
     root: int
     spine: tuple[int, ...]
@@ -103,7 +103,7 @@ NAMED = {
     "knee": ("lowerleg01.L", "lowerleg01.R"),
     "ankle": ("foot.L", "foot.R"),
 }
-"""The default body's joints."""
+"""Names of the default body's joints."""
 JOINTS = tuple(name for names in NAMED.values() for name in names)
 ORDERED = Skeleton(
     root=0,
@@ -119,14 +119,14 @@ ORDERED = Skeleton(
     knee=(4, 5),
     ankle=(7, 8),
 )
-"""The first 22 joints of the SMPL family, whose files name none (Loper et al. 2015; Pavlakos et al. 2019)."""
+"""The first 22 joints of the SMPL family, whose files have no names (Loper et al. 2015; Pavlakos et al. 2019)."""
 
 
 def skeleton(body: Body) -> Skeleton:
-    """Where a body's joints are: by name, else in the order of the SMPL family.
+    """Return the joints of a body by role: by name, else in the order of the SMPL family.
 
     Raises:
-        DataError: fewer than 22 joints without names, or names of another body.
+        DataError: there are fewer than 22 joints without names, or names of another body.
     """
     if not body.names:
         if len(body.parents) < 22:
@@ -143,7 +143,10 @@ def skeleton(body: Body) -> Skeleton:
 
 
 def draw(count: int, random: Generator) -> Float[np.ndarray, "pose movement"]:
-    """Movements of so many poses, degrees, in the order of MOVEMENTS; both sides' mean the same to left and right."""
+    """Return movements of random poses, degrees, in the order of MOVEMENTS.
+
+    Equal values of the left and the right side are mirror images.
+    """
     wide = np.where(random.random(count) < TAIL, WIDER, 1.0)
     left_arm = _choice(ARMS, count, random)
     right_arm = np.where(random.random(count) < ALIKE, left_arm, _choice(ARMS, count, random))
@@ -172,7 +175,7 @@ def _limited(
     wide: np.ndarray,
     random: Generator,
 ) -> Float[np.ndarray, "pose"]:
-    """Normal numbers, folded back at the limits so that none piles up there."""
+    """Return normal numbers, folded back at the limits so that none accumulate there."""
     _, _, least, most = limits
     drawn = random.normal(mean, spread * wide)
     once = np.where(drawn < least, 2 * least - drawn, np.where(drawn > most, 2 * most - drawn, drawn))
@@ -182,13 +185,13 @@ def _limited(
 def rotations(
     body: Body, where: Skeleton, movements: Float[np.ndarray, "pose movement"]
 ) -> Float[np.ndarray, "pose joint 3"]:
-    """Joint rotations for plugins.data.bodies.body, axis times angle in radians, that make these movements."""
+    """Return joint rotations for plugins.data.bodies.body, axis times angle in radians, that make these movements."""
     angle = dict(zip(MOVEMENTS, np.radians(movements).T, strict=True))
     count, joints = len(movements), body.joints.astype(np.float64)
     found = [Rotation.identity(count)] * len(body.parents)
 
     def turn(places: Sequence[int], *about: tuple[Sequence[float] | np.ndarray, np.ndarray]) -> None:
-        """Rotations about fixed axes, the last first, shared equally by some joints; on top of what is there."""
+        """Add rotations about fixed axes, the last first, to those of some joints, which share them equally."""
         for place in places:
             for axis, radians in reversed(about):
                 found[place] = _about(axis, radians / len(places)) * found[place]
@@ -201,9 +204,9 @@ def rotations(
         of = {name: angle[f"{('left', 'right')[side]} {name}"] for name in SIDED}
         shoulder, elbow, wrist = (joints[role[side]] for role in (where.arm, where.elbow, where.wrist))
         upper, fore = _unit(elbow - shoulder), _unit(wrist - elbow)
-        raised = np.arctan2(sign * upper[0], -upper[1])  # in the rest pose, from hanging
+        raised = np.arctan2(sign * upper[0], -upper[1])  # angle from hanging in the rest pose
         bent = np.arccos(np.clip(upper @ fore, -1, 1))
-        # about this axis a forearm comes forwards; where an arm is straight in the rest pose only z says where that is
+        # rotation about this axis bends a forearm forwards; for an arm straight in the rest pose, forwards is z
         hinge = np.cross(upper, fore) if bent > 0.1 else np.cross(upper, z)
         turn([where.clavicle[side]], (z, sign * of["shrug"]))
         turn([where.arm_twist[side]], (upper, sign * of["twist"]))

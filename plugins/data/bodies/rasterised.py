@@ -1,4 +1,4 @@
-"""Registered vertices as the picture of their mesh: what a learned renderer is compared with, or starts from."""
+"""Encoder `rasterised`: the rendered image of a registered mesh, as a baseline or as input of a learned renderer."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,18 +27,21 @@ from plugins.data.bodies.topologies import Name, sheet, topology
 COLUMNS = (*XYZ, *COLOURS)
 Metres = Annotated[float, Field(gt=0, le=1e6)]
 TEXELS = 4
-"""Along a side of a texture, at most, for each pixel of the picture's longer side; finer ones are averaged. Of the
-default body some 6 × 6 texels lie in a pixel then: with `supersampling` 4 no sample passes over one."""
+"""Largest number of texels along a side of a texture for each pixel of the image's longer side.
+
+Finer textures are averaged. For the default body some 6 × 6 texels then lie in a pixel, so that with `supersampling` 4
+the samples skip no texel.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Picture:
-    """What is drawn.
+    """Settings of the rendered image.
 
     Attributes:
         height, width: pixels.
-        ground: one channel in place of the colours: how much of a pixel the mesh leaves free.
-        depth: whether there is one channel more, 0 at `nearest` and 1 at `farthest` and beyond.
+        ground: whether a single channel, the share of a pixel that the mesh leaves free, replaces the colours.
+        depth: whether there is a further channel, 0 at `nearest` and 1 at `farthest` and beyond.
         nearest, farthest: metres.
     """
 
@@ -52,7 +55,7 @@ class Picture:
 
 @dataclass(frozen=True, kw_only=True)
 class Registered:
-    """Which mesh the points are the vertices of: as the data's parameters of these names say."""
+    """Mesh whose vertices the points are; the settings are those of the same names of the data."""
 
     topology: Name = "7k"
     root: FilePath | None = None
@@ -60,24 +63,25 @@ class Registered:
 
 
 class Rasterised(Encoder):
-    """The mesh of a registered body with its vertices' colours or its texture, on white, before the canonical camera.
+    """Rendered image of a registered body with vertex colours or a texture, on white, in the canonical camera.
 
     Inputs are those of `human_scans`, whose vertices are in the order of the topology. Colours are interpolated and
-    averaged as light. Textures lie in the folder of the data and are read when first drawn. Features are (3, height,
-    width), numbers as files hold them, in the inputs' dtype; with `depth` (4, height, width), as `encoder=projection`
-    has it: what a network may start from in place of points. With `ground` the silhouette alone, black on white.
+    averaged in linear RGB. Textures lie in the folder of the data and are read when they are first drawn. Features are
+    (3, height, width), sRGB numbers as files hold them, in the inputs' dtype; with `depth` (4, height, width), as those
+    of `encoder=projection`. A network may read them in place of points. With `ground` the image is the silhouette
+    alone, black on white.
 
     Args:
         input_shape: (points, columns).
-        input_columns: names of the columns, where data give them.
+        input_columns: names of the columns, if the data name them.
         renderer: draws the mesh.
-        textures: the `human_scans` with the textures of all who come; None: vertices' colours are drawn.
-        picture, mesh: what is drawn, and of what.
+        textures: the `human_scans` with the textures of all subjects that occur; None: vertex colours are drawn.
+        picture, mesh: settings of the image and of the mesh.
 
     Raises:
-        ConfigError: an input that is no cloud of coloured points, a renderer that lacks a channel, or other data with
-            textures.
-        DataError: the mesh cannot be had; or, from `forward`, a texture.
+        ConfigError: the input is no cloud of coloured points, the renderer lacks a channel, or `textures` is other
+            data.
+        DataError: the mesh is not available; or, from `forward`, a texture.
     """
 
     fixed = True
@@ -124,12 +128,12 @@ class Rasterised(Encoder):
         self.camera = canonical_camera(picture.height, picture.width)
         self.ground, self.depth = picture.ground, picture.depth
         self.limits = (picture.nearest, picture.farthest)
-        self.faces = faces_of(mesh)  # no buffer: meshes are drawn on the CPU wherever the model is
+        self.faces = faces_of(mesh)  # no buffer: meshes are drawn on the CPU on any device of the model
         self.output_shape = ((1 if picture.ground else 3) + picture.depth, picture.height, picture.width)
 
     @torch.no_grad()
     def forward(self, inputs: Float[Tensor, "batch points columns"]) -> Float[Tensor, "batch *features"]:
-        sizes(inputs)  # refuses what is no cloud
+        sizes(inputs)  # refuses inputs that are no clouds
         if len(inputs) and inputs.shape[1] <= int(self.faces.max()):
             raise DataError(
                 f"A mesh of {inputs.shape[1]} vertices came; the topology has {int(self.faces.max()) + 1}. Set "
@@ -149,7 +153,7 @@ class Rasterised(Encoder):
         return found
 
     def _scene(self, cloud: Float[Tensor, "points columns"], row: int) -> Scene:
-        """A fourth channel of what the mesh shows is 1: how much of a pixel the mesh covers."""
+        """Return the scene of a cloud; a fourth colour channel of 1 renders as the share of a pixel that is covered."""
         vertices, colors = cloud[:, :3].float(), cloud[:, 3:6].float()
         if self.people is None:
             paint = torch.cat([light_of(colors), colors.new_ones(len(colors), 1)], 1)
@@ -161,10 +165,10 @@ class Rasterised(Encoder):
 
 
 def faces_of(mesh: Registered) -> Tensor:
-    """Triangles of a topology: of generated people's, or of the first registration in a folder.
+    """Return the triangles of a topology: of generated people, or of the first registration in a folder.
 
     Raises:
-        DataError: the body, or the folder's meshes, cannot be had.
+        DataError: the body, or the folder's meshes, are not available.
     """
     if mesh.root is None:
         chosen, _ = chosen_body(mesh.body)

@@ -1,12 +1,12 @@
-"""`python -m plugins.data.bodies.repose <registration> ... --out <folder>` poses and shapes registered people anew.
+"""`python -m plugins.data.bodies.repose <registration> ... --out <folder>` changes pose and shape of registered people.
 
 A registration is a mesh with vertex colours in one of the body's topologies, or a subject's folder of `human_scans`.
-Its pose and shape are found, it is taken back to the rest pose, and written in each pose and shape asked for, with
-cameras, so that a trained renderer draws it (thesis Figures 7.4 and 7.5):
+The command finds its pose and shape, takes it back to the rest pose, and writes it in each requested pose and shape,
+with cameras, so that a trained renderer can draw it (thesis Figures 7.4 and 7.5):
 
     python -m framework mode=predict checkpoint=<run> mode.files=<folder>
 
-It is written with its root over the origin, and with its lowest vertex where it was: metres, y up, facing z.
+Each mesh is written with its root over the origin and its lowest vertex at the original height: metres, y up, facing z.
 """
 
 import argparse
@@ -35,18 +35,18 @@ from plugins.data.bodies.topologies import in_topology, recognised
 from plugins.data.bodies.unposing import unposed
 
 Poses = dict[str, Float[np.ndarray, "joint 3"]]
-"""Joint rotations of each pose, by what to call it."""
+"""Joint rotations of each pose, by the name of the pose."""
 
 
 @dataclass(frozen=True)
 class Subject:
-    """A model of one person: the body's with offsets in the rest pose (the thesis's template of a subject).
+    """Model of one person: the body's with offsets in the rest pose (the thesis's template of a subject).
 
     Attributes:
-        model: float64, in the registration's topology.
-        found: pose, shape and place of the registration.
-        offsets: of its vertices from the model's in the rest pose, metres.
-        folded: how many of them are the model's own along some direction, see plugins.data.bodies.unposing.
+        model: body model, float64, in the registration's topology.
+        found: pose, shape and translation of the registration.
+        offsets: displacements of its vertices from the model's in the rest pose, metres.
+        folded: number of vertices that are the model's own along some direction, see plugins.data.bodies.unposing.
     """
 
     model: BodyModel
@@ -59,7 +59,7 @@ class Subject:
     def posed(
         self, pose: Float[np.ndarray, "joint 3"] | None = None, change: Float[Tensor, "shape"] | None = None
     ) -> Registration:
-        """In a pose (None: as registered), with a change of shape coefficients."""
+        """Return the person in a pose (None: as registered), with a change of shape coefficients."""
         shape = self.found.shape if change is None else self.found.shape + change
         turned = self.found.pose if pose is None else torch.from_numpy(pose)[None]
         vertices = self.model(shape, turned, offsets=self.offsets)[0]
@@ -71,13 +71,13 @@ class Subject:
 
 
 def subject(body: Body, few: Body, registration: Registration, source: str) -> Subject:
-    """The model of a person.
+    """Return the model of a person.
 
-    Args:
-        body: as it is; `few`: with few shape coefficients, see plugins.data.bodies.shape_space.
+    `body` is the unchanged body; `few` has few shape coefficients, see plugins.data.bodies.shape_space. `source` names
+    the mesh in messages.
 
     Raises:
-        DataError: a mesh of another body.
+        DataError: the mesh is of another body.
     """
     surface, mesh = recognised(body, len(registration.vertices), registration.faces.numpy(), source)
     own = in_topology(few, surface, mesh)
@@ -88,10 +88,10 @@ def subject(body: Body, few: Body, registration: Registration, source: str) -> S
 
 
 def a_pose_with(changes: str) -> Float[np.ndarray, "1 movement"]:
-    """Movements, degrees, of an A-pose with some of them named: "left raise=90,left elbow=60".
+    """Return the movements, degrees, of an A-pose with some of them replaced: "left raise=90,left elbow=60".
 
     Raises:
-        DataError: a movement of no such name, or no angle.
+        DataError: no movement has such a name, or an angle is no number.
     """
     ranges = [*poses.CENTRAL.values(), *2 * (*poses.SIDED.values(),)]
     found = dict(zip(poses.MOVEMENTS, (float(limits[0]) for limits in ranges), strict=True))
@@ -119,7 +119,7 @@ def _numbers(text: str) -> dict[str, float]:
 
 
 def asked_poses(body: Body, given: argparse.Namespace) -> Poses:
-    """All poses that the arguments ask for."""
+    """Return all poses that the arguments ask for."""
     where = poses.skeleton(body)
     found: Poses = {}
     for number, changes in enumerate(given.pose):
@@ -143,10 +143,10 @@ def asked_poses(body: Body, given: argparse.Namespace) -> Poses:
 
 
 def shape_change(text: str, count: int) -> Float[Tensor, "shape"]:
-    """Coefficients from "0=-2,3=1".
+    """Return the shape coefficients of a text such as "0=-2,3=1".
 
     Raises:
-        DataError: not such a text, or a direction that is not there.
+        DataError: the text has another form, or a direction does not exist.
     """
     found = torch.zeros(count, dtype=torch.float64)
     for name, number in _numbers(text).items():
@@ -157,7 +157,7 @@ def shape_change(text: str, count: int) -> Float[Tensor, "shape"]:
 
 
 def around(vertices: Float[Tensor, "vertex 3"], views: int, size: tuple[int, int]) -> dict[str, Camera]:
-    """Cameras that see all vertices, at equal distances round the vertical, the first in front."""
+    """Return cameras that see all vertices, at equal angles around the vertical, the first in front."""
     found = {}
     for view in range(views):
         angle = 2 * math.pi * view / views
@@ -169,17 +169,17 @@ def around(vertices: Float[Tensor, "vertex 3"], views: int, size: tuple[int, int
 
 
 def read(file: Path, topology: str) -> tuple[str, Registration]:
-    """Name and mesh of a registration, or of a subject's folder."""
+    """Return name and mesh of a registration, or of a subject's folder."""
     if file.is_dir():
         return file.resolve().name, scan_layout.read_registration(file / f"registration_{topology}.ply")
     return file.stem, scan_layout.read_registration(file)
 
 
 def main(arguments: list[str]) -> None:
-    """Write `<name>_<pose>.ply` and cameras.json.
+    """Write `<name>_<pose>.ply` for each pose and shape, and cameras.json.
 
     Raises:
-        UserError: a mesh cannot be read, has no colours or is of another body; a pose or shape that is not there.
+        UserError: a mesh cannot be read, has no colours or is of another body; a pose or shape does not exist.
     """
     parser = argparse.ArgumentParser(
         prog="python -m plugins.data.bodies.repose",

@@ -1,14 +1,15 @@
-"""Arrays out of pickles, without running anything that a pickle names.
+"""Reader of arrays from pickles that runs nothing that a pickle names.
 
-A pickle is a program: it names functions of any installed module and calls them. Here the standard library only takes
-it apart into its instructions, and a machine of our own obeys the few that arrays need. A name becomes an inert record
-of itself and of what it was given; afterwards those records that mean an array, a sparse matrix or a wrapped array
-are turned into a plain array, and any other name has already been refused. Pickles of Python 2 (text as latin-1) and
-of every protocol are read.
+A pickle is a program: it names functions of any installed module and calls them. This module uses the standard library
+only to split it into its instructions, and interprets only the few instructions that arrays need. A name becomes an
+inert record of itself and of its arguments. Records of an array, a sparse matrix or a wrapped array are then converted
+to plain arrays; any other name is refused before that. Pickles of Python 2 (text as latin-1) and of every protocol are
+read.
 
-What a file may cost is bounded by its size: so many instructions, so much nesting, and arrays no larger than what the
-file brings, but for sparse matrices, which are written out and counted. Keys are words and small numbers, since what is
-hashed (a tuple of the same tuple twice, thirty deep, say) could take for ever.
+The cost of a file is bounded by its size: the number of instructions, the depth of nesting, and the size of arrays,
+which may not exceed the data in the file. Sparse matrices are an exception: they become dense, and the numbers of all
+of them are counted. Keys are words and small numbers, because hashing other keys could take unlimited time (for
+example, a tuple of the same tuple twice, thirty levels deep).
 """
 
 import math
@@ -35,18 +36,18 @@ ALLOWED = {
     ("builtins", "object"): "object",
     ("__builtin__", "bytes"): "bytes",
     ("builtins", "bytes"): "bytes",
-    # the autodiff library in whose arrays body models were first published
+    # the autodiff library whose arrays hold the first published body models
     ("chumpy.ch", "Ch"): "Ch",
     ("chumpy.reordering", "Select"): "Select",
 }
-"""What a pickle may name, and what it is called here."""
+"""Names that a pickle may use, and their kinds in this module."""
 SPARSE = re.compile(r"(csc|csr|coo)_(matrix|array)")
 DTYPE = re.compile(r"[<>=|]?(b1|[iu][1248]|f[248]|c(8|16)|[SU]\d{1,4})")
 DEEPEST = 40
 MOST_INSTRUCTIONS = 200_000
-"""Published bodies take a few thousand."""
+"""Largest number of instructions; published bodies have a few thousand."""
 LARGEST = 2**24
-"""Numbers of all sparse matrices of a file when they are written out."""
+"""Largest count of numbers in all dense copies of a file's sparse matrices."""
 CONSTANTS = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False, "EMPTY_TUPLE": ()}
 FRESH = {"EMPTY_LIST": list, "EMPTY_DICT": dict}
 VALUES = re.compile(
@@ -56,15 +57,18 @@ VALUES = re.compile(
 TUPLES = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
 MARK = object()
 MOST_SIDES, LONGEST_SIDE = 32, 2**31
-"""Of an array; numbers of thousands of digits would take long to multiply."""
+"""Largest number of dimensions of an array, and limit of each: multiplying numbers of thousands of digits is slow."""
 
 
 class PickleRefused(ValueError):
-    """A pickle that holds more than arrays, or is damaged; says what was found."""
+    """Error for a pickle that holds more than arrays, or is damaged; its message says what was found."""
 
 
 class _Record:
-    """Something a pickle names, and what it was given; `made`: whether it was called, else it is the bare name."""
+    """Record of a name in a pickle and of its arguments.
+
+    `made` is true if the pickle called the name; otherwise the record is the bare name.
+    """
 
     def __init__(self, kind: str, arguments: tuple[Any, ...] = (), *, made: bool = False) -> None:
         self.kind = kind
@@ -74,21 +78,23 @@ class _Record:
 
 
 def load(content: bytes) -> Any:
-    """What a pickle holds: None, numbers, text, bytes, lists, tuples, dictionaries, arrays; sparse matrices as arrays.
+    """Return the content of a pickle.
+
+    It consists of None, numbers, text, bytes, lists, tuples, dictionaries and arrays; sparse matrices become arrays.
 
     Raises:
-        PickleRefused: it names anything else, holds arrays of objects, or is damaged.
+        PickleRefused: the pickle names anything else, holds arrays of objects, or is damaged.
     """
     try:
         return _Plain(len(content)).of(_obeyed(content), 0)
     except PickleRefused:
         raise
-    except Exception as error:  # damage leads to whatever error it likes
+    except Exception as error:  # a damaged pickle can raise an error of any type
         raise PickleRefused(f"it is damaged ({type(error).__name__}: {shown(error)})") from error
 
 
 def _obeyed(content: bytes) -> Any:
-    """What the instructions build, of records."""
+    """Return the object that the instructions build, with records in place of named objects."""
     stack: list[Any] = []
     memo: dict[int, Any] = {}
     for count, (opcode, argument, _) in enumerate(pickletools.genops(content)):
@@ -116,7 +122,7 @@ def _obeyed(content: bytes) -> Any:
 
 
 def _obey(name: str, argument: Any, stack: list[Any]) -> None:
-    """One instruction that changes the stack alone."""
+    """Execute one instruction that changes the stack alone."""
     match name:
         case "MARK":
             stack.append(MARK)
@@ -170,7 +176,7 @@ def _obey(name: str, argument: Any, stack: list[Any]) -> None:
 
 def _since_mark(stack: list[Any]) -> list[Any]:
     place = len(stack) - 1
-    while stack[place] is not MARK:  # an IndexError where there is none
+    while stack[place] is not MARK:  # raises an IndexError if there is no mark
         place -= 1
     items = stack[place + 1 :]
     del stack[place:]
@@ -200,17 +206,19 @@ def _refuse(why: str) -> NoReturn:
 
 
 class _Plain:
-    """Turns records into arrays: what was read twice is made once, so that nesting cannot multiply it.
+    """Conversion of records to arrays.
+
+    An object that is referenced twice is converted once, so that nesting cannot multiply it.
 
     Args:
-        size: of the file, bytes: what is made of it may not be much larger.
+        size: size of the file, bytes, which limits the size of the result.
     """
 
     def __init__(self, size: int) -> None:
         self.done: dict[int, Any] = {}
         self.bytes_left = (
             4 * size
-        )  # an array is its text, that in bytes, the array, and what is selected of it
+        )  # four copies of an array: its text, its bytes, the array itself, and a selection from it
         self.sparse_left = LARGEST
 
     def of(self, item: Any, depth: int) -> Any:
@@ -231,7 +239,7 @@ class _Plain:
             return bytes(item)
         if not isinstance(item, _Record) or not item.made:
             _refuse(f"it holds a bare {item.kind if isinstance(item, _Record) else type(item).__name__}")
-        # names may be arguments: which class an array once was is no matter
+        # bare names may be arguments: the original class of an array is irrelevant
         bare = [isinstance(value, _Record) and not value.made for value in item.arguments]
         given: list[Any] = [
             None if name else self.of(value, depth) for name, value in zip(bare, item.arguments, strict=True)
@@ -265,7 +273,7 @@ class _Plain:
     def _array(self, shape: Any, dtype: Any, fortran: Any, raw: Any) -> np.ndarray:
         if not isinstance(dtype, np.dtype):
             _refuse("an array without a type")
-        raw = raw.encode("latin1") if isinstance(raw, str) else raw  # as Python 2 wrote it
+        raw = raw.encode("latin1") if isinstance(raw, str) else raw  # Python 2 wrote text
         sides = tuple(shape) if isinstance(shape, list | tuple) else ()
         if not isinstance(raw, bytes) or len(sides) > MOST_SIDES or not all(map(_side, sides)):
             _refuse("an array of Python objects")
@@ -283,7 +291,7 @@ class _Plain:
             _refuse("it makes much more of itself than it holds")
 
     def _sparse(self, kind: str, state: Mapping[str, Any]) -> np.ndarray:
-        """The matrix with its zeros; entries of one place add up."""
+        """Return the matrix as a dense array; entries at the same position are added."""
         rows, columns = state.get("_shape", state.get("shape"))
         if not _side(rows) or not _side(columns) or rows * columns > self.sparse_left:
             _refuse(f"a sparse matrix of {rows} x {columns}, too large to be a body's")
@@ -296,7 +304,7 @@ class _Plain:
         else:
             starts, inner = _line(state["indptr"], "iu"), _line(state["indices"], "iu")
             lines = columns if kind == "csc" else rows
-            # bounded before they are cast or subtracted: either is modulo 2^64, and `repeat` adds its counts up
+            # checked before casts and subtractions, which are modulo 2^64; `repeat` allocates the sum of its counts
             bounded = len(starts) == lines + 1 and starts.min() >= 0 and starts.max() <= len(data)
             counts = np.diff(starts.astype(np.int64)) if bounded else np.array([-1])
             if not bounded or starts[0] != 0 or starts[-1] != len(data) or (counts < 0).any():
@@ -338,7 +346,7 @@ def _side(value: Any) -> bool:
 
 
 def _line(values: Any, kinds: str) -> np.ndarray:
-    """Numbers in a row, of a sparse matrix."""
+    """Return the one-dimensional numbers of a sparse matrix; refuse anything else."""
     if not isinstance(values, np.ndarray) or values.ndim != 1 or values.dtype.kind not in kinds:
         _refuse("a sparse matrix without its numbers")
     return values

@@ -1,4 +1,4 @@
-"""Shows a registered mesh with the scan it was registered to: as one PLY file, and as a figure."""
+"""Registered mesh and its scan as one PLY file, and as a figure."""
 
 from pathlib import Path
 
@@ -16,11 +16,11 @@ from framework.figures.style import titled_figure
 SKIN, SCAN = (0.86, 0.68, 0.58), (0.16, 0.36, 0.75)
 """Colours of the mesh and of the scan's points (thesis Figure 6.6)."""
 AMBIENT = 0.3
-"""Share of the light that comes from everywhere; the rest comes from the viewer."""
+"""Share of ambient light; the rest comes from the viewer."""
 DISTANCES = "viridis"
-"""Colour map of how far points lie from the mesh."""
+"""Colour map of the distance of points from the mesh."""
 NEAR = 3
-"""Vertices around which the nearest point of the mesh is looked for."""
+"""Number of nearest vertices whose faces are searched for the nearest point of the mesh."""
 
 
 def write_ply(
@@ -29,7 +29,7 @@ def write_ply(
     faces: Int[np.ndarray, "face 3"],
     cloud: Float[np.ndarray, "points 3"],
 ) -> None:
-    """The mesh, skin-coloured, and the cloud's points, blue, as vertices that no face uses; binary, metres."""
+    """Write a binary PLY, metres: the mesh, skin-coloured, and the cloud's points, blue, as vertices without faces."""
     colours = np.repeat([_bytes(SKIN), _bytes(SCAN)], (len(vertices), len(cloud)), 0)
     points = np.concatenate([vertices, cloud])
     trimesh.Trimesh(points, faces, vertex_colors=colours, process=False).export(file, "ply")
@@ -40,7 +40,7 @@ def distances(
     faces: Int[np.ndarray, "face 3"],
     cloud: Float[np.ndarray, "points 3"],
 ) -> Float[np.ndarray, "points"]:
-    """From each point of the cloud to the mesh: to the nearest face of those around the nearest vertices."""
+    """Return the distance of each point of the cloud to the mesh: to the faces around the nearest vertices."""
     around = trimesh.Trimesh(vertices, faces, process=False).vertex_faces  # padded with -1
     used = np.flatnonzero((around >= 0).any(1))
     _, nearest = KDTree(vertices[used]).query(cloud, k=min(NEAR, len(used)))
@@ -59,7 +59,7 @@ def figure(
     cloud: Float[np.ndarray, "points 3"],
     title: str,
 ) -> Figure:
-    """The panels with axes in metres, and how far each point of the scan lies from the mesh, millimetres."""
+    """Return a figure of the panels with axes in metres, and of the scan's distances from the mesh, millimetres."""
     millimetres = 1e3 * distances(vertices, faces, cloud)
     far = np.quantile(millimetres, 0.95)
     told = f"its points lie {millimetres.mean():.1f} mm off on average, 95 % within {far:.1f} mm"
@@ -72,7 +72,7 @@ def figure(
     for axes, head in zip(grid[0], heads, strict=True):
         axes.set_title(head, fontsize=10)
     side, height, depth = (middle[axis] + reach * np.array([-0.5, 0.5]) for axis in range(3))
-    # seen from the left, the front is at the left
+    # in the view from the left, the front is at the left
     across = (("front: x (m)", side), ("left side: z (m)", depth[::-1]))
     for row, (label, ends), images in zip(grid, across, panels(vertices, faces, cloud, colours), strict=True):
         for axes, image in zip(row, images, strict=True):
@@ -91,12 +91,14 @@ def panels(
     colours: Float[np.ndarray, "points 3"],
     height: int = 280,
 ) -> UInt8[np.ndarray, "2 4 height width 3"]:
-    """From the front and from the left, orthographic on white, y up: the cloud alone, the mesh, both, and the cloud in
-    its own colours."""
+    """Return orthographic views on white, y up, from the front and from the left.
+
+    The columns are the cloud alone, the mesh, both, and the cloud in its own colours.
+    """
     middle, reach = _frame(vertices, cloud)
     views = []
     for right, towards in ((0, 2), (2, 0)):
-        flip = 1 if right == 0 else -1  # from the left, the front is to the viewer's left
+        flip = 1 if right == 0 else -1  # in the view from the left, the front is to the viewer's left
         frame = np.zeros((3, 3))
         frame[0, right], frame[1, 1], frame[2, towards] = flip, 1, 1
         seen = (vertices - middle) @ frame.T / reach
@@ -108,7 +110,7 @@ def panels(
 
 
 def _frame(vertices: np.ndarray, cloud: np.ndarray) -> tuple[np.ndarray, float]:
-    """Middle and edge of the cube that is drawn."""
+    """Return middle and edge length of the cube that is drawn."""
     everything = np.concatenate([vertices, cloud])
     low, high = everything.min(0), everything.max(0)
     return (low + high) / 2, 1.06 * max(float((high - low).max()), 1e-9)
@@ -117,7 +119,10 @@ def _frame(vertices: np.ndarray, cloud: np.ndarray) -> tuple[np.ndarray, float]:
 def _drawn(
     vertices: np.ndarray | None, points: np.ndarray | None, colours: np.ndarray, faces: np.ndarray, side: int
 ) -> UInt8[np.ndarray, "side side 3"]:
-    """x right, y up, z to the viewer, all within ±0.5; nearer surfaces hide others, points sit on what they touch."""
+    """Return an image of mesh and points: x right, y up, z to the viewer, all coordinates within ±0.5.
+
+    Nearer surfaces hide others; points on a surface are drawn in front of it.
+    """
     image = np.ones((side, side, 3))
     depth = np.full((side, side), -np.inf)
     if vertices is not None:
@@ -126,13 +131,16 @@ def _drawn(
         place = _pixels(points[:, :2], side)
         order = np.argsort(points[:, 2], kind="stable")  # the nearest last
         row, column, near = *place[order].T, points[order, 2]
-        seen = near >= depth[row, column] - 0.01  # noise of a scan may lie a little under the surface
+        seen = near >= depth[row, column] - 0.01  # a scan's noise moves points a little under the surface
         image[row[seen], column[seen]] = colours[order[seen]]
     return _bytes(image)
 
 
 def _draw_mesh(vertices: np.ndarray, faces: np.ndarray, image: np.ndarray, depth: np.ndarray) -> None:
-    """Points densely over every face that looks at the viewer, each as near as it is; brighter the more it does."""
+    """Draw dense points on every face that looks at the viewer, with a depth test.
+
+    Faces that look more directly at the viewer are brighter.
+    """
     side = len(image)
     corners = vertices[faces]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -156,7 +164,7 @@ def _draw_mesh(vertices: np.ndarray, faces: np.ndarray, image: np.ndarray, depth
 
 
 def _pixels(points: np.ndarray, side: int) -> Int[np.ndarray, "points 2"]:
-    """Row and column of points within ±0.5."""
+    """Return row and column of points within ±0.5."""
     column = np.floor((points[:, 0] + 0.5) * side)
     row = np.floor((0.5 - points[:, 1]) * side)
     return np.stack([row, column], 1).clip(0, side - 1).astype(np.int64)

@@ -33,7 +33,7 @@ JOINTS = np.array(
 
 
 def doll() -> dict[str, np.ndarray]:
-    """A small octahedron around every joint, which follows it alone."""
+    """Return the arrays of a body with a small octahedron around every joint, which follows that joint alone."""
     around = 0.04 * np.array([(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)])
     faces = np.array([(0, 2, 4), (2, 1, 4), (1, 3, 4), (3, 0, 4), (2, 0, 5), (1, 2, 5), (3, 1, 5), (0, 3, 5)])
     template = np.concatenate([joint + around for joint in JOINTS])
@@ -51,17 +51,18 @@ def doll() -> dict[str, np.ndarray]:
 
 
 def body_file(folder: Path) -> Mapping[str, str]:
+    """Write the doll to a folder, and return the parameter that names its file."""
     np.savez(folder / "doll.npz", **doll())  # type: ignore[arg-type]
     return {"body": str(folder / "doll.npz")}
 
 
 def small_body() -> Mapping[str, str]:
-    """The doll, in a folder that lasts as long as this process."""
+    """Return the parameter of the doll's file, in a folder that lasts as long as this process."""
     return body_file(Path(FOLDER.name))
 
 
 def cut_out(folder: Path) -> Sequence[Path]:
-    """Two pictures with an alpha channel."""
+    """Write two images with an alpha channel, and return their paths."""
     files = [folder / "one.png", folder / "other.png"]
     for number, file in enumerate(files):
         pixels = np.random.default_rng(number).integers(0, 256, (16, 12, 4), dtype=np.uint8)
@@ -70,7 +71,7 @@ def cut_out(folder: Path) -> Sequence[Path]:
 
 
 def person(number: int) -> tuple[np.ndarray, np.ndarray]:
-    """A person's own shape in a pose of its own, 40 vertices, metres, and a scan of it with 300 points."""
+    """Return the mesh of a person with its own shape and pose, 40 vertices, metres, and a scan of 300 points."""
     mesh = np.random.default_rng(0).normal(0, 0.3, (40, 3))
     mesh = mesh * (1 + number // 10 / 20) + 0.1 * np.sin(3 * mesh[:, [1, 2, 0]] + number % 10) + [0, 1.0, 0]
     near = np.random.default_rng(number).integers(0, 40, 300)
@@ -78,7 +79,7 @@ def person(number: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def people(folder: Path) -> Mapping[str, str]:
-    """Two scans each of four of FAUST's ten people."""
+    """Write two scans each of four of FAUST's ten people, and return the parameter that names their folder."""
     faces = np.array([(0, 1, 2), (2, 1, 3)])
     for number in (0, 3, 70, 75, 80, 81, 90, 99):
         mesh, scan = person(number)
@@ -88,8 +89,10 @@ def people(folder: Path) -> Mapping[str, str]:
 
 
 def scanned(folder: Path) -> Mapping[str, str]:
-    """Six subjects of 40 coloured vertices, photographed twice each: 12 × 9 pixels of noise, half of them masked; each
-    has a texture."""
+    """Write six subjects of 40 coloured vertices, and return the parameter that names their folder.
+
+    Each has two photographs of 12 × 9 pixels of noise with random masks, and a texture.
+    """
     folder.mkdir(exist_ok=True)
     names = {"train": ("ann", "bob", "cleo"), "validation": ("dan",), "test": ("eve", "fay")}
     scan_layout.write_splits(folder, names)
@@ -120,14 +123,14 @@ def scanned(folder: Path) -> Mapping[str, str]:
 
 
 def seen(count: int) -> torch.Tensor:
-    """The first of these subjects, one after the other, 3 m ahead."""
+    """Return inputs of `count` subjects, in turn, 3 m in front of the camera."""
     people = [colored(number % 6) for number in range(count)]
     clouds = [torch.cat([one.vertices * 2 + torch.tensor([0, -2, 3]), one.colors / 255], 1) for one in people]
     return torch.stack(clouds) if clouds else torch.empty(0, 40, 6)
 
 
 def colored(number: int) -> Registration:
-    """A person's mesh with random colours."""
+    """Return a person's mesh with random colours."""
     colors = np.random.default_rng(number).integers(0, 256, (40, 3), np.uint8)
     faces = np.array([(0, 1, 2), (2, 1, 3)])
     return Registration(
@@ -136,7 +139,7 @@ def colored(number: int) -> Registration:
 
 
 def colored_meshes(folder: Path) -> Sequence[Path]:
-    """Two meshes with vertex colours."""
+    """Write two meshes with vertex colours, and return their paths."""
     files = [folder / "one.ply", folder / "other.ply"]
     for number, file in enumerate(files):
         scan_layout.write_registration(file, colored(number))

@@ -1,4 +1,4 @@
-"""Generates dressed people and writes what a scanner would have made of them, in the layout of `human_scans`."""
+"""Generator of dressed people and of their simulated scans, in the layout of `human_scans`."""
 
 import hashlib
 from collections.abc import Mapping
@@ -29,26 +29,26 @@ from plugins.data.bodies.scan_layout import Registration
 from plugins.data.bodies.topologies import Name, Topology, topology
 
 VERSION = 1
-"""Of what is drawn; a change takes a new number."""
+"""Version of the random draws; any change of them takes a new number."""
 SPLITS = ("train", "validation", "test")
 CALM = 0.4
-"""Of the usual spread of movements, that of people who stand still in an A-pose."""
+"""Spread of the movements of people who stand still in an A-pose, as a share of the usual spread."""
 RAISED = 38.0
-"""Degrees of the arms of an A-pose from hanging."""
+"""Angle of the arms of an A-pose from hanging, degrees."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Drawing:
-    """How people are generated and photographed.
+    """Settings of generated people and of their photographs.
 
     Attributes:
-        views: photographs of each.
+        views: number of photographs of each person.
         height, width: pixels of a photograph.
         topologies: meshes registered to each scan.
-        posed: share of the test subjects that do not stand in an A-pose but anyhow.
-        texture_side: texels along a side of texture.png; 0: none is made.
-        skins: folder of pictures of skin in the default body's texture layout, each worn in one split alone; None: skin
-            is painted.
+        posed: share of the test subjects that have a random pose instead of an A-pose.
+        texture_side: texels along a side of texture.png; 0: no texture is made.
+        skins: folder of images of skin in the default body's texture layout, each used in one split alone; None: skin
+            is painted by procedure.
         body: file of a body model of the SMPL family (.npz, .pkl); None: the default body.
     """
 
@@ -63,18 +63,18 @@ class Drawing:
 
 
 def scans_root(renderer: Renderer, counts: Mapping[str, int], drawing: Drawing, seed: int) -> Path:
-    """Where generated people lie in the cache; drawn now where they are not there.
+    """Return the folder of generated people in the cache; they are generated if they are not there.
 
     Raises:
-        DataError: the body or the skins cannot be had or read.
-        ConfigError: fewer skins than splits, or skins for a body without texture places.
+        DataError: the body or the skins are not available or cannot be read.
+        ConfigError: there are fewer skins than splits, or skins for a body without texture coordinates.
     """
     crowd = Crowd(renderer, counts, drawing, seed)
     return generated(crowd.root, crowd.mark, crowd.write)
 
 
 class Person(NamedTuple):
-    """Shape coefficients, pose, a picture of skin where there are some, and where further draws come from."""
+    """Shape coefficients, pose, an image of skin or None, and the generator of further random draws."""
 
     shape: Float[Tensor, "1 shape"]
     pose: Float[Tensor, "1 joint 3"]
@@ -83,13 +83,13 @@ class Person(NamedTuple):
 
 
 class Crowd:
-    """All people of a data set: each is a function of the seed, the split and its number there."""
+    """All people of a data set; each is a function of the seed, the split and its number there."""
 
     def __init__(self, renderer: Renderer, counts: Mapping[str, int], drawing: Drawing, seed: int) -> None:
         self.renderer, self.counts, self.drawing, self.seed = renderer, dict(counts), drawing, seed
         self.body, self.traits = chosen_body(drawing.body)
         self.skins = _shared_out(drawing.skins, self.body.uv is not None)
-        # of the body and of the skins what is drawn from them, not where they lie
+        # body and skins are identified by their content, not by their paths
         settings = {key: value for key, value in asdict(drawing).items() if key not in ("skins", "body")}
         self.mark = {
             "human_scans": VERSION,
@@ -105,13 +105,16 @@ class Crowd:
 
     @cached_property
     def wardrobe(self) -> Wardrobe:
+        """Return the clothing of the body; it is computed once."""
         return Wardrobe(self.body)
 
     @cached_property
     def meshes(self) -> dict[Name, Topology]:
+        """Return the topologies to write, by name; they are computed once."""
         return {name: topology(self.body, self.wardrobe.sheet, name) for name in self.drawing.topologies}
 
     def write(self, root: Path) -> None:
+        """Write all people to a folder in the layout of plugins.data.bodies.scan_layout."""
         everyone = [(split, number) for split in SPLITS for number in range(self.counts[split])]
         scan_layout.write_splits(
             root, {split: [_name(split, number) for number in range(self.counts[split])] for split in SPLITS}
@@ -151,7 +154,7 @@ class Crowd:
             Image.fromarray(pixels).save(folder / "texture.png")
 
     def person(self, split: str, number: int) -> Person:
-        """Who it is, before anything is worn."""
+        """Return a person before dressing."""
         random = np.random.default_rng([self.seed, SPLITS.index(split), number])
         skin = None
         if some := self.skins[SPLITS.index(split)]:
@@ -169,13 +172,13 @@ class Crowd:
     def posed(
         self, shape: Float[Tensor, "1 shape"], pose: Float[Tensor, "1 joint 3"]
     ) -> Float[np.ndarray, "vertices 3"]:
-        """The bare body as it stands."""
+        """Return the vertices of the bare body in a pose, metres."""
         kind = self.wardrobe.model.template.dtype
         return self.wardrobe.model(shape.to(kind), pose.to(kind))[0].numpy()
 
 
 def a_pose(random: Generator) -> Float[np.ndarray, "1 movement"]:
-    """Movements, degrees, of somebody who stands to be scanned: arms off the body, looking ahead, nearly still."""
+    """Return movements, degrees, of a person who stands to be scanned: arms off the body, nearly still."""
     ranges = [*poses.CENTRAL.values(), *2 * (*poses.SIDED.values(),)]
     usual, spread, least, most = np.array(ranges, float).T
     usual = np.where(np.char.endswith(np.array(poses.MOVEMENTS), "raise"), RAISED, usual)
@@ -187,7 +190,10 @@ def _name(split: str, number: int) -> str:
 
 
 def _shared_out(folder: str | None, has_places: bool) -> list[list[Path]]:
-    """Skins of each split: a quarter, at least one, for test, an eighth for validation, the others for training."""
+    """Return the skins of each split: a quarter for test and an eighth for validation, at least one each.
+
+    All others are for training.
+    """
     if folder is None:
         return [[], [], []]
     if not has_places:

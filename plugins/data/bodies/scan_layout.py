@@ -1,14 +1,14 @@
 """The folder of `human_scans`: registered meshes, cameras, photographs and masks; read, and written by the generator.
 
-    train.txt, validation.txt, test.txt        names of subjects, a line each
+    train.txt, validation.txt, test.txt        names of subjects, one per line
     topology_<topology>.npz                    optional: faces, uv, uv_faces of every registration, for texture.png
     subjects/<name>/registration_<topology>.ply    vertices in metres, y up, with 8-bit sRGB colours; faces
     subjects/<name>/cameras.json               {"views": [{"name", "height", "width", "K", "R", "t"}, ...]}
     subjects/<name>/images/<view>.png          8-bit sRGB: the subject's colours wherever the mask is above 0
-    subjects/<name>/masks/<view>.png           8-bit grey: how much of a pixel is the subject
+    subjects/<name>/masks/<view>.png           8-bit grey: share of the pixel that the subject covers
     subjects/<name>/texture.png                optional
 
-Cameras are OpenCV's: pixel = K (R X + t), divided by depth; pixel centres at whole numbers, metres.
+Cameras follow OpenCV: pixel = K (R X + t), divided by depth; pixel centres at whole numbers, metres.
 """
 
 import json
@@ -37,10 +37,10 @@ from framework.storage.reading import guarded, opened, read_bytes
 from framework.storage.text import lines_of
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
-"""Of subjects and views: they are names of files."""
+"""Pattern of the names of subjects and views, which become file names."""
 PNG_END = b"IEND\xaeB`\x82"
 SLACK = 1e-4
-"""How far the numbers of RᵀR may be from those of the identity."""
+"""Largest difference of the entries of RRᵀ from those of the identity."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class View:
 
 @dataclass(frozen=True)
 class Registration:
-    """A subject's mesh: metres, 8-bit sRGB numbers, triangles."""
+    """A subject's mesh: vertices in metres, 8-bit sRGB colours, triangles."""
 
     vertices: Float[Tensor, "vertices 3"]
     colors: UInt8[Tensor, "vertices 3"]
@@ -64,7 +64,7 @@ class Registration:
 
 @dataclass(frozen=True)
 class Subject:
-    """Everything of one subject but the pixels."""
+    """A subject's registration and views, without the pixels of the images."""
 
     name: str
     registration: Registration
@@ -73,7 +73,7 @@ class Subject:
 
 @dataclass(frozen=True)
 class TexturePlaces:
-    """Where a topology's triangles lie in texture.png: u to the right, v upwards."""
+    """Texture coordinates of a topology's triangles in texture.png: u to the right, v upwards."""
 
     faces: Int[np.ndarray, "faces 3"]
     uv: Float[np.ndarray, "places 2"]
@@ -81,17 +81,17 @@ class TexturePlaces:
 
 
 class Photograph(NamedTuple):
-    """8-bit sRGB of the subject wherever the mask is above 0, and how much of each pixel is the subject."""
+    """8-bit sRGB of the subject wherever the mask is above 0, and the share of each pixel that the subject covers."""
 
     pixels: UInt8[np.ndarray, "height width 3"]
     mask: UInt8[np.ndarray, "height width"]
 
 
 def read_splits(root: Path) -> dict[str, tuple[str, ...]]:
-    """Names of each split's subjects.
+    """Return the names of each split's subjects.
 
     Raises:
-        DataError: no such folder, a list is missing, empty, names a subject twice, or one that another list names.
+        DataError: the folder does not exist, or a list is missing, is empty, or names a subject that is listed already.
     """
     if not root.is_dir():
         raise DataError(
@@ -119,10 +119,10 @@ def read_splits(root: Path) -> dict[str, tuple[str, ...]]:
 
 
 def read_subject(root: Path, name: str, topology: str) -> Subject:
-    """One subject; of photographs and masks the headers are looked at.
+    """Read one subject; of photographs and masks only size and end are checked.
 
     Raises:
-        DataError: a file is missing or damaged; says which.
+        DataError: a file is missing or damaged; the message names it.
     """
     folder = root / "subjects" / name
     if not folder.is_dir():
@@ -139,10 +139,10 @@ def read_subject(root: Path, name: str, topology: str) -> Subject:
 
 
 def read_registration(file: Path) -> Registration:
-    """A mesh with one colour a vertex.
+    """Read a mesh with one colour per vertex.
 
     Raises:
-        DataError: it cannot be read, has no faces, or no colours of 0 to 1 (0 to 255 in whole numbers).
+        DataError: the file cannot be read, has no faces, or no colours of 0 to 1 (0 to 255 in whole numbers).
     """
     if not file.exists() and (others := sorted(file.parent.glob("registration_*.ply"))):
         there = ", ".join(other.stem.removeprefix("registration_") for other in others)
@@ -162,10 +162,10 @@ def read_registration(file: Path) -> Registration:
 
 
 def vertex_colors(mesh: meshes.Mesh) -> UInt8[np.ndarray, "vertices 3"]:
-    """8-bit colours of a mesh.
+    """Return the 8-bit colours of a mesh.
 
     Raises:
-        DataError: it has none.
+        DataError: the mesh has none.
     """
     if not set(COLOURS) <= set(mesh.columns):
         raise DataError(
@@ -176,10 +176,10 @@ def vertex_colors(mesh: meshes.Mesh) -> UInt8[np.ndarray, "vertices 3"]:
 
 
 def read_cameras(file: Path) -> dict[str, Camera]:
-    """Cameras by the names of their views.
+    """Return cameras by the names of their views.
 
     Raises:
-        DataError: the file is missing or damaged, a view is named twice, or a number makes no camera.
+        DataError: the file is missing or damaged, a view is named twice, or the numbers of a view make no camera.
     """
     found: dict[str, Camera] = {}
     document = read_json(file, "cameras")
@@ -247,7 +247,7 @@ def _checked_view(folder: Path, name: str, camera: Camera) -> View:
 
 
 def tail(file: Path) -> bytes:
-    """The last bytes of a PNG: the checksum of all its pixels, and its end."""
+    """Return the last bytes of a PNG: the checksum of its pixels, and its end mark."""
     with opened(file) as stream:
         stream.seek(max(0, file.stat().st_size - 20))
         return stream.read()
@@ -262,10 +262,10 @@ def _check_size(file: Path, image: Image.Image, camera: Camera) -> None:
 
 
 def read_photograph(view: View) -> Photograph:
-    """Pixels and mask of a view.
+    """Return pixels and mask of a view.
 
     Raises:
-        DataError: a file is damaged, or of another size than its camera says.
+        DataError: a file is damaged, or its size differs from the camera's.
     """
     found = []
     for file, channels in ((view.image, 3), (view.mask, 1)):
@@ -276,10 +276,10 @@ def read_photograph(view: View) -> Photograph:
 
 
 def read_places(root: Path, topology: str) -> TexturePlaces:
-    """Where the topology's triangles lie in a texture.
+    """Return the texture coordinates of a topology's triangles.
 
     Raises:
-        DataError: the file is missing or damaged, or does not fit together.
+        DataError: the file is missing or damaged, or its arrays do not fit together.
     """
     file = root / f"topology_{topology}.npz"
     with guarded(file, "faces, uv and uv_faces of a topology"):
@@ -299,7 +299,7 @@ def read_places(root: Path, topology: str) -> TexturePlaces:
 
 
 def read_texture(root: Path, name: str) -> UInt8[np.ndarray, "height width 3"]:
-    """Pixels of a subject's texture.
+    """Return the pixels of a subject's texture.
 
     Raises:
         DataError: the file is missing or damaged.
@@ -309,7 +309,7 @@ def read_texture(root: Path, name: str) -> UInt8[np.ndarray, "height width 3"]:
 
 
 def write_registration(file: Path, registration: Registration) -> None:
-    """As binary PLY."""
+    """Write a registration as binary PLY."""
     write_mesh(file, registration.vertices.numpy(), registration.faces.numpy(), registration.colors.numpy())
 
 
@@ -319,7 +319,7 @@ def write_mesh(
     faces: Int[np.ndarray, "faces 3"],
     colors: UInt8[np.ndarray, "vertices 3"] | None = None,
 ) -> None:
-    """As binary PLY; a cloud where there are no faces."""
+    """Write a mesh as binary PLY; a cloud if there are no faces."""
     columns = [("place", "<f4", 3), *([] if colors is None else [("colour", "u1", 3)])]
     table = np.empty(len(vertices), columns)
     table["place"] = vertices
@@ -342,6 +342,7 @@ def write_mesh(
 
 
 def write_cameras(file: Path, cameras: Mapping[str, Camera]) -> None:
+    """Write cameras with the names of their views as JSON."""
     views = []
     for name, camera in cameras.items():
         (fx, fy), (cx, cy) = (tuple(map(float, pair)) for pair in (camera.focal, camera.principal))
@@ -362,7 +363,7 @@ def write_cameras(file: Path, cameras: Mapping[str, Camera]) -> None:
 
 
 def write_views(folder: Path, cameras: Sequence[Camera], photographs: Sequence[Photograph]) -> None:
-    """Cameras, images and masks of a subject; views are called 000, 001 and so on."""
+    """Write cameras, images and masks of a subject; views are named 000, 001 and so on."""
     names = [f"{view:03}" for view in range(len(cameras))]
     write_cameras(folder / "cameras.json", dict(zip(names, cameras, strict=True)))
     for kind in ("images", "masks"):
@@ -373,5 +374,6 @@ def write_views(folder: Path, cameras: Sequence[Camera], photographs: Sequence[P
 
 
 def write_splits(root: Path, names: Mapping[str, Sequence[str]]) -> None:
+    """Write the list of subjects of each split."""
     for split, subjects in names.items():
         (root / f"{split}.txt").write_text("".join(f"{name}\n" for name in subjects), encoding="utf-8")

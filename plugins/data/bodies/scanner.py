@@ -1,4 +1,4 @@
-"""What a scanner makes of a body: points of its surface with noise, parts missing, and points of something else."""
+"""Simulated scans of a body: points of its surface with noise, missing parts, and points of other objects."""
 
 from dataclasses import dataclass
 from typing import Annotated, Literal
@@ -19,10 +19,10 @@ Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 
 @dataclass(frozen=True, kw_only=True)
 class Scanner:
-    """How a body is scanned.
+    """Settings of the simulated scanner.
 
     Attributes:
-        points: of the surface and beside it, all in all; fewer where parts are missing.
+        points: total number of points of the surface and of other objects; fewer if parts are missing.
         noise: largest standard deviation of every coordinate, metres; each scan has its own, uniform below.
         cut: largest share of the points that is missing behind a plane or within a ball.
         strangers: largest share of the points that are not the body's.
@@ -42,16 +42,16 @@ class Kinds:
     outliers: Share = 0.2
 
     def shares(self) -> Float[np.ndarray, "kind"]:
-        """Of each kind of scan, of sum 1."""
+        """Return the share of each kind of scan; their sum is 1."""
         found = (1 - min(1, self.partial + self.outliers), self.partial, self.outliers)
         return np.array(found) / sum(found)
 
 
 def scan(mesh: Mesh, kind: Kind, scanner: Scanner, random: Generator) -> Float[np.ndarray, "points 3"]:
-    """Points of one body, metres, uniform over what is seen of its surface.
+    """Return points of one body, metres, uniform over the visible part of its surface.
 
-    "partial": without what lies behind a plane or within a ball, or as one camera at its height sees it (surfaces that
-    face away are missing; what an arm hides is not). "outliers": with a patch of floor and points anywhere around.
+    "partial" removes the points behind a plane or within a ball, or all that face away from a camera at the body's
+    height (what an arm occludes is not removed). "outliers" adds a patch of floor and points anywhere around.
     """
     stranger = int(scanner.strangers * scanner.points * random.random()) if kind == "outliers" else 0
     drawn = sample(mesh, scanner.points - stranger, random)
@@ -68,7 +68,7 @@ def scan(mesh: Mesh, kind: Kind, scanner: Scanner, random: Generator) -> Float[n
 def strangers(
     vertices: Float[np.ndarray, "vertex 3"], count: int, random: Generator
 ) -> Float[np.ndarray, "points 3"]:
-    """A patch of the floor under the feet, and at most one in fifty of them anywhere in a box around the body."""
+    """Return a patch of the floor under the feet, and up to one point in fifty anywhere in a box around the body."""
     low, high = vertices.min(0), vertices.max(0)
     anywhere = random.integers(count // 50 + 1)
     middle, reach = (low + high) / 2, 0.65 * (high - low).max()
@@ -98,7 +98,7 @@ def _within_ball(
 def _facing_away(
     mesh: Mesh, points: np.ndarray, face: np.ndarray, most: float, random: Generator
 ) -> Bool[np.ndarray, "points"]:
-    azimuth = random.normal(0, 0.7) + (np.pi if random.random() < 0.3 else 0)  # mostly from the front
+    azimuth = random.normal(0, 0.7) + (np.pi if random.random() < 0.3 else 0)  # mostly the front is seen
     towards = np.array([np.sin(azimuth), random.normal(0, 0.15), np.cos(azimuth)])
     return normals(mesh)[face] @ towards < 0
 

@@ -1,4 +1,4 @@
-"""Scans of drawn people, made when they are fetched."""
+"""Scans of random people, computed when they are fetched."""
 
 from collections.abc import Sequence
 
@@ -21,9 +21,9 @@ class Scans(Dataset[Batch]):
 
     Args:
         people: shape and pose of every body, for `model`.
-        kind: of every scan, places in KINDS.
-        seed: of the scans, which also depend on the sample's number.
-        precision: of the targets.
+        kind: kind of every scan, as an index of KINDS.
+        seed: seed of the scans, which also depend on the sample's number.
+        precision: dtype of the targets.
     """
 
     def __init__(

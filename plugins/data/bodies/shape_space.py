@@ -1,4 +1,4 @@
-"""The few directions in which bodies differ most, as those of the SMPL family have them."""
+"""The few directions in which bodies differ most, with the scaling that the SMPL family uses."""
 
 from dataclasses import replace
 
@@ -10,17 +10,17 @@ from plugins.data.bodies.default_body import Traits
 from plugins.data.bodies.people import adults
 
 COUNT = 10
-"""Shape coefficients (thesis §7.3.1)."""
+"""Number of shape coefficients (thesis §7.3.1)."""
 DRAWN = 400
-"""Random adults from whom the directions are found."""
+"""Number of random adults from whom the directions are computed."""
 
 
 def in_few_shapes(body: Body, traits: Traits | None) -> Body:
-    """The body with at most COUNT shape coefficients, each of standard deviation 1 and of mean 0 among people.
+    """Return the body with at most COUNT shape coefficients, each of standard deviation 1 and of mean 0 among people.
 
-    A file's are that, and its first ones are kept. The default body's are made to be: its template becomes the mean of
-    random adults, its shapes the principal components of their vertices, the largest first, with the sign that makes
-    the person taller.
+    Those of a body from a file are scaled so already; the first of them are kept. For the default body, the template
+    becomes the mean of random adults. Its shapes become the principal components of their vertices, the largest first,
+    with the sign that makes the person taller.
     """
     if traits is None:
         return replace(body, shapes=body.shapes[..., :COUNT], joint_shapes=body.joint_shapes[..., :COUNT])
@@ -28,12 +28,12 @@ def in_few_shapes(body: Body, traits: Traits | None) -> Body:
     people = traits.coefficients(torch.from_numpy(values)).numpy()
     mean = people.mean(0)
     spread = (people - mean) / np.sqrt(DRAWN - 1)
-    # principal components of vertices, from the small matrix of how people's vertices agree
+    # principal components of vertices, from the small Gram matrix of people's vertices
     shapes = body.shapes.reshape(-1, body.shapes.shape[2]).astype(np.float64)
     agreement = spread @ (shapes.T @ shapes) @ spread.T
     variance, shares = np.linalg.eigh(agreement)
     kept = np.argsort(-variance, kind="stable")[:COUNT]
-    # of unit shares u with variance s² the direction spreadᵀ u moves vertices by s, one standard deviation
+    # for a unit eigenvector u with variance s², the direction spreadᵀ u moves vertices by s, one standard deviation
     directions = spread.T @ shares[:, kept]
     taller = np.ptp(body.template[:, 1] + body.shapes[:, 1] @ mean)
     for column in directions.T:

@@ -1,4 +1,4 @@
-"""The skin of generated people: painted by procedure, or a picture in the body's own texture layout."""
+"""Skin of generated people: painted by procedure, or an image in the body's own texture layout."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -19,10 +19,10 @@ Carry = Callable[[np.ndarray], np.ndarray]
 
 
 def files(folder: Path) -> list[Path]:
-    """Pictures of a folder, by name.
+    """Return the paths of a folder's PNG images, sorted by name.
 
     Raises:
-        DataError: no such folder, or no PNG in it.
+        DataError: the folder does not exist, or has no PNG.
     """
     found = sorted(folder.glob("*.png"))
     if not found:
@@ -34,17 +34,17 @@ def files(folder: Path) -> list[Path]:
 
 
 def content(file: Path) -> bytes:
-    """A skin's file, whole.
+    """Return the whole content of a skin's file.
 
     Raises:
-        DataError: it is missing, or no regular file.
+        DataError: the file is missing, or is no regular file.
     """
     with guarded(file, "a picture of skin"):
         return read_bytes(file)
 
 
 def read(file: Path) -> UInt8[np.ndarray, "height width 3"]:
-    """A skin's pixels.
+    """Return a skin's pixels.
 
     Raises:
         DataError: the file is damaged.
@@ -56,7 +56,7 @@ def read(file: Path) -> UInt8[np.ndarray, "height width 3"]:
 def shown(
     pixels: UInt8[np.ndarray, "height width 3"], uv: Float[np.ndarray, "places 2"]
 ) -> Float[np.ndarray, "places 3"]:
-    """Linear light of a skin at places, interpolated between texels; v upwards."""
+    """Return the linear RGB of a skin at texture coordinates, v upwards, interpolated between texels."""
     light = linear(torch.from_numpy(pixels)).numpy()
     height, width = light.shape[:2]
     x = (uv[:, 0] * width - 0.5).clip(0, width - 1.001)
@@ -70,18 +70,22 @@ def shown(
 
 
 BLANK = 128
-"""Red, green and blue of texels that no one has painted: what garments are expected to cover."""
+"""Red, green and blue of unpainted texels, which garments are expected to cover."""
 
 
 def filled(
     colors: Float[np.ndarray, "vertices 3"], body: Anatomy, count: int, average: Carry, carried: Carry
 ) -> Float[np.ndarray, "vertices 3"]:
-    """Linear light of a skin at all vertices, where blank that of the face, blended into what lies around.
+    """Return the linear RGB of a skin at all vertices, with blank vertices filled.
+
+    They get the median colour of the face, blended into their surroundings.
 
     Args:
-        count: of the body's own vertices, the first of `colors`.
-        average: numbers of these to means over their neighbours.
-        carried: takes numbers of these to all.
+        colors: linear RGB of all vertices.
+        body: anatomy of all vertices.
+        count: number of the body's own vertices, which are the first of `colors`.
+        average: function from values of these to their means over neighbours.
+        carried: function that interpolates values of these to all vertices.
     """
     grey = float(linear(torch.tensor(BLANK, dtype=torch.uint8)))
     blank = np.asarray(np.abs(colors - grey).max(1) < 0.002)
@@ -92,13 +96,13 @@ def filled(
     own[open_] = np.median(colors[face], axis=0)
     for _ in range(40):
         own[open_] = average(own)[open_]
-    # a midpoint between what is blank and what is not takes from both
+    # a midpoint between a blank and a painted vertex is interpolated from both
     near = carried(np.where(open_, 1.0, 0.0)) > 0
     return np.where((blank | near)[:, None], carried(own), colors)
 
 
 def painted(body: Anatomy, random: Generator) -> Float[np.ndarray, "vertices 3"]:
-    """Skin with a face, linear light of every vertex."""
+    """Return the linear RGB of every vertex of a random skin with a face."""
     tone = _tone(random)
     spots = 1 + 0.05 * noise(body.place, 0.03, random) + 0.03 * noise(body.place, 0.01, random)
     found = tone * spots[:, None]
@@ -106,12 +110,12 @@ def painted(body: Anatomy, random: Generator) -> Float[np.ndarray, "vertices 3"]
 
 
 def _tone(random: Generator) -> Color:
-    depth = random.random()  # from light to dark
+    depth = random.random()  # 0 is light, 1 is dark
     return hue(24 - 5 * depth, 0.3 + 0.35 * depth, 0.95 - 0.6 * depth)
 
 
 def _with_face(body: Anatomy, found: np.ndarray, tone: Color, random: Generator) -> np.ndarray:
-    """Lips, cheeks, brows, eyes and shade about them, at their places on the head."""
+    """Return colours with lips, cheeks, brows, eyes and shade around them, at their positions on the head."""
     x, y, z = body.on_head.T
     face = (body.head > 0.5) & (z > 0.35)
     side = np.abs(x)
@@ -132,7 +136,7 @@ def _with_face(body: Anatomy, found: np.ndarray, tone: Color, random: Generator)
 
 
 def with_eyes(body: Anatomy, found: np.ndarray, random: Generator) -> Float[np.ndarray, "vertices 3"]:
-    """With the white, the iris and the pupil of both eyes, at their places on the head."""
+    """Return colours with the white, the iris and the pupil of both eyes, at their positions on the head."""
     x, y, z = body.on_head.T
     face = (body.head > 0.5) & (z > 0.35)
     away = (np.abs(x) - 0.355, y - 0.482)

@@ -1,4 +1,4 @@
-"""Textures of the subjects in a folder of `human_scans`, for the mesh of whoever comes."""
+"""Textures of the subjects in a folder of `human_scans`, for the meshes of these subjects."""
 
 import hashlib
 from functools import lru_cache
@@ -16,24 +16,24 @@ from framework.storage.reading import read_bytes
 from plugins.data.bodies import scan_layout
 
 KEPT = 16
-"""Textures that stay in memory: of 512 × 512 texels they take 67 MB."""
+"""Number of textures that stay in memory: they take 67 MB if they have 512 × 512 texels."""
 
 
 class Textures:
-    """Finds the texture of a person by the colours of the registered vertices, which are nobody else's.
+    """Textures by the colours of the registered vertices, which identify a subject.
 
-    So neither another order of the lists nor another folder lays one person's texture on another: who is not known is
-    refused.
+    A texture is therefore never drawn on another subject, even if the lists have another order or the folder is another
+    one. An unknown subject is refused.
 
     Args:
-        root: the folder, laid out as scan_layout says.
-        topology: which of the registered meshes come.
+        root: the folder, in the layout of scan_layout.
+        topology: topology of the registered meshes.
         faces: their triangles.
-        longest: texels along a side, at most; larger textures are averaged, as light.
+        longest: largest number of texels along a side; larger textures are averaged in linear RGB.
 
     Raises:
-        DataError: the folder, the places of the topology or a subject's texture is missing or damaged, or two subjects
-            with other textures have the same colours.
+        DataError: the folder, the texture coordinates of the topology or a subject's texture is missing or damaged, or
+            two subjects with different textures have the same colours.
     """
 
     def __init__(self, root: Path, topology: str, faces: Int[Tensor, "faces 3"], longest: int) -> None:
@@ -70,14 +70,14 @@ class Textures:
                 )
 
     def of(self, colors: Float[Tensor, "points 3"], row: int) -> Texture:
-        """What the mesh with these vertex colours shows.
+        """Return the texture of the mesh with these vertex colours.
 
         Args:
             colors: sRGB numbers in [0, 1].
-            row: of the batch, to be named.
+            row: row of the batch, for the message.
 
         Raises:
-            DataError: they are no subject's.
+            DataError: no subject has these colours.
         """
         numbers = (colors[: self.vertices].float() * 255).round().clamp(0, 255)
         file = self.files.get(_known_by(numbers.to(torch.uint8)))
@@ -96,7 +96,7 @@ def _known_by(colors: UInt8[Tensor, "vertices 3"]) -> bytes:
 
 @lru_cache(maxsize=KEPT)
 def _light(file: Path, longest: int) -> Float[Tensor, "height width 4"]:
-    """Light of a texture, and a channel of ones, of which the renderer makes how much of a pixel is covered."""
+    """Return a texture in linear RGB with a channel of ones, which renders as the share of a pixel that is covered."""
     pixels = scan_layout.read_texture(file.parents[2], file.parent.name)
     light = linear(torch.from_numpy(pixels))
     times = -(-max(light.shape[:2]) // longest)

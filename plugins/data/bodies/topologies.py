@@ -1,6 +1,7 @@
-"""Meshes of one body with fewer and with more vertices: some of it, or midpoints of its edges beside it.
+"""Meshes of one body with fewer or more vertices: a subset of its vertices, or its vertices and midpoints of its edges.
 
-All of them are rows of one finely split surface, so that what is known there (colours, places) is known for each.
+The vertices of all of them are rows of one finely split surface, so that values of that surface (colours, positions)
+hold for each mesh.
 """
 
 import hashlib
@@ -20,21 +21,26 @@ from plugins.data.bodies.body import Body
 from plugins.data.bodies.decimation import Decimated, decimated
 
 VERSION = 1
-"""Of what is kept of a decimation; a change takes a new number."""
+"""Version of the cached decimations; any change of them takes a new number."""
 Name = Literal["7k", "14k", "27k", "110k"]
 COUNTS: dict[Name, int] = {"7k": 6_890, "27k": 27_578, "110k": 110_312}
-"""Vertices; the first two are the thesis's (Table 7.1). "14k" is the default body as it is."""
+"""Numbers of vertices; the first two are the thesis's (Table 7.1). "14k" is the unchanged default body."""
 
 
 class Corners(NamedTuple):
-    """Triangles of vertices, and the same triangles of places in the texture."""
+    """Triangles of vertices, and the same triangles of texture coordinates."""
 
     faces: Int[np.ndarray, "faces 3"]
     uv_faces: Int[np.ndarray, "faces 3"]
 
 
 class Split(NamedTuple):
-    """A mesh after edges were split: its triangles, and between which old vertices and places every new one lies."""
+    """A mesh after edges were split.
+
+    Attributes:
+        corners: its triangles.
+        pairs, uv_pairs: the two old vertices, and the two old texture coordinates, around each new one.
+    """
 
     corners: Corners
     pairs: Int[np.ndarray, "new 2"]
@@ -43,11 +49,12 @@ class Split(NamedTuple):
 
 @dataclass(frozen=True)
 class Sheet:
-    """The body's surface with every edge split in the middle, as often as there are stages.
+    """The body's surface after all edges were split in the middle, once for each stage.
 
     Attributes:
-        corners: of the body, and after each stage.
-        pairs, uv_pairs: of each stage the ends of the edges whose midpoints follow the vertices (places) before.
+        corners: triangles of the body, and those after each stage.
+        pairs, uv_pairs: for each stage the ends of the split edges, whose midpoints follow the earlier vertices
+            (texture coordinates).
     """
 
     corners: tuple[Corners, ...]
@@ -56,13 +63,15 @@ class Sheet:
 
     @property
     def faces(self) -> Int[np.ndarray, "faces 3"]:
+        """Return the triangles after the last stage."""
         return self.corners[-1].faces
 
     def carried(self, values: np.ndarray, stages: int | None = None) -> np.ndarray:
-        """Numbers of the body's vertices for those of the sheet (after the first `stages`): means of their ends."""
+        """Return values of the body's vertices interpolated to those of the sheet (after the first `stages`)."""
         return _carried(values, self.pairs[:stages])
 
     def carried_uv(self, uv: Float[np.ndarray, "place 2"]) -> Float[np.ndarray, "places 2"]:
+        """Return the body's texture coordinates interpolated to those of the sheet."""
         return _carried(uv, self.uv_pairs)
 
 
@@ -71,9 +80,9 @@ class Topology:
     """A mesh whose vertices are rows of a sheet.
 
     Attributes:
-        rows: of the sheet's vertices.
+        rows: rows of the sheet's vertices.
         faces: rows of `rows`, corners counter-clockwise seen from outside.
-        uv_rows: of the sheet's places in the texture.
+        uv_rows: rows of the sheet's texture coordinates.
         uv_faces: rows of `uv_rows`.
     """
 
@@ -84,7 +93,10 @@ class Topology:
 
 
 def sheet(body: Body, stages: int = 2) -> Sheet:
-    """The body's surface, split so often. A body without places in a texture has its vertices' numbers for theirs."""
+    """Return the body's surface with edges split in `stages` stages.
+
+    For a body without texture coordinates, the numbers of its vertices take their role.
+    """
     corners = [Corners(body.faces, body.faces if body.uv_faces is None else body.uv_faces)]
     places = len(body.template) if body.uv is None else len(body.uv)
     pairs, uv_pairs, count = [], [], len(body.template)
@@ -98,7 +110,10 @@ def sheet(body: Body, stages: int = 2) -> Sheet:
 
 
 def topology(body: Body, surface: Sheet, name: Name) -> Topology:
-    """One of the meshes; of a body with fewer vertices as it is, or with each edge split once at most."""
+    """Return one of the meshes.
+
+    A body with too few vertices stays unchanged, or has each edge split once at most.
+    """
     vertices, places = len(body.template), len(body.template if body.uv is None else body.uv)
     wanted = COUNTS.get(name, vertices)
     if name == "7k":
@@ -122,13 +137,13 @@ def topology(body: Body, surface: Sheet, name: Name) -> Topology:
 def recognised(
     body: Body, vertices: int, faces: Int[np.ndarray, "faces 3"], source: str
 ) -> tuple[Sheet, Topology]:
-    """Which of the body's meshes this is.
+    """Return the sheet and the topology of the body that a mesh has.
 
     Raises:
-        DataError: none has so many vertices, or the one that has other triangles.
+        DataError: no mesh of the body has this number of vertices, or the one that has it has other triangles.
     """
     for name in ("14k", "7k", "27k", "110k"):
-        # decimating takes seconds
+        # decimation takes seconds, so it is done only if the number of vertices matches
         if name == "7k" and not vertices == COUNTS["7k"] < len(body.template):
             continue
         surface = sheet(body, {"7k": 0, "110k": 2}.get(name, 1))
@@ -149,11 +164,11 @@ def recognised(
 
 
 def in_topology(body: Body, surface: Sheet, mesh: Topology) -> Body:
-    """A body with the vertices of a mesh, each with the template, shapes and shares of joints that it has on the body's
-    surface: means of an edge's ends where it is a midpoint. Without places in a texture.
+    """Return a body with the vertices of a mesh, without texture coordinates.
 
-    Vertices of a decimated mesh are the body's own. A midpoint's skinning is not quite the middle of its edge where
-    that is bent.
+    Each vertex has the template, shapes and skinning weights of its point on the body's surface; at a midpoint they are
+    the means of the edge's ends. Vertices of a decimated mesh are the body's own. On a bent surface, the skinned
+    midpoint is not quite the middle of its edge.
     """
     parts = {
         part: surface.carried(getattr(body, part))[mesh.rows]
@@ -173,9 +188,8 @@ def split(
 ) -> Split:
     """Split edges, all or those chosen (in the order of `edges`), in the middle.
 
-    Args:
-        vertices, places: how many there are; midpoints are numbered from there on.
-        numbered_as_all: leave out the numbers of edges that are not split.
+    Midpoints are numbered from `vertices` and `places` on, the numbers of existing vertices and texture coordinates.
+    With `numbered_as_all`, edges that are not split also take a number, which stays unused.
     """
     pairs, sides = edges(corners.faces)
     uv_pairs, uv_sides = edges(corners.uv_faces)
@@ -193,8 +207,10 @@ def split(
 
 
 def edges(faces: Int[np.ndarray, "faces 3"]) -> tuple[Int[np.ndarray, "edge 2"], Int[np.ndarray, "faces 3"]]:
-    """All edges, lower end first, in ascending order; and the numbers of each triangle's sides, the first from its
-    first to its second corner."""
+    """Return all edges, lower end first, in ascending order, and the numbers of each triangle's sides.
+
+    The first side of a triangle leads from its first to its second corner.
+    """
     sides = np.sort(np.stack([faces, np.roll(faces, -1, 1)], -1), -1).reshape(-1, 2)
     keys = sides[:, 0] * (faces.max(initial=0) + 1) + sides[:, 1]
     _, first, numbers = np.unique(keys, return_index=True, return_inverse=True)
@@ -202,9 +218,9 @@ def edges(faces: Int[np.ndarray, "faces 3"]) -> tuple[Int[np.ndarray, "edge 2"],
 
 
 def _triangles(faces: np.ndarray, middle: np.ndarray, marked: np.ndarray) -> Int[np.ndarray, "triangles 3"]:
-    """What triangles become whose marked sides are split at the vertices `middle`."""
+    """Return the triangles after their marked sides are split at the vertices `middle`."""
     count = marked.sum(1)
-    # turned so that of one marked side it is the first, and of two the last is not
+    # corners are rotated so that a single marked side is the first, and of two marked sides neither is the last
     shift = np.where(count == 1, marked.argmax(1), np.where(count == 2, (~marked).argmax(1) + 1, 0)) % 3
     order = (np.arange(3) + shift[:, None]) % 3
     a, b, c = np.take_along_axis(faces, order, 1).T
@@ -230,7 +246,7 @@ def _carried(values: np.ndarray, stages: tuple[np.ndarray, ...]) -> np.ndarray:
 
 
 def _compact(rows: np.ndarray, faces: np.ndarray, uv_faces: np.ndarray) -> Topology:
-    """With triangles in the rows' numbers, and the places that are used."""
+    """Return the topology with triangles in the numbers of its rows, and with the used texture coordinates alone."""
     place = np.zeros(max(faces.max(initial=0), rows.max(initial=0)) + 1, np.int64)
     place[rows] = np.arange(len(rows))
     uv_rows, uv_numbers = np.unique(uv_faces, return_inverse=True)
@@ -238,7 +254,7 @@ def _compact(rows: np.ndarray, faces: np.ndarray, uv_faces: np.ndarray) -> Topol
 
 
 def _decimated(body: Body, corners: Corners, count: int) -> Decimated:
-    """From the cache: it takes some seconds."""
+    """Return a decimated body from the cache, because decimation takes some seconds."""
     digest = hashlib.sha256(np.ascontiguousarray(body.template).tobytes())
     for part in corners:
         digest.update(np.ascontiguousarray(part).tobytes())

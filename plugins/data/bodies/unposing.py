@@ -1,4 +1,4 @@
-"""Takes a registered mesh back to the rest pose: inverse linear blend skinning (thesis §7.4.3).
+"""Inverse linear blend skinning: takes a registered mesh back to the rest pose (thesis §7.4.3).
 
 The thesis makes a template of every subject, W⁻¹(X) - B_P(θ). Here that template is the model's plus offsets, so that
 another pose and another shape are the model's own with the same offsets.
@@ -13,16 +13,17 @@ from torch import Tensor
 from plugins.data.bodies.body import BodyModel
 
 SMALLEST = 0.2
-"""Singular value of a blended matrix from which on it is inverted: errors in a mesh grow fivefold at most. A vertex
-that follows two bones half and half has cos(φ / 2), φ the angle between them: 0.2 at 157°, 0 where one is turned over.
+"""Smallest singular value of a blended matrix that is inverted: errors in a mesh grow fivefold at most.
+
+A vertex that follows two bones half and half has cos(φ / 2), where φ is the angle between them: 0.2 at 157°, 0 at 180°.
 """
 
 
 class Unposed(NamedTuple):
-    """What a subject has beyond the model.
+    """A subject's differences from the model.
 
     Attributes:
-        offsets: in the rest pose, metres.
+        offsets: displacements in the rest pose, metres.
         folded: vertices whose blended matrix has a singular value below SMALLEST.
     """
 
@@ -38,14 +39,16 @@ def unposed(
     pose: Float[Tensor, "batch joint 3"],
     translation: Float[Tensor, "batch 3"],
 ) -> Unposed:
-    """Offsets with which the model, in this pose, has these vertices (metres).
+    """Return the offsets with which the model, in this pose, has these vertices (metres).
 
-    With A = Σ_j w_j R_j they are A⁻¹ r, where r is what the vertices are off the bare model's in this pose: skinning is
-    affine, and B_P(θ) is in both. Only r is divided, so errors of A do not count by the distance from the origin.
+    With A = Σ_j w_j R_j the offsets are A⁻¹ r, where r is the difference of the vertices from the bare model's in this
+    pose: skinning is affine, and B_P(θ) is in both. Only r is multiplied by A⁻¹, so that the effect of errors of A does
+    not grow with the distance from the origin.
 
-    Where A = U diag(σ) Vᵀ has a σ below SMALLEST the mesh hardly says what lies along that v: many places in the rest
-    pose meet there. 1/σ fades to σ/SMALLEST², so that the vertex goes to the model's own place along it, of which
-    posing in the same pose shows nothing; it does not jump, and no number grows without bound.
+    Where A = U diag(σ) Vᵀ has a σ below SMALLEST, the mesh hardly determines the component along that v: many positions
+    in the rest pose are mapped to the same point. 1/σ is replaced by σ/SMALLEST², which falls to 0, so that the vertex
+    moves to the model's own position along v; posing in the same pose shows no difference. The result is continuous and
+    bounded.
 
     Raises:
         ValueError: other shapes, or numbers that are not finite.
