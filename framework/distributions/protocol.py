@@ -314,9 +314,9 @@ def scales(density: Distribution) -> Tensor:
 
 
 class Slope(NamedTuple):
-    """A lower bound of log p that touches it (see `slope`): log_prob (*sample, *batch), gradient `pull`, and `stiffness`.
+    """A lower bound of log p that touches it (see `slope`): log_prob, its gradient `pull`, and a `stiffness`.
 
-    `pull` and `stiffness` are (*sample, *batch, *event).
+    log_prob is (*sample, *batch); `pull` and `stiffness` are (*sample, *batch, *event).
     """
 
     log_prob: Tensor
@@ -370,7 +370,10 @@ class ValueSet(ABC):
 
     @abstractmethod
     def size(self) -> Tensor:
-        """Return the size of each set: labels, radians of one angle, length of one real, volume of several; float64 (*batch)."""
+        """Return the size of each set, float64 (*batch).
+
+        The size is a number of labels, radians of one angle, the length for one real, or the volume for several.
+        """
 
     @abstractmethod
     def empty(self) -> Tensor:

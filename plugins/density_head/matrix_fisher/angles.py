@@ -1,4 +1,4 @@
-"""One angle of a viewpoint whose rotation is matrix Fisher: its log-density, from F = 0 to concentrations of 1e12."""
+"""The log-density of one angle of a viewpoint whose rotation is matrix Fisher, from F = 0 to concentrations of 1e12."""
 
 import math
 from collections.abc import Callable, Iterable
@@ -11,24 +11,28 @@ from plugins.density_head.matrix_fisher import quadrature, quaternions
 from plugins.density_head.matrix_fisher.functions import Frame, log_height
 
 CHUNK = 2**18
-"""Points at which the density is evaluated at once: arrays of 2 MB stay in the cache."""
+"""Number of points at which the density is evaluated at once: arrays of 2 MB stay in the cache."""
 FEW = {32: 19.0, 48: 54.0, 96: 236.0, 192: 368.0}
-"""Nodes of a plain rule, and the largest of λ up to which they do: Σ λᵢqᵢ² is c₀ - κ cos(a - φ) in each angle, κ at
-most half the largest λ, whatever the other angles are. Of exp(κ cos) the trapezium rule of N nodes on the circle errs
-by 2 I_N(κ)/I₀(κ), here below 1e-15 of the integral; for Gauss and Legendre's on half of it the bounds were tried out
-(`test_few_nodes_do_up_to_their_bound`: 5e-12). Beyond, nodes follow the peaks."""
+"""Number of nodes of a plain rule, and the largest λ for which this number suffices.
+
+Σ λᵢqᵢ² is c₀ - κ cos(a - φ) in each angle, with κ at most half the largest λ, whatever the other angles are. For
+exp(κ cos) the trapezium rule of N nodes on the circle errs by 2 I_N(κ)/I₀(κ), here below 1e-15 of the integral. For
+Gauss-Legendre quadrature on half of the circle the bounds were found by experiment
+(`test_few_nodes_do_up_to_their_bound`: 5e-12). For a larger λ, the nodes follow the peaks.
+"""
 MOST = 2 * quadrature.PEAKS * sum(quadrature.NODES)
-"""Nodes there."""
+"""Number of nodes that follow the peaks."""
 
 
 @torch.no_grad()
 def log_marginal(angle: Float[Tensor, "..."], frame: Frame, index: int) -> Float[Tensor, "..."]:
-    """Log-density of azimuth (index 0), elevation (1) or tilt (2), radians: nats, float64; the frame's batch shape
-    broadcasts with `angle`.
+    """Return the log-density of azimuth (index 0), elevation (1) or tilt (2), radians; nats, float64.
 
-    With the aligned quaternion linear in (cos, sin) of half of each angle, the energy Σ λᵢqᵢ² is a quadratic form of
-    the first angle's pair. Its smaller and larger eigenvalue μ and ν give the integral over that angle, and the
-    second is left to quadrature:
+    The batch shape of `frame` broadcasts with the shape of `angle`.
+
+    The aligned quaternion is linear in (cos, sin) of half of each angle, so the energy Σ λᵢqᵢ² is a quadratic form of
+    the first angle's pair. Its smaller and larger eigenvalues μ and ν give the integral over that angle, and the second
+    angle is integrated by quadrature:
 
         p(a) = ∫ cos e / (4π k(λ)) exp(-μ) I₀ₑ((ν-μ)/2) de.
     """
@@ -37,7 +41,7 @@ def log_marginal(angle: Float[Tensor, "..."], frame: Frame, index: int) -> Float
     parts = [part.expand(*shape, part.shape[-1]).reshape(-1, part.shape[-1]) for part in parts]
     angles = angle.double().expand(shape).reshape(-1)
     bounds = torch.tensor(list(FEW.values()), dtype=torch.float64, device=angles.device)
-    kind = torch.bucketize(parts[2].amax(-1), bounds)  # NaN: the last
+    kind = torch.bucketize(parts[2].amax(-1), bounds)  # NaN counts as the last kind
     found = torch.empty_like(angles)
     for number, count in enumerate([*FEW, None]):
         for rows in (kind == number).nonzero()[:, 0].split(CHUNK // (count or MOST)):
@@ -51,8 +55,11 @@ def log_marginal(angle: Float[Tensor, "..."], frame: Frame, index: int) -> Float
 def _log_integral(
     angle: Tensor, left: Tensor, right: Tensor, falls: Tensor, index: int, count: int | None
 ) -> Tensor:
-    """The integral over both other angles, without 1/k(λ), by so many nodes; None: as many as it takes."""
-    around = index == 1  # the azimuth is left to quadrature, otherwise the elevation
+    """Return the log of the integral over both other angles, without 1/k(λ), with `count` nodes.
+
+    If `count` is None, the nodes follow the peaks.
+    """
+    around = index == 1  # quadrature runs over the azimuth then, otherwise over the elevation
     log_density = _log_density(angle, left, right, falls, index)
     low, high = (-math.pi, math.pi) if around else (-math.pi / 2, math.pi / 2)
     if count is None:
@@ -67,7 +74,7 @@ def _log_integral(
 def _log_density(
     angle: Tensor, left: Tensor, right: Tensor, falls: Tensor, index: int
 ) -> Callable[[Tensor], Tensor]:
-    """Of a second angle, points (*batch, point), with the third integrated out."""
+    """Return the log-density of a second angle, points (*batch, point), with the third angle integrated out."""
     _, i, _, k = torch.eye(4, dtype=falls.dtype, device=falls.device)
     product = quaternions.product
     # the viewpoint's quaternion is (1, k)·(cos, sin)(t/2) (1, i)·(cos, sin)(e/2 - π/4) (1, -k)·(cos, sin)(a/2)
@@ -81,7 +88,7 @@ def _log_density(
         turned = quaternions.about(3, angle)
         corners = turned, product(turned, i), product(turned, k), product(turned, product(i, k))
     corners = [product(product(quaternions.inverse(left), corner), right)[..., 1:] for corner in corners]
-    # per component (*batch, 1)
+    # each component is (*batch, 1)
     even, odd, even_turned, odd_turned = (corner.unsqueeze(-1).unbind(-2) for corner in corners)
     fall = falls.unsqueeze(-1).unbind(-2)
 
@@ -94,7 +101,7 @@ def _log_density(
         one_one = _sum(fall[n] * first[n] * first[n] for n in range(3))
         two_two = _sum(scaled[n] * second[n] for n in range(3))
         one_two = _sum(scaled[n] * first[n] for n in range(3))
-        # of a Gram matrix (Cauchy and Binet): nothing cancels
+        # determinant of a Gram matrix as a sum of squares (Cauchy and Binet), so nothing cancels
         determinant = _sum(
             fall[n] * fall[m] * (first[n] * second[m] - first[m] * second[n]).square()
             for n, m in ((0, 1), (0, 2), (1, 2))

@@ -19,9 +19,9 @@ from plugins.density_head.matrix_fisher import angles, functions, quadrature, qu
 VOLUME = 8 * math.pi**2
 """∫ cos e da de dt over the chart."""
 CHART = ((-math.pi, math.pi), (-math.pi / 2, math.pi / 2), (-math.pi, math.pi))
-"""Of azimuth, elevation and tilt."""
+"""Ranges of azimuth, elevation and tilt, radians."""
 SUMMITS = 6
-"""Of the density of one angle on a grid, at which its mode is looked for."""
+"""Number of the highest maxima of the density of one angle on a grid, near which its mode is searched."""
 
 
 class MatrixFisher(Distribution):
@@ -32,10 +32,10 @@ class MatrixFisher(Distribution):
 
         log p(a, e, t) = log p(R) + log(cos e / 8π²),
 
-    p(R) with respect to the rotation-invariant measure of total mass 1. It integrates to 1 over the chart, and
-    samples lie in it. An elevation outside is read as the same rotation's viewpoint inside, (a+π, π-e, t+π): over
-    the whole torus of three angles it would integrate to 2. Independent von Mises angles integrate to 1 over the
-    torus; the mass that they spend outside the chart is no viewpoint's, so that on data from the chart this density
+    p(R) with respect to the rotation-invariant measure of total mass 1. The density integrates to 1 over the chart, and
+    samples lie in the chart. An elevation outside is read as the same rotation's viewpoint inside, (a+π, π-e, t+π):
+    over the whole torus of three angles the density would integrate to 2. Independent von Mises angles integrate to 1
+    over the torus; their mass outside the chart belongs to no viewpoint, so that on data from the chart this density
     starts with an advantage of up to log 2.
 
     At the poles the density is 0 in da de dt. No floating-point number is exactly π/2, so that log_prob and its
@@ -43,7 +43,7 @@ class MatrixFisher(Distribution):
 
     Args:
         parameter: F, (*batch, 3, 3); 0 is the uniform density of rotations.
-        dtype: of log_prob, samples and so on; the parameter's own where not given. Inside all is float64.
+        dtype: number type of log_prob, samples and so on; by default the parameter's. All computations are in float64.
     """
 
     arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
@@ -66,12 +66,12 @@ class MatrixFisher(Distribution):
 
     @property
     def mean_rotation(self) -> Float[Tensor, "*batch 3 3"]:
-        """E R, differentiable in F."""
+        """The mean rotation matrix E R, differentiable in F."""
         return functions.mean_rotation(self.parameter).to(self.dtype)
 
     @property
     def mode(self) -> Float[Tensor, "*batch 3"]:
-        """The likeliest rotation U Vᵀ: where log p(R), without the cos e of the chart, is highest."""
+        """The likeliest rotation U Vᵀ, where log p(R), without the cos e of the chart, is highest."""
         return quaternions.viewpoint(self.frame.mode).to(self.dtype)
 
     def log_prob(self, value: Float[Tensor, "... 3"]) -> Float[Tensor, "..."]:
@@ -85,23 +85,25 @@ class MatrixFisher(Distribution):
         return quaternions.viewpoint(self.frame.turn(aligned)).to(self.dtype)
 
     def entropy(self) -> Tensor:
-        """Nats, with respect to da de dt: that of the rotation in closed form, less E log(cos e / 8π²) by quadrature;
-        without gradient."""
+        """Return the entropy, nats, with respect to da de dt; without gradient.
+
+        It is the entropy of the rotation in closed form, minus E log(cos e / 8π²) by quadrature.
+        """
         elevation = Angle(self, 1)
         log_volume = elevation.expectation(_log_volume)
         return (functions.entropy(self.frame.falls) - log_volume).to(self.dtype)
 
 
 class Angle(Distribution):
-    """One angle of a matrix Fisher density, alone; no gradients.
+    """The density of one angle of a matrix Fisher density; without gradients.
 
-    A second angle integrates to a Bessel function in closed form, the third by quadrature whose nodes follow the
-    peaks (at most two for most F) from the uniform density to concentrations of 1e12. Elevations outside the chart
-    are read as those inside.
+    A second angle is integrated to a Bessel function in closed form, the third by quadrature whose nodes follow the
+    peaks (at most two for most F), from the uniform density to concentrations of 1e12. Elevations outside the chart
+    are read as the equivalent elevations inside.
 
     Args:
-        joint: of all three.
-        index: 0 azimuth, 1 elevation, 2 tilt.
+        joint: the density of all three angles.
+        index: 0 for azimuth, 1 for elevation, 2 for tilt.
     """
 
     arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
@@ -126,7 +128,7 @@ class Angle(Distribution):
 
     @property
     def mode(self) -> Float[Tensor, "*batch 1"]:
-        """The highest of the peaks next to the joint mode's angle and to the summits of a grid."""
+        """The highest of the peaks next to the joint mode's angle and next to the maxima on a grid."""
         points = 90
         around = grid(points, dtype=torch.float64, device=self.joint.parameter.device)
         step = 2 * math.pi / points
@@ -140,11 +142,11 @@ class Angle(Distribution):
         return found.unsqueeze(-1).to(self.joint.dtype)
 
     def entropy(self) -> Tensor:
-        """Nats, by quadrature."""
+        """Return the entropy, nats, by quadrature."""
         return entropy_of_one(self)
 
     def expectation(self, function: Callable[[Tensor], Tensor]) -> Float[Tensor, "*batch"]:
-        """E function(angle), float64; `function` takes and gives (*batch, point), radians in."""
+        """Return E function(angle), float64; `function` maps radians (*batch, point) to values (*batch, point)."""
         most = math.pi / 2 if self.index == 1 else math.pi
         like = self.joint.frame.falls[..., 0]
         points, weights = quadrature.nodes(self._log_density, -most, most, like, periodic=self.index != 1)
@@ -160,7 +162,7 @@ def _log_volume(elevation: Tensor) -> Tensor:
 
 
 estimate.register(MatrixFisher, exactly)
-estimate.register(Angle, exactly)  # by quadrature, which draws nothing
+estimate.register(Angle, exactly)  # quadrature draws nothing
 
 
 @marginal.register
@@ -170,7 +172,7 @@ def _(density: MatrixFisher, index: int) -> Angle:
 
 @uniform.register
 def _(density: MatrixFisher) -> MatrixFisher:
-    """Of rotations: that of Haar's measure, cos e / 8π² on the chart."""
+    """Return the uniform density of rotations, Haar's measure, which is cos e / 8π² on the chart."""
     return MatrixFisher(torch.zeros_like(density.parameter), density.dtype)
 
 
@@ -187,6 +189,9 @@ def _(density: MatrixFisher, index: Tensor) -> MatrixFisher:
 
 @tempered.register
 def _(density: MatrixFisher, temperature: Tensor) -> MatrixFisher:
-    """The power of the density of rotations, exp(tr(FᵀR))^(1/T): with F/T. Its viewpoint's density keeps the factor
-    cos e of the chart as it is, which is no one's belief."""
+    """Return the power of the density of rotations, exp(tr(FᵀR))^(1/T), which has the parameter F/T.
+
+    The density of the viewpoint keeps the chart's factor cos e as it is, since this factor is not part of the
+    prediction.
+    """
     return MatrixFisher(density.parameter / temperature, density.dtype)

@@ -5,10 +5,10 @@ the unit quaternion q of the aligned rotation UᵀRV,
 
     tr(FᵀR) = tr S - λ₁q₁² - λ₂q₂² - λ₃q₃²,   λ₁ = 2(s₂+s₃), λ₂ = 2(s₁+s₃), λ₃ = 2(s₁+s₂),
 
-so that q is Bingham (Mardia & Jupp 2000, §13.2.3) with *falls* 0 ≤ λ₁ ≤ λ₂ ≤ λ₃, any such. Nothing below
+so that q is Bingham (Mardia & Jupp 2000, §13.2.3) with any *falls* 0 ≤ λ₁ ≤ λ₂ ≤ λ₃. No function below
 subtracts large numbers that nearly agree: the density is its height at the mode, 1/k(λ) with
 k(λ) = c(F) exp(-tr S) = E exp(-Σ λᵢqᵢ²) over uniform q, times exp(-Σ λᵢqᵢ²). Densities are with respect to the
-rotation-invariant measure of total mass 1. All is computed in float64.
+rotation-invariant measure of total mass 1. All computations are in float64.
 """
 
 from fractions import Fraction
@@ -24,22 +24,28 @@ from torch.autograd import Function
 from plugins.density_head.matrix_fisher import quaternions
 
 SAMPLING_ROUNDS = 96
-"""At least 45 % of proposals are accepted (README): after 96 rounds fewer than one lane in 10^24 is left."""
+"""Largest number of proposals per lane.
+
+At least 45 % of proposals are accepted (README), so after 96 rounds fewer than one lane in 10^24 is left.
+"""
 REACH = 44.0
-"""exp(-44) is less than half the last digit of float64."""
+"""Exponent beyond which terms are left out: exp(-44) is less than half the last digit of float64."""
 NODES = (64, 48)
 PANEL = 4.0
-"""112 nodes in two panels keep log k to 3e-14 for falls from 0 to 1e30 (README)."""
+"""Length of the last panel in y; the two panels have NODES nodes.
+
+112 nodes in two panels keep log k to 3e-14 for falls from 0 to 1e30 (README).
+"""
 LARGE = 25.0
-"""From here on the asymptotic series of I₁/I₀ has all digits."""
+"""Concentration from which on the asymptotic series of I₁/I₀ has all digits."""
 
 
 class Frame(NamedTuple):
-    """F without its redundancies.
+    """The proper singular value decomposition of F, without redundant numbers.
 
     Attributes:
         left, right: (*batch, 3, 3), the rotations U and V.
-        falls: (*batch, 3), λ ascending.
+        falls: (*batch, 3), λ in ascending order.
     """
 
     left: Tensor
@@ -52,40 +58,40 @@ class Frame(NamedTuple):
         return self.turn(self.falls.new_tensor([1.0, 0, 0, 0]))
 
     def turn(self, aligned: Float[Tensor, "... 4"]) -> Float[Tensor, "... 4"]:
-        """The quaternion of R from that of UᵀRV."""
+        """Return the quaternion of R from the quaternion of UᵀRV."""
         left, right = quaternions.of_matrix(self.left), quaternions.of_matrix(self.right)
         return quaternions.product(quaternions.product(left, aligned), quaternions.inverse(right))
 
     def aligned(self, turn: Float[Tensor, "... 4"]) -> Float[Tensor, "... 4"]:
-        """The quaternion of UᵀRV from that of R."""
+        """Return the quaternion of UᵀRV from the quaternion of R."""
         left, right = quaternions.of_matrix(self.left), quaternions.of_matrix(self.right)
         return quaternions.product(quaternions.product(quaternions.inverse(left), turn), right)
 
 
 def log_prob(turn: Float[Tensor, "... 4"], parameter: Float[Tensor, "... 3 3"]) -> Float[Tensor, "..."]:
-    """Log-density, nats, of the rotation with unit quaternion `turn`, float64; batch shapes broadcast.
+    """Return the log-density, nats, float64, of the rotation with unit quaternion `turn`; batch shapes broadcast.
 
     Its first and second derivatives in both arguments are accurate everywhere, also where singular values are equal
-    or zero: they are moments of the rotation, and no gap between singular values is divided by. The derivative in
-    the turn is meant for chains that keep it of unit length.
+    or zero: they are moments of the rotation, and are computed without division by a gap between singular values. The
+    derivative in the turn is meant for chains that keep the quaternion of unit length.
     """
     return _LogProb.apply(turn.double(), parameter.double())
 
 
 def mean_rotation(parameter: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """E R = U diag(d) Vᵀ, the derivative of log c in F (Lee 2018, Thm. 1), float64; differentiable once."""
+    """Return E R = U diag(d) Vᵀ, the derivative of log c in F (Lee 2018, Thm. 1), float64; differentiable once."""
     return _Mean.apply(parameter.double())
 
 
 @torch.no_grad()
 def entropy(falls: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-    """-E log p = log k + Σ λᵢ E qᵢ², nats, at most 0, with respect to the measure of total mass 1."""
+    """Return -E log p = log k + Σ λᵢ E qᵢ², nats, at most 0, with respect to the measure of total mass 1."""
     return log_height(falls).neg() + (falls * second_moments(falls)).sum(-1)
 
 
 @torch.no_grad()
 def align(parameter: Float[Tensor, "*batch 3 3"]) -> Frame:
-    """The proper singular value decomposition, float64; with equal singular values one of the many."""
+    """Return the proper singular value decomposition, float64; with equal singular values, one of the many."""
     left, singular, right = torch.linalg.svd(parameter.double())
     right = right.mT
     flips = torch.stack([torch.linalg.det(left), torch.linalg.det(right)]).sign()
@@ -102,15 +108,15 @@ def align(parameter: Float[Tensor, "*batch 3 3"]) -> Frame:
 
 @torch.no_grad()
 def log_height(falls: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-    """-log k(λ): the log-density at the mode, nats, float64."""
+    """Return -log k(λ), the log-density at the mode, nats, float64."""
     return -_quadrature(falls)[2].sum(-1).log()
 
 
 @torch.no_grad()
 def second_moments(falls: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-    """E qᵢ² = -∂log k/∂λᵢ for i = 1, 2, 3, each to full relative precision.
+    """Return E qᵢ² = -∂log k/∂λᵢ for i = 1, 2, 3, each to full relative precision.
 
-    They give the diagonal of E UᵀRV, for example d₁ = 1 - 2(E q₂² + E q₃²).
+    These moments give the diagonal of E UᵀRV, for example d₁ = 1 - 2(E q₂² + E q₃²).
     """
     outer, inner, mass = _quadrature(falls)
     mass = mass / mass.sum(-1, keepdim=True)
@@ -122,7 +128,7 @@ def second_moments(falls: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"
 
 @torch.no_grad()
 def fourth_moments(falls: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4 4"]:
-    """E qᵢ²qⱼ² for i, j = 0, ..., 3, each to nearly full relative precision."""
+    """Return E qᵢ²qⱼ² for i, j = 0, ..., 3, each to nearly full relative precision."""
     outer, inner, mass = _quadrature(falls)
     mass = mass / mass.sum(-1, keepdim=True)
     blocks = []
@@ -146,16 +152,16 @@ def fourth_moments(falls: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4 
 
 @torch.no_grad()
 def sample(falls: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4"]:
-    """One aligned quaternion per element by rejection (Kent, Ganeiber & Mardia 2018, §3), float64.
+    """Return one aligned quaternion per element by rejection (Kent, Ganeiber & Mardia 2018, §3), float64.
 
     The proposal is the angular central Gaussian z/|z| with zᵢ ~ N(0, 1/(1 + 2λᵢ/b)); b solves Σᵢ 1/(b + 2λᵢ) = 1,
-    λ₀ = 0 among them. Lanes that have not accepted after SAMPLING_ROUNDS keep their last proposal: no input can
-    hang the loop.
+    with λ₀ = 0 included. Lanes that have not accepted after SAMPLING_ROUNDS keep their last proposal, so that no input
+    can hang the loop.
     """
     fall = falls.double().reshape(-1, 3)
     fall = torch.cat([torch.zeros_like(fall[:, :1]), fall], -1)
     width = torch.ones_like(fall[:, :1])
-    for _ in range(40):  # Newton from the left of a convex falling function: it never oversteps
+    for _ in range(40):  # Newton's method from the left on a convex falling function never oversteps
         parts = 1 / (width + 2 * fall)
         width = width + (parts.sum(-1, keepdim=True) - 1) / parts.square().sum(-1, keepdim=True)
     width = width.clamp(1, 4)
@@ -170,7 +176,7 @@ def sample(falls: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4"]:
 
 
 def _propose(fall: Tensor, width: Tensor) -> tuple[Tensor, Tensor]:
-    """One proposal per lane, and whether it is rejected."""
+    """Return one proposal per lane, and whether it is rejected."""
     normal = torch.randn_like(fall) / (1 + 2 * fall / width).sqrt()
     turn = normal / torch.linalg.vector_norm(normal, dim=-1, keepdim=True)
     cost = (fall * turn.square()).sum(-1)
@@ -181,22 +187,22 @@ def _propose(fall: Tensor, width: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class _Circle(NamedTuple):
-    """(r cos φ, r sin φ), r² and the concentration of 2φ, at the nodes: 2φ is von Mises about 0."""
+    """The circle (r cos φ, r sin φ) at the nodes, as r² and the concentration of 2φ, which is von Mises about 0."""
 
     square: Tensor
     concentration: Tensor
 
 
 def _quadrature(falls: Tensor) -> tuple[_Circle, _Circle, Tensor]:
-    """k(λ) as a sum over nodes: the circles of (q₀, q₁) and of (q₂, q₃) there, and the mass (*batch, node).
+    """Return k(λ) as a sum over nodes: the circles of (q₀, q₁) and of (q₂, q₃), and the mass (*batch, node).
 
     w = q₂² + q₃² is uniform on [0, 1] and the two directions are uniform (cf. Lee 2018, eq. 12, which pairs the
     components otherwise). On each circle the density integrates to a Bessel function:
 
         k(λ) = ∫₀¹ exp(-λ₂w) I₀ₑ((λ₃-λ₂)w/2) I₀ₑ(λ₁(1-w)/2) dw,   I₀ₑ(x) = I₀(x) exp(-x).
 
-    This pairing decays fastest. Its scales 1/λ₃ ≪ 1/λ₂ are spread out by √w = t₀ sinh y: Gauss-Legendre in y, in two
-    panels of which the last holds the decay.
+    This pairing decays fastest. Its scales 1/λ₃ ≪ 1/λ₂ are spread out by √w = t₀ sinh y, with Gauss-Legendre quadrature
+    in y on two panels, of which the last holds the decay.
     """
     first, second, third = (falls.double()[..., index, None] for index in range(3))
     end = REACH / second.clamp(min=REACH)
@@ -217,7 +223,7 @@ def _quadrature(falls: Tensor) -> tuple[_Circle, _Circle, Tensor]:
 
 
 def _legendre(count: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Nodes and weights of Gauss and Legendre on [0, 1]."""
+    """Return nodes and weights of Gauss-Legendre quadrature on [0, 1]."""
     nodes, weights = _legendre_numbers(count)
     return torch.tensor(nodes, device=device), torch.tensor(weights, device=device)
 
@@ -228,7 +234,7 @@ def _legendre_numbers(count: int) -> tuple[np.ndarray, np.ndarray]:
     return (nodes + 1) / 2, weights / 2
 
 
-# Of 2φ von Mises about 0 with concentration κ, A = I₁/I₀ (Mardia & Jupp 2000, §3.5.4):
+# For 2φ von Mises about 0 with concentration κ, and A = I₁/I₀ (Mardia & Jupp 2000, §3.5.4):
 # E sin²φ = (1-A)/2, E sin²φ cos²φ = A/(4κ), E sin⁴φ = (1-A)/2 - A/(4κ).
 
 
@@ -250,7 +256,7 @@ def _sine_fourth(concentration: Tensor) -> Tensor:
 
 
 def _ratio(concentration: Tensor) -> tuple[Tensor, Tensor]:
-    """Whether the concentration is small enough for 1 - A to be taken directly, and A."""
+    """Return whether the concentration is small enough to compute 1 - A directly, and A."""
     return concentration < LARGE, torch.special.i1e(concentration) / torch.special.i0e(concentration)
 
 
@@ -265,7 +271,10 @@ def _series(name: str, concentration: Tensor) -> Tensor:
 
 @cache
 def _coefficients(terms: int = 20) -> dict[str, list[float]]:
-    """Of the asymptotic series in 1/κ. That of A solves A' = 1 - A² - A/κ (Mardia & Jupp 2000, A.14)."""
+    """Return coefficients of the asymptotic series in 1/κ.
+
+    The series of A solves A' = 1 - A² - A/κ (Mardia & Jupp 2000, A.14).
+    """
     ratio = [Fraction(1)]
     for order in range(1, terms):
         squares = sum(ratio[index] * ratio[order - index] for index in range(1, order))
@@ -278,7 +287,7 @@ def _coefficients(terms: int = 20) -> dict[str, list[float]]:
 
 
 class _LogProb(Function):
-    """Its derivative in F is R - E R, in the turn that of -Σ λᵢqᵢ²."""
+    """The log-density; its derivative in F is R - E R, and in the quaternion that of -Σ λᵢqᵢ²."""
 
     @staticmethod
     def forward(ctx: Any, turn: Tensor, parameter: Tensor) -> Tensor:
@@ -291,7 +300,7 @@ class _LogProb(Function):
         turn, parameter, *parts = ctx.saved_tensors
         frame = Frame(*parts)
         by_turn = by_parameter = None
-        if torch.is_grad_enabled():  # a second derivative is wanted: the same in operations that have one
+        if torch.is_grad_enabled():  # a second derivative is wanted: use operations that have a derivative
             if ctx.needs_input_grad[0]:
                 by_turn = 2 * (_quadratic_form(parameter) @ turn[..., None]).squeeze(-1)
             if ctx.needs_input_grad[1]:
@@ -316,7 +325,7 @@ class _LogProb(Function):
 
 
 class _Mean(Function):
-    """E R; its derivative is the covariance of the elements of R, which alignment makes nearly diagonal."""
+    """The mean rotation E R; its derivative is the covariance of the elements of R, nearly diagonal after alignment."""
 
     @staticmethod
     def forward(ctx: Any, parameter: Tensor) -> Tensor:
@@ -349,13 +358,13 @@ class _Mean(Function):
 
 
 def _shrinkage(falls: Tensor) -> Tensor:
-    """1 - dᵢ = 2 Σ_{j≠i} E qⱼ², (*batch, 3)."""
+    """Return 1 - dᵢ = 2 Σ_{j≠i} E qⱼ², (*batch, 3)."""
     first, second, third = second_moments(falls).unbind(-1)
     return 2 * torch.stack([second + third, first + third, first + second], -1)
 
 
 def _quadratic_form(parameter: Tensor) -> Tensor:
-    """K with tr(FᵀR) = qᵀ K q (Mardia & Jupp 2000, §13.2.3), (*batch, 4, 4)."""
+    """Return K with tr(FᵀR) = qᵀ K q (Mardia & Jupp 2000, §13.2.3), (*batch, 4, 4)."""
     (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in parameter.unbind(-2))
     rows = [
         torch.stack([a + e + i, h - f, c - g, d - b], -1),

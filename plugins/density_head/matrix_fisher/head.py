@@ -1,4 +1,4 @@
-"""The matrix Fisher head: nine numbers, one density over viewpoints."""
+"""The matrix Fisher head, which turns nine raw parameters into one density over viewpoints."""
 
 from collections.abc import Mapping
 from typing import ClassVar
@@ -15,15 +15,15 @@ from plugins.density_head.matrix_fisher.density import MatrixFisher
 
 ANGLES = ("azimuth", "elevation", "tilt")
 LARGEST_PARAMETER = 1e12
-"""Largest |F|: standard deviations of a microradian; float32 angles resolve no more."""
+"""Largest |F|, with standard deviations of a microradian; float32 angles resolve no more."""
 
 
 class MatrixFisherHead(DensityHead):
-    """One matrix Fisher density of the rotation, azimuth, elevation and tilt jointly.
+    """One joint matrix Fisher density of azimuth, elevation and tilt, through the rotation that they describe.
 
-    The joint density that the thesis leaves to future work (§3.7), with a network as in Mohlin et al. 2020.
+    The thesis leaves this joint density to future work (§3.7). The network is as in Mohlin et al. 2020.
 
-    Reads the nine elements of a matrix X, row by row, of which F is a multiple that grows faster than X
+    The head reads the nine elements of a matrix X, row by row. F is a multiple of X that grows faster than X
     (`parameter_of_raw`). F is the density's natural parameter, so that the uniform density of rotations, X = 0, is a
     point like any other.
 
@@ -58,17 +58,17 @@ class MatrixFisherHead(DensityHead):
         return -self(raw).log_prob(target)
 
     def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
-        pass  # everything is trained
+        pass  # all parameters are trained
 
 
 def parameter_of_raw(raw: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """F = X (1 + |X|²/16)^(3/2), float64, at most LARGEST_PARAMETER in the Frobenius norm |F|.
+    """Return F = X (1 + |X|²/16)^(3/2), float64, at most LARGEST_PARAMETER in the Frobenius norm |F|.
 
-    F = X near 0, and |F| grows with the fourth power: a concentration of 1e4 is as near as |X| = 27, and no gradient
-    explodes. Smooth at 0, since only |X|² is read.
+    F = X near 0, and |F| grows with the fourth power: |X| = 27 already gives a concentration of 1e4, and no gradient
+    explodes. The function is smooth at 0, since it reads only |X|².
     """
-    raw = raw.double().clamp(-1e100, 1e100)  # so that squares do not overflow
+    raw = raw.double().clamp(-1e100, 1e100)  # keeps squares from overflowing
     square = raw.square().sum((-2, -1), keepdim=True)
     growth = (1 + square / 16) ** 1.5
-    # the norm is at least 1 where the bound is felt, and its root has no gradient at 0
+    # where the bound applies the norm is at least 1; the clamp avoids the root at 0, which has no gradient
     return raw * torch.minimum(growth, LARGEST_PARAMETER / square.clamp(min=1).sqrt())

@@ -1,4 +1,4 @@
-"""Integrals over one angle of functions with one or two peaks of any width, many at once."""
+"""Integrals over one angle of many functions at once, each with one or two peaks of any width."""
 
 from collections.abc import Callable
 from functools import cache
@@ -9,13 +9,16 @@ from jaxtyping import Float
 from torch import Tensor
 
 GRID = 64
-"""Cells in which peaks are looked for."""
+"""Number of cells in which peaks are searched."""
 PEAKS = 2
-"""The highest have nodes of their own."""
+"""Number of highest peaks that have nodes of their own."""
 ROUNDS = 14
-"""Each narrows a peak's bracket fivefold, or moves it: 0.1 rad becomes 1e-8 in ten."""
+"""Number of rounds that refine a peak.
+
+Each round narrows a peak's bracket fivefold, or moves it: 0.1 rad becomes 1e-8 in ten rounds.
+"""
 NEAR = 12.0
-"""A panel reaches from the peak to so many of its widths, another from there to the end."""
+"""Number of a peak's widths that the panel next to the peak covers; a second panel covers the rest."""
 NODES = (32, 24)
 
 
@@ -27,15 +30,16 @@ def nodes(
     like: Float[Tensor, "*batch"],
     periodic: bool = False,
 ) -> tuple[Float[Tensor, "*batch node"], Float[Tensor, "*batch node"]]:
-    """Nodes, radians, and weights of a quadrature over [low, high] that resolves exp(log_density).
+    """Return nodes, radians, and weights of a quadrature over [low, high] that resolves exp(log_density).
 
     Where log_density has more than two maxima, only the two highest have nodes of their own.
 
     Args:
-        log_density: points (*batch, point) → (*batch, point), nats up to a constant per batch element.
-        low, high: ends, radians.
-        like: tells batch shape and device.
-        periodic: high is low again; then the interval is cut where log_density is least.
+        log_density: maps points (*batch, point) to values (*batch, point), nats up to a constant per batch element.
+        low: lower end, radians.
+        high: upper end, radians.
+        like: a tensor with the batch shape and device.
+        periodic: whether high is the same angle as low; then the interval is cut where log_density is least.
     """
     step = (high - low) / GRID
     grid = torch.linspace(low, high, GRID + 1, dtype=torch.float64, device=like.device)
@@ -53,7 +57,7 @@ def nodes(
     absent = heights == -torch.inf
     index, order = index.where(~absent, GRID).sort(
         -1
-    )  # what is no peak goes to the end, where its piece is empty
+    )  # an absent peak moves to the end, where its piece is empty
     absent = absent.gather(-1, order)
     summit = grid.gather(-1, index)
     peak, width = _refine(
@@ -83,7 +87,7 @@ def nodes(
 
 @cache
 def equal(count: int, low: float, high: float) -> tuple[Float[Tensor, "node"], Float[Tensor, "node"]]:
-    """Nodes and weights of the trapezium rule over one period."""
+    """Return nodes and weights of the trapezium rule over one period."""
     step = (high - low) / count
     return low + step * torch.arange(count, dtype=torch.float64), torch.full(
         (count,), step, dtype=torch.float64
@@ -92,7 +96,7 @@ def equal(count: int, low: float, high: float) -> tuple[Float[Tensor, "node"], F
 
 @cache
 def gauss(count: int, low: float, high: float) -> tuple[Float[Tensor, "node"], Float[Tensor, "node"]]:
-    """Nodes and weights of Gauss and Legendre."""
+    """Return nodes and weights of Gauss-Legendre quadrature."""
     at, weights = np.polynomial.legendre.leggauss(count)
     half = (high - low) / 2
     return torch.from_numpy(low + half * (at + 1)), torch.from_numpy(half * weights)
@@ -110,8 +114,10 @@ def maximum(
 def _refine(
     log_density: Callable[[Tensor], Tensor], centre: Tensor, reach: float, low: Tensor, high: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Peaks by parabolas through three points ever closer, kept in [low, high], and the widths over which the
-    logarithm falls by about one."""
+    """Return peaks, kept in [low, high], and the widths over which the logarithm falls by about one.
+
+    A peak is found by parabolas through three points that come ever closer.
+    """
     width, step = torch.full_like(centre, torch.inf), torch.full_like(centre, reach)
     for _ in range(ROUNDS):
         three = log_density(torch.cat([centre - step, centre, centre + step], -1))
@@ -122,13 +128,16 @@ def _refine(
         fall = torch.maximum(bend.clamp(min=0).sqrt(), slope.abs())
         width = torch.where(fall > 0.3, step / fall, width)
         centre = torch.maximum(torch.minimum(centre + step * move, high), low)
-        # a parabola whose top is further away is not believed
+        # a parabola whose maximum lies outside of the three points is not trusted: the step stays as it is
         step = torch.where(inside | (centre == high) | (centre == low), step / 5, step)
     return centre, width.clamp(max=1.0)
 
 
 def _half(length: Tensor, width: Tensor) -> tuple[Tensor, Tensor]:
-    """Offsets from a peak and their weights over [0, length]: Gauss-Legendre in y with offset = width sinh y."""
+    """Return offsets from a peak and their weights over [0, length].
+
+    This is Gauss-Legendre quadrature in y with offset = width sinh y.
+    """
     ends = [
         torch.asinh(torch.minimum(length / width, torch.full_like(length, NEAR))),
         torch.asinh(length / width),

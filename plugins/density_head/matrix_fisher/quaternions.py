@@ -1,4 +1,4 @@
-"""Unit quaternions (…, 4), real part first: rotations of which the small ones lose no digits. q and -q are the same.
+"""Unit quaternions (…, 4), real part first, as rotations; small rotations keep all digits, and q equals -q.
 
 A viewpoint's rotation is framework.geometry.rotation.viewpoint_rotation: Rz(tilt) Rx(elevation - π/2) Rz(-azimuth).
 """
@@ -10,11 +10,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 Quaternions = Float[Tensor, "... 4"]
-"""Batch shapes broadcast."""
+"""Unit quaternions; their batch shapes broadcast."""
 
 
 def product(first: Quaternions, second: Quaternions) -> Quaternions:
-    """The quaternion of the rotation `first` after the rotation `second`; batch shapes broadcast."""
+    """Return the quaternion of the rotation `first` after the rotation `second`; batch shapes broadcast."""
     a, b, c, d = first.unbind(-1)
     e, f, g, h = second.unbind(-1)
     return torch.stack(
@@ -29,19 +29,19 @@ def product(first: Quaternions, second: Quaternions) -> Quaternions:
 
 
 def inverse(turn: Quaternions) -> Quaternions:
-    """The quaternion of the inverse rotation."""
+    """Return the quaternion of the inverse rotation."""
     return torch.cat([turn[..., :1], -turn[..., 1:]], -1)
 
 
 def about(axis: int, angle: Float[Tensor, "..."]) -> Quaternions:
-    """The rotation by `angle`, radians, about the axis 1 (x), 2 (y) or 3 (z)."""
+    """Return the quaternion of the rotation by `angle`, radians, about the axis 1 (x), 2 (y) or 3 (z)."""
     numbers = [torch.zeros_like(angle)] * 4
     numbers[0], numbers[axis] = torch.cos(angle / 2), torch.sin(angle / 2)
     return torch.stack(numbers, -1)
 
 
 def of_viewpoint(angles: Float[Tensor, "... 3"]) -> Quaternions:
-    """The rotation of azimuth, elevation and tilt, radians."""
+    """Return the quaternion of the rotation with azimuth, elevation and tilt, radians."""
     azimuth, elevation, tilt = angles.unbind(-1)
     half, sum_, difference = elevation / 2 - math.pi / 4, (tilt + azimuth) / 2, (tilt - azimuth) / 2
     cosine, sine = torch.cos(half), torch.sin(half)
@@ -57,10 +57,10 @@ def of_viewpoint(angles: Float[Tensor, "... 3"]) -> Quaternions:
 
 
 def viewpoint(turn: Quaternions) -> Float[Tensor, "... 3"]:
-    """Azimuth and tilt in [-π, π], elevation in [-π/2, π/2], radians; at the poles one of the many."""
+    """Return azimuth and tilt in [-π, π] and elevation in [-π/2, π/2], radians; at the poles one of many viewpoints."""
     real, x, y, z = turn.unbind(-1)
     elevation = math.pi / 2 - 2 * torch.atan2(torch.hypot(x, y), torch.hypot(real, z))
-    # of_viewpoint read backwards; in the chart its sine is never positive and its cosine never negative
+    # the inverse of of_viewpoint; in the chart its sine is never positive and its cosine never negative
     difference, sum_ = torch.atan2(z, real), torch.atan2(-y, -x)
     azimuth, tilt = sum_ - difference, sum_ + difference
     turn_ = 2 * math.pi
@@ -69,9 +69,9 @@ def viewpoint(turn: Quaternions) -> Float[Tensor, "... 3"]:
 
 
 def of_matrix(matrix: Float[Tensor, "... 3 3"]) -> Quaternions:
-    """The quaternion of a rotation matrix, to full precision at any angle."""
+    """Return the quaternion of a rotation matrix, to full precision at any angle."""
     (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in matrix.unbind(-2))
-    # 4 q qᵀ; its row of the largest diagonal element, at least 1, is q but for its length
+    # 4 q qᵀ; the row of its largest diagonal element, at least 1, is a multiple of q
     rows = torch.stack(
         [
             torch.stack([1 + a + e + i, h - f, c - g, d - b], -1),
@@ -87,7 +87,7 @@ def of_matrix(matrix: Float[Tensor, "... 3 3"]) -> Quaternions:
 
 
 def matrix_less_identity(turn: Quaternions) -> Float[Tensor, "... 3 3"]:
-    """R - I: of small rotations without cancellation."""
+    """Return R - I, for small rotations without cancellation."""
     w, x, y, z = turn.unbind(-1)
     rows = [
         torch.stack([-2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),

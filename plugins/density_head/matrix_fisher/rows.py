@@ -1,4 +1,4 @@
-"""Rows of the contract: the matrix Fisher head, with log-densities from 60 digits and another quadrature."""
+"""Rows of the contract for the matrix Fisher head, with log-densities from 60 digits and another quadrature."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -15,7 +15,7 @@ from plugins.density_head.matrix_fisher.head import ANGLES, LARGEST_PARAMETER
 
 TARGET = Target("angle", ANGLES)
 TURN = [[2.0, -1.0, 2.0], [2.0, 2.0, -1.0], [-1.0, 2.0, 2.0]]
-"""Three times a rotation: all singular values are exactly 3."""
+"""A rotation multiplied by three, so that all singular values are exactly 3."""
 GENERIC = [[0.5, -1.25, 0.75], [2.0, 0.125, -0.5], [0.25, 1.5, -1.0]]
 VALUES = [[0.3, 0.2, -0.1], [2.5, -1.2, 3.0], [-1.0, 1.5, 0.7], [4.0, 2.0, -5.0], [1000.0, -0.5, -1e6]]
 RAWS = {
@@ -38,7 +38,7 @@ RAWS = {
 
 
 def exact(raw: np.ndarray, value: np.ndarray) -> float:
-    """log p(a, e, t) = tr(FᵀR) - log c(F) + log(|cos e| / 8π²), in 60 digits but for 15 of c(F) exp(-tr S)."""
+    """Return log p(a, e, t) = tr(FᵀR) - log c(F) + log(|cos e| / 8π²), in 60 digits, and 15 for c(F) exp(-tr S)."""
     with mpmath.workdps(60):
         parameter = _parameter(raw)
         left, singular, right = mpmath.svd_r(parameter)
@@ -52,15 +52,15 @@ def exact(raw: np.ndarray, value: np.ndarray) -> float:
 
 
 def log_constant(first: float, second: float, third: float) -> float:
-    """log(c(F) exp(-tr S)) by Lee's integral (2018, eq. 12, u = 1 - 2w) of the falls λ, Gauss-Legendre on panels that
-    shrink tenfold every other panel towards both ends.
+    """Return log(c(F) exp(-tr S)) by Lee's integral (2018, eq. 12, u = 1 - 2w) of the falls λ.
 
-    It pairs the quaternion's components otherwise than functions.py does: (q₀, q₃) and (q₁, q₂).
+    The integral uses Gauss-Legendre quadrature on panels that shrink tenfold every other panel towards both ends. It
+    pairs the quaternion's components otherwise than functions.py does: (q₀, q₃) and (q₁, q₂).
     """
     borders = np.concatenate([[0.0], np.logspace(-40, np.log10(0.5), 80)])
     nodes, weights = np.polynomial.legendre.leggauss(24)
     half = np.diff(borders)[:, None] / 2
-    near = (borders[:-1, None] + half * (nodes + 1)).ravel()  # w, and then 1 - w
+    near = (borders[:-1, None] + half * (nodes + 1)).ravel()  # values of w, and in the second pass of 1 - w
     weight = (half * weights).ravel()
     total = 0.0
     for w, rest in ((near, 1 - near), (1 - near, near)):
@@ -70,7 +70,7 @@ def log_constant(first: float, second: float, third: float) -> float:
 
 
 def _parameter(raw: np.ndarray) -> Any:
-    """F of raw numbers, as the head promises."""
+    """Return F for raw parameters, as the head's docstring defines it."""
     matrix = mpmath.matrix(raw.tolist())
     square = sum(number**2 for number in matrix)
     if square == 0:
@@ -91,7 +91,7 @@ def _rotation(azimuth: Any, elevation: Any, tilt: Any) -> Any:
 
 
 def cases(head: DensityHead) -> Iterator[Case]:
-    """Every matrix at a few viewpoints, of which some lie outside the chart or many turns on."""
+    """Yield a case for every matrix with a few viewpoints, some outside the chart or many turns further."""
     for name, matrix in RAWS.items():
         raw = torch.tensor(matrix.ravel()).float().double().expand(len(VALUES), 9)
         value = torch.tensor(VALUES).float().double()

@@ -41,7 +41,10 @@ def random_rotations(count, seed=0):
 
 
 def chart(points=72):
-    """Azimuth, elevation and tilt (point, point, point, 3), and weights of ∫ da de dt (point, 1), spectrally exact."""
+    """Return azimuth, elevation and tilt (point, point, point, 3), and weights of ∫ da de dt (point, 1).
+
+    The weights are spectrally exact.
+    """
     turn = (torch.arange(points).double() / points * 2 - 1) * math.pi
     nodes, weights = np.polynomial.legendre.leggauss(points)
     axes = torch.meshgrid(turn, double(nodes) * math.pi / 2, turn, indexing="ij")
@@ -247,8 +250,10 @@ def test_concentrated_densities_are_normal(concentration):
 
 @pytest.mark.parametrize("concentration", [1e-3, 1.0, 1e2, 1e4])
 def test_the_mode_of_an_angle_is_its_highest_place(concentration):
-    """Of ranks 0 to 3, against a fine grid that is finer about its own highest point; of rank one the angle has two
-    narrow peaks, of which only one is near the likeliest rotation's."""
+    """Compare the mode for ranks 0 to 3 with a fine grid that is finer about its own highest point.
+
+    For rank one the angle has two narrow peaks, of which only one is near the likeliest rotation's.
+    """
     left, right = random_rotations(2, seed=3)
     shapes = [(0, 0, 0), (1, 0, 0), (1, 0.6, 0), (1, 0.5, 0.1), (1, 0.6, -0.6)]
     parameters = [left @ torch.diag(concentration * double(shape)) @ right.T for shape in shapes]
@@ -290,7 +295,7 @@ def test_marginals_of_ridges_and_flat_directions_integrate_to_one(concentration,
     ],
 )
 def test_few_nodes_do_up_to_their_bound(index, count, monkeypatch):
-    """At the bound itself, for peaks, ridges and flat directions, wherever they lie and far from them too."""
+    """Check the bound itself, for peaks, ridges and flat directions, wherever they lie and far from them too."""
     bound = angles.FEW[count]
     falls = double([[1, 1, 1], [0.5, 1, 1], [0.01, 1, 1], [0.4, 0.6, 1], [0, 1, 1]]) * bound * (1 - 1e-9)
     shapes = torch.diag_embed(falls.sum(-1, keepdim=True) / 4 - falls / 2)
