@@ -1,1 +1,1 @@
-"""Triangle meshes drawn on one CPU core."""
+"""A renderer that draws triangle meshes on one CPU core."""

@@ -36,11 +36,14 @@ examples:
   python -m plugins.renderer.rasterizer chair.glb --camera camera.json --channel depth --out depth.npy
 """
 VIEW = {"azimuth": 30.0, "elevation": 15.0, "tilt": 0.0, "distance": "auto", "fov": 40.0, "size": (480, 640)}
-"""What no camera file says."""
+"""Default view where no camera file is given.
+
+Angles and field of view are in degrees, the distance is in metres, the size in pixels.
+"""
 
 
 class Parser(argparse.ArgumentParser):
-    """One sentence for a mistake, and no usage before it."""
+    """An argument parser that reports a mistake in one sentence, without printing the usage first."""
 
     def error(self, message: str) -> NoReturn:
         message = shown(message)
@@ -52,7 +55,7 @@ class Parser(argparse.ArgumentParser):
 def number(
     low: float | int, high: float | int, unit: str, *, kind: type = float
 ) -> Callable[[str], float | int]:
-    """A reader of a number from `low` to `high`."""
+    """Return a function that reads a number from `low` to `high`."""
 
     def parse(text: str) -> float | int:
         try:
@@ -70,11 +73,12 @@ def number(
 
 
 def distance(text: str) -> float | int | str:
+    """Return a distance in metres, or "auto", read from a text."""
     return text if text == "auto" else number(1e-6, 1e9, ", metres, or auto")(text)
 
 
 def size(text: str) -> tuple[int, int]:
-    """(height, width)."""
+    """Return (height, width) read from a text such as 640x480."""
     sides = text.lower().split("x")
     if len(sides) != 2 or not all(
         side.isdecimal() and 1 <= int(side) <= turntable.LONGEST_SIDE for side in sides
@@ -86,6 +90,7 @@ def size(text: str) -> tuple[int, int]:
 
 
 def background(text: str) -> tuple[int, int, int] | None:
+    """Return a colour as red, green and blue, 0 to 255, read from a text; None for transparent."""
     if text == "transparent":
         return None
     try:
@@ -99,6 +104,7 @@ def background(text: str) -> tuple[int, int, int] | None:
 
 
 def channel(text: str) -> str:
+    """Return the name of a channel if the renderer draws it."""
     known = sorted(Rasterizer.channels)
     if text not in known:
         near = did_you_mean(text, known)
@@ -109,6 +115,7 @@ def channel(text: str) -> str:
 
 
 def parser() -> Parser:
+    """Return the parser of the command's arguments."""
     found = Parser(
         prog="python -m plugins.renderer.rasterizer",
         description=__doc__,
@@ -160,10 +167,10 @@ def parser() -> Parser:
 
 
 def main(arguments: list[str]) -> None:
-    """Draw a file and write the picture; its name goes to the output, notes and the report to the error stream.
+    """Draw a file and write the image; print its name to the output, and notes and the report to the error stream.
 
     Raises:
-        UserError: what was asked for cannot be done, or a file cannot be read.
+        UserError: the request cannot be carried out, or a file cannot be read.
         OSError: the place cannot be written.
     """
     given = parser().parse_args(arguments)
@@ -192,11 +199,11 @@ def main(arguments: list[str]) -> None:
             scene = staged.seen(place)
             began = time.perf_counter()
             try:
-                if given.report and not seconds:  # the first makes compiled code
+                if given.report and not seconds:  # the first drawing compiles the kernels, so it is not timed
                     Rasterizer(supersampling=renderer.supersampling)(scene, (given.channel,))
                     began = time.perf_counter()
                 drawn = renderer(scene, (given.channel,))[given.channel]
-            except ValueError as error:  # what the renderer cannot draw, in a sentence
+            except ValueError as error:  # the message says in a sentence what the renderer cannot draw
                 raise DataError(f"{given.scene}: {error}") from error
             seconds.append(time.perf_counter() - began)
             if given.channel == "color" and not numbers:
@@ -214,7 +221,11 @@ def main(arguments: list[str]) -> None:
 
 
 def check(given: argparse.Namespace, out: Path) -> None:
-    """What can be refused before anything is read."""
+    """Refuse what can be refused before any file is read.
+
+    Raises:
+        ConfigError: the arguments contradict each other or `out`.
+    """
     suffix = out.suffix.lower()
     if suffix not in pictures.SUFFIXES:
         raise ConfigError(
@@ -246,6 +257,7 @@ def check(given: argparse.Namespace, out: Path) -> None:
 
 
 def chosen_camera(given: argparse.Namespace, around: turntable.Ball, up: Axis) -> Camera:
+    """Return the camera that a file or the arguments describe."""
     if given.camera is not None:
         return turntable.read_camera(given.camera)
     chosen = {name: getattr(given, name) for name in VIEW}
@@ -256,6 +268,7 @@ def chosen_camera(given: argparse.Namespace, around: turntable.Ball, up: Axis) -
 
 
 def check_size(camera: Camera, given: argparse.Namespace, out: Path) -> None:
+    """Refuse an image that is too large, or whose size its file format cannot hold."""
     samples = camera.height * camera.width * given.supersampling**2
     if samples > MOST_SAMPLES:
         raise ConfigError(
@@ -267,7 +280,7 @@ def check_size(camera: Camera, given: argparse.Namespace, out: Path) -> None:
 
 
 def told(report: Report | None, seconds: list[float]) -> str:
-    """The last picture's report, and how long one took."""
+    """Return the report of the last image, and the median time per frame, as text."""
     lines = []
     if report is not None:
         left = ", ".join(f"{count} {reason}" for reason, count in report.left_out.items()) or "none"

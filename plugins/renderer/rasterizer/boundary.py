@@ -1,9 +1,9 @@
-"""Slopes of a loss in vertices and camera by what moving edges hand from one surface to another; compiled functions.
+"""Gradients of a loss in vertices and camera that come from moving edges; compiled functions.
 
-Arrays are those of `raster`. What an image of areas gains where an edge moves is the difference of the two surfaces
-beside it, times how far it moves, along its whole length (Li et al. 2018, eq. 4). Between two neighbouring pixels that
-show surfaces of different depth the edge is crossed once; the pair in a row sees what moves along the row, the pair in
-a column the rest.
+Arrays are those of `raster`. Where an edge moves, an image of areas gains the difference of the two surfaces
+beside the edge, times the distance that the edge moves, along its whole length (Li et al. 2018, eq. 4). Between two
+neighbouring pixels that show surfaces of different depth the edge is crossed once. A pair of pixels in a row measures
+motion along the row, and a pair in a column measures motion along the column.
 """
 
 from typing import no_type_check
@@ -15,18 +15,20 @@ from plugins.renderer.rasterizer.raster import SUBPIXELS, compiled
 from plugins.renderer.rasterizer.shading import light, weights_in_space
 
 MOST_FACES = 1000
-"""That lie between two neighbouring pixels, at most."""
+"""Largest number of faces that may lie between two neighbouring pixels."""
 
 
 def neighbours(faces):
-    """The face beyond each edge of each face, (faces, 3), edge i from corner i to the next; -1 where there is none, or
-    more than one."""
+    """Return the face beyond each edge of each face, (faces, 3), with edge i from corner i to the next.
+
+    The entry is -1 where there is no such face, or more than one.
+    """
     start, end = faces.astype(np.int64), np.roll(faces, -1, 1).astype(np.int64)
     key = (np.minimum(start, end) * (faces.max(initial=0) + 1) + np.maximum(start, end)).ravel()
     order = np.argsort(key, kind="stable")
     ordered = key[order]
     same = np.concatenate([[False], ordered[1:] == ordered[:-1], [False]])
-    # exactly two alike in a row
+    # keys that occur exactly twice
     first = np.flatnonzero(same[1:-1] & ~same[:-2] & ~same[2:])
     beside = np.full(len(key), -1, np.int64)
     beside[order[first]] = order[first + 1] // 3
@@ -39,11 +41,11 @@ def neighbours(faces):
 def boundary(
     seen, screen, faces, beside, colors, laid, lens, face, depth, box, once, along_color, of_seen, of_lens
 ):
-    """Add to `of_seen` and `of_lens` what edges hand over where they move.
+    """Add to `of_seen` and `of_lens` the gradient that comes from moving edges.
 
-    Args:
-        beside: as `neighbours` says.
-        once: whether a pixel is one sample, and not the mean of several.
+    `beside` is the result of `neighbours`. `once` says that a pixel is one sample, and not the mean of several.
+    `along_color` is the gradient of the loss in the image, (height, width, channels). `colors`, `laid` and `lens` are
+    as in `shading`.
     """
     height, width = face.shape
     top, bottom = max(box[0] - 1, 0), min(box[1] + 1, height)
@@ -62,7 +64,7 @@ def boundary(
                 if not parted(one, other, footprint):
                     continue
                 pixels = (row, column, other_row, other_column)
-                if other < one:  # the nearer one first
+                if other < one:  # the pixel of the nearer surface comes first
                     pixels = (other_row, other_column, row, column)
                 goal = face[pixels[2], pixels[3]]
                 end = walk(screen, faces, beside, face[pixels[0], pixels[1]], goal, pixels)
@@ -75,18 +77,23 @@ def boundary(
 @compiled
 @no_type_check
 def parted(depth, other, footprint):
-    """Whether neighbouring pixels may show surfaces that are apart: by a pixel's width, at their distance, or more."""
+    """Return whether neighbouring pixels may show separate surfaces, whose depths differ by a pixel's width or more.
+
+    The width is that of a pixel at the distance of the farther surface.
+    """
     return abs(depth - other) > footprint * max(depth, other) or depth == np.inf or other == np.inf
 
 
 @compiled
 @no_type_check
 def walk(screen, faces, beside, index, goal, pixels):
-    """From one pixel to the other, which shows the face `goal`, from face to face to where the nearer surface ends or
-    turns away.
+    """Go from one pixel towards another, face by face, to the place where the nearer surface ends or turns away.
+
+    The other pixel shows the face `goal`.
 
     Returns:
-        The last face, -1 if there is no such place; by which edge it ends, and at which share of the way.
+        The last face, or -1 if there is no such place; the number of the edge where the surface ends; the share of the
+        way at that edge.
     """
     row, column, other_row, other_column = pixels
     facing = turn(screen, faces, index)
@@ -106,7 +113,7 @@ def walk(screen, faces, beside, index, goal, pixels):
 @compiled
 @no_type_check
 def hand_over(pixels, end, surfaces, picture, of_seen, of_lens, steps):
-    """What one pair of neighbouring pixels sees of the edge between them that `walk` found."""
+    """Add the gradient that one pair of neighbouring pixels contributes, for the edge between them from `walk`."""
     row, column, other_row, other_column = pixels
     index, corner, share = end
     seen, screen, faces, colors, laid, lens = surfaces
@@ -114,7 +121,7 @@ def hand_over(pixels, end, surfaces, picture, of_seen, of_lens, steps):
     first, second = faces[index, corner], faces[index, (corner + 1) % 3]
     in_row = other_row == row
     axis = 0 if in_row else 1
-    # the crossing's place between the edge's ends, along the other axis
+    # share of the crossing between the edge's ends, along the other axis
     start, end = screen[first, 1 - axis], screen[second, 1 - axis]
     if start == end:
         return
@@ -125,7 +132,8 @@ def hand_over(pixels, end, surfaces, picture, of_seen, of_lens, steps):
     ray_x = (column + share * (other_column - column) - lens[2]) / lens[0]
     ray_y = (row + share * (other_row - row) - lens[3]) / lens[1]
     if behind >= 0:
-        # a surface that goes on is no edge: the farther one must lie behind the crossing by more than it may rise
+        # a surface that continues has no edge here: the farther surface must lie behind the crossing by more than
+        # its own slope explains
         far = np.float64(depth[other_row, other_column])
         beyond = depth_at(seen, faces, behind, ray_x, ray_y)
         if not far - near > 2 * abs(far - beyond) + far / min(lens[0], lens[1]):
@@ -135,7 +143,7 @@ def hand_over(pixels, end, surfaces, picture, of_seen, of_lens, steps):
         light(faces, colors, laid, behind, w0, w1, w2, steps, 0, 1)
     else:
         steps[0, 1] = 0.0
-    # colours where the edge is: towards it that of a surface that turns away changes fast
+    # colours are taken at the edge, since they change fast towards it on a surface that turns away
     of_first, of_second = near * of_first, near * of_second
     if corner == 0:
         light(faces, colors, laid, index, of_first, of_second, 0.0, steps, 0, 0)
@@ -143,8 +151,8 @@ def hand_over(pixels, end, surfaces, picture, of_seen, of_lens, steps):
         light(faces, colors, laid, index, 0.0, of_first, of_second, steps, 0, 0)
     else:
         light(faces, colors, laid, index, of_second, 0.0, of_first, steps, 0, 0)
-    # The area that changes hands is part of the pixel in which the edge lies. Of one sample a pixel the slope there is
-    # that of all or nothing, and jumps when the edge passes the border: the mean of both pixels' does not.
+    # The area that changes colour is part of the pixel in which the edge lies. With one sample per pixel, the gradient
+    # of this pixel alone would jump when the edge passes the border; the mean of both pixels' gradients does not.
     inside = 1.0 if share < 0.5 else 0.0
     if once or share == 0.5:
         inside = 0.5
@@ -161,8 +169,10 @@ def hand_over(pixels, end, surfaces, picture, of_seen, of_lens, steps):
 @compiled
 @no_type_check
 def turn(screen, faces, index):
-    """Twice the area of a face on the screen, above 0 where its inside is on the positive side of its edges (`side`);
-    0 of one that the near plane cuts."""
+    """Return twice the area of a face on the screen; 0 for a face that the near plane cuts.
+
+    The area is above 0 where the inside of the face is on the positive side of its edges (`side`).
+    """
     a, b, c = faces[index, 0], faces[index, 1], faces[index, 2]
     if screen[a, 2] == 0 or screen[b, 2] == 0 or screen[c, 2] == 0:
         return 0.0
@@ -174,7 +184,7 @@ def turn(screen, faces, index):
 @compiled
 @no_type_check
 def leaves(screen, faces, index, facing, row, column, other_row, other_column):
-    """By which edge the way from a pixel to another leaves a face, and at which share of the way; -1 if by none."""
+    """Return by which edge the way from a pixel to another leaves a face, or -1, and at which share of the way."""
     share, found = np.inf, -1
     for corner in range(3):
         a, b = faces[index, corner], faces[index, (corner + 1) % 3]
@@ -188,7 +198,7 @@ def leaves(screen, faces, index, facing, row, column, other_row, other_column):
 @compiled
 @no_type_check
 def side(screen, a, b, row, column):
-    """On which side of an edge, extended, a pixel lies, and how far: twice the area of the triangle they make."""
+    """Return on which side of an edge's line a pixel lies, and how far: twice the area of their triangle."""
     x, y = column * SUBPIXELS, row * SUBPIXELS
     return (screen[a, 0] - x) * (screen[b, 1] - y) - (screen[b, 0] - x) * (screen[a, 1] - y)
 
@@ -196,7 +206,7 @@ def side(screen, a, b, row, column):
 @compiled
 @no_type_check
 def depth_at(seen, faces, index, ray_x, ray_y):
-    """Depth of a face's plane under a ray, metres."""
+    """Return the depth of a face's plane along a ray, metres."""
     a, b, c = faces[index, 0], faces[index, 1], faces[index, 2]
     bc0, bc1, bc2 = cross(seen[b, 0], seen[b, 1], seen[b, 2], seen[c, 0], seen[c, 1], seen[c, 2])
     ca0, ca1, ca2 = cross(seen[c, 0], seen[c, 1], seen[c, 2], seen[a, 0], seen[a, 1], seen[a, 2])
@@ -208,7 +218,7 @@ def depth_at(seen, faces, index, ray_x, ray_y):
 @compiled
 @no_type_check
 def along(seen, vertex, axis, slope, lens, of_seen, of_lens):
-    """Add a slope along the screen's `axis`, per pixel, of a vertex's place f x / z + c."""
+    """Add the gradient of a vertex's place f x / z + c along the screen's `axis`, given per pixel as `slope`."""
     focal, inverse = lens[axis], 1.0 / seen[vertex, 2]
     place = seen[vertex, axis] * inverse
     of_seen[vertex, axis] += slope * focal * inverse

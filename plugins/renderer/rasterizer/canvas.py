@@ -1,7 +1,7 @@
-"""What one picture leaves for the next: arrays to draw in, checked faces, and geometry that may not have changed.
+"""Data that one image leaves for the next: arrays to draw in, checked faces, and geometry that may be unchanged.
 
-Nothing is believed to be the same because it is the same object: what is kept is compared with what comes, number by
-number, which costs as much as reading it until the first difference.
+The same object is not taken as unchanged: the kept numbers are compared with the new numbers one by one, which costs as
+much as reading them up to the first difference.
 """
 
 from functools import cached_property
@@ -14,9 +14,9 @@ from plugins.renderer.rasterizer.boundary import neighbours
 
 BLOCK = 1024
 MOST = 8
-"""Of meshes and of canvases that wait for their next use."""
+"""Largest number of meshes that are kept, and of canvases that wait for their next use."""
 MOST_BYTES = 2**28
-"""Of all canvases that wait."""
+"""Largest size of all waiting canvases together, bytes."""
 
 Box = tuple[int, int, int, int]
 Tiles = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -25,7 +25,7 @@ Tiles = tuple[np.ndarray, np.ndarray, np.ndarray]
 @raster.compiled
 @no_type_check
 def alike(one, other):
-    """Whether two flat arrays of whole numbers, of one length, are equal."""
+    """Return whether two flat integer arrays of the same length are equal."""
     for start in range(0, one.shape[0], BLOCK):
         part, other_part = one[start : start + BLOCK], other[start : start + BLOCK]
         differing = np.int64(0)
@@ -37,13 +37,15 @@ def alike(one, other):
 
 
 def bits(array: np.ndarray) -> np.ndarray:
-    """Of floating point numbers, flat."""
+    """Return floating-point numbers as a flat array of integers with the same bits."""
     return array.reshape(-1).view(f"i{array.itemsize}")
 
 
 class Corners:
-    """Rows of three indices, as kernels read them: (faces, 3) int32, and the largest of them, where a negative one
-    counts as larger than any array; with one beyond int32 the rows mean nothing."""
+    """Rows of three indices in the form that kernels read, (faces, 3) int32, and the largest index.
+
+    A negative index counts as larger than any array. If an index does not fit int32, the rows are meaningless.
+    """
 
     def __init__(self, given: np.ndarray) -> None:
         self.array = given.astype(np.int32)
@@ -51,7 +53,7 @@ class Corners:
 
     @cached_property
     def beside(self) -> np.ndarray:
-        """See `neighbours`."""
+        """The face beyond each edge of each face, see `neighbours`."""
         return neighbours(self.array)
 
     def holds(self, given: np.ndarray) -> bool:
@@ -59,13 +61,13 @@ class Corners:
 
 
 class Shelf:
-    """Meshes that were drawn lately, the latest first; threads may share it, since lists are only replaced."""
+    """Meshes that were drawn recently, the latest first; threads may share it, since lists are only replaced."""
 
     def __init__(self) -> None:
         self._kept: list[Corners] = []
 
     def find(self, given: np.ndarray) -> Corners:
-        """Of rows of indices, which may name anything."""
+        """Return the checked form of rows of indices, which may refer to vertices or to texture places."""
         for kept in self._kept:
             if kept.holds(given):
                 if kept is not self._kept[0]:
@@ -77,9 +79,9 @@ class Shelf:
 
 
 class Canvas:
-    """Arrays of one picture; see `raster`.
+    """Arrays of one image; see `raster`.
 
-    `depth` and `face` are clear outside of `box`; `counts` says what became of the faces that they show.
+    `depth` and `face` are clear outside of `box`; `counts` says what happened to the faces that they show.
     """
 
     def __init__(self) -> None:
@@ -104,7 +106,7 @@ class Canvas:
         return sum(array.nbytes for array in arrays)
 
     def placed(self, vertices: np.ndarray, pose: np.ndarray) -> bool:
-        """Whether `seen` and `screen` hold these vertices from this pose; if not they are taken to from now on."""
+        """Return whether `seen` and `screen` hold these vertices from this pose; otherwise record that they will."""
         kept = self._vertices
         if kept.shape == vertices.shape and kept.dtype == vertices.dtype and len(self._pose) == len(pose):
             if bool((self._pose == pose).all()) and alike(bits(vertices), bits(kept)):
@@ -118,18 +120,18 @@ class Canvas:
         return False
 
     def scratch(self, faces: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """What `interior` works with."""
+        """Return the working arrays of `interior`."""
         most = min(faces, self.face.size)
         if len(self._scratch[0]) != faces or len(self._scratch[2]) < most:
             self._scratch = np.full(faces, -1, np.int32), np.empty((most, 20)), np.empty(most, np.int32)
         return self._scratch
 
     def forget(self) -> None:
-        """Take nothing for the same at the next picture."""
+        """Forget what was drawn, so that the next image reuses nothing."""
         self._pose, self._drawn = np.empty(0), None
 
     def has(self, corners: Corners, cull: bool, size: tuple[int, int]) -> bool:
-        """Whether `depth` and `face` show this mesh, in the place that `placed` was last asked for."""
+        """Return whether `depth` and `face` show this mesh, in the pose of the last call of `placed`."""
         return self.depth.shape == size and self._drawn == (corners, cull)
 
     def cleared(self, size: tuple[int, int]) -> None:
@@ -144,10 +146,10 @@ class Canvas:
             top, bottom, left, right = self.box
             self.depth[top:bottom, left:right] = np.inf
             self.face[top:bottom, left:right] = -1
-        self._drawn, self.box = None, (0, height, 0, width)  # whatever happens before `shows`
+        self._drawn, self.box = None, (0, height, 0, width)  # safe if drawing fails before `shows`
 
     def empty_tiles(self) -> Tiles:
-        """Of clear arrays."""
+        """Return the tiles of cleared arrays."""
         farthest, empty, changed = self.tiles
         farthest.fill(np.inf)
         changed.fill(0)
@@ -163,13 +165,13 @@ class Canvas:
 
 
 class Lease:
-    """A canvas while a picture, or the gradient that a picture may still be asked for, needs it."""
+    """A canvas that is in use as long as an image needs it, or the gradient of that image."""
 
     def __init__(self, pool: list[Canvas]) -> None:
         self._pool = pool
         try:
             self.canvas = pool.pop()
-        except IndexError:  # none waits
+        except IndexError:  # no canvas waits
             self.canvas = Canvas()
 
     def __del__(self) -> None:

@@ -1,4 +1,4 @@
-"""Whether a scene can be drawn: what came, what was wanted; and what kernels read of it, as arrays."""
+"""Checks that a scene can be drawn, and its data as arrays that kernels read."""
 
 import math
 from collections.abc import Collection
@@ -21,16 +21,16 @@ CHANNELS = ("color", "depth", "face", "mask", "normal", "barycentric", "uv")
 PAINTED = ("color", "uv")
 """Channels that read a texture."""
 WHOLE = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64)
-"""Types that indices may have."""
+"""Number types that indices may have."""
 
 
 @dataclass(frozen=True)
 class Ready:
-    """A scene that can be drawn.
+    """A checked scene that can be drawn.
 
     Attributes:
-        faces: of the scene.
-        corners: of its texture.
+        faces: faces of the scene.
+        corners: faces of its texture.
         lens: fx, fy, cx, cy, pixels.
         learning: whether a gradient may be asked for.
     """
@@ -50,14 +50,17 @@ class Ready:
         return (None, ()) if self.texture is None else (self.texture.uv, self.texture.images)
 
     def given(self, times: int, colored: bool) -> tuple[Given, Tensor]:
-        """As arrays, with so many samples a pixel along each axis; and the lens as a tensor, which may be learned."""
+        """Return the scene as arrays, with `times` samples per pixel along each axis, and the lens as a tensor.
+
+        The lens may require a gradient.
+        """
         camera = self.scene.camera
         numbers = self.lens
         lens = torch.from_numpy(numbers)
         if self.learning and any(isinstance(part, Tensor) for part in (camera.focal, camera.principal)):
             parts = [torch.as_tensor(part, dtype=torch.float64) for part in (camera.focal, camera.principal)]
             lens = torch.cat(parts)
-        if times > 1:  # the middle of pixel 0 is that of its samples
+        if times > 1:  # the centre of pixel 0 is the centre of its samples
             shift = torch.tensor([0.0, 0.0, 1.0, 1.0], dtype=torch.float64)
             lens = (lens + 0.5 * shift) * times - 0.5 * shift
             numbers = lens.detach().numpy()
@@ -95,14 +98,15 @@ class Ready:
 
 
 def array(tensor: Tensor) -> np.ndarray:
+    """Return a tensor as a contiguous NumPy array, without gradient."""
     return tensor.detach().contiguous().numpy()
 
 
 def ready(scene: Scene, channels: Collection[str], shelf: Shelf, gradient: Gradient) -> Ready:
-    """The scene, checked for these channels.
+    """Return the scene, checked for these channels.
 
     Raises:
-        ValueError: says what came and what was wanted.
+        ValueError: the scene cannot be drawn; the message says what came and what was wanted.
     """
     check_channels(channels)
     check_device("vertices", scene.vertices)
@@ -142,10 +146,10 @@ def ready(scene: Scene, channels: Collection[str], shelf: Shelf, gradient: Gradi
 
 
 def check_on_device(scene: Scene, channels: Collection[str], gradient: Gradient) -> Tensor:
-    """A scene for `reference.picture`, whose tensors lie on one device; its lens there.
+    """Check a scene for `reference.picture`, whose tensors lie on one device, and return its lens there.
 
     Raises:
-        ValueError: says what came and what was wanted.
+        ValueError: the scene cannot be drawn; the message says what came and what was wanted.
     """
     check_channels(channels)
     camera, texture = scene.camera, scene.texture
@@ -191,6 +195,7 @@ def check_on_device(scene: Scene, channels: Collection[str], gradient: Gradient)
 
 
 def check_channels(channels: Collection[str]) -> None:
+    """Refuse channels that the renderer does not draw."""
     if isinstance(channels, str):
         raise ValueError(
             f"channels came as the string {channels!r}; wanted a collection, e.g. ({channels!r},)."
@@ -204,6 +209,7 @@ def check_channels(channels: Collection[str]) -> None:
 
 
 def check_paint(scene: Scene, channels: Collection[str]) -> None:
+    """Refuse to draw colours of a scene that has none."""
     if "color" in channels and scene.colors is None and scene.texture is None:
         raise ValueError(
             '"color" was asked of a scene without colours; give colors or a texture, or ask other channels.'
@@ -211,6 +217,7 @@ def check_paint(scene: Scene, channels: Collection[str]) -> None:
 
 
 def check_device(name: str, tensor: Tensor) -> None:
+    """Refuse a tensor that is not on the CPU."""
     if tensor.device.type != "cpu":
         raise ValueError(
             f"{name} came on {tensor.device}; rasterizer draws on the CPU, or a whole scene on cuda: give {name}.cpu()."
@@ -218,7 +225,7 @@ def check_device(name: str, tensor: Tensor) -> None:
 
 
 def numbers(name: str, tensor: Tensor, columns: int | None) -> Tensor:
-    """Rows of so many coordinates, or of any number of colours, in a type that kernels take."""
+    """Return rows of `columns` coordinates, or of any number of colours, in a number type that kernels read."""
     if tensor.ndim != 2 or tensor.shape[1] < 1 or (columns is not None and tensor.shape[1] != columns):
         wanted = "channels, 1 or more" if columns is None else columns
         raise ValueError(f"{name} came with the shape {tuple(tensor.shape)}; wanted ({name}, {wanted}).")
@@ -226,13 +233,14 @@ def numbers(name: str, tensor: Tensor, columns: int | None) -> Tensor:
 
 
 def floating(name: str, tensor: Tensor) -> Tensor:
+    """Return a floating-point tensor in a number type that kernels read, float32 or float64."""
     if not tensor.is_floating_point():
         raise ValueError(f"{name} came as {tensor.dtype}; wanted floating point, e.g. torch.float32.")
     return tensor if tensor.dtype in (torch.float32, torch.float64) else tensor.float()
 
 
 def checked_colors(colors: Tensor, count: int) -> Tensor:
-    """Colours of so many vertices, in a type that kernels take."""
+    """Return colours of `count` vertices, in a number type that kernels read."""
     found = numbers("colors", colors, None)
     if len(found) != count:
         raise ValueError(f"{len(found)} colors came for {count} vertices; wanted one each.")
@@ -240,7 +248,7 @@ def checked_colors(colors: Tensor, count: int) -> Tensor:
 
 
 def check_corners(name: str, given: Tensor) -> None:
-    """Rows of three whole numbers."""
+    """Refuse anything but rows of three integers."""
     if given.ndim != 2 or given.shape[1] != 3:
         raise ValueError(f"{name} came with the shape {tuple(given.shape)}; wanted ({name}, 3).")
     if given.dtype not in WHOLE:
@@ -248,14 +256,14 @@ def check_corners(name: str, given: Tensor) -> None:
 
 
 def check_indices(name: str, given: Tensor, count: int, of: str) -> None:
-    """Rows of three indices, all below `count`, on any device."""
+    """Refuse anything but rows of three indices below `count`, on any device."""
     check_corners(name, given)
     if given.numel() and not (int(given.min()) >= 0 and int(given.max()) < count):
         raise ValueError(out_of_range(name, given, count, of))
 
 
 def indices(name: str, given: Tensor, count: int, of: str, shelf: Shelf) -> Corners:
-    """The same on the CPU, as kernels read them."""
+    """Return checked rows of three indices below `count` on the CPU, in the form that kernels read."""
     check_corners(name, given)
     kept = given.dtype in (torch.int32, torch.int64)
     found = shelf.find(array(given if kept else given.long()))
@@ -265,6 +273,7 @@ def indices(name: str, given: Tensor, count: int, of: str, shelf: Shelf) -> Corn
 
 
 def out_of_range(name: str, given: Tensor, count: int, of: str) -> str:
+    """Return the message about indices beyond the scene's vertices or places."""
     return (
         f"{name} name the {of} {int(given.min())} to {int(given.max())}; wanted 0 to {count - 1}, since the scene has "
         f"{count} {of}."
@@ -272,7 +281,7 @@ def out_of_range(name: str, given: Tensor, count: int, of: str) -> str:
 
 
 def laid_parts(texture: Texture) -> dict[str, Tensor]:
-    """What a texture is made of, by names for messages."""
+    """Return the tensors of a texture, by their names in messages."""
     parts = {"uv": texture.uv, "texture.faces": texture.faces}
     if texture.shown is not None:
         parts["texture.shown"] = texture.shown
@@ -280,10 +289,14 @@ def laid_parts(texture: Texture) -> dict[str, Tensor]:
 
 
 def checked_texture(texture: Texture, count: int, channels: int | None) -> Texture:
-    """A texture of so many faces, in types that kernels take, on any device; which places they name is left to check.
+    """Return a texture of `count` faces, in number types that kernels read, on any device.
+
+    The indices in `texture.faces` are not yet checked.
 
     Args:
-        channels: of the colours that the scene has beside it.
+        texture: the texture.
+        count: number of faces of the scene.
+        channels: number of channels of the scene's vertex colours; None if it has none.
     """
     if not texture.images:
         raise ValueError("a texture came without images; wanted one or more.")
@@ -323,7 +336,7 @@ def checked_texture(texture: Texture, count: int, channels: int | None) -> Textu
 
 
 def check_camera(camera: Camera) -> np.ndarray:
-    """Its lens, (fx, fy, cx, cy), float64."""
+    """Check a camera and return its lens, (fx, fy, cx, cy), float64."""
     for name, side in (("height", camera.height), ("width", camera.width)):
         if not 1 <= side <= 2**16:
             raise ValueError(f"camera.{name} = {side}; wanted 1 to {2**16} pixels.")

@@ -1,4 +1,4 @@
-"""What the near plane leaves of faces that it cuts; compiled functions on arrays of `raster`."""
+"""Clipping of faces at the near plane; compiled functions on arrays of `raster`."""
 
 from typing import no_type_check
 
@@ -10,10 +10,10 @@ from plugins.renderer.rasterizer.raster import FARTHEST, compiled, on_screen
 @compiled
 @no_type_check
 def clipped(seen, faces, focal, principal, near):
-    """What the near plane leaves of faces that it cuts: corners on the screen, triangles of them, the faces' numbers.
+    """Return what remains of faces that the near plane cuts: corners on the screen, triangles, and the faces' numbers.
 
-    One corner in front gives a triangle, two give two. A corner on an edge is computed from the edge's vertices in the
-    order of their indices, so that neighbours get the same.
+    A face with one corner in front of the plane leaves one triangle, a face with two leaves two. A corner on an edge is
+    computed from the edge's vertices in the order of their indices, so that neighbouring faces get the same corner.
     """
     count = 0
     for index in range(faces.shape[0]):
@@ -56,14 +56,14 @@ def clipped(seen, faces, focal, principal, near):
 @compiled
 @no_type_check
 def drawable(seen, vertex, near):
-    """Whether a vertex is in front of the near plane."""
+    """Return whether a vertex is in front of the near plane."""
     return seen[vertex, 2] >= near
 
 
 @compiled
 @no_type_check
 def finite(seen, faces, index):
-    """Whether the coordinates of a face's vertices are within what products of them can hold."""
+    """Return whether the coordinates of a face's vertices are small enough for products of them to stay finite."""
     for corner in range(3):
         for axis in range(3):
             if not abs(seen[faces[index, corner], axis]) <= FARTHEST:

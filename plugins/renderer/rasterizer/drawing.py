@@ -1,4 +1,4 @@
-"""One picture of one scene as a differentiable operation on tensors: compiled kernels forwards and backwards."""
+"""One image of one scene as a differentiable operation on tensors, with compiled forward and backward kernels."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -21,23 +21,25 @@ Gradient = Literal["boundary", "interior", "nmr", "soft"]
 Saving = Literal["view", "box", "hidden", "unchanged"]
 NUMBERS = {"normal": 3, "barycentric": 3, "uv": 2}
 STEEPEST = 1e37
-"""Of slopes, which float32 holds, and a few of them in sum; what is steeper, where faces almost touch the eye, is this.
+"""Largest absolute value of a gradient, such that float32 holds it and sums of a few.
+
+Steeper gradients, where faces almost touch the camera, are clamped to this value.
 """
 
 
 @dataclass(frozen=True)
 class View:
-    """What a picture needs beside what it is differentiated in; plain numbers.
+    """Settings of an image apart from the inputs that have a gradient; plain numbers.
 
     Attributes:
-        faces: of the scene.
-        near: metres.
+        faces: faces of the scene.
+        near: distance of the near plane, metres.
         size: (height, width), pixels.
         cull: leave out faces seen from behind.
-        channels: to draw, in this order.
-        gradient: see `Rasterizer`; "soft" draws another picture.
+        channels: channels to draw, in this order.
+        gradient: see `Rasterizer`; "soft" draws another image.
         softness: σ and γ of "soft".
-        savings: what to leave out, see `Rasterizer`.
+        savings: work that may be left out, see `Rasterizer`.
         once: whether a pixel is one sample, and not the mean of several.
     """
 
@@ -53,13 +55,13 @@ class View:
 
     @property
     def blended(self) -> bool:
-        """Whether the colour is that of `soft`."""
+        """True if the colour is that of `soft`."""
         return "color" in self.channels and self.gradient == "soft"
 
 
 @dataclass(frozen=True)
 class Given:
-    """What a picture is differentiated in, and the texture around it, as arrays.
+    """Inputs of an image that have a gradient, and the whole texture, as arrays.
 
     Attributes:
         lens: fx, fy, cx, cy, pixels.
@@ -75,18 +77,18 @@ class Given:
 
     @property
     def paints(self) -> int:
-        """How many channels a colour has."""
+        """Number of channels of a colour."""
         return self.colors.shape[1] if self.colors is not None else cast(Laid, self.laid).texels.shape[1]
 
 
 @dataclass
 class Drawn:
-    """A picture and what its gradient reads.
+    """An image and the data that its gradient reads.
 
     Attributes:
-        channels: those asked for.
-        box: of the canvas, what may show a face.
-        blend: what the colour was rounded from where the gradient is "soft" and something is in view.
+        channels: the channels that were asked for.
+        box: part of the canvas that may show a face.
+        blend: unrounded colours where the gradient is "soft" and something is in view.
     """
 
     channels: dict[str, Tensor]
@@ -97,7 +99,7 @@ class Drawn:
 
 
 def draw(given: Given, view: View, pool: list[Canvas], learning: bool) -> Drawn:
-    """The channels of a view. `learning`: keep what the gradient needs."""
+    """Return the channels of a view; `learning` keeps what the gradient needs."""
     lease = Lease(pool)
     canvas, (height, width), faces = lease.canvas, view.size, view.faces.array
     numbers = outputs(given, view)
@@ -114,7 +116,7 @@ def draw(given: Given, view: View, pool: list[Canvas], learning: bool) -> Drawn:
             numbers["color"][:] = blend.color
         exact = set(numbers) - {"color"} if view.blended else set(numbers)
         if learning and "depth" in numbers:
-            exact.add("face")  # which a depth's slope is led through
+            exact.add("face")  # the gradient of a depth needs the visible faces
         if exact and canvas.has(view.faces, view.cull, view.size):
             reused.add("faces")
             box, counts = canvas.box, canvas.counts
@@ -135,7 +137,7 @@ def draw(given: Given, view: View, pool: list[Canvas], learning: bool) -> Drawn:
 
 
 def out_of_view(given: Given, view: View) -> bool:
-    """Whether there is nothing to draw; False too where nobody wants to know before all is projected."""
+    """Return whether there is nothing to draw; false also where `savings` does not include this test."""
     if len(view.faces.array) == 0:
         return True
     if "view" not in view.savings:
@@ -148,7 +150,7 @@ def out_of_view(given: Given, view: View) -> bool:
 
 
 def placed(given: Given, view: View, canvas: Canvas) -> bool:
-    """Put the vertices on the canvas; whether they were there already."""
+    """Put the vertices on the canvas, and return whether they were there already."""
     if "unchanged" not in view.savings:
         canvas.forget()
     pose = np.concatenate([given.rotation.ravel(), given.translation, given.lens, [view.near]])
@@ -161,7 +163,7 @@ def placed(given: Given, view: View, canvas: Canvas) -> bool:
 
 
 def outputs(given: Given, view: View) -> dict[str, np.ndarray]:
-    """Arrays for the channels, showing the background."""
+    """Return arrays for the channels, filled with the background."""
     made: dict[str, np.ndarray] = {}
     for name in view.channels:
         if name == "face":
@@ -171,14 +173,16 @@ def outputs(given: Given, view: View) -> dict[str, np.ndarray]:
         elif name == "mask":
             made[name] = np.zeros(view.size, np.bool_)
         else:
-            # Fresh zeros cost nothing until they are touched, which pixels that no face covers are not.
+            # Fresh zeros cost nothing until they are touched, and pixels that no face covers are never touched.
             made[name] = np.zeros((*view.size, NUMBERS.get(name) or given.paints), np.float32)
     return made
 
 
 def rasterised(given: Given, view: View, canvas: Canvas, alone: np.ndarray | None, counts: np.ndarray) -> Box:
-    """Draw all faces on the canvas, or in a mask alone; those that the near plane cuts as well. Count what became of
-    them."""
+    """Draw all faces on the canvas, or into a mask alone, and count what happens to them.
+
+    Faces that the near plane cuts are drawn too.
+    """
     faces, box = view.faces.array, (view.size[0], 0, view.size[1], 0)
     tiles = None
     if alone is None:
@@ -186,7 +190,7 @@ def rasterised(given: Given, view: View, canvas: Canvas, alone: np.ndarray | Non
         tiles = canvas.empty_tiles() if "hidden" in view.savings else None
     arrays = (canvas.depth, canvas.face, None) if alone is None else (None, None, alone)
     cut = 0
-    if canvas.cut:  # what the near plane cuts is near, and hides what comes later
+    if canvas.cut:  # faces that the near plane cuts are near and hide later faces, so they are drawn first
         corners, parts, numbers = clipped(canvas.seen, faces, given.lens[:2], given.lens[2:], view.near)
         if len(parts):
             known = tiles or (None, None, None)
@@ -229,8 +233,11 @@ def fill(given: Given, view: View, canvas: Canvas, numbers: dict[str, np.ndarray
 
 
 class Picture(torch.autograd.Function):
-    """The channels, in the view's order, of vertices, colours, rotation, translation, lens (fx, fy, cx, cy), uv and
-    images; `made` takes what was drawn."""
+    """The differentiable channels, in the view's order, of all inputs that have a gradient.
+
+    These are vertices, colours, rotation, translation, lens (fx, fy, cx, cy), uv and images. `made` receives the
+    report.
+    """
 
     @staticmethod
     def forward(  # type: ignore[override]
@@ -251,12 +258,12 @@ class Picture(torch.autograd.Function):
         made.append(drawn.report)
         ctx.set_materialize_grads(False)
         ctx.given, ctx.view = given, view
-        ctx.drawn = replace(drawn, channels={})  # a picture that held itself would never be freed
+        ctx.drawn = replace(drawn, channels={})  # an image that refers to itself would never be freed
         ctx.color = None
         if view.gradient == "nmr" and "color" in drawn.channels:
             ctx.color = drawn.channels["color"].numpy().copy()
         learned = (vertices, colors, rotation, translation, lens, uv)
-        # torch then refuses a gradient of what was changed in place since
+        # torch then refuses a gradient of inputs that were changed in place in the meantime
         ctx.save_for_backward(*[part for part in (*learned, *images) if part is not None])
         ctx.types = [None if part is None else part.dtype for part in learned]
         ctx.images = [(image.shape, image.dtype) for image in images]
@@ -285,13 +292,14 @@ class Picture(torch.autograd.Function):
 
 
 def slopes_as(found: np.ndarray, kind: torch.dtype) -> Tensor:
+    """Return a gradient as a tensor of the input's number type, clamped to STEEPEST."""
     return torch.from_numpy(found).clamp_(-STEEPEST, STEEPEST).to(kind)
 
 
 def of_images(
     of_texels: np.ndarray | None, images: Sequence[tuple[torch.Size, torch.dtype]]
 ) -> list[Tensor | None]:
-    """The slopes of all texels as those of the images."""
+    """Split the gradient of all texels into one gradient per image."""
     found, start = [], 0
     for shape, kind in images:
         count = shape[0] * shape[1]
@@ -312,8 +320,11 @@ def backward(
     asked: Sequence[bool],
     of_images: bool,
 ) -> tuple[np.ndarray | None, ...]:
-    """Slopes in vertices, colours, rotation, translation, lens, uv and texels, float64; of what was not asked for None
-    or what came along. `color` is the picture, where the kind of gradient reads it."""
+    """Return gradients in vertices, colours, rotation, translation, lens, uv and texels, float64.
+
+    A gradient that was not asked for is None, or is returned where it was computed anyway. `color` is the image, for
+    the kinds of gradient that read it.
+    """
     canvas, laid, vertices = drawn.lease.canvas, given.laid, given.vertices
     moving = any((asked[0], asked[2], asked[3], asked[4]))
     of_colors = np.zeros(given.colors.shape) if asked[1] and given.colors is not None else None
@@ -341,7 +352,7 @@ def to_camera(
     of_texels: np.ndarray | None,
     of_uv: np.ndarray | None,
 ) -> None:
-    """Add the slopes in camera coordinates, lens, colours and texture, by the kind of gradient."""
+    """Add the gradients in camera coordinates, lens, colours and texture, by the kind of gradient."""
     canvas, lens, colors, laid = drawn.lease.canvas, given.lens, given.colors, given.laid
     along_color, along_depth = slopes.get("color"), slopes.get("depth")
     faces = view.faces.array
@@ -368,7 +379,7 @@ def to_camera(
             )
             soft.slopes(canvas.seen, faces, colors, lens, drawn.blend, along_color, *sums)
         elif along_color is not None and visible and view.gradient == "nmr":
-            # of what faces do within, colours and textures alone
+            # inside of faces, "nmr" has gradients in colours and textures only
             interior(*surface, along_color, None, None, None, *of_paint)
             if of_seen is not None and of_lens is not None and color is not None:
                 picture = (canvas.face, color, along_color)

@@ -1,4 +1,4 @@
-"""Reads glTF 2.0 (Khronos, 2021) files, .gltf and .glb: surfaces, their base colours, and where they stand.
+"""Reader of glTF 2.0 (Khronos, 2021) files, .gltf and .glb: surfaces, base colours and positions.
 
 Light that materials reflect, animations and cameras are not read.
 """
@@ -35,13 +35,14 @@ POINTS_AND_LINES, TRIANGLES, STRIP, FAN = (0, 1, 2, 3), 4, 5, 6
 
 
 def read(file: Path) -> Subject:
-    """The surfaces of a file's scene, in base colours.
+    """Return the surfaces of a file's scene, in base colours.
 
     Raises:
-        DataError: the file, or one that it names, is missing, damaged or no glTF 2.0, needs an extension that is not
-            understood, or shows no surface.
+        DataError: the file, or a file that it refers to, is missing, damaged or no glTF 2.0, needs an extension that is
+            not understood, or shows no surface.
     """
-    with guarded(file, "glTF"), np.errstate(all="ignore"):  # what is not finite in the end is refused
+    # overflow gives numbers that are not finite, which are refused at the end
+    with guarded(file, "glTF"), np.errstate(all="ignore"):
         document = opened(file)
         version = str(document.content["asset"]["version"])
         if not version.startswith("2."):
@@ -76,13 +77,13 @@ def read(file: Path) -> Subject:
 
 
 def _count(document: Document, shown_nodes: Iterable[int]) -> int:
-    """How many parts these nodes show: known before any of them is read or placed."""
+    """Return how many parts these nodes show, before any of them is read or placed."""
     nodes = (document.item("nodes", number) for number in shown_nodes)
     return sum(len(document.item("meshes", node["mesh"])["primitives"]) for node in nodes if "mesh" in node)
 
 
 def _parts(document: Document, above: dict[int, int | None]) -> Iterator[Part]:
-    """Parts where their nodes stand; a mesh that several nodes show is there for each."""
+    """Yield the parts where their nodes stand; a mesh that several nodes show is yielded for each."""
     places = _places(document, above)
     known: dict[tuple[int, int], Part] = {}
     needed = 0
@@ -108,7 +109,7 @@ def _parts(document: Document, above: dict[int, int | None]) -> Iterator[Part]:
 
 
 def _above(document: Document) -> dict[int, int | None]:
-    """The nodes that the scene shows, each after the one that it stands in, and that one."""
+    """Return the nodes that the scene shows with their parent nodes; each node comes after its parent."""
     scenes = document.content.get("scenes", [])
     if scenes:
         roots = document.item("scenes", document.content.get("scene", 0)).get("nodes", [])
@@ -128,7 +129,7 @@ def _above(document: Document) -> dict[int, int | None]:
 
 
 def _places(document: Document, above: dict[int, int | None]) -> dict[int, Float[np.ndarray, "4 4"]]:
-    """From each node's own axes to the scene's."""
+    """Return the matrices from each node's own axes to the scene's axes."""
     found: dict[int, NDArray] = {}
     for number, parent in above.items():
         place = np.eye(4) if parent is None else found[parent]
@@ -138,7 +139,7 @@ def _places(document: Document, above: dict[int, int | None]) -> dict[int, Float
 
 
 def _transform(node: dict[str, Any]) -> Float[np.ndarray, "4 4"]:
-    """A node's matrix, or translation · rotation · scale (section 3.5.3)."""
+    """Return a node's matrix, or translation · rotation · scale (section 3.5.3)."""
     if "matrix" in node:
         return numbers(node["matrix"]).reshape(4, 4).T
     found = np.eye(4)
@@ -168,7 +169,7 @@ def _skinned(
     skin: dict[str, Any],
     places: dict[int, NDArray],
 ) -> Part:
-    """As its joints stand without an animation; where the node itself stands does not count (section 3.7.3.3)."""
+    """Return a part posed by its joints without an animation; the node's own position is ignored (section 3.7.3.3)."""
     document.notes.append("it is shown in its rest pose.")
     joints = np.stack([places[number] for number in skin["joints"]])
     if "inverseBindMatrices" in skin:
@@ -226,7 +227,7 @@ def _each(found: NDArray, count: int, what: str) -> NDArray:
 
 
 def _triangles(order: Int[np.ndarray, "corners"], mode: Any) -> Int[np.ndarray, "faces 3"]:
-    """Section 3.7.2.1, equations of primitive types."""
+    """Return the triangles of a primitive of the given mode (section 3.7.2.1, equations of primitive types)."""
     if mode == TRIANGLES:
         return order[: len(order) // 3 * 3].reshape(-1, 3)
     inner = np.arange(max(len(order) - 2, 0))
@@ -240,7 +241,7 @@ def _triangles(order: Int[np.ndarray, "corners"], mode: Any) -> Int[np.ndarray, 
 def _material(
     document: Document, primitive: dict[str, Any]
 ) -> tuple[Float[np.ndarray, "3"] | None, dict[str, Any] | None]:
-    """The factor of the base colour, None where there is none, and what describes its texture."""
+    """Return the factor of the base colour, None where there is none, and the description of its texture."""
     if "material" not in primitive:
         return None, None
     material = document.item("materials", primitive["material"])
@@ -268,8 +269,8 @@ def _textured(document: Document, part: Part, attributes: dict[str, Any], descri
         np.float64
     )
     if moved:
-        # KHR_texture_transform: translation · rotation · scale, counter-clockwise where v runs downwards: its text and
-        # its test model; the GLSL beside them turns the other way (github.com/KhronosGroup/glTF/issues/1563)
+        # KHR_texture_transform: translation · rotation · scale, counter-clockwise where v runs downwards, as its text
+        # and its test model say; the GLSL beside them turns the other way (github.com/KhronosGroup/glTF/issues/1563)
         angle = float(numbers(moved.get("rotation", 0)))
         turned = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
         uv = (uv * numbers(moved.get("scale", (1, 1)))) @ turned.T

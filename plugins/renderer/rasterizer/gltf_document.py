@@ -1,7 +1,7 @@
 """A glTF 2.0 document (Khronos, 2021): its description, and the numbers and files that it refers to.
 
-What a number of the file names is looked for within bounds, and nothing is made larger than the file's size allows: it
-may be damaged, or a stranger's.
+The file may be damaged or malicious: all numbers in it are checked against bounds, and no array is made larger than
+the file's size allows.
 """
 
 import base64
@@ -26,7 +26,7 @@ WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 
 @dataclass
 class Document:
-    """A file's description and what it refers to."""
+    """A file's description and the data that it refers to."""
 
     content: dict[str, Any]
     folder: Path
@@ -37,10 +37,10 @@ class Document:
     notes: list[str] = field(default_factory=list)
 
     def item(self, kind: str, number: Any) -> dict[str, Any]:
-        """Number `number` of a kind of things: "meshes".
+        """Return item `number` of a kind of items, such as "meshes".
 
         Raises:
-            ValueError: there is none.
+            ValueError: there is no such item.
         """
         items = self.content.get(kind, [])
         if not isinstance(number, int) or isinstance(number, bool) or not 0 <= number < len(items):
@@ -65,7 +65,7 @@ class Document:
         return self.buffers[number]
 
     def referred(self, address: str) -> bytes:
-        """What a data: address holds, or a file beside this one."""
+        """Return the content of a data: address, or of a file beside this file."""
         if address.startswith("data:"):
             head, _, body = address.partition(",")
             if not head.endswith(";base64"):
@@ -74,14 +74,14 @@ class Document:
         return self.of_file(beside(self.folder, unquote(address, errors="surrogateescape")))
 
     def of_file(self, file: Path) -> bytes:
-        """What a file beside this one holds."""
+        """Return the content of a file beside this file."""
         with guarded(file, "a part of a glTF file"):
             found = read_bytes(file)
         self.size += len(found)
         return found
 
     def view(self, number: Any) -> tuple[bytes | memoryview, int]:
-        """The bytes of a buffer view, and how far apart its elements are (0: close together)."""
+        """Return the bytes of a buffer view, and the distance of its elements in bytes (0: close together)."""
         described = self.item("bufferViews", number)
         buffer = self.buffer(whole(described["buffer"]))
         first, length = whole(described.get("byteOffset", 0)), whole(described["byteLength"])
@@ -92,10 +92,12 @@ class Document:
         return memoryview(buffer)[first : first + length], whole(described.get("byteStride", 0))
 
     def numbers(self, number: Any, width: int, *, shares: bool = False) -> NDArray:
-        """What an accessor stands for, (count, width): whole numbers as they are, or float64.
+        """Return the numbers of an accessor, (count, width): integers as they are, or float64.
 
         Args:
-            shares: whole numbers stand for shares of the largest one, whether the accessor says so or not.
+            number: number of the accessor.
+            width: number of columns.
+            shares: read integers as shares of the largest one, whether the accessor says so or not.
         """
         described = self.item("accessors", number)
         if WIDTHS.get(described["type"]) != width:
@@ -134,12 +136,17 @@ class Document:
         return np.ndarray((count, width), kind, content, first, (apart, kind.itemsize))
 
     def bounded(self, needed: int) -> None:
-        """Raises: ValueError: so many bytes are more than a file of this size may become."""
+        """Refuse to use more bytes than a file of this size may become.
+
+        Raises:
+            ValueError: `needed` bytes are too many.
+        """
         if needed > max(SCENE_BYTES, UNFOLDED_TIMES * self.size):
             raise ValueError(f"{self.size} bytes would become {needed}; it repeats itself, or is damaged")
 
 
 def opened(file: Path) -> Document:
+    """Return the document that a .gltf or .glb file holds."""
     content = read_bytes(file)
     size, binary = len(content), None
     if content[:4] == b"glTF":
@@ -154,7 +161,7 @@ def opened(file: Path) -> Document:
 
 
 def _chunks(content: bytes) -> tuple[bytes, bytes | None]:
-    """The description and the binary part of a .glb (section 4.4)."""
+    """Return the description and the binary part of a .glb (section 4.4)."""
     version, length = (int.from_bytes(content[place : place + 4], "little") for place in (4, 8))
     if version != 2 or length > len(content):
         raise ValueError(
@@ -176,15 +183,16 @@ def _chunks(content: bytes) -> tuple[bytes, bytes | None]:
 
 
 def numbers(value: Any) -> NDArray:
-    """Return what a description holds in a place of numbers, as float64.
+    """Return a value of the description, where numbers are wanted, as float64.
 
     Raises:
-        ValueError: something in it is no number.
+        ValueError: something in it is not a number.
     """
     return np.array(plain_numbers(value), np.float64)
 
 
 def whole(value: Any) -> int:
+    """Return a value of the description if it is an integer from 0."""
     if not isinstance(value, int) or isinstance(value, bool) or value < 0:
         raise ValueError(f"wanted a whole number from 0, got {quoted(value)}")
     return value

@@ -1,9 +1,9 @@
-"""Slopes of a loss in what faces show within: colours, textures, vertices and camera; compiled functions on arrays.
+"""Gradients of a loss inside of faces, in colours, textures, vertices and camera; compiled functions on arrays.
 
 Arrays are those of `raster`. In camera coordinates a pixel's ray is r = ((column - cx) / fx, (row - cy) / fy, 1), and
 the barycentric weights of a face A, B, C under it are m_i / Σ m with m_0 = r·(B×C), m_1 = r·(C×A), m_2 = r·(A×B)
-(homogeneous edge functions, Olano & Greer 1997): linear in every corner, and right for corners behind the camera. Of a
-pixel beside its face r is the ray to the place that `shading` shows there, taken to stand still.
+(homogeneous edge functions, Olano & Greer 1997): linear in every corner, and right for corners behind the camera. For
+a pixel beside its face, r is the ray to the place that `shading` shows there, and this ray is taken as constant.
 """
 
 from typing import no_type_check
@@ -15,18 +15,20 @@ from plugins.renderer.rasterizer.shading import weights_at
 from plugins.renderer.rasterizer.textures import among_texels, mixed, mixed_slopes, uv_at
 
 FLATTEST = 1e-12
-"""Least Σ m, relative to its terms: a flatter face is seen edge-on, and its position has no slope of any meaning."""
+"""Least Σ m, relative to its terms; a flatter face is seen edge-on, and the gradient in its position is meaningless."""
 
 
 @compiled
 @no_type_check
 def cross(a0, a1, a2, b0, b1, b2):
+    """Return the cross product of two vectors."""
     return a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
 
 
 @compiled
 @no_type_check
 def add(to, vertex, scale, x, y, z):
+    """Add a scaled vector to a row of `to`."""
     to[vertex, 0] += scale * x
     to[vertex, 1] += scale * y
     to[vertex, 2] += scale * z
@@ -52,14 +54,12 @@ def interior(
     of_texels,
     of_uv,
 ):
-    """Add to `of_*`, float64, what weights, colours and depths change within the faces; what is None is not computed.
+    """Add to `of_*`, float64, the gradients through weights, colours and depths inside of the faces.
 
-    Args:
-        colors, laid, lens, face: see `shading`.
-        scratch: (faces) int32 of -1, and (faces or pixels, 20) and (faces or pixels) of anything, for one row each of
-            the faces in view.
-        along_color, along_depth: slopes of the loss, (height, width, channels) and (height, width), or None.
-        of_seen, of_lens: of both or of none.
+    Gradients that are None are not computed; `of_seen` and `of_lens` are both given, or both None. `colors`, `laid`,
+    `lens` and `face` are as in `shading`. `scratch` holds (faces) int32 of -1, and (faces or pixels, 20) and (faces or
+    pixels) with any content, with one row for each face in view. `along_color` and `along_depth` are gradients of the
+    loss in the image, (height, width, channels) and (height, width), or None.
     """
     top, bottom, left, right = box
     places, sums, owners = scratch
@@ -137,9 +137,8 @@ def interior(
 def beside(seen, faces, index, sums, place, w0, w1, w2, inverse):
     """Return the ray to the place of a face at barycentric weights, and 1 / Σ m there.
 
-    Args:
-        sums, place: see `begin`.
-        inverse: 1 / Σ m at a pixel beside the face; 0 where the face is seen edge-on, then so is what is returned.
+    `sums` and `place` are as in `begin`. `inverse` is 1 / Σ m at a pixel beside the face; it is 0 where the face is
+    seen edge-on, and then all results are 0.
     """
     a, b, c = faces[index, 0], faces[index, 1], faces[index, 2]
     x = w0 * seen[a, 0] + w1 * seen[b, 0] + w2 * seen[c, 0]
@@ -163,8 +162,11 @@ def beside(seen, faces, index, sums, place, w0, w1, w2, inverse):
 @compiled
 @no_type_check
 def begin(seen, faces, index, sums, place):
-    """A row of a face: B×C, C×A, A×B; Σ d r of the slopes d in m_0, m_1 and m_2; Σ of slopes over Σ m in depths; and
-    A·(B×C)."""
+    """Start the row of sums of a face.
+
+    The row holds B×C, C×A, A×B; Σ d r of the gradients d in m_0, m_1 and m_2; Σ of gradients over Σ m in depths; and
+    A·(B×C).
+    """
     a, b, c = faces[index, 0], faces[index, 1], faces[index, 2]
     ax, ay, az = seen[a, 0], seen[a, 1], seen[a, 2]
     bx, by, bz = seen[b, 0], seen[b, 1], seen[b, 2]
@@ -180,7 +182,7 @@ def begin(seen, faces, index, sums, place):
 @compiled
 @no_type_check
 def settle(seen, faces, index, sums, place, lens, of_seen, of_lens):
-    """Hand what the pixels of a face summed up to its corners and the lens: ∂m_0/∂B = C×r, ∂m_0/∂C = r×B and so on."""
+    """Add the sums over the pixels of a face to its corners and the lens: ∂m_0/∂B = C×r, ∂m_0/∂C = r×B and so on."""
     a, b, c = faces[index, 0], faces[index, 1], faces[index, 2]
     ax, ay, az = seen[a, 0], seen[a, 1], seen[a, 2]
     bx, by, bz = seen[b, 0], seen[b, 1], seen[b, 2]
@@ -216,11 +218,10 @@ def settle(seen, faces, index, sums, place, lens, of_seen, of_lens):
 @compiled
 @no_type_check
 def into_texture(faces, colors, laid, where, pixel, of_colors, of_texels, of_uv):
-    """Add a pixel's slopes to those of colours, texels and uv; returns the slopes in its weights.
+    """Add a pixel's gradients to those of colours, texels and uv; return the gradients in its weights.
 
-    Args:
-        where: the face and the weights.
-        pixel: slopes of the loss, (height, width, channels), row and column.
+    `where` holds the face and the weights; `pixel` holds the gradient of the loss, (height, width, channels), row and
+    column.
     """
     index, w0, w1, w2 = where
     slopes, row, column = pixel
@@ -266,7 +267,7 @@ def into_texture(faces, colors, laid, where, pixel, of_colors, of_texels, of_uv)
 @compiled
 @no_type_check
 def of_the_world(vertices, rotation, of_seen, of_vertices, of_rotation, of_translation):
-    """From slopes in camera coordinates x = R X + t to those in X, R and t."""
+    """Turn gradients in camera coordinates x = R X + t into gradients in X, R and t."""
     for vertex in range(vertices.shape[0]):
         x, y, z = of_seen[vertex, 0], of_seen[vertex, 1], of_seen[vertex, 2]
         if x == 0 and y == 0 and z == 0:

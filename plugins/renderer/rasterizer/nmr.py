@@ -1,19 +1,19 @@
 """The approximate gradient of Kato, Ushiku & Harada, "Neural 3D Mesh Renderer" (CVPR 2018, section 3); compiled.
 
-An edge that moves along a row of pixels repaints a pixel j when it has come as far as j. The paper replaces that step
-of height δ_j^I at the distance δ_i^x by a ramp, so that j pulls at the vertex i from where it is, however far:
+An edge that moves along a row of pixels recolours a pixel j when it has come as far as j. The paper replaces that step
+of height δ_j^I at the distance δ_i^x by a ramp, so that j attracts the vertex i from any distance:
 
     ∂I_j/∂x_i = δ_j^I / δ_i^x  where δ_j^P δ_j^I < 0 (the loss falls; δ_j^P is its slope in I_j), else 0
 
-For a pixel outside of the face, δ_j^I leads to the colour just inside of the edge; for one of the face's own, there is
-one such term for the edge on either side, which leads to the colour just outside of it. An edge sends nothing outwards
-where its face is hidden beside it. What the paper leaves open is as in its published kernel: these colours are those
-of the two pixels beside the edge; faces seen from behind (clockwise) have no part; 1e-4 is added to every distance, in
-units in which the image is 2 wide. Where a pixel is within its face makes no slope in positions; colours have their
-exact one.
+For a pixel outside of the face, δ_j^I leads to the colour just inside of the edge. For a pixel of the face itself,
+there is one such term for the edge on either side, which leads to the colour just outside of it. An edge has no effect
+on pixels outside where its face is hidden beside it. Where the paper is silent, this code follows its published kernel:
+these colours are those of the two pixels beside the edge; faces seen from behind (clockwise) have no part; 1e-4 is
+added to every distance, in units in which the image is 2 wide. The place of a pixel inside its face has no gradient in
+positions; colours have their exact gradient.
 
-Pixels without a slope pull at nothing: a line keeps the others alone. Arrays are those of `raster`; a line is a row of
-pixels, or a column where the arrays come transposed, and a place is a pixel's number along it.
+Pixels without a gradient have no effect, so for each line only the others are kept. Arrays are those of `raster`; a
+line is a row of pixels, or a column where the arrays come transposed, and a place is a pixel's number along the line.
 """
 
 from typing import no_type_check
@@ -24,9 +24,9 @@ from framework.storage.kernels import compiler
 from plugins.renderer.rasterizer.boundary import along
 from plugins.renderer.rasterizer.raster import KEPT_IN, SUBPIXELS, compiled
 
-LEAST_DISTANCE = 1e-4  # added to distances; half images, of the side that an edge moves along
+LEAST_DISTANCE = 1e-4  # added to distances, in half image sides along the direction in which an edge moves
 
-# sums in any order, so that a processor adds several at once
+# sums may be reordered, so that a processor adds several terms at once
 reordered = compiler(KEPT_IN, fastmath={"reassoc", "contract", "nsz"})
 
 
@@ -41,7 +41,7 @@ def sweeps(
     of_seen: np.ndarray,
     of_lens: np.ndarray,
 ) -> None:
-    """Add to `of_seen` and `of_lens` what all pixels pull at all edges, along rows and along columns."""
+    """Add to `of_seen` and `of_lens` the gradient from all pixels on all edges, along rows and along columns."""
     for axis in (0, 1):
         if axis == 1:
             face = np.ascontiguousarray(face.T)
@@ -56,11 +56,11 @@ def sweeps(
 @compiled
 @no_type_check
 def pulling(face, color, along_color):
-    """The pixels that have a slope g, line by line.
+    """Return the pixels that have a gradient g, line by line.
 
     Returns:
-        before: (lines, length + 1), how many are kept before a pixel.
-        place, owner, value: of each kept one, its place, face and I · g.
+        before: (lines, length + 1), how many pixels are kept before a pixel.
+        place, owner, value: place, face and I · g of each kept pixel.
         slopes: (channels, kept), g.
     """
     lines, length = face.shape
@@ -94,7 +94,7 @@ def pulling(face, color, along_color):
 @compiled
 @no_type_check
 def sweep(axis, screen, faces, face, color, before, place, owner, value, slopes, of_place):
-    """Add to `of_place`, per vertex, the loss' slope in its place along the lines, per pixel."""
+    """Add to `of_place`, per vertex, the gradient of the loss in the vertex's place along the lines, per pixel."""
     lines, length = face.shape
     least = LEAST_DISTANCE * length / 2
     shown = np.zeros(faces.shape[0], np.bool_)
@@ -122,12 +122,12 @@ def sweep(axis, screen, faces, face, color, before, place, owner, value, slopes,
             )
             start, end = screen[one, 1 - axis] / SUBPIXELS, screen[other, 1 - axis] / SUBPIXELS
             if start == end:
-                continue  # along the lines: it crosses none, where the published kernel divides by 0
+                continue  # an edge along the lines crosses none of them; the published kernel divides by 0 here
             here = screen[one, axis] / SUBPIXELS
             lean = (screen[other, axis] / SUBPIXELS - here) / (end - start)
             opposite = here + lean * (screen[third, 1 - axis] / SUBPIXELS - start)
             outwards = 1 if opposite > screen[third, axis] / SUBPIXELS else -1
-            # within the lines before the casts, which hold no end that is 1e30 lines away
+            # clamp before the casts, since an integer cannot hold an end that is 1e30 lines away
             first_line = np.int64(np.ceil(min(max(min(start, end), 0.0), lines)))
             last_line = np.int64(np.floor(max(min(max(start, end), lines - 1.0), -1.0)))
             for line in range(first_line, last_line + 1):
@@ -173,8 +173,10 @@ def sweep(axis, screen, faces, face, color, before, place, owner, value, slopes,
 @reordered
 @no_type_check
 def pull(first, last, number, painted, crossing, share, least, place, owner, value, slopes, gains):
-    """What the kept pixels from `first` to before `last` (of the face `number`; -1: of any) gain a pixel of the way of
-    an edge's two ends."""
+    """Return the gain per pixel of motion of each end of an edge, summed over kept pixels.
+
+    These are the pixels from `first` to before `last` that show the face `number`; -1 stands for all faces.
+    """
     count = last - first
     gains = gains[:count]
     gains[:] = value[first:last]
@@ -203,6 +205,7 @@ def pull(first, last, number, painted, crossing, share, least, place, owner, val
 @compiled
 @no_type_check
 def to_camera(seen, axis, of_place, lens, of_seen, of_lens):
+    """Add gradients in places along one axis of the screen to those in camera coordinates and lens."""
     for vertex in range(of_place.shape[0]):
         if of_place[vertex] != 0:
             along(seen, vertex, axis, of_place[vertex], lens, of_seen, of_lens)

@@ -1,4 +1,4 @@
-"""Reads what Wavefront OBJ files say of colours: places in textures, and the materials of an MTL file beside them."""
+"""Reader of colours in Wavefront OBJ files: places in textures, and materials of an MTL file beside the OBJ file."""
 
 from dataclasses import dataclass, field
 from os import fsdecode
@@ -16,18 +16,20 @@ from framework.storage.reading import guarded, read_bytes
 from plugins.renderer.rasterizer.parts import Part, Pictures, drawn_without
 
 OPTIONS = {"-blendu": 1, "-blendv": 1, "-cc": 1, "-boost": 1, "-imfchan": 1, "-texres": 1}
-"""Options of a texture that do not change where it lies or what it repeats, and how many words follow each."""
+"""Texture options that do not change place or repetition, and the number of words that follow each."""
 NAMES = (b"usemtl", b"mtllib", b"newmtl", b"map_Kd")
 """Statements that end in a name, to the end of the line: in `wall #1` or `#ff0000` the # begins no comment."""
 
 
 @dataclass
 class Material:
-    """Attributes:
-    color: linear; None where none is said. What is written is taken for light, as Blender writes it.
-    texture: what the MTL file says of a file beside it.
-    library: the MTL file.
-    wrap: beyond the texture's edges.
+    """The colour and texture of a surface.
+
+    Attributes:
+        color: linear RGB; None where the file gives none. The numbers are read as linear, as Blender writes them.
+        texture: the texture file's name as the MTL file gives it.
+        library: the MTL file.
+        wrap: what lies beyond the texture's edges.
     """
 
     color: Float[np.ndarray, "3"] | None = None
@@ -38,12 +40,12 @@ class Material:
 
 @dataclass
 class Corners:
-    """What stands beside the vertices of an OBJ's faces.
+    """Texture places and materials of the faces of an OBJ file.
 
     Attributes:
         uv: places in textures, u to the right, v upwards.
-        rows: of `uv`, a row per triangle; -1 where a corner has none.
-        materials: the name of each triangle's, "" for none.
+        rows: rows of `uv` for each triangle; -1 where a corner has none.
+        materials: name of each triangle's material, "" for none.
         libraries: files with materials.
     """
 
@@ -54,11 +56,18 @@ class Corners:
 
 
 def parts(file: Path, content: bytes, mesh: Part, pictures: Pictures, notes: list[str]) -> list[Part]:
-    """The mesh of an OBJ file, whose content was read, cut by its materials.
+    """Return the mesh of an OBJ file, split by its materials.
+
+    Args:
+        file: path of the OBJ file.
+        content: its bytes.
+        mesh: its mesh.
+        pictures: decoder of textures.
+        notes: receives a sentence about each file that is missing, or lies elsewhere.
 
     Raises:
-        DataError: a file that it names is damaged. One that is missing, or lies elsewhere, is noted alone.
-        ValueError: a face names a place that is not there.
+        DataError: a file that the OBJ file refers to is damaged.
+        ValueError: a face refers to a texture place that does not exist.
     """
     corners = _corners(content)
     known: dict[str, Material] = {}
@@ -125,7 +134,7 @@ def _corners(content: bytes) -> Corners:
         key, said = _statement(line)
         rest = said.split()
         if key == b"vt":
-            points.append(b" ".join([*rest, b"0"][:2]))  # v is 0 where only u is said
+            points.append(b" ".join([*rest, b"0"][:2]))  # v is 0 where only u is given
         elif key == b"f":
             words += [word.partition(b"/")[2].partition(b"/")[0] or b"0" for word in rest]
             counts.append(len(rest))
@@ -151,13 +160,13 @@ def _corners(content: bytes) -> Corners:
 
 
 def _statement(line: bytes) -> tuple[bytes, bytes]:
-    """The first word of a line, and what follows it: a name may hold blanks."""
+    """Return the first word of a line and the rest, which may be a name with blanks."""
     key, *rest = line.split(None, 1)
     return key, rest[0].strip() if rest else b""
 
 
 def _materials(library: Path) -> dict[str, Material]:
-    """The colours (Kd) and textures (map_Kd) of an MTL file, by name."""
+    """Return the colours (Kd) and textures (map_Kd) of an MTL file, by name."""
     found: dict[str, Material] = {}
     with guarded(library, "an MTL file"):
         current = Material()

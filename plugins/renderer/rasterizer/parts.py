@@ -1,4 +1,4 @@
-"""Pieces of a scene as files hold them, and how they become one scene."""
+"""Parts of a scene as files store them, and functions that join them into one scene."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,12 +21,12 @@ from framework.storage.limits import FEW_TEXELS, MOST_TEXELS, TEXELS_PER_BYTE
 
 Axis = Literal["y", "z"]
 GREY = 0.55
-"""Light of a surface whose colour its file does not say."""
+"""Linear RGB value of a surface whose file gives no colour."""
 FARTHEST = 1e30
-"""Coordinates beyond have depths that float32 cannot say."""
+"""Largest coordinate for which float32 can hold the depth."""
 NOWHERE = look_from(0.0, 0.0, 0.0, 1.0, 1.0, (1, 1))
 EDGE = 1e-4
-"""Places in a texture that lie so little beyond its edge are rounding, and need no rule of what lies there."""
+"""Largest distance beyond a texture's edge that is taken as rounding, so that no wrap rule is needed there."""
 
 
 @dataclass(frozen=True)
@@ -34,12 +34,12 @@ class Part:
     """Triangles of one material.
 
     Attributes:
-        vertices: metres, or what unit the file has.
+        vertices: in metres, or in the file's unit.
         faces: rows of `vertices`, counter-clockwise seen from outside.
-        colors: linear in [0, 1], multiplied with the texture's; None where the file says none.
+        colors: linear in [0, 1], multiplied with the texture's colours; None where the file gives none.
         image: the texture, linear in [0, 1], rows from top to bottom.
         uv: places in it, u to the right, v upwards.
-        corners: rows of `uv` per face; None: those of `vertices`.
+        corners: rows of `uv` per face; if None, these are the rows of `vertices`.
         wraps: what lies beyond the image's edges along u and v.
         smooth: interpolate between its texels.
     """
@@ -56,13 +56,13 @@ class Part:
 
 @dataclass(frozen=True)
 class Subject:
-    """What a file shows.
+    """The content of a scene file.
 
     Attributes:
-        scene: in the file's own axes and unit; its camera means nothing.
-        plain: vertices of parts that have one colour and no texture: only light shows their form.
-        up: the axis that points upwards where the file's format has a custom.
-        notes: what the file has and the scene has not, a sentence each.
+        scene: in the file's own axes and unit; its camera is meaningless.
+        plain: vertices of parts with one colour and no texture, whose shape only shading shows.
+        up: the axis that points upwards by the convention of the file's format.
+        notes: one sentence about each thing that the file has and the scene lacks.
     """
 
     scene: Scene
@@ -75,7 +75,7 @@ def subject(parts: Sequence[Part], up: Axis, notes: Sequence[str] = ()) -> Subje
     """Join the parts of a file.
 
     Raises:
-        DataError: there are no faces, a coordinate is not finite or too large, or textures go on beyond their edges
+        DataError: there are no faces, a coordinate is not finite or too large, or textures continue beyond their edges
             in different ways.
     """
     parts = [part for part in parts if len(part.faces)]
@@ -108,7 +108,7 @@ def _scene(part: Part, wrap: Wrap, smooth: bool) -> Scene:
         )
     return Scene(
         torch.tensor(part.vertices),
-        torch.tensor(part.faces.copy()),  # a view may run backwards
+        torch.tensor(part.faces.copy()),  # torch accepts no view with negative strides
         torch.tensor(colors).float(),
         NOWHERE,
         texture,
@@ -120,7 +120,7 @@ def _plain(part: Part) -> bool:
 
 
 def _wrap(parts: Sequence[Part]) -> Wrap:
-    """What lies beyond the edges of all textures: a scene has one rule. Only parts that reach beyond need theirs."""
+    """Return the one rule for what lies beyond the edges of all textures; only parts that reach beyond need it."""
     named: set[Wrap] = set()
     needed: set[Wrap] = set()
     for part in parts:
@@ -139,7 +139,7 @@ def _wrap(parts: Sequence[Part]) -> Wrap:
 
 
 class Pictures:
-    """Decodes the textures of one file, each once, within a bound on all of them together."""
+    """Decoder of the textures of one file, each once, with a limit on all of them together."""
 
     def __init__(self) -> None:
         self._decoded: dict[object, Float[Tensor, "height width 3"]] = {}
@@ -149,10 +149,10 @@ class Pictures:
         return self._decoded.get(key)
 
     def decode(self, key: object, content: bytes, name: str) -> Float[Tensor, "height width 3"]:
-        """Light of an image file's content, rows from top to bottom; transparency is ignored.
+        """Return the linear RGB of an image file's content, rows from top to bottom; transparency is ignored.
 
         Raises:
-            DataError: it is no image, or too large.
+            DataError: the content is no image, or too large.
         """
         try:
             with images.of_stream(BytesIO(content)) as image:
@@ -182,15 +182,15 @@ def _light(pixels: UInt8[np.ndarray, "*any"]) -> Float[np.ndarray, "*any"]:
 
 
 def beside(folder: Path, name: str) -> Path:
-    """The file that another one in `folder` names; none but those in the same folder, and below it, are read.
+    """Return the file that another file in `folder` refers to, if it lies in this folder or below it.
 
     Raises:
-        DataError: it is an address, or lies elsewhere.
+        DataError: the name is an address, or the file lies elsewhere.
     """
     plain = name.replace("\\", "/")
     try:
         found = (folder / plain).resolve()
-        found.exists()  # raises where there can be no file of this name
+        found.exists()  # raises if the name is not possible for a file
         inside = ":" not in plain and found.is_relative_to(folder.resolve())
     except (OSError, ValueError):
         inside = False
@@ -202,12 +202,16 @@ def beside(folder: Path, name: str) -> Path:
 
 
 def drawn_without(folder: Path, name: str, what: str, notes: list[str]) -> Path | None:
-    """The file that another one in `folder` names; None where it is missing or lies elsewhere, which is noted.
+    """Return the file that another file in `folder` refers to; None, with a note, if it is missing or lies elsewhere.
 
-    Of a place elsewhere, as programs write the folders of their own machine, the file of the same name beside is taken.
+    Programs write folders of their own machine. For such a place elsewhere, the file of the same name in `folder` is
+    taken.
 
     Args:
-        what: the file holds: "texture is".
+        folder: folder of the file that refers to it.
+        name: the name that it is given there.
+        what: what the file holds, with a verb: "texture is".
+        notes: receives the notes.
 
     Raises:
         DataError: a link leads elsewhere.
@@ -222,7 +226,7 @@ def drawn_without(folder: Path, name: str, what: str, notes: list[str]) -> Path 
         notes.append(f"its {what} in another folder, {shown(name)}; {shown(file.name)} beside it is read.")
         return file
     file = beside(folder, name)
-    if file.exists():  # what is no regular file is refused where it is read
+    if file.exists():  # anything but a regular file is refused where it is read
         return file
     thing, _, verb = what.rpartition(" ")
     notes.append(f"its {thing} {shown(name)} {verb} not beside it: drawn without.")

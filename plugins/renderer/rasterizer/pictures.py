@@ -1,4 +1,4 @@
-"""From a scene to 8-bit pictures and films: light, background, other channels, and the files that hold them."""
+"""Functions that turn a scene into 8-bit images and films: shading, background, other channels, and output files."""
 
 import math
 import shutil
@@ -24,26 +24,27 @@ from framework.storage.files import replacing
 from plugins.renderer.rasterizer.parts import Subject
 
 AMBIENT = 0.12
-"""Light that reaches a surface seen edge-on, as a share of what one that faces the camera gets."""
+"""Brightness of a surface seen edge-on, as a share of the brightness of a surface that faces the camera."""
 CREASE = math.cos(math.radians(40))
-"""Faces that meet at a larger angle keep their edge."""
+"""Cosine of the largest angle between faces whose common edge is smoothed."""
 MOST_AROUND = 32
-"""Faces around a vertex whose directions are averaged."""
+"""Largest number of faces around a vertex whose directions are averaged."""
 
 
 @dataclass(frozen=True)
 class Stage:
-    """A scene to be drawn in colour, with coverage as its last channel.
+    """A scene that is drawn in colour, with coverage as its last channel.
 
     Attributes:
-        normals: of the vertices that a light at the camera shades, and 0 of the others; None: it shades none.
+        normals: normals of the vertices that a light at the camera shades, and 0 for the other vertices; None if no
+            vertex is shaded.
     """
 
     scene: Scene
     normals: Float[Tensor, "vertices 3"] | None
 
     def seen(self, camera: Camera) -> Scene:
-        """By a camera, lit from there: Lambert's law, for both sides of a surface."""
+        """Return the scene as seen by a camera and lit from there, by Lambert's law for both sides of a surface."""
         scene = replace(self.scene, camera=camera)
         if self.normals is None or scene.colors is None:
             return scene
@@ -57,8 +58,11 @@ class Stage:
 
 
 def stage(subject: Subject, shade: bool | None) -> Stage:
-    """Args:
-    shade: light everything, nothing, or (None) what has one colour and no texture.
+    """Prepare a file's content for drawing in colour.
+
+    Args:
+        subject: the content of the file.
+        shade: whether to shade everything, nothing, or (None) parts with one colour and no texture.
     """
     scene = subject.scene
     lit = subject.plain if shade is None else torch.full_like(subject.plain, shade)
@@ -81,13 +85,16 @@ def _with_ones(light: Float[Tensor, "*any channels"]) -> Float[Tensor, "*any mor
 
 
 def corner_normals(vertices: NDArray, faces: NDArray) -> Float[np.ndarray, "corners 3"]:
-    """For each corner of each face the mean direction, by area, of the faces around it that no crease parts from it."""
+    """Return smooth normals, one for each corner of each face.
+
+    A normal is the mean direction, by area, of the faces around the corner that no crease separates from its face.
+    """
     a, b, c = vertices[faces.T]
     with np.errstate(all="ignore"):
         areas = np.nan_to_num(np.cross(b - a, c - a), posinf=0, neginf=0)
     unit = areas / np.maximum(np.linalg.norm(areas, axis=1, keepdims=True), 1e-300)
     areas = areas / max(float(np.abs(areas).max()), 1e-300)
-    places = np.unique(vertices, axis=0, return_inverse=True)[1].reshape(-1)  # files split vertices at seams
+    places = np.unique(vertices, axis=0, return_inverse=True)[1].reshape(-1)  # joins vertices split at seams
     corners = places[faces.reshape(-1)]
     order = np.argsort(corners, kind="stable")
     corners, face = corners[order], order // 3
@@ -107,7 +114,7 @@ def corner_normals(vertices: NDArray, faces: NDArray) -> Float[np.ndarray, "corn
 def color(
     drawn: Float[Tensor, "height width 4"], background: tuple[int, int, int] | None
 ) -> NDArray[np.uint8]:
-    """sRGB of light before a background; None: transparent, a fourth channel says how much is covered."""
+    """Return sRGB of a linear image before a background; None: transparent, with coverage as a fourth channel."""
     light, covered = drawn[..., :-1], drawn[..., -1:].clamp(0, 1)
     if background is None:
         plain = light / covered.clamp(min=1e-6)
@@ -118,7 +125,7 @@ def color(
 
 
 def depth(drawn: Float[Tensor, "height width"]) -> NDArray[np.uint16]:
-    """Millimetres; 0 where there is nothing."""
+    """Return depths in millimetres; 0 where there is nothing."""
     millimetres = torch.where(drawn.isfinite(), 1000 * drawn, 0.0)
     if not 0 <= float(millimetres.max()) < 65_535.5:
         raise DataError(
@@ -129,7 +136,7 @@ def depth(drawn: Float[Tensor, "height width"]) -> NDArray[np.uint16]:
 
 
 def face(drawn: Tensor) -> NDArray[np.uint16]:
-    """Numbers of faces from 1; 0 where there is nothing."""
+    """Return numbers of faces from 1; 0 where there is nothing."""
     if int(drawn.max()) >= 65_535:
         raise DataError(
             f"face {int(drawn.max())} came; 16 bits hold numbers up to 65534. Write a .npy instead."
@@ -138,17 +145,18 @@ def face(drawn: Tensor) -> NDArray[np.uint16]:
 
 
 def mask(drawn: Tensor) -> NDArray[np.uint8]:
+    """Return 255 where there is a face, otherwise 0."""
     return 255 * drawn.numpy().astype(np.uint8)
 
 
 def normal(drawn: Float[Tensor, "height width 3"]) -> NDArray[np.uint8]:
-    """(-1, 1) as 0 to 255, black where there is nothing."""
+    """Return (-1, 1) as 0 to 255, black where there is nothing."""
     shares = torch.where(drawn.any(-1, keepdim=True), (drawn + 1) / 2, 0.0)
     return (255 * shares).round().to(torch.uint8).numpy()
 
 
 def uv(drawn: Float[Tensor, "height width 2"]) -> NDArray[np.uint8]:
-    """u as red, v as green, what repeats."""
+    """Return u as red and v as green, both modulo 1."""
     return (
         (255 * torch.cat([drawn.remainder(1), torch.zeros_like(drawn[..., :1])], -1))
         .round()
@@ -158,6 +166,7 @@ def uv(drawn: Float[Tensor, "height width 2"]) -> NDArray[np.uint8]:
 
 
 def barycentric(drawn: Float[Tensor, "height width 3"]) -> NDArray[np.uint8]:
+    """Return weights of 0 to 1 as 0 to 255."""
     return (255 * drawn.clamp(0, 1)).round().to(torch.uint8).numpy()
 
 
@@ -169,16 +178,17 @@ CODES: dict[str, Callable[[Tensor], NDArray]] = {
     "normal": normal,
     "uv": uv,
 }
-"""How channels other than colour become the whole numbers of a picture; others are written as .npy alone."""
+"""Functions that turn channels other than colour into integers of an image; other channels are written as .npy only."""
 SUFFIXES = (".png", ".gif", ".mp4", ".npy")
 
 
 def write(out: Path, frames: Iterable[NDArray], rate: int) -> None:
-    """One picture (.png), a film (.gif, .mp4) or numbers (.npy), whole or not at all.
+    """Write one image (.png), a film (.gif, .mp4) or numbers (.npy), completely or not at all.
 
     Args:
-        frames: (height, width) or (height, width, channels), 8 or 16 bits, but for .npy.
-        rate: frames a second.
+        out: path of the file.
+        frames: (height, width) or (height, width, channels), 8 or 16 bits, except for .npy.
+        rate: frames per second.
 
     Raises:
         DataError: ffmpeg failed.
@@ -200,10 +210,10 @@ def write(out: Path, frames: Iterable[NDArray], rate: int) -> None:
 
 
 def encoder() -> str:
-    """The program that makes an .mp4.
+    """Return the path of the program that makes an .mp4.
 
     Raises:
-        ConfigError: the machine has none.
+        ConfigError: the machine has no such program.
     """
     program = shutil.which("ffmpeg")
     if program is None:
@@ -214,7 +224,7 @@ def encoder() -> str:
 
 
 def _film(file: Path, frames: Iterator[NDArray], rate: int) -> None:
-    """H.264 where the machine's ffmpeg has it."""
+    """Write a film in H.264 if the machine's ffmpeg supports it."""
     program = encoder()
     first = next(frames)
     height, width = first.shape[:2]
@@ -230,7 +240,7 @@ def _film(file: Path, frames: Iterator[NDArray], rate: int) -> None:
                 process.stdin.write(np.ascontiguousarray(pixels).tobytes())
             process.stdin.close()
         except BrokenPipeError:
-            pass  # it ended: what it says follows
+            pass  # ffmpeg ended early; its message is reported below
         except BaseException:
             process.kill()
             raise

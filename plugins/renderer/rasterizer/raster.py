@@ -1,16 +1,16 @@
-"""From triangles to the pixels that they cover, on one CPU core; compiled functions on NumPy arrays.
+"""Rasterisation: which pixels a triangle covers, on one CPU core; compiled functions on NumPy arrays.
 
-Corners are rounded to 1/256 pixel, and edge functions that are exact on those whole numbers (Pineda 1988)
+Corners are rounded to 1/256 pixel, and edge functions that are exact on these integers (Pineda 1988)
 decide with the top-left rule which pixels a triangle covers: a pixel centre on the edge between two triangles
-belongs to exactly one of them. Rounded corners also decide which of several triangles is the nearest at a pixel. What
-the nearest triangle shows there is interpolated between corners that are not rounded, see `shading`.
+belongs to exactly one of them. Rounded corners also decide which of several triangles is the nearest at a pixel. The
+colours of the nearest triangle are interpolated between corners that are not rounded, see `shading`.
 
 Arrays:
     seen: (vertices, 3) float64: x right, y down, z forward from the camera, metres.
-    screen: (vertices, 5) float64: column and row in 1/256 pixel, rounded to whole numbers; 1 / depth in 1/metre, 0
+    screen: (vertices, 5) float64: column and row in 1/256 pixel, rounded to integers; 1 / depth in 1/metre, 0
         where a vertex cannot be drawn; column and row in 1/256 pixel, not rounded.
     depth, face, mask: (height, width) float32, int32, bool; the depths are those of rounded corners.
-    box: first row, past-the-last row, first column, past-the-last column of what may have been drawn.
+    box: first row, past-the-last row, first column, past-the-last column of the pixels that may have been drawn.
 
 An argument that is None is compiled away. `no_type_check` keeps the type checks that tests switch on from wrapping a
 kernel before it is compiled.
@@ -25,19 +25,22 @@ from framework.storage.kernels import compiler, kept_in
 
 SUBPIXELS = 256.0
 EXACT = 2.0**25
-"""In 1/256 pixel; up to here edge functions stay under 2^53: int64 and float64 give the same whole number."""
+"""Largest coordinate in 1/256 pixel at which edge functions are exact.
+
+Up to here they stay under 2^53, so that int64 and float64 give the same integer.
+"""
 LARGEST = 1e100  # 1/256 pixel; a product of two coordinates and an inverse depth stays finite in float64
-NEAREST = 1e-100  # metres; likewise
-FARTHEST = 3e38  # metres; a depth that float32 holds
+NEAREST = 1e-100  # metres; the same holds for depths above this
+FARTHEST = 3e38  # metres; the largest depth that float32 holds
 TILE = 8  # pixels
 RUN = 128  # faces
 DRAWN, BEHIND, FLAT, BACK, OUTSIDE, HIDDEN = range(6)
-"""What became of a face."""
+"""Numbers of what can happen to a face."""
 REASONS = {BEHIND: "behind", FLAT: "flat", BACK: "back", OUTSIDE: "outside", HIDDEN: "hidden"}
 
 # Without fastmath: products must be rounded before they are subtracted, see `_draw_far`.
 KERNELS = "boundary", "canvas", "clipping", "interior", "nmr", "raster", "shading", "soft", "textures"
-"""Files whose functions call each other."""
+"""Files whose compiled functions call each other."""
 KEPT_IN = kept_in("rasterizer", (Path(__file__).with_name(f"{name}.py") for name in KERNELS))
 compiled = compiler(KEPT_IN)
 
@@ -45,7 +48,7 @@ compiled = compiler(KEPT_IN)
 @compiled
 @no_type_check
 def largest_index(indices):
-    """The largest of whole numbers read as unsigned: a negative one counts as larger than any array."""
+    """Return the largest of integers read as unsigned: a negative integer counts as larger than any array."""
     largest = indices.dtype.type(0)
     for index in indices:
         largest = max(largest, index)
@@ -55,10 +58,10 @@ def largest_index(indices):
 @compiled
 @no_type_check
 def out_of_view(vertices, rotation, translation, focal, principal, near, height, width):
-    """Whether the box around all vertices lies wholly outside one plane of the view.
+    """Return whether the box around all vertices lies wholly outside one plane of the view.
 
-    The planes stand one pixel outside the image: no rounding hides a visible pixel. NaN enters no comparison; an
-    infinite coordinate makes the box infinite and the answer no.
+    The planes stand one pixel outside the image, so that rounding hides no visible pixel. NaN takes part in no
+    comparison; an infinite coordinate makes the box infinite and the answer false.
     """
     low = np.full(3, np.inf)
     high = np.full(3, -np.inf)
@@ -97,7 +100,7 @@ def out_of_view(vertices, rotation, translation, focal, principal, near, height,
 @compiled
 @no_type_check
 def project(vertices, rotation, translation, focal, principal, near, seen, screen):
-    """Fill `seen` and `screen` from world coordinates. Returns how many finite vertices the near plane cuts off."""
+    """Fill `seen` and `screen` from world coordinates; return how many finite vertices the near plane cuts off."""
     hidden = 0
     for vertex in range(vertices.shape[0]):
         a = np.float64(vertices[vertex, 0])
@@ -131,14 +134,14 @@ def on_screen(x, y, z, focal, principal, near, place):
 @compiled
 @no_type_check
 def owned(along_column, along_row):
-    """Top-left rule: whether pixels exactly on an edge are the triangle's, by the edge function's slope."""
+    """Return whether pixels exactly on an edge belong to the triangle, by the edge function's slope (top-left rule)."""
     return along_column > 0 or (along_column == 0 and along_row > 0)
 
 
 @compiled
 @no_type_check
 def before(x, y, other_x, other_y):
-    """Whether one point comes before another, row by row."""
+    """Return whether one point comes before another, row by row."""
     return y < other_y or (y == other_y and x < other_x)
 
 
@@ -147,18 +150,16 @@ def before(x, y, other_x, other_y):
 def rasterise(
     screen, faces, first, numbers, cull, height, width, depth, face, mask, farthest, empty, changed, counts
 ):
-    """Draw the faces into `depth` and `face`, or into `mask` alone; the others are None. Returns the box.
+    """Draw the faces into `depth` and `face`, or into `mask` alone, and return the box.
 
-    Each pixel shows the nearest, among equal float32 depths that of the lowest number. The arrays may hold what was
-    drawn before.
+    Each pixel shows the nearest face, and among equal float32 depths the face with the lowest number. The arrays may
+    hold faces that were drawn before; arrays that are not drawn into are None.
 
-    Args:
-        first, numbers: faces are numbered from `first` on where `numbers` is None; else by it, those with the same
-            number being parts of one.
-        cull: leave out faces seen from behind.
-        farthest, empty, changed: None, or of tiles of `TILE` × `TILE` pixels: no depth in one is beyond `farthest`,
-            so many pixels show the background, and so many were written since `farthest` was looked up.
-        counts: what became of the faces is added, by `DRAWN` and so on.
+    Faces are numbered from `first` on where `numbers` is None, otherwise by `numbers`; faces with the same number are
+    parts of one face. `cull` leaves out faces seen from behind. `farthest`, `empty` and `changed` are None, or arrays
+    over tiles of `TILE` × `TILE` pixels: no depth in a tile is beyond `farthest`, `empty` pixels of it show the
+    background, and `changed` pixels were written since `farthest` was computed. What happens to the faces is added to
+    `counts`, by `DRAWN` and so on.
     """
     last_x, last_y = (width - 1) * SUBPIXELS, (height - 1) * SUBPIXELS
     box_top, box_bottom, box_left, box_right = height, 0, width, 0
@@ -274,7 +275,7 @@ def rasterise(
 @compiled
 @no_type_check
 def is_hidden(farthest, pixels, nearest):
-    """Whether everything in a box of pixels was drawn nearer than `nearest`, as far as the tiles know."""
+    """Return whether everything in a box of pixels was drawn nearer than `nearest`, as far as the tiles tell."""
     first_row, last_row, first_column, last_column = pixels
     for row in range(first_row // TILE, last_row // TILE + 1):
         for column in range(first_column // TILE, last_column // TILE + 1):
@@ -286,8 +287,11 @@ def is_hidden(farthest, pixels, nearest):
 @compiled
 @no_type_check
 def look_up(farthest, empty, changed, pixels, written, depth):
-    """Note that so many pixels of a box were written, and look up how far its full tiles reach, the first time and
-    whenever as many were written again as one has."""
+    """Record that `written` pixels of a box were written, and compute how far its full tiles reach.
+
+    The depth of a tile is computed when the tile is first full, and again whenever as many pixels were written as a
+    tile has.
+    """
     first_row, last_row, first_column, last_column = pixels
     for row in range(first_row // TILE, last_row // TILE + 1):
         for column in range(first_column // TILE, last_column // TILE + 1):
@@ -307,8 +311,10 @@ def look_up(farthest, empty, changed, pixels, written, depth):
 @compiled
 @no_type_check
 def front_to_back(screen, faces, cull, height, width, depth, face, farthest, empty, changed, counts):
-    """As `rasterise`, runs of `RUN` faces nearest first; a run that is hidden as a whole is counted as hidden. Returns
-    the box."""
+    """Draw as `rasterise` does, in runs of `RUN` faces from near to far, and return the box.
+
+    A run that is hidden as a whole is counted as hidden.
+    """
     runs = (faces.shape[0] + RUN - 1) // RUN
     last_x, last_y = (width - 1) * SUBPIXELS, (height - 1) * SUBPIXELS
     nearest, bounds = np.zeros(runs), np.empty((runs, 4), np.int64)
@@ -323,7 +329,7 @@ def front_to_back(screen, faces, cull, height, width, depth, face, farthest, emp
                 whole &= near > 0
                 nearest[run] = max(nearest[run], near)
                 left, right, top, bottom = min(left, x), max(right, x), min(top, y), max(bottom, y)
-        # of what is not wholly before the near plane, or out of view, nothing is known: no pixels
+        # a run that is not wholly before the near plane, or is out of view, gets no pixels, so it is never hidden
         if not whole or right < 0 or bottom < 0 or left > last_x or top > last_y:
             left, right, top, bottom = 0.0, -SUBPIXELS, 0.0, -SUBPIXELS
         bounds[run, 0], bounds[run, 1] = np.int64(max(top, 0.0)) >> 8, np.int64(min(bottom, last_y)) >> 8
@@ -345,10 +351,10 @@ def front_to_back(screen, faces, cull, height, width, depth, face, farthest, emp
 @compiled
 @no_type_check
 def _draw_far(corners, pixels, number, depth, face, mask):
-    """Draw a face that reaches past `EXACT`, with edge functions in float64, anew at each pixel.
+    """Draw a face that reaches beyond `EXACT`, with edge functions in float64, computed anew at each pixel.
 
-    Even rounded, they change exactly their sign with an edge's direction (`edges`), so that neighbours share
-    no pixel and leave none out; between corners within `EXACT` they are the whole numbers of `rasterise`.
+    Even rounded, these change exactly their sign with an edge's direction (`edges`), so that neighbouring faces share
+    no pixel and leave none out; between corners within `EXACT` they are the integers of `rasterise`.
     """
     ax, ay, near0, bx, by, near1, cx, cy, near2 = corners
     first_row, last_row, first_column, last_column = pixels
@@ -376,7 +382,7 @@ def _draw_far(corners, pixels, number, depth, face, mask):
 @compiled
 @no_type_check
 def edges(ax, ay, bx, by, cx, cy, row, column):
-    """A triangle's edge functions at a pixel, each opposite its corner: x1 y2 - x2 y1 seen from the pixel."""
+    """Return a triangle's edge functions at a pixel, each opposite its corner: x1 y2 - x2 y1 relative to the pixel."""
     x, y = column * SUBPIXELS, row * SUBPIXELS
     ax, ay, bx, by, cx, cy = ax - x, ay - y, bx - x, by - y, cx - x, cy - y
     return bx * cy - cx * by, cx * ay - ax * cy, ax * by - bx * ay
@@ -385,7 +391,7 @@ def edges(ax, ay, bx, by, cx, cy, row, column):
 @compiled
 @no_type_check
 def to_edge(ax, ay, bx, by, x, y):
-    """Squared distance from a point to an edge, and where on it the closest point is, 0 to 1."""
+    """Return the squared distance from a point to an edge, and the place of the closest point on it, 0 to 1."""
     ux, uy, vx, vy = bx - ax, by - ay, x - ax, y - ay
     length = ux * ux + uy * uy
     part = min(max((ux * vx + uy * vy) / length, 0.0), 1.0) if length > 0 else 0.0

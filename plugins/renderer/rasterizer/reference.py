@@ -1,7 +1,7 @@
-"""The same pictures in plain torch: the oracle of the compiled kernels, and what draws on a GPU.
+"""The renderer's images in plain torch: a reference for tests of the compiled kernels, and the renderer on a GPU.
 
-Every pixel in the box around a face is tried (`PAIRS` at a time), and the nearest face kept by one minimum over packed
-numbers: depth in the upper half, which sorts as its bits do, and the face's number in the lower. Colours and
+Every pixel in the box around a face is tested (`PAIRS` at a time). The nearest face is kept by one minimum over packed
+numbers: depth in the upper half, which sorts as its bits do, and the face's number in the lower half. Colours and
 depths are differentiable within faces, by autograd. Faces that the near plane cuts are left out.
 """
 
@@ -28,7 +28,7 @@ def picture(
     channels: tuple[str, ...],
     cull: bool,
 ) -> dict[str, Tensor]:
-    """The channels; `pose` is rotation, translation and lens (fx, fy, cx, cy), float64."""
+    """Return the channels of an image; `pose` is rotation, translation and lens (fx, fy, cx, cy), float64."""
     rotation, translation, lens = pose
     faces = faces.long()
     seen = vertices.double() @ rotation.double().T + translation.double()
@@ -105,7 +105,7 @@ def visible(
 
 
 def portions(counts: Tensor) -> Iterator[Tensor]:
-    """Faces, a few at a time: with no more than `PAIRS` pixels, or one."""
+    """Yield the faces in groups of at most `PAIRS` pixels, or of a single face."""
     waiting = counts.nonzero()[:, 0]
     while len(waiting):
         whole = counts[waiting].cumsum(0)
@@ -115,7 +115,7 @@ def portions(counts: Tensor) -> Iterator[Tensor]:
 
 
 def pixels(low: Tensor, sides: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Of each pixel of each box the box's number, column and row."""
+    """Return the box's number, the column and the row of each pixel of each box."""
     counts = sides.prod(1)
     part = torch.arange(len(counts), device=counts.device).repeat_interleave(counts)
     offset = torch.arange(len(part), device=counts.device) - (counts.cumsum(0) - counts)[part]
@@ -123,13 +123,16 @@ def pixels(low: Tensor, sides: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def cross(one: Tensor, other: Tensor) -> Tensor:
+    """Return the cross product of vectors of two numbers."""
     return one[..., 0] * other[..., 1] - other[..., 0] * one[..., 1]
 
 
 def barycentric(seen: Tensor, corners: Tensor, lens: Tensor, pixels: Tensor) -> Tensor:
-    """Return weights of the corners (number, 3) at pixels (number, 2), column and row, that show them: r·(B×C),
-    r·(C×A), r·(A×B) over their sum (Olano & Greer 1997), r the ray to the pixel, or to the place of the face that is
-    nearest to a pixel beside it."""
+    """Return weights (number, 3) of the corners (number, 3) at the pixels (number, 2), column and row, that show them.
+
+    The weights are r·(B×C), r·(C×A), r·(A×B) over their sum (Olano & Greer 1997). r is the ray to the pixel, or for a
+    pixel beside the face, the ray to the nearest place of the face.
+    """
     a, b, c = seen[corners].unbind(-2)
     normals = torch.stack([torch.linalg.cross(*pair) for pair in ((b, c), (c, a), (a, b))], 1)
     parts = volumes(normals, lens, pixels.to(seen))
@@ -139,7 +142,7 @@ def barycentric(seen: Tensor, corners: Tensor, lens: Tensor, pixels: Tensor) -> 
         place = torch.where(beside, place, pixels)
     parts = volumes(normals, lens, place)
     total = parts.sum(-1, keepdim=True)
-    # What is edge-on has no slope. At a border no part is of another sign than the rest: their terms are compared.
+    # A face seen edge-on has no gradient. At a border all parts have the same sign, so their terms are compared.
     terms = torch.where(beside, volumes(normals, lens, place, absolute=True), parts.abs())
     seen_at_all = total.abs() > 1e-12 * terms.sum(-1, keepdim=True)
     found = torch.where(seen_at_all, parts / torch.where(seen_at_all, total, 1), weights).clamp(min=0)
@@ -147,8 +150,10 @@ def barycentric(seen: Tensor, corners: Tensor, lens: Tensor, pixels: Tensor) -> 
 
 
 def volumes(normals: Tensor, lens: Tensor, places: Tensor, absolute: bool = False) -> Tensor:
-    """Return r·n (number, 3) of rays r through places (number, 2), pixels, and normals n (number, 3, 3); with
-    `absolute` the sums of the terms' absolute values."""
+    """Return r·n (number, 3) of rays r through places (number, 2), pixels, and normals n (number, 3, 3).
+
+    If `absolute` is true, return the sums of the terms' absolute values.
+    """
     ray = (places - lens[2:]) / lens[:2]
     terms = torch.cat([ray, torch.ones_like(ray[:, :1])], -1)[:, None] * normals
     return (terms.abs() if absolute else terms).sum(-1)
@@ -170,7 +175,7 @@ def nearest(seen: Tensor, corners: Tensor, lens: Tensor, pixels: Tensor) -> tupl
 
 
 def textured(texture: Texture, face: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """What faces show of their images, 1 where they show none, and where it lies in them."""
+    """Return the colours of faces from their images, 1 where they have none, and the places in the images."""
     there = face.clamp(min=0)
     uv = (weights[..., None] * texture.uv[texture.faces.long()[there]].double()).sum(-2)
     shown = torch.zeros_like(face) if texture.shown is None else texture.shown.long()[there]
@@ -182,6 +187,7 @@ def textured(texture: Texture, face: Tensor, weights: Tensor) -> tuple[Tensor, T
 
 
 def sampled(image: Tensor, uv: Tensor, texture: Texture) -> Tensor:
+    """Return the colours of an image at places uv, interpolated if the texture is smooth."""
     height, width, _ = image.shape
     x, y = uv[..., 0] * width - 0.5, (1 - uv[..., 1]) * height - 0.5
     if not texture.smooth:
@@ -197,6 +203,7 @@ def sampled(image: Tensor, uv: Tensor, texture: Texture) -> Tensor:
 
 
 def wrapped(place: Tensor, count: int, wrap: str) -> Tensor:
+    """Return the row or column of an image of `count` that stands at an integer place, by the wrap rule."""
     place = place.detach().long()
     if wrap == "clamp":
         return place.clamp(0, count - 1)

@@ -1,4 +1,4 @@
-"""A differentiable rasteriser on one CPU core; the contract is framework.renderer's."""
+"""A differentiable rasteriser on one CPU core; it implements the contract of framework.renderer."""
 
 from collections.abc import Collection, Sequence
 from typing import Annotated
@@ -20,28 +20,29 @@ ALL: tuple[Saving, ...] = ("view", "box", "unchanged")
 
 
 class Rasterizer(Renderer):
-    """Meshes with colours and textures, drawn without holes, differentiable in all that a scene is made of.
+    """A rasteriser of coloured and textured meshes, without gaps between faces, differentiable in all scene inputs.
 
-    Corners are rounded to 1/256 pixel and whole numbers decide which pixels a triangle covers: triangles that
-    share an edge leave no pixel between them out and share none. What has no area after rounding is left out; what
-    the near plane cuts is clipped. Depth and colour are perspective-correct, between corners that are not rounded.
-    Tensors live on the CPU; a scene on a GPU is drawn there in plain torch, without faces that the near plane cuts and
-    with gradient "interior" alone.
+    Corners are rounded to 1/256 pixel, and integers decide which pixels a triangle covers: triangles that share an edge
+    leave out no pixel between them and share none. Faces without area after rounding are left out; faces that the near
+    plane cuts are clipped. Depth and colour are perspective-correct, between corners that are not rounded. Tensors live
+    on the CPU; a scene on a GPU is drawn there in plain torch, without faces that the near plane cuts and with gradient
+    "interior" alone.
 
     "color" has a gradient in vertices, colours, textures' images and uv, and the camera's rotation, translation, focal
-    lengths and principal point; "depth" too, but for the edges of what is seen.
+    lengths and principal point. "depth" has one too, except for the edges of visible surfaces.
 
     Args:
         cull: leave out faces seen from behind; right for closed meshes only, and faster.
-        gradient: "boundary": what the inside of faces does and what moving edges hand from one surface to another;
-            "interior": the former alone; "nmr": the approximation of Kato et al., for comparison; "soft": the picture
-            itself is that of Liu et al., blurred and blended, for comparison, in "color" of vertex colours alone.
+        gradient: "boundary": gradients inside of faces and from moving edges, where one surface replaces another;
+            "interior": gradients inside of faces alone; "nmr": the approximation of Kato et al., for comparison;
+            "soft": the image itself is that of Liu et al., blurred and blended, for comparison, in "color" of vertex
+            colours alone.
         sigma: how far coverage blurs ("soft" alone): squared distance, where the image's shorter side is 2.
-        gamma: how far depths blend ("soft" alone): of the nearest depth over a face's.
-        supersampling: samples a pixel along each axis, of "color" alone, whose mean it then is.
-        savings: what may be left out; the picture is the same to the last bit. "view": scenes wholly out of view;
-            "box": pixels around what is drawn; "hidden": faces behind what was drawn before, nearest first; pays
-            where much is hidden; "unchanged": what is as it was in the last picture.
+        gamma: how far depths blend ("soft" alone), as a ratio of the nearest depth to a face's depth.
+        supersampling: samples per pixel along each axis, for "color" alone, which is then their mean.
+        savings: work that may be left out; the image is the same to the last bit. "view": scenes wholly out of view;
+            "box": pixels around the drawn faces; "hidden": faces behind those drawn before, nearest first, which is
+            faster where much is hidden; "unchanged": everything that is as it was in the last image.
     """
 
     channels = frozenset(CHANNELS)
@@ -105,12 +106,12 @@ class Rasterizer(Renderer):
     def batch(
         self, scenes: Sequence[Scene], channels: Collection[str] = ("color",)
     ) -> list[dict[str, Tensor]]:
-        """Several scenes, side by side on as many threads as torch uses; `report` is then of the last one."""
+        """Draw several scenes in parallel on as many threads as torch uses; `report` is then of the last scene."""
         learning = torch.is_grad_enabled()
         found: list[tuple[dict[str, Tensor], Report | None]] = [({}, None)] * len(scenes)
 
         def draw(number: int) -> None:
-            with torch.set_grad_enabled(learning):  # which each thread has for itself
+            with torch.set_grad_enabled(learning):  # each thread has its own setting
                 found[number] = self._picture(scenes[number], channels)
 
         POOL.share(draw, len(scenes), torch.get_num_threads())
@@ -130,7 +131,7 @@ class Rasterizer(Renderer):
         return {name: found[name] for name in channels}, report
 
     def on_device(self, scene: Scene, channels: Collection[str]) -> dict[str, Tensor]:
-        """The same by `reference`, wherever the scene's tensors lie."""
+        """Return the channels as drawn by `reference`, on the device of the scene's tensors."""
         lens, camera = check_on_device(scene, channels, self.gradient), scene.camera
         if self.gradient == "soft":
             raise ValueError(
@@ -142,7 +143,7 @@ class Rasterizer(Renderer):
             pose = (camera.rotation, camera.translation, (lens + shift) * times - shift)
             size = (camera.height * times, camera.width * times)
             near = max(float(camera.near), NEAREST)
-            colors = scene.colors if "color" in names else None  # what nobody reads was not checked
+            colors = scene.colors if "color" in names else None  # colours were checked only if they are read
             texture = None if set(PAINTED).isdisjoint(names) else scene.texture
             surface = (scene.vertices, scene.faces, colors, texture)
             drawn = reference.picture(*surface, pose, near, size, names, self.cull)
@@ -152,7 +153,7 @@ class Rasterizer(Renderer):
     def _drawn(
         self, scene: Scene, checked: Ready, channels: tuple[str, ...], times: int
     ) -> tuple[dict[str, Tensor], Report]:
-        """The channels, with so many samples a pixel along each axis."""
+        """Return the channels, with `times` samples per pixel along each axis."""
         camera = scene.camera
         view = View(
             checked.faces,
@@ -180,7 +181,10 @@ class Rasterizer(Renderer):
 
 
 def samples(channels: Collection[str], supersampling: int) -> list[tuple[tuple[str, ...], int]]:
-    """Channels that are drawn together, each once, with so many samples a pixel along each axis: colours at last."""
+    """Return the groups of channels that are drawn together, each with its samples per pixel along each axis.
+
+    Colours come last.
+    """
     names = tuple(dict.fromkeys(channels))
     rest = tuple(name for name in names if name != "color")
     if supersampling == 1 or rest == names:
@@ -189,6 +193,7 @@ def samples(channels: Collection[str], supersampling: int) -> list[tuple[tuple[s
 
 
 def pooled(drawn: dict[str, Tensor], times: int) -> dict[str, Tensor]:
+    """Return the mean of `times` × `times` samples for each pixel."""
     if times == 1:
         return drawn
     return {name: avg_pool2d(picture.movedim(-1, 0), times).movedim(0, -1) for name, picture in drawn.items()}

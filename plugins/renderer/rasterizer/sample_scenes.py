@@ -1,4 +1,4 @@
-"""Scenes as bytes, for tests: glTF from a description and arrays, a whole sample of it, and one of OBJ."""
+"""Scenes as bytes, for tests: glTF from a description and arrays, a complete sample of it, and a sample of OBJ."""
 
 import base64
 import copy
@@ -17,7 +17,10 @@ Entry = dict[str, Any]
 
 
 def described(content: Entry, parts: Sequence[NDArray | bytes]) -> tuple[Entry, bytes]:
-    """A whole description, and the binary part: arrays become accessors, bytes only buffer views, in their order."""
+    """Return a complete description and the binary part, from arrays and bytes in their order.
+
+    Arrays become accessors, bytes become buffer views only.
+    """
     content = {"asset": {"version": "2.0"}, "accessors": [], "bufferViews": [], **copy.deepcopy(content)}
     binary = b""
     for part in parts:
@@ -39,11 +42,13 @@ def described(content: Entry, parts: Sequence[NDArray | bytes]) -> tuple[Entry, 
 
 
 def glb(content: Entry, parts: Sequence[NDArray | bytes]) -> bytes:
+    """Return the bytes of a .glb file."""
     whole, binary = described(content, parts)
     return packed(json.dumps(whole).encode(), binary)
 
 
 def packed(text: bytes, binary: bytes) -> bytes:
+    """Return the bytes of a .glb file from its description and its binary part."""
     text += b" " * (-len(text) % 4)
     size = 12 + 8 + len(text) + 8 + len(binary)
     words = [b"glTF", (2).to_bytes(4, "little"), size.to_bytes(4, "little")]
@@ -59,7 +64,7 @@ def packed(text: bytes, binary: bytes) -> bytes:
 
 
 def gltf(content: Entry, parts: Sequence[NDArray | bytes]) -> bytes:
-    """With its binary part as base64."""
+    """Return the bytes of a .gltf file with its binary part in base64."""
     whole, binary = described(content, parts)
     whole["buffers"][0]["uri"] = "data:application/octet-stream;base64," + base64.b64encode(binary).decode()
     return json.dumps(whole).encode()
@@ -114,7 +119,7 @@ QUAD: Entry = {
     "samplers": [{"wrapS": 33071, "wrapT": 33071}],
     "images": [{"bufferView": 7, "mimeType": "image/png"}],
 }
-"""A textured and coloured square, three times, once skinned."""
+"""Description of a textured and coloured square, shown three times, once skinned."""
 PARTS: list[NDArray | bytes] = [
     PLACES,
     UV,
@@ -127,12 +132,14 @@ PARTS: list[NDArray | bytes] = [
 
 
 def png(pixels: NDArray) -> bytes:
+    """Return the bytes of a .png file."""
     content = io.BytesIO()
     Image.fromarray(pixels).save(content, "PNG")
     return content.getvalue()
 
 
 def quad() -> tuple[Entry, list[NDArray | bytes]]:
+    """Return the description of the square and its parts."""
     return QUAD, [*PARTS, png(np.zeros((4, 4, 3), np.uint8))]
 
 

@@ -1,4 +1,4 @@
-"""Reads a user's scene from a file: surfaces, colours and textures."""
+"""Reader of a user's scene files: surfaces, colours and textures."""
 
 import re
 from os import fsdecode
@@ -17,17 +17,17 @@ from plugins.renderer.rasterizer import gltf, obj_materials
 from plugins.renderer.rasterizer.parts import Axis, Part, Pictures, Subject, drawn_without, subject
 
 UPWARDS: dict[str, Axis] = {".glb": "y", ".gltf": "y", ".obj": "y", ".off": "z", ".ply": "y", ".stl": "z"}
-"""What can be read, by the end of the file's name, and the axis that most such files have upwards."""
+"""File suffixes that can be read, and the axis that points upwards in most such files."""
 PLACES = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"))
-"""What PLY files call places in a texture."""
+"""Names that PLY files use for places in a texture."""
 
 
 def read(file: Path) -> Subject:
-    """A file's surfaces in its own axes and unit, in linear light.
+    """Return a file's surfaces in the file's own axes and unit, in linear RGB.
 
     Raises:
-        DataError: no such file or format, damage, points without faces, a texture that is too large or that lies
-            in another folder.
+        DataError: there is no such file or format, the file is damaged, has points without faces, or has a texture
+            that is too large or that lies in another folder.
     """
     suffix = file.suffix.lower()
     if file.is_dir():
@@ -55,7 +55,7 @@ def read(file: Path) -> Subject:
 
 
 def _colors(mesh: meshes.Mesh) -> Float[np.ndarray, "vertices 3"] | None:
-    """The vertices' colours, which files store as sRGB, as light."""
+    """Return the vertices' colours, which files store as sRGB, as linear RGB."""
     if not set(COLOURS) <= set(mesh.columns):
         return None
     stored = np.round(255 * mesh.attribute(COLOURS)).astype(np.uint8)
@@ -63,7 +63,7 @@ def _colors(mesh: meshes.Mesh) -> Float[np.ndarray, "vertices 3"] | None:
 
 
 def _textured(file: Path, mesh: meshes.Mesh, part: Part, notes: list[str]) -> Part:
-    """The texture that a PLY file names in a comment, as Blender and MeshLab write it."""
+    """Return the part with the texture that a PLY file names in a comment, as Blender and MeshLab write it."""
     head = read_bytes(file).split(b"end_header", 1)[0]
     named = re.search(rb"[\r\n]comment TextureFile[ \t]+([^\r\n]+)", head)
     if named is None:

@@ -1,10 +1,10 @@
-"""What a visible face shows at its pixels: colours, depths, textures, normals; compiled functions.
+"""Colours, depths, texture places and normals of the visible face at each pixel; compiled functions.
 
-Arrays are those of `raster`. Corners are where they are projected to, not rounded. A pixel that a face covers by the
-rounding of its corners alone, and which lies less than 1/256 pixel beside it, shows the nearest place of the face.
+Arrays are those of `raster`. Corners are at their projected places, not rounded. A pixel that a face covers only by the
+rounding of its corners, and which lies less than 1/256 pixel beside it, shows the nearest place of the face.
 
 Args:
-    colors: (vertices, channels), or None for white ones.
+    colors: (vertices, channels), or None for white vertices.
     laid: `textures.Laid`, or None.
     lens: fx, fy, cx, cy, pixels.
     face: (height, width) int32, the face that each pixel of `box` shows; -1: none.
@@ -23,8 +23,8 @@ from plugins.renderer.rasterizer.textures import among_texels, mixed, uv_at
 def weights(ax, ay, near0, bx, by, near1, cx, cy, near2, row, column):
     """Return perspective-correct barycentric weights of a face at a pixel that shows it: (w / z) / Σ (w / z).
 
-    Args:
-        ax, ay, near0: column and row of its first corner in 1/256 pixel, not rounded, and 1 / depth; and so on.
+    `ax`, `ay` and `near0` are column and row of the first corner in 1/256 pixel, not rounded, and its 1 / depth; the
+    other corners follow in the same way.
     """
     edge0, edge1, edge2 = edges(ax, ay, bx, by, cx, cy, row, column)
     part0, part1, part2 = edge0 * near0, edge1 * near1, edge2 * near2
@@ -38,7 +38,7 @@ def weights(ax, ay, near0, bx, by, near1, cx, cy, near2, row, column):
 @compiled
 @no_type_check
 def weights_beside(ax, ay, near0, bx, by, near1, cx, cy, near2, row, column):
-    """Return those of the place of a face that is nearest, on the screen, to a pixel beside it."""
+    """Return the weights of the place of a face that is nearest, on the screen, to a pixel beside it."""
     x, y = column * SUBPIXELS, row * SUBPIXELS
     to_ab, part_ab = to_edge(ax, ay, bx, by, x, y)
     to_bc, part_bc = to_edge(bx, by, cx, cy, x, y)
@@ -56,8 +56,10 @@ def weights_beside(ax, ay, near0, bx, by, near1, cx, cy, near2, row, column):
 @compiled
 @no_type_check
 def weights_in_space(seen, a, b, c, ray_x, ray_y):
-    """Return barycentric weights of a face that may have corners behind the camera: r·(b × c) and so on over their sum
-    (Olano & Greer 1997)."""
+    """Return barycentric weights of a face that may have corners behind the camera.
+
+    The weights are r·(b × c) and so on over their sum (Olano & Greer 1997).
+    """
     part0 = volume(seen, b, c, ray_x, ray_y)
     part1 = volume(seen, c, a, ray_x, ray_y)
     part2 = volume(seen, a, b, ray_x, ray_y)
@@ -94,7 +96,7 @@ def weights_at(seen, screen, faces, lens, index, row, column):
 @compiled
 @no_type_check
 def light(faces, colors, laid, index, w0, w1, w2, picture, row, column):
-    """Fill a pixel of a picture, (height, width, channels), with what a face shows at barycentric weights."""
+    """Fill a pixel of an image, (height, width, channels), with the colour of a face at barycentric weights."""
     if colors is None:
         for channel in range(picture.shape[2]):
             picture[row, column, channel] = 1.0
@@ -111,7 +113,7 @@ def light(faces, colors, laid, index, w0, w1, w2, picture, row, column):
 @compiled
 @no_type_check
 def tint(laid, index, w0, w1, w2, picture, row, column):
-    """Multiply a pixel by what the texture of a face shows there, if it has one."""
+    """Multiply a pixel by the colour of the face's texture there, if the face has one."""
     if laid.shown[index] < 0:
         return
     u, v = uv_at(laid, index, w0, w1, w2)
@@ -125,8 +127,7 @@ def tint(laid, index, w0, w1, w2, picture, row, column):
 def shade(seen, screen, faces, colors, laid, lens, near, face, box, color, depth):
     """Fill `color` (height, width, channel) and `depth` (height, width), or one of them, where a face is seen.
 
-    Args:
-        near: distance of the near plane, metres: no depth is less.
+    `near` is the distance of the near plane, metres; no depth is smaller.
     """
     top, bottom, left, right = box
     for row in range(top, bottom):
@@ -134,7 +135,7 @@ def shade(seen, screen, faces, colors, laid, lens, near, face, box, color, depth
             index = face[row, column]
             if index < 0:
                 continue
-            # as `weights_at` and `light` do, in place: a call for each pixel counts references to every array
+            # same as `weights_at` and `light`, but inlined: a call per pixel would count references to every array
             a, b, c = faces[index, 0], faces[index, 1], faces[index, 2]
             near0, near1, near2 = screen[a, 2], screen[b, 2], screen[c, 2]
             if near0 != 0 and near1 != 0 and near2 != 0:
@@ -163,7 +164,7 @@ def shade(seen, screen, faces, colors, laid, lens, near, face, box, color, depth
 @compiled
 @no_type_check
 def inform(seen, screen, vertices, faces, laid, lens, face, box, normal, barycentric, uv):
-    """Fill those that are not None, (height, width, 3 or 2), where a face is seen."""
+    """Fill `normal`, `barycentric` and `uv`, (height, width, 3 or 2), where a face is seen; None is left out."""
     top, bottom, left, right = box
     last = -1
     x = y = z = 0.0
@@ -189,7 +190,7 @@ def inform(seen, screen, vertices, faces, laid, lens, face, box, normal, barycen
 @compiled
 @no_type_check
 def normal_of(vertices, faces, index):
-    """Of length 1, to the side from which a face's corners run counter-clockwise; 0 of one without area."""
+    """Return the unit normal on the side where a face's corners run counter-clockwise; 0 for a face without area."""
     edge = np.empty((2, 3))
     for which in range(2):
         for axis in range(3):

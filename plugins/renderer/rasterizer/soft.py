@@ -1,4 +1,4 @@
-"""Aggregation of Liu, Li, Chen & Li, "Soft Rasterizer" (ICCV 2019, section 3), forwards and backwards; compiled.
+"""Aggregation of Liu, Li, Chen & Li, "Soft Rasterizer" (ICCV 2019, section 3), forward and backward; compiled.
 
 A pixel's colour is A_O A_S: the colours of the faces near it, blended by nearness and coverage, over black by the soft
 silhouette (which the paper gives beside the colours):
@@ -10,9 +10,9 @@ silhouette (which the paper gives beside the colours):
 
 d is the distance from the pixel to the face's border, in units in which the image's shorter side is 2; z_j,
 "normalised inverse depth", is the depth of the nearest vertex in view over the face's. Outside of a face its colour
-and depth are those of its barycentric weights cut at 0 and scaled to the sum 1, as in the published kernel, which also
-leaves a face out where D < 1e-4; here they are perspective-correct. No corner is rounded. A face that the near plane
-cuts is left out.
+and depth use its barycentric weights cut at 0 and scaled to the sum 1, as in the published kernel, which also
+leaves a face out where D < 1e-4. Here the colours and depths are perspective-correct. No corner is rounded. A face that
+the near plane cuts is left out.
 """
 
 import math
@@ -32,7 +32,7 @@ FLATTEST = 1e-12  # area over the square of the longest side
 
 @dataclass
 class Blend:
-    """A soft picture and what its gradient reads.
+    """A soft image and the data that its gradient reads.
 
     Attributes:
         place: (vertices, 2) float64, column and row, pixels.
@@ -57,7 +57,7 @@ class Blend:
 
 
 def reach(sigma: float, size: tuple[int, int]) -> float:
-    """How far outside of a face it is seen, pixels."""
+    """Return how far outside of a face the face is seen, pixels."""
     return math.sqrt(REACH * sigma) * min(size) / 2
 
 
@@ -73,7 +73,7 @@ def blend(
     gamma: float,
     counts: np.ndarray,
 ) -> Blend:
-    """The soft picture of what `raster.project` found; `counts` of the faces as in `raster.rasterise`."""
+    """Return the soft image of the vertices from `raster.project`; `counts` is as in `raster.rasterise`."""
     place, bounds = np.zeros((len(seen), 2)), np.zeros((len(faces), 4), np.int64)
     margin = reach(sigma, size)
     nearest = prepare(seen, screen, faces, lens, cull, *size, margin, place, bounds, counts)
@@ -97,7 +97,7 @@ def slopes(
     of_colors: np.ndarray,
     of_lens: np.ndarray,
 ) -> None:
-    """Add to `of_*` the slopes of a loss whose slopes in the picture are `along_color`."""
+    """Add to `of_*` the gradients of a loss whose gradient in the image is `along_color`."""
     if drawn.nearest >= 0:
         arrays = (drawn.place, drawn.bounds, drawn.nearest, *drawn.scales)
         arrays += (drawn.most, drawn.total, drawn.clear, drawn.mean)
@@ -107,7 +107,7 @@ def slopes(
 @compiled
 @no_type_check
 def prepare(seen, screen, faces, lens, cull, height, width, margin, place, bounds, counts):
-    """Fill `place` and `bounds` and count what becomes of the faces; returns the nearest vertex in view, or -1."""
+    """Fill `place` and `bounds`, count what happens to the faces, and return the nearest vertex in view, or -1."""
     for vertex in range(seen.shape[0]):
         if screen[vertex, 2] != 0:
             for axis in range(2):
@@ -150,13 +150,14 @@ def prepare(seen, screen, faces, lens, cull, height, width, margin, place, bound
 @compiled
 @no_type_check
 def corners_of(place, a, b, c):
+    """Return column and row of the three corners of a face, pixels."""
     return place[a, 0], place[a, 1], place[b, 0], place[b, 1], place[c, 0], place[c, 1]
 
 
 @compiled
 @no_type_check
 def parts(ax, ay, bx, by, cx, cy, x, y):
-    """Barycentric weights on the screen; their sum is 1."""
+    """Return barycentric weights on the screen; their sum is 1."""
     inverse = 1.0 / ((bx - ax) * (cy - ay) - (cx - ax) * (by - ay))
     return (
         ((bx - x) * (cy - y) - (cx - x) * (by - y)) * inverse,
@@ -168,7 +169,7 @@ def parts(ax, ay, bx, by, cx, cy, x, y):
 @compiled
 @no_type_check
 def heights_of(ax, ay, bx, by, cx, cy):
-    """Of a triangle over its edges, each opposite its corner, pixels."""
+    """Return the heights of a triangle over its edges, each opposite its corner, pixels."""
     area = abs((bx - ax) * (cy - ay) - (cx - ax) * (by - ay))
     return (
         area / np.hypot(cx - bx, cy - by),
@@ -180,9 +181,10 @@ def heights_of(ax, ay, bx, by, cx, cy):
 @compiled
 @no_type_check
 def to_border(corners, heights, w0, w1, w2, x, y):
-    """Squared distance to the border of a triangle, 1 inside of it or -1, and the nearest edge, by the corner opposite.
+    """Return the squared distance to the border of a triangle, 1 inside of it or -1 outside, and the nearest edge.
 
-    From inside, that to the nearest of the edges' lines; from outside, to one of the edges that face the pixel.
+    The edge is named by the corner opposite. From inside, the distance is to the nearest of the edges' lines; from
+    outside, to one of the edges that face the pixel.
     """
     ax, ay, bx, by, cx, cy = corners
     least, edge = np.inf, 0
@@ -207,8 +209,11 @@ def to_border(corners, heights, w0, w1, w2, x, y):
 @compiled
 @no_type_check
 def reached(corners, heights, low, sharpness, x, y):
-    """Barycentric weights of a pixel; 1 inside of the triangle, -1 outside, 0 out of reach (as it is below the weights
-    `low`); the nearest edge; and exp(-d²/σ) of the distance d to it."""
+    """Return weights, side, nearest edge and exp(-d²/σ) of a pixel, where d is the distance to the edge.
+
+    The weights are barycentric. The side is 1 inside of the triangle, -1 outside, and 0 out of reach. A pixel with a
+    weight below its limit in `low` is out of reach.
+    """
     w0, w1, w2 = parts(*corners, x, y)
     if w0 < low[0] or w1 < low[1] or w2 < low[2]:
         return w0, w1, w2, 0.0, 0, 0.0
@@ -221,7 +226,7 @@ def reached(corners, heights, low, sharpness, x, y):
 @compiled
 @no_type_check
 def cut(w0, w1, w2):
-    """Weights cut at 0 and scaled to the sum 1, and that sum before."""
+    """Return the weights cut at 0 and scaled to the sum 1, and their sum before scaling."""
     w0, w1, w2 = max(w0, 0.0), max(w1, 0.0), max(w2, 0.0)
     scale = w0 + w1 + w2
     return w0 / scale, w1 / scale, w2 / scale, scale
@@ -232,7 +237,7 @@ def cut(w0, w1, w2):
 def forward(
     seen, faces, colors, place, bounds, nearest, sharpness, gamma, margin, most, total, clear, mean, color
 ):
-    """Fill the arrays of `Blend`, face by face; sums are rescaled where a nearer face comes (w_j)."""
+    """Fill the arrays of `Blend`, face by face; the sums are rescaled when a nearer face comes (w_j)."""
     channels = colors.shape[1]
     height, width = most.shape
     unit = seen[nearest, 2]
@@ -285,7 +290,7 @@ def forward(
 @compiled
 @no_type_check
 def backward(scene, drawn, along_color, sums):
-    """Add to `of_*` the slopes of the loss, face by face; everything of a face at a pixel is computed anew."""
+    """Add to `of_*` the gradients of the loss, face by face; the terms of a face at a pixel are computed again."""
     seen, faces, colors, lens = scene
     place, bounds, nearest, sharpness, gamma, margin, most, total, clear, mean = drawn
     of_seen, of_colors, of_lens = sums

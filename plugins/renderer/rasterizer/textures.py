@@ -1,4 +1,4 @@
-"""Textures on faces: where a place lies among texels, and what it shows; compiled functions on arrays.
+"""Textures on faces: texels around a place, and the interpolated colour; compiled functions on arrays.
 
 Texel centres lie at whole numbers: u W - 1/2 from the left and (1 - v) H - 1/2 from the top.
 """
@@ -12,18 +12,18 @@ from plugins.renderer.rasterizer.raster import compiled
 REPEAT, CLAMP, MIRROR = range(3)
 WRAPS = {"repeat": REPEAT, "clamp": CLAMP, "mirror": MIRROR}
 FARTHEST_UV = 1e6
-"""Beyond which float32 says no more where in an image a place lies."""
+"""Largest uv for which float32 still resolves a place within an image."""
 
 
 class Laid(NamedTuple):
-    """A texture as kernels read it.
+    """A texture in the form that kernels read.
 
     Attributes:
-        texels: (texels, channels), the images' one after the other, each row by row from the top.
-        images: (images, 3) int64, of each the first texel, height and width.
+        texels: (texels, channels), the texels of all images one after the other, each image row by row from the top.
+        images: (images, 3) int64, the first texel, height and width of each image.
         uv: (places, 2).
         corners: (faces, 3) int32, rows of `uv`.
-        shown: (faces) int32, of the images, or -1.
+        shown: (faces) int32, the image of each face, or -1.
         wrap: `REPEAT`, `CLAMP` or `MIRROR`.
         smooth: whether to interpolate between texels.
     """
@@ -40,7 +40,7 @@ class Laid(NamedTuple):
 @compiled
 @no_type_check
 def uv_at(laid, index, w0, w1, w2):
-    """Where in its texture a face shows, at barycentric weights."""
+    """Return the place in its texture that a face shows at barycentric weights."""
     a, b, c = laid.corners[index, 0], laid.corners[index, 1], laid.corners[index, 2]
     uv = laid.uv
     return (
@@ -52,7 +52,7 @@ def uv_at(laid, index, w0, w1, w2):
 @compiled
 @no_type_check
 def wrapped(place, count, wrap):
-    """The texel of a row of `count` that stands at a whole number, wherever it lies."""
+    """Return the texel of a row of `count` texels that stands at an integer place, also beyond the row's ends."""
     if wrap == CLAMP:
         return min(max(place, 0), count - 1)
     if wrap == REPEAT:
@@ -64,8 +64,10 @@ def wrapped(place, count, wrap):
 @compiled
 @no_type_check
 def among_texels(laid, image, u, v):
-    """The four texels around a place, from the top left one on, row by row, and how far right and down between them
-    it lies, 0 to 1; where a texture is not smooth four times the same."""
+    """Return the four texels around a place, and its distance to the right and down between them, 0 to 1.
+
+    The texels start at the top left and run row by row. In a texture that is not smooth, all four are the same texel.
+    """
     start, height, width = laid.images[image, 0], laid.images[image, 1], laid.images[image, 2]
     x, y = u * width - 0.5, (1 - v) * height - 0.5
     if not laid.smooth:
@@ -92,7 +94,7 @@ def among_texels(laid, image, u, v):
 @compiled
 @no_type_check
 def mixed(laid, place, channel):
-    """What a texture shows at a place of `among_texels`."""
+    """Return the colour of a texture at a place from `among_texels`."""
     a, b, c, d, right, down = place
     texels = laid.texels
     above = texels[a, channel] + right * (texels[b, channel] - texels[a, channel])
@@ -103,7 +105,7 @@ def mixed(laid, place, channel):
 @compiled
 @no_type_check
 def mixed_slopes(laid, image, place, channel):
-    """Of `mixed` in u and v."""
+    """Return the derivatives of `mixed` in u and v."""
     a, b, c, d, right, down = place
     texels = laid.texels
     above = texels[b, channel] - texels[a, channel]

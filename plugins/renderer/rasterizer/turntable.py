@@ -1,4 +1,4 @@
-"""Cameras that look at a subject, from angles or from a file, and that go around it."""
+"""Cameras that look at a subject, given by angles or by a file, and cameras on a circle around it."""
 
 import json
 import math
@@ -21,31 +21,32 @@ from framework.storage.text import decoded
 from plugins.renderer.rasterizer.parts import Axis
 
 MARGIN = 1.03
-"""A sphere around the subject fills the picture's shorter side but for so much."""
+"""Factor on the nearest distance from which the sphere around the subject is seen whole."""
 NEAR = 1e-3
-"""Metres, or this share of the distance where that is less."""
+"""Distance of the near plane, metres, or as a share of the distance to the subject if that is less."""
 LONGEST_SIDE = 2**14
 ROTATION_ERROR = 1e-4
-"""So much may R Rᵀ differ from the identity: files round."""
+"""Largest difference between R Rᵀ and the identity, since files round."""
 UPRIGHT = {
     "y": torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]], dtype=torch.float64),
     "z": torch.eye(3, dtype=torch.float64),
 }
-"""Turns a scene's axes so that z points upwards and its front, z or -y, looks towards -y."""
+"""Rotations that turn a scene's axes so that z points upwards and its front, z or -y, looks towards -y."""
 IMAGE = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64).diag()
-"""From a viewer's axes (x right, y up, z backwards) to a camera's."""
+"""Rotation from a viewer's axes (x right, y up, z backwards) to a camera's axes."""
 KEYS = ("K", "R", "t", "size")
 
 
 @dataclass(frozen=True)
 class Ball:
-    """What surrounds a subject: the centre of its box, and how far the farthest corner of a face is from it."""
+    """A sphere around a subject: the centre of its box, and the distance to the farthest corner of a face."""
 
     centre: Float[Tensor, "3"]
     radius: float
 
 
 def ball(scene: Scene) -> Ball:
+    """Return the sphere around a scene's faces."""
     corners = scene.vertices[scene.faces.flatten().unique()].double()
     centre = corners.amin(0) / 2 + corners.amax(0) / 2
     radius = float((corners - centre).norm(dim=1).max())
@@ -64,12 +65,14 @@ def looking_at(
     field_of_view: float,
     size: tuple[int, int],
 ) -> Camera:
-    """A camera that sees the subject's centre in the middle of the picture.
+    """Return a camera that sees the subject's centre in the middle of the image.
 
     Args:
-        angles: azimuth, elevation, tilt in radians: those of `framework.geometry.camera.look_from`.
-        distance: from the subject's centre; None: as near as a sphere around it is seen whole.
-        field_of_view: from top to bottom, radians.
+        around: sphere around the subject.
+        up: the scene's vertical axis.
+        angles: azimuth, elevation, tilt in radians, as in `framework.geometry.camera.look_from`.
+        distance: distance from the subject's centre; None: the nearest from which a sphere around it is seen whole.
+        field_of_view: angle from top to bottom, radians.
         size: (height, width), pixels.
     """
     height, width = size
@@ -90,7 +93,7 @@ def looking_at(
 
 
 def turned(camera: Camera, centre: Float[Tensor, "3"], up: Axis, angle: float) -> Camera:
-    """The camera after it went around the vertical axis through `centre`, by `angle` radians: azimuth grows."""
+    """Return the camera turned around the vertical axis through `centre` by `angle` radians; its azimuth grows."""
     vertical = UPRIGHT[up]
     turn = vertical.T @ about_z(torch.tensor(-angle, dtype=torch.float64)) @ vertical
     rotation = camera.rotation.double()
@@ -99,16 +102,16 @@ def turned(camera: Camera, centre: Float[Tensor, "3"], up: Axis, angle: float) -
 
 
 def around(camera: Camera, centre: Float[Tensor, "3"], up: Axis, count: int) -> Iterator[Camera]:
-    """Cameras of a whole turn in `count` equal steps; the first is the camera itself."""
+    """Yield cameras of a whole turn in `count` equal steps; the first is the camera itself."""
     for number in range(count):
         yield turned(camera, centre, up, 2 * math.pi * number / count) if number else camera
 
 
 def read_camera(file: Path) -> Camera:
-    """An exact camera: `K`, `R`, `t`, `size` ([width, height]) as `framework.geometry.camera` defines them.
+    """Read a camera from `K`, `R`, `t`, `size` ([width, height]), as `framework.geometry.camera` defines them.
 
     Raises:
-        DataError: the file is missing or damaged, or one of the four is missing or means no camera.
+        DataError: the file is missing or damaged, or one of the four is missing or describes no camera.
     """
     found = _values(file)
     unknown = [key for key in found if key not in KEYS]
