@@ -27,7 +27,7 @@ SIZE = (60, 80)
 
 
 def square(depth, side, turn=(0.0, 0.0, 0.0), shift=(0.0, 0.0)):
-    """Corners of a square before a canonical camera, turned about its middle."""
+    """Return the corners of a square in front of a canonical camera, rotated about its centre."""
     flat = torch.tensor([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], dtype=torch.float64) * side / 2
     turned = flat @ torch.from_numpy(Rotation.from_rotvec(turn).as_matrix()).T
     return turned + torch.tensor([*shift, depth], dtype=torch.float64)
@@ -37,7 +37,7 @@ FACES = torch.tensor([[0, 1, 2], [0, 2, 3], [2, 1, 0], [3, 2, 0]])
 
 
 def homography(vertices):
-    """From places on the square, in [-1, 1]², to pixels (Hartley & Zisserman 2004, eq. 8.3)."""
+    """Return the homography from points of the square, in [-1, 1]², to pixels (Hartley & Zisserman 2004, eq. 8.3)."""
     focal, (across, down) = SIZE[0], canonical_camera(*SIZE).principal
     lens = torch.tensor([[focal, 0, across], [0, focal, down], [0, 0, 1]], dtype=torch.float64)
     middle = vertices.mean(0)
@@ -47,7 +47,7 @@ def homography(vertices):
 def test_flow_of_a_plane_is_its_homography_and_what_is_hidden_is_not_seen():
     camera = canonical_camera(*SIZE)
     one, other = square(3.0, 1.6, (0.2, -0.3, 0.1)), square(3.2, 1.6, (-0.1, 0.4, 0.5), (0.2, -0.1))
-    hiding = square(1.5, 0.3, shift=(-0.1, 0.1))  # before one part of the first picture; away in the second
+    hiding = square(1.5, 0.3, shift=(-0.1, 0.1))  # hides a part of the first image, absent in the second
     away = hiding + torch.tensor([9.0, 0, 0])
     faces = torch.cat([FACES, FACES + 4])
     scenes = [Scene(torch.cat(pair), faces, None, camera) for pair in ((one, hiding), (other, away))]
@@ -60,7 +60,7 @@ def test_flow_of_a_plane_is_its_homography_and_what_is_hidden_is_not_seen():
     wanted = wanted[..., :2] / wanted[..., 2:]
     assert seen.sum() > 500
     assert (place - wanted)[seen].abs().max() < 0.01  # pixels; the rasteriser rounds corners to 1/256
-    corners = torch.tensor([[-0.25, -0.05], [0.05, 0.25]]) / 1.5  # of what hides
+    corners = torch.tensor([[-0.25, -0.05], [0.05, 0.25]]) / 1.5  # of the hiding square
     x, y = (torch.tensor(camera.principal) + SIZE[0] * corners).T
     hidden = (
         (wanted[..., 0] > x[0]) & (wanted[..., 0] < x[1]) & (wanted[..., 1] > y[0]) & (wanted[..., 1] < y[1])
@@ -103,7 +103,7 @@ JOINTS = {
 
 
 def bvh(frames):
-    """The file's text; of each frame degrees about z, y and x of some joints."""
+    """Return the text of a BVH file; each frame gives degrees about z, y and x of some joints."""
 
     def joint(name, depth):
         word = "ROOT" if not depth else "JOINT"
@@ -157,7 +157,7 @@ def test_a_generated_person_is_the_data_sets_and_moves(data, person, tmp_path):
     written = scan_layout.read_registration(file)
     assert torch.equal(written.vertices, person.registration.vertices)
     assert torch.equal(written.colors, person.registration.colors)
-    # in the pose in which they stood they are who they were, whatever pose came in between
+    # in the original pose the person is unchanged, also after another pose in between
     other = person.at(0.3 * np.ones(person.stood.shape[1:]))
     again = person.at(person.stood[0].double().numpy())
     assert (again.vertices - written.vertices).abs().max() < 1e-4
@@ -174,7 +174,7 @@ def test_pictures_show_a_mesh_on_white_and_the_data_sets_photograph(data, person
     found = animation.photograph(data.renderer, person.first().scan, view.camera)
     assert (
         np.abs(found.astype(int) - written).max() <= 1
-    )  # the file's colours are rounded before they are on white
+    )  # the file's colours are rounded before compositing on white
     scene = animation.actor(person.registration).scene(person.first(), view.camera)
     drawn = animation.on_white(RENDERER, scene)
     seen = RENDERER(scene, ("mask", "color"))
@@ -187,7 +187,7 @@ def test_a_run_and_a_motion_become_pictures_side_by_side(data, tmp_path, walks, 
     run = contract("renderer", "smplpix").rows[0].config["checkpoint"]
     description, _ = stored(run)
     height, width = animate.data_of(description).size
-    # of a doll: the run's own data needs the default body
+    # data of a doll, because the run's own data needs the default body
     monkeypatch.setattr(animate, "data_of", lambda description: data)
     (tmp_path / "walk.bvh").write_text(bvh([{}, TURNS, {}]))
     asked = [run, "--frames", "3", "--out", str(tmp_path / "new/film.gif")]
@@ -198,7 +198,7 @@ def test_a_run_and_a_motion_become_pictures_side_by_side(data, tmp_path, walks, 
         first = np.asarray(film.convert("RGB")).astype(int)
         film.seek(1)
         second = np.asarray(film.convert("RGB")).astype(int)
-    assert np.abs(first - second).max() > 50  # somebody moves
+    assert np.abs(first - second).max() > 50  # the person moves
 
 
 def test_cameras_see_all_of_somebody_from_everywhere(person):
@@ -211,7 +211,7 @@ def test_cameras_see_all_of_somebody_from_everywhere(person):
         share = (place - torch.tensor(camera.principal)).abs() * 2 / torch.tensor(SIZE[::-1])
         assert (depth > 0).all() and share.max() < animation.FREE + 1e-4
         fullest = max(fullest, share.max().item())
-    assert fullest == pytest.approx(animation.FREE, abs=1e-3)  # and no smaller than need be
+    assert fullest == pytest.approx(animation.FREE, abs=1e-3)  # and no smaller than necessary
 
 
 def frames(count):
@@ -230,7 +230,7 @@ def test_pictures_become_a_film_on_white(kind, tmp_path):
         film.seek(3)
         assert np.asarray(film.convert("RGB"))[:12, :32].min() >= (
             255 if kind == ".gif" else 250
-        )  # the ground
+        )  # the background
 
 
 def test_a_film_needs_its_program_and_people_who_are_there(data, tmp_path, monkeypatch):

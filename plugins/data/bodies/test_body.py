@@ -21,7 +21,7 @@ PARENTS = (1, -1, 1, 2, 0, 2)  # the root is not the first, and a child comes be
 
 
 def body(features=None, seed=0, **changes):
-    """A body of 17 vertices, 6 joints and 3 shape coefficients."""
+    """Return a body of 17 vertices, 6 joints and 3 shape coefficients."""
     random = np.random.default_rng(seed)
     weights = random.random((17, 6)) * (random.random((17, 6)) < 0.5) + 1e-3
     parts = {
@@ -48,7 +48,7 @@ def parameters(count=4, size=1.0, seed=1):
 
 
 def by_loop(made, shape, pose, translation):
-    """Eq. 7.1-7.2 one body, one vertex, one joint at a time, with homogeneous matrices and SciPy's rotations."""
+    """Compute eq. 7.1-7.2 by loops over bodies, vertices and joints, with homogeneous matrices and SciPy's rotation."""
     found = np.empty((len(shape), len(made.template), 3))
     for row in range(len(shape)):
         turn = [Rotation.from_rotvec(vector).as_matrix() for vector in pose[row]]
@@ -131,7 +131,7 @@ def test_joints_go_where_the_chain_takes_them():
     shape, pose, _ = parameters()
     model = BodyModel(made)
     found = model.posed_joints(torch.from_numpy(shape), torch.from_numpy(pose)).numpy()
-    # a vertex at a joint that follows it alone goes with it
+    # a vertex at a joint, with weight 1 for that joint, moves as the joint does
     single = body(
         template=np.vstack([made.joints, made.template[6:]]),
         weights=np.eye(17, 6) + np.eye(17, 6, -6) + np.eye(17, 6, -12),
@@ -198,7 +198,7 @@ def test_quaternions_have_a_gradient_at_nothing():
 
 def test_joints_that_never_bend_can_be_left_out():
     made = body()
-    less = with_joints(made, ["b", "c", "f"])  # of the chains b-a-e and b-c-d, c-f
+    less = with_joints(made, ["b", "c", "f"])  # the chains are b-a-e, b-c-d and c-f
     assert less.parents == (-1, 0, 1)
     shape, pose, translation = parameters()
     pose[:, [0, 3, 4]] = 0

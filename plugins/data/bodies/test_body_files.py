@@ -13,7 +13,7 @@ JOINTS, VERTICES, SHAPES = 4, 12, 5
 
 
 def arrays(features=9 * (JOINTS - 1), seed=0):
-    """A body in the usual layout: parents 0 ← 1 ← 2, 0 ← 3."""
+    """Return the arrays of a body in the published layout: parents 0 ← 1 ← 2, 0 ← 3."""
     random = np.random.default_rng(seed)
     weights, regressor = random.random((VERTICES, JOINTS)), random.random((JOINTS, VERTICES))
     return {
@@ -93,7 +93,7 @@ def test_our_own_layout_keeps_every_bit(tmp_path):
 
 NESTED = [0.0, 1.0, 2.0]
 for _ in range(30):
-    NESTED = [NESTED, NESTED]  # as an array without end
+    NESTED = [NESTED, NESTED]  # would become an array of 2³⁰ rows
 
 
 def changed(**changes):

@@ -32,7 +32,7 @@ def test_it_stands_upright_faces_the_front_and_has_two_sides(found):
     assert place["wrist.L"][0] > 0 > place["wrist.R"][0]  # x to its left
     assert place["eye.L"][2] > place["head"][2]  # z to the front
     assert vertices.isfinite().all()
-    # closed enough to have an inside: the volume of a person's surface is positive with faces seen from outside
+    # the surface is nearly closed: its volume is positive if faces are counter-clockwise seen from outside
     corners = vertices[model.faces]
     volume = torch.linalg.det(corners).sum() / 6
     assert 0.01 < volume < 0.2
@@ -43,10 +43,10 @@ def test_it_has_places_in_a_texture_with_seams(found):
     assert body.uv.shape == (21_334, 2) and body.uv_faces.shape == body.faces.shape
     assert body.uv.min() > 0 and body.uv.max() < 1
     pairs = np.unique(np.stack([body.faces.ravel(), body.uv_faces.ravel()]), axis=1)
-    # a place belongs to one vertex, and few vertices lie on a seam
+    # each texture coordinate belongs to one vertex, and few vertices lie on a seam
     assert len(np.unique(pairs[1])) == pairs.shape[1]
     assert 1.02 < pairs.shape[1] / len(body.template) < 1.2
-    # hands lie apart from the face: a skin's v upwards puts hands and feet low
+    # hands lie apart from the face in the texture: with v upwards, hands and feet are low
     face, hands = (
         body.uv[pairs[1][body.weights[pairs[0]][:, joints].sum(1) > 0.9]] for joints in _joints(body)
     )
@@ -58,7 +58,7 @@ def test_it_has_places_in_a_texture_with_seams(found):
 
 
 def _joints(body):
-    """Of the head, and of the fingers."""
+    """Return the joints of the head, and those of the fingers."""
     return [
         [number for number, name in enumerate(body.names) if name.startswith(words)]
         for words in (("head", "eye"), ("finger",))
@@ -97,7 +97,7 @@ def test_without_the_package_it_says_how_to_get_it(monkeypatch):
 
 
 def made():
-    """Traits "age" of three anchors and "size" of two, "side" without anchors, and "hidden", which is not given."""
+    """Return traits "age" with three anchors, "size" with two, "side" without anchors, and "hidden" without a label."""
     columns = ("age", "age", "age", "side", "side", "size", "size", "hidden", "hidden")
     random = np.random.default_rng(0)
     return Traits(
@@ -128,7 +128,7 @@ def test_coefficients_are_those_of_a_loop(size, age):
 
 
 def hat(value, anchors):
-    """NumPy's linear interpolation of each anchor's own 1."""
+    """Return NumPy's linear interpolation of the indicator of each anchor."""
     return [float(np.interp(value, anchors, np.eye(len(anchors))[i])) for i in range(len(anchors))]
 
 

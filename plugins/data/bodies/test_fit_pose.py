@@ -79,7 +79,7 @@ def test_place_turns_the_body_about_its_root_and_moves_it(figure):
 
 
 def test_movements_bend_what_they_name(figure):
-    """The forearm comes forwards, the knee goes back, an arm is raised; left and right are mirror images."""
+    """Check that the forearm moves forwards, the knee back and the arm up, and that left mirrors right."""
 
     def moved(name):
         given = torch.zeros(len(figure.names), dtype=torch.float64)
@@ -113,7 +113,7 @@ def test_slopes_are_those_of_the_vertices(figure):
 
 
 def test_a_smaller_picture_is_the_mean_of_the_pixels(figure):
-    """Drawn with 1/part of the pixels and part times the samples: the same samples, so the same numbers."""
+    """Check that 1/part of the pixels with part times the samples has the same samples, and so the same numbers."""
     camera, fine = figure.camera(**SIZE), renderer(supersampling=8)
     whole = renderer(supersampling=2)(figure.scene(numbers(figure), camera))["color"]
     drawn = fine(figure.scene(numbers(figure), smaller(camera, 4)))["color"]
@@ -133,7 +133,7 @@ def test_blur_is_a_gaussian(deviation):
 
 
 def test_the_gradient_is_that_of_the_loss(figure):
-    """Against central differences of a loss drawn with 16 x 16 samples a pixel; and the curvature against theirs."""
+    """Compare with central differences of a loss drawn with 16 x 16 samples a pixel, and check the curvature."""
     camera, stage = figure.camera(**SIZE), Stage(2, 1.0, 0.1)
     at, fine = numbers(figure, 1, 0.5), renderer(supersampling=16)
     aim = fine(figure.scene(at + 0.05 * numbers(figure, 2), camera))["color"]
@@ -157,7 +157,10 @@ def test_the_gradient_is_that_of_the_loss(figure):
 
 
 def test_an_update_keeps_the_curvature_positive_and_learns_a_quadratic():
-    """BFGS with exact steps along n directions that are conjugate finds the matrix (Nocedal & Wright 2006, th. 6.4)."""
+    """Check that BFGS with exact steps along n conjugate directions finds the matrix.
+
+    Source: Nocedal & Wright 2006, th. 6.4.
+    """
     random = np.random.default_rng(0)
     root = torch.from_numpy(random.normal(0, 1, (5, 5)))
     wanted = root @ root.T + torch.eye(5)
@@ -172,7 +175,7 @@ def test_an_update_keeps_the_curvature_positive_and_learns_a_quadratic():
 
 @pytest.mark.parametrize("gradient", ["boundary", "nmr", "soft"])
 def test_a_small_offset_is_found_again(figure, gradient):
-    """Every gradient leads nearer; that of the picture itself to where the picture was taken."""
+    """Check that every gradient reduces the error, and that the exact one finds the original parameters."""
     camera = figure.camera(**SIZE)
     wanted = torch.zeros(len(figure.names), dtype=torch.float64)
     wanted[:6] = torch.tensor([0.05, 0.15, -0.1, 0.05, -0.04, 0.06])
@@ -273,7 +276,7 @@ def test_the_metric_sees_what_arrived(data):
 
 
 class Blind(Renderer):
-    """Draws, without gradients."""
+    """Renderer without gradients."""
 
     bibtex = ""
     channels = frozenset({"color", "face"})

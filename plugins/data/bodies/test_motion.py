@@ -29,12 +29,12 @@ TREE = {
         **{f"{side}UpLeg": {f"{side}Leg": {f"{side}Foot": {}}} for side in ("Left", "Right")},
     }
 }
-"""Of a file's joints, those below each."""
+"""Joints of a file, as a tree."""
 ORDERS = ("ZYX", "XYZ", "YZX")
 
 
 def written(file, frames=3, seed=0, prefix=""):
-    """A BVH file of random bones and angles; its numbers: offsets, channel orders and angles by name."""
+    """Write a BVH file of random bones and angles, and return its offsets, channel orders and angles by joint name."""
     random = np.random.default_rng(seed)
     lines, offsets, orders = ["HIERARCHY"], {}, {}
 
@@ -67,7 +67,7 @@ def written(file, frames=3, seed=0, prefix=""):
 
 
 def directions(offsets, orders, angles, frame):
-    """Unit vectors of the arms' and legs' bones, by products of matrices about single axes from the root on."""
+    """Return unit vectors of the arms' and legs' bones, by products of matrices about single axes from the root on."""
     found = {}
 
     def walk(name, below, above):
@@ -104,7 +104,7 @@ def test_bones_point_where_those_of_the_file_do(file, tmp_path):
             for name, (start, end) in ROLES.items():
                 bone = joints[row, getattr(where, end)[number]] - joints[row, getattr(where, start)[number]]
                 np.testing.assert_allclose(bone / np.linalg.norm(bone), wanted[side + name], atol=1e-6)
-    # the head turns as the file's, however many joints share that
+    # the head rotates as the file's, for any number of joints that share the rotation
     turned, at = Rotation.identity(), where.neck[-1]
     while at >= 0:
         turned, at = Rotation.from_rotvec(found[1, at]) * turned, made.parents[at]
@@ -177,7 +177,7 @@ def test_a_captured_walk_swings_arms_and_legs_as_the_file_does():
     joints = BodyModel(made).double().posed_joints(torch.zeros(len(frames), 1).double(), pose).numpy()
     for role, name in ((where.wrist, "Hand"), (where.ankle, "Foot")):
         ours = (joints[:, role[0]] - joints[:, role[1]])[:, 2]
-        # how far the left one is ahead in the file's own skeleton
+        # lead of the left side over the right in the file's own skeleton
         theirs = [
             placed(moving, frame, f"Left{name}")[2] - placed(moving, frame, f"Right{name}")[2]
             for frame in frames
@@ -189,7 +189,7 @@ def test_a_captured_walk_swings_arms_and_legs_as_the_file_does():
 
 
 def placed(moving, frame, name):
-    """Where a joint of the file is, from the joint itself up to the root."""
+    """Return the position of a joint of the file, computed from the joint up to the root."""
     joint, place = moving.names.index(name), np.zeros(3)
     while joint >= 0:
         place = moving.offsets[joint] + moving.rotations[frame, joint] @ place

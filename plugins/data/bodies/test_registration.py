@@ -48,7 +48,7 @@ def angles(**movements):
 
 
 def rest(name):
-    """The movement that leaves a T-pose as it is."""
+    """Return the value of a movement that leaves a T-pose unchanged."""
     return 90.0 if name.endswith("raise") else 0.0
 
 
@@ -180,7 +180,7 @@ def test_a_scanner_sees_one_side_and_cuts_no_more_than_asked():
     mesh = Mesh("a doll", content["v_template"], content["f"])
     for seed in range(40):
         found = scan(mesh, "partial", Scanner(points=2_000, noise=0.0, cut=0.1), np.random.default_rng(seed))
-        # a tenth at most behind a plane or in a ball; or half, which faces away
+        # a tenth at most is removed by a plane or a ball; or the half that faces away
         assert len(found) >= 1_800 or 800 < len(found) < 1_200
     noisy = scan(mesh, "whole", Scanner(points=20_000, noise=0.01), np.random.default_rng(3))
     assert len(noisy) == 20_000
@@ -248,8 +248,8 @@ def test_a_result_is_one_coloured_ply(tmp_path):
 
 
 def test_the_panels_show_the_front_and_the_left_side():
-    # a square that looks to the front, to its left a bar that looks to the left; a point before and one behind the
-    # square
+    # a square that faces the front, and to its left a bar that faces left; one point is in front of the square, one
+    # behind it
     vertices = np.array([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0), (1, -1, -0.3), (1, 1, -0.3)], float)
     faces = np.array([(0, 1, 2), (0, 2, 3), (1, 4, 5), (1, 5, 2)])
     cloud = np.array([(0.5, 0.5, 1.0), (-0.5, -0.5, -1.0)])
@@ -277,7 +277,7 @@ def test_the_panels_show_the_front_and_the_left_side():
 
 
 def test_distances_are_to_the_surface():
-    # a square with a vertex that no face uses close to every point
+    # a square, and a vertex without faces that is close to the points
     vertices = np.array([(0, 0, 0), (2, 0, 0), (2, 2, 0), (0, 2, 0), (1, 0.9, 0.3)], float)
     faces = np.array([(0, 1, 2), (0, 2, 3)])
     cloud = np.array([(1, 0.9, 0.3), (0.4, 1.5, -0.02), (3, 3, 0), (1, -4, 3)])
@@ -291,7 +291,7 @@ def write(path, vertices, faces=None):
 
 
 def command(folder, *arguments):
-    """`python -m ...` as a user calls it: exit code, output."""
+    """Run `python -m ...` as a user does, and return exit code and output."""
     call = [sys.executable, "-m", *map(str, arguments)]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     done = subprocess.run(call, cwd=folder, env=environment, capture_output=True, text=True, timeout=300)
@@ -327,7 +327,7 @@ def test_a_trained_run_registers_a_users_scan(file, tmp_path):
     assert code == 1
     assert "error:" in told and "nobody.ply: no such file" in told and "Traceback" not in told
 
-    # thesis Table 6.4: a model of the body that FAUST's registrations have, on FAUST's scans
+    # thesis Table 6.4: a model is tested on FAUST's scans; it was trained on the body of FAUST's registrations
     batch = prepared(file, points=200).splits().test.__getitems__(range(6))
     place = batch["centre"], batch["scale"]
     meshes = denormalised(batch["target"].unflatten(1, (-1, 3)), *place).numpy()

@@ -35,7 +35,7 @@ def default():
 def test_any_pose_and_shape_is_found_from_the_vertices_alone(doll, size, number):
     random = np.random.default_rng(number)
     pose = torch.from_numpy(size * random.normal(size=(1, 22, 3)))
-    pose[0, 0] = torch.from_numpy(Rotation.random(rng=random).as_rotvec())  # however they stand, or lie
+    pose[0, 0] = torch.from_numpy(Rotation.random(rng=random).as_rotvec())  # any global rotation
     shape, place = (torch.from_numpy(random.normal(size=(1, count))) for count in (4, 3))
     model = BodyModel(doll).double()
     mesh = model(shape, pose, place)[0]
@@ -81,7 +81,7 @@ FEWER = {"shapes": np.zeros((13_718, 3, 1), np.float32), "joint_shapes": np.zero
 
 @pytest.mark.parametrize("name", ["7k", "14k", "27k", "110k"])
 def test_vertices_of_a_topology_bend_with_the_body(doll, default, name):
-    """Those that are the body's own exactly, midpoints nearly as the middle of their edges."""
+    """Check that the body's own vertices bend exactly alike, and midpoints nearly as the middle of their edges."""
     for body, tolerance in ((doll, 1e-12), (replace(default[0], **FEWER), 1e-6)):
         surface = sheet(body)
         mesh = topology(body, surface, name)
@@ -109,7 +109,7 @@ def test_meshes_of_other_bodies_are_told(doll):
 
 
 def test_somebody_posed_anew_is_as_in_that_pose_and_reshaped_as_of_that_shape(default):
-    """Clothes are up to two centimetres outwards in the rest pose; the truth is the body's own skinning of them."""
+    """Compare with the body's own skinning of clothes that are up to two centimetres outwards in the rest pose."""
     body, traits = default
     few = in_few_shapes(body, traits)
     surface = sheet(body, 0)
@@ -142,7 +142,7 @@ def test_somebody_posed_anew_is_as_in_that_pose_and_reshaped_as_of_that_shape(de
         (one.posed(after[0].numpy()), whole(shape, after, None, clothes)[0]),
         (one.posed(before[0].numpy(), taller), None),
     ):
-        if truth is None:  # the truth's joints and vertices, moved by the same two standard deviations
+        if truth is None:  # joints and vertices of the truth are moved by the same two standard deviations
             whole.joints += 2 * joints
             truth = whole(shape, before, None, clothes + 2 * step)[0]
         ours = found.vertices.double()

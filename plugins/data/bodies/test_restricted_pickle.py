@@ -20,7 +20,7 @@ PROTOCOLS = range(pickle.HIGHEST_PROTOCOL + 1)
 
 
 class Calls:
-    """Pickles to a call of something."""
+    """Object that is pickled as a call of a function."""
 
     def __init__(self, function, *arguments):
         self.call = (function, arguments)
@@ -33,7 +33,7 @@ def same(found, wanted):
     if isinstance(wanted, np.ndarray | np.generic):
         assert found.dtype == wanted.dtype
         np.testing.assert_array_equal(found, wanted)
-    else:  # a sparse matrix comes back with its zeros
+    else:  # a sparse matrix is returned as a dense array
         same(found, wanted.toarray())
 
 
@@ -76,7 +76,7 @@ def test_what_is_read_is_writable_and_no_view_of_the_file():
     assert found.tolist() == [7, 1, 2]
 
 
-# What Python 2 wrote of {"v": array([[1., 2.]]), "u": array([5], uint32)} and of wrapped arrays, protocol 2: names of
+# Pickles by Python 2 of {"v": array([[1., 2.]]), "u": array([5], uint32)} and of wrapped arrays, protocol 2: names of
 # old modules, data as byte strings
 def array_of_python2(raw, dtype, shape):
     short = b"".join(b"K" + bytes([side]) for side in shape)
@@ -169,7 +169,7 @@ def test_the_shell_of_the_test_above_would_have_run(tmp_path):
 
 
 RAW = {
-    # opcodes by hand: what no pickler writes
+    # opcodes written by hand, which no pickler writes
     "a method of an allowed name": b"cnumpy\nndarray.tofile\n.",
     "attributes by dots": b"\x80\x04\x8c\x05numpy\x8c\x0dcore.sys.exit\x93.",
     "a function of this reader": b"cframework.restricted_pickle\nload\n.",
@@ -190,7 +190,7 @@ RAW = {
     "an array of pointers": b"\x80\x02" + TWO.replace(b"U\x02f8", b"U\x01O") + b".",
     "no state": b"\x80\x02cnumpy.core.multiarray\n_reconstruct\ncnumpy\nndarray\nK\x00\x85U\x01b\x87R.",
     "a dictionary with an array for key": b"}" + TWO + b"Ns.",
-    # what is hashed or multiplied out could take for ever
+    # hashing or expanding these could take unlimited time
     "a set": b"\x8f(K\x01\x90.",
     "a frozen set": b"(K\x01\x91.",
     "a tuple for a key": b"}K\x01K\x02\x86Ns.",
@@ -220,7 +220,7 @@ def test_hand_made_and_damaged_pickles_are_refused(name):
 
 
 def test_nesting_does_not_multiply():
-    """Thirty lists that each hold the one before twice: a billion items for whoever copies them."""
+    """Check thirty lists that each hold the one before twice, of which a copy would have a billion items."""
     content = BytesIO()
     pickler = pickle.Pickler(content, protocol=2)
     item = []
@@ -233,7 +233,7 @@ def test_nesting_does_not_multiply():
 
 @pytest.mark.parametrize("kind", ["csc", "csr", "coo"])
 def test_sparse_matrices_are_added_up_as_scipy_does(kind):
-    """Entries in no order, several of one place, lines and matrices without any."""
+    """Check unordered entries, several entries at one position, and empty rows and matrices."""
     random = np.random.default_rng(0)
     for rows, columns, count in ((5, 7, 40), (1, 9, 3), (6, 1, 0), (0, 4, 0)):
         places = random.integers(0, (max(rows, 1), max(columns, 1)), (count, 2)).T
@@ -266,7 +266,7 @@ def test_a_sparse_matrix_that_is_not_whole_is_refused(name, made):
         attribute = {"indices": "row", "indptr": "col"}.get(name, name) if made is sparse.coo_matrix else name
         if made is sparse.coo_matrix and attribute in ("row", "col"):
             if name == "indptr" and np.shape(value) == (3,):
-                continue  # as columns these may be right
+                continue  # three numbers may be valid columns
             attribute, value = "coords", (np.arange(3), np.array(value))
         vars(matrix)[attribute] = np.array(value) if isinstance(value, list) else value
         with pytest.raises(PickleRefused):

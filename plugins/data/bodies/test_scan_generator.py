@@ -50,9 +50,9 @@ def test_registrations_are_near_the_body_and_scans_are_not_registrations(wardrob
         gap = np.linalg.norm(found.vertices - scan.vertices[: len(bare)], axis=1)
         gaps.append((np.median(gap), gap.max()))
     median, largest = np.array(gaps).T
-    assert (median < 0.01).all()  # drawn to it
-    assert (largest > 0.01).mean() > 0.6  # hair, hems and skirts are the scan's alone
-    # some wear what is no part of the body: skirts, long hair
+    assert (median < 0.01).all()  # the registration follows the scan
+    assert (largest > 0.01).mean() > 0.6  # hair, hems and skirts are only in the scan
+    # some people have skirts or long hair, which are no part of the body's mesh
     assert 0.2 < np.mean([len(scan.vertices) > len(bare) for scan, _ in dressed]) < 1
 
 
@@ -61,7 +61,7 @@ def test_colours_of_a_registration_are_those_of_the_nearest_points_that_a_scanne
         for vertex in range(0, len(found.vertices), 4001):
             order = np.linalg.norm(scan.vertices - found.vertices[vertex], axis=1).argsort()
             colors = eight_bit(torch.from_numpy(scan.colors[order[:1]])).numpy()
-            # under a skirt legs are nearer than it, but no scanner sees them
+            # legs under a skirt are nearer than the skirt, but no scanner sees them
             hidden = len(scan.vertices) > len(found.vertices)
             assert hidden or np.array_equal(found.colors[vertex], colors[0])
 
@@ -109,7 +109,7 @@ def test_a_texture_holds_the_colours_of_its_places(wardrobe, dressed):
 
 @pytest.mark.parametrize("number", range(4))
 def test_photographs_show_a_point_where_its_camera_says(number):
-    """Seen in the mask: a ball of 12 cm, whose outline's middle is its own to a hundredth of a pixel."""
+    """Compare the centroid of a 12 cm ball's mask with the projection of its centre."""
     random = np.random.default_rng(number)
     people = random.normal(0, 0.4, (500, 3)) * [0.5, 1, 0.5] + random.normal(0, 1, 3)
     camera = photographs.rig(people, 5, (60, 48), random)[number]
@@ -126,7 +126,7 @@ def test_photographs_show_a_point_where_its_camera_says(number):
     cover = found.mask.astype(float)
     row, column = (np.average(place, weights=cover) for place in np.indices(cover.shape))
     pixel, depth = camera.projected(torch.from_numpy(centre)[None])
-    # a ball's outline is off its middle by the share that (radius / depth)² is of the way from the axis
+    # the outline of a ball is shifted outwards by (radius / depth)² times its distance from the axis
     assert np.abs(np.array([column, row]) - pixel[0].numpy()).max() < 0.05 + 40 * (0.12 / float(depth)) ** 2
     assert (found.pixels[found.mask > 0] == 255).all() and (found.pixels[found.mask == 0] == 188).all()
 
@@ -181,7 +181,7 @@ def test_a_subject_is_a_function_of_seed_split_and_number(tmp_path, monkeypatch)
 
 
 def test_the_default_body_is_photographed_with_what_textured_renderers_need(tmp_path, monkeypatch):
-    """From what is read the photograph can be drawn again: less well from fewer vertices, best with the texture."""
+    """Check that the photograph can be drawn again from the files, best with the texture, worst with few vertices."""
     root = Path(cache.folder("body")).resolve()
     (tmp_path / "body").symlink_to(root)
     monkeypatch.setenv("FRAMEWORK_CACHE", str(tmp_path))
@@ -230,7 +230,7 @@ def test_a_topology_that_is_not_generated_is_told_before_anything_is_drawn():
 
 
 def test_a_renderer_that_smooths_edges_itself_draws_nearly_the_same():
-    """The light of a pixel is that of the subject alone, whatever else the pixel shows."""
+    """Check that the colour of a pixel is that of the subject alone, whatever else the pixel shows."""
     corners = torch.tensor([[0.0, 0, 2], [0.3, 0.9, 2], [0.8, 0.1, 2.5]])
     camera = Camera(torch.eye(3), torch.zeros(3), (40.0, 40.0), (2.0, 2.0), 24, 24)
     scene = Scene(corners, torch.tensor([[0, 1, 2]]), torch.tensor([[0.2, 0.5, 0.9]]).expand(3, 3), camera)

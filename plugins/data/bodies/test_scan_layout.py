@@ -46,7 +46,7 @@ def root(whole, tmp_path):
 @pytest.mark.parametrize("file", FILES)
 def test_damage_is_told_with_the_file(root, file, kind):
     if file == "test.txt" and kind == "cut":
-        kind = "missing"  # half a list of names is a list
+        kind = "missing"  # half a list of names is still a valid list
     damage(root / file, kind)
     with pytest.raises(DataError, match=(root / file).name):
         data(root).prepare()
@@ -75,7 +75,7 @@ def larger_mesh(root):
 
 
 def without(words):
-    """A registration as text, without some of its lines."""
+    """Return a function that writes a registration as text without some of its lines."""
 
     def spoil(root):
         text = (
@@ -230,7 +230,7 @@ def test_own_meshes_are_seen_whole_or_by_their_own_cameras(whole, tmp_path):
 def test_a_varied_batch_shows_what_a_photograph_of_the_varied_points_would(
     whole, mirrored, recoloured, shows
 ):
-    """Mesh and photograph change alike: of each sample one of twelve ways, and no way but those chosen."""
+    """Check that mesh and photograph change alike, each sample in one of the twelve ways that the settings allow."""
     prepared = data(whole, mirrored=mirrored, recoloured=recoloured, shows=shows)
     prepared.prepare()
     train = prepared.splits().train
@@ -257,7 +257,7 @@ def test_a_varied_batch_shows_what_a_photograph_of_the_varied_points_would(
         target = turned["target"][..., list(order)] if shows == "photograph" else turned["target"]
         assert torch.equal(found["target"][row], target)
         assert torch.equal(found["mask"][row], turned["mask"])
-        # where the canonical camera sees the points, mirrored about its middle column
+        # pixels at which the canonical camera sees the points, mirrored about its middle column
         pixel = height * found["input"][row, :, 0] / found["input"][row, :, 2] + (width - 1) / 2
         before = height * batch["input"][row, :, 0] / batch["input"][row, :, 2] + (width - 1) / 2
         torch.testing.assert_close(pixel, before if sign[0] > 0 else width - 1 - before)
@@ -299,6 +299,6 @@ def test_a_mesh_drawn_as_ground_leaves_free_what_its_picture_leaves_white():
         for ground in (False, True)
     )
     assert drawn.shape == (1, 4, 24, 20) and ground.shape == (1, 2, 24, 20)
-    # black vertices: what light is left is the white of the ground
+    # vertices are black, so that all remaining light is the white background
     torch.testing.assert_close(light_of(drawn[:, :1]), ground[:, :1], atol=1e-5, rtol=0)
     assert torch.equal(drawn[:, 3], ground[:, 1]) and 0 < float(ground[:, 0].mean()) < 1

@@ -1,4 +1,4 @@
-"""Pictures of textured meshes against a ray through every sample, and who wears which texture."""
+"""Rendered images of textured meshes against ray casting, and the assignment of textures to subjects."""
 
 import math
 import shutil
@@ -41,7 +41,11 @@ def root(tmp_path):
 
 
 def globe(root, sides):
-    """The first subject as a bumpy ball with a seam in its texture, of (height, width) texels of smooth colours."""
+    """Write the subjects as a bumpy ball with a texture seam, and the first one's texture of smooth colours.
+
+    `sides` is the (height, width) of the texture, texels. Returns vertices, faces, texture coordinates, their faces and
+    pixels.
+    """
     rows, columns = 7, 9
     turn, rise = np.meshgrid(np.arange(columns + 1) / columns, np.arange(rows + 1) / rows)
     places = np.stack([turn, 1 - rise], -1).reshape(-1, 2)
@@ -76,14 +80,16 @@ def globe(root, sides):
 
 
 def light(stored):
-    """IEC 61966-2-1."""
+    """Return linear RGB of 8-bit sRGB numbers (IEC 61966-2-1)."""
     share = stored / 255
     return np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
 
 
 def traced(vertices, faces, places, uv_faces, texels):
-    """The picture by a ray through every sample: the nearest triangle it meets (Möller & Trumbore 1997), of the texture
-    what lies there, between the four nearest texels."""
+    """Return the image by one ray per sample: the texture of the nearest triangle that the ray meets.
+
+    Intersections follow Möller & Trumbore (1997); texels are interpolated between the four nearest.
+    """
     step = (np.arange(SAMPLES) + 0.5) / SAMPLES - 0.5
     y = (np.arange(HEIGHT)[:, None] + step).ravel() - (HEIGHT - 1) / 2
     x = (np.arange(WIDTH)[:, None] + step).ravel() - (WIDTH - 1) / 2
@@ -117,7 +123,7 @@ def traced(vertices, faces, places, uv_faces, texels):
 
 @pytest.mark.parametrize("times", [1, 2])
 def test_a_textured_mesh_is_what_a_ray_through_every_sample_sees(root, times):
-    """Also where the texture is finer than is drawn: it is averaged, as light."""
+    """Check also a texture finer than the largest size that is drawn, which is averaged in linear RGB."""
     vertices, faces, places, uv_faces, pixels = globe(root, (32 * times, 96 * times))
     texels = light(pixels).reshape(32, times, 96, times, 3).mean((1, 3))
     placed = vertices + np.array([0.1, -0.05, 2.0])
@@ -143,7 +149,7 @@ def test_everybody_wears_their_own_texture_however_lists_are_ordered(root):
     )
     shutil.copytree(
         root / "subjects/bob", root / "subjects/zoe"
-    )  # known by the same colours, of the same texture
+    )  # subjects with the same colours and the same texture are accepted
     assert torch.equal(encoder(root)(inputs), before)
     assert torch.equal(encoder(root)(inputs[[4, 1]].double()), before[[4, 1]].double())
 
@@ -212,7 +218,7 @@ WRONG = {
 
 @pytest.mark.parametrize("spoil, words", WRONG.values(), ids=WRONG)
 def test_what_is_wrong_is_said(root, spoil, words):
-    made = encoder(root)  # as a model that is loaded later
+    made = encoder(root)  # built before the fault, as in a model that is loaded later
     spoil(root)
     with pytest.raises(DataError) as caught:
         made(seen(1))

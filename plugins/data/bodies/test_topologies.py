@@ -8,7 +8,7 @@ from plugins.data.bodies.topologies import COUNTS, Corners, edges, sheet, split,
 
 
 def ball(stages=3):
-    """A sphere, its texture in two halves: places of the equator are there twice."""
+    """Return a sphere whose texture has two halves, so that points of the equator have two texture coordinates."""
     points = np.array([(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)], float)
     upper = [(2, 4, 0), (2, 0, 5), (2, 5, 1), (2, 1, 4)]
     faces = np.array([*upper, *((3, c, b) for _, b, c in upper)])
@@ -25,7 +25,7 @@ def ball(stages=3):
 
 
 def assert_closed(vertices, faces, bodies=1):
-    """Every side is there once in each direction; the volume inside."""
+    """Require that every side occurs once in each direction; return the volume inside."""
     sides = np.stack([faces, np.roll(faces, -1, 1)], -1).reshape(-1, 2)
     forwards, backwards = (np.sort(side @ [len(vertices), 1]) for side in (sides, sides[:, ::-1]))
     assert np.array_equal(forwards, backwards) and (np.diff(forwards) > 0).all()
@@ -45,7 +45,7 @@ def test_a_decimated_mesh_is_closed_keeps_its_volume_and_its_seams(count):
     assert np.array_equal(found.kept, np.unique(found.faces))
     volume, whole = assert_closed(points, found.faces), assert_closed(points, corners.faces)
     assert abs(volume / whole - 1) < 12 / count
-    # every corner still shows a place that its vertex had, in the chart of its triangle
+    # every corner still has a texture coordinate of its vertex, in the chart of its triangle
     assert np.isin(pairs_of(Corners(found.faces, found.uv_faces)), pairs_of(corners)).all()
     again = decimated(points, *corners, count)
     assert all(np.array_equal(one, other) for one, other in zip(found, again, strict=True))
@@ -93,6 +93,6 @@ def test_topologies_of_the_default_body(body, surface, name):
     fine = surface.carried(body.template.astype(np.float64))
     volume = assert_closed(fine[found.rows], found.faces, bodies=4)  # a tongue and two eyes beside the body
     assert volume == pytest.approx(assert_closed(body.template.astype(float), body.faces, bodies=4), rel=3e-3)
-    # every corner shows a place that its vertex has on the finest surface
+    # every corner has a texture coordinate that its vertex has on the finest surface
     pairs = pairs_of(Corners(found.rows[found.faces], found.uv_rows[found.uv_faces]))
     assert np.isin(pairs, pairs_of(surface.corners[-1])).all()

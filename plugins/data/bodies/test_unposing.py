@@ -33,7 +33,7 @@ def drawn(size, batch=3):
 
 
 def affine(made, shape, pose):
-    """Of each vertex the matrix and the shift of skinning, by products of homogeneous matrices."""
+    """Return the matrix and the translation of each vertex's skinning, by products of homogeneous matrices."""
     joints, matrices = made.joints + made.joint_shapes @ shape, []
     for joint in range(len(made.parents)):
         matrix, at = np.eye(4), joint
@@ -67,7 +67,7 @@ def test_offsets_are_found_again_and_as_inverted_matrices_find_them(features, si
             close = np.abs(smallest - SMALLEST) > 1e-5
             assert np.array_equal((smallest < SMALLEST)[close], ~upright[row][close])
             np.testing.assert_allclose(model.skinning(*given[:2])[row], matrices, atol=tolerance)
-            # W⁻¹(X) is the rest pose with what the pose does to its shape, and with the offsets
+            # W⁻¹(X) is the rest pose with pose blend shapes and offsets
             bare = model(given[0], given[1], given[2])[row].double().numpy()
             for vertex in np.flatnonzero(upright[row]):
                 back, own = (
@@ -78,7 +78,7 @@ def test_offsets_are_found_again_and_as_inverted_matrices_find_them(features, si
 
 
 def folding(degrees, share=0.5):
-    """Sixty vertices that follow two bones, of which the second is turned by so much, and offsets that a mesh shows."""
+    """Return a model of sixty vertices that follow two bones, and parameters that rotate the second by `degrees`."""
     weights = np.tile([1 - share, share], (VERTICES, 1))
     made = body(parents=(-1, 0), joints=np.zeros((2, 3)), joint_shapes=np.zeros((2, 3, 2)), weights=weights)
     model = BodyModel(made).double()
@@ -99,7 +99,7 @@ def test_a_joint_folded_over_leaves_finite_offsets_that_show_the_same_mesh(degre
     assert found.offsets.isfinite().all() and (lengths <= most / SMALLEST * (1 + 1e-9)).all()
     shown = model(*given, offsets=found.offsets) - model(*given)
     kept = 1.0 if smallest >= SMALLEST else smallest**2 / SMALLEST**2
-    # along the axis of the fold nothing is lost; across it what the mesh hardly says is taken from the model
+    # along the axis of the fold all is kept; across it, the poorly determined part is taken from the model
     torch.testing.assert_close(shown[..., 2], apart[..., 2], atol=1e-12, rtol=0)
     torch.testing.assert_close(shown[..., :2], kept * apart[..., :2], atol=1e-9, rtol=0)
 
