@@ -82,10 +82,8 @@ def _of_each(density: Distribution, change: Callable[[Tensor], Tensor]) -> Distr
     """
     kind: Any = next(one for one in type(density).__mro__ if getattr(torchs, one.__name__, None) is one)
     names = {*inspect.signature(kind.__init__).parameters} - {"self", "validate_args"}
-    if {
-        "probs",
-        "logits",
-    } <= names:  # one of the two was given; torch computes the other with rounding errors
+    # one of the two was given; torch computes the other with rounding errors
+    if {"probs", "logits"} <= names:
         names -= {"probs"} if "logits" in vars(density) else {"logits"}
     shape = None if density.event_shape else density.batch_shape
     changed: dict[str, Tensor] = {}
@@ -101,9 +99,8 @@ def _below(base: Distribution, value: Tensor) -> Tensor:
     """Return the distribution function of one of `_ON_THE_LINE`, float64; SciPy gives Student's, which torch lacks."""
     if not isinstance(base, torchs.StudentT):
         return base.cdf(value)
-    from scipy.special import (
-        stdtr,
-    )  # imported here, since importing SciPy is slow and most commands do not need it
+    # imported here, since importing SciPy is slow and most commands do not need it
+    from scipy.special import stdtr
 
     freedom, standard = torch.broadcast_tensors(base.df, (value - base.loc) / base.scale)
     return torch.from_numpy(stdtr(freedom.cpu().numpy(), standard.cpu().numpy())).to(value.device)

@@ -36,9 +36,8 @@ def crossings(components: Distribution, modes: Tensor) -> Tensor:
         components: a density with batch_shape (*batch, K).
         modes: modes of the components, (K, *batch, *event).
     """
-    both = slope(
-        components, modes.unsqueeze(-2)
-    )  # (K, *batch, K, *event): the second component at the first's mode
+    # (K, *batch, K, *event): the second component at the first's mode
+    both = slope(components, modes.unsqueeze(-2))
     if both is None:
         return modes[:0]
     own = both.stiffness.diagonal(dim1=0, dim2=-2).movedim(-1, 0).unsqueeze(-2)

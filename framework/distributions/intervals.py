@@ -233,9 +233,8 @@ def _angle(density: Distribution, mass: float) -> Interval | None:
     support = density.support
     assert isinstance(support, Circular)
     low, high = support.ranges[0] if support.ranges is not None else (-math.pi, math.pi)
-    if (
-        high - low < 2 * math.pi - 1e-9
-    ):  # a part of the circle has two ends, so the quantiles start at the lower end
+    # a part of the circle has two ends, so the quantiles start at the lower end
+    if high - low < 2 * math.pi - 1e-9:
         below = _tails(mass).to(flat.sample().device).unsqueeze(-1)
         places = below.new_full((2, flat.batch_shape[0]), low)
 

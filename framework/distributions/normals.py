@@ -73,9 +73,8 @@ class JointNormal(MultivariateNormal):
 @marginal.register
 def _(density: JointNormal, index: int) -> JointNormal:
     row = density.root[..., index, :]
-    deviation = torch.linalg.vector_norm(
-        row, dim=-1
-    )  # root of R Rᵀ's diagonal, without squares that overflow
+    # root of R Rᵀ's diagonal, without squares that overflow
+    deviation = torch.linalg.vector_norm(row, dim=-1)
     return JointNormal(density.loc[..., index : index + 1], deviation[..., None, None])
 
 
