@@ -1,4 +1,4 @@
-"""The command: what its pictures show, cameras against formulas, films, and a sentence for every mistake."""
+"""Tests of the command: content of its images, cameras against formulas, films, and a message for every mistake."""
 
 import io
 import json
@@ -25,12 +25,12 @@ from plugins.renderer.rasterizer.scene_files import read
 
 SIDES = {(1, 0, 0): "#ff0000", (-1, 0, 0): "#00ff00", (0, 1, 0): "#0000ff", (0, -1, 0): "#ffff00",
          (0, 0, 1): "#ff8040", (0, 0, -1): "#305070"}  # fmt: skip
-"""Of a cube, by the direction to which each looks."""
+"""Colours of a cube's sides, by the direction that each side faces."""
 
 
 @pytest.fixture(scope="module")
 def cube(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A cube of side 2 around (5, 6, 7) whose sides have a colour each."""
+    """Write a cube of side 2 around (5, 6, 7) whose sides have different colours."""
     mesh = trimesh.creation.box((2, 2, 2))
     mesh.unmerge_vertices()
     colors = np.zeros((len(mesh.vertices), 4), np.uint8)
@@ -52,7 +52,7 @@ def drawn(file: Path, folder: Path, *options: str, name: str = "one.png") -> Any
 
 @pytest.mark.parametrize("up", ["y", "z"])
 def test_a_cube_shows_the_side_that_the_camera_faces(cube: Path, tmp_path: Path, up: str) -> None:
-    """Azimuth 0 sees the front (z of y up, -y of z up), 90 what is on the right of it; elevation 90 the top."""
+    """Check that azimuth 0 shows the front (z for y up, -y for z up), azimuth 90 its right, elevation 90 the top."""
     front, right, top = ((0, 0, 1), (1, 0, 0), (0, 1, 0)) if up == "y" else ((0, -1, 0), (1, 0, 0), (0, 0, 1))
     opposite = lambda side: tuple(-part for part in side)  # noqa: E731
     views = {(0, 0): front, (90, 0): right, (180, 0): opposite(front), (270, 0): opposite(right), (0, 90): top,
@@ -70,7 +70,7 @@ def test_a_cube_shows_the_side_that_the_camera_faces(cube: Path, tmp_path: Path,
 
 @pytest.mark.parametrize("name", ["one.glb", "one.obj"])
 def test_a_texture_is_drawn_upright_and_in_its_colours(tmp_path: Path, name: str) -> None:
-    """Red and green above, blue and white below, seen from the front: at the middles of texels those are exact."""
+    """Check red and green above, blue and white below, seen from the front; at the centres of texels they are exact."""
     four = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 255]]], np.uint8)
     square = trimesh.Trimesh(
         [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], [[0, 1, 2], [0, 2, 3]], process=False
@@ -104,7 +104,7 @@ def test_a_texture_is_drawn_upright_and_in_its_colours(tmp_path: Path, name: str
 def test_edges_are_blended_in_light_and_transparent_pictures_know_their_share(
     cube: Path, tmp_path: Path
 ) -> None:
-    """Of a transparent picture any background makes what is drawn before it at once."""
+    """Compare a transparent image before any background with an image that is drawn on that background."""
     options = ("--azimuth", "40", "--elevation", "30", "--supersampling", "4")
     clear = np.asarray(drawn(cube, tmp_path, *options, "--background", "transparent"))
     assert clear.shape == (40, 48, 4) and {0, 255} < set(clear[..., 3].ravel().tolist())
@@ -142,7 +142,7 @@ def test_channels_become_whole_numbers_as_they_say() -> None:
 
 
 def test_a_sphere_of_one_colour_is_lit_from_the_camera(tmp_path: Path) -> None:
-    """Lambert's law, on normals that its facets share; an edge of a cube stays sharp."""
+    """Check Lambert's law on normals that the sphere's facets share; an edge of a cube stays sharp."""
     trimesh.creation.icosphere(4, 1.0).export(tmp_path / "ball.stl")
     pixels = drawn(
         tmp_path / "ball.stl", tmp_path, "--distance", "50", "--fov", "2.6", "--background", "black"
@@ -165,7 +165,7 @@ def test_a_sphere_of_one_colour_is_lit_from_the_camera(tmp_path: Path) -> None:
 
 
 def test_the_camera_is_that_of_look_from_and_sees_all_of_the_subject() -> None:
-    """About any centre; of a ball that touches no edge and nearly all of them, whatever the picture's shape."""
+    """Check cameras about any centre, and that the image contains a sphere but only just, for any image shape."""
     random = np.random.default_rng(0)
     for _ in range(10):
         centre = torch.from_numpy(random.normal(size=3) * 100)
@@ -273,7 +273,7 @@ def program(folder: Path, text: str) -> None:
 def test_a_film_is_what_ffmpeg_makes_of_the_frames(
     cube: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Played by a program that keeps the bytes and its arguments, by one that fails, and by none."""
+    """Replace ffmpeg by a program that keeps the bytes and its arguments, by one that fails, and by none."""
     monkeypatch.setenv("PATH", str(tmp_path))
     out = tmp_path / "films" / "one.mp4"
     options = [str(cube), "--turntable", "3", "--size", "48x40", "--out", str(out)]

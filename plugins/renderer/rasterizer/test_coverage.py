@@ -1,4 +1,4 @@
-"""Every pixel of a tessellated plane is covered once, counted face by face with the kernel itself."""
+"""Test that every pixel of a tessellated plane is covered once, counted face by face with the kernel itself."""
 
 import math
 from collections.abc import Iterable, Iterator
@@ -21,7 +21,7 @@ FAR = 4.0  # metres, half a side of the plane
 @njit(error_model="numpy")  # not kept on disk, where nothing would see that a kernel it calls has changed
 @no_type_check
 def added(screen, faces, height, width, alone, number):
-    """Add to `number`, (height, width), how many faces cover each pixel, each drawn alone; `alone` is of False."""
+    """Add to `number`, (height, width), how many faces cover each pixel, each drawn alone; `alone` is all false."""
     counts = np.zeros(6, np.int64)
     for index in range(faces.shape[0]):
         face = faces[index : index + 1]
@@ -35,8 +35,10 @@ def added(screen, faces, height, width, alone, number):
 
 
 def covered(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """How many faces cover each pixel, each drawn alone, and which pixels all of them cover, drawn together; by the
-    kernels that `Rasterizer` calls. Of a face that the near plane cuts each part counts as a face."""
+    """Return how many faces cover each pixel, each drawn alone, and which pixels they cover when drawn together.
+
+    The kernels are those that `Rasterizer` calls. Each part of a face that the near plane cuts counts as a face.
+    """
     rotation, translation = camera.rotation.double().numpy(), camera.translation.double().numpy()
     lens = np.array(camera.focal), np.array(camera.principal)
     size = camera.height, camera.width
@@ -52,8 +54,10 @@ def covered(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> tuple[np
 
 
 def on_the_plane(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """By rays in the world: whether that of each pixel hits the square |x|, |y| <= FAR of the plane z = 0 beyond the
-    near plane; and how far from where this ends its centre lies, pixels."""
+    """Return whether each pixel's ray hits the plane, and how far the pixel is from the plane's border, pixels.
+
+    The plane is the square |x|, |y| <= FAR of z = 0 beyond the near plane. The computation uses rays in the world.
+    """
     back_to_world = np.linalg.inv(camera.rotation.double().numpy())
     eye = -back_to_world @ camera.translation.double().numpy()
     rows, columns = np.meshgrid(np.arange(camera.height), np.arange(camera.width), indexing="ij")
@@ -62,9 +66,9 @@ def on_the_plane(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
         (rows - camera.principal[1]) / camera.focal[1],
     )
     ray = np.stack([right, down, np.ones(rows.shape)], -1) @ back_to_world.T
-    steps = back_to_world[:, :2] / camera.focal  # of the ray, by a pixel to the right and by one downwards
-    # The plane's depth under the ray is d = -eye_z / ray_z, the place eye + d ray; what must be positive of these is
-    # linear in the pixel when multiplied by |eye_z| / d, and over its slope a distance in pixels.
+    steps = back_to_world[:, :2] / camera.focal  # change of the ray per pixel to the right, and downwards
+    # The plane's depth under the ray is d = -eye_z / ray_z, and the place is eye + d ray. Each number that must be
+    # positive is linear in the pixel when multiplied by |eye_z| / d; divided by its slope it is a distance in pixels.
     away = abs(eye[2])
     inverse, inverse_step = -np.sign(eye[2]) * ray[..., 2], -np.sign(eye[2]) * steps[2]
     limits = [(inverse, inverse_step), (away - camera.near * inverse, -camera.near * inverse_step)]
@@ -80,7 +84,10 @@ def on_the_plane(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
 
 
 def loose(random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """The square cut along a Delaunay triangulation of random points, bent nowhere; corners in any order."""
+    """Return the square, cut along a Delaunay triangulation of random points.
+
+    It is flat, and the corners of a face have any order.
+    """
     inner, along = random.uniform(-FAR, FAR, (40, 2)), random.uniform(-FAR, FAR, (4, 5))
     ends = np.full((4, 5), FAR) * np.array([[1], [-1], [1], [-1]])
     sides = np.concatenate([np.stack([ends[:2], along[:2]], -1), np.stack([along[2:], ends[2:]], -1)])
@@ -90,7 +97,7 @@ def loose(random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
 
 
 def regular() -> tuple[np.ndarray, np.ndarray]:
-    """The square cut into 8 × 8 squares, and those along either diagonal in turn."""
+    """Return the square cut into 8 × 8 squares, which are cut along either diagonal in turn."""
     row, column = np.meshgrid(np.arange(8), np.arange(8), indexing="ij")
     a, b, c, d = (9 * (row + down) + column + right for down, right in ((0, 0), (0, 1), (1, 0), (1, 1)))
     odd = (row + column) % 2 == 1
@@ -101,7 +108,7 @@ def regular() -> tuple[np.ndarray, np.ndarray]:
 
 
 def somewhere(random: np.random.Generator) -> Camera:
-    """Above or below the plane, near or far, with any lens, the principal point anywhere around the image."""
+    """Return a camera above or below the plane, near or far, with any lens and principal point."""
     height, width = (int(side) for side in random.integers(1, 65, 2))
     distance = float(10.0 ** random.uniform(math.log10(0.05), 4))
     pose = random.uniform([-7, -1.57, -7], [7, 1.57, 7])
@@ -124,7 +131,7 @@ def somewhere(random: np.random.Generator) -> Camera:
 
 
 def square_on(random: np.random.Generator) -> Camera:
-    """Where all numbers are exact, and the edges of the regular plane run through pixel centres."""
+    """Return a camera for which all numbers are exact, and edges of the regular plane run through pixel centres."""
     height, width = (int(side) for side in random.integers(1, 65, 2))
     depth, pixels = 2.0 ** random.integers(-4, 14), 2.0 ** random.integers(0, 6)  # metres; pixels a metre
     turn = np.linalg.matrix_power([[0, -1, 0], [1, 0, 0], [0, 0, 1]], int(random.integers(4))) @ np.diag(
@@ -144,13 +151,13 @@ def square_on(random: np.random.Generator) -> Camera:
 
 
 class Seen(NamedTuple):
-    """Pixels of a view.
+    """Numbers of pixels of a view.
 
     Attributes:
-        inside: that must show the plane.
-        holes, doubled: of these, that no face covers, and that more than one covers.
-        strays: off the plane, that faces cover.
-        other: in which the whole picture disagrees with its faces.
+        inside: pixels that must show the plane.
+        holes, doubled: pixels of these that no face covers, and that more than one face covers.
+        strays: pixels off the plane that faces cover.
+        other: pixels in which the whole image disagrees with its faces.
     """
 
     inside: int
@@ -170,7 +177,7 @@ def looked_at(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> Seen:
 
 
 def views(number: int, seed: int = 0) -> Iterator[tuple[str, Seen]]:
-    """So many cameras, a third of them square on, and the plane that each sees."""
+    """Yield the views of `number` cameras, a third of them square on, with the name of the plane that each sees."""
     random = np.random.default_rng(seed)
     planes = {"regular": regular()} | {f"loose {index}": loose(random) for index in range(5)}
     names = list(planes)
@@ -185,7 +192,7 @@ def total(found: Iterable[tuple[str, Seen]]) -> Seen:
 
 
 def test_every_pixel_of_a_tessellated_plane_is_covered_once_whatever_the_camera() -> None:
-    """From 2,000 cameras; benchmarks/rendering/rasterizer_coverage.py has 10,000."""
+    """Check 2,000 cameras; benchmarks/rendering/rasterizer_coverage.py has 10,000."""
     seen = total(views(2000))
     assert seen.inside > 600_000
     assert (seen.holes, seen.doubled, seen.strays, seen.other) == (0, 0, 0, 0)

@@ -1,4 +1,4 @@
-"""Extreme scenes: pictures are right or a sentence, and no gradient from finite numbers is NaN or infinite."""
+"""Tests of extreme scenes: images are right or refused with a message, and gradients of finite numbers are finite."""
 
 import itertools
 import math
@@ -25,13 +25,16 @@ TYPES = (torch.float32, torch.float64)
 
 
 def ahead(height: int = 9, width: int = 11, near: float = 1e-3, focal: float = 8.0) -> Camera:
-    """A camera at the origin that looks along z."""
+    """Return a camera at the origin that looks along z."""
     middle = ((width - 1) / 2, (height - 1) / 2)
     return Camera(torch.eye(3), torch.zeros(3), (focal, focal), middle, height, width, near)
 
 
 def meshed(corners: np.ndarray | list, camera: Camera, faces: np.ndarray | list | None = None) -> Scene:
-    """Vertices (n, 3), each three a face where none are given; colours and places in a texture differ everywhere."""
+    """Return a scene of vertices (n, 3), in which colours and texture places differ everywhere.
+
+    Without `faces`, every three vertices are a face.
+    """
     vertices = torch.tensor(np.asarray(corners, dtype=np.float64)).reshape(-1, 3)
     faces = np.arange(len(vertices)) if faces is None else faces
     indices = torch.tensor(np.asarray(faces, dtype=np.int64)).reshape(-1, 3)
@@ -43,11 +46,11 @@ def meshed(corners: np.ndarray | list, camera: Camera, faces: np.ndarray | list 
 
 
 WALL = [[-9, -9, 3.0], [9, -9, 3], [0, 12, 3]]
-"""Behind everything, over the whole image."""
+"""A face behind everything, over the whole image."""
 
 
 def slivers() -> np.ndarray:
-    """Triangles as thin as 1e-12 to 1e-2 of their length, every way round."""
+    """Return triangles as thin as 1e-12 to 1e-2 of their length, in all directions."""
     found = []
     for turn, width in enumerate(10.0 ** np.arange(-12, -1)):
         along = np.array([math.cos(turn), math.sin(turn), 0.1])
@@ -58,7 +61,7 @@ def slivers() -> np.ndarray:
 
 
 def crossing() -> np.ndarray:
-    """Two bodies, and planes, that pass through one another."""
+    """Return 60 random vertices of triangles that intersect one another."""
     random = np.random.default_rng(3)
     return random.uniform(-1, 1, (60, 3)) + np.array([0, 0, 2.0])
 
@@ -109,7 +112,7 @@ SCENES: dict[str, Callable[[], Scene]] = {
 
 
 def learned(scene: Scene, kind: torch.dtype, textured: bool) -> tuple[Scene, dict[str, Tensor]]:
-    """The scene in one type, and what of it is learned."""
+    """Return the scene in one number type, and its parts that require a gradient."""
     seen = scene.camera
     parts: dict[str, Tensor] = {
         "vertices": scene.vertices,
@@ -133,7 +136,7 @@ def learned(scene: Scene, kind: torch.dtype, textured: bool) -> tuple[Scene, dic
 
 
 def bad_slopes(scene: Scene, renderer: Rasterizer, kind: torch.dtype, scale: float = 1.0) -> list[str]:
-    """Parameters whose gradients are not finite, and channels that are not where they should be."""
+    """Return parameters whose gradients are not finite, and channels that are not finite where they must be."""
     given, parts = learned(scene, kind, renderer.gradient != "soft")
     found = renderer(given, ("color", "depth", "mask", "normal", "barycentric", "uv"))
     bad = [name for name in ("color", "normal", "barycentric", "uv") if not found[name].isfinite().all()]
@@ -164,8 +167,10 @@ def test_no_gradient_is_NaN_or_infinite(name: str, gradient: Gradient) -> None:
 
 
 def wild(seed: int) -> Scene:
-    """Coordinates of any size that float32 holds, most of them in front of a camera with any lens; few are alike, or,
-    on a grid with edges through the eye and through pixel centres, most."""
+    """Return a scene with coordinates of any size that float32 holds, mostly in front of a camera with any lens.
+
+    In some scenes, all coordinates lie on a grid with edges through the camera's centre and through pixel centres.
+    """
     random = np.random.default_rng(seed)
     count, size = int(random.integers(3, 12)), random.choice([1e-25, 1e-3, 1.0, 1e3, 1e25])
     spread = random.choice([0.0, 1.0, 5.0, 36.0])
@@ -204,7 +209,7 @@ def test_wild_scenes_have_finite_pictures_and_gradients(seed: int, gradient: Gra
 def test_a_face_whose_corners_are_1e30_away_fills_the_image_whatever_is_asked(
     quarter: int, gradient: Gradient
 ) -> None:
-    """Also where two corners lie far below or far right of the image: whole numbers hold no such row."""
+    """Check faces with two corners far below or far right of the image too, where no integer holds the row."""
     turn = np.linalg.matrix_power(np.array([[0, -1.0, 0], [1, 0, 0], [0, 0, 1]]), quarter)
     corners = np.array([[-1, -1, 0], [1, -1.5, 0], [0, 1, 0]]) * 1e30 @ turn.T + [0, 0, 2]
     for faces in ([0, 1, 2], [0, 2, 1]):

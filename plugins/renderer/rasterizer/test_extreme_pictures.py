@@ -1,4 +1,4 @@
-"""Pictures and reports of extreme scenes: right, or a sentence."""
+"""Tests of images and reports of extreme scenes: they are right, or refused with a message."""
 
 import math
 from dataclasses import replace
@@ -39,7 +39,7 @@ SAVINGS = get_args(Saving)
 def test_each_face_is_counted_once_and_savings_change_no_bit_however_wild_the_scene(
     seed: int, cull: bool, savings: set[Saving], channels: set[str]
 ) -> None:
-    """A second picture, which takes over what has not changed, reports the same."""
+    """Check that a second image, which reuses what has not changed, has the same report."""
     scene = wild(seed)
     renderer = Rasterizer(cull=cull, savings=tuple(savings))
     plain = Rasterizer(cull=cull, savings=())(scene, channels)
@@ -55,7 +55,7 @@ def test_each_face_is_counted_once_and_savings_change_no_bit_however_wild_the_sc
 
 
 def with_number(scene: Scene, where: str, number: float) -> Scene:
-    """With a number that is not finite in one input: that of vertex 0 where it has one for each."""
+    """Return the scene with a number that is not finite in one input, at vertex 0 for inputs per vertex."""
     camera, texture = scene.camera, scene.texture
     assert scene.colors is not None and texture is not None
     first = torch.zeros(len(scene.vertices), dtype=torch.bool)
@@ -107,7 +107,7 @@ def test_what_is_not_finite_is_refused_or_disturbs_only_the_faces_that_have_it(
     else:
         same = (found["color"] == plain["color"]).all(-1)
         assert same[~plain["mask"]].all() and 0.3 < same.float().mean() < 1
-    # out of view it is nobody's
+    # out of view the number has no effect
     away = replace(bad, camera=replace(bad.camera, translation=torch.tensor([0.0, 0, -50])))
     assert not Rasterizer()(away)["color"].any()
 
@@ -144,7 +144,7 @@ def test_planes_that_pass_through_one_another_show_the_nearer() -> None:
 
 @pytest.mark.parametrize("depth", [0.0, -1e-300, 1e-300, 1e-3, -1.0])
 def test_a_vertex_on_the_plane_of_the_camera_hides_no_part_of_its_face(depth: float) -> None:
-    """A floor that begins beside the eye: as deep as the ray says, however far it begins behind."""
+    """Check that a floor that begins beside the camera has the depth of each ray, however far it begins behind."""
     camera = ahead(30, 40, focal=16.0)
     scene = meshed(
         [[-50, 1, depth], [50, 1, depth], [50, 1, 50], [-50, 1, 50]], camera, [[0, 1, 2], [0, 2, 3]]
@@ -179,7 +179,7 @@ def test_gradients_of_a_hundred_thousand_faces_in_one_pixel_are_finite(gradient:
 
 
 def test_a_picture_does_not_depend_on_the_unit_of_length_or_on_how_long_the_lens_is() -> None:
-    """Focal lengths from 0.001 to 1,000,000 pixels, with all depths as many times as long."""
+    """Check focal lengths from 0.001 to 1,000,000 pixels, with all depths scaled by the same factor."""
     pixels = crossing()
     pictures = []
     for power in range(-10, 21):
@@ -195,7 +195,7 @@ def test_a_picture_does_not_depend_on_the_unit_of_length_or_on_how_long_the_lens
 
 
 def test_millimetres_are_seen_a_million_metres_from_the_origin() -> None:
-    """With vertices and camera in float64; float32 holds 6 cm there, which is the user's to know."""
+    """Check vertices and camera in float64; float32 resolves 6 cm there, which is left to the user."""
     far = torch.tensor([1e6, -1e6, 1e6], dtype=torch.float64)
     turn = torch.linalg.qr(
         torch.randn(3, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -219,7 +219,7 @@ def test_millimetres_are_seen_a_million_metres_from_the_origin() -> None:
 
 
 def test_the_largest_images() -> None:
-    """4096 × 4096, a face over all of it and one in a corner; and one pixel."""
+    """Draw 4096 × 4096 pixels, with a face over all of it and one in a corner."""
     camera = ahead(4096, 4096, focal=2048.0)
     corners = [[-3, -3, 1.0], [9, -3, 1], [-3, 9, 1], [0.9, 0.9, 0.9], [0.9, 0.8, 0.9], [0.8, 0.9, 0.9]]
     scene = replace(meshed(corners, camera), texture=None)
@@ -249,8 +249,11 @@ def test_of_nothing_at_all_comes_the_background_and_no_slope(gradient: Gradient)
 
 @pytest.mark.parametrize("gradient", KINDS)
 def test_slopes_do_not_depend_on_how_long_the_lens_is(gradient: Gradient) -> None:
-    """To the bit, where depths are as many times as long; with `boundary`, from lenses on that see surfaces apart which
-    are a pixel's width apart, in this scene 512 pixels."""
+    """Check that gradients are the same to the last bit where depths grow with the focal length.
+
+    With `boundary` this holds from lenses on for which surfaces are seen apart when they are a pixel's width apart, in
+    this scene 512 pixels.
+    """
     first: dict[str, torch.Tensor] = {}
     for power in range(9 if gradient == "boundary" else -10, 21):
         focal = 2.0**power

@@ -1,4 +1,4 @@
-"""Gradients of pictures, against autograd through a plain formula and against differences of supersampled pictures."""
+"""Tests of gradients of images, against autograd through a plain formula and differences of supersampled images."""
 
 import math
 from dataclasses import replace
@@ -16,7 +16,7 @@ torch_float = torch.float64
 
 
 def blob(rings: int = 40) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """A closed body that hides parts of itself: a sphere with two bumps and a dent; smooth colours."""
+    """Return a closed body that hides parts of itself, a sphere with two bumps and a dent, with smooth colours."""
     theta = torch.linspace(0, math.pi, rings + 1, dtype=torch_float)
     phi = torch.arange(2 * rings, dtype=torch_float) * (math.pi / rings)
     x, y = torch.outer(theta.sin(), phi.cos()), torch.outer(theta.sin(), phi.sin())
@@ -48,7 +48,7 @@ def camera(azimuth: float = 0.5, size: tuple[int, int] = (72, 88)) -> Camera:
 
 
 def turned(rotation: torch.Tensor, by: torch.Tensor) -> torch.Tensor:
-    """exp([by]×) R."""
+    """Return exp([by]×) R."""
     zero = torch.zeros_like(by[0])
     cross = torch.stack(
         [
@@ -82,11 +82,11 @@ KINDS = {
     "texture": ("texture", True),
     "vertices, textured": ("vertices", True),
 }
-"""What is differentiated in, and whether the body has a texture instead of colours."""
+"""Parameter of each test, and whether the body has a texture instead of colours."""
 
 
 def parameters() -> dict[str, torch.Tensor]:
-    """All 0 at the scene itself."""
+    """Return parameters that are all 0 at the scene itself."""
     sizes = {"vertices": 8, "colors": 3, "rotation": 3, "translation": 3, "focal": 1, "texture": 3}
     return {name: torch.zeros(size, dtype=torch_float, requires_grad=True) for name, size in sizes.items()}
 
@@ -118,9 +118,12 @@ def scene(
 
 @pytest.mark.slow
 def test_gradients_are_those_of_differences_of_supersampled_pictures() -> None:
-    """Squared error against another pose, over four views, in every kind of parameter: 8 deformations, colours, the
-    camera's rotation, translation and focal length, a texture. Cosine and length over all parameters of a kind; with
-    one sample a pixel, whose error is another, the cosine alone."""
+    """Compare gradients with differences of supersampled images, by cosine and length over all parameters of a kind.
+
+    The loss is the squared error against another pose, over four views. The parameters are 8 deformations, colours, the
+    camera's rotation, translation and focal length, and a texture. With one sample per pixel the error is another, so
+    only the cosine is compared.
+    """
     body = blob()
     hard = Rasterizer(supersampling=16)
     tried = {
@@ -166,13 +169,15 @@ def test_gradients_are_those_of_differences_of_supersampled_pictures() -> None:
         assert cosine("16 samples", kind) > 0.99, kind
         assert abs(np.linalg.norm(found["16 samples", kind]) / np.linalg.norm(other) - 1) < 0.05, kind
         assert cosine("1 sample", kind) > 0.99, kind
-    assert cosine("interior", "vertices") < 0.9  # what edges hand over is needed
+    assert cosine("interior", "vertices") < 0.9  # the gradient of moving edges is needed
 
 
 @pytest.mark.parametrize("behind", [False, True])
 def test_inside_a_face_slopes_are_those_of_the_plane(behind: bool) -> None:
-    """Colour, depth and every parameter, against autograd through rays and planes at the pixels that one face covers;
-    also where the near plane cuts it."""
+    """Compare gradients of colour and depth in every parameter with autograd through rays and planes.
+
+    Only pixels that one face covers are compared, also where the near plane cuts the face.
+    """
     torch.manual_seed(0)
     vertices = torch.tensor(
         [[-2.0, -2, 4], [3, -1, 5], [-1, 0.3, -1.0] if behind else [-1, 3, 3]], dtype=torch_float
@@ -209,8 +214,10 @@ def test_inside_a_face_slopes_are_those_of_the_plane(behind: bool) -> None:
 
 
 def test_inside_a_face_slopes_are_those_of_differences() -> None:
-    """Of colour and depth, in every number of a scene whose one face covers all pixels, against central differences of
-    the picture itself."""
+    """Compare gradients of colour and depth with central differences of the image itself.
+
+    They are compared in every number of a scene whose one face covers all pixels.
+    """
     torch.manual_seed(0)
     slope, down = torch.rand(20, 24, 4), torch.rand(20, 24)
     given = {
@@ -271,7 +278,7 @@ def test_gradients_of_extreme_scenes_are_finite(gradient: Gradient) -> None:
             faces = torch.tensor([[0, 1, 2], [0, 2, 1], [3, 4, 5]])
             colors = torch.rand(6, 3).requires_grad_()
             drawn = Rasterizer(gradient=gradient)(Scene(given, faces, colors, seen), ("color", "depth"))
-            # of both signs: nmr drops what a loss does not gain by
+            # terms of both signs, since nmr drops changes that do not lower the loss
             (drawn["color"].square().sum() - drawn["color"].sum()).backward(retain_graph=True)
             drawn["depth"].where(drawn["depth"] < math.inf, 0).sum().backward()
             assert drawn["color"].isfinite().all()

@@ -1,4 +1,4 @@
-"""The gradient of Kato et al. against the paper's definition, taken literally pixel by pixel, and where it leads."""
+"""Tests of the gradient of Kato et al. against the paper's definition, pixel by pixel, and of its effect."""
 
 import math
 
@@ -16,15 +16,18 @@ DISTANCE_ADDED = 1e-4  # as published, where the image is 2 wide
 
 
 def at(places: np.ndarray, depths: np.ndarray, lens: torch.Tensor) -> torch.Tensor:
-    """Vertices that are seen at those places."""
+    """Return vertices that are seen at the given places."""
     rays = (torch.as_tensor(places) - lens[2:]) / lens[:2]
     z = torch.as_tensor(depths)[:, None]
     return torch.cat([rays * z, z], 1)
 
 
 def literal(places, faces, face, color, slopes) -> np.ndarray:
-    """∂L/∂(column, row) of every vertex: for each pixel, face, edge and end i of that edge, how far i alone must move
-    along the axis until the edge meets the pixel, and what the pixel would then show."""
+    """Return ∂L/∂(column, row) of every vertex, by the paper's definition.
+
+    For each pixel, face, edge and end i of that edge, it computes how far i alone must move along the axis until the
+    edge meets the pixel, and what the pixel would then show.
+    """
     found = np.zeros_like(places)
     for axis, number, corner in np.ndindex(2, len(faces), 3):
         corners = places[faces[number]]
@@ -84,14 +87,17 @@ def literal(places, faces, face, color, slopes) -> np.ndarray:
 @pytest.mark.parametrize("whole", [False, True])
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 4))])
 def test_it_is_the_papers_sum_over_pixels_and_edges(seed: int, whole: bool) -> None:
-    """Overlapping faces, also from behind and past the image; `whole`: corners on pixels, edges along lines of them."""
+    """Check overlapping faces, also from behind and beyond the image.
+
+    With `whole`, corners lie on pixels and edges lie along lines of pixels.
+    """
     random = np.random.default_rng(seed)
     places = random.uniform([-3, -3], [WIDTH + 2, HEIGHT + 2], (9, 2))
     places = np.round(places) if whole else np.round(places * 256) / 256
     if whole:
         places[1, 1], places[4, 0] = places[0, 1], places[3, 0]
     faces = np.concatenate([np.arange(9).reshape(3, 3), random.integers(0, 9, (2, 3))])
-    for number in range(2):  # these from the front
+    for number in range(2):  # turn these two to the front
         ways = places[faces[number, 1:]] - places[faces[number, 0]]
         if np.linalg.det(ways) > 0:
             faces[number] = faces[number, ::-1]
@@ -131,7 +137,7 @@ def test_colors_and_depths_are_led_back_as_within_faces() -> None:
 
 
 def test_it_reaches_a_target_that_the_face_does_not_touch() -> None:
-    """What long sweeps are for: descending leads to the right, where a gradient of the edges alone says nothing."""
+    """Check that descent leads to the target on the right, where a gradient of the edges alone is nearly 0."""
     eye = torch.eye(3)
     seen = Camera(eye, torch.zeros(3), (20.0, 20.0), (19.5, 9.5), 20, 40)
     corners = torch.tensor([[-0.8, -0.2, 1.0], [-0.5, 0.2, 1], [-0.3, -0.2, 1]])

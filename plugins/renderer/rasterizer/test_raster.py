@@ -24,13 +24,13 @@ wild = settings(deadline=None, max_examples=60, derandomize=True)
 
 
 def ahead(height, width, near=1e-3):
-    """A camera at the origin, looking along z; its focal length, a power of two, keeps grid points exact."""
+    """Return a camera at the origin, looking along z; its focal length, a power of two, keeps grid points exact."""
     middle = ((width - 1) / 2, (height - 1) / 2)
     return Camera(torch.eye(3), torch.zeros(3), (FOCAL, FOCAL), middle, height, width, near)
 
 
 def seen_at(pixels, depths, camera):
-    """World points that the camera of `ahead` sees at pixels (column, row) and depths, float64."""
+    """Return world points that the camera of `ahead` sees at pixels (column, row) and depths, float64."""
     pixels, depths = np.asarray(pixels, dtype=np.float64), np.asarray(depths, dtype=np.float64)
     sideways = (pixels - np.array(camera.principal)) / FOCAL * depths[..., None]
     return torch.tensor(np.concatenate([sideways, depths[..., None]], -1))
@@ -50,9 +50,10 @@ def same(first, second):
 
 
 def by_rays(scene):
-    """A brute-force reference that shares nothing with the kernels: rays against planes in space.
+    """Return what pixels show by brute force, with rays and planes in space, independent of the kernels.
 
-    A pixel's ray hits a triangle where it is on one side of the three planes through the eye and an edge.
+    A pixel's ray hits a triangle where it is on the same side of all three planes through the camera's centre and an
+    edge.
 
     Returns:
         hits, distances to the nearest edge line (pixels) and depths, each (faces, height, width); barycentric
@@ -82,7 +83,7 @@ def by_rays(scene):
 
 @st.composite
 def soups(draw, subpixels):
-    """Loose triangles in front of a camera, corners on a grid of 1 / subpixels pixel."""
+    """Return separate triangles in front of a camera, with corners on a grid of 1 / subpixels pixel."""
     height, width = draw(st.integers(1, 20)), draw(st.integers(1, 20))
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     camera = ahead(height, width)
@@ -117,8 +118,10 @@ def test_every_channel_agrees_with_rays_through_pixel_centres(scene):
 
 @st.composite
 def slivers(draw):
-    """Long triangles of any width down to a hundredth of what corners are rounded by; some have all corners in a line
-    but for rounding."""
+    """Return long triangles of any width down to a hundredth of the rounding of corners.
+
+    Some triangles have all corners in a line, except for rounding.
+    """
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     camera = ahead(20, 20)
     start, end = rng.uniform(-5, 25, (2, 300, 2))
@@ -133,8 +136,10 @@ def slivers(draw):
 @wild
 @given(st.one_of(soups(subpixels=1e6), slivers()))
 def test_what_a_face_shows_is_interpolated_between_corners_that_are_not_rounded(scene):
-    """Weights lead to the place of the face that is under the pixel, or to the nearest one where rounding alone covers
-    the pixel; colours and depths are theirs."""
+    """Check that weights lead to the place of the face under the pixel, with the place's colour and depth.
+
+    Where only rounding covers the pixel, they lead to the nearest place of the face.
+    """
     hits, margins, _, _ = by_rays(scene)
     got = draw(scene, ("face", "barycentric", "color", "depth"))
     row, column = np.nonzero(got["face"] >= 0)
@@ -166,7 +171,7 @@ def test_off_the_grid_coverage_is_that_of_the_triangle_up_to_half_a_subpixel(sce
 
 
 def coverage(vertices, faces, camera):
-    """How many faces, each drawn alone, cover each pixel; the whole mesh's mask must be where any does."""
+    """Return how many faces, each drawn alone, cover each pixel; check that the whole mesh covers the same pixels."""
     counts = sum(
         draw(scene_of(vertices, face, camera), ("mask",))["mask"].astype(int) for face in np.asarray(faces)
     )
@@ -384,8 +389,10 @@ def test_a_triangle_with_one_corner_that_cannot_be_drawn_is_left_out(vertex, val
 
 @st.composite
 def cut_soups(draw):
-    """Triangles of which corners may be nearer than the near plane, or behind the camera; every corner is far from the
-    plane through the eye, so that nothing is decided by rounding alone."""
+    """Return triangles with corners that may be nearer than the near plane, or behind the camera.
+
+    Every corner is far from the plane through the camera's centre, so that rounding alone decides nothing.
+    """
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     camera = ahead(draw(st.integers(1, 20)), draw(st.integers(1, 20)), near=0.5)
     count = draw(st.integers(1, 8))
@@ -397,7 +404,7 @@ def cut_soups(draw):
 @wild
 @given(cut_soups())
 def test_what_the_near_plane_cuts_is_drawn_as_far_as_it_is_in_front(scene):
-    """Against rays through pixel centres, for triangles that have corners behind the camera."""
+    """Compare triangles that have corners behind the camera with rays through pixel centres."""
     hits, margins, depths, weights = by_rays(scene)
     near = scene.camera.near
     got = draw(scene, ALL)
@@ -421,7 +428,7 @@ def test_what_the_near_plane_cuts_is_drawn_as_far_as_it_is_in_front(scene):
     weight = np.take_along_axis(weights, nearest[None, ..., None], 0)[0]
     colors = (weight[..., None] * scene.colors.numpy()[scene.faces.numpy()[nearest]]).sum(-2)
     partly = (scene.vertices[:, 2].numpy()[scene.faces.numpy()] < near).any(1)[nearest]
-    # of faces that are cut weights come from space, without rounded corners
+    # weights of cut faces are computed in space, without rounded corners
     assert np.allclose(got["color"][shown & partly], colors[shown & partly], rtol=0, atol=1e-6)
 
 
@@ -571,7 +578,7 @@ def test_layouts_and_types_of_the_input_do_not_matter():
 
 
 ROADS = pytest.mark.parametrize("road", [Rasterizer.__call__, Rasterizer.on_device])
-"""On the CPU compiled, and in plain torch wherever tensors lie."""
+"""Names of the two implementations: compiled on the CPU, and plain torch on any device."""
 
 
 @ROADS

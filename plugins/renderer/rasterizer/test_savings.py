@@ -1,4 +1,4 @@
-"""What is left out changes no bit of a picture, and the report of it is true, against brute force."""
+"""Tests that savings change no bit of an image, and that its report is true, against brute force."""
 
 import copy
 import gc
@@ -30,7 +30,7 @@ def seen(distance: float = 4.0, size: tuple[int, int] = (60, 70), azimuth: float
 
 
 def crowd(camera: Camera, random: np.random.Generator, count: int = 3) -> Scene:
-    """Bodies before and behind one another, some out of view or through the near plane; one has a texture."""
+    """Return a scene of bodies that hide one another, some out of view or cut by the near plane; one has a texture."""
     vertices, faces, colors = blob(8)
     subjects = []
     for number in range(count):
@@ -66,7 +66,7 @@ def test_savings_change_no_bit(seed: int, cull: bool) -> None:
 @settings(deadline=None, max_examples=15, derandomize=True)
 @given(st.integers(0, 2**32 - 1))
 def test_one_renderer_draws_what_a_new_one_draws_whatever_came_before(seed: int) -> None:
-    """Scenes that change in one part at a time, in place and past torch's own count of changes too."""
+    """Draw scenes that change in one part at a time, also in place and unseen by torch's own count of changes."""
     random = np.random.default_rng(seed)
     renderer = Rasterizer(savings=SAVINGS)
     scene = crowd(seen(), random)
@@ -116,7 +116,7 @@ def test_what_did_not_change_is_not_computed_again() -> None:
 
 
 def by_hand(scene: Scene, cull: bool) -> dict[str, int]:
-    """What becomes of the faces of a scene in front of the near plane, one by one."""
+    """Count what happens to the faces of a scene in front of the near plane, one by one."""
     camera = scene.camera
     pixels, depth = camera.projected(scene.vertices.double())
     assert (depth >= camera.near).all()
@@ -208,7 +208,10 @@ def test_blended_pictures_report_what_became_of_every_face() -> None:
 
 @pytest.mark.parametrize("name", ["vertices", "colors"])
 def test_a_gradient_of_what_was_changed_since_is_refused(name: str) -> None:
-    """By torch, as for its own functions; and a second one where the first has freed what it needs."""
+    """Check that torch refuses such a gradient, as for its own functions.
+
+    It also refuses a second gradient after the first has freed its data.
+    """
     vertices, faces, colors = blob(6)
     learned = {"vertices": vertices.clone().requires_grad_(), "colors": colors.clone().requires_grad_()}
     loss = Rasterizer()(Scene(learned["vertices"], faces, learned["colors"], seen()))["color"].sum()
@@ -223,7 +226,7 @@ def test_a_gradient_of_what_was_changed_since_is_refused(name: str) -> None:
 
 
 def test_pictures_in_one_graph_keep_what_their_gradients_read() -> None:
-    """Several views before one backward pass, as in fitting to many cameras, give the sum of their gradients."""
+    """Check that several views before one backward pass, as in a fit to many cameras, give the sum of gradients."""
     vertices, faces, colors = blob(8)
     views = [seen(azimuth=azimuth) for azimuth in (0.1, 1.7, 3.1, 4.4)]
 
@@ -249,7 +252,7 @@ def test_pictures_in_one_graph_keep_what_their_gradients_read() -> None:
     "threads", [pytest.param(1, marks=pytest.mark.slow), 2, pytest.param(3, marks=pytest.mark.slow)]
 )
 def test_a_batch_is_its_scenes_side_by_side(threads: int) -> None:
-    """Of different sizes and meshes, with gradients, and without where none are wanted."""
+    """Check scenes of different sizes and meshes, with gradients, and without where none are wanted."""
     random = np.random.default_rng(1)
     scenes = [
         crowd(seen(size=(int(random.integers(1, 80)), int(random.integers(1, 80)))), random, 2)
@@ -276,7 +279,7 @@ def test_a_batch_is_its_scenes_side_by_side(threads: int) -> None:
 
 
 def test_after_the_first_picture_nothing_is_allocated_but_pictures() -> None:
-    """Whether gradients are asked for or not; and nothing is kept when pictures are gone."""
+    """Check this with and without gradients; and that nothing is kept when the images are gone."""
     vertices, faces, colors = blob(40)
     scene = Scene(vertices, faces, colors, seen(size=(300, 300)))
     renderer = Rasterizer(cull=True)
@@ -301,7 +304,7 @@ def test_after_the_first_picture_nothing_is_allocated_but_pictures() -> None:
 
 @pytest.mark.parametrize("gradient", get_args(Gradient))
 def test_a_picture_of_27_thousand_vertices_and_its_gradient_take_less_than_64_mib(gradient: Gradient) -> None:
-    """Of NumPy's memory, outputs too; benchmarks/rendering/rasterizer_memory.md has what a process grows by."""
+    """Measure NumPy's memory with outputs; benchmarks/rendering/rasterizer_memory.md has the growth of a process."""
     vertices, faces, colors = blob(117)
     assert len(vertices) > 27_554
     learned, painted = vertices.float().requires_grad_(), colors.float().requires_grad_()

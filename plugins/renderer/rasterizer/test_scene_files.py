@@ -1,4 +1,4 @@
-"""Scenes from files against trimesh, against formulas written out, and against each other."""
+"""Tests of scenes from files against trimesh, against formulas, and against each other."""
 
 import json
 import os
@@ -32,18 +32,21 @@ from plugins.renderer.rasterizer.sample_scenes import (
 from plugins.renderer.rasterizer.scene_files import UPWARDS, read
 
 FOUR = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 255]]], np.uint8)
-"""Red and green above, blue and white below."""
+"""An image with red and green above, blue and white below."""
 REAL = os.environ.get("REAL_DATA_ROOT")
 
 
 def light(stored: NDArray) -> NDArray:
-    """Of 8-bit sRGB (IEC 61966-2-1), as written there."""
+    """Return linear RGB of 8-bit sRGB, by the formula of IEC 61966-2-1."""
     share = stored / 255
     return np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
 
 
 def part(image: bytes | None = None, **changes: Any) -> tuple[dict[str, Any], list[NDArray | bytes]]:
-    """A square of one node and one material, from (0, 0) to (1, 1), its texture upright; `changes` to its material."""
+    """Return a square of one node and one material, from (0, 0) to (1, 1), with its texture upright.
+
+    `changes` go to its material.
+    """
     content: dict[str, Any] = {
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0}],
@@ -64,7 +67,7 @@ def written(
     name: str = "one.glb",
     change: Callable[[dict[str, Any]], object] = lambda _: None,
 ) -> Path:
-    """A .glb, or a .gltf with one file beside it; `change` is made to the whole description."""
+    """Write a .glb, or a .gltf with one file beside it; `change` is applied to the whole description."""
     whole, binary = described(content, arrays)
     file = folder / name
     if name.endswith(".gltf"):
@@ -77,7 +80,7 @@ def written(
 
 
 def texel(scene: Scene, face: int, corner: int, inwards: float = 0.1) -> NDArray:
-    """The texture's nearest texel a little inside of a face's corner, by the contract: u right, v upwards."""
+    """Return the texture's nearest texel a little inside of a face's corner, by the contract: u right, v upwards."""
     texture = scene.texture
     assert texture is not None
     places = texture.uv[texture.faces[face]].numpy()
@@ -125,7 +128,7 @@ def test_what_has_no_colour_is_grey_and_what_has_one_is_lit_alike(tmp_path: Path
 
 
 def test_nodes_stand_where_trimesh_puts_them(tmp_path: Path) -> None:
-    """Trees of turned, stretched and mirrored nodes: corners, and on which side faces show."""
+    """Compare trees of turned, stretched and mirrored nodes: corners, and on which side faces are visible."""
     random = np.random.default_rng(0)
     for _ in range(5):
         nodes: list[dict[str, Any]] = []
@@ -162,7 +165,7 @@ def test_nodes_stand_where_trimesh_puts_them(tmp_path: Path) -> None:
 def test_strips_and_fans_are_the_triangles_that_they_stand_for(
     tmp_path: Path, mode: int, order: list[int]
 ) -> None:
-    """All face z. Their vertices are interleaved with places in the texture, and one is said anew (sparse)."""
+    """Check that all faces face z; vertices are interleaved with texture places, and one is replaced (sparse)."""
     content, arrays = part()
     content["meshes"][0]["primitives"][0]["mode"] = mode
     content["images"] = [{"bufferView": 2}]
@@ -221,7 +224,7 @@ def test_a_skin_is_shown_as_its_joints_stand(tmp_path: Path) -> None:
 
 
 def test_a_texture_may_be_moved_turned_and_scaled(tmp_path: Path) -> None:
-    """Counter-clockwise as one looks at the image, whose v runs downwards: from right to up, which is -v."""
+    """Check that the turn is counter-clockwise on the image, whose v runs downwards: from right to up, which is -v."""
     content, arrays = part()
     moved = {"offset": [0.25, 0.5], "rotation": np.pi / 2, "scale": [2, 3]}
     content["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"]["extensions"] = {
@@ -252,7 +255,7 @@ NUMBERS = {"repeat": 10497, "clamp": 33071, "mirror": 33648}
 def test_what_lies_beyond_a_texture_is_told(
     tmp_path: Path, samplers: list[str | None], reach: int, wanted: str | None
 ) -> None:
-    """One rule for a scene; what stays inside needs none."""
+    """Check that a scene has one wrap rule, and that textures need none where faces stay inside."""
     content, arrays = part()
     content["textures"], content["samplers"], content["materials"], content["meshes"] = [], [], [], []
     content["nodes"] = [{"mesh": number, "translation": [number, 0, 0]} for number in range(len(samplers))]
@@ -283,7 +286,7 @@ def test_what_lies_beyond_a_texture_is_told(
 
 
 def test_the_same_mesh_as_obj_and_glb_is_the_same_scene(tmp_path: Path) -> None:
-    """As trimesh writes both: corners, places in the texture, light."""
+    """Compare both files as trimesh writes them: corners, texture places, linear RGB."""
     mesh = trimesh.creation.box((1, 2, 3))
     mesh.unmerge_vertices()
     uv = np.random.default_rng(2).uniform(0, 1, (len(mesh.vertices), 2))
@@ -301,7 +304,7 @@ def test_the_same_mesh_as_obj_and_glb_is_the_same_scene(tmp_path: Path) -> None:
 
 
 def test_an_obj_has_the_colours_of_its_materials(tmp_path: Path) -> None:
-    """Cut by material, relative indices, a place in the texture per corner; a missing file is noted, and no more."""
+    """Check splitting by material, relative indices and a texture place per corner; a missing file is only noted."""
     (tmp_path / "one.obj").write_bytes(OBJ)
     without = read(tmp_path / "one.obj")
     assert without.scene.texture is None and len(without.notes) == 1 and "one.mtl" in without.notes[0]
@@ -335,7 +338,7 @@ PICTURES = ("a#b.png", "#c.png", "d #2.png")
 def test_names_may_hold_what_begins_a_comment_elsewhere(
     tmp_path: Path, library: str, before: str, end: str
 ) -> None:
-    """A triangle of each material, beside comments: colours are those that trimesh reads, textures as written."""
+    """Check a triangle of each material, beside comments: colours as trimesh reads them, textures as written."""
     random = np.random.default_rng(0)
     behind = "# a comment" if before else ""  # trimesh reads neither these nor lines that begin with blanks
     colors = random.uniform(0, 1, (len(NAMES), 3)).round(3)
@@ -395,7 +398,7 @@ def test_ply_colours_are_light_and_its_texture_is_found(tmp_path: Path, binary: 
 
 
 def naming(folder: Path, name: str) -> list[Path]:
-    """A scene of each format whose texture has this name."""
+    """Return a scene of each format whose texture has this name."""
     content, arrays = part()
     content["images"] = [{"uri": name}]
     (folder / "one.obj").write_bytes(OBJ)
@@ -568,7 +571,7 @@ def test_a_bad_gltf_gets_its_sentence(
 
 
 def test_every_damage_of_length_is_refused(tmp_path: Path) -> None:
-    """Cut anywhere, a .glb is never taken for a whole one. `tests/fuzz/fuzz.py` damages files in other ways."""
+    """Check that a .glb cut anywhere is refused; `tests/fuzz/fuzz.py` damages files in other ways."""
     whole = glb(*quad())
     file = tmp_path / "one.glb"
     for end in range(0, len(whole), 29):

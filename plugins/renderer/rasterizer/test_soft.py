@@ -1,4 +1,4 @@
-"""Soft pictures and their slopes against the paper's formulas in plain torch, and against differences of themselves."""
+"""Tests of soft images and their gradients, against the paper's formulas in plain torch and against differences."""
 
 import math
 
@@ -20,7 +20,7 @@ KNOBS = ((1e-2, 0.05), (1e-3, 0.3), (0.2, 1e-3), (1e-5, 1e-4))
 
 def reference(vertices: Tensor, colors: Tensor, rotation: Tensor, translation: Tensor, lens: Tensor, faces: Tensor,
               cull: bool, sigma: float, gamma: float) -> Tensor:  # fmt: skip
-    """The picture by autograd, every pixel with every face; all are in front of the camera and in view."""
+    """Return the image by autograd, every pixel with every face; all faces are in front of the camera and in view."""
     seen = vertices @ rotation.T + translation
     place = seen[:, :2] / seen[:, 2:] * lens[:2] + lens[2:]
     if cull:
@@ -57,7 +57,10 @@ def reference(vertices: Tensor, colors: Tensor, rotation: Tensor, translation: T
 
 
 def given(seed: int) -> tuple[list[Tensor], Tensor]:
-    """Vertices, colours, rotation, translation, lens, float64; faces that overlap, share vertices, leave the image."""
+    """Return vertices, colours, rotation, translation, lens, float64, and faces.
+
+    The faces overlap, share vertices and extend beyond the image.
+    """
     torch.manual_seed(seed)
     vertices = torch.rand(9, 3).double() * torch.tensor([2.0, 1.6, 1]) - torch.tensor([1.0, 0.8, 0])
     faces = torch.cat([torch.arange(9).reshape(3, 3), torch.tensor([[2, 3, 7], [0, 4, 8], [1, 8, 5]])])
@@ -86,7 +89,7 @@ def view(faces: Tensor, cull: bool, sigma: float, gamma: float) -> View:
 
 
 def picture(parts: list[np.ndarray], seen: View) -> np.ndarray:
-    """In float64, before it is rounded."""
+    """Return the image in float64, before it is rounded."""
     drawn = draw(Given(*parts, None), seen, [], learning=True)
     assert drawn.blend is not None
     return drawn.blend.color
@@ -114,7 +117,7 @@ def test_picture_and_slopes_are_the_formulas(knobs: tuple[float, float], cull: b
 
 @pytest.mark.parametrize("knobs", KNOBS)
 def test_slopes_are_differences_of_the_picture(knobs: tuple[float, float]) -> None:
-    """In every number of the scene, central differences; to 1e-4 of the largest slope of its kind."""
+    """Compare gradients in every number of the scene with central differences, to 1e-4 of the largest of a kind."""
     parts, faces = given(5)
     arrays, seen = [part.numpy() for part in parts], view(faces, False, *knobs)
     slope = np.random.default_rng(0).normal(size=(*SIZE, 2)).astype(np.float32)
@@ -136,7 +139,7 @@ def test_slopes_are_differences_of_the_picture(knobs: tuple[float, float]) -> No
 
 
 def test_without_blur_it_is_the_hard_picture_and_says_so_at_any_size() -> None:
-    """Away from edges, whichever way σ is asked for; knobs are in units of the image, whatever its pixels."""
+    """Check pixels away from edges, however σ is given; settings are in units of the image, whatever its pixels."""
     vertices, faces, colors = blob(16)
     scene = Scene(vertices, faces, colors, camera())
     hard = Rasterizer()(scene, ("color", "depth", "face", "mask"))

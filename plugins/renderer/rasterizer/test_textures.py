@@ -1,4 +1,4 @@
-"""Textures against torch's own sampling, and what faces say of themselves against one another."""
+"""Tests of textures against torch's own sampling, and of the channels of faces against one another."""
 
 import itertools
 from collections.abc import Callable, Sequence
@@ -16,7 +16,7 @@ from plugins.renderer.rasterizer.test_gradient import blob, camera
 
 
 def covered(kind: torch.dtype = torch.float64, wrap: Wrap = "repeat", smooth: bool = True) -> Scene:
-    """A round body with a small image on it, several times; corners share vertices, but not places in the image."""
+    """Return a round body with a small, repeated image on it; corners share vertices, but not texture places."""
     vertices, faces, colors = blob(10)
     generator = torch.Generator().manual_seed(1)
     image = torch.rand(5, 7, colors.shape[1], generator=generator, dtype=torch.float64).to(kind)
@@ -28,7 +28,7 @@ def covered(kind: torch.dtype = torch.float64, wrap: Wrap = "repeat", smooth: bo
 
 
 def sampled(image: Tensor, uv: Tensor, wrap: Wrap) -> Tensor:
-    """Bilinear samples at places (row, column, 2) in [-1, 2] by torch."""
+    """Return bilinear samples at places (row, column, 2) in [-1, 2] by torch."""
     if wrap == "repeat":  # five copies each way, the middle one from 0 to 1
         image, uv, wrap = image.repeat(5, 5, 1), (uv + 2) / 5, "clamp"
     grid = torch.stack([2 * uv[..., 0] - 1, 1 - 2 * uv[..., 1]], -1)
@@ -78,7 +78,7 @@ def test_the_texel_that_a_place_lies_in_is_shown_where_it_is_not_smooth() -> Non
 
 
 def test_joined_subjects_show_what_each_shows_alone() -> None:
-    """Textured, coloured, both, none of them; each image its own, whatever stands before it."""
+    """Check subjects with textures, colours, both or neither; each keeps its own image, whatever stands before it."""
     textured = covered()
     assert textured.texture is not None
     vertices, faces, colors = blob(10)
@@ -124,7 +124,7 @@ WHOLE = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64)
 def test_joined_indices_are_those_of_int64_whatever_types_came(
     kind: torch.dtype, other: torch.dtype, textured: tuple[bool, bool], count: int
 ) -> None:
-    """Of many vertices, places and images before few: sums that none of the smaller types holds."""
+    """Join many vertices, places and images before few, with sums that no smaller type holds."""
 
     def subject(count: int, kind: torch.dtype, cover: bool) -> Scene:
         most = min(count, torch.iinfo(kind).max)
