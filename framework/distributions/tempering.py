@@ -36,7 +36,7 @@ RESOLVED = 1e-4
 MASS_GAP = 0.01
 """Largest |log ∫ p| on a grid that resolves p; beyond it, a peak lies between the grid's angles."""
 HELD = 0.3
-"""Share of the mass at one angle from which on a grid is too coarse for p itself, though not for its power."""
+"""Share of the mass at one angle above which a grid is too coarse for p itself, though not for its power."""
 NARROWEST = 3.0
 """Width of the innermost half of a stretched grid, in standard deviations of the power at its mode."""
 QUANTILES = 2048

@@ -17,7 +17,7 @@ from framework.distributions.uniform import uniform
 from plugins.density_head.matrix_fisher import angles, functions, quadrature, quaternions
 
 VOLUME = 8 * math.pi**2
-"""∫ cos e da de dt over the chart."""
+"""Volume of the chart, ∫ cos e da de dt."""
 CHART = ((-math.pi, math.pi), (-math.pi / 2, math.pi / 2), (-math.pi, math.pi))
 """Ranges of azimuth, elevation and tilt, radians."""
 SUMMITS = 6

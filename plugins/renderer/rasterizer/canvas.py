@@ -57,6 +57,7 @@ class Corners:
         return neighbours(self.array)
 
     def holds(self, given: np.ndarray) -> bool:
+        """Return whether these are the given rows of indices."""
         return given.shape == self.array.shape and alike(given.reshape(-1), self.array.reshape(-1))
 
 
@@ -102,6 +103,7 @@ class Canvas:
 
     @property
     def bytes(self) -> int:
+        """Size of all arrays, bytes."""
         arrays = (self.seen, self.screen, self.depth, self.face, self._vertices, *self._scratch)
         return sum(array.nbytes for array in arrays)
 
@@ -161,6 +163,7 @@ class Canvas:
         return self.tiles
 
     def shows(self, corners: Corners, cull: bool, box: Box, counts: np.ndarray) -> None:
+        """Record which mesh `depth` and `face` show, in which box, and what happened to its faces."""
         self._drawn, self.box, self.counts = (corners, cull), box, counts
 
 

@@ -47,6 +47,7 @@ class Ready:
 
     @property
     def uv_and_images(self) -> tuple[Tensor | None, tuple[Tensor, ...]]:
+        """The texture's uv and images; None and an empty tuple without a texture."""
         return (None, ()) if self.texture is None else (self.texture.uv, self.texture.images)
 
     def given(self, times: int, colored: bool) -> tuple[Given, Tensor]:
@@ -75,6 +76,7 @@ class Ready:
 
     @cached_property
     def laid(self) -> Laid | None:
+        """The texture in the form that kernels read; None without a texture."""
         texture, corners = self.texture, self.corners
         if texture is None or corners is None:
             return None

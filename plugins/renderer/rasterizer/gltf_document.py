@@ -48,6 +48,11 @@ class Document:
         return items[number]
 
     def buffer(self, number: int) -> bytes:
+        """Return the bytes of a buffer.
+
+        Raises:
+            ValueError: the file and the files beside it do not hold the buffer.
+        """
         if number not in self.buffers:
             described = self.item("buffers", number)
             if "uri" in described:

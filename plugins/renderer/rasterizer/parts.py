@@ -146,6 +146,7 @@ class Pictures:
         self._texels, self._bytes = 0, 0
 
     def known(self, key: object) -> Float[Tensor, "height width 3"] | None:
+        """Return the texture that was decoded under this key, or None."""
         return self._decoded.get(key)
 
     def decode(self, key: object, content: bytes, name: str) -> Float[Tensor, "height width 3"]:

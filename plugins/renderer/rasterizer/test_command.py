@@ -345,7 +345,7 @@ def test_the_command_says_where_it_wrote_and_its_report_on_request(
 def test_extreme_subjects_are_drawn_or_get_a_sentence(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The same picture whatever the size, from where a coordinate's last digits are as large as a pixel."""
+    """Check that the image is the same for every size and place of the subject; too large coordinates are refused."""
     ball = trimesh.creation.icosphere(2)
     shown = []
     for scale, move in ((1.0, 0.0), (1e-20, 0.0), (1e29, 0.0), (1e-3, 1e6), (1e40, 0.0)):
