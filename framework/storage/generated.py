@@ -70,9 +70,8 @@ def draw_all(count: int, draw: Callable[[int], None], what: str) -> None:
 
 def _write(root: Path, mark: Mapping[str, Any], write: Callable[[Path], None]) -> None:
     part = root.with_name(f".{root.name}.part")
-    shutil.rmtree(
-        part, ignore_errors=True
-    )  # left by a process that was killed, because this one holds the lock
+    # left by a process that was killed, because this one holds the lock
+    shutil.rmtree(part, ignore_errors=True)
     try:
         part.mkdir()
         write(part)
