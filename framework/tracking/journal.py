@@ -108,9 +108,8 @@ class Journal:
             if not os.path.lexists(self.path):
                 return []
             with guarded(self.path, "a journal"):
-                file = read_stream(
-                    self.path
-                )  # stays open on the old file if drop_after replaces it meanwhile
+                # stays open on the old file if drop_after replaces it meanwhile
+                file = read_stream(self.path)
         records: list[dict[str, Any]] = []
         with file:
             file.seek(offset)
@@ -152,9 +151,8 @@ class Journal:
                     if record is not None and record.get("step", step) > step:
                         dropped += 1
                     else:
-                        kept.write(
-                            line
-                        )  # damaged lines are kept too: only lines that were understood are removed
+                        # damaged lines are kept too: only lines that were understood are removed
+                        kept.write(line)
                 kept.write(_encode(marker).encode() + b"\n")
             self.last += 1
             self._reopen()

@@ -305,15 +305,13 @@ def run_folder(run_id: str, uri: str | None = None) -> Path:
         copy = cache_folder("runs") / run_id
         copy.mkdir(exist_ok=True)
         if models:
-            place = client.get_logged_model(
-                models[0]
-            ).artifact_location  # an address "models:/" would ask another store
+            # an address "models:/" would ask another store
+            place = client.get_logged_model(models[0]).artifact_location
             if not store.named:
                 require_own_files(store.uri, (place or "",))
             return Path(artifacts.download_artifacts(place, dst_path=str(copy), tracking_uri=store.uri))
-        client.download_artifacts(
-            run_id, "checkpoints", str(copy)
-        )  # runs of version 0.1 keep checkpoints as files
+        # runs of version 0.1 keep checkpoints as files
+        client.download_artifacts(run_id, "checkpoints", str(copy))
     except MlflowException as error:
         raise CheckpointError(f"Run {run_id} cannot be had from {told}: {reason(error)}.") from error
     return copy

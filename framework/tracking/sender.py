@@ -19,10 +19,8 @@ _BATCH = 1000  # metrics, parameters and tags that a store accepts in one call
 _LINES = 50  # number of waiting lines that triggers a call of the store
 _SECONDS = 2.0  # longest time that a line waits while the store answers
 _PAUSE = 0.5  # shortest time between calls, so that a fast training is not slowed by its own numbers
-_FIRST_RETRY, _LAST_RETRY = (
-    1.0,
-    30.0,
-)  # first and longest time between attempts, in seconds; it doubles each time
+# first and longest time between attempts, in seconds; it doubles each time
+_FIRST_RETRY, _LAST_RETRY = 1.0, 30.0
 
 Record = dict[str, Any]
 

@@ -92,9 +92,8 @@ class _DistantStore(Store):
     def __init__(self, process: StoreProcess, folder: Path, info: RunInfo) -> None:
         self._process = process
         answer = process.ask(open=str(folder), info=asdict(info))
-        owed = tuple(
-            (path, place) for path, place in answer["identity"]["owed"]
-        )  # JSON turns tuples into lists
+        # JSON turns tuples into lists
+        owed = tuple((path, place) for path, place in answer["identity"]["owed"])
         self.identity, self.replay = {**answer["identity"], "owed": owed}, answer["replay"]
 
     def send(self, batch: Sequence[Record]) -> None:
