@@ -1,1 +1,1 @@
-"""From names to built parts: registry, schema, settings, composition, assembly."""
+"""Configuration: registry, schema, settings, composition, and assembly of the parts."""

@@ -1,4 +1,4 @@
-"""Builds the parts of the density pipeline from a config: data, predictor, objectives, metrics."""
+"""Building of the parts of the density pipeline from a config: data, predictor, objectives and metrics."""
 
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -20,17 +20,17 @@ if TYPE_CHECKING:
     from framework.metric import Metric
 
 Resolved = dict[str, Any]
-"""Every plugin of a run with every parameter written out: plain values, by group; lists for plural groups."""
+"""Configs of all plugins of a run with every parameter, as plain values by group; a plural group holds a list."""
 
 
 def resolve_all(config: Mapping[str, Any]) -> Resolved:
-    """Check every plugin of a composed config before any data is read.
+    """Check every plugin of a composed config before any data is read, and return the resolved configs.
 
     Raises:
-        ConfigError: a part of the pipeline is missing, or a plugin's name, key or value is wrong.
+        ConfigError: A part of the pipeline is missing, or a plugin's name, key or value is wrong.
     """
     for group in ("data", "density_head", "encoder"):
-        # a head that is fitted at once may read inputs as they are
+        # a head that is fitted in one step may read the inputs without an encoder
         if not config.get(group) and not (group == "encoder" and _fitted_at_once(config["density_head"])):
             raise ConfigError(
                 f"No {group} is chosen. Name an experiment (`experiment=...`; `--help` lists them), "
@@ -41,7 +41,7 @@ def resolve_all(config: Mapping[str, Any]) -> Resolved:
         "density_head": resolve("density_head", config["density_head"]),
     }
     target = getattr(build_data(resolved), "target", None)
-    if target is not None:  # known without reading: what cannot describe it says so now
+    if target is not None:  # known before data is read, so a head that cannot describe the target fails here
         build("density_head", resolved["density_head"], target=target)
     for group in ("encoder", "uncertainty", "objective", "metric"):
         chosen = config.get(group) or {}
@@ -63,10 +63,10 @@ def _fitted_at_once(head: Any) -> bool:
 
 
 def require_outliers(resolved: Resolved) -> None:
-    """Refuse metrics of outliers without outliers.
+    """Refuse metrics that read outliers if no outliers are configured.
 
     Raises:
-        ConfigError: a metric reads outliers and none are configured.
+        ConfigError: A metric reads outliers and none are configured.
     """
     wanting = reading_outliers(resolved)
     if wanting and not resolved.get("outliers"):
@@ -77,16 +77,16 @@ def require_outliers(resolved: Resolved) -> None:
 
 
 def reading_outliers(resolved: Resolved) -> list[str]:
-    """Names of the metrics that read predictions on outliers."""
+    """Return the names of the metrics that read predictions on outliers."""
     return [part["name"] for part in resolved["metric"] if "outliers" in load("metric", part["name"]).splits]
 
 
 def build_outliers(resolved: Resolved, data: Data) -> Data | None:
-    """The data set of the outliers, prepared; None where no metric reads it.
+    """Return the prepared data set of the outliers; None if no metric reads it.
 
     Raises:
-        ConfigError: its inputs are not of the shape of `data`, which is prepared.
-        DataError: as `Data.prepare`.
+        ConfigError: Its inputs have another shape than those of `data`, which is already prepared.
+        DataError: `Data.prepare` fails.
     """
     if not reading_outliers(resolved):
         return None
@@ -101,7 +101,7 @@ def build_outliers(resolved: Resolved, data: Data) -> Data | None:
 
 
 def build_data(resolved: Resolved) -> Data:
-    """The data set, not yet prepared."""
+    """Return the data set, not yet prepared."""
     return build("data", resolved["data"])
 
 
@@ -112,14 +112,15 @@ def build_predictor(
     seed: int,
     columns: tuple[str, ...] = (),
 ) -> Predictor:
-    """The untrained predictor; its initial weights are a function of `seed` and the config.
+    """Return the untrained predictor, whose initial weights are a function of `seed` and the config.
 
-    Encoders with fixed features, as many as stand first, are outside what the wrappers of `uncertainty` wrap.
+    The leading encoders with fixed features are placed outside the wrappers of `uncertainty`.
     """
-    torch.default_generator.manual_seed(seed)  # of the CPU, where it is built; devices keep their own states
+    # the model is built on the CPU; the generators of other devices stay unchanged
+    torch.default_generator.manual_seed(seed)
     parts = list(resolved["encoder"])
     fixed: list[Encoder] = []
-    ready: list[Encoder] = []  # built already, for the first model
+    ready: list[Encoder] = []  # the encoder that is built already is used for the first model
     shape, names = input_shape, columns
     while parts:
         encoder: Encoder = build("encoder", parts[0], input_shape=shape, input_columns=names)
@@ -157,18 +158,20 @@ def _wrapped(
 
 
 def build_objectives(resolved: Resolved) -> Sequence[Objective]:
-    """The extra terms of the training loss; none by default."""
+    """Return the objectives, which are added to the training loss; none by default."""
     return [build("objective", part) for part in resolved["objective"]]
 
 
 def build_metrics(resolved: Resolved, target: Target) -> "list[Metric]":
-    """Fresh metrics, in the order asked for."""
+    """Return new metrics in the order of the config."""
     return [build("metric", part, target=target) for part in resolved["metric"]]
 
 
 def citations(resolved: Resolved) -> dict[str, str]:
-    """BibTeX of every plugin used, parts of parts included, keyed 'group name'. Of a stored model's metrics and
-    objectives those that are installed: it predicts without the others."""
+    """Return the BibTeX of every plugin used, including parts of parts, by the key 'group name'.
+
+    Metrics and objectives of a stored model that are not installed are left out, since the model predicts without them.
+    """
     found: dict[str, str] = {}
 
     def visit(group: str, part: Mapping[str, Any]) -> None:
@@ -194,7 +197,7 @@ def citations(resolved: Resolved) -> dict[str, str]:
 
 
 def entries(bibtex: Iterable[str]) -> dict[str, str]:
-    """The entries of several pieces of BibTeX by their keys, each once, in their order."""
+    """Return the entries of several BibTeX texts by their keys, each once and in order."""
     found: dict[str, str] = {}
     for entry in re.split(r"^(?=@)", "\n".join(bibtex), flags=re.MULTILINE):
         if entry.strip():

@@ -1,4 +1,4 @@
-"""What a command line means, before Hydra reads it."""
+"""Checks and translation of a command line before Hydra reads it."""
 
 import sys
 from contextlib import nullcontext, suppress
@@ -20,10 +20,11 @@ from framework.tracking.stores import require_no_password
 
 
 def command_line(arguments: list[str]) -> list[str]:
-    """The arguments as Hydra is to read them.
+    """Return the arguments in the form that Hydra reads.
 
     Raises:
-        ConfigError: one would run code or store a password, is no flag, or names a run to resume that is not there.
+        ConfigError: An argument would run code or store a password, is an unknown flag, or names a missing run to
+            resume.
     """
     _refuse_code_and_passwords(arguments)
     arguments = _flags_first(arguments)
@@ -33,10 +34,10 @@ def command_line(arguments: list[str]) -> list[str]:
 
 
 def _newest_checkpoint(arguments: list[str]) -> list[str]:
-    """Write `checkpoint=last` as the folder of the newest run, so that a config names one run for good.
+    """Replace `checkpoint=last` by the folder of the newest run, so that the stored config names a fixed run.
 
     Raises:
-        CheckpointError: there is none.
+        CheckpointError: There is no run with a checkpoint.
     """
     if f"checkpoint={LAST}" not in arguments or Path(LAST).exists():
         return arguments
@@ -49,10 +50,10 @@ def _newest_checkpoint(arguments: list[str]) -> list[str]:
 
 
 def _flags_first(arguments: list[str]) -> list[str]:
-    """Return Hydra's flags, then the settings, which Hydra reads in one piece only.
+    """Return Hydra's flags followed by the settings, because Hydra reads settings only if they follow each other.
 
     Raises:
-        ConfigError: a flag is unknown, or lacks its value.
+        ConfigError: A flag is unknown, or lacks its value.
     """
     parser = get_args_parser()
 
@@ -76,7 +77,7 @@ def _flags_first(arguments: list[str]) -> list[str]:
 
 
 def _no_flag(flag: str, arguments: list[str]) -> str:
-    """Say what an unknown flag, such as `--epochs 5`, is written as."""
+    """Return an error message that says how to write an unknown flag, such as `--epochs 5`, as a setting."""
     key, equals, value = flag.lstrip("-").partition("=")
     after = arguments[arguments.index(flag) + 1 :] if flag in arguments else []
     if not equals:
@@ -86,7 +87,7 @@ def _no_flag(flag: str, arguments: list[str]) -> str:
 
 
 def _setting_like(key: str) -> str:
-    """Return the dotted key of the setting that is called like this; the key itself where none is."""
+    """Return the dotted key of the setting with the most similar name; the given key if there is none."""
     from framework.configuration.settings import OptimizerSettings, Settings, TrainerSettings
 
     models = {"": Settings, "trainer.": TrainerSettings, "optimizer.": OptimizerSettings}
@@ -94,7 +95,7 @@ def _setting_like(key: str) -> str:
         name: f"{before}{name}"
         for before, model in reversed(models.items())
         for name in model.model_fields
-        if not name.startswith("min_")  # --epochs are the most
+        if not name.startswith("min_")  # --epochs means the maximum
     }
     if key in groups() or "." in key:
         return key
@@ -103,10 +104,10 @@ def _setting_like(key: str) -> str:
 
 
 def _preset_for_the_data(arguments: list[str]) -> list[str]:
-    """`preset=a` as `preset=a/<experiment>` or `preset=a/<data>` where presets by such names stand in a folder a.
+    """Replace `preset=a` by `preset=a/<experiment>` or `preset=a/<data>` if a folder `a` holds such presets.
 
     Raises:
-        ConfigError: there is none of that name or for this data, or a sweep over experiments wants several.
+        ConfigError: There is no preset of that name or for this data, or a sweep over experiments needs several.
     """
     arguments = [one.removeprefix("+") if one.startswith("+preset=") else one for one in arguments]
     given = [one for one in arguments if one.startswith("preset=")]
@@ -133,7 +134,7 @@ def _preset_for_the_data(arguments: list[str]) -> list[str]:
 
 
 def _choices(argument: str) -> list[str]:
-    """The name that a group is given, or in a sweep each of them."""
+    """Return the names that an argument chooses for a group: one, or several in a sweep."""
     with suppress(HydraException):
         one = OverridesParser.create().parse_override(argument)
         if one.is_sweep_override():
@@ -142,7 +143,7 @@ def _choices(argument: str) -> list[str]:
 
 
 def _preset(name: str, options: list[str], arguments: list[str], experiment: str) -> str:
-    """The one for what the other arguments choose."""
+    """Return the preset of the folder `name` for the experiment or the data that the other arguments choose."""
     own = [one for one in arguments if one.startswith("data=")]
     register()
     ready = GlobalHydra.instance().is_initialized()
@@ -164,7 +165,7 @@ def _preset(name: str, options: list[str], arguments: list[str], experiment: str
 
 
 def _in_resumed_folder(arguments: list[str]) -> list[str]:
-    """`resume=<run folder>` runs in that folder, so that Hydra makes no new one."""
+    """Set Hydra's run folder to the folder of `resume=<run folder>`, so that Hydra creates no new one."""
     for index, argument in enumerate(arguments):
         key, _, value = argument.partition("=")
         if key == "resume" and value not in ("auto", "never", "null", ""):
@@ -183,18 +184,20 @@ def _in_resumed_folder(arguments: list[str]) -> list[str]:
 
 
 def _refuse_code_and_passwords(arguments: list[str]) -> None:
-    """Refuse what would run code, or be stored, before Hydra reads it.
+    """Refuse arguments that would run code or store a password, before Hydra reads them.
 
-    Hydra's logging configs go to logging.config.dictConfig, which calls what they name. Its reruns unpickle a file.
+    Hydra passes its logging configs to logging.config.dictConfig, which calls the functions that they name. Hydra's
+    reruns unpickle a file.
 
     Raises:
-        ConfigError: an argument chooses or changes such a config, names such a file, or holds a password.
+        ConfigError: An argument chooses or changes such a config, names such a file, or contains a password.
     """
     for argument in arguments:
         flag = argument.partition("=")[0]
         if flag in ("--experiment", "--exp"):
             raise ConfigError(_no_flag(argument, arguments))
-        if flag.startswith("--e") and "--experimental-rerun".startswith(flag):  # argparse takes abbreviations
+        # argparse accepts abbreviations
+        if flag.startswith("--e") and "--experimental-rerun".startswith(flag):
             raise ConfigError(
                 f"{argument}: refused, since Hydra unpickles that file, which runs what it holds. Use resume=<folder>, "
                 "or repeat the command that the run's overrides.yaml lists."
@@ -210,10 +213,10 @@ def _refuse_code_and_passwords(arguments: list[str]) -> None:
 
 
 def _swept_with_experiment(arguments: list[str]) -> list[str]:
-    """The arguments of a sweep over experiments, single values written as sweeps of one.
+    """Return the arguments of a sweep over experiments, with single values written as sweeps over one value.
 
-    Hydra first composes what is not swept, by itself: `data.x=1` beside `experiment=a,b` would meet a config in which
-    no data is chosen yet.
+    Hydra first composes the config from the arguments that are not swept. With `experiment=a,b`, an argument
+    `data.x=1` would be applied to a config in which no data is chosen yet.
     """
     if not {"-m", "--multirun"} & set(arguments):
         return arguments
@@ -223,7 +226,7 @@ def _swept_with_experiment(arguments: list[str]) -> list[str]:
     try:
         parsed = dict(zip(overrides, OverridesParser.create().parse_overrides(overrides), strict=True))
     except HydraException:
-        return arguments  # Hydra itself will say what is wrong
+        return arguments  # Hydra itself reports the error
     if not any(one.key_or_group == "experiment" and one.is_sweep_override() for one in parsed.values()):
         return arguments
 

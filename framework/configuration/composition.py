@@ -1,4 +1,4 @@
-"""Composes a config with Hydra, and turns what Hydra says of a mistake into one sentence."""
+"""Composition of a config with Hydra, and translation of Hydra's errors into one sentence."""
 
 import re
 import shlex
@@ -22,13 +22,13 @@ from framework.configuration.registry import config_folders
 from framework.errors import ConfigError, did_you_mean, listed, nearest, shown
 
 PLURAL = ("encoder", "uncertainty", "objective", "metric")
-"""Groups of which an experiment may choose several; their configs are keyed by name."""
+"""Groups of which an experiment may choose several plugins; their configs are keyed by name."""
 GLOBAL = ("experiment", "preset", "debug")
-"""Groups whose configs stand at the top level."""
+"""Groups whose configs set keys at the top level."""
 
 
 def folder() -> Path:
-    """The project's own conf/: inside the package in a wheel, beside it in a checkout."""
+    """Return the project's own folder conf/, which lies inside the package in a wheel and beside it in a checkout."""
     package = Path(__file__).resolve().parent.parent
     for candidate in (package / "conf", package.parent / "conf"):
         if (candidate / "config.yaml").is_file():
@@ -37,7 +37,7 @@ def folder() -> Path:
 
 
 class PluginConfigs(SearchPathPlugin):
-    """Appends the config folders of installed plugins after the project's own, which therefore win."""
+    """Hydra plugin that appends the plugins' config folders after the project's own, which takes priority."""
 
     folders: Mapping[str, Path] = {}
 
@@ -47,7 +47,7 @@ class PluginConfigs(SearchPathPlugin):
 
 
 class PluginFolder(FileConfigSource):
-    """A plugin's config folder. Of a config that two plugins ship Hydra would take the first in silence."""
+    """Config folder of a plugin; it refuses a config that two plugins ship, of which Hydra would silently take one."""
 
     @staticmethod
     def scheme() -> str:
@@ -69,7 +69,7 @@ class PluginFolder(FileConfigSource):
 
 
 def register() -> None:
-    """Make plugin configs known to Hydra; call before composing. Twice is harmless."""
+    """Register the plugins' configs with Hydra; call this before composing. Repeated calls are harmless."""
     PluginConfigs.folders = config_folders()
     Plugins.instance().register(PluginConfigs)
     Plugins.instance().register(PluginFolder)
@@ -77,22 +77,23 @@ def register() -> None:
 
 
 def in_quotes(text: str) -> str:
-    """A text that Hydra's grammar reads as it stands, whatever it holds."""
+    """Return a text in quotes such that Hydra's grammar reads it back unchanged."""
     ending = re.sub(r"(\\+)$", r"\1\1", text)
     return "'" + re.sub(r"(\\*)'", r"\1\1\\'", ending) + "'"
 
 
 def plain(config: DictConfig) -> dict[str, Any]:
-    """The composed config as plain values, interpolations resolved; leftovers of replaced choices dropped.
+    """Return the composed config as plain values with interpolations resolved.
 
-    An experiment that tunes `encoder.a` and is run with `encoder=b` leaves an `encoder.a` without a name.
+    Leftover parts of replaced choices are dropped. For example, an experiment that sets keys of `encoder.a` and is run
+    with `encoder=b` leaves a part `encoder.a` without a name.
 
     Raises:
-        ConfigError: a value that must be given is not, or an experiment's keys do not stand at the top level.
+        ConfigError: A required value is missing, or an experiment's keys are not at the top level.
     """
     try:
         values = OmegaConf.to_container(config, resolve=True)
-    except OmegaConfBaseException as error:  # an interpolation of what is not there
+    except OmegaConfBaseException as error:  # an interpolation of a missing key
         raise ConfigError(
             f"{_in_its_config(error)}. Give it a value, or mend what stands between ${{ and }}."
         ) from error
@@ -114,7 +115,7 @@ def plain(config: DictConfig) -> dict[str, Any]:
 
 
 def _missing(values: Any, before: str = "") -> Iterator[tuple[str, str]]:
-    """Keys of values that must be given and are not, dotted; a config may say what is wanted: `<a file of ...>`."""
+    """Yield the dotted keys of missing required values, each with the description (`<a file of ...>`) in the config."""
     if isinstance(values, str) and re.fullmatch(r"\?\?\?|<.*>", values):
         yield before, f": wanted {values[1:-1]}" if values != "???" else ""
     parts = enumerate(values) if isinstance(values, list) else ()
@@ -123,9 +124,9 @@ def _missing(values: Any, before: str = "") -> Iterator[tuple[str, str]]:
 
 
 def help_text() -> str:
-    """What `--help` prints: how to call, and every group with its options.
+    """Return the text of `--help`: the usage, and every group with its options.
 
-    Hydra's own copies its store of configs for each group, which takes longer than all else.
+    Hydra's own function copies its store of configs for each group, which takes longer than everything else.
     """
     words = yaml.safe_load((folder() / "config.yaml").read_text(encoding="utf-8"))["hydra"]["help"]
     lines = [f"{group}: {', '.join(options(group))}" for group in groups()]
@@ -133,7 +134,7 @@ def help_text() -> str:
 
 
 def groups() -> list[str]:
-    """Return the names of all config groups, ours and the plugins'."""
+    """Return the names of all config groups of the framework and the plugins."""
     return sorted({path.name for root in _roots() for path in root.iterdir() if path.is_dir()})
 
 
@@ -142,13 +143,13 @@ def _roots() -> list[Path]:
 
 
 def options(group: str) -> list[str]:
-    """Every config of a group, sub-folders included, ours and the plugins'."""
+    """Return the names of all configs of a group, including subfolders, of the framework and the plugins."""
     found = {path.relative_to(root / group) for root in _roots() for path in (root / group).rglob("*.yaml")}
     return sorted(str(path.with_suffix("")) for path in found)
 
 
 def sentence(error: BaseException) -> str | None:
-    """A composition error of Hydra or OmegaConf as one sentence with a suggestion; None for any other error."""
+    """Return a composition error of Hydra or OmegaConf as a message with a suggestion; None for any other error."""
     if isinstance(error, MissingConfigException):
         wanted = error.missing_cfg_file or ""
         group, _, name = wanted.partition("/")
@@ -188,7 +189,7 @@ def _cannot_be_read(override: str) -> str:
 
 
 def _damaged(error: BaseException) -> str | None:
-    """What is wrong with a file that is no config at all; None for any other error."""
+    """Return an error message for a file that is no config at all; None for any other error."""
     cause: BaseException | None = error
     while cause is not None and not isinstance(cause, yaml.YAMLError):
         cause = cause.__cause__
@@ -217,7 +218,7 @@ def _damaged(error: BaseException) -> str | None:
 
 
 def _in_its_config(error: BaseException) -> str:
-    """What Hydra or OmegaConf says, in one line, after the name of the config that it says it of."""
+    """Return the message of Hydra or OmegaConf in one line, after the name of the config that it concerns."""
     said = (str(error) or str(error.__cause__ or "")).split("\n\nSet the environment")[0]
     said = " ".join(said.split("\nSee https://hydra.cc")[0].split())
     said = re.sub(r" full_key: (\S*) ?object_type=\w+", lambda key: f" (at {key[1]})" * bool(key[1]), said)
@@ -226,7 +227,7 @@ def _in_its_config(error: BaseException) -> str:
 
 
 def _being_composed(error: BaseException) -> str | None:
-    """The config that Hydra was reading or adding when it failed, e.g. 'experiment/moons/scvae'."""
+    """Return the config that Hydra was reading or adding when it failed, such as 'experiment/moons/scvae', or None."""
     found = None
     for frame, _ in walk_tb(error.__traceback__):
         if frame.f_globals["__name__"] in (
@@ -239,7 +240,7 @@ def _being_composed(error: BaseException) -> str | None:
 
 
 def _unknown(cause: OmegaConfBaseException) -> str:
-    """Where a key stands that was not found: elsewhere by that name, or near by under one like it."""
+    """Return a message about an unknown key that suggests a key of the same name elsewhere, or a similar name."""
     assert cause.parent_node is not None
     key, root = str(cause.key), cause.parent_node._get_root()
     known = [str(name) for name in cause.parent_node if name != "hydra"]
@@ -258,7 +259,7 @@ def _unknown(cause: OmegaConfBaseException) -> str:
 
 
 def _paths(values: Any, before: str = "") -> list[str]:
-    """Every key of nested mappings, dotted, but for Hydra's own."""
+    """Return the dotted keys of nested mappings, without Hydra's own keys."""
     found = []
     for key, value in values.items() if isinstance(values, Mapping) else ():
         if before or key != "hydra":

@@ -1,4 +1,4 @@
-"""The config of a command: as it was composed, as the framework checked it, and the run folder it is for."""
+"""Config of a command: its composed values, its checked settings, and the folder of its run."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from framework.configuration.settings import Settings, settings
 
 
 class Options(BaseModel):
-    """What a mode can be told; each mode derives its own, with types and ranges."""
+    """Base of the options of a mode; each mode derives its own class with types and ranges."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -26,14 +26,14 @@ Chosen = TypeVar("Chosen", bound=Options)
 
 @dataclass(frozen=True)
 class Config:
-    """Everything a mode is given.
+    """Config of a command, as a mode receives it.
 
     Attributes:
-        values: plain, as composed: what a run folder keeps, and what a resumed run is compared with.
-        settings: the core's own part, checked.
-        folder: of the run.
-        overrides: what the command line changed.
-        trained_on: the data set of the stored model that the command is about; empty where there is none.
+        values: Composed config as plain values, which is kept in the run folder and compared when the run is resumed.
+        settings: Checked settings of the core.
+        folder: Folder of the run.
+        overrides: Overrides on the command line.
+        trained_on: Data set on which the stored model of the command was trained; empty if there is no such model.
     """
 
     values: Mapping[str, Any]
@@ -44,37 +44,38 @@ class Config:
 
     @classmethod
     def of(cls, values: Mapping[str, Any], folder: Path, overrides: Sequence[str]) -> "Config":
-        """Check the core's part of composed values.
+        """Check the core's part of composed values, and return the config.
 
         Raises:
-            ConfigError: an unknown key, or a value out of range.
+            ConfigError: A key is unknown, or a value is out of range.
         """
         return cls(values, settings(values), folder, overrides)
 
     @cached_property
     def parts(self) -> dict[str, Any]:
-        """Every plugin with every parameter, checked once.
+        """Return the resolved configs of all plugins, which are checked at the first access.
 
         Raises:
-            ConfigError: a part is missing, or a plugin's name, key or value is wrong.
+            ConfigError: A part is missing, or a plugin's name, key or value is wrong.
         """
-        from framework.configuration.assembly import resolve_all  # torch, which not every mode needs
+        from framework.configuration.assembly import resolve_all  # imports torch, which not every mode needs
 
         return resolve_all(self.values)
 
     @property
     def mode(self) -> str:
+        """Return the name of the mode."""
         return self.values["mode"]["name"]
 
     def options(self, kind: type[Chosen]) -> Chosen:
-        """What the mode is told.
+        """Return the checked options of the mode as an object of class `kind`.
 
         Raises:
-            ConfigError: an unknown key, or a value out of range.
+            ConfigError: A key is unknown, or a value is out of range.
         """
         return kind.model_validate(check(kind, self.values["mode"], "mode"))
 
     def given(self, key: str) -> str | None:
-        """What the command line says of a key, or of one below it; None where it says nothing."""
+        """Return the first override on the command line of a key or of a key below it; None if there is none."""
         found = (item for item in self.overrides if is_below(key_of(item).removeprefix("stored."), (key,)))
         return next(found, None)

@@ -1,4 +1,4 @@
-"""What a checkpoint says of its model beside the weights: enough to build it again, to feed it and to name it."""
+"""Description of a model in a checkpoint, which suffices to build the model, to prepare its inputs and to name it."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -17,27 +17,28 @@ from framework.storage.limits import LONGEST_NAME, MOST_DRAWN, MOST_DRAWS, MOST_
 from framework.target import Kind, Target
 
 MOST_REMARKS, LONGEST_REMARK = 8, 500
-"""Remarks of a stored model that are read, and letters of each."""
+"""Largest number of remarks of a stored model that are read, and of characters in each."""
 INHERITED = ("seed", "batch_size", "samples", "experiment_name")
-"""Settings that a later test of the model repeats, so that it gives the numbers of the model's own run."""
+"""Settings that a later test of the model takes over, so that it gives the same numbers as the model's own run."""
 
 
 @dataclass(frozen=True)
 class Description:
-    """Plain values, written into every checkpoint.
+    """Description of a model in plain values, which every checkpoint holds.
 
     Attributes:
-        config: every part with every parameter.
-        target: what is predicted.
-        input_shape, columns: of what the model reads, as of `Data`.
-        synthetic: whether it was trained on generated data.
-        method: what tables call it; "" in checkpoints of version 0.1.
-        settings: of its run, those `INHERITED`; none in checkpoints of version 0.1.
-        data_state: `Data.state_dict` of the data it was trained on.
-        path: of the checkpoint it was read from.
-        dropped: paths that the stored config names and the user has not said again, by dotted keys; in `config` they
-            have their defaults.
-        remarks: what the wrappers found when they were calibrated (`Uncertainty.remark`).
+        config: Configs of all parts with every parameter.
+        target: Target that the model predicts.
+        input_shape: Shape of one input, as in `Data`.
+        columns: Names of the input columns, as in `Data`.
+        synthetic: Whether the model was trained on generated data.
+        method: Name of the model in tables; "" in checkpoints of version 0.1.
+        settings: Settings of the model's run that are in `INHERITED`; none in checkpoints of version 0.1.
+        data_state: `Data.state_dict` of the training data.
+        path: Path of the checkpoint from which the description was read.
+        dropped: Paths in the stored config that the user has not repeated, by dotted keys; in `config` they have their
+            defaults.
+        remarks: Remarks of the wrappers from their calibration (`Uncertainty.remark`).
     """
 
     config: Resolved
@@ -56,7 +57,7 @@ class Description:
     def of(
         cls, parts: Resolved, data: Data, method: str, settings: Settings, remarks: tuple[str, ...] = ()
     ) -> "Description":
-        """Of a model made of `parts` for `data`, which is prepared."""
+        """Return the description of a model that consists of `parts`, for prepared `data`."""
         kept = {key: getattr(settings, key) for key in INHERITED}
         state = dict(data.state_dict())
         about = data.target, data.input_shape, data.columns, data.synthetic
@@ -83,7 +84,7 @@ class Description:
         )
 
     def stored(self) -> dict[str, Any]:
-        """As a checkpoint holds it."""
+        """Return the description as the plain values that a checkpoint holds."""
         return {
             "format": 1,
             "version": version("robust-visual-learning"),
@@ -94,16 +95,17 @@ class Description:
     def read(
         cls, content: Mapping[str, Any], path: str, paths: Mapping[str, Any] | None = None
     ) -> "Description":
-        """Out of a checkpoint's contents; the config is checked again: it can only choose among installed plugins.
+        """Return the description in a checkpoint, after checking its config: it can only choose installed plugins.
 
         Args:
-            content, path: of the checkpoint.
-            paths: what the user says again of its config's paths (`framework.configuration.paths`).
+            content: Contents of the checkpoint.
+            path: Path of the checkpoint.
+            paths: Paths of the stored config that the user repeats (`framework.configuration.paths`).
 
         Raises:
-            CheckpointError: there is none.
-            ConfigError: a part of the config is unknown here, or a path of the model is not said again.
-            LookupError, TypeError, ValueError: it is not whole.
+            CheckpointError: The checkpoint holds no description.
+            ConfigError: A part of the config is unknown here, or the user does not repeat a path of the model.
+            LookupError, TypeError, ValueError: The description is incomplete.
         """
         stored = content.get("framework")
         if not isinstance(stored, Mapping) or stored.get("format") != 1:
@@ -130,7 +132,11 @@ class Description:
 
 
 def stored_shape(stored: Sequence[Any]) -> tuple[int, ...]:
-    """The shape of an input; a ValueError where it is none, or of more than MOST_INPUT numbers."""
+    """Return the stored shape of an input.
+
+    Raises:
+        ValueError: It is no shape, or has more than MOST_SIDES dimensions or MOST_INPUT elements.
+    """
     shape = tuple(map(int, stored[: MOST_SIDES + 1]))
     if len(shape) > MOST_SIDES or min(shape, default=0) < 0 or math.prod(shape) > MOST_INPUT:
         raise ValueError(
@@ -140,7 +146,11 @@ def stored_shape(stored: Sequence[Any]) -> tuple[int, ...]:
 
 
 def stored_names(stored: Sequence[Any], what: str) -> tuple[str, ...]:
-    """Names of columns or of a target; a ValueError where they are too many, or too long."""
+    """Return the stored names of columns or of a target.
+
+    Raises:
+        ValueError: There are too many names, or one is too long.
+    """
     if len(stored) > MOST_NAMES:
         raise ValueError(f"{len(stored)} {what}; at most {MOST_NAMES}")
     names = tuple(map(str, stored))
@@ -150,10 +160,11 @@ def stored_names(stored: Sequence[Any], what: str) -> tuple[str, ...]:
 
 
 def stored_settings(stored: Mapping[str, Any], target: Target) -> dict[str, Any]:
-    """Those `INHERITED`, as the command line takes them; a ValueError where `samples` would fill any memory.
+    """Return the stored settings that are in `INHERITED`, checked as on the command line.
 
     Raises:
-        ConfigError: a value is of the wrong type or range.
+        ConfigError: A value has the wrong type or range.
+        ValueError: `samples` is so large that the samples would fill the memory.
     """
     kept = {key: value for key, value in dict(stored).items() if key in INHERITED}
     values = check(Settings, kept, "settings")
@@ -166,7 +177,11 @@ def stored_settings(stored: Mapping[str, Any], target: Target) -> dict[str, Any]
 
 
 def stored_target(stored: Mapping[str, Any]) -> Target:
-    """What is predicted; a ValueError where that is no target."""
+    """Return the stored target.
+
+    Raises:
+        ValueError: The stored values do not form a target.
+    """
     kind, names = stored["kind"], stored_names(stored["names"], "names of a target")
     location, scale = (tuple(map(float, stored.get(key, ()))) for key in ("location", "scale"))
     sizes = {len(location), len(scale)}
@@ -191,10 +206,10 @@ def stored_target(stored: Mapping[str, Any]) -> Target:
 
 
 def checked(config: Mapping[str, Any]) -> Resolved:
-    """A stored config, checked again: a checkpoint can only choose among installed plugins and valid values.
+    """Return a stored config after checking that it chooses only installed plugins and valid values.
 
-    What a model predicts without (its data, metrics and objectives) is checked where it is used: the packages may be
-    missing where the model is deployed.
+    Data, metrics and objectives, without which the model can predict, are checked only where they are used, because
+    their packages may be missing on the machine where the model is deployed.
     """
     resolved: Resolved = {}
     for group, part in config.items():

@@ -1,4 +1,4 @@
-"""Config folders that a command adds (`--config-dir`): they may have come with somebody's sweep, and run no code."""
+"""Checks of config folders that a command adds (`--config-dir`), so that an untrusted folder cannot run code."""
 
 import re
 from collections.abc import Collection, Sequence
@@ -13,24 +13,25 @@ from framework.storage.enclosed import require_enclosed
 from framework.storage.plain_values import read_yaml
 
 OWN = ("hydra", "logger", "mode")
-"""Parts of a config that say what is run, where it is written and which store is contacted."""
+"""Parts of a config that determine the command, the output folder and the store that is contacted."""
 HARMLESS = {"hydra": ("sweeper", "launcher", "verbose"), "logger": ("name", "experiment"), "mode": ()}
-"""Keys of these that such a folder may set all the same."""
+"""Keys of these parts that such a folder may set nevertheless."""
 CHOSEN = re.compile(r"hydra/(launcher|sweeper)|logger")
 MOST = 1000
-"""Config files of such a folder."""
+"""Largest number of config files in such a folder."""
 
 
 def require_harmless(arguments: Sequence[str], groups: Collection[str]) -> None:
-    """Refuse config folders on a command line that would say what Hydra runs, or where results go.
+    """Refuse config folders on a command line that would determine what Hydra runs, or where results go.
 
     Args:
-        groups: config groups of the framework and its plugins. Of such a folder their files are looked at, and no other
-            can be chosen; where the command names the primary config, that too.
+        arguments: Arguments of the command.
+        groups: Config groups of the framework and its plugins. Only files of these groups are checked, and no other
+            file can be chosen; the primary config is checked too if the command names it.
 
     Raises:
-        ConfigError: a folder holds links, or a config of Hydra's logging, callbacks, environment or folders, of a
-            store's address or of a mode.
+        ConfigError: A folder holds links, or it configures Hydra's logging, callbacks, environment or folders, the
+            address of a store, or a mode.
     """
     named, _ = get_args_parser().parse_known_args(list(arguments))
     for text in (named.config_dir, named.config_path):
@@ -50,7 +51,7 @@ def require_harmless(arguments: Sequence[str], groups: Collection[str]) -> None:
 
 
 def _group(file: Path, folder: Path) -> str:
-    """Return the first folder below `folder` in which a config stands; empty for one in `folder` itself."""
+    """Return the name of the first folder below `folder` on the path of a config; empty for one in `folder` itself."""
     return (*file.relative_to(folder).parts[:-1], "")[0]
 
 
@@ -59,7 +60,7 @@ def _require_harmless(file: Path, folder: Path, groups: Collection[str]) -> None
         content = read_yaml(file, "a config", "Mend it, or take it out of the folder.", ConfigError)
     except ConfigError as error:
         if isinstance(error.__cause__, yaml.YAMLError | UnicodeDecodeError):
-            return  # what is no YAML Hydra cannot read either, and says where
+            return  # Hydra cannot read it either, and reports the place of the error
         raise
     with file.open(encoding="utf-8") as text:
         header = re.findall(r"^#\s*@package\s+(.*)$", text.read(), re.MULTILINE)
@@ -86,13 +87,13 @@ def _require_harmless(file: Path, folder: Path, groups: Collection[str]) -> None
             if _is_own(group.lstrip("/"), package) or ".." in f"{group}{name}":
                 raise _refused(file, f"chooses {quoted(entry)}")
             first = group.lstrip("/").split("/")[0]
-            # what a sweep has left there was not looked at; of what is nowhere Hydra says so
+            # other files in the folder, which a sweep may have left, were not checked; Hydra reports missing ones
             if absolute and first not in (*groups, "", "_self_") and _holds(folder, first):
                 raise _refused(file, f"chooses {quoted(entry)}")
 
 
 def _is_own(group: str, package: str) -> bool:
-    """Return whether a choice is one of, or goes into, a part of the config that is the user's own."""
+    """Return whether a choice belongs to, or changes, a part of the config that only the user may set."""
     if CHOSEN.fullmatch(group):
         return bool(package)
     return any(word in f"{group}@{package}" for word in OWN)

@@ -1,4 +1,4 @@
-"""Gives a trained model back, from a run folder, a checkpoint file or an MLflow run id; no Hydra needed."""
+"""Loading of a trained model from a run folder, a checkpoint file or an MLflow run id, without Hydra."""
 
 from collections.abc import Mapping
 from contextlib import suppress
@@ -31,73 +31,78 @@ from framework.target import Target
 
 FOREIGN = "This framework did not write it: do not use it."
 PREFIX = "predictor."
-"""What Lightning's checkpoints put before the predictor's own parameter names."""
+"""Prefix of the predictor's parameter names in Lightning's checkpoints."""
 
 
 def load(
     run_or_checkpoint: str | Path, *, uri: str | None = None, paths: Mapping[str, Any] | None = None
 ) -> Predictor:
-    """The trained model in evaluation mode, on the CPU; it takes what its user has, and answers in the user's unit.
+    """Return the trained model in evaluation mode, on the CPU; it reads the user's own data and uses the user's unit.
 
-    `model(given)` is the density over the target, with batch_shape (batch,): of files, arrays, or what else the data
-    set takes (`Data.inputs`); angles in radians, reals in their own unit, classes by their number in `density.names`,
-    which of other targets are those of their numbers. Its other methods take inputs as the data set makes them. What is
-    drawn (latent variables, dropout, samples) comes from torch's global generator: `torch.manual_seed` before a call
-    repeats it. Loading draws nothing from it. The weights ask for no gradient, so that NumPy, pandas and Matplotlib
-    take what comes out; `model.requires_grad_()` before training on.
+    `model(given)` returns the density over the target, with batch_shape (batch,). `given` are files, arrays or other
+    data that the data set accepts (`Data.inputs`). Angles are in radians and real numbers in their own unit. A class is
+    its index in `density.names`; for other targets, `density.names` are the names of the numbers. The other methods of
+    the model take inputs in the form that the data set produces.
+
+    Random numbers (latent variables, dropout, samples) come from torch's global generator, so `torch.manual_seed`
+    before a call repeats them. Loading draws nothing from it. The weights require no gradient, so that NumPy, pandas
+    and Matplotlib accept the results; call `model.requires_grad_()` to continue training.
 
     Args:
-        run_or_checkpoint: a run folder (`outputs/...`), a `.ckpt` file, or an MLflow run id.
-        uri: tracking store for a run id; the local one under `outputs/` by default.
-        paths: files and folders by their keys in the model's config, {"encoder.rasterised.body": "/my/body.npz"}. A
-            path that the checkpoint names itself is used for nothing: it may come from anybody.
+        run_or_checkpoint: A run folder (`outputs/...`), a `.ckpt` file, or an MLflow run id.
+        uri: Tracking store of the run id; the local store under `outputs/` by default.
+        paths: Files and folders by their keys in the model's config, {"encoder.rasterised.body": "/my/body.npz"}. Paths
+            in the checkpoint itself are never used, because it may come from an untrusted source.
 
     Raises:
-        CheckpointError: nothing is there, it is damaged, or it does not fit the model it describes.
-        ConfigError: the model needs a path that `paths` does not give.
+        CheckpointError: There is no checkpoint, it is damaged, or its weights do not fit the model that it describes.
+        ConfigError: The model needs a path that `paths` does not give.
     """
     predictor, description = load_with_description(run_or_checkpoint, uri=uri, paths=paths)
     predictor.description = description
     predictor.requires_grad_(False)
     user = User(reader(description))
-    predictor.register_forward_pre_hook(user.asks, prepend=True)  # before what looks at inputs
+    predictor.register_forward_pre_hook(user.asks, prepend=True)  # before other hooks, which check the inputs
     predictor.register_forward_hook(user.hears)
     return predictor
 
 
 class User:
-    """What a loaded model takes and answers, as its hooks: methods of an object, so that the model can be copied,
-    pickled and sent to another process with them.
+    """Hooks of a loaded model that convert the user's data to inputs and the density to the user's unit.
+
+    The hooks are methods of an object, so that the model can be copied, pickled and sent to another process with them.
 
     Args:
-        data: the data set of the model; it makes inputs of what is given, and knows the unit of the answer.
+        data: Data set of the model, which converts the user's data to inputs and knows the unit of the target.
     """
 
     def __init__(self, data: Data) -> None:
         self.data = data
-        self.frames = WeakTensorKeyDictionary()  # of the inputs that are being predicted for
+        self.frames = WeakTensorKeyDictionary()  # frames of the inputs of the calls in progress
 
     def asks(self, model: nn.Module, given: tuple[Any]) -> Tensor:
+        """Return the model's inputs for the user's data, and keep the frame in which the density is returned."""
         batch = asked_of(model, self.data, *given)
         self.frames[batch["input"]] = self.data.frame(batch)
         return batch["input"]
 
     def hears(self, model: nn.Module, inputs: tuple[Tensor], density: Distribution) -> Distribution:
+        """Return the density in the frame of its inputs, with the names of the target."""
         frame: Frame | None = self.frames.pop(inputs[0])
         answer = density if frame is None else Moved(density, *(part.to(inputs[0]) for part in frame))
-        with suppress(AttributeError):  # a density may have names of its own
+        with suppress(AttributeError):  # a density may have an attribute `names` that cannot be set
             answer.names = self.data.target.names  # type: ignore[attr-defined]
         return answer
 
     def __reduce__(self) -> tuple[type["User"], tuple[Data]]:
-        return User, (self.data,)  # weak references cannot be pickled, and no call is under way in the copy
+        return User, (self.data,)  # weak references cannot be pickled, and the copy has no call in progress
 
 
 def asked_of(model: nn.Module, data: Data, given: Any) -> Batch:
-    """Return what a model reads of what a user gives; a path may begin with `~`.
+    """Return the batch that a model reads for the user's data; a path may begin with `~`.
 
     Raises:
-        DataError: as `Data.asked`, and for whatever else it cannot make inputs of.
+        DataError: `Data.asked` refuses the data or fails on them, or they are empty.
     """
     given = _without_tilde(given)
     if hasattr(given, "__len__") and not isinstance(given, str) and not len(given):
@@ -108,20 +113,21 @@ def asked_of(model: nn.Module, data: Data, given: Any) -> Batch:
         batch = data.asked(given)
     except UserError:
         raise
-    except Exception as error:  # of NumPy, pandas or torch, about a date or a tensor with a gradient, say
+    except Exception as error:
+        # for example for a date or a tensor with a gradient
         raise DataError(
             f"{type(given).__name__} cannot be read as inputs ({shown(error)}). Give files, an array of numbers, or "
             "what else the data set of this model takes."
         ) from error
     inputs = batch["input"]
     own = next(model.parameters(), inputs)
-    # bytes are pixels, which encoders scale; any other number is one of the model's own type
+    # bytes are pixels, which encoders scale; any other number is converted to the type of the model's weights
     kind = inputs.dtype if inputs.dtype == torch.uint8 else own.dtype
     return {**batch, "input": inputs.to(own.device, kind)}
 
 
 def _without_tilde(given: Any) -> Any:
-    """Return paths in which `~` is the user's folder; anything else as it is."""
+    """Return paths with `~` replaced by the user's home folder; other values are returned unchanged."""
     if isinstance(given, str | Path):
         return type(given)(Path(given).expanduser()) if str(given).startswith("~") else given
     if isinstance(given, list | tuple) and given and all(isinstance(item, str | Path) for item in given):
@@ -130,9 +136,9 @@ def _without_tilde(given: Any) -> Any:
 
 
 def reader(description: Description) -> Data:
-    """The data set of a model, not prepared: it makes inputs of what a user gives.
+    """Return the data set of a model, not prepared, which converts the user's data to inputs.
 
-    Where a path of it was not said again, preparing it is refused: it would be other data.
+    If the user has not repeated one of its paths, preparing it is refused, because it would hold other data.
     """
     with guarded(Path(description.path), "a checkpoint of this framework", FOREIGN, kind=CheckpointError):
         try:
@@ -152,7 +158,7 @@ def reader(description: Description) -> Data:
 def load_with_description(
     run_or_checkpoint: str | Path, *, uri: str | None = None, paths: Mapping[str, Any] | None = None
 ) -> tuple[Predictor, Description]:
-    """The trained predictor, as `load`, with what the checkpoint says of itself."""
+    """Return the trained predictor and the description in its checkpoint; arguments and errors are those of `load`."""
     description, state = stored(run_or_checkpoint, uri=uri, paths=paths)
     return rebuilt(description, state), description
 
@@ -160,7 +166,7 @@ def load_with_description(
 def stored(
     run_or_checkpoint: str | Path, *, uri: str | None = None, paths: Mapping[str, Any] | None = None
 ) -> tuple[Description, dict[str, torch.Tensor]]:
-    """What a checkpoint says of its model, and the model's weights; as `load`."""
+    """Return the description and the weights in a checkpoint; arguments and errors are those of `load`."""
     path = find_checkpoint(run_or_checkpoint, uri=uri)
     content = read(path)
     with guarded(path, "a checkpoint of this framework", FOREIGN, kind=CheckpointError):
@@ -171,7 +177,7 @@ def interface(described: Mapping[str, Any], path: Path) -> tuple[Target, tuple[i
     """Return the target, the shape of an input and its columns that the checkpoint `path` describes.
 
     Raises:
-        CheckpointError: what stands there describes none.
+        CheckpointError: The description is invalid.
     """
     with guarded(path, "a checkpoint of this framework", FOREIGN, kind=CheckpointError):
         return (
@@ -182,18 +188,18 @@ def interface(described: Mapping[str, Any], path: Path) -> tuple[Target, tuple[i
 
 
 def rebuilt(description: Description, state: Mapping[str, torch.Tensor]) -> Predictor:
-    """The predictor that is described, with these weights, in evaluation mode.
+    """Return the predictor of a description with the given weights, in evaluation mode.
 
     Raises:
-        CheckpointError: they are of another model.
+        CheckpointError: The weights belong to another model.
     """
     with guarded(Path(description.path), "a checkpoint of this framework", FOREIGN, kind=CheckpointError):
         parts = description.config
         for part in parts["encoder"]:
-            # the checkpoint holds the weights now; the file they were started from may be gone
+            # the checkpoint holds the weights, and the file of the initial weights may be gone
             part.update(dict.fromkeys(registry.load("encoder", part["name"]).initial))
         shape, columns = description.input_shape, description.columns
-        # the initial weights are drawn, and replaced: the user's own draws stay what they were
+        # the initial weights are drawn and then replaced; the state of the user's generator is preserved
         with budget.building(description.path, state.values()), torch.random.fork_rng(devices=[]):
             predictor = build_predictor(parts, description.target, shape, 0, columns)
             fill(predictor, state, description.path)
@@ -202,9 +208,11 @@ def rebuilt(description: Description, state: Mapping[str, torch.Tensor]) -> Pred
 
 
 def bounded_at_first(predictor: Predictor, path: str) -> None:
-    """Let the first prediction of a stored model end in an error before it takes far more memory than the weights and
-    inputs account for (`budget.predicting`)."""
-    # of one with fixed encoders in front each is called apart, by the frozen form
+    """Limit the memory of the first prediction of a stored model (`budget.predicting`).
+
+    A prediction ends in an error before it takes far more memory than its weights and inputs account for.
+    """
+    # fixed encoders and the predictor behind them are called separately by a frozen model
     split = isinstance(predictor, FrozenFrontEnd)
     for module in (predictor.encoders, predictor.predictor) if split else (predictor,):
         first = FirstPrediction(path)
@@ -213,23 +221,25 @@ def bounded_at_first(predictor: Predictor, path: str) -> None:
 
 
 class FirstPrediction:
-    """The hooks of `bounded_at_first`; later predictions for as many samples do nothing with them.
+    """Hooks of `bounded_at_first`; they do nothing in later predictions for at most as many samples.
 
     Args:
-        path: the checkpoint.
+        path: Path of the checkpoint.
     """
 
     def __init__(self, path: str) -> None:
         self.path = path
-        self.bounded = 0  # rows of the largest batch that was predicted for
+        self.bounded = 0  # number of samples of the largest batch so far
         self.active: dict[int, budget.Budget] = {}  # by thread
 
     def begins(self, module: nn.Module, given: tuple[Any, ...]) -> None:
+        """Start the memory limit if the batch is larger than all before."""
         if isinstance(given[0], Tensor) and len(given[0]) > self.bounded:
             active = budget.predicting(self.path, module.state_dict().values(), given[0])
             self.active[get_ident()] = active.__enter__()
 
     def ends(self, module: nn.Module, given: tuple[Any, ...], density: Any) -> None:
+        """End the memory limit, and note the size of the batch if the prediction succeeded."""
         active = self.active.pop(get_ident(), None)
         if active is not None:
             active.__exit__(None, None, None)
@@ -237,7 +247,7 @@ class FirstPrediction:
 
 
 def weights(content: Mapping[str, Any]) -> dict[str, torch.Tensor]:
-    """The predictor's own parameters and buffers out of a checkpoint of either kind."""
+    """Return the predictor's own parameters and buffers in a checkpoint of Lightning or of `Session.save_model`."""
     state = content["state_dict"]
     return {key.removeprefix(PREFIX): value for key, value in state.items() if key.startswith(PREFIX)}
 
@@ -246,20 +256,20 @@ def fill(predictor: Predictor, state: Mapping[str, torch.Tensor], name: str) -> 
     """Copy weights into a predictor.
 
     Raises:
-        CheckpointError: they belong to another model; says what does not fit.
+        CheckpointError: The weights belong to another model; the message says what does not fit.
     """
-    # what a head fitted at once holds depends on the data it was fitted to
+    # the state of a head that is fitted in one step depends on its training data
     own = tuple(
         f"{name}." if name else "" for name, part in predictor.named_modules() if isinstance(part, Fitted)
     )
     require_match(describe_mismatch(predictor.state_dict(), state, any_shape=own), name)
     predictor.load_state_dict(dict(state))
-    # of a row of numbers torch takes the first where it wants one
+    # where torch expects one number, it takes the first of a row without an error
     require_match(describe_mismatch(predictor.state_dict(), state), name)
 
 
 def require_match(mismatch: str | None, name: str) -> None:
-    """Refuse weights that do not fit; errors as `fill`."""
+    """Refuse weights with a mismatch; raises the error of `fill`."""
     if mismatch:
         raise CheckpointError(
             f"{name} belongs to another model: {mismatch} Use the config it was trained with, or another checkpoint."
@@ -267,10 +277,10 @@ def require_match(mismatch: str | None, name: str) -> None:
 
 
 def find_checkpoint(run_or_checkpoint: object, *, uri: str | None = None) -> Path:
-    """The file meant by a run folder, a file or an MLflow run id.
+    """Return the checkpoint file of a run folder, a file or an MLflow run id.
 
     Raises:
-        CheckpointError: nothing is there, or it is no path or name.
+        CheckpointError: There is no checkpoint, or the argument is neither a path nor a name.
     """
     if not isinstance(run_or_checkpoint, (str, Path)):
         raise CheckpointError(

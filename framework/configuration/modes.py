@@ -1,4 +1,4 @@
-"""What each mode reads of a config. What a command sets and its mode does not read is refused (DESIGN, law 11)."""
+"""Keys of a config that each mode reads; other settings in a command are refused (DESIGN, law 11)."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -8,9 +8,9 @@ from framework.configuration.registry import GROUPS, MODEL
 from framework.errors import ConfigError, shown
 
 EVERYWHERE = ("mode", "seed", "threads", "logger", "hydra")
-"""Keys that mean something to any command, and that scripts therefore give to all of theirs."""
+"""Keys that every command accepts, because scripts pass them to all their commands."""
 BUNDLES = ("experiment", "preset", "debug")
-"""Groups whose configs set keys of several others; a mode takes from them what it reads."""
+"""Groups whose configs set keys of several other groups; a mode uses only the keys that it reads."""
 _RUN = ("resume", "experiment_name")
 _TEST = ("batch_size", "workers", "samples", "pictures")
 _STORED = (*_RUN, *_TEST, *BUNDLES, "trainer.accelerator", "data", "metric")
@@ -18,11 +18,11 @@ _STORED = (*_RUN, *_TEST, *BUNDLES, "trainer.accelerator", "data", "metric")
 
 @dataclass(frozen=True)
 class Mode:
-    """What a mode reads of what a command sets.
+    """Keys that a mode reads.
 
     Attributes:
-        reads: keys; where one is read, all keys below it are.
-        stored: groups of the stored model's config of which a command may say a key again: `data.root=...`.
+        reads: Keys that the mode reads, including all keys below them.
+        stored: Groups of the stored model's config of which a command may repeat a key, such as `data.root=...`.
     """
 
     reads: tuple[str, ...] = ()
@@ -48,7 +48,7 @@ MODES: Mapping[str, Mode] = {
     "plugins": Mode(),
     "sync": Mode(),
 }
-"""By the name of each mode."""
+"""Modes by name."""
 
 UNUSED_BY_TRAINING = {
     "limit_test_batches": "the test always covers its whole split",
@@ -58,12 +58,18 @@ UNUSED_BY_TRAINING = {
     "enable_autolog_hparams": "parameters go to the run's store, which logger chooses",
     "model_registry": "the model goes to the run's store, which logger chooses",
 }
-"""Keys of `trainer` that Lightning takes and that change nothing of a training here, with what does instead."""
+"""Keys of `trainer` that Lightning accepts but that have no effect on a training here, each with the reason."""
 
 
 @dataclass(frozen=True)
 class _Condition:
-    """When a setting is read: its key, whether a config lets it be read, and why another does not."""
+    """Condition under which a setting is read.
+
+    Attributes:
+        key: Dotted key of the setting.
+        holds: Function that returns whether a config meets the condition.
+        why: Reason for which the setting is not read otherwise.
+    """
 
     key: str
     holds: Callable[[Mapping[str, Any]], bool]
@@ -108,18 +114,18 @@ _CONDITIONS = (
         for key in ("preset", "debug")
     ),
 )
-"""Conditions that a composed config tells; others are known once the parts are built (`runs.session.refuse_idle`)."""
+"""Conditions that a composed config decides; others are known after the parts are built (`runs.job.refuse_idle`)."""
 
 
 def require_read(mode: str, overrides: Sequence[str]) -> None:
-    """Refuse what a command sets and its mode never reads.
+    """Refuse settings of a command that its mode never reads.
 
     Args:
-        mode: one of MODES.
-        overrides: what the command line changed.
+        mode: One of MODES.
+        overrides: Overrides on the command line.
 
     Raises:
-        ConfigError: names the first such setting, and the modes that read it.
+        ConfigError: There is such a setting; the message names the first, and the modes that read it.
     """
     for override in overrides:
         key = key_of(override)
@@ -134,11 +140,11 @@ def require_read(mode: str, overrides: Sequence[str]) -> None:
 
 
 def idle(values: Mapping[str, Any], overrides: Sequence[str]) -> Iterator[str]:
-    """Yield a sentence about each setting of a command that its mode reads, but not beside the other settings.
+    """Yield a sentence about each setting of a command that has no effect because of its other settings.
 
     Args:
-        values: the composed config.
-        overrides: what the command line changed.
+        values: Composed config.
+        overrides: Overrides on the command line.
     """
     for override in overrides:
         for condition in _CONDITIONS:
@@ -158,16 +164,16 @@ def key_of(override: str) -> str:
 
 
 def is_below(key: str, roots: Sequence[str]) -> bool:
-    """Return whether a dotted key is one of `roots`, or stands below one."""
+    """Return whether a dotted key is one of `roots` or lies below one."""
     return any(key == root or key.startswith(f"{root}.") for root in roots)
 
 
 def _written(override: str) -> str:
-    """Return an override as the user wrote it: `stored` is our word for what stands beside a checkpoint."""
+    """Return an override as the user wrote it, without the prefix `stored` that the framework adds."""
     return shown(override.removeprefix("+stored."))
 
 
 def _readers(key: str) -> str:
-    """Say which modes read a key; nothing where none does."""
+    """Return the end of a sentence that lists the modes that read a key; an empty text if there is none."""
     names = [name for name, mode in MODES.items() if is_below(key, mode.reads)]
     return f", {', '.join(names)} {'do' if len(names) > 1 else 'does'}" if names else ""

@@ -1,4 +1,4 @@
-"""The newest run of the working directory, which `checkpoint=last` means."""
+"""Search for the newest run of the working directory, which `checkpoint=last` names."""
 
 import os
 from pathlib import Path
@@ -13,7 +13,7 @@ def newest_run(outputs: Path) -> Path:
     """Return the folder of the run below `outputs` whose checkpoints were written last; links are not followed.
 
     Raises:
-        CheckpointError: no run there has a checkpoint.
+        CheckpointError: No run there has a checkpoint.
     """
     written: dict[Path, float] = {}
     for name, below, files in os.walk(outputs):

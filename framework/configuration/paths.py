@@ -1,7 +1,8 @@
-"""Paths that a stored config names: used where the user says them again, or not at all (DESIGN, law 15).
+"""Handling of paths in a stored config, which are used only if the user repeats them (DESIGN, law 15).
 
-A checkpoint or a run folder may come from anybody. A path counts as one by its parameter's annotation (`FilePath`,
-`pathlib.Path`, pydantic's `FilePath` and `DirectoryPath`), or by its looks, so that a plugin that says nothing is safe.
+A checkpoint or a run folder may come from an untrusted source. A text counts as a path by the annotation of its
+parameter (`FilePath`, `pathlib.Path`, pydantic's `FilePath` and `DirectoryPath`), or else if it looks like a path, so
+that a plugin without such annotations is safe too.
 """
 
 import argparse
@@ -25,35 +26,44 @@ from framework.storage.path_marks import Mark
 from framework.storage.path_marks import Words as Words
 
 SINGLE = ("data", "outliers", "density_head", "renderer")
-"""Groups of which a config names one plugin; of others it names several."""
+"""Groups of which a config names one plugin; of the other groups it names several."""
 OPTIONS = ("files", "into", "members", "run")
 """Options of modes that name files, folders or runs."""
 UNUSED = ("metric", "objective", "outliers", "renderer")
-"""Groups that loading a model does not import: there any parameter is looked at as text alone."""
+"""Groups whose plugins are not imported to load a model; their parameters are checked as texts only."""
 
 
 @dataclass
 class _Part:
-    """A plugin's config that can be changed: where it stands, and its class where that is known."""
+    """Config of a plugin that can be changed.
+
+    Attributes:
+        key: Dotted key of the plugin in the whole config.
+        values: Parameters of the plugin.
+        cls: Class of the plugin; None if it is not known.
+    """
 
     key: str
     values: dict[str, Any]
     cls: type | None
 
     def annotation(self, name: str) -> Any:
+        """Return the annotation of a parameter; Any if it is not known."""
         return signature(self.cls)[name][0] if self.cls and name in signature(self.cls) else Any
 
     def default(self, name: str) -> Any:
+        """Return the default of a parameter; None if it is not known."""
         return signature(self.cls)[name][1] if self.cls and name in signature(self.cls) else None
 
     def take_default(self, name: str) -> None:
+        """Set a parameter to its default."""
         default = self.default(name)
         self.values[name] = default
-        if self.cls is None or not (default is None or isinstance(default, str)):  # which the schema fills in
+        if self.cls is None or not (default is None or isinstance(default, str)):  # the schema fills it in
             del self.values[name]
 
     def paths(self) -> Iterator[str]:
-        """Names of the parameters whose value holds a path, other than their default."""
+        """Yield the names of the parameters whose value differs from the default and holds a path."""
         for name, value in self.values.items():
             if name == "name" or (self.cls and name in parts(self.cls)):
                 continue
@@ -64,19 +74,19 @@ class _Part:
 def without_paths(
     config: Mapping[str, Any], said: Mapping[str, Any], unused: Collection[str] = ()
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Take out of a stored config every path that the user does not say again.
+    """Remove from a stored config every path that the user does not repeat.
 
     Args:
-        config: plugins by group, as a checkpoint or a run folder holds them; not checked yet.
-        said: values of the user by dotted keys: "data.root", "encoder.<name>.weights".
-        unused: groups whose plugins are not imported for this.
+        config: Plugins by group, as a checkpoint or a run folder holds them; not checked yet.
+        said: Values of the user by dotted keys, such as "data.root" or "encoder.<name>.weights".
+        unused: Groups whose plugins are not imported for this.
 
     Returns:
-        A copy with what is said, and without the other paths, so that they take their defaults; and those paths by
-        their keys. What training alone starts from (`Encoder.initial`) is left out without a word.
+        A copy of the config with the user's values, in which the other paths have their defaults; and the removed
+        paths by their keys. Parameters that only training needs (`Encoder.initial`) are not among the removed paths.
 
     Raises:
-        ConfigError: nothing of the config stands under a key of `said`, or it is no path of the model.
+        ConfigError: The config has no part for a key of `said`, or the key is no path of the model.
     """
     found = deepcopy(dict(config))
     dropped: dict[str, Any] = {}
@@ -114,7 +124,7 @@ def without_paths(
 
 
 def paths_of(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Every path of a composed config by the key under which a command says it."""
+    """Return all paths of a composed config, by the keys under which a command gives them."""
     config = deepcopy({group: values.get(group) for group in (*GROUPS, "outliers")})
     found = {f"{part.key}.{name}": part.values[name] for part in _parts(config, ()) for name in part.paths()}
     mode = values.get("mode")
@@ -128,7 +138,7 @@ def paths_of(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def flat(said: Mapping[str, Any]) -> dict[str, Any]:
-    """What is said below nested keys, by dotted keys."""
+    """Return the values of nested mappings by dotted keys."""
     found: dict[str, Any] = {}
     for key, value in said.items():
         inner = flat(value) if isinstance(value, Mapping) else None
@@ -137,10 +147,15 @@ def flat(said: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def require_said(dropped: Mapping[str, Any], groups: Collection[str], source: str) -> None:
-    """Refuse to go on without the paths of some groups.
+    """Refuse to continue without the paths of some groups.
+
+    Args:
+        dropped: Removed paths, by dotted keys.
+        groups: Groups whose paths are needed.
+        source: Path of the checkpoint, for the message.
 
     Raises:
-        ConfigError: some were `dropped`; says which, and what to write.
+        ConfigError: Paths of these groups were removed; the message says which, and what to write.
     """
     needed = {key: value for key, value in dropped.items() if key.partition(".")[0] in groups}
     if needed:
@@ -154,10 +169,15 @@ def require_said(dropped: Mapping[str, Any], groups: Collection[str], source: st
 
 
 def require_repeated(stored: Mapping[str, Any], said: Mapping[str, Any], folder: object) -> None:
-    """Refuse to go on with a run whose paths the command does not say again.
+    """Refuse to resume a run whose paths the command does not repeat.
+
+    Args:
+        stored: Paths of the stored config, by dotted keys.
+        said: Paths that the command gives, by dotted keys.
+        folder: Folder of the run.
 
     Raises:
-        ConfigError: a path is missing, or is another; says what to write.
+        ConfigError: A path is missing or differs; the message says what to write.
     """
     for key, value in said.items():
         if key not in stored or not _equal(stored[key], value):
@@ -176,7 +196,7 @@ def require_repeated(stored: Mapping[str, Any], said: Mapping[str, Any], folder:
 
 
 def words(paths: Mapping[str, Any]) -> list[str]:
-    """What says these paths on a command line, as typed into a shell."""
+    """Return the arguments that give these paths on a command line, as typed into a shell."""
     return [shlex.quote(f"{shown(key)}={_typed(value)}") for key, value in paths.items()]
 
 
@@ -188,15 +208,16 @@ def _typed(value: Any) -> str:
     text = printable(str(value), kept="")
     if isinstance(value, str) and not re.fullmatch(
         r"[A-Za-z0-9_.@-]*/[A-Za-z0-9_./@-]+", text
-    ):  # no number, nor null
-        from framework.configuration.composition import in_quotes  # Hydra, which loading does without
+    ):  # quotes are needed so that it is not read as a number or null
+        # imports Hydra, which loading does not need
+        from framework.configuration.composition import in_quotes
 
         return in_quotes(text)
     return text
 
 
 def add_option(parser: argparse.ArgumentParser) -> None:
-    """Let a command of a plugin take `--path KEY=PATH`, which `said` reads."""
+    """Add the option `--path KEY=PATH`, which `said` reads, to a command of a plugin."""
     parser.add_argument(
         "--path",
         action="append",
@@ -207,12 +228,12 @@ def add_option(parser: argparse.ArgumentParser) -> None:
 
 
 def said(options: Sequence[str]) -> dict[str, str]:
-    """What `--path` gives."""
+    """Return the paths of the option `--path`, by their keys."""
     return {key: path for key, _, path in (option.partition("=") for option in options)}
 
 
 def _parts(config: dict[str, Any], unused: Collection[str]) -> Iterator[_Part]:
-    """Every plugin in a config, and every plugin in one."""
+    """Yield every plugin in a config, including plugins that are parts of others."""
     for group in (*GROUPS, "outliers"):
         chosen = config.get(group)
         named: list[tuple[str, Any]] = []
@@ -232,7 +253,7 @@ def _within(group: str, key: str, values: dict[str, Any], unused: bool) -> Itera
         try:
             cls = load(group, values["name"])
         except ConfigError:
-            cls = None  # where it is used that is said
+            cls = None  # the error is raised where the plugin is used
     inner = parts(cls) if cls else {}
     yield _Part(key, values, cls)
     for name, part in inner.items():
@@ -250,7 +271,7 @@ def _name(part: Any) -> str:
 
 
 def holds_path(annotation: Any, value: Any) -> bool:
-    """Whether the value of a parameter holds the path of a file or folder, to the best of our knowledge."""
+    """Return whether the value of a parameter holds a path, as its annotation says or, without one, as it looks."""
     if isinstance(value, str):
         if value in _literals(annotation):
             return False
@@ -274,7 +295,7 @@ def _marked(annotation: Any) -> bool:
 
 
 def _mark(annotation: Any) -> bool | None:
-    """What an annotation says of texts: they are paths, they never are, or nothing."""
+    """Return whether an annotation says that a text is a path (True), is never a path (False), or neither (None)."""
     marks = [each.path for each in getattr(annotation, "__metadata__", ()) if isinstance(each, Mark)]
     if isinstance(annotation, type) and issubclass(annotation, PurePath):
         marks.append(True)
@@ -289,12 +310,12 @@ def _literals(annotation: Any) -> set[Any]:
 
 
 def _fields(annotation: Any) -> dict[str, Any]:
-    """Annotations of the fields of the dataclasses and pydantic models that stand in an annotation."""
+    """Return the annotations of the fields of all dataclasses and pydantic models inside an annotation."""
     found: dict[str, Any] = {}
     if isinstance(annotation, type) and (is_dataclass(annotation) or issubclass(annotation, BaseModel)):
         try:
             found = typing.get_type_hints(annotation, include_extras=True)
-        except Exception:  # a name for type checkers alone
+        except Exception:  # the annotation uses a name that exists for type checkers only
             found = {}
     for inner in typing.get_args(annotation):
         found |= _fields(inner)

@@ -1,4 +1,4 @@
-"""The names of everything installed, read from package metadata; reading them imports nothing."""
+"""Registry of the installed plugins, read from package metadata without importing anything."""
 
 import re
 from contextlib import suppress
@@ -12,21 +12,21 @@ from framework.errors import ConfigError, did_you_mean, listed, quoted
 
 GROUPS = ("data", "encoder", "density_head", "uncertainty", "objective", "renderer", "metric")
 MODEL = ("encoder", "density_head", "uncertainty")
-"""Groups of what a model predicts with."""
+"""Groups of the plugins with which a model predicts."""
 
 Entry = Any
-"""An importlib.metadata.EntryPoint, or that of its backport, which takes over once MLflow has been imported."""
+"""Type of an entry point: importlib.metadata's, or its backport's, which replaces it once MLflow was imported."""
 
 
 @cache
 def installed(group: str) -> dict[str, Entry]:
-    """Name and entry point of everything installed under `framework.<group>`, sorted by name; without the `refused`."""
+    """Return the entry points under `framework.<group>` by name, sorted, without the `refused` names."""
     return {name: found[0] for name, found in _entries(group).items() if name not in refused(group)}
 
 
 @cache
 def refused(group: str) -> dict[str, str]:
-    """Names that cannot be used, each with a sentence that says why; all others still work."""
+    """Return the names that cannot be used, each with a sentence that says why; all other names still work."""
     reasons = {}
     for name, found in _entries(group).items():
         if len(found) > 1:
@@ -35,7 +35,7 @@ def refused(group: str) -> dict[str, str]:
                 f"Several installed packages call a {group} {name!r}: {things}. Uninstall all but one, or rename their "
                 "entry points."
             )
-        elif found[0].dist and not found[0].dist.name:  # a package that was removed by half
+        elif found[0].dist and not found[0].dist.name:  # a package that was only partly removed
             reasons[name] = (
                 f"The {group} {name!r} ({found[0].value}) is of a package whose METADATA file is gone. Install that "
                 "package again, or remove what is left of it."
@@ -44,7 +44,7 @@ def refused(group: str) -> dict[str, str]:
 
 
 def _entries(group: str) -> dict[str, list[Entry]]:
-    """By name, sorted, the entry points that are different things."""
+    """Return the entry points of a group by name, sorted; a name has several if they refer to different objects."""
     found: dict[str, list[Entry]] = {}
     for entry in sorted(entry_points(group=f"framework.{group}"), key=lambda entry: entry.name):
         others = found.setdefault(entry.name, [])
@@ -54,15 +54,15 @@ def _entries(group: str) -> dict[str, list[Entry]]:
 
 
 def origin(entry: Entry) -> str:
-    """Distribution and version an entry point comes from, e.g. 'their-package 1.2'."""
+    """Return name and version of the package that an entry point comes from, such as 'their-package 1.2'."""
     return f"{entry.dist.name} {entry.dist.version}" if entry.dist else "an unknown package"
 
 
 def find(group: str, name: str) -> Entry:
-    """The entry point called `name`.
+    """Return the entry point called `name`.
 
     Raises:
-        ConfigError: nothing of that name is installed, or it is one of the `refused`.
+        ConfigError: No plugin of that name is installed, or the name is `refused`.
     """
     names = installed(group)
     if name in refused(group):
@@ -77,10 +77,11 @@ def find(group: str, name: str) -> Entry:
 
 
 def load(group: str, name: str) -> type[Any]:
-    """Import the class called `name`; the only place where a plugin is imported.
+    """Import and return the class called `name`; plugins are imported here and nowhere else.
 
     Raises:
-        ConfigError: no such name, the import fails, or it is not a whole implementation of the group's base.
+        ConfigError: There is no such name, the import fails, or the class is no complete implementation of the group's
+            base.
     """
     entry = find(group, name)
     try:
@@ -122,7 +123,7 @@ def _where_it_is_not(entry: Entry, module: str) -> str:
 
 
 def _remedy(entry: Entry, module: str) -> str:
-    """What installs a missing module: an extra of the plugin's own package, where one asks for it by that name."""
+    """Return how to install a missing module: by an extra of the plugin's own package, if one requires the module."""
     wanted = module.partition(".")[0].lower()
     for requirement in (entry.dist.requires if entry.dist else None) or ():
         asked = re.match(r"[\w.-]+", requirement)
@@ -133,7 +134,7 @@ def _remedy(entry: Entry, module: str) -> str:
 
 
 def group_of(annotation: object) -> str | None:
-    """The registry a class belongs to: the `group` its abstract base carries; None for any other object."""
+    """Return the registry of a class, which is the attribute `group` of its abstract base; None for other objects."""
     if not isinstance(annotation, type):
         return None
     group = getattr(annotation, "group", None)
@@ -141,17 +142,17 @@ def group_of(annotation: object) -> str | None:
 
 
 def config_folders() -> dict[str, Path]:
-    """Plugin name and config folder of every installed plugin that ships configs.
+    """Return the config folder of every installed plugin that ships configs, by the name of the plugin.
 
     Raises:
-        ConfigError: a plugin ships a config of Hydra itself.
+        ConfigError: A plugin ships a config of Hydra itself.
     """
     folders: dict[str, Path] = {}
     for entry in sorted(entry_points(group="framework.conf"), key=lambda entry: entry.name):
         package, *rest = entry.value.split(".")
         roots = package_folders(package)
         if not roots:
-            continue  # half-uninstalled: it can disturb nobody but its own users
+            continue  # the package is only partly installed, which affects only commands that use it
         folder = roots[0].joinpath(*rest)
         own = next(folder.glob("hydra/**/*.yaml"), None)
         if own is not None:
@@ -160,14 +161,14 @@ def config_folders() -> dict[str, Path]:
                 "Hydra itself, whose logging config can run code. Uninstall it."
             )
         if folder not in folders.values():
-            # two packages may give their folders one name, and both count
+            # two packages may give their folders the same name, and both are kept
             folders[f"{entry.name} of {origin(entry)}" if entry.name in folders else entry.name] = folder
     return folders
 
 
 def package_folders(package: str) -> list[Path]:
-    """Where a top-level package's files are; importing nothing, and empty where it is not found."""
-    with suppress(ImportError, ValueError):  # a name that is none, or a module that says nothing of itself
+    """Return the folders of a top-level package without importing it; an empty list if it is not found."""
+    with suppress(ImportError, ValueError):  # the name is no module name, or the module has no spec
         spec = find_spec(package)
         return [Path(root) for root in (spec.submodule_search_locations if spec else None) or ()]
     return []

@@ -1,15 +1,16 @@
-"""From a plugin's constructor signature to a checked config, and from a checked config to the built plugin.
+"""Checking of a config against a plugin's constructor signature, and construction of the plugin from the config.
 
-The rule of constructors: parameters before `*` come from the framework and are filled by name (`target`,
-`input_shape`, `model`); keyword-only parameters come from the config, are checked against their annotations
-and have their defaults there. A keyword-only parameter annotated with an abstract base is a *part*: the config
-names it, it is built from that base's registry and arrives ready. One annotated with a dataclass of keyword-only
-fields is a *value*: its fields stand in the config beside the other keys, and it arrives made of them; the
-parameter's own default, where it has one, gives the keys their defaults.
+Parameters of a constructor before `*` come from the framework and are filled by name (`target`, `input_shape`,
+`model`). Keyword-only parameters come from the config, are checked against their annotations, and have their defaults
+in the signature. A keyword-only parameter that is annotated with an abstract base is a *part*: the config names a
+plugin of that base's registry, and the constructor receives the built plugin. A parameter that is annotated with a
+dataclass of keyword-only fields is a *value*: its fields are keys of the config beside the other keys, and the
+constructor receives the dataclass. If the parameter has a default, the fields of that default are the defaults of these
+keys.
 
-A checked config holds plain values only, since checkpoints keep it: a path is its text, an enum its value, a pydantic
-model or a dataclass a mapping of its fields. `build` reads them by the annotations again, so that each arrives as what
-its parameter is annotated with.
+A checked config holds plain values only, because checkpoints store it: a path is stored as text, an enum as its value,
+and a pydantic model or a dataclass as a mapping of its fields. `build` reads these values by the annotations again, so
+that the constructor receives values of the annotated types.
 """
 
 import inspect
@@ -34,14 +35,14 @@ from framework.errors import ConfigError, did_you_mean, listed, quoted, shown
 from framework.storage.plain_values import is_number
 
 WRITTEN = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
-"""Text that is taken for a number, as of a variable of the environment."""
+"""Pattern of a text that is accepted as a number, such as the value of an environment variable."""
 
 
 def forbid_targets(config: Any, path: str = "") -> None:
-    """Refuse `_target_` anywhere: a config holds names and values, never code.
+    """Refuse the key `_target_` anywhere, because a config holds names and values but never code.
 
     Raises:
-        ConfigError: a `_target_` key stands somewhere in `config`.
+        ConfigError: `config` contains a key `_target_`.
     """
     if isinstance(config, Mapping):
         for key, value in config.items():
@@ -58,15 +59,15 @@ def forbid_targets(config: Any, path: str = "") -> None:
 
 
 def resolve(group: str, config: Any, path: str | None = None) -> dict[str, Any]:
-    """The config of one plugin with every default filled in, checked against its constructor.
+    """Return the config of one plugin with every default filled in, checked against its constructor.
 
     Args:
-        group: registry, e.g. "density_head".
-        config: a plugin's name, or a mapping with `name` and parameters.
-        path: how the config is called in messages; the group's name by default.
+        group: Registry, such as "density_head".
+        config: Name of a plugin, or a mapping with `name` and parameters.
+        path: Name of the config in messages; the group's name by default.
 
     Raises:
-        ConfigError: unknown name, unknown key, or a value of wrong type or range.
+        ConfigError: The name or a key is unknown, or a value has the wrong type or range.
     """
     path = path or group
     if isinstance(config, str):
@@ -98,11 +99,15 @@ def resolve(group: str, config: Any, path: str | None = None) -> dict[str, Any]:
 
 
 def build(group: str, config: Mapping[str, Any], **context: Any) -> Any:
-    """Construct the plugin of a resolved config; parts first, `context` by parameter name.
+    """Build the plugin of a resolved config, after building its parts.
+
+    Args:
+        group: Registry, such as "density_head".
+        config: Resolved config of the plugin.
+        context: Values that the framework supplies, by parameter name.
 
     Raises:
-        ConfigError: the constructor asks the framework for something it does not have here, or refuses what it is given
-            by a ValueError.
+        ConfigError: The constructor has a parameter that the framework cannot supply here, or raises a ValueError.
     """
     cls = load(group, config["name"])
     given = []
@@ -123,7 +128,7 @@ def build(group: str, config: Mapping[str, Any], **context: Any) -> Any:
                 values[key] = part.many(build(part.group, item, **context) for item in values[key])
             else:
                 values[key] = build(part.group, values[key], **context)
-        except ConfigError as error:  # which the user may never have named
+        except ConfigError as error:  # the user may never have named the part
             raise ConfigError(f"{group} {config['name']}, of which {key} is a part: {error}") from error
     try:
         return cls(*given, **arguments(cls, values))
@@ -136,7 +141,7 @@ def build(group: str, config: Mapping[str, Any], **context: Any) -> Any:
 
 
 def _place(error: BaseException, cls: type) -> str:
-    """Where it was raised: the last line of the plugin's own file, if that was reached."""
+    """Return file and line of an error: the last line reached in the plugin's own file, or else the last of all."""
     lines = [(frame.f_code.co_filename, line) for frame, line in walk_tb(error.__traceback__)]
     own = [place for place in lines if place[0] == inspect.getsourcefile(cls)]
     file, line = (own or lines)[-1]
@@ -144,10 +149,11 @@ def _place(error: BaseException, cls: type) -> str:
 
 
 def check(model: type[BaseModel], values: Mapping[str, Any], path: str) -> dict[str, Any]:
-    """`values` validated and completed by a pydantic model; the first fault becomes a sentence.
+    """Return `values` validated and completed by a pydantic model.
 
     Raises:
-        ConfigError: unknown key, missing key, or a value of wrong type or range.
+        ConfigError: A key is unknown or missing, or a value has the wrong type or range; the message describes the
+            first fault.
     """
     try:
         found = model.model_validate(dict(values)).model_dump()
@@ -158,10 +164,10 @@ def check(model: type[BaseModel], values: Mapping[str, Any], path: str) -> dict[
 
 
 def _require_numbers(given: Any, read: Any, where: str) -> None:
-    """Refuse what pydantic takes for a number and nobody writes for one: true, "1_0", " 1 ", "nan".
+    """Refuse values that pydantic reads as a number but that are not meant as one: true, "1_0", " 1 ", "nan".
 
     Raises:
-        ConfigError: such a value stands in `given` where a number was `read`.
+        ConfigError: `given` contains such a value where pydantic `read` a number.
     """
     if isinstance(given, Mapping) and isinstance(read, Mapping):
         for key in given.keys() & read.keys():
@@ -178,10 +184,11 @@ def _no_number(given: Any) -> bool:
 
 
 def _refusal(error: ValidationError, path: str, known: Sequence[str]) -> ConfigError:
-    """The first fault as a sentence; `known` are the keys where one is unknown."""
+    """Return an error that describes the first fault; `known` are the valid keys, for an unknown key."""
     fault = error.errors()[0]
     where = shown(".".join(filter(None, [path, *(str(item) for item in fault["loc"])])))
-    if fault["type"] in ("extra_forbidden", "unexpected_keyword_argument"):  # the latter of a dataclass
+    # the second kind comes from a dataclass
+    if fault["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
         left = path and fault["input"] is not None and "[" not in where
         return _unknown(where, str(fault["loc"][-1]), known, bool(left))
     if fault["type"] == "missing":
@@ -194,7 +201,7 @@ def _refusal(error: ValidationError, path: str, known: Sequence[str]) -> ConfigE
 
 
 def _unknown(where: str, key: str, known: Sequence[str], left: bool) -> ConfigError:
-    # of another plugin that an experiment had chosen; Hydra deletes no key whose value is null
+    # the key may belong to another plugin that the experiment chose; Hydra cannot delete a key whose value is null
     advice = f" ~{where} leaves out what an experiment sets." if left else ""
     return ConfigError(
         f"{where}: unknown key.{did_you_mean(key, known)} Known keys: {listed(key, known) or 'none'}.{advice}"
@@ -202,10 +209,10 @@ def _unknown(where: str, key: str, known: Sequence[str], left: bool) -> ConfigEr
 
 
 def _stored(cls: type, values: Mapping[str, Any], path: str) -> dict[str, Any]:
-    """`values` checked and completed by the defaults of `cls`, as plain values that give the same when read again.
+    """Return `values` checked and completed by the defaults of `cls`, as plain values that do not change when reread.
 
     Raises:
-        ConfigError: unknown key, missing key, a value of wrong type or range, or one that cannot be kept.
+        ConfigError: A key is unknown or missing, or a value has the wrong type or range or cannot be stored.
     """
     found = _kept(cls, _validated(cls, _defaults(cls) | dict(values), path), path)
     try:
@@ -216,7 +223,7 @@ def _stored(cls: type, values: Mapping[str, Any], path: str) -> dict[str, Any]:
             "annotate the parameter with a type that also takes plain values."
         ) from None
     for key, value in found.items():
-        # NaN equals nothing
+        # NaN does not equal itself, so its text is compared too
         if again[key] != value and repr(again[key]) != repr(value):
             raise ConfigError(
                 f"{shown(f'{path}.{key}')} = {quoted(value)} becomes {quoted(again[key])} when a checkpoint that "
@@ -231,13 +238,17 @@ def _defaults(cls: type) -> dict[str, Any]:
 
 
 def _validated(cls: type, values: Mapping[str, Any], path: str, *, nullable: bool = False) -> dict[str, Any]:
-    """The value of every key of `cls` as its annotation reads it.
+    """Return the value of every key of `cls`, converted as its annotation says.
 
-    `nullable`: None is taken as it is, since a loaded model is given None for what only training needs
-    (`Encoder.initial`).
+    Args:
+        cls: Class of the plugin.
+        values: Values by key.
+        path: Name of the config in messages.
+        nullable: Accept None for any key, since a loaded model receives None for parameters that only training needs
+            (`Encoder.initial`).
 
     Raises:
-        ConfigError: unknown key, missing key, or a value of wrong type or range.
+        ConfigError: A key is unknown or missing, or a value has the wrong type or range.
     """
     found = {}
     models = _models(cls)
@@ -253,9 +264,9 @@ def _validated(cls: type, values: Mapping[str, Any], path: str, *, nullable: boo
             found[key] = None
             continue
         try:
-            # without `extra` a misspelt key of an inner model would be left out in silence
+            # without `extra`, a misspelt key of an inner model would be ignored silently
             read: Any = models[key].model_validate({key: value}, extra="forbid")
-            # pydantic reads what is annotated as an Iterable lazily, and once
+            # pydantic turns a value annotated as Iterable into an iterator, which can be read only once
             found[key] = list(read.value) if isinstance(read.value, Iterator) else read.value
             _require_numbers(value, found[key], f"{path}.{key}")
         except ValidationError as error:
@@ -264,16 +275,16 @@ def _validated(cls: type, values: Mapping[str, Any], path: str, *, nullable: boo
 
 
 def _inner_keys(annotation: Any) -> list[str]:
-    """Fields of the models and dataclasses that stand in an annotation."""
+    """Return the names of the fields of all models and dataclasses inside an annotation."""
     named = getattr(annotation, "model_fields", None) or getattr(annotation, "__dataclass_fields__", ())
     return [*named, *(name for inner in get_args(annotation) for name in _inner_keys(inner))]
 
 
 def _kept(cls: type, values: Mapping[str, Any], path: str) -> dict[str, Any]:
-    """The values as a checkpoint keeps them.
+    """Return the values in the form in which a checkpoint stores them.
 
     Raises:
-        ConfigError: one is not made of plain values.
+        ConfigError: A value does not consist of plain values.
     """
     found = {}
     for key, value in values.items():
@@ -290,10 +301,10 @@ def _kept(cls: type, values: Mapping[str, Any], path: str) -> dict[str, Any]:
 
 @cache
 def _models(cls: type) -> dict[str, type[BaseModel]]:
-    """For each key a model whose `value` it is, whatever the key is called.
+    """Return for each key a pydantic model with one field `value`, whose alias is the key.
 
     Raises:
-        ConfigError: an annotation is no type that pydantic knows how to check.
+        ConfigError: An annotation is no type that pydantic can check.
     """
     found = {}
     config = ConfigDict(extra="forbid", arbitrary_types_allowed=True)
@@ -314,10 +325,10 @@ _SINGLE: tuple[Any, ...] = (bool, int, float, complex, str, bytes)
 
 
 def _plain(value: Any) -> Any:
-    """A copy made of None, numbers, text, lists, tuples, sets and dicts.
+    """Return a copy that consists of None, numbers, text, lists, tuples, sets and dicts.
 
     Raises:
-        TypeError: something in it is none of these, nor made of them; says what.
+        TypeError: A value in it cannot be converted to these; the message names its type.
     """
     if isinstance(value, Enum):
         return _plain(value.value)
@@ -330,7 +341,8 @@ def _plain(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {_plain(key): _plain(item) for key, item in value.items()}
     if isinstance(value, frozenset):
-        return tuple(map(_plain, value))  # torch reads no frozenset, and a list could be no item of a set
+        # torch does not read a frozenset, and a list cannot be an item of a set
+        return tuple(map(_plain, value))
     for kind in _SEVERAL:
         if isinstance(value, kind):
             return kind(map(_plain, value))

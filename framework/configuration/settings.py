@@ -1,4 +1,4 @@
-"""The core's own part of the config: types, ranges and defaults; plugins check theirs by their constructors."""
+"""Settings of the core: types, ranges and defaults; the settings of plugins are checked by their constructors."""
 
 import re
 from collections.abc import Mapping
@@ -33,7 +33,7 @@ def _devices(value: Any) -> Any:
 
 
 MOST_AT_ONCE = 1024
-"""Threads, or data-loading processes, of one run."""
+"""Largest number of threads, and of data-loading processes, of one run."""
 Positive = Annotated[int, Field(gt=0)]
 NotNegative = Annotated[int, Field(ge=0)]
 Count = Annotated[int, Field(strict=True, ge=1)]
@@ -53,7 +53,7 @@ STRATEGIES = (
     *("deepspeed_stage_3_offload", "deepspeed_stage_3_offload_nvme"),
     *(f"{name}{end}" for name in _PLAIN for end in _UNUSED),
 )
-"""Names that Lightning has registered."""
+"""Names of the strategies that Lightning has registered."""
 PRECISIONS = (
     *("32-true", "bf16-mixed", "16-mixed", "64-true", "bf16-true", "16-true", "transformer-engine"),
     *("transformer-engine-float16", "32", "16", "64", "bf16", 32, 16, 64),
@@ -65,22 +65,22 @@ class _Strict(BaseModel):
 
 
 class OptimizerSettings(_Strict):
-    """An optimiser of torch.optim by its lower-case name, and a schedule of its rate (framework.training.schedules)."""
+    """Optimiser of torch.optim by its lower-case name, and schedule of its rate (framework.training.schedules)."""
 
     name: Literal["adam", "adamw", "sgd", "nadam", "radam"] = "adamw"
     learning_rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1e-3
     momentum: Annotated[float, Field(ge=0, lt=1)] | None = None
-    """Of sgd alone, and 0 where nothing is said; the others have moments of their own."""
+    """Momentum of sgd, 0 if it is not given; the other optimisers have moments of their own and refuse it."""
     weight_decay: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
     schedule: Literal["constant", "cosine", "step", "plateau"] = "constant"
     warmup_steps: NotNegative = 0
-    """Steps over which the rate rises linearly; of a short training at most a quarter of all."""
+    """Number of steps over which the learning rate rises linearly; in a short training at most a quarter of them."""
     factor: Annotated[float, Field(gt=0, lt=1)] = 0.1
-    """Of a reduction by step or plateau."""
+    """Factor of a reduction by the schedule step or plateau."""
     milestones: list[Count] = []
-    """Epochs after which step reduces the rate."""
+    """Epochs after which the schedule step reduces the learning rate."""
     patience: Count = 5
-    """Epochs without a better validation loss after which plateau does."""
+    """Number of epochs without a better validation loss after which the schedule plateau reduces the learning rate."""
 
     @model_validator(mode="after")
     def _fits(self) -> "OptimizerSettings":
@@ -100,17 +100,19 @@ class OptimizerSettings(_Strict):
 
 
 class LoggerSettings(_Strict):
-    """Where metrics go beside the local journal."""
+    """Destination of metrics in addition to the local journal."""
 
     name: Literal["mlflow", "none"] = "mlflow"
     uri: str | None = None
-    """Without a password; None: MLFLOW_TRACKING_URI, else mlflow.db in the outputs folder."""
+    """Address of the store without a password; None means MLFLOW_TRACKING_URI, else mlflow.db in the outputs folder."""
     experiment: str | None = None
 
 
 class TrainerSettings(_Strict):
-    """Our own keys of `trainer`, and the arguments of pytorch_lightning.Trainer that a config can hold; checked only:
-    what is not given has Lightning's defaults. It is known here what Lightning takes, since importing it costs seconds.
+    """Keys of `trainer`: the framework's own, and the arguments of pytorch_lightning.Trainer that a config can hold.
+
+    The class is used only to check the keys; keys that are not given have Lightning's defaults. The arguments are
+    listed here because importing Lightning takes seconds.
     """
 
     patience: Count | None = None
@@ -122,7 +124,7 @@ class TrainerSettings(_Strict):
     max_steps: Annotated[int, Field(strict=True, ge=-1)] | None = None
     min_steps: Count | None = None
     max_time: Annotated[str, Field(pattern=r"^\d+:\d{2}:\d{2}:\d{2}$")] | None = None
-    """Days, hours, minutes and seconds."""
+    """Longest duration of a training as days, hours, minutes and seconds, dd:hh:mm:ss."""
     check_val_every_n_epoch: Count | None = None
     val_check_interval: Share | None = None
     limit_train_batches: Share | None = None
@@ -160,7 +162,7 @@ TRAINER_OURS = {"patience", "checkpoint_every_steps", "log_every_steps", "keep"}
 
 
 class Settings(_Strict):
-    """Everything of a composed config that is not a plugin's."""
+    """All keys of a composed config that do not belong to a plugin."""
 
     seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
     threads: Annotated[int, Field(gt=0, le=MOST_AT_ONCE)] | None = None
@@ -168,11 +170,11 @@ class Settings(_Strict):
     workers: Annotated[int, Field(ge=0, le=MOST_AT_ONCE)] = 0
     samples: Positive = 1000
     pictures: Literal[True, False, "png", "pdf", "svg"] = True
-    """True is png."""
+    """Format of the figures; True means png, and False draws none."""
     checkpoint: str | None = None
     resume: str | None = "auto"
     stored: dict[str, Any] = {}
-    """What a command says again of a stored config: `data.root=...` beside `checkpoint=`, by groups and keys."""
+    """Keys of a stored config that a command repeats, by group: `data.root=...` beside `checkpoint=`, for example."""
     experiment_name: str | None = None
     optimizer: OptimizerSettings = OptimizerSettings()
     logger: LoggerSettings = LoggerSettings()
@@ -181,11 +183,12 @@ class Settings(_Strict):
 
 
 def store_experiment(config: Mapping[str, Any], trained_on: str = "") -> str:
-    """Return the tracking store's experiment for a run, which the logger may name.
+    """Return the name of the experiment in the tracking store for a run.
 
-    Else it is "data" for `experiment=data/method`, the name of the data set for a run without an experiment, that of
-    the data which a stored model was `trained_on`, and for a run without data "Default", which MLflow makes itself. One
-    for all methods on the same data, so that a sweep over methods stands under its parent and compares.
+    It is the name that the logger gives, if any. Otherwise it is "data" for `experiment=data/method`, the name of the
+    data set for a run without an experiment, or the data set on which a stored model was trained (`trained_on`). For a
+    run without data it is "Default", which MLflow creates itself. All methods on the same data share one experiment, so
+    that a sweep over methods appears under its parent and can be compared.
     """
     logger = config.get("logger") or {}
     name = config.get("experiment_name")
@@ -197,10 +200,10 @@ def store_experiment(config: Mapping[str, Any], trained_on: str = "") -> str:
 
 
 def settings(config: Mapping[str, Any]) -> Settings:
-    """The checked core settings of a composed config.
+    """Return the checked settings of the core in a composed config.
 
     Raises:
-        ConfigError: `_target_` anywhere, an unknown key, or a value out of range.
+        ConfigError: The config contains `_target_`, a key is unknown, or a value is out of range.
     """
     forbid_targets(config)
     own = {key: value for key, value in config.items() if key not in (*GROUPS, "outliers")}
@@ -214,19 +217,19 @@ def settings(config: Mapping[str, Any]) -> Settings:
         require_no_password(checked.logger.uri)
     check(TrainerSettings, checked.trainer, "trainer")
     every, epochs = checked.trainer.get("check_val_every_n_epoch"), checked.trainer.get("max_epochs")
-    if every and epochs:  # a shorter run is validated at its end, too
+    if every and epochs:  # so that a run with fewer epochs is validated at its end
         checked.trainer["check_val_every_n_epoch"] = min(every, epochs)
     return checked
 
 
 def device_of(accelerator: str | None) -> "torch.device":
-    """Return the device on which a stored model is tested: a GPU where there is one, unless the user chose another.
+    """Return the device on which a stored model is tested: a GPU if there is one, unless the user chose another device.
 
     Args:
-        accelerator: `trainer.accelerator`; None and "auto" leave the choice to the machine.
+        accelerator: Value of `trainer.accelerator`; None and "auto" use CUDA if the machine has it, else the CPU.
 
     Raises:
-        ConfigError: this machine does not have it, or it is one that only trains.
+        ConfigError: This machine does not have the device, or the device can only train.
     """
     import torch
 
@@ -244,7 +247,7 @@ def require_device(accelerator: str | None) -> None:
     """Refuse a device that this machine does not have.
 
     Raises:
-        ConfigError: there is none.
+        ConfigError: PyTorch finds no such device.
     """
     if accelerator in ("gpu", "cuda", "mps"):
         import torch

@@ -1,4 +1,4 @@
-"""Reads a plugin's constructor: its keys in the config, their annotations and defaults, and which are plugins."""
+"""Inspection of a plugin's constructor: its keys in the config, their annotations and defaults, and its parts."""
 
 import inspect
 import sys
@@ -14,7 +14,7 @@ from framework.errors import ConfigError, shown
 
 
 class Part(typing.NamedTuple):
-    """A constructor parameter that is itself a plugin (`many`: a list or a tuple of them)."""
+    """Constructor parameter that is itself a plugin, or a list or tuple of plugins (`many`)."""
 
     group: str
     many: type[list[Any]] | type[tuple[Any, ...]] | None
@@ -22,10 +22,10 @@ class Part(typing.NamedTuple):
 
 @cache
 def parts(cls: type) -> dict[str, Part]:
-    """The keyword-only parameters of `cls` that are annotated with an abstract base.
+    """Return the keyword-only parameters of `cls` that are annotated with an abstract base.
 
     Raises:
-        ConfigError: a base stands where no config can name its plugins, in a dict, say.
+        ConfigError: A base is part of an annotation for which no config can name plugins, such as a dict.
     """
     found = {}
     for name, (annotation, _) in signature(cls).items():
@@ -55,10 +55,10 @@ def _groups_within(annotation: Any) -> Iterator[str]:
 
 @cache
 def signature(cls: type) -> dict[str, tuple[Any, Any]]:
-    """Annotation and default of every key that `cls` has in the config.
+    """Return annotation and default of every key that `cls` has in the config.
 
     Raises:
-        ConfigError: a key stands there twice, or is the one that names the plugin.
+        ConfigError: Two parameters have the same key, or a key is `name`, which names the plugin.
     """
     found: dict[str, tuple[Any, Any]] = {}
     owner: dict[str, str] = {"name": "the name of the plugin"}
@@ -75,7 +75,7 @@ def signature(cls: type) -> dict[str, tuple[Any, Any]]:
 
 
 def _keys(cls: type, made: Any = None) -> Iterator[tuple[str, str, Any, Any]]:
-    """Each parameter's keys, their annotations and their defaults, which are those of the value `made` where given."""
+    """Yield parameter, key, annotation and default of every key; the defaults are attributes of `made`, if given."""
     for name, (annotation, default) in _keywords(cls).items():
         default = getattr(made, name, default)
         if _is_value(annotation):
@@ -86,7 +86,7 @@ def _keys(cls: type, made: Any = None) -> Iterator[tuple[str, str, Any, Any]]:
 
 
 def arguments(cls: type, values: Mapping[str, Any]) -> dict[str, Any]:
-    """The keyword arguments of `cls` out of the values of its keys."""
+    """Return the keyword arguments of `cls`, made from the values of its keys."""
     return {
         name: kind(**arguments(kind, values)) if _is_value(kind) else values[name]
         for name, (kind, _) in _keywords(cls).items()
@@ -94,7 +94,7 @@ def arguments(cls: type, values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _is_value(kind: Any) -> bool:
-    """Whether it is a dataclass of keyword-only fields."""
+    """Return whether an annotation is a dataclass of keyword-only fields."""
     if not (isinstance(kind, type) and is_dataclass(kind)):
         return False
     return all(field.kw_only for field in fields(kind) if field.init)
@@ -102,10 +102,10 @@ def _is_value(kind: Any) -> bool:
 
 @cache
 def _keywords(cls: type) -> dict[str, tuple[Any, Any]]:
-    """Annotation and default of every keyword-only parameter.
+    """Return annotation and default of every keyword-only parameter.
 
     Raises:
-        ConfigError: an annotation cannot be evaluated.
+        ConfigError: An annotation cannot be evaluated.
     """
     factories = {
         field.name: field.default_factory
@@ -120,10 +120,11 @@ def _keywords(cls: type) -> dict[str, tuple[Any, Any]]:
 
 
 def _annotation(cls: type, name: str) -> Any:
-    """What a parameter is annotated with, evaluated by itself: those of others may be for a type checker alone."""
+    """Return the evaluated annotation of one parameter, since other annotations may exist for type checkers only."""
     written = getattr(cls.__init__, "__annotations__", {}).get(name, Any)
     names = getattr(inspect.unwrap(cls.__init__), "__globals__", {})
-    if is_dataclass(cls):  # its constructor belongs to the class's module, a field maybe to that of a base
+    # the constructor belongs to the module of the class, but a field may come from a base in another module
+    if is_dataclass(cls):
         owner = next((base for base in cls.__mro__ if name in inspect.get_annotations(base)), cls)
         names = vars(sys.modules[owner.__module__])
     one = types.SimpleNamespace(__annotations__={name: written})
@@ -138,7 +139,7 @@ def _annotation(cls: type, name: str) -> Any:
 
 
 def positional(cls: type) -> list[inspect.Parameter]:
-    """The parameters that the framework fills."""
+    """Return the parameters of `cls` that the framework fills."""
     parameters = list(inspect.signature(cls.__init__).parameters.values())[1:]
     return [one for one in parameters if one.kind in (one.POSITIONAL_ONLY, one.POSITIONAL_OR_KEYWORD)]
 

@@ -1,4 +1,4 @@
-"""Keys of a config that is stored already: `data.root=...` beside `checkpoint=` or `resume=<folder>`."""
+"""Keys of a stored config in a command, such as `data.root=...` beside `checkpoint=` or `resume=<folder>`."""
 
 import re
 from collections.abc import Sequence
@@ -7,14 +7,14 @@ from framework.configuration.modes import MODES
 from framework.configuration.registry import GROUPS
 
 READING = tuple(name for name, mode in MODES.items() if mode.stored)
-"""Modes that take the plugins of a stored model where the command chooses none."""
+"""Modes that use the plugins of a stored model if the command chooses none."""
 
 
 def as_stored(arguments: Sequence[str]) -> list[str]:
-    """Write keys of a plugin that the command does not choose as keys of `stored`.
+    """Rename keys of plugins that the command does not choose to keys of `stored`.
 
-    Hydra refuses `data.root=<folder>` where no data is chosen. Beside a checkpoint, or the folder of a run to go on
-    with, it is a key of the data that is stored there.
+    Hydra refuses `data.root=<folder>` if no data is chosen. In a command with a checkpoint, or with the folder of a run
+    to resume, it is a key of the data that is stored there.
     """
     given = {key.lstrip("+"): value for key, _, value in (one.partition("=") for one in arguments)}
     resumed = given.get("resume", "") not in ("auto", "never", "null", "")
