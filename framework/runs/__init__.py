@@ -1,1 +1,1 @@
-"""The run: its folder, its session, where it comes from, and loading what it trained."""
+"""The run: its folder, its session, its provenance, and the files that it reads."""

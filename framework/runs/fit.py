@@ -1,4 +1,4 @@
-"""Fits the session's predictor: by gradient with Lightning, or at once where its head has no gradient."""
+"""Fitting of the session's predictor: by gradient with Lightning, or in one step if its head has no gradient."""
 
 import sys
 import time
@@ -28,10 +28,10 @@ from framework.uncertainty import outermost
 
 
 def fit(session: Session, run: Run) -> tuple[float, int | None]:
-    """Leaves the kept weights in the predictor; their validation loss (nats) and epoch, from 0.
+    """Fit the predictor, leave the kept weights in it, and return their validation loss (nats) and epoch (from 0).
 
-    The epoch is None where the head was fitted at once, or nothing learns (a renderer, say). Ranks other than the first
-    return when training has ended.
+    The epoch is None if the head was fitted in one step, or if nothing learns (a renderer, for example). Ranks other
+    than the first return when training has ended.
     """
     if not learns(session.predictor):
         return _at_once(session, run), None
@@ -40,7 +40,7 @@ def fit(session: Session, run: Run) -> tuple[float, int | None]:
 
 def _at_once(session: Session, run: Run) -> float:
     if run.resumed:
-        run.tracker.drop_after(-1)  # it may have been killed with its loss logged, which is of step 0
+        run.tracker.drop_after(-1)  # a killed run may have logged its loss, which has step 0
     fed = _cached(session) if fitted_models(session.predictor) else session.data
     inner = session.predictor
     if fed is not session.data and isinstance(inner, FrozenFrontEnd):
@@ -56,7 +56,7 @@ def _at_once(session: Session, run: Run) -> float:
 
 def _by_gradient(session: Session, run: Run) -> tuple[float, int]:
     settings = session.settings
-    fed = session.data if session.objectives else _cached(session)  # those may change or add inputs
+    fed = session.data if session.objectives else _cached(session)  # objectives may change or add inputs
     training = Training(
         session.predictor,
         session.objectives,
@@ -91,7 +91,7 @@ def _by_gradient(session: Session, run: Run) -> tuple[float, int]:
 
 
 def _resumed_from(session: Session, run: Run) -> Path | None:
-    """The checkpoint that training goes on from: every rank looks before the first writes another."""
+    """Return the checkpoint from which training continues, or None; every rank looks before rank 0 writes another."""
     resume = trained(run.checkpoints) if run.resumed else None
     if run.resumed and first_rank():
         step = 0 if resume is None else int(read(resume)["global_step"])
@@ -105,13 +105,13 @@ def _resumed_from(session: Session, run: Run) -> Path | None:
 
 
 def keep_model_alone(run: Run) -> None:
-    """Delete what only going on would need: the run is about to finish, and its model.ckpt is written."""
+    """Delete the files that only resuming needs, because the run is about to finish and model.ckpt is written."""
     for name in (*TRAINED, BEST):
         (run.checkpoints / name).unlink(missing_ok=True)
 
 
 def _give_up(run: Run, error: BaseException) -> None:
-    """Close the run of a process that cannot go on and will not come back."""
+    """Close the run of a process that cannot continue and will end without returning to the caller."""
     stopped = isinstance(error, Stopped)
     sentence = f"stopped by {error.signal}" if isinstance(error, Stopped) else str(error)
     sys.stderr.write(f"{sentence}; go on with: python -m framework {going_on(run)}\n")
@@ -120,14 +120,14 @@ def _give_up(run: Run, error: BaseException) -> None:
 
 
 def _part() -> None:
-    """Leave the other ranks: what follows is the first one's alone, and no collective may wait for the others."""
+    """Leave the process group, because only rank 0 does the rest and no collective may wait for the others."""
     if dist.is_available() and dist.is_initialized():
         dist.barrier()
         dist.destroy_process_group()
 
 
 def _cached(session: Session) -> Data:
-    """The data with features computed before training, where that gives what computing them in each step would."""
+    """Return the data with precomputed features if those equal the features of each step, else the data unchanged."""
     predictor, data = session.predictor, session.data
     if not isinstance(predictor, FrozenFrontEnd) or data.varies or not fits(data, predictor.features):
         return data
@@ -155,7 +155,7 @@ def _trainer(run: Run, keep: KeepCheckpoints, console: Console) -> pl.Trainer:
         terminal = Console(stderr=True, quiet=console.quiet)
         callbacks.append(Progress(terminal if terminal.is_terminal else console))
     arguments = {key: value for key, value in chosen.items() if key not in TRAINER_OURS}
-    arguments |= {"enable_progress_bar": False}  # Lightning's own
+    arguments |= {"enable_progress_bar": False}  # Lightning's own progress bar
     defaults = {"enable_model_summary": False, "num_sanity_val_steps": 0}
     return pl.Trainer(
         **{**defaults, **arguments},

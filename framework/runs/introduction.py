@@ -1,4 +1,4 @@
-"""What a command says first: what it reads, what it predicts, what it leaves out, and how many threads compute."""
+"""First lines of a command's output: its inputs, its target, the samples left out, and the number of threads."""
 
 import os
 from collections.abc import Mapping, Sequence, Sized
@@ -13,22 +13,22 @@ from framework.errors import shown
 from framework.target import Target
 
 MOST = 12
-"""Names that a line lists."""
+"""Largest number of names that a line lists."""
 BUSY = 1.0
-"""Load of a machine from which on it is said."""
+"""Load of the machine from which on the output mentions it."""
 
 
 def introduce(data: Data, console: Console) -> None:
-    """Say what prepared data hold."""
+    """Print what prepared data contain."""
     _say(lines(data), console)
 
 
 def introduce_threads(chosen: int | None, console: Console) -> None:
-    """Say how many threads compute, and why so many.
+    """Print how many threads compute, and the reason for that number.
 
     Args:
-        chosen: what the setting `threads` says.
-        console: where to say it.
+        chosen: Value of the setting `threads`.
+        console: Console to print on.
     """
     allowed = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
@@ -37,13 +37,13 @@ def introduce_threads(chosen: int | None, console: Console) -> None:
 
 
 def introduce_model(description: Description, method: str, data: Data | None, console: Console) -> None:
-    """Say what a stored model predicts, and for what it is asked now.
+    """Print what a stored model predicts, and on which data it is used.
 
     Args:
-        description: of the model.
-        method: what tables call it.
-        data: prepared; None where only files of the user are read.
-        console: where to say it.
+        description: Description of the model.
+        method: Name of the model in tables.
+        data: Prepared data; None if only files of the user are read.
+        console: Console to print on.
     """
     trained_on = shown(description.config["data"]["name"]) + " (synthetic)" * description.synthetic
     said = [f"model: {shown(method)}, trained on {trained_on}", f"predicts {predicted(description.target)}"]
@@ -51,7 +51,7 @@ def introduce_model(description: Description, method: str, data: Data | None, co
 
 
 def lines(data: Data) -> list[str]:
-    """The first lines of a run."""
+    """Return the first lines of a run's output: inputs, target and number of samples."""
     read = (
         _listed(data.columns) if data.columns else f"inputs of shape {'×'.join(map(str, data.input_shape))}"
     )
@@ -62,9 +62,9 @@ class Cores(NamedTuple):
     """The processor cores of a machine.
 
     Attributes:
-        allowed: number that this process may use.
-        all: number that the machine has.
-        load: processes that ran, or waited for a core, on average during the last minute.
+        allowed: Number of cores that this process may use.
+        all: Number of cores of the machine.
+        load: Average number of processes that ran or waited for a core during the last minute.
     """
 
     allowed: int
@@ -73,13 +73,13 @@ class Cores(NamedTuple):
 
 
 def threads_line(threads: int, chosen: int | None, cores: Cores, environment: Mapping[str, str]) -> str:
-    """Return how many threads compute, and why so many.
+    """Return a line that says how many threads compute, and the reason for that number.
 
     Args:
-        threads: number that PyTorch uses.
-        chosen: what the setting `threads` says.
-        cores: of this machine.
-        environment: variables of this process.
+        threads: Number of threads that PyTorch uses.
+        chosen: Value of the setting `threads`.
+        cores: Processor cores of this machine.
+        environment: Environment variables of this process.
     """
     of = "1 core" if cores.allowed == 1 else f"{cores.allowed} cores"
     limited = f" that this process may use of the machine's {cores.all}" * (cores.allowed < cores.all)
@@ -97,7 +97,7 @@ def threads_line(threads: int, chosen: int | None, cores: Cores, environment: Ma
 
 
 def predicted(target: Target) -> str:
-    """What a target is, in words."""
+    """Return a description of a target in words."""
     if target.kind == "class":
         return f"one of {len(target.names)} classes: {_listed(target.names)}"
     if target.kind == "image":
@@ -106,7 +106,7 @@ def predicted(target: Target) -> str:
 
 
 def _samples(data: Data) -> list[str]:
-    """Return how many samples each split of prepared data has, and what is odd in the user's files."""
+    """Return lines with the number of samples of each split, and remarks on peculiarities of the user's files."""
     sizes = [
         f"{name} {len(part)}"
         for name, part in zip(Splits._fields, data.splits(), strict=True)

@@ -1,4 +1,4 @@
-"""A run as one job of a sweep: what the sweep tells it, and what it leaves behind."""
+"""A run as one job of a sweep: the settings that the sweep passes to it, and the files that the job leaves."""
 
 import json
 import os
@@ -12,13 +12,13 @@ from framework.storage.first_rank import first_rank
 from framework.storage.plain_values import read_json
 
 PARENT = "FRAMEWORK_SWEEP_PARENT"
-"""Environment variable that tells a job the tracking run its sweep is recorded under."""
+"""Environment variable that gives a job the id of the tracking run under which its sweep is recorded."""
 SYNCED_WITHIN = 60.0
-"""Seconds: what a shorter job has to tell the tracking store, the sweep sends when it has ended."""
+"""Seconds; for a job shorter than this, the sweep sends its journal to the tracking store after it has ended."""
 RECORD = "job.json"
 VALUE = "value.json"
 _COMMAND = "multirun.yaml"
-"""What Hydra leaves in the folder of a sweep."""
+"""File that Hydra leaves in the folder of a sweep."""
 
 
 _NUMBER, _TEXT = (int, float), (str, type(None))
@@ -32,10 +32,10 @@ _KINDS: dict[str, tuple[type, ...]] = {
 
 
 def read_record(folder: Path) -> dict[str, Any]:
-    """Return the record of the job in a folder (`framework.sweeps.jobs.Job`); it may be a stranger's.
+    """Return the record of the job in a folder (`framework.sweeps.jobs.Job`), which may come from an untrusted source.
 
     Raises:
-        DataError: there is none, or it is not what a sweep writes.
+        DataError: There is no record, or a sweep would not write such a record.
     """
     path, remedy = folder / RECORD, "Delete it, and the job runs anew."
     record = read_json(path, "the record of a job", remedy)
@@ -57,16 +57,16 @@ def read_record(folder: Path) -> dict[str, Any]:
 
 
 def by_number(folder: Path) -> list[tuple[int, str]]:
-    """A key that sorts folders by name, 2 before 10."""
+    """Return a key that sorts folders by name, with 2 before 10."""
     return [(len(part), part) for part in folder.parts]
 
 
 def recorded(folder: Path) -> list[Path]:
-    """The folders of a sweep's jobs, sorted `by_number`, however deep they lie; not those of a sweep below it."""
+    """Return the folders of a sweep's jobs at any depth, sorted `by_number`, without those of a sweep inside it."""
     found = []
     for name, below, files in os.walk(folder):
         here = Path(name)
-        # A damaged record may be a folder: whoever reads it says so.
+        # A damaged record may be a folder; the function that reads it raises the error.
         is_job = RECORD in files or RECORD in below
         if is_job:
             found.append(here)
@@ -76,20 +76,20 @@ def recorded(folder: Path) -> list[Path]:
 
 
 def leave_value(folder: Path, value: float) -> None:
-    """Leave the number that a sweeper which optimises is to get; nothing where `folder` is of no sweep."""
+    """Write the number that an optimising sweeper reads; do nothing if `folder` does not belong to a sweep."""
     if (folder / RECORD).is_file():
         write_whole(folder / VALUE, json.dumps(value).encode())
 
 
 def refuse_idle(folder: Path, sentence: str) -> None:
-    """Refuse a setting that has no effect; in a job of a sweep, whose other jobs may read it, only say so.
+    """Refuse a setting that has no effect; in a job of a sweep, only print a note, since other jobs may read it.
 
     Args:
-        folder: of the run.
-        sentence: about the setting (`framework.configuration.modes.sets_nothing`).
+        folder: Folder of the run.
+        sentence: Sentence about the setting (`framework.configuration.modes.sets_nothing`).
 
     Raises:
-        ConfigError: the run is no job of a sweep.
+        ConfigError: The run is not a job of a sweep.
     """
     if not ((folder / RECORD).is_file() or (folder.parent / _COMMAND).is_file()):
         raise ConfigError(sentence)

@@ -1,4 +1,4 @@
-"""Where a result comes from: the code's commit, the versions of its packages, its config."""
+"""Provenance of a result: the versions of its packages and its config."""
 
 import platform
 from collections.abc import Mapping, Sequence
@@ -10,9 +10,9 @@ _PACKAGES = ("torch", "pytorch-lightning", "hydra-core", "omegaconf", "numpy", "
 
 
 def package_versions() -> dict[str, str]:
-    """Versions of Python, of what every run rests on, and of all distributions that provide plugins.
+    """Return the versions of Python, of the packages that every run uses, and of all packages that provide plugins.
 
-    Read from package metadata; imports nothing.
+    The versions are read from package metadata; nothing is imported.
     """
     names = set(_PACKAGES)
     for group in GROUPS:
@@ -22,15 +22,14 @@ def package_versions() -> dict[str, str]:
         try:
             found[name] = version(name)
         except PackageNotFoundError:
-            continue  # not installed, so not in use
+            continue  # the package is not installed, so it is not in use
     return found
 
 
 def flatten(config: Mapping[str, object]) -> dict[str, object]:
-    """A nested config with dotted keys: {"a": {"b": [1, {"c": 2}]}} becomes {"a.b.0": 1, "a.b.1.c": 2}.
+    """Return a nested config with dotted keys: {"a": {"b": [1, {"c": 2}]}} becomes {"a.b.0": 1, "a.b.1.c": 2}.
 
-    A list of plain values stays one value. An empty mapping or list is a value of its own, so that nothing is
-    lost.
+    A list of plain values stays one value. An empty mapping or list is also kept as a value, so that nothing is lost.
     """
     flat: dict[str, object] = {}
     for key, value in config.items():

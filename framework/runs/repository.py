@@ -1,8 +1,9 @@
-"""Commit and state of the git repository around a folder; nothing that the repository names is ever run.
+"""Commit and state of the git repository around a folder; no program that the repository names is ever run.
 
-A repository is a stranger's folder (DESIGN, law 15), and git runs what its configuration names: `core.fsmonitor`,
-filters, hooks. So the commit is read from plain files. Whether files differ is asked of git, in a repository of our
-own that shares the stranger's objects and holds a copy of its index, and of its configuration a few words only.
+A repository may come from an untrusted source (DESIGN, law 15), and git runs the programs that its configuration names
+(`core.fsmonitor`, filters, hooks). The commit is therefore read from plain files. To find out whether files differ, git
+is run in a temporary repository. That repository shares the objects of the original, and holds a copy of its index and
+a few harmless settings of its configuration.
 """
 
 import os
@@ -18,11 +19,11 @@ from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 SECONDS = 3.0
-"""Time that git is given for all questions about one repository."""
+"""Time limit, in seconds, for all git commands about one repository."""
 SMALL, PACKED, INDEX = 2**12, 2**26, 2**28
-"""Bytes that are read of one name or commit, of a list of them, and of an index."""
+"""Largest size in bytes of a file with one name or commit, of a list of packed references, and of an index."""
 LINKS = 5
-"""Symbolic references that are followed one after the other, as git does."""
+"""Largest number of symbolic references that are followed in a chain, as in git."""
 KEYS = frozenset(
     (
         *("core.autocrlf", "core.checkstat", "core.eol", "core.filemode", "core.ignorecase"),
@@ -30,21 +31,21 @@ KEYS = frozenset(
         *("core.trustctime", "sparse.expectfilesoutsideofpatterns"),
     )
 )
-"""Settings by which git compares files. Each is one of `WORDS`; none names a program or a file."""
+"""Settings by which git compares files; their values must be in `WORDS`, and none names a program or a file."""
 SPARSE = re.compile(rb"sdir[\0-\x10]")
-"""Mark of an index that holds folders in place of files; git changes the times of objects when it unfolds them."""
+"""Mark of a sparse index, which holds folders in place of files; git changes the times of objects to expand them."""
 TRUE = ("", "1", "on", "true", "yes")
 WORDS = frozenset((*TRUE, "0", "crlf", "default", "false", "input", "lf", "minimal", "native", "no", "off"))
 
 
 class Repository(NamedTuple):
-    """A repository as it was found.
+    """Paths of a git repository.
 
     Attributes:
-        tree: folder with its files.
-        own: folder of `HEAD` and the index.
-        common: folder of objects, configuration and most references; differs from `own` in a linked worktree.
-        link: the file `.git` that names `own`; None where that is a folder.
+        tree: Folder with the files of the repository.
+        own: Folder with `HEAD` and the index.
+        common: Folder with objects, configuration and most references; it differs from `own` in a linked worktree.
+        link: The file `.git` that names `own`; None if `.git` is a folder.
     """
 
     tree: Path
@@ -54,16 +55,16 @@ class Repository(NamedTuple):
 
 
 def git_commit(folder: Path) -> dict[str, str]:
-    """Return the `commit` (40 or 64 hex digits) around a folder, and `dirty` ("true": tracked files differ from it).
+    """Return the `commit` (40 or 64 hex digits) around a folder, and `dirty` ("true" if tracked files differ from it).
 
-    Empty where the folder is in no repository, in one without a commit, or in one of another user that the own
-    `safe.directory` does not list. `dirty` is absent where git is missing or cannot say: it takes too long, or what
-    differs has passed a filter program, which is not run. Submodules are not looked into.
+    The result is empty if the folder is in no repository, in a repository without a commit, or in a repository of
+    another user that the user's own `safe.directory` does not list. `dirty` is absent if git is missing, takes too
+    long, or would have to run a filter program to compare the files. Submodules are not inspected.
     """
     try:
         found = _repository(folder.resolve(strict=True))
         commit = found and _commit(found)
-    except (OSError, RuntimeError, ValueError):  # a loop of links, say
+    except (OSError, RuntimeError, ValueError):  # for example a loop of links
         return {}
     if found is None or commit is None:
         return {}
@@ -80,7 +81,7 @@ def git_commit(folder: Path) -> dict[str, str]:
 
 
 def _repository(folder: Path) -> Repository | None:
-    """The nearest one; a folder that is no repository but is called `.git` is passed over, as git does."""
+    """Return the nearest enclosing repository, or None; as in git, a folder `.git` that is no repository is skipped."""
     ceilings = {
         os.path.realpath(one) for one in os.environ.get("GIT_CEILING_DIRECTORIES", "").split(":") if one
     }
@@ -109,10 +110,10 @@ def _repository(folder: Path) -> Repository | None:
 def _commit(found: Repository) -> str | None:
     name = "HEAD"
     for _ in range(LINKS + 1):
-        # of a linked worktree these are its own
+        # a linked worktree has references of its own under these names
         private = name == "HEAD" or name.startswith(("refs/bisect/", "refs/worktree/", "refs/rewritten/"))
         path = (found.own if private else found.common) / name
-        if path.is_symlink():  # how git once wrote symbolic references
+        if path.is_symlink():  # git once wrote symbolic references as links
             text = f"ref: {path.readlink()}"
         else:
             text = _text(path) or _packed(found.common, name)
@@ -136,7 +137,7 @@ def _packed(common: Path, name: str) -> str | None:
 
 
 def _owned(found: Repository) -> bool:
-    """Whether all of it belongs to this user; under `sudo` to the one who called that, as git has it."""
+    """Return whether the repository belongs to this user or, as in git, to the user who called `sudo`."""
     user = os.geteuid()
     owners = {path.lstat().st_uid for path in (found.tree, found.own, found.link) if path is not None}
     called_by = os.environ.get("SUDO_UID", "")
@@ -145,7 +146,7 @@ def _owned(found: Repository) -> bool:
 
 
 def _listed(tree: Path, settings: list[tuple[str, str]]) -> bool:
-    """Whether the user's own `safe.directory` names it; an empty value takes back what came before."""
+    """Return whether the user's `safe.directory` lists a folder; an empty value clears the values before it."""
     safe = False
     for key, value in settings:
         if key == "safe.directory":
@@ -188,7 +189,7 @@ def _dirty(git: "_Git", found: Repository, commit: str, user: list[tuple[str, st
         objects=found.common / "objects",
     )
     lines = [line for line in changes.split(b"\0") if line]
-    # of a file that a filter program has changed on its way git compares what that program makes of it
+    # for a file with a filter program, git would compare the output of that program, which is not run here
     doubtful = [line[3:] for line in lines if line[:2] == b" M"]
     if len(doubtful) < len(lines) or not lines:
         return bool(lines)
@@ -203,7 +204,7 @@ def _dirty(git: "_Git", found: Repository, commit: str, user: list[tuple[str, st
 
 
 def _shared_indices(own: Path) -> Iterator[str]:
-    """Of a split index the newest files that it may share."""
+    """Yield the names of the newest files (at most 8) that a split index may share."""
     shared = [
         one for one in own.iterdir() if re.fullmatch(r"sharedindex\.([0-9a-f]{40}|[0-9a-f]{64})", one.name)
     ]
@@ -211,14 +212,14 @@ def _shared_indices(own: Path) -> Iterator[str]:
 
 
 class _Git:
-    """The program git, asked in a folder of our own until the time is over.
+    """The program git, run in a temporary repository until the time limit.
 
     Raises:
-        OSError: it is not installed.
+        OSError: git is not installed.
     """
 
     def __init__(self, folder: Path) -> None:
-        # a relative entry of PATH could be the stranger's folder
+        # a relative entry of PATH could lead into the untrusted folder
         self.path = os.pathsep.join(filter(os.path.isabs, os.get_exec_path()))
         program = shutil.which("git", path=self.path)
         if program is None:
@@ -230,7 +231,7 @@ class _Git:
         self.write({}, "")
 
     def write(self, settings: Mapping[str, str], commit: str) -> None:
-        """Make this a repository at a commit, with these settings alone."""
+        """Write the temporary repository's `HEAD` and configuration, with these settings only."""
         sha256 = len(commit) == 64
         lines = ["[core]\nbare = false", f"repositoryformatversion = {int(sha256)}"]
         lines += ["[extensions]\nobjectformat = sha256"] * sha256
@@ -241,17 +242,17 @@ class _Git:
         (self.folder / "HEAD").write_text(f"{commit or 'ref: refs/heads/none'}\n")
 
     def settings_of(self, file: Path) -> list[tuple[str, str]]:
-        """Read a stranger's configuration as text: nothing in it has an effect, nothing that it includes is read.
+        """Return the settings of an untrusted configuration file without applying them or reading included files.
 
         Raises:
-            OSError: it is no regular file, or too large.
+            OSError: It is no regular file, or it is too large.
         """
         copy = self.folder / "theirs"
         copy.unlink(missing_ok=True)
         return self.settings("--file", str(copy), "--no-includes", "--list") if _copy(file, copy) else []
 
     def settings(self, *arguments: str, user: bool = False) -> list[tuple[str, str]]:
-        """Keys in small letters and values in their order; with `user` those of the user and the system."""
+        """Return keys (in lower case) and values in their order; with `user`, the settings of user and system."""
         found = self.ask("config", "--null", *arguments, user=user).decode(errors="surrogateescape")
         pairs = (one.partition("\n") for one in found.split("\0") if one)
         return [(key.lower(), value) for key, _, value in pairs]
@@ -264,12 +265,19 @@ class _Git:
         tree: Path | None = None,
         objects: Path | None = None,
     ) -> bytes:
-        """What git writes.
+        """Run git and return its output.
+
+        Args:
+            arguments: Command and options of git.
+            given: Standard input.
+            user: Whether git reads the settings of the user and the system.
+            tree: Folder with the files to compare, if any.
+            objects: Folder with the objects to read, if any.
 
         Raises:
-            OSError, subprocess.SubprocessError: it fails, or the time is over.
+            OSError, subprocess.SubprocessError: git fails, or the time is over.
         """
-        # GIT_CONFIG itself is a file for `git config` alone
+        # the variable GIT_CONFIG names a file for `git config` only, so it is not kept
         kept = {
             name: value
             for name, value in os.environ.items()
@@ -277,7 +285,7 @@ class _Git:
         }
         own = {"GIT_CONFIG_NOSYSTEM": "1", "GIT_CONFIG_GLOBAL": os.devnull, "GIT_CONFIG_SYSTEM": os.devnull}
         own |= {"HOME": str(self.folder), "XDG_CONFIG_HOME": str(self.folder)}  # for git before 2.32
-        # should git ever write an object, then into our own folder
+        # if git ever writes an object, it goes into the temporary repository
         places = {"GIT_WORK_TREE": tree, "GIT_ALTERNATE_OBJECT_DIRECTORIES": objects and _escaped(objects)}
         environment = {
             **kept,
@@ -303,19 +311,19 @@ class _Git:
 
 
 def _escaped(path: Path) -> str:
-    """Of a list of paths the only one: a colon in it would end it."""
+    """Return a path in quotes, as the only one of a list of paths, in which a colon would otherwise end it."""
     escaped = str(path).replace("\\", "\\\\").replace('"', '\\"')
     return f'"{escaped}"'
 
 
 def _text(path: Path) -> str | None:
-    """A short file's text; None where there is no such regular file."""
+    """Return the text of a short regular file without surrounding blanks; None if there is no such file."""
     content = _content(path, SMALL)
     return None if content is None else os.fsdecode(content).strip()
 
 
 def _content(path: Path, most: int) -> bytes | None:
-    """All of a regular file, no link; None where there is none, or it is larger than `most` bytes."""
+    """Return the content of a regular file; None if it is missing, a link, or larger than `most` bytes."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC)
     except OSError:
@@ -329,10 +337,12 @@ def _content(path: Path, most: int) -> bytes | None:
 
 
 def _copy(source: Path, to: Path) -> bool:
-    """Copy a file with its time, by which git sees what changed while an index was written; whether there is one.
+    """Copy a file with its modification time, and return whether it exists.
+
+    From the time of the index, git detects files that changed while the index was written.
 
     Raises:
-        OSError: it is no regular file, or too large.
+        OSError: The source is no regular file, or is too large.
     """
     if not os.path.lexists(source):
         return False

@@ -1,4 +1,4 @@
-"""One run: its folder, its tracking, its signals; closed FINISHED, FAILED or KILLED whatever happens."""
+"""One run with its folder, tracking and signals; it is closed as FINISHED, FAILED or KILLED whatever happens."""
 
 import itertools
 import os
@@ -30,7 +30,7 @@ from framework.tracking.tracker import MlflowTracker, NoTracker, Tracker
 from framework.tracking.watch import watched
 
 TRACEBACK = "traceback.txt"
-"""How a run ended that failed or was stopped; gone when it has gone on and finished."""
+"""File with the traceback of a run that failed or was stopped; it is removed when the resumed run finishes."""
 LEFT_BY_RUNS = (
     "config.yaml",
     "overrides.yaml",
@@ -44,14 +44,21 @@ LEFT_BY_RUNS = (
     TRACEBACK,
     "unreadable.txt",
 )
-"""What modes write into a run folder, but for the journal, which the tracker keeps."""
+"""Files and folders that modes write into a run folder, except the journal, which the tracker keeps."""
 HOW = ("threads", "workers", "logger.uri")
-"""Keys that say how a run is run and not what it computes: a resumed one may be given others."""
+"""Keys that do not affect what a run computes, so a resumed run may have other values of them."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """What a mode needs to know of the run it is in."""
+    """Run in progress, as a mode sees it.
+
+    Attributes:
+        config: Config of the command.
+        tracker: Tracker that records the run.
+        stopper: Handler of the signals that stop the run.
+        resumed: Whether the run continues an earlier one in its folder.
+    """
 
     config: Config
     tracker: Tracker
@@ -60,25 +67,28 @@ class Run:
 
     @property
     def folder(self) -> Path:
+        """Return the folder of the run."""
         return self.config.folder
 
     @property
     def settings(self) -> Settings:
+        """Return the settings of the run."""
         return self.config.settings
 
     @property
     def checkpoints(self) -> Path:
+        """Return the folder of the run's checkpoints."""
         return self.folder / "checkpoints"
 
 
 def stored_config(folder: Path) -> dict[str, Any] | None:
-    """The config a run folder was made with; None where there is none yet."""
+    """Return the config with which a run folder was made; None if it holds none yet."""
     path = folder / "config.yaml"
     return read_yaml(path, "the config of a run") if path.is_file() else None
 
 
 def goes_on(config: Config) -> bool:
-    """Whether the run in its folder has the same config, did not finish, and `resume` allows it to go on."""
+    """Return whether the run in the folder has the same config, did not finish, and may be resumed (`resume`)."""
     earlier = read_run_info(config.folder)
     return (
         earlier is not None
@@ -90,10 +100,10 @@ def goes_on(config: Config) -> bool:
 
 @contextmanager
 def opened(config: Config) -> Iterator[Run]:
-    """Open the run; on the way out close it with the right status.
+    """Open the run for the block, and close it with the right status at the end.
 
-    Continues the run in its folder where that goes on (`goes_on`); otherwise what that run left is set aside. A rank
-    other than the first writes nothing: its run is a silent one.
+    The run in the folder is continued if `goes_on` returns True; otherwise the files of that run are set aside. A rank
+    other than the first writes nothing and gets a silent tracker.
     """
     stopper = Stopper()
     earlier, resumed = read_run_info(config.folder), goes_on(config)
@@ -104,13 +114,13 @@ def opened(config: Config) -> Iterator[Run]:
     config.folder.mkdir(parents=True, exist_ok=True)
     tracker = _tracker(config, earlier.run_id if resumed and earlier else None, resumed)
     with stopper.installed(), watched(config.folder):
-        tracker.open()  # from here on the folder is this process's
+        tracker.open()  # from here on, only this process writes to the folder
         run = Run(config, tracker, stopper, resumed)
         try:
             if not resumed:
                 _begin_folder(config)
             _describe(run)
-            if resumed:  # how it ended before says nothing of how it ends now
+            if resumed:  # the earlier error no longer describes the run
                 tracker.set_tags({"error": None})
             yield run
         except BaseException as error:
@@ -128,15 +138,17 @@ def opened(config: Config) -> Iterator[Run]:
 
 
 def going_on(run: Run) -> str:
-    """Return what goes on with a run, as typed into a shell."""
-    store = run.settings.logger.uri  # a stored address or path is used only where the user says it again
+    """Return the arguments of the command that continues a run, as typed into a shell."""
+    store = run.settings.logger.uri  # a stored address or path is used only if the user repeats it
     own = [f"resume={run.folder}", *([f"logger.uri={store}"] if store else [])]
     return " ".join([*map(shlex.quote, own), *words(paths_of(run.config.values))])
 
 
 def _begin_folder(config: Config) -> None:
-    """Leave the config in the folder, and what an earlier run left there in `earlier.<n>`: nothing of it may be
-    resumed from, loaded or compared as this one's."""
+    """Write the config into the folder, after moving the files of an earlier run to `earlier.<n>`.
+
+    They are moved so that none of them is resumed from, loaded or compared as a file of this run.
+    """
     folder = config.folder
     left = [folder / name for name in LEFT_BY_RUNS if (folder / name).exists()]
     if left:
@@ -179,19 +191,21 @@ def _tracker(config: Config, run_id: str | None, resumed: bool) -> Tracker:
 
 
 def _method(config: Config) -> str | None:
-    """Return the head that a training without an experiment is called by; None for other runs."""
+    """Return the density head, which names a training without an experiment; None for other runs."""
     head = config.values.get("density_head") if config.mode == "train" else None
     return str(head.get("name")) if isinstance(head, Mapping) else None
 
 
 def run_name(settings: Settings, method: str, overrides: Sequence[str]) -> str:
-    """Return what tells a run from its neighbours.
+    """Return a name that distinguishes a run from similar ones.
 
-    That is the method, then what was changed on the command line, then the seed. Up to the first comma it is also the
-    name of the run's model in the store.
+    It consists of the method, the changes on the command line, and the seed. The part before the first comma is also
+    the name of the run's model in the store.
 
     Args:
-        method: of a run without an experiment.
+        settings: Settings of the run.
+        method: Name of the method, for a run without an experiment.
+        overrides: Overrides on the command line.
     """
     parts = [(settings.experiment_name or method).rpartition("/")[2]]
     for override in overrides:
@@ -221,9 +235,9 @@ def _describe(run: Run) -> None:
 
 
 def _record(run: Run, error: BaseException) -> None:
-    """Leave the traceback and the sentence with the run."""
+    """Store the traceback in the run folder, and the error message as a tag of the run."""
     path = run.folder / TRACEBACK
-    with suppress(OSError):  # of a full disk there is no more to be said than the error itself
+    with suppress(OSError):  # on a full disk, the error itself is all that can be reported
         write_whole(path, encodable("".join(traceback.format_exception(error))).encode())
         run.tracker.log_artifact(path)
     sentence = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"

@@ -1,4 +1,4 @@
-"""A session: threads, device, and all parts of a command, built and matched before a step is trained."""
+"""Session of a command: threads, device and all parts, built and checked against each other before training."""
 
 import ctypes
 import logging
@@ -67,26 +67,26 @@ from framework.training.checkpoint import WholeCheckpoints, trained
 from framework.uncertainty import remarks
 
 FEW = 8
-"""With so many validation samples wrappers are tried before training: some want more than one."""
-M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of malloc.h
+"""Number of validation samples with which wrappers are tried before training, since some need more than one."""
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # constants of malloc.h
 
 
 @dataclass
 class Session:
-    """What a mode works with.
+    """Objects with which a mode works.
 
     Attributes:
-        config: of the command; of a test the settings that make its numbers are those of the model's own run.
-        parts: every plugin with every parameter, as they were built.
-        method: what tables call the model.
-        target: what is predicted.
-        data: prepared, unless only a user's own files are read.
-        predictor: untrained, or as loaded.
-        device: where the predictor is evaluated.
-        console: for people; says nothing in ranks other than the first.
-        objectives: of the training loss.
-        metrics: fresh, in the order asked for; none before `tested`.
-        outliers: prepared, where a metric reads them; None before `tested`.
+        config: Config of the command; in a test, settings that affect its numbers come from the model's own run.
+        parts: Every plugin with every parameter, as they were built.
+        method: Name of the model in tables.
+        target: Target that is predicted.
+        data: Data set, prepared unless only a user's own files are read.
+        predictor: Predictor, untrained or as loaded.
+        device: Device on which the predictor is evaluated.
+        console: Console for people; it prints nothing in ranks other than the first.
+        objectives: Objectives of the training loss.
+        metrics: Unused metrics in the order of the config; empty before `tested`.
+        outliers: Prepared outliers, if a metric reads them; None before `tested`.
     """
 
     config: Config
@@ -103,37 +103,38 @@ class Session:
 
     @property
     def settings(self) -> Settings:
+        """Return the settings of the command."""
         return self.config.settings
 
     @property
     def data_title(self) -> str:
-        """What pictures and tables call the data."""
+        """Return the name of the data in figures and tables."""
         data = self.data
         return data.title or (data.groups[0] if len(data.groups) == 1 else self.parts["data"]["name"])
 
     @property
     def title(self) -> str:
-        """What pictures and tables call the data and the model."""
+        """Return the name of data and model in figures and tables."""
         return f"{self.data_title} · {self.method}"
 
     def batches(self, data: Data | None = None) -> Batches:
-        """Of the session's data, or of what stands in for them, as they are trained on."""
+        """Return the training batches of the session's data, or of `data`, which replaces them."""
         chosen = self.settings
         return Batches(
             data or self.data, batch_size=chosen.batch_size, workers=chosen.workers, seed=chosen.seed
         )
 
     def blocks(self) -> Batches:
-        """The session's data as they are evaluated: in blocks of one size, whatever the batch size is."""
+        """Return the session's data for evaluation, in blocks of one size whatever the batch size is."""
         return Batches(self.data, batch_size=BLOCK, workers=self.settings.workers, seed=self.settings.seed)
 
     def description(self) -> dict[str, Any]:
-        """What a checkpoint holds beside the weights."""
+        """Return the description that a checkpoint holds beside the weights."""
         remarks_now = remarks(self.predictor)
         return Description.of(self.parts, self.data, self.method, self.settings, remarks_now).stored()
 
     def record(self, run: Run) -> None:
-        """Tell the run what it is fed, and leave what to cite with it."""
+        """Record the data sets that the run reads, and write the references to cite."""
         for role, data in (("data", self.data), ("outliers", self.outliers)):
             if data is not None:
                 about = {"synthetic": str(data.synthetic).lower(), "skipped": str(data.skipped)}
@@ -145,7 +146,7 @@ class Session:
         record_citations(run, self.parts)
 
     def save_model(self, run: Run) -> None:
-        """Leave weights and description with the run, for `framework.load`; in the store they are its model."""
+        """Write weights and description for `framework.load`; the file is also the run's model in the store."""
         path = run.checkpoints / "model.ckpt"
         state = {f"{PREFIX}{key}": value.cpu() for key, value in self.predictor.state_dict().items()}
         WholeCheckpoints().save_checkpoint({"framework": self.description(), "state_dict": state}, path)
@@ -153,7 +154,7 @@ class Session:
 
 
 def record_citations(run: Run, parts: Resolved) -> None:
-    """Write what to cite into the run folder and the store."""
+    """Write the references to cite into the run folder and the store."""
     path = run.folder / "citations.bib"
     if first_rank():
         path.write_text("\n\n".join(entries(citations(parts).values()).values()) + "\n", encoding="utf-8")
@@ -161,7 +162,7 @@ def record_citations(run: Run, parts: Resolved) -> None:
 
 
 def begin(settings: Settings) -> Console:
-    """Set this process up: threads, memory, what Lightning prints. Where to print."""
+    """Set up threads, memory and Lightning's messages in this process, and return the console to print on."""
     if settings.threads:
         torch.set_num_threads(settings.threads)
     keep_memory()
@@ -170,11 +171,11 @@ def begin(settings: Settings) -> Console:
 
 
 def for_training(config: Config) -> Session:
-    """Everything built from the config; the data prepared, the metrics tried on a prediction.
+    """Build everything from the config, prepare the data, try the metrics on a prediction, and return the session.
 
     Raises:
-        ConfigError: a part is missing or does not fit another.
-        DataError: as `Data.prepare`.
+        ConfigError: A part is missing or does not fit another.
+        DataError: `Data.prepare` fails.
     """
     console = begin(config.settings)
     parts = config.parts
@@ -220,10 +221,10 @@ def for_training(config: Config) -> Session:
 
 
 def refuse_unread_outliers(config: Config, parts: Resolved) -> None:
-    """Refuse outliers that the command chooses and no metric reads.
+    """Refuse outliers that the command chooses although no metric reads them.
 
     Raises:
-        ConfigError: that is so.
+        ConfigError: The command chooses outliers, and no metric reads them.
     """
     given = config.given("outliers")
     if given and not reading_outliers(parts):
@@ -231,10 +232,10 @@ def refuse_unread_outliers(config: Config, parts: Resolved) -> None:
 
 
 def _refuse_training(config: Config, why: str) -> None:
-    """Refuse what the command says of training by gradient, where there is none.
+    """Refuse settings for training by gradient in a command that does not train by gradient.
 
     Raises:
-        ConfigError: it says something.
+        ConfigError: The command contains such a setting.
     """
     for group in ("optimizer", "trainer"):
         given = config.given(group)
@@ -244,13 +245,13 @@ def _refuse_training(config: Config, why: str) -> None:
 
 @dataclass(frozen=True)
 class Start:
-    """The weights of an earlier run, from which training starts.
+    """Weights of an earlier run, from which training starts.
 
     Attributes:
-        path: of the checkpoint.
-        state: its weights.
-        predictor: a model with these weights; None where the checkpoint describes none.
-        about: target, shape of an input and its columns, for which that was built.
+        path: Path of the checkpoint.
+        state: Weights in the checkpoint, by name.
+        predictor: Predictor with these weights; None if the checkpoint does not describe a model.
+        about: Target, input shape and input columns for which `predictor` was built.
     """
 
     path: Path
@@ -260,18 +261,18 @@ class Start:
 
     @classmethod
     def of(cls, parts: Resolved, data: Data, settings: Settings) -> "Start":
-        """Compare the model with the one whose weights it starts from, before data is read or generated.
+        """Read the weights from which the model starts, and check that they fit it before data is read or generated.
 
-        It is built for the target and the inputs that the checkpoint describes, unless the data set knows its own
-        target already; `predictor_for` compares it with the data as they are.
+        The model is built for the target and the inputs that the checkpoint describes; if the data set already knows
+        its target, that target is used. `predictor_for` compares the model with the prepared data.
 
         Raises:
-            CheckpointError: there is no checkpoint, or it is another model's.
+            CheckpointError: There is no checkpoint, or it belongs to another model.
         """
         path = find_checkpoint(str(settings.checkpoint), uri=settings.logger.uri)
         content = read(path)
         state, described = weights(content), content.get("framework")
-        if not isinstance(described, Mapping):  # `predictor_for` says what is wrong with the weights
+        if not isinstance(described, Mapping):  # `predictor_for` raises the error about wrong weights
             return cls(path, state)
         stored, shape, columns = interface(described, path)
         target = getattr(data, "target", None) or stored
@@ -285,10 +286,10 @@ class Start:
         return cls(path, state, predictor, (target, shape, columns))
 
     def predictor_for(self, data: Data, parts: Resolved, seed: int) -> Predictor:
-        """Return the predictor with the weights; the one that was built where prepared data are as was described.
+        """Return a predictor with the weights; it is built again if the prepared data differ from the description.
 
         Raises:
-            CheckpointError: the weights are another model's.
+            CheckpointError: The weights belong to another model.
         """
         if self.predictor is not None and self.about == (data.target, data.input_shape, data.columns):
             return self.predictor
@@ -298,7 +299,11 @@ class Start:
 
 
 def method_of(config: Config, parts: Resolved) -> str:
-    """What tables call a model: its experiment, which stands for its own wrappers, or its head; then other wrappers."""
+    """Return the name of a model in tables.
+
+    It is the experiment, or the density head if there is none, followed by the uncertainty wrappers. The wrappers that
+    belong to an experiment are not listed.
+    """
     name = config.settings.experiment_name
     method = name.rpartition("/")[2] if name else str(parts["density_head"]["name"])
     changed = any(item.lstrip("+~").startswith("uncertainty") for item in config.overrides)
@@ -307,14 +312,14 @@ def method_of(config: Config, parts: Resolved) -> str:
 
 
 def tested(session: Session) -> Session:
-    """The session with what a test reads: fresh metrics, and the outliers of those that want some.
+    """Return the session with the parts of a test added: new metrics, and outliers if a metric reads them.
 
     Raises:
-        ConfigError: a metric does not fit the target, or wants outliers and there are none.
-        DataError: as `Data.prepare`.
+        ConfigError: A metric does not fit the target, or needs outliers and there are none.
+        DataError: `Data.prepare` fails.
     """
     parts = session.parts
-    # those of a checkpoint are checked where they are used: a model predicts without them
+    # metrics of a checkpoint are checked here, where they are used, since a model predicts without them
     parts = {**parts, "metric": [resolve("metric", part) for part in parts["metric"]]}
     require_outliers(parts)
     metrics = build_metrics(parts, session.target)
@@ -327,12 +332,14 @@ def tested(session: Session) -> Session:
 
 @torch.no_grad()
 def rehearse(session: Session) -> None:
-    """Whatever can go wrong without training goes wrong now: look at a few targets, give every metric predictions of
-    two samples by the untrained model, calibrate a copy of it. Of a model that predicts nothing before it is fitted,
-    look whether the true images are there.
+    """Try the steps after training on a few samples, so that their errors appear before training.
+
+    The function checks a few targets, gives every metric predictions of two samples by the untrained model, and
+    calibrates a copy of the model. If the model predicts nothing before it is fitted, the function only checks that the
+    true images exist.
 
     Raises:
-        UserError: what the data, the metric or the wrapper says.
+        UserError: The data, a metric or a wrapper raises it.
     """
     fitted, reads = (
         bool(fitted_models(session.predictor)),
@@ -352,9 +359,9 @@ def rehearse(session: Session) -> None:
     session.predictor.train(training)
     samples = session.settings.samples
     predictions = [Prediction(density, some, samples)]
-    if session.outliers is not None:  # as outliers some test samples do
+    if session.outliers is not None:  # test samples serve as outliers here
         predictions.append(Prediction(density, some, samples, "outliers"))
-    # what is said of so few samples means nothing
+    # warnings about so few samples mean nothing
     with _silence():
         for metric in session.metrics:
             trial = metric.clone()
@@ -368,13 +375,13 @@ def rehearse(session: Session) -> None:
 
 
 def _few(dataset: Dataset[Batch], most: int) -> Batch:
-    """The first samples."""
+    """Return a batch of the first samples, at most `most`."""
     return fetched(dataset, range(min(most, len(dataset))))  # type: ignore[arg-type]
 
 
 @contextmanager
 def _silence() -> Iterator[None]:
-    """Neither warnings nor what is logged below an error."""
+    """Suppress warnings and log messages below the level of an error during the block."""
     before = logging.root.manager.disable
     logging.disable(logging.WARNING)
     try:
@@ -386,13 +393,14 @@ def _silence() -> Iterator[None]:
 
 
 def for_trained(config: Config, *, prepare: bool = True) -> Session:
-    """The model of `checkpoint`, with the data, outliers and metrics that the command line names, or else its own.
+    """Return the session of a trained model: the one that `checkpoint` names.
 
-    Without `prepare` the data can only read a user's own files: nothing is generated or loaded for that.
+    Data, outliers and metrics are those that the command line names, or else the model's own. Without `prepare`, the
+    data can only read a user's own files, and nothing is generated or loaded for them.
 
     Raises:
-        ConfigError: no checkpoint is named.
-        CheckpointError: there is none, or the data does not fit the model.
+        ConfigError: No checkpoint is named.
+        CheckpointError: There is no such checkpoint, or the data does not fit the model.
     """
     console = begin(config.settings)
     if config.settings.checkpoint is None:
@@ -408,10 +416,10 @@ def for_trained(config: Config, *, prepare: bool = True) -> Session:
 def around(
     config: Config, predictor: Predictor, description: Description, console: Console, *, prepare: bool = True
 ) -> Session:
-    """The session of a predictor that is there already and described by a checkpoint; see `for_trained`.
+    """Return the session of a loaded predictor that a checkpoint describes; see `for_trained`.
 
     Raises:
-        ConfigError: `prepare`, and a path of the stored data, outliers or metrics is not said again.
+        ConfigError: `prepare` is True, and the command does not repeat a path of the stored data, outliers or metrics.
     """
     reads = MODES[config.mode].reads
     chosen_device = config.settings.trainer.get("accelerator") if "trainer.accelerator" in reads else "cpu"
@@ -462,22 +470,22 @@ def _reading(
     config: Config | None,
     files: Sequence[Path],
 ) -> Dataset[Batch]:
-    """Read a user's own files by a data set that the command chose or changed.
+    """Read a user's own files with a data set that the command chose or changed.
 
     Args:
-        read: of the data set.
-        data: the data set.
-        description: of the model.
-        config: of the command; None for a run that goes on, whose settings are not looked at again.
-        files: the user's.
+        read: Method `read` of the data set.
+        data: Data set.
+        description: Description of the model.
+        config: Config of the command; None for a resumed run, whose settings are not checked again.
+        files: Files of the user.
 
     Raises:
-        CheckpointError: the first sample is of another shape than the model reads.
-        ConfigError: the first files are read the same as the model reads them by itself.
+        CheckpointError: The first sample has another shape than the model reads.
+        ConfigError: The choice has no effect, since the model alone reads the first files in the same way.
     """
     samples = read(files)
     found, wanted = tuple(fetched(samples, range(1))["input"].shape[1:]), description.input_shape
-    free = len(wanted) == 2  # clouds have any number of points
+    free = len(wanted) == 2  # a point cloud has any number of points
     if found[free:] != wanted[free:] or len(found) != len(wanted):
         raise CheckpointError(
             f"{description.path} reads inputs of shape {wanted}, but with data={description.config['data']['name']} as "
@@ -487,7 +495,7 @@ def _reading(
     if config is not None and given is not None and not isinstance(data, Mapped):
         skips = any(
             "unreadable=" in item for item in config.overrides
-        )  # which the mode reads, not the data set
+        )  # the mode reads this key, not the data set
         some = list(files[:FEW])
         if not skips and _same_samples(_by_itself(description, some), read(some)):
             refuse_idle(config.folder, sets_nothing(given, f"the model reads {files[0]} the same without it"))
@@ -495,12 +503,12 @@ def _reading(
 
 
 def _by_itself(description: Description, files: Sequence[Path]) -> Dataset[Batch] | None:
-    """Return the samples of files as a model reads them without anything that the command says of its data."""
+    """Return the samples of files as the model reads them without the command's data settings; None if it cannot."""
     stored = read(Path(description.path))["framework"]["config"]["data"]
     try:
         config, _ = without_paths({"data": stored}, {})
         return reader(replace(description, config={**description.config, **config}, dropped={})).read(files)
-    except UserError:  # without a path that the command says, for one
+    except UserError:  # for example, the data need a path that only the command gives
         return None
 
 
@@ -512,7 +520,7 @@ def _same_samples(one: Dataset[Batch] | None, other: Dataset[Batch]) -> bool:
 
 
 def inherited(config: Config, description: Description) -> Config:
-    """The config with the settings of the model's own run, but for those that the command line gives."""
+    """Return the config with the settings of the model's own run, except those that the command line sets."""
     given = {item.lstrip("+~").partition("=")[0] for item in config.overrides}
     kept = {
         key: value for key, value in description.settings.items() if key.removesuffix("_name") not in given
@@ -521,10 +529,10 @@ def inherited(config: Config, description: Description) -> Config:
 
 
 def require_fit(data: Data, description: Description) -> None:
-    """Refuse data that the model was not made for.
+    """Refuse data with other inputs or targets than the model's.
 
     Raises:
-        CheckpointError: inputs of another shape, or other targets.
+        CheckpointError: The inputs have another shape, or the targets differ.
     """
     target = description.target
     wanted = description.input_shape, target.kind, target.names, target.size
@@ -538,10 +546,10 @@ def require_fit(data: Data, description: Description) -> None:
 
 
 def require_target(target: Target | None, description: Description) -> None:
-    """Refuse data that is known, before it is read or generated, to have other targets than the model.
+    """Refuse data whose targets are known before it is read or generated, and differ from the model's.
 
     Raises:
-        CheckpointError: it has.
+        CheckpointError: The targets differ.
     """
     wanted = description.target
     if target is not None and (target.kind, target.names, target.size) != (
@@ -556,7 +564,7 @@ def require_target(target: Target | None, description: Description) -> None:
 
 
 def calibrate(session: Session) -> None:
-    """Fit what is not trained by gradient, on the validation set."""
+    """Calibrate the session's predictor on the validation split, and print its remarks."""
     session.predictor.eval().to(session.device)
     seed_step(session.settings.seed, 0, "calibrate")
     batches = told(session.blocks().val_dataloader(), "calibrating")
@@ -566,10 +574,10 @@ def calibrate(session: Session) -> None:
 
 
 def keep_memory() -> None:
-    """Let glibc keep freed memory: a training step frees and asks for the same megabytes again and again.
+    """Make glibc keep freed memory, since every training step frees and requests the same megabytes.
 
-    Without it each step pays for thousands of page faults, a quarter of a small network's time. Elsewhere than on
-    glibc nothing happens.
+    Otherwise each step causes thousands of page faults, which take a quarter of a small network's time. Without glibc
+    the function does nothing.
     """
     if platform.libc_ver()[0] == "glibc":
         library = ctypes.CDLL(None)
@@ -578,14 +586,14 @@ def keep_memory() -> None:
 
 
 def quiet() -> None:
-    """Lightning's notices about hardware it did not find, and a deprecation inside it, tell our user nothing."""
+    """Silence messages of Lightning that do not help the user: missing hardware, and its own deprecations."""
     for name in ("pytorch_lightning", "lightning_fabric"):
         logging.getLogger(name).setLevel(logging.ERROR)
     warnings.filterwarnings("ignore", message=".*LeafSpec", module="pytorch_lightning")
     warnings.filterwarnings("ignore", message=".*does not have many workers", module="pytorch_lightning")
-    # a machine of a cluster, on which nobody asked for SLURM
+    # a cluster node that is used without SLURM
     warnings.filterwarnings("ignore", message="The `srun` command is available on your system")
-    # ours is resumable, by another way than the one Lightning looks for
+    # the framework's data loader is resumable in a way that Lightning does not detect
     warnings.filterwarnings(
         "ignore", message=".*your dataloader is not resumable", module="pytorch_lightning"
     )

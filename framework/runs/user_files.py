@@ -1,4 +1,4 @@
-"""Which files of a user's folder a data set reads: others may lie beside them."""
+"""Choice of the files that a data set reads from a user's folder, which may hold other files too."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -12,16 +12,16 @@ from framework.storage.names import spelled
 from framework.storage.progress import tracked
 
 UNREADABLE = "unreadable.txt"
-"""The files that were left out, a line each."""
+"""Name of the file that lists the files left out, one per line."""
 
 
 def files_in(path: Path) -> tuple[list[Path], list[Path]]:
-    """Return the files to read, `path` itself or those in it, and the folders in it, which are not looked into.
+    """Return the files to read, and the folders inside `path`, which are not searched.
 
-    Hidden ones are neither.
+    The files are `path` itself, or the files in it. Hidden files and folders are left out of both lists.
 
     Raises:
-        DataError: there is no file.
+        DataError: There is no file.
     """
     if not path.exists():
         raise DataError(f"mode.files={path} does not exist. Give a file, or a folder of files.")
@@ -43,7 +43,7 @@ def files_in(path: Path) -> tuple[list[Path], list[Path]]:
 
 
 def readable(data: Data, file: Path) -> bool:
-    """Whether every sample of a file can be read."""
+    """Return whether every sample of a file can be read."""
     try:
         dataset = data.read([file])
         for index in range(len(dataset)):  # type: ignore[arg-type]
@@ -56,11 +56,14 @@ def readable(data: Data, file: Path) -> bool:
 def to_read(
     data: Data, files: Sequence[Path], config: Mapping[str, Any], console: Console
 ) -> tuple[list[Path], list[Path]]:
-    """The files to read, and those left out because they cannot be read; `console` is told of what is not read.
+    """Return the files to read, and the files left out because they cannot be read; print which files are not read.
 
-    Hidden files are ignored, and files whose suffix is not one of the data set's and of which it can read none (a
-    README, a table), or that belong to others (`Data.companions`). What then cannot be read stays, and is an error
-    later; where the data's `config` says to skip it, it is left out.
+    Three kinds of files are ignored: hidden files, files that belong to others (`Data.companions`), and files with a
+    suffix that is not one of the data set's if the data set can read none of them (a README, a table). A remaining file
+    that cannot be read stays in the list and causes an error later, unless `config` says to skip such files.
+
+    Raises:
+        DataError: No file remains.
     """
     beside = {file for file in files if data.companions and file.name.lower().endswith(data.companions)}
     say_left_out(console, "files", "belong to others and are read with them", sorted(beside))
@@ -96,7 +99,7 @@ def to_read(
 
 
 def say_left_out(console: Console, kind: str, why: str, paths: Sequence[Path]) -> None:
-    """Tell the user of files or folders that are not read, where there are any."""
+    """Print the names of files or folders that are not read, if there are any."""
     if paths:
         console.print(f"{len(paths)} {kind} {why}: {_listed(paths)}", soft_wrap=True, highlight=False)
 
