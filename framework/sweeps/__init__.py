@@ -1,1 +1,1 @@
-"""Many jobs on one machine, and their comparison."""
+"""Sweeps: running many jobs on one machine, and comparing them."""

@@ -1,4 +1,4 @@
-"""A sweep as one thing: a parent run, and the table and picture that compare its jobs."""
+"""Parent run of a sweep, and the table and figure that compare its jobs."""
 
 import logging
 import math
@@ -30,18 +30,18 @@ from framework.tracking.tracker import MlflowTracker, mlflow_store
 
 _DIRECTIONS: Mapping[str, Literal["higher", "lower"]] = {"minimize": "lower", "maximize": "higher"}
 DESCRIPTION, LONGEST_DESCRIPTION = "mlflow.note.content", 7500
-"""The tag that MLflow shows as a run's description, and the letters that fit into it."""
+"""Tag that MLflow shows as a run's description, and the largest number of characters in it."""
 RETURNED = "best validation loss (nats)"
-"""What a training returns to its sweep."""
+"""Name of the value that a training returns to its sweep."""
 _HEADER = ("method", "data", "columns", "better")
-"""What a table needs to know of each of its rows."""
+"""Keys that the results of every job must contain for the table."""
 
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Trial:
-    """A job of a search; `value` is what it returned, None where it returned nothing."""
+    """A job of a search; `value` is the value that it returned, or None if it returned nothing."""
 
     folder: Path
     overrides: list[str]
@@ -51,18 +51,19 @@ class Trial:
 
 @dataclass(frozen=True)
 class Ranking:
-    """The best trial of a search, None where no trial has a finite value, and a line that says what it reached."""
+    """The best trial of a search (None if no trial has a finite value), and a line that states its value."""
 
     best: Trial | None
     said: str
 
 
 def begin(folder: Path, config: Mapping[str, Any]) -> str | None:
-    """Open the parent run of a sweep; its id, or None without a tracking store."""
+    """Open the parent run of a sweep, and return its id, or None without a tracking store."""
     logger = config.get("logger") or {}
     if logger.get("name") != "mlflow":
         return None
-    earlier = read_run_info(folder)  # of the sweep that is being repeated, which may have been killed
+    # set if a sweep is repeated in this folder; the earlier one may have been killed
+    earlier = read_run_info(folder)
     tracker = _parent(folder, config, earlier, store_experiment(config))
     tracker.open()
     tracker.set_tags({"mode": "sweep", "folder": str(folder), DESCRIPTION: f"A sweep in `{folder}`."})
@@ -72,10 +73,12 @@ def begin(folder: Path, config: Mapping[str, Any]) -> str | None:
 
 
 def summarise(folder: Path, overrides: Sequence[Sequence[str]], config: Mapping[str, Any]) -> None:
-    """Compare the finished jobs in `folder`: print the table, log it and a picture to the parent.
+    """Compare the finished jobs in `folder`: print the table, and log it and a figure to the parent run.
 
     Args:
-        config: of the first job, as of `begin`; the store it names is the only one that is contacted.
+        folder: Folder of the sweep.
+        overrides: Overrides of each job of this command.
+        config: Config of the first job, as for `begin`; the store that it names is the only one that is contacted.
     """
     console = output()
     jobs = recorded(folder)
@@ -86,16 +89,16 @@ def summarise(folder: Path, overrides: Sequence[Sequence[str]], config: Mapping[
     files: list[Path] = []
     said = ""
     if rows:
-        # also those of another command's jobs in this folder: what tells rows apart must be told
+        # rows of another command's jobs in this folder count too: every key that distinguishes rows must be shown
         everything = [*overrides, *(row["overrides"] for row in rows)]
         keys = _varied(everything)
-        if _repeated(rows, keys):  # a setting that one command leaves at its default
+        if _repeated(rows, keys):  # a setting is then given by some commands only
             keys = _varied(everything, absent=True)
         rows = [{**dict.fromkeys(keys), **row} for row in rows]
         shown = (key for key in keys if key not in ("seed", "experiment") and not _repeats_data(rows, key))
         by = ["method", "data", *shown]
         columns = {key: key.rpartition(".")[2] for key in by} | rows[0]["columns"] | COST_COLUMNS
-        # a column that no job has a number for says nothing (what only some classes have, say)
+        # a column without any number is left out (one that only some classes have, for example)
         columns = {
             key: heading for key, heading in columns.items() if any(row.get(key) is not None for row in rows)
         }
@@ -111,7 +114,7 @@ def summarise(folder: Path, overrides: Sequence[Sequence[str]], config: Mapping[
 
 
 def store_of(config: Mapping[str, Any]) -> str | None:
-    """Return the address of the store that a sweep's command names; None where it names none."""
+    """Return the address of the store that a sweep's command names; None if it names none."""
     uri = (config.get("logger") or {}).get("uri")
     return None if uri is None else str(uri)
 
@@ -123,15 +126,19 @@ def rank(
     metric: str | None = None,
     direction: str | None = None,
 ) -> Ranking:
-    """Print the trials of a search, the best first and those without a finite value last; write ranking.csv.
+    """Print the trials of a search, write ranking.csv, and return the best trial.
+
+    The best trial comes first, and trials without a finite value come last.
 
     Args:
-        keys: the overridden keys to show, each a column.
-        metric: a key of results.json; None is the value the trials returned.
-        direction: "minimize" or "maximize"; None is what the metric itself says.
+        folder: Folder of the search.
+        trials: Trials in the order in which they were drawn.
+        keys: Overridden keys to show, one column each.
+        metric: Key of results.json; None ranks by the value that the trials returned.
+        direction: "minimize" or "maximize"; None takes the direction from the metric.
 
     Raises:
-        ConfigError: no trial has the metric, or nothing says which way it is better.
+        ConfigError: No trial has the metric, or its direction is not known.
     """
     results = {trial.folder: _results(trial.folder) if trial.completed else {} for trial in trials}
     known = [one for one in results.values() if one]
@@ -143,8 +150,9 @@ def rank(
     synthetic = any(row["synthetic"] for row in rows)
     sign = 1 if better == "lower" else -1
     ranks = [sign * row["value"] if math.isfinite(row["value"]) else math.inf for row in rows]
-    order = sorted(range(len(rows)), key=ranks.__getitem__)  # stable: of equals the one drawn first
-    # of a trial that failed nothing is known: it is labelled as soon as any is
+    # stable, so of equal trials the one drawn first comes first
+    order = sorted(range(len(rows)), key=ranks.__getitem__)
+    # a failed trial does not say whether its data are synthetic, so it is labelled if any other trial is
     shown = [
         {**row, "synthetic": synthetic if row["synthetic"] is None else row["synthetic"]} for row in rows
     ]
@@ -180,13 +188,13 @@ def rank(
 
 
 def close_ranking(folder: Path, said: str, config: Mapping[str, Any]) -> None:
-    """Log to the parent run what a search found; `said` describes it, and `config` is as of `begin`."""
+    """Log the result of a search to the parent run, with `said` as description and `config` as for `begin`."""
     paths = (folder / name for name in ("ranking.csv", "best.yaml"))
     _close_parent(folder, [path for path in paths if path.is_file()], said, config)
 
 
 def _results(job: Path) -> dict[str, Any]:
-    """Empty, with a warning, where they cannot be read: the other jobs are compared."""
+    """Return the results of a job; log a warning and return an empty dictionary if they cannot be read."""
     path = job / "results.json"
     if not path.is_file():
         return {}
@@ -201,10 +209,10 @@ def _results(job: Path) -> dict[str, Any]:
 
 
 def _checked(results: Mapping[str, Any], path: Path) -> dict[str, Any]:
-    """Return what a job found, its texts as they may be printed: the file may be a stranger's.
+    """Return a job's results with texts that are safe to print, since the file may come from an untrusted source.
 
     Raises:
-        DataError: it is not what a test writes.
+        DataError: A test would not write such results.
     """
     columns, better = results["columns"], results["better"]
     wanted = {
@@ -229,7 +237,7 @@ def _checked(results: Mapping[str, Any], path: Path) -> dict[str, Any]:
 def _trial_row(
     trial: Trial, results: Mapping[str, Any], keys: Sequence[str], metric: str | None
 ) -> dict[str, Any]:
-    """A trial's line: NaN where it has no value, "synthetic" None where that is not known."""
+    """Return the row of a trial; its value is NaN if it has none, and "synthetic" is None if that is not known."""
     found = trial.value if metric is None else results.get(metric)
     given = {key: value for key, _, value in (override.partition("=") for override in trial.overrides)}
     return {
@@ -265,7 +273,7 @@ def _status(folder: Path) -> str:
 
 
 def _row(job: Path) -> dict[str, Any] | None:
-    """What a completed job found; None for another, and for one of which that cannot be read."""
+    """Return the row of a completed job; None if the job did not complete or its results cannot be read."""
     record = read_record(job)
     results = _results(job) if record.get("status") == "completed" else {}
     if not results:
@@ -274,13 +282,13 @@ def _row(job: Path) -> dict[str, Any] | None:
     swept = dict(override.lstrip("+~").split("=", 1) for override in overrides if "=" in override)
     row = {**swept, **results, "overrides": overrides, "folder": str(job)}
     if "batch_size" in swept:
-        # in results it is that at which the cost was measured, which a small test split limits
+        # in the results, it is the batch size of the cost measurement, which a small test split limits
         row["batch_size"] = swept["batch_size"]
     return row
 
 
 def _varied(overrides: Sequence[Sequence[str]], *, absent: bool = False) -> list[str]:
-    """The keys that differ between jobs, in the order given; with `absent` those also that only some jobs have."""
+    """Return the keys whose values differ between jobs, in order; with `absent`, also keys that only some jobs have."""
     seen: dict[str, list[str]] = {}
     for job in overrides:
         for override in job:
@@ -294,13 +302,13 @@ def _varied(overrides: Sequence[Sequence[str]], *, absent: bool = False) -> list
 
 
 def _repeated(rows: Sequence[Mapping[str, Any]], keys: Sequence[str]) -> bool:
-    """Whether two rows are the same but for what they found."""
+    """Return whether two rows have the same method, data, seed and `keys`."""
     told = [tuple(row.get(key) for key in ("method", "data", "seed", *keys)) for row in rows]
     return len(set(told)) < len(told)
 
 
 def _repeats_data(rows: Sequence[Mapping[str, Any]], key: str) -> bool:
-    """Whether the column `key` varies but adds nothing to the column `data`, each value of which has one of `key`."""
+    """Return whether the column `key` varies but is determined by the column `data`."""
     pairs = {(row["data"], row[key]) for row in rows}
     return len({value for _, value in pairs}) > 1 and len({data for data, _ in pairs}) == len(pairs)
 
@@ -308,10 +316,13 @@ def _repeats_data(rows: Sequence[Mapping[str, Any]], key: str) -> bool:
 def _picture(
     compared: Sequence[Mapping[str, Any]], rows: Sequence[Mapping[str, Any]], by: Sequence[str], folder: Path
 ) -> list[Path]:
-    """Of the first column that says which way it is better, against run time; none where a row lacks it.
+    """Draw the first column with a known direction against run time, and return the file; none if a row lacks it.
 
     Args:
-        compared: means of the `rows`, one for each value of the keys `by`: method, data, and what was varied.
+        compared: Means of the `rows`, one for each combination of values of the keys `by`.
+        rows: Results of the jobs.
+        by: Keys of method and data, and the keys that were varied.
+        folder: Folder of the sweep.
     """
     from framework.figures.style import saved
     from framework.reports.tradeoff_picture import error_against_run_time
@@ -348,8 +359,8 @@ def _parent(
     return MlflowTracker(
         folder,
         Destination(store_of(config), experiment, f"sweep {folder.name}", run_id=run_id),
-        opening_patience=30.0,  # its jobs are told its id
-        open_store=mlflow_store(),  # which sends what they leave, too
+        opening_patience=30.0,  # the jobs need its id
+        open_store=mlflow_store(),  # this process also sends the journals of the jobs
     )
 
 
@@ -359,7 +370,7 @@ def _close_parent(folder: Path, files: Sequence[Path], said: str, config: Mappin
         return
     tracker = _parent(folder, config, begun, begun.experiment)
     tracker.open()
-    if said:  # numbers of the parent's own would be charts that none of its jobs has a point in
+    if said:  # a text, because metrics of the parent would give charts without a point of any job
         tracker.set_tags({DESCRIPTION: f"A sweep in `{folder}`: {said}"[:LONGEST_DESCRIPTION]})
     for file in files:
         tracker.log_artifact(file)

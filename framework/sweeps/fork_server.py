@@ -1,10 +1,10 @@
-"""Runs the jobs of a sweep as forks of one process that has imported what they need: that takes seconds each time.
+"""Server process that runs the jobs of a sweep as forks, so that the imports, which take seconds, happen only once.
 
-Its arguments are a descriptor of a socket, modules to import, and what to run: `-m` and a module, or a file. A packet
-on the socket is a job as JSON, its arguments and the environment variables that are its own; with it come the
-descriptors of its console and of its lock. It says {"ready": pid} before it imports, for each job {"started": pid} and,
-in the end, {"ended": pid, "code": as of subprocess.Popen, "seconds": processor time of the job and all its processes}.
-Who closes the socket ends it.
+Its arguments are the descriptor of a socket, the modules to import, and the target to run: `-m` and a module, or a
+file. A packet on the socket describes a job as JSON (its arguments and its own environment variables), and carries the
+descriptors of the job's console and lock. The server answers {"ready": pid} before it imports, and {"started": pid} for
+each job. When a job has ended, it sends {"ended": pid, "code": exit code as in subprocess.Popen, "seconds": processor
+time of the job and all its processes}. The server ends when the other side closes the socket.
 """
 
 import gc
@@ -25,12 +25,12 @@ from framework.sweeps.processes import LARGEST
 from framework.tracking.signals import ending_with_parent
 
 PATIENCE = 0.02
-"""Seconds within which the end of a job is noticed."""
+"""Seconds between two checks whether a job has ended."""
 
 
 @dataclass(frozen=True)
 class Given:
-    """A job: what a fork is to become."""
+    """Job that a fork runs: its arguments, environment variables, and descriptors of its console and lock."""
 
     arguments: list[str]
     environment: dict[str, str]
@@ -39,7 +39,7 @@ class Given:
 
 
 def serve(channel: socket.socket) -> Given | None:
-    """Fork for each job that is asked for; in a fork the job, None once nobody asks any more."""
+    """Fork a process for each requested job; return the job in a fork, and None in the server after the last one."""
     running = set[int]()
     while True:
         if select.select([channel], [], [], PATIENCE if running else None)[0]:
@@ -69,7 +69,7 @@ def serve(channel: socket.socket) -> Given | None:
 
 
 def _become(job: Given) -> None:
-    """What a process of its own would have: its streams, environment, arguments and random numbers."""
+    """Give a fork the streams, environment, arguments and random seed that a separate process would have."""
     for number, descriptor in enumerate((os.open(os.devnull, os.O_RDONLY), job.console, job.console)):
         os.dup2(descriptor, number)
     os.close(job.console)
@@ -82,19 +82,19 @@ def _become(job: Given) -> None:
 
 
 def _tell(channel: socket.socket, answer: dict[str, Any]) -> None:
-    with suppress(OSError):  # nobody asks any more: the next packet says so
+    with suppress(OSError):  # the other side has closed the socket, which the next packet shows
         channel.send(json.dumps(answer).encode())
 
 
 def main(descriptor: str, modules: str, *target: str) -> None:
-    """Import, serve, and in each fork run the target as Python would."""
+    """Import the modules, serve requests, and run the target in each fork as Python would."""
     channel = socket.socket(fileno=int(descriptor))
     _tell(channel, {"ready": os.getpid()})
     for name in filter(None, modules.split(",")):
-        with suppress(Exception):  # the job will say what is wrong with it
+        with suppress(Exception):  # the job itself will report the error
             import_module(name)
     gc.collect()
-    gc.freeze()  # so that collecting a fork's garbage copies none of these pages
+    gc.freeze()  # so that garbage collection in a fork copies none of these pages
     if serve(channel) is not None:
         _run(target)
 

@@ -1,4 +1,4 @@
-"""A sweep on one machine: a process for each job, so many at once, a record of each; it can be resumed."""
+"""Running of a sweep on one machine: one process and one record per job, several at a time; a sweep can be resumed."""
 
 import fcntl
 import hashlib
@@ -27,10 +27,10 @@ from framework.sweeps.processes import Fresh, Process, Starter
 from framework.tracking.signals import ENDING, SIGNALS, Stopped, ends_with_parent, handled
 
 COMMAND: Sequence[str] = (sys.executable, "-P", "-m", "framework")
-"""What runs one job; its overrides follow. No config can set it, since it would then run code."""
+"""Command of one job, to which its overrides are added. No config can set it, because a config must not run code."""
 CONSOLE = "console.log"
 LONGEST_VALUE = 4096
-"""Bytes of what a job returned."""
+"""Largest size, in bytes, of the file with the value that a job returned."""
 
 log = logging.getLogger(__name__)
 
@@ -39,17 +39,23 @@ log = logging.getLogger(__name__)
 class Job:
     """One job of a sweep.
 
-    Its record, job.json, holds number, overrides, key and config as here, command, pid, tries, started and
-    ended (seconds since 1970; of the last try), processor_seconds (of all tries, all threads and processes of the
-    job; null where the sweep itself was killed in one of them), error and status: "queued", "running", "completed",
-    "failed" (it exited with an error) or "died" (it was killed, or stopped by a signal).
+    The record of a job, job.json, holds number, overrides, key and config as below. It also holds command, pid, tries,
+    started and ended (seconds since 1970, of the last try), processor_seconds, error and status. The processor time
+    covers all tries, threads and processes of the job; it is null if the sweep was killed during one of the tries. The
+    status is "queued", "running", "completed", "failed" (the job exited with an error) or "died" (it was killed, or
+    stopped by a signal).
 
     Attributes:
-        key: hash of the overrides: which job of the sweep it is.
-        config: hash of the whole composed config: whether a completed job still stands.
-        attempts: how often it was started by this process.
-        waits: whether a process of another sweep was seen in its folder.
-        unlocked: whether its folder is on a file system without locks.
+        number: Number of the job in the sweep.
+        overrides: Overrides of the job.
+        arguments: Arguments of the job's command.
+        folder: Folder of the job.
+        key: Hash of the overrides, which identifies the job in the sweep.
+        config: Hash of the whole composed config, by which a completed job is recognised as up to date.
+        attempts: Number of times that this process has started the job.
+        waits: Whether a process of another sweep was seen in its folder.
+        unlocked: Whether its folder is on a file system without locks.
+        record: Content of job.json.
     """
 
     number: int
@@ -65,16 +71,16 @@ class Job:
 
     @property
     def completed(self) -> bool:
-        """With the config it would have now."""
+        """Return whether the job has completed with its present config."""
         return self.record.get("status") == "completed" and self.record.get("config") == self.config
 
     @property
     def identity(self) -> dict[str, Any]:
-        """What its record says of it whatever happens to it."""
+        """Return the part of the record that never changes."""
         return {"key": self.key, "number": self.number, "overrides": self.overrides}
 
     def reread(self) -> bool:
-        """Take the record from the disk, where another sweep may have changed it; False where it is another job's."""
+        """Read the record from disk, where another sweep may have changed it; return False if it is another job's."""
         found = read_record(self.folder)
         if found.get("key") == self.key:
             self.record = found
@@ -85,12 +91,12 @@ class Job:
         return False
 
     def update(self, **values: Any) -> None:
-        """Change the record, in memory and on the disk."""
+        """Change the record in memory and on disk."""
         self.record |= values
         write_whole(self.folder / RECORD, json.dumps(self.record, indent=1).encode())
 
     def value(self) -> float | None:
-        """What the job left for the sweeper to minimise (`leave_value`)."""
+        """Return the value that the job left for the sweeper to minimise (`leave_value`), or None."""
         path = self.folder / VALUE
         with guarded(path, "a number", "Delete it, and the job runs anew."):
             return (
@@ -99,12 +105,12 @@ class Job:
 
 
 def hashed(*parts: str) -> str:
-    """A short name for texts that tells them apart."""
+    """Return a short hash (16 hex digits) of texts."""
     return hashlib.sha256(as_bytes("\0".join(parts))).hexdigest()[:16]
 
 
 def records(folder: Path) -> dict[str, list[tuple[Path, dict[str, Any]]]]:
-    """Folder and record of every job an earlier sweep in `folder` knew, by key (overrides may repeat)."""
+    """Return folder and record of every job of earlier sweeps in `folder`, by key; a key may have several jobs."""
     found: dict[str, list[tuple[Path, dict[str, Any]]]] = {}
     for path in recorded(folder):
         record = read_record(path)
@@ -113,10 +119,10 @@ def records(folder: Path) -> dict[str, list[tuple[Path, dict[str, Any]]]]:
 
 
 def free_number(subfolder: Callable[[int], Path], number: int, taken: set[Path]) -> int:
-    """The first number from `number` on whose folder no other job has.
+    """Return the first number, from `number` on, whose folder belongs to no other job.
 
     Raises:
-        ConfigError: `hydra.sweep.subdir` gives two jobs one folder.
+        ConfigError: `hydra.sweep.subdir` gives two jobs the same folder.
     """
     for candidate in range(number, number + len(taken) + 1):
         if subfolder(candidate) not in taken:
@@ -128,8 +134,10 @@ def free_number(subfolder: Callable[[int], Path], number: int, taken: set[Path])
 
 
 def reserve(jobs: Sequence[Job]) -> None:
-    """Leave a record of each job that has none, so that no other sweep in this folder takes its place; hold a lock of
-    the sweep's folder from before the numbers were chosen."""
+    """Write a record for each job that has none, so that no other sweep in this folder takes its folder.
+
+    The caller must hold the lock of the sweep's folder since before the numbers were chosen.
+    """
     for job in jobs:
         if not job.record:
             job.folder.mkdir(parents=True, exist_ok=True)
@@ -137,7 +145,7 @@ def reserve(jobs: Sequence[Job]) -> None:
 
 
 def cores() -> int:
-    """The CPU cores this process may use."""
+    """Return the number of CPU cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -151,21 +159,22 @@ def run(
     starter: Starter = Fresh,
     store: str | None = None,
 ) -> None:
-    """Run every job that has not completed; returns when all have ended, however they ended.
+    """Run every job that has not completed, and return when all have ended, in whatever way.
 
-    SIGINT, SIGTERM and SIGHUP are passed on to the jobs, which close their runs; a second signal makes them hurry, a
-    third kills them.
+    SIGINT, SIGTERM and SIGHUP are passed on to the jobs, which close their runs. A second signal stops the jobs
+    immediately, and a third kills them.
 
     Args:
-        at_once: how many run at a time; each gets an equal part of the cores.
-        retries: how often a job that died is started again.
-        devices: CUDA devices to hand out, one to each running job; none leaves all visible to all.
-        parent: tracking run the jobs are recorded under.
-        starter: of their processes.
-        store: address of the tracking store that the command names.
+        jobs: Jobs of the sweep.
+        at_once: Number of jobs that run at the same time; each gets an equal part of the cores.
+        retries: Number of times that a job that died is started again.
+        devices: CUDA devices to distribute, one to each running job; if empty, all jobs see all devices.
+        parent: Id of the tracking run under which the jobs are recorded.
+        starter: Function that starts the process of a job.
+        store: Address of the tracking store that the command names.
 
     Raises:
-        Stopped: a signal came.
+        Stopped: A signal was received.
     """
     queue = deque(job for job in jobs if not job.completed)
     for job in queue:
@@ -200,7 +209,7 @@ def run(
                 if lock is None:
                     queue.append(job)
                     continue
-                # by another sweep, while this one waited for the folder
+                # another sweep may have run the job while this one waited for the folder
                 if not job.reread() or job.completed:
                     os.close(lock)
                 else:
@@ -226,7 +235,7 @@ def run(
 
 
 def _sync(folder: Path, store: str | None) -> None:
-    """Send what a job left unsent; one that died is closed and sent by the comparison."""
+    """Send the journal lines that a job has not sent; a job that died is closed and sent by the comparison."""
     from framework.tracking.ended import sync  # Hydra imports this module at every start
 
     try:
@@ -236,7 +245,7 @@ def _sync(folder: Path, store: str | None) -> None:
 
 
 def failure(jobs: Sequence[Job]) -> UserError | None:
-    """What to tell of the jobs that did not complete; None where all did."""
+    """Return an error that lists the jobs that did not complete; None if all completed."""
     bad = [job for job in jobs if job.record.get("status") != "completed"]
     if not bad:
         return None
@@ -259,10 +268,10 @@ class _Running:
 
 
 def _environment(at_once: int, slot: int, devices: Sequence[str], parent: str | None) -> dict[str, str]:
-    # The cores are divided by `at_once` and not by the jobs there are: another number of threads may sum in
-    # another order, and a resumed job must give the bits of an uninterrupted one.
+    # The cores are divided by `at_once` and not by the number of jobs: another number of threads may add numbers in
+    # another order, and a resumed job must give the same bits as an uninterrupted one.
     environment = {"OMP_NUM_THREADS": str(max(1, cores() // at_once)), **os.environ}
-    # What was printed must be there even if the process is killed.
+    # Printed text must reach the file even if the process is killed.
     environment |= {"PYTHONUNBUFFERED": "1", "PYTHONFAULTHANDLER": "1"}
     if devices:
         environment["CUDA_VISIBLE_DEVICES"] = devices[slot % len(devices)]
@@ -272,7 +281,7 @@ def _environment(at_once: int, slot: int, devices: Sequence[str], parent: str | 
 
 
 def _spent(record: Mapping[str, Any], config: str) -> float | None:
-    """Processor seconds of the tries that this one continues; None where nobody saw one of them end."""
+    """Return the processor seconds of the tries that this one continues; None if the end of one was not observed."""
     if record.get("config") != config:
         return 0.0
     return None if record.get("ended") is None else record.get("processor_seconds")
@@ -300,9 +309,9 @@ def _start(job: Job, slot: int, lock: int, environment: Mapping[str, str], start
 
 
 def _end(one: _Running, code: int) -> None:
-    """Record how a job ended."""
+    """Record the way in which a job ended."""
     job = one.job
-    one.process.kill()  # what a killed job left behind: data loaders, the other ranks
+    one.process.kill()  # ends processes that a killed job left behind, such as data loaders and other ranks
     if one.process.seconds is None:
         status, error = "died", "nobody saw how it ended, since the process that it was a fork of died"
     elif code == 0:
@@ -311,7 +320,7 @@ def _end(one: _Running, code: int) -> None:
         status, error = "died", f"killed by {signal.Signals(-code).name}"
         if code == -signal.SIGKILL:
             error += ", as the system does when memory runs out"
-    elif code - 128 in (*SIGNALS, signal.SIGKILL):  # the latter where a rank of several was killed
+    elif code - 128 in (*SIGNALS, signal.SIGKILL):  # SIGKILL if one of several ranks was killed
         status, error = "died", f"stopped by {signal.Signals(code - 128).name}"
     else:
         status, error = "failed", f"{_last_line(job.folder / CONSOLE)} (exit code {code})"
@@ -327,7 +336,7 @@ def _end(one: _Running, code: int) -> None:
 
 
 def _last_line(console: Path) -> str:
-    """Where Python, and this framework, say what was wrong."""
+    """Return the last non-empty line of a console file, in which Python and this framework state the error."""
     with read_stream(console) as stream:
         stream.seek(max(0, os.fstat(stream.fileno()).st_size - 4096))
         lines = stream.read(4096).decode("utf-8", "replace").split("\n")
@@ -345,7 +354,7 @@ def _pass_on(number: int, before: int, running: Sequence[_Running]) -> None:
 
 @contextmanager
 def _signals() -> Iterator[list[int]]:
-    """The numbers of those that came inside the block."""
+    """Handle signals during the block, and yield the growing list of the received signal numbers."""
     received: list[int] = []
     numbers = handled()
     before = [signal.signal(number, lambda number, frame: received.append(number)) for number in numbers]
@@ -357,10 +366,10 @@ def _signals() -> Iterator[list[int]]:
 
 
 def _lock(job: Job) -> int | None:
-    """A descriptor that holds the job's folder; None where a process of another sweep does.
+    """Return a descriptor that locks the job's folder; None if a process of another sweep holds the lock.
 
-    A file system without `flock` gets a POSIX record lock, which holds as long as this process lives; one without
-    either a warning.
+    A file system without `flock` gets a POSIX record lock, which lasts as long as this process. On a file system
+    without either, a warning is logged.
     """
     path = job.folder / ".lock"
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)

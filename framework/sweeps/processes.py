@@ -1,4 +1,4 @@
-"""The processes that jobs of a sweep run in: one of its own each, or forks of one that has imported what they need."""
+"""Processes of the jobs of a sweep: a separate one for each, or forks of one that has already imported the modules."""
 
 import ctypes
 import json
@@ -16,34 +16,37 @@ from typing import Any, Protocol, runtime_checkable
 from framework.tracking.signals import ending_with_parent
 
 LARGEST = 2**17
-"""Bytes of a packet that describes a job."""
+"""Largest size, in bytes, of a packet that describes a job."""
 PATIENCE = 60.0
-"""Seconds that the start of a process may take, without what it imports then."""
+"""Seconds that the start of a process may take, without its imports."""
 _SERVER = "framework.sweeps.fork_server"
-_SET_CHILD_SUBREAPER = 36  # of prctl.h
+_SET_CHILD_SUBREAPER = 36  # constant of prctl.h
 
 
 @runtime_checkable
 class Process(Protocol):
-    """A job that runs, or has run.
+    """Contract of a job that runs or has run.
 
     Attributes:
-        seconds: processor time of all its processes, once it has ended; None where nobody saw how it did.
+        seconds: Processor time of all its processes after it has ended; None if its end was not observed.
     """
 
     seconds: float | None
 
     @property
     def pid(self) -> int | None:
-        """That of its session; None before it is known."""
+        """Return the id of the first process of its session; None before it is known."""
         ...
 
     def poll(self) -> int | None:
-        """Exit code, below 0 the signal that killed it, or that it was sent where nobody saw; None while it runs."""
+        """Return the exit code, or None while the job runs.
+
+        A negative code is the signal that killed the job or, if its end was not observed, the signal sent to it.
+        """
         ...
 
     def send(self, number: int) -> None:
-        """A signal for the job's first process, which tells the others."""
+        """Send a signal to the job's first process, which informs the others."""
         ...
 
     def kill(self) -> None:
@@ -52,12 +55,15 @@ class Process(Protocol):
 
 
 Starter = Callable[[Sequence[str], Mapping[str, str], int, int], Process]
-"""Starts a job, given a command of Python, the whole environment, the descriptor of the file for its output, and one to
-hold until the last process of the job has ended."""
+"""Type of a function that starts a job.
+
+Its arguments are a Python command, the whole environment, the descriptor of the output file, and the descriptor of a
+lock that is held until the last process of the job has ended.
+"""
 
 
 class Fresh:
-    """A job in a process of its own."""
+    """Job in a separate process."""
 
     def __init__(
         self, command: Sequence[str], environment: Mapping[str, str], console: int, lock: int
@@ -69,7 +75,7 @@ class Fresh:
             stderr=subprocess.STDOUT,
             env=environment,
             pass_fds=(lock,),
-            start_new_session=True,  # Ctrl-C comes to the sweep alone, and from there once to each job
+            start_new_session=True,  # Ctrl-C reaches the sweep only, which passes it on once to each job
             preexec_fn=ending_with_parent(),
         )
         self.pid = self._process.pid
@@ -92,14 +98,14 @@ class Fresh:
 
 
 class Forks:
-    """Starts jobs as forks of one process (`fork_server`), which is started with the first of them; Linux.
+    """Starter of jobs as forks of one server process (`fork_server`), which is started with the first job; Linux only.
 
-    A job gets all that a process of its own would have, but for modules that are there already. If that process dies,
-    its jobs are told to end; later jobs get another one, or processes of their own where it could not start any, as do
-    jobs that it had not started yet.
+    A job has everything that a separate process would have, but the modules are already imported. If the server dies,
+    its running jobs are told to end. Later jobs get another server, or separate processes if the first server had not
+    forked any job. Jobs that the dead server had not started yet get separate processes.
 
     Args:
-        modules: what it imports.
+        modules: Modules that the server imports.
     """
 
     def __init__(self, modules: Sequence[str] = ()) -> None:
@@ -119,19 +125,20 @@ class Forks:
             if self._server is None:
                 self._server = _Server(command, self._modules, environment)
             return self._server.fork(command, environment, console, lock)
-        except OSError:  # it could not start; a command of more than a packet, a limit of descriptors
+        except OSError:
+            # the server did not start, the command exceeds a packet, or too many descriptors are open
             self._useless = self._server is None
             return Fresh(command, environment, console, lock)
 
     def close(self) -> None:
-        """End the process; jobs that still run in forks of it are told to end."""
+        """End the server process; jobs that still run as its forks are told to end."""
         if self._server is not None:
             self._server.close()
         self._server = None
 
 
 class _Server:
-    """Raises OSError where the process does not start."""
+    """Connection to a server process (`fork_server`); the constructor raises OSError if the process does not start."""
 
     def __init__(
         self, command: Sequence[str], modules: Sequence[str], environment: Mapping[str, str]
@@ -166,13 +173,14 @@ class _Server:
     def fork(
         self, command: Sequence[str], environment: Mapping[str, str], console: int, lock: int
     ) -> "_Fork":
+        """Request a fork for a job; raises OSError if the job does not fit into a packet."""
         own = {key: value for key, value in environment.items() if self._environment.get(key) != value}
         arguments = command[_target(command) + len(_run(command)) :]
         packet = json.dumps({"arguments": arguments, "environment": own}).encode()
         if len(packet) > LARGEST:
             raise OSError("a packet is smaller")
         socket.send_fds(self._channel, [packet], [console, lock])
-        path = Path(f"/proc/self/fd/{console}").readlink()  # whoever opened it closes it soon
+        path = Path(f"/proc/self/fd/{console}").readlink()  # the caller closes the descriptor soon
 
         def fresh() -> Process:
             with path.open("ab") as again:
@@ -183,7 +191,7 @@ class _Server:
         return job
 
     def listen(self) -> None:
-        """Take what the process has answered."""
+        """Read the answers that the server has sent, and pass them to the jobs."""
         while self.alive:
             try:
                 packet = self._channel.recv(LARGEST, socket.MSG_DONTWAIT)
@@ -193,7 +201,7 @@ class _Server:
                 packet = b""
             if not packet:
                 self.alive = False
-                self.close()  # when it has ended, its jobs are children of this process
+                self.close()  # after the server has ended, its jobs are children of this process
                 return
             answer: dict[str, Any] = json.loads(packet)
             if "started" in answer:
@@ -204,13 +212,14 @@ class _Server:
                 self._running.pop(answer["ended"]).end(answer["code"], answer["seconds"])
 
     def close(self) -> None:
+        """Close the socket and kill the server."""
         self._channel.close()
         self._process.kill()
         self._process.wait()
 
 
 class _Fork:
-    """A job that a server is to fork; a process of its own where the server dies before it has."""
+    """Job that a server was asked to fork; it gets a separate process if the server dies before the fork."""
 
     def __init__(self, server: _Server, fresh: Callable[[], Process]) -> None:
         self._server = server
@@ -222,11 +231,13 @@ class _Fork:
         self.seconds: float | None = None
 
     def begin(self, pid: int) -> None:
+        """Note that the job was started, and send it the signals that came before."""
         self.pid = pid
         for number in self._early:
             self.send(number)
 
     def end(self, code: int, seconds: float) -> None:
+        """Note the exit code and the processor time of the job."""
         self._code, self.seconds = code, seconds
 
     def poll(self) -> int | None:
@@ -244,7 +255,7 @@ class _Fork:
         elif not self._server.alive and self.pid is not None:
             try:
                 ended, status, usage = os.wait4(self.pid, os.WNOHANG)
-            except ChildProcessError:  # the server asked how it ended, and died before it said so
+            except ChildProcessError:  # the server read the exit code and died before it sent the code
                 self._code = -signal.SIGTERM
             else:
                 if ended:
@@ -254,7 +265,7 @@ class _Fork:
     def send(self, number: int) -> None:
         self._server.listen()
         if self.pid is None:
-            self._early.append(number)  # while the server imports
+            self._early.append(number)  # the server is still importing
         elif self._code is None:
             with suppress(ProcessLookupError):
                 os.kill(self.pid, number)
@@ -270,22 +281,22 @@ class _Fork:
 
 
 def _adopt_orphans() -> None:
-    """Become the parent of the children of a child that dies (Linux), so that their ends are known."""
+    """Make this process the parent of the children of a dead child (Linux), so that it observes their ends."""
     ctypes.CDLL(None).prctl(_SET_CHILD_SUBREAPER, 1)
 
 
 def _target(command: Sequence[str]) -> int:
-    """Where options of Python end in a command of it."""
+    """Return the index at which the options of Python end in a Python command."""
     return next(index for index, word in enumerate(command) if index and (word == "-m" or word[0] != "-"))
 
 
 def _run(command: Sequence[str]) -> Sequence[str]:
-    """`-m` and a module, or a file."""
+    """Return the target of a Python command: `-m` and a module, or a file."""
     start = _target(command)
     return command[start : start + (2 if command[start] == "-m" else 1)]
 
 
 def _of_children() -> float:
-    """Processor seconds of the processes that were waited for, and of theirs."""
+    """Return the processor seconds of all ended child processes and their descendants."""
     usage = resource.getrusage(resource.RUSAGE_CHILDREN)
     return usage.ru_utime + usage.ru_stime

@@ -1,4 +1,4 @@
-"""Finds the mistakes in a sweep's jobs before any of them runs, in a process of its own that may import torch."""
+"""Check of all jobs of a sweep before any of them runs, in a separate process that may import torch."""
 
 import json
 import signal
@@ -18,20 +18,20 @@ COMMAND: Sequence[str] = (sys.executable, "-P", "-m", "framework.sweeps.rehearsa
 
 
 def refuse_mistakes(jobs: Sequence[tuple[Sequence[str], Mapping[str, Any]]]) -> None:
-    """Check the configs of trainings, and of their data what a look at the user's files says (`Data.check_files`).
+    """Check the configs of all training jobs, and the user's files that their data sets read (`Data.check_files`).
 
     Args:
-        jobs: overrides and composed values of each.
+        jobs: Overrides and composed values of each job.
 
     Raises:
-        ConfigError: what the first job at fault would say of itself.
+        ConfigError: A job has a mistake; the message is the one that the first such job would print.
     """
     training = [
         (list(overrides), values) for overrides, values in jobs if values.get("mode") == {"name": "train"}
     ]
     for overrides, values in training:
         try:
-            Config.of(values, Path(), overrides)  # takes no process
+            Config.of(values, Path(), overrides)  # this part needs no separate process
             require_read("train", overrides)
         except UserError as error:
             raise ConfigError(_told(overrides, str(error))) from error
@@ -47,7 +47,7 @@ def refuse_mistakes(jobs: Sequence[tuple[Sequence[str], Mapping[str, Any]]]) -> 
     )
     if done.returncode == 2:
         raise ConfigError(done.stdout)
-    # anything else that went wrong is for the jobs to say
+    # any other failure is reported by the jobs themselves
 
 
 def _told(overrides: Sequence[str], message: str) -> str:
@@ -55,7 +55,7 @@ def _told(overrides: Sequence[str], message: str) -> str:
 
 
 def main() -> None:
-    """Read jobs from standard input; print the first mistake and exit with 2."""
+    """Read jobs from standard input; print the first mistake, if any, and then exit with 2."""
     looked_at: set[str] = set()
     for overrides, values in json.load(sys.stdin):
         try:
