@@ -1,4 +1,4 @@
-"""What a command line can ask for; each mode is a module of its own, imported when it is chosen."""
+"""Modes of the command line; each mode is a separate module, which is imported when the mode is chosen."""
 
 import sys
 from collections.abc import Sequence
@@ -16,10 +16,10 @@ from framework.storage.enclosed import require_enclosed
 
 
 def run(values: dict[str, Any], folder: Path, overrides: Sequence[str]) -> float | None:
-    """Run the chosen mode on composed values; what it returns, if anything, is what a sweeper minimises.
+    """Run the chosen mode on composed values, and return its value for a sweeper to minimise, or None.
 
     Raises:
-        ConfigError: an unknown mode, or a fault in the config.
+        ConfigError: The mode is unknown, or the config has a fault.
     """
     require_enclosed(folder)
     resumed = values.get("resume") not in ("auto", "never", None)
@@ -33,18 +33,19 @@ def run(values: dict[str, Any], folder: Path, overrides: Sequence[str]) -> float
             f"mode = {name!r}: unknown.{did_you_mean(str(name), MODES)} Known: {', '.join(MODES)}."
         )
     config = Config.of(values, folder, overrides)
-    if not resumed:  # which has the settings of a run that was begun, perhaps when they were not looked at
+    # a resumed run keeps its settings, which an earlier version may have accepted without this check
+    if not resumed:
         require_read(name, overrides)
         for sentence in idle(values, overrides):
             refuse_idle(folder, sentence)
-    if name == "train":  # what is wrong is found before Lightning is imported, which takes seconds
+    if name == "train":  # finds mistakes before the import of Lightning, which takes seconds
         require_device(config.settings.trainer.get("accelerator"))
         _ = config.parts
     return import_module(f"framework.modes.{name}").run(config)
 
 
 def _sent_the_rest(folder: Path, store: str | None) -> bool:
-    """Send what a run that finished could not send, since its process was killed meanwhile; whether there was any."""
+    """Send the lines that a finished run has not sent because it was killed; return whether there were any."""
     from framework.tracking.ended import sync
     from framework.tracking.run_info import read_run_info
 
@@ -62,7 +63,10 @@ def _sent_the_rest(folder: Path, store: str | None) -> bool:
 def _stored(
     folder: Path, given: dict[str, Any], overrides: Sequence[str]
 ) -> tuple[dict[str, Any], list[str]]:
-    """The config and overrides the run in `folder` was started with, but for how it is run now, which is `given`."""
+    """Return the config and overrides with which the run in `folder` was started.
+
+    Keys that do not affect the results (`HOW`) are taken from the present command, `given`, if it sets them.
+    """
     from framework.configuration.paths import flat, paths_of, require_repeated
     from framework.runs.run import HOW
     from framework.storage.plain_values import read_yaml
@@ -70,7 +74,7 @@ def _stored(
     from framework.tracking.stores import confirmed
 
     keys = {item: item.lstrip("+~").partition("=")[0] for item in overrides}
-    again = ("resume", "checkpoint", *HOW)  # and `stored.…`: paths that are said again
+    again = ("resume", "checkpoint", *HOW)  # and keys `stored.…`, which repeat stored paths
     others = [item for item, key in keys.items() if key not in again and not key.startswith("stored.")]
     if others:
         raise ConfigError(
@@ -100,7 +104,7 @@ def _stored(
     said = flat(given.get("stored") or {})
     said |= {"checkpoint": given["checkpoint"]} if "checkpoint" in keys.values() else {}
     require_repeated(paths_of(values), said, folder)
-    values["resume"] = "auto"  # also where it was begun with resume=never
+    values["resume"] = "auto"  # also if the run was started with resume=never
     for key in HOW:
         if key in keys.values():
             group, _, name = key.rpartition(".")

@@ -1,4 +1,4 @@
-"""mode=calibrate: wrappers around a trained model, fitted to the validation split and tested."""
+"""mode=calibrate: fit uncertainty wrappers around a trained model to the validation split, and test the result."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -21,18 +21,18 @@ from framework.target import Target
 from framework.uncertainty import Several
 
 FEW = 2
-"""Samples of which wrappers are tried before anything is fitted."""
+"""Number of samples on which wrappers are tried before anything is fitted."""
 
 
 class CalibrateOptions(Options):
-    """Nothing: what is fitted is chosen by `uncertainty`."""
+    """Options of mode=calibrate, which has none: `uncertainty` chooses the wrappers to fit."""
 
 
 def run(config: Config) -> None:
-    """Write checkpoints/model.ckpt, which every other mode takes; print its table row.
+    """Calibrate the wrappers, write checkpoints/model.ckpt for the other modes, and print the table row of its test.
 
     Raises:
-        ConfigError: no wrapper is chosen, or one that has to be trained, or has been fitted already.
+        ConfigError: No wrapper is chosen, or a chosen wrapper must be trained or has been fitted already.
     """
     config.options(CalibrateOptions)
     wrappers = chosen(config.values.get("uncertainty") or {})
@@ -59,10 +59,10 @@ def run(config: Config) -> None:
 
 
 def chosen(wrappers: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """The wrappers of a config, innermost first, checked.
+    """Return the checked wrappers of a config, innermost first.
 
     Raises:
-        ConfigError: there is none, or one of them trains several models.
+        ConfigError: There is no wrapper, or one of them trains several models.
     """
     if not wrappers:
         raise ConfigError(
@@ -83,14 +83,17 @@ def chosen(wrappers: Mapping[str, Any]) -> list[dict[str, Any]]:
 def around_trained(
     predictor: Predictor, wrappers: Sequence[Mapping[str, Any]], target: Target, inputs: Tensor
 ) -> Predictor:
-    """A trained predictor in wrappers, behind its fixed encoders, in evaluation mode.
+    """Return a trained predictor in wrappers, behind its fixed encoders, in evaluation mode.
 
     Args:
-        inputs: of a few samples.
+        predictor: Trained predictor.
+        wrappers: Configs of the wrappers, innermost first.
+        target: Target that is predicted.
+        inputs: Inputs of a few samples.
 
     Raises:
-        ConfigError: a wrapper wants more than one model, has weights of its own to be trained, or drops the sets that
-            what it wraps promises; or as it says.
+        ConfigError: A wrapper needs more than one model, has weights of its own to train, or would drop the conformal
+            prediction sets of the predictor inside it; or the wrapper itself raises the error.
     """
     front = predictor if isinstance(predictor, FrozenFrontEnd) else None
     inner = predictor if front is None else front.predictor

@@ -1,4 +1,4 @@
-"""mode=check: the contract of installed plugins on stiff and extreme cases; fails where a plugin does."""
+"""mode=check: test the contract of installed plugins on stiff and extreme cases, and fail if a plugin breaks it."""
 
 import math
 import time
@@ -35,15 +35,15 @@ UNCOMPARED = (
 
 
 class ContractBroken(UserError):
-    """A plugin does not do what its group's contract promises."""
+    """Error for a plugin that breaks the contract of its registry."""
 
 
 def run(config: Config) -> None:
-    """Print a table for every plugin chosen on the command line.
+    """Check every plugin chosen on the command line, and print a table for each.
 
     Raises:
-        ConfigError: nothing that has a contract is chosen.
-        ContractBroken: a property does not hold; the table says which and where.
+        ConfigError: No plugin with a contract is chosen.
+        ContractBroken: A property does not hold; the table says which one, and in which case.
     """
     config.options(Options)
     if config.settings.threads:
@@ -72,7 +72,7 @@ def run(config: Config) -> None:
 
 
 def examine(plugin: Contract, console: Console) -> tuple[Table, list[dict[str, object]], list[str]]:
-    """The table of one plugin (the worst row of each property), every finding, and what failed."""
+    """Return the table of one plugin (worst row of each property), all findings, and the names of failed properties."""
     start = time.perf_counter()
     worst: dict[str, tuple[Row, Finding]] = {}
     lines: list[dict[str, object]] = []
@@ -91,7 +91,7 @@ def examine(plugin: Contract, console: Console) -> tuple[Table, list[dict[str, o
 
 
 def _chosen(values: Mapping[str, Any]) -> list[tuple[str, Mapping[str, Any]]]:
-    """Group and config of every plugin named that has a contract."""
+    """Return the registry and the config of every chosen plugin that has a contract."""
     found = []
     for group in CONTRACTS:
         config = values.get(group)
@@ -103,7 +103,7 @@ def _chosen(values: Mapping[str, Any]) -> list[tuple[str, Mapping[str, Any]]]:
 
 
 def _excess(finding: Finding) -> tuple[bool, float]:
-    """How near to its limit, or beyond."""
+    """Return a sort key that grows with the ratio of the error to its limit; findings that fail come last."""
     error = math.inf if math.isnan(finding.error) else finding.error
     return not finding.holds, error / finding.limit if finding.limit > 0 else error
 

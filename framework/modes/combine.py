@@ -1,4 +1,4 @@
-"""mode=combine: models that were trained apart become the members of one wrapper, which is calibrated and tested."""
+"""mode=combine: join separately trained models as the members of one wrapper, calibrate it and test it."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -28,14 +28,14 @@ _MODEL = "checkpoints/model.ckpt"
 
 
 class CombineOptions(Options):
-    """Which models become members, and of what."""
+    """Options of mode=combine: the models that become members, and the wrapper that joins them."""
 
     members: str | list[str]
     wrapper: str
 
 
 def run(config: Config) -> None:
-    """Write checkpoints/model.ckpt, which every other mode takes; print its table row."""
+    """Join the members, write checkpoints/model.ckpt for the other modes, and print the table row of its test."""
     options = config.options(CombineOptions)
     console = begin(config.settings)
     sources = found(options.members)
@@ -64,11 +64,13 @@ def run(config: Config) -> None:
 
 
 def found(members: str | Sequence[str]) -> list[str | Path]:
-    """Run folders, files or MLflow run ids; of a folder of runs those that hold a trained model, by name,
-    and where it holds none itself those of its jobs below.
+    """Return the run folders, checkpoint files or MLflow run ids of the members.
+
+    If `members` is a folder of runs, these are the runs directly in it that hold a trained model, sorted by name. If
+    there are none, they are the jobs at any depth that hold one.
 
     Raises:
-        ConfigError: fewer than two.
+        ConfigError: There are fewer than two members.
     """
     if not isinstance(members, str):
         listed: list[str | Path] = list(members)
@@ -86,10 +88,10 @@ def found(members: str | Sequence[str]) -> list[str | Path]:
 
 
 def common(members: Sequence[Description]) -> Description:
-    """What all members say of themselves.
+    """Return the description that all members share.
 
     Raises:
-        CheckpointError: two of them are models of different kinds; says in what.
+        CheckpointError: Two members differ in data, parts, target or inputs; the message says in which.
     """
     first = members[0]
     for other in members[1:]:
@@ -119,10 +121,10 @@ def common(members: Sequence[Description]) -> Description:
 
 
 def wrapping(wrapper: str, count: int) -> dict[str, Any]:
-    """The config of a wrapper around `count` members.
+    """Return the config of a wrapper around `count` members.
 
     Raises:
-        ConfigError: the wrapper cannot take members that were trained apart.
+        ConfigError: The wrapper cannot join separately trained members.
     """
     kind = load("uncertainty", wrapper)
     if not issubclass(kind, Joining):
@@ -134,7 +136,7 @@ def wrapping(wrapper: str, count: int) -> dict[str, Any]:
 
 
 def joined(config: dict[str, Any], data: Data, members: Sequence[Predictor]) -> Predictor:
-    """The predictor of `config`, of which `wrapping` is part, around the members."""
+    """Return the predictor of `config`, which contains the wrapper of `wrapping`, with the members joined in it."""
     predictor = build_predictor(config, data.target, data.input_shape, 0, data.columns)
     if isinstance(predictor, FrozenFrontEnd):
         members = [_inner(predictor, member, index) for index, member in enumerate(members)]
@@ -143,7 +145,10 @@ def joined(config: dict[str, Any], data: Data, members: Sequence[Predictor]) -> 
 
 
 def _inner(whole: FrozenFrontEnd, member: Predictor, index: int) -> Predictor:
-    """What reads the features of a member's encoders, which must be the same in all; they are put into `whole`."""
+    """Return the part of a member behind its fixed encoders.
+
+    The encoders must be equal in all members. Those of the first member (`index` 0) are copied into `whole`.
+    """
     assert isinstance(member, FrozenFrontEnd)
     state = member.encoders.state_dict()
     if index == 0:

@@ -1,4 +1,4 @@
-"""mode=encode: features of very many files, in parts that several jobs write and a stopped one goes on with."""
+"""mode=encode: compute the features of very many files in parts, which several jobs can share and a job can resume."""
 
 import hashlib
 import io
@@ -30,11 +30,11 @@ from framework.storage.progress import Work
 from framework.training.batches import Batches
 
 DESCRIPTION, NAMES = "encoding.json", "files.txt"
-"""What stands beside the parts: what was computed, and of which files, a line each."""
+"""Files beside the parts: the settings of the computation, and the names of the encoded files, one per line."""
 
 
 class EncodeOptions(Options):
-    """Which files to encode, and where the features go."""
+    """Options of mode=encode: the files to encode, and the folder for the features."""
 
     files: str
     into: str
@@ -44,13 +44,13 @@ class EncodeOptions(Options):
 
 @dataclass(frozen=True)
 class Collection:
-    """Files whose features are wanted, in parts of so many, and where the features go.
+    """Files to encode, divided into parts, and the folder for the features.
 
     Attributes:
-        root: what the names are relative to.
-        names: of the files, in order.
-        part: files of a part.
-        into: the folder of the parts.
+        root: Folder to which the names are relative.
+        names: Names of the files, in order.
+        part: Number of files in a part.
+        into: Folder of the parts.
     """
 
     root: Path
@@ -60,21 +60,24 @@ class Collection:
 
     @property
     def parts(self) -> int:
+        """Return the number of parts."""
         return -(-len(self.names) // self.part)
 
     def files(self, number: int) -> list[Path]:
-        """Those of a part."""
+        """Return the files of the part with this number, counted from 0."""
         return [self.root / name for name in self.names[number * self.part : (number + 1) * self.part]]
 
     def path(self, number: int) -> Path:
+        """Return the file for the features of a part."""
         return self.into / f"part-{number:06}.npy"
 
     def missing(self) -> list[int]:
+        """Return the numbers of the parts that are not written yet."""
         return [number for number in range(self.parts) if not self.path(number).is_file()]
 
 
 def run(config: Config) -> None:
-    """Write this job's share of the parts; those that are there already are left as they are."""
+    """Write this job's share of the parts; parts that exist already are left unchanged."""
     options = config.options(EncodeOptions)
     console = begin(config.settings)
     chosen = config.values
@@ -100,11 +103,11 @@ def run(config: Config) -> None:
         except BaseException:
             if (
                 len(collection.missing()) == collection.parts
-            ):  # nothing is described: another attempt may differ
+            ):  # without any part, the description is removed, as another attempt may use other settings
                 for name in (DESCRIPTION, NAMES):
                     (collection.into / name).unlink(missing_ok=True)
             raise
-        describe(collection, parts)  # again, where another job failed meanwhile
+        describe(collection, parts)  # written again if another job failed meanwhile and removed it
         if bad:
             left_out = "".join(f"{spelled(file.relative_to(collection.root))}\n" for file in bad)
             write_whole(collection.into / UNREADABLE, left_out.encode())
@@ -117,10 +120,10 @@ def run(config: Config) -> None:
 
 
 def share(parts: int, which: str) -> range:
-    """The parts of job "2/4": every fourth from the second.
+    """Return the parts of a job: for job "2/4", every fourth part from the second on.
 
     Raises:
-        ConfigError: a job beyond the last.
+        ConfigError: The number of the job exceeds the number of jobs.
     """
     number, jobs = map(int, which.split("/"))
     if number > jobs:
@@ -131,11 +134,11 @@ def share(parts: int, which: str) -> range:
 
 
 def collected(root: Path, into: Path, part: int) -> Collection:
-    """All files of a folder and its subfolders but hidden ones, by name.
+    """Return all files of a folder and its subfolders except hidden ones, sorted by name.
 
     Raises:
-        DataError: there are none.
-        ConfigError: the features would go among them.
+        DataError: There are no files.
+        ConfigError: The folder for the features lies inside the folder of the files.
     """
     if into.resolve().is_relative_to(root.resolve()):
         raise ConfigError(
@@ -151,10 +154,10 @@ def collected(root: Path, into: Path, part: int) -> Collection:
 
 
 def describe(collection: Collection, config: Mapping[str, Any]) -> None:
-    """Say beside the parts what they are; several jobs say the same.
+    """Write the description of the parts beside them, or check that an existing one is the same.
 
     Raises:
-        ConfigError: there are parts of something else.
+        ConfigError: The folder holds parts of other files or settings.
     """
     text = "".join(f"{spelled(name)}\n" for name in collection.names).encode()
     said = {
@@ -181,11 +184,17 @@ def describe(collection: Collection, config: Mapping[str, Any]) -> None:
 
 @torch.no_grad()
 def encode(collection: Collection, config: Mapping[str, Any], mine: Sequence[int], settings: Settings) -> int:
-    """Write those parts that are not there; returns how many. A part is whole or absent.
+    """Write the missing parts, and return their number; a part is whole or absent.
+
+    Args:
+        collection: Files to encode.
+        config: Resolved configs of the data set and the encoders.
+        mine: Numbers of the parts of this job.
+        settings: Settings of the command.
 
     Raises:
-        ConfigError: an encoder learns, or there is none.
-        DataError: a file cannot be read, or holds several samples; names it. Parts before it are kept.
+        ConfigError: An encoder learns, or there is no encoder.
+        DataError: A file cannot be read, or holds several samples; the message names it. Earlier parts are kept.
     """
     if not config["encoder"]:
         raise ConfigError("mode=encode wants an encoder. Name one; mode=plugins lists them.")
@@ -224,10 +233,10 @@ def encode(collection: Collection, config: Mapping[str, Any], mine: Sequence[int
 def chain(
     parts: Sequence[Mapping[str, Any]], shape: tuple[int, ...], columns: tuple[str, ...]
 ) -> list[Encoder]:
-    """The encoders, each built for the features of the one before it.
+    """Return the encoders, each built for the features that the encoder before it returns.
 
     Raises:
-        ConfigError: one learns.
+        ConfigError: An encoder learns, or draws random numbers.
     """
     found: list[Encoder] = []
     for part in parts:

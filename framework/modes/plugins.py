@@ -1,4 +1,4 @@
-"""mode=plugins: every registry with origin, a line of description and the paper; imports no plugin."""
+"""mode=plugins: list the plugins of every registry with description, paper and origin, without importing any."""
 
 import ast
 import re
@@ -16,13 +16,13 @@ from framework.errors import shown
 
 
 def run(config: Config) -> None:
-    """Print the list."""
+    """Print the list of plugins."""
     config.options(Options)
     show()
 
 
 def show() -> None:
-    """Print every registry: name, what it is, the paper, and the package it comes from."""
+    """Print every registry with the name, description, paper and package of each plugin."""
     console = Console(highlight=False)
     for group in GROUPS:
         console.print(Text(group, style="bold"))
@@ -38,7 +38,7 @@ def show() -> None:
 
 
 def paper(bibtex: str) -> str:
-    """Return 'Author et al. 2015, Title' from a BibTeX entry; "" from one without an author."""
+    """Return 'Author et al. 2015, Title' for a BibTeX entry; "" for an entry without an author."""
     authors = _value(bibtex, "author").split(" and ")
     if authors == [""]:
         return ""
@@ -56,14 +56,14 @@ def _value(bibtex: str, key: str) -> str:
 
 
 def _with_accent(command: re.Match[str]) -> str:
-    """Return the letter that a LaTeX command for an accent stands for."""
+    """Return the accented letter for which a LaTeX command stands."""
     marks = {'"': "\u0308", "'": "\u0301", "`": "\u0300", "^": "\u0302", "~": "\u0303"}
     return unicodedata.normalize("NFC", command[2] + marks[command[1]])
 
 
 @dataclass(frozen=True)
 class Description:
-    """What `mode=plugins` says of a plugin, read from its source without importing it."""
+    """Description of a plugin for `mode=plugins`, read from its source without importing it."""
 
     group: str
     name: str
@@ -73,7 +73,7 @@ class Description:
 
 
 def describe(group: str, entry: Entry) -> Description:
-    """First docstring line and BibTeX of the class an entry point names."""
+    """Return the description of a plugin: first docstring line and BibTeX of the class that its entry point names."""
     summary, bibtex = "(source not found)", ""
     module, _, attribute = entry.value.partition(":")
     package, *rest = module.split(".")
@@ -91,11 +91,11 @@ def _candidates(root: Path, rest: list[str]) -> tuple[Path, Path]:
 
 def _docstring_and_bibtex(path: Path, attribute: str) -> tuple[str, str]:
     try:
-        tree = ast.parse(path.read_bytes())  # bytes, since the file may say that it is in another encoding
+        tree = ast.parse(path.read_bytes())  # bytes, since the file may declare another encoding
     except SyntaxError as error:
         place = f" line {error.lineno}" if error.lineno else ""
         return f"(broken: {path.name}{place} does not parse)", ""
-    # unreadable, a null byte, or far too deep
+    # the file is unreadable, contains a null byte, or nests too deeply
     except (OSError, ValueError, RecursionError, MemoryError) as error:
         return f"(broken: {path.name} cannot be read: {shown(error)})", ""
     for node in tree.body:
@@ -111,7 +111,7 @@ def _docstring_and_bibtex(path: Path, attribute: str) -> tuple[str, str]:
 
 
 def _text(value: ast.expr, module: ast.Module) -> str:
-    """A text as it stands in the source, or under a name of the same module; "" where it is computed."""
+    """Return a text that the source gives literally or by a name of the same module; "" if it is computed."""
     if isinstance(value, ast.Name):
         named = (item for item in module.body if isinstance(item, ast.Assign))
         found = (item.value for item in named if value.id in (getattr(one, "id", "") for one in item.targets))

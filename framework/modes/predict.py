@@ -1,5 +1,7 @@
-"""mode=predict: a CSV of point predictions and uncertainties for a user's own files, or for the test split; images as
-PNG files beside it, and maps where the data set draws them."""
+"""mode=predict: write point predictions and uncertainties for a user's own files or the test split to a CSV file.
+
+Predicted images are written as PNG files beside it, and so are maps if the data set draws them.
+"""
 
 import csv
 import math
@@ -34,14 +36,19 @@ ENDS = ("_low", "_high", "_low_deg", "_high_deg")
 
 
 class PredictOptions(Options):
-    """What to predict for: a file or a folder of files, or the test split; and the mass of intervals."""
+    """Options of mode=predict.
+
+    Attributes:
+        files: File or folder of files to predict for; None for the test split.
+        interval: Probability of the prediction intervals; None for no intervals.
+    """
 
     files: str | None = None
     interval: Annotated[float, Field(gt=0, lt=1)] | None = None
 
 
 def run(config: Config) -> None:
-    """Write predictions.csv into the run folder."""
+    """Predict, and write predictions.csv into the run folder."""
     options = config.options(PredictOptions)
     files, folders = files_in(Path(options.files).expanduser()) if options.files else ([], [])
     session = for_trained(config, prepare=not files)
@@ -89,11 +96,14 @@ def predictions(
     images: Path,
     mass: float | None = None,
 ) -> tuple[list[dict[str, str]], list[tuple[Tensor, Tensor]]]:
-    """One row a sample: its name, the point prediction, the density's entropy in nats, and the set that the model
-    promises or the interval of that mass, with standard errors where its ends are drawn. And of each batch, where maps
-    are drawn, what is predicted with its standard deviation, (batch, number).
+    """Return the rows of the table, and the tensors for maps.
 
-    Predicted images are written into the folder `images`; the row names the file.
+    A row holds the name of a sample, the point prediction and the density's entropy in nats. It also holds the
+    conformal prediction set, if the model has one, or else the interval of probability `mass`. Standard errors are
+    given if the ends of intervals are estimated from samples. If the data set draws maps of files, the second list
+    holds, for each batch, the point predictions and their standard deviations, each (batch, number).
+
+    Predicted images are written into the folder `images`, and the row names the file.
     """
     dataset = data.read(files) if files else data.splits().test
     loader = Batches(data, batch_size=BLOCK, workers=settings.workers, seed=settings.seed).of(dataset)
@@ -126,7 +136,7 @@ def predictions(
 def _intervals(
     target: Target, prediction: Prediction, mass: float | None
 ) -> Mapping[str, Sequence[Any] | Tensor]:
-    """Columns of the set that comes with the density; of one without a set those of intervals of a mass."""
+    """Return the columns of the density's prediction set or, without a set, of the intervals of a given probability."""
     sets = value_set(prediction.density)
     if sets is None:
         return ends(target, prediction.interval(mass)) if mass else {}
@@ -146,7 +156,7 @@ def _maps(
 
 
 def _names(data: Data, files: Sequence[Path], samples: int) -> list[str]:
-    """Of each sample: its file, with its row where a file holds several; without files its place in the test split."""
+    """Return a name for each sample: its file, with the row if a file holds several, or its place in the test split."""
     if not files:
         return [f"test {number}" for number in range(samples)]
     if samples == len(files):
@@ -160,7 +170,10 @@ def _names(data: Data, files: Sequence[Path], samples: int) -> list[str]:
 
 
 def text(value: str | float | Tensor, key: str) -> str:
-    """A cell of the table; of a large number in the user's unit the small digits count, of an interval's ends all."""
+    """Return the text of a table cell, with 15 significant digits for the ends of intervals and 10 for other numbers.
+
+    In the user's unit a number can be large, and its last digits still matter.
+    """
     if isinstance(value, str):
         return value
     number = float(value)

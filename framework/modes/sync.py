@@ -1,4 +1,4 @@
-"""mode=sync: send to the tracking store what a run could not send while it ran."""
+"""mode=sync: send the journal lines that a run could not send while it ran to the tracking store."""
 
 from pathlib import Path
 
@@ -10,13 +10,13 @@ from framework.tracking.ended import sync
 
 
 class SyncOptions(Options):
-    """Whose journal to send."""
+    """Options of mode=sync: the folder of the run whose journal is sent."""
 
     run: str
 
 
 def run(config: Config) -> None:
-    """Replay the journal of `mode.run`."""
+    """Send the journal of `mode.run`, and print the number of lines sent."""
     folder = Path(config.options(SyncOptions).run).expanduser()
     if not (folder / "run.json").is_file():
         raise ConfigError(

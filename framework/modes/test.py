@@ -7,7 +7,7 @@ from framework.runs.session import for_trained, tested
 
 
 def run(config: Config) -> None:
-    """Print the table row of `checkpoint`."""
+    """Test the model of `checkpoint`, and print its table row."""
     config.options(Options)
     session = tested(for_trained(config))
     with opened(session.config) as run:

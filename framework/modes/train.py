@@ -1,4 +1,4 @@
-"""mode=train: fit, calibrate, test, report."""
+"""mode=train: fit a model, calibrate it, test it and report the results."""
 
 from framework.configuration.config import Config, Options
 from framework.reports.report import report_test, report_training
@@ -10,7 +10,7 @@ from framework.storage.first_rank import first_rank
 
 
 def run(config: Config) -> float:
-    """Returns the validation loss of the kept weights, nats: what a sweeper minimises."""
+    """Train and test a model, and return the validation loss of the kept weights (nats), which a sweeper minimises."""
     config.options(Options)
     session = for_training(config)
     with opened(config) as run:

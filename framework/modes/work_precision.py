@@ -1,4 +1,4 @@
-"""mode=work_precision: error against run time along a declared knob of a trained model."""
+"""mode=work_precision: measure error against run time along a declared knob of a trained model."""
 
 from typing import Annotated, Literal
 
@@ -22,11 +22,11 @@ from framework.runs.run import Run, opened
 from framework.runs.session import Session, for_trained
 
 ERROR, AXIS = "error_nats", "error of the mean log-likelihood (nats, RMS)"
-"""What is drawn of a head's knob where no metrics are named, and the label of its axis."""
+"""Quantity that is drawn for a knob of a density head if no metrics are named, and the label of its axis."""
 
 
 class WorkPrecisionOptions(Options):
-    """Which knob is turned, to which values, and what is measured."""
+    """Options of mode=work_precision: the knob, its values, and the quantities to measure."""
 
     knob: str | None = None
     values: list[Positive] | None = None
@@ -37,7 +37,7 @@ class WorkPrecisionOptions(Options):
 
 
 def run(config: Config) -> None:
-    """Write work_precision.csv and a picture; print the table with Pareto points marked."""
+    """Write work_precision.csv and a figure, and print the table with the points of the Pareto front marked."""
     options = config.options(WorkPrecisionOptions)
     session = for_trained(config)
     with opened(session.config) as run:
@@ -103,15 +103,15 @@ def _run(run: Run, session: Session, options: WorkPrecisionOptions) -> None:
 
 
 def _refuse_unmeasured(config: Config, measured: bool, compared: bool) -> None:
-    """Refuse settings of what is not measured.
+    """Refuse settings for quantities that are not measured.
 
     Args:
-        config: of the command.
-        measured: whether metrics are.
-        compared: whether the error against a reference is.
+        config: Config of the command.
+        measured: Whether metrics are measured.
+        compared: Whether the error against a reference is measured.
 
     Raises:
-        ConfigError: names the first.
+        ConfigError: There is such a setting; the message names the first.
     """
     for key, used, why in (
         ("metric", measured, f"{ERROR} alone is measured here, unless mode.metrics=[...] names others"),
@@ -127,14 +127,15 @@ def _refuse_unmeasured(config: Config, measured: bool, compared: bool) -> None:
 
 
 def _chosen(names: list[str] | None, metrics: list[Metric], *, own: bool) -> Better:
-    """The keys to measure, and which way they are better.
+    """Return the keys to measure, each with the direction in which it is better.
 
     Args:
-        names: the keys asked for; None: the error against a reference, or every metric where the knob is not the
-            model's `own`, its head's.
+        names: Requested keys. None selects the error against a reference if `own` is True, and else every metric.
+        metrics: Metrics of the session.
+        own: Whether the knob belongs to the density head of the model.
 
     Raises:
-        ConfigError: nothing of such a name says which way it is better.
+        ConfigError: No metric with a known direction has such a key.
     """
     known: dict[str, Literal["higher", "lower"]] = {
         key: metric.better[key] for metric in metrics for key in metric.columns if key in metric.better
@@ -153,7 +154,7 @@ def _chosen(names: list[str] | None, metrics: list[Metric], *, own: bool) -> Bet
 
 
 def _kept(session: Session, limit: int) -> list[Batch]:
-    """The first `limit` test samples, in batches."""
+    """Return the first `limit` test samples, in batches."""
     kept, seen = [], 0
     for batch in on_device(session.batches().test_dataloader(), session.device):
         kept.append({name: tensor[: limit - seen] for name, tensor in batch.items()})
