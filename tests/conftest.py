@@ -80,18 +80,18 @@ def importing_mlflow() -> Iterator[None]:
 
 @dataclass
 class Done:
-    """What a command left behind."""
+    """Exit code, output and run folder of a command that has ended."""
 
     code: int
     out: str
     folder: Path
 
     def losses(self) -> dict[int, float]:
-        """Training loss by step, to the last bit, from the journal."""
+        """Return the training loss by step from the journal, to the last bit."""
         return self.values("train/loss")
 
     def values(self, name: str) -> dict[int, float]:
-        """Of one metric by step."""
+        """Return the values of one metric by step, from the journal."""
         found: dict[int, float] = {}
         for line in (self.folder / "journal.jsonl").read_text(encoding="utf-8").splitlines():
             record: Mapping[str, Any] = json.loads(line)
@@ -214,7 +214,7 @@ Framework = Callable[..., Done]
 
 
 def paths_again(arguments: Sequence[str]) -> list[str]:
-    """What a command that goes on with a run says of the paths in its config."""
+    """Return the arguments with which a command that resumes a run must repeat the paths in its config."""
     for argument in arguments:
         config = Path(argument.removeprefix("resume=")) / "config.yaml"
         if argument.startswith("resume=") and config.is_file():

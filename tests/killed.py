@@ -26,7 +26,7 @@ PLACES = {
 
 
 def end(how: str) -> None:
-    """What becomes of this process."""
+    """End this process by an error or a signal."""
     Path(os.environ["KILLED"]).touch()
     if how == "error":
         raise ValueError("this rank is bad")

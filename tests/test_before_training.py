@@ -1,4 +1,4 @@
-"""What is wrong without any training is said before a step is taken; what nobody needs costs nothing."""
+"""Mistakes that can be found without training are reported before it; unused parts cost nothing."""
 
 import json
 import math

@@ -140,7 +140,7 @@ def test_fixed_encoders_stay_in_front() -> None:
 @pytest.mark.parametrize("rows", [4, 5, 14, 100, 1000])
 @pytest.mark.parametrize("miscoverage", [0.1, 0.2])
 def test_few_rows_are_said_with_what_they_leave_open(rows: int, miscoverage: float) -> None:
-    """Against simulated validation sets: uniform scores of which the k-th smallest is the coverage itself."""
+    """The message agrees with simulations, in which the k-th smallest of uniform scores is the coverage itself."""
     config = {"name": "conformal", "miscoverage": miscoverage}
     wrapper = schema.build(
         "uncertainty", schema.resolve("uncertainty", config), model=lambda: Plain(REAL), target=REAL

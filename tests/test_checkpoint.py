@@ -474,7 +474,7 @@ def test_what_a_pickle_calls_is_refused_before_it_is_called(name: str, saved: Pa
 
 @pytest.mark.usefixtures("_reader_of_torch")
 def test_an_archive_that_can_be_read_in_two_ways_is_refused(saved: Path) -> None:
-    """What is looked through must be what torch reads: parts of one name, other bytes before them, an older format."""
+    """The inspected pickle must be the one that torch reads: repeated names, preceding bytes, and an older format."""
     sound, other = packed(CONTENTS), packed({"other": torch.zeros(3).to_sparse()})
     twice = io.BytesIO(sound)
     with zipfile.ZipFile(twice, "a") as archive, pytest.warns(UserWarning, match="Duplicate name"):

@@ -1,4 +1,4 @@
-"""What commands and loaded models do where a machine, a terminal or a user is not as the code would like it."""
+"""Commands and loaded models on unusual machines and terminals, and with unusual input of the user."""
 
 import errno
 import fcntl

@@ -84,7 +84,7 @@ flights no preset gives the thesis's setting."""
 
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_every_experiment_can_be_shortened(name: str) -> None:
-    """By the preset and by hand; an interval of validation beyond the end becomes the end."""
+    """Shorten by the preset and by hand; a validation interval longer than the training becomes its length."""
     from framework.configuration.assembly import resolve_all
 
     values = plain(composed(f"experiment={name}", "debug=fast"))
@@ -97,7 +97,7 @@ def test_every_experiment_can_be_shortened(name: str) -> None:
 
 @pytest.mark.parametrize("data", SMOKE_RUNS)
 def test_a_smoke_run_goes_through_every_stage(data: str, framework: Framework) -> None:
-    """As the thesis trains: what no preset says is the experiment's own."""
+    """Train with the thesis preset; settings that the preset does not contain come from the experiment."""
     run = ("preset=thesis", "debug=fast", "logger=none", "pictures=false", "samples=50", "threads=1")
     done = framework(f"experiment={SMOKE_RUNS[data]}", *run)
     assert done.code == 0, done.out
@@ -130,7 +130,7 @@ FAMILIES = {name.partition("/")[0]: name for name in [*reversed(SHORTENED), *SMO
     ],
 )
 def test_every_experiment_runs_shortened(name: str, framework: Framework) -> None:
-    """In the cache that all tests share, since bodies take minutes to make."""
+    """Run with the cache that all tests share, since generating bodies takes minutes."""
     done = framework(
         *(f"experiment={name}", "debug=fast", "logger=none", "pictures=false", "threads=1", "samples=20"),
         more={"FRAMEWORK_CACHE": str(cache.folder(""))},

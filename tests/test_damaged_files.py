@@ -224,7 +224,7 @@ def test_stored_values_are_plain(tmp_path: Path) -> None:
 
 
 def test_a_pickle_of_tuples_that_hold_the_same_tuple_twice_is_refused() -> None:
-    """As a key, thirty deep, it takes minutes to hash; what is as deep and holds no tuple twice is all right."""
+    """Hashing such a tuple of depth thirty takes minutes; a tuple as deep that repeats none is accepted."""
     nested: tuple = (1,)
     deep: tuple = (1,)
     for number in range(30):

@@ -1,4 +1,4 @@
-"""What stands in a run folder is opened only if it is a plain file of that folder."""
+"""An entry of a run folder is opened only if it is a plain file of that folder."""
 
 import os
 import socket

@@ -1,4 +1,4 @@
-"""Which files of a folder `mode.files` names, and what is said of the others."""
+"""Tests of the files that `mode.files` selects in a folder, and of the messages about the others."""
 
 import io
 from itertools import product

@@ -12,7 +12,7 @@ STEPS = ("trainer.checkpoint_every_steps=2", "trainer.max_epochs=2", "optimizer=
 
 
 def one_sentence(done: Done) -> str:
-    """What a command that failed says of it."""
+    """Return the single error message of a command that failed, after checking that there is no traceback."""
     errors = [line for line in done.out.splitlines() if line.startswith("error: ")]
     assert done.code == 1, done.out
     assert len(errors) == 1, done.out
@@ -22,7 +22,7 @@ def one_sentence(done: Done) -> str:
 
 @pytest.mark.parametrize(("size", "at"), [(4_000, "checkpoint"), (12_000, "last.ckpt"), (20_000, "")])
 def test_a_disk_that_is_full_ends_a_run_with_a_sentence(size: int, at: str, framework: Framework) -> None:
-    """While it trains, after it and when it draws: nothing longer than `size` bytes can be written."""
+    """No file longer than `size` bytes can be written, so the run fails in training, after it, or when it draws."""
     done = framework(*TINY, f"+data.longest_file={size}", "logger=none", *STEPS)
     said = one_sentence(done)
     assert at in said, said

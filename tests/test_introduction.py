@@ -1,4 +1,4 @@
-"""What a run says first of its data."""
+"""Tests of the first lines that a run prints about its data."""
 
 from pathlib import Path
 

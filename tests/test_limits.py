@@ -1,4 +1,4 @@
-"""What a stranger's checkpoint or file takes: at most 1 GB and 5 s, until it predicts or an error says why not."""
+"""An untrusted checkpoint or file takes at most 1 GB and 5 s until the model predicts or an error says why not."""
 
 import json
 import os
@@ -74,7 +74,7 @@ OPERATIONS = {
 
 @pytest.mark.parametrize("name", OPERATIONS)
 def test_a_size_is_known_before_the_operation_runs(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is computed is at least what the result has, and at most twice that; one byte less is refused."""
+    """The computed size is between one and two times the size of the result; a limit one byte lower is refused."""
     seen: list[tuple[int, int]] = []
     original = Budget.__torch_dispatch__
 

@@ -218,7 +218,10 @@ Said = Callable[[list[str]], str]
 
 @pytest.fixture
 def said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Said:
-    """What a command that is a mistake says, in one line; in an empty folder, which it leaves empty."""
+    """Return a function that runs a mistaken command in an empty folder and returns its one-line error message.
+
+    The function checks that the folder stays empty.
+    """
 
     def say(command: list[str]) -> str:
         monkeypatch.setattr(composition, "config_folders", FOLDERS)

@@ -71,7 +71,7 @@ def test_plateau_reduces_when_torchs_does(patience: int) -> None:
 
 
 def test_step_reduces_after_the_epochs_that_it_names() -> None:
-    """As torch's MultiStepLR by epochs."""
+    """The learning rate equals that of torch's MultiStepLR by epochs."""
     settings = OptimizerSettings(schedule="step", factor=0.1, milestones=[2, 3], learning_rate=0.25)
     ours, theirs = (torch.optim.SGD([nn.Parameter(torch.zeros(2))], lr=0.25) for _ in range(2))
     rates = torch.optim.lr_scheduler.LambdaLR(ours, [schedule(settings, 20, 5)])
@@ -213,7 +213,7 @@ def test_a_direct_head_reads_what_the_encoder_gives_once_a_step() -> None:
 @pytest.mark.parametrize("wrapper", [None, "ensemble"])
 @pytest.mark.parametrize("direct", [True, False])
 def test_fixed_features_are_computed_once_a_step(direct: bool, wrapper: str | None) -> None:
-    """Whatever stands behind them."""
+    """The features are computed once whatever model reads them."""
     reals = Target("real", ("x",))
 
     def inner() -> Predictor:

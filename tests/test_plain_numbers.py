@@ -1,4 +1,4 @@
-"""Where a reader of JSON or YAML wants a number, true and texts that Python can make one of are refused."""
+"""Readers of JSON and YAML refuse true, and texts that Python could convert, in place of a number."""
 
 import json
 from collections.abc import Callable
@@ -91,7 +91,7 @@ def left_value(folder: Path, value: Any) -> Any:
 
 
 def results(folder: Path, value: Any, key: str) -> Any:
-    """Of a job; those that cannot be read are left out with a warning."""
+    """Read the results of a job in which `key` has `value`; unreadable results are left out with a warning."""
     found = {"method": "a", "data": "b", "columns": {"nll": "NLL"}, "better": {}, "nll": 1.0, "seed": 0}
     written(folder / "results.json", {**found, "device": "cpu", "threads": 1, key: value})
     read = _results(folder)

@@ -415,7 +415,7 @@ def test_jobs_end_with_the_process_they_are_forks_of_and_the_next_ones_get_anoth
 
 @LINUX
 def test_a_signal_that_comes_before_a_job_has_begun_reaches_it(tmp_path: Path) -> None:
-    """While the process it is to be a fork of still imports."""
+    """The signal comes while the server process, of which the job will be a fork, is still importing."""
     app = App(tmp_path, fork=True)
     (app.folder / "slow.py").write_text(
         "from pathlib import Path\nimport time\n"
@@ -536,7 +536,7 @@ def test_sweeps_that_begin_at_once_in_one_folder_keep_their_jobs_apart(app: App,
 
 
 def test_a_folder_that_another_job_has_taken_is_left_to_it(app: App) -> None:
-    """As a sweep of an earlier version could take it, or a folder copied over another."""
+    """A sweep of an earlier version could take the folder, or another folder can be copied over it."""
     process = app.start("-m", "hydra/launcher=pool", "what=hold", "x=0,1", "hydra.launcher.jobs=1")
     app.until_ready(0)
     record = app.record(1) | {"key": "another", "overrides": ["y=3"]}

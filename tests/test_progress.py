@@ -1,4 +1,4 @@
-"""What long work says: nothing soon, a bar on a terminal, lines in a log, and no word in ranks other than the first."""
+"""Tests of progress reports: none for short work, a bar on a terminal, lines in a log, and none in other ranks."""
 
 import io
 
@@ -19,7 +19,7 @@ class Clock:
 
 
 def said(seconds: float, steps: int, *, terminal: bool = False, quiet: bool = False) -> str:
-    """What work of so many equal steps says that takes so long in all."""
+    """Return the progress report of work that takes `seconds` in equal `steps`."""
     clock, out = Clock(), io.StringIO()
     console = Console(file=out, force_terminal=terminal, width=100, quiet=quiet)
     with Work("reading [b]", steps, "files", console=console, clock=clock) as work:

@@ -1,4 +1,4 @@
-"""Where a result comes from."""
+"""Tests of the provenance of a result."""
 
 from importlib.metadata import version
 

@@ -271,7 +271,7 @@ def test_every_installed_plugin_loads_as_its_base(group: str) -> None:
 
 
 def test_a_key_cites_one_thing_and_once() -> None:
-    """Over every installed plugin: two entries of one key say the same, and what a run records has each key once."""
+    """All plugins give the same text for a BibTeX key, and the list that a run records has each key once."""
     texts = [load(group, name).bibtex for group in GROUPS for name in installed(group)]
     found = entries(text for text in texts if text.strip())
     for text in texts:

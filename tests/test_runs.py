@@ -592,7 +592,7 @@ def test_a_strangers_run_is_not_resumed_into_the_store_that_it_names(framework: 
 
 
 def test_answers_that_are_not_finite_get_a_sentence(framework: Framework) -> None:
-    """As in half precision, whose numbers end at 65,504."""
+    """Half precision gives such answers, because its largest number is 65,504."""
     done = framework(
         *("experiment=moons/vanilla_128", "debug=fast", "logger=none", "pictures=false"),
         *("trainer.precision=16-true", "optimizer.learning_rate=1e3"),

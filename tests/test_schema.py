@@ -1,4 +1,4 @@
-"""From constructor signatures to checked configs: every fault becomes a sentence."""
+"""Configs are checked against constructor signatures, and every fault becomes a sentence."""
 
 import importlib
 import math

@@ -1,4 +1,4 @@
-"""What each mode reads of a config is what it says it reads; anything else that a command sets is refused."""
+"""Each mode reads exactly the keys of a config that it declares; a command that sets any other key is refused."""
 
 import warnings
 from collections.abc import Callable, Iterator, Sequence

@@ -1,4 +1,4 @@
-"""What a command does not need, it does not import; seen in fresh processes."""
+"""A command does not import modules that it does not need, as fresh processes show."""
 
 import os
 import subprocess

@@ -148,7 +148,7 @@ def is_words(group: str, name: str, key: str) -> bool:
 
 
 def test_what_is_said_to_be_words_is_no_path() -> None:
-    """Which of our own parameters are, so that a new one is thought about."""
+    """The parameters of the project's plugins that never hold a path are listed, so that a new one is considered."""
     assert {f"{name}.{key}" for group, name, key in texts() if is_words(group, name, key)} == {
         "tabular.target",
         "tabular.columns",

@@ -417,7 +417,7 @@ FOREIGN = [
 def test_a_store_that_only_a_file_names_is_not_contacted(
     recorded: str, own: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whether the user names another one in the command or in the environment."""
+    """The store is not contacted, even if the user names another one in the command or in the environment."""
     for named, setting in ((own, None), (None, own)):
         monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
         if setting:

@@ -1,4 +1,4 @@
-"""Which files of a user's folder are read."""
+"""Tests of the choice of files that are read from a user's folder."""
 
 import io
 from pathlib import Path

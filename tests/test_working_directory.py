@@ -51,7 +51,7 @@ def archive(tmp_path_factory: pytest.TempPathFactory, stranger_site: Path) -> Pa
 
 
 def imported(archive: Path, command: Sequence[str], *paths: Path, code: int | None = None) -> list[str]:
-    """What `python -m` imports of the archive in which it runs."""
+    """Return the modules that `python -m` imports from the archive in which it runs."""
     marker = archive.parent / "imported"
     marker.unlink(missing_ok=True)
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, paths))}
