@@ -85,7 +85,7 @@ class Session:
         device: Device on which the predictor is evaluated.
         console: Console for people; it prints nothing in ranks other than the first.
         objectives: Objectives of the training loss.
-        metrics: Unused metrics in the order of the config; empty before `tested`.
+        metrics: New metrics without any state, in the order of the config; empty before `tested`.
         outliers: Prepared outliers, if a metric reads them; None before `tested`.
     """
 

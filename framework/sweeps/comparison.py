@@ -92,7 +92,7 @@ def summarise(folder: Path, overrides: Sequence[Sequence[str]], config: Mapping[
         # rows of another command's jobs in this folder count too: every key that distinguishes rows must be shown
         everything = [*overrides, *(row["overrides"] for row in rows)]
         keys = _varied(everything)
-        if _repeated(rows, keys):  # a setting is then given by some commands only
+        if _repeated(rows, keys):  # a setting that only some commands give
             keys = _varied(everything, absent=True)
         rows = [{**dict.fromkeys(keys), **row} for row in rows]
         shown = (key for key in keys if key not in ("seed", "experiment") and not _repeats_data(rows, key))
