@@ -1,0 +1,79 @@
+"""How docstrings begin: with a verb in the imperative or with a noun phrase that can stand alone."""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+PREPOSITIONS = (
+    *(
+        "About",
+        "Above",
+        "Against",
+        "Among",
+        "At",
+        "Below",
+        "Beside",
+        "Between",
+        "Beyond",
+        "By",
+        "For",
+        "From",
+        "In",
+    ),
+    *("Into", "Of", "On", "Over", "Through", "To", "Under", "Until", "With", "Within", "Without"),
+)
+DANGLING = (
+    "After",
+    "Before",
+    "How",
+    "Like",
+    "Likewise",
+    "Than",
+    "Those",
+    "What",
+    "Whatever",
+    "When",
+    "Where",
+)
+UNCLEAR = ("Whether", "Which", "While", "Who", "Whoever")
+BANNED = frozenset({*PREPOSITIONS, *DANGLING, *UNCLEAR})
+"""First words of docstrings that a reader has to read twice (a colleague would not begin a sentence so)."""
+ROOMS = ("framework", "plugins", "hydra_plugins")
+
+
+def docstrings(tree: ast.AST) -> Iterator[str]:
+    """Yield the docstrings of a module, its classes and functions, and of attributes and constants."""
+    for node in ast.walk(tree):
+        body = getattr(node, "body", None)
+        if not isinstance(body, list):
+            continue
+        documented = isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)
+        for number, statement in enumerate(body):
+            text = statement.value if isinstance(statement, ast.Expr) else None
+            follows = number > 0 and isinstance(body[number - 1], ast.Assign | ast.AnnAssign)
+            if (
+                isinstance(text, ast.Constant)
+                and isinstance(text.value, str)
+                and (follows or (documented and number == 0))
+            ):
+                yield text.value
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_docstrings_begin_with_a_verb_or_a_noun(room: str) -> None:
+    unclear = [
+        f"{path.relative_to(ROOT)}: {text.strip().partition(chr(10))[0]}"
+        for path in sorted((ROOT / room).rglob("*.py"))
+        if not path.name.startswith("test_")
+        for text in docstrings(ast.parse(path.read_text(encoding="utf-8")))
+        if text.split(None, 1)[0].rstrip(",:") in BANNED
+    ]
+    assert not unclear, "\n".join(unclear)
+
+
+def test_a_docstring_of_each_kind_is_read() -> None:
+    source = '"""Module."""\nLIMIT = 1\n"""Limit."""\nclass A:\n    """Class."""\n\n    def f(self):\n        """Do."""'
+    assert [*docstrings(ast.parse(source))] == ["Module.", "Limit.", "Class.", "Do."]
