@@ -99,7 +99,7 @@ class SeededBatches(Sampler[list[int]]):
 
 
 def epoch_order(length: int, seed: int | None, epoch: int, member: int = 0) -> list[int]:
-    """Return the permutation of `length` samples for (seed, epoch); without a seed it is 0, 1, 2, …
+    """Return the permutation of `length` samples for (seed, epoch); without a seed they keep their order.
 
     Args:
         length: number of samples.

@@ -348,14 +348,14 @@ def load4(typing, array, start):
 @intrinsic
 @no_type_check
 def load_triples(typing, array, start):
-    """Return x, y, z of 16 points that are stored as x y z x y z …"""
+    """Return x, y, z of 16 points that are stored as x y z x y z and so on."""
     return loaded(array, 3, 3)
 
 
 @intrinsic
 @no_type_check
 def load_quadruples(typing, array, start):
-    """Return the four parts of 16 records that are stored as x y z w x y z w …"""
+    """Return the four parts of 16 records that are stored as x y z w x y z w and so on."""
     return loaded(array, 4, 4)
 
 

@@ -12,17 +12,20 @@ from plugins.data.cest.generator import write_slice
 
 
 def slice_of(folder: Path, data_seed: int = 0) -> dict[str, np.ndarray]:
+    """Write a small synthetic slice and return its arrays."""
     write_slice(folder, side=32, noise=0.01, shift=0.05, data_seed=data_seed)
     with np.load(folder / "brain.npz") as held:
         return dict(held)
 
 
 def as_numpy(folder: Path) -> Mapping[str, str]:
+    """Write a slice as `.npz`."""
     slice_of(folder)
     return {"root": str(folder / "brain.npz")}
 
 
 def as_matlab(folder: Path) -> Mapping[str, str]:
+    """Write a slice as `.mat`."""
     held = slice_of(folder)
     (folder / "brain.npz").unlink()
     savemat(

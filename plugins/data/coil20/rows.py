@@ -23,12 +23,14 @@ def turntable(symmetric: bool = False) -> np.ndarray:
 
 
 def as_matlab(folder: Path, views: np.ndarray, **more: object) -> Path:
+    """Write 1440 views in the layout of COIL20.mat and return the folder."""
     pixels = views.swapaxes(-1, -2).reshape(1440, 1024)
     savemat(folder / "COIL20.mat", {"X": pixels, "Y": np.repeat(np.arange(1, 21), 72)[:, None], **more})
     return folder
 
 
 def write(folder: Path) -> Mapping[str, str]:
+    """Write the views of a blob on a turntable."""
     return {"root": str(as_matlab(folder, turntable()))}
 
 

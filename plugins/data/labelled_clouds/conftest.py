@@ -7,11 +7,14 @@ from framework.configuration.schema import build, resolve
 
 @pytest.fixture(autouse=True)
 def cache(tmp_path_factory, monkeypatch):
+    """Give each test a cache of its own."""
     monkeypatch.setenv("FRAMEWORK_CACHE", str(tmp_path_factory.mktemp("cache")))
 
 
 @pytest.fixture
 def data(request):
+    """Return a function that builds the data set NAME of the test's module."""
+
     def make(**config):
         if "root" in config:
             config["root"] = str(config["root"])
@@ -22,6 +25,8 @@ def data(request):
 
 @pytest.fixture
 def prepared(data):
+    """Return a function that builds and prepares the data set."""
+
     def make(**config):
         found = data(**config)
         found.prepare()

@@ -42,6 +42,7 @@ def objects(counts: tuple[int, ...] = (11, 10, 12)) -> dict[str, np.ndarray]:
 
 
 def archive(folder: Path) -> Mapping[str, str]:
+    """Write a few objects as one `.npz` archive."""
     np.savez(folder / "objects.npz", **objects())  # type: ignore[arg-type]
     return {"root": str(folder / "objects.npz")}
 

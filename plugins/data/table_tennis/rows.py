@@ -18,6 +18,7 @@ def table(number: int, frames: int = 40) -> np.ndarray:
 
 
 def write_csv(file: Path, rows: np.ndarray) -> Path:
+    """Write rows of t, x, y, z and return the file."""
     np.savetxt(file, rows, "%.6f", ",", header="t,x,y,z", comments="")
     return file
 
@@ -44,6 +45,7 @@ def matlab(place: Path) -> Mapping[str, str]:
 
 
 def files(place: Path) -> Sequence[Path]:
+    """Write three flights that a model is asked about."""
     return [write_csv(place / f"{number}.csv", table(number + 20, 13 + number)) for number in range(3)]
 
 

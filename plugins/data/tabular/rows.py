@@ -26,6 +26,7 @@ def files(folder: Path) -> Sequence[Path]:
 
 
 def row(name: str, target: object, kind: str) -> DataRow:
+    """Return the row of a target of a small table."""
     return DataRow(
         name,
         {"target": target, "kind": kind, "columns": ["number", "square"]},

@@ -20,8 +20,8 @@ from plugins.density_head.trees.heads_without_gradient import (
     FLOOR,
     WIDEST,
     load_any_shape,
-    require_fitted,
     require_class_or_real,
+    require_fitted,
     single,
     with_gradient_of_0,
 )

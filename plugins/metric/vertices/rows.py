@@ -8,10 +8,12 @@ from framework.testing.rows import MetricRow
 
 
 def mesh(vertices: int) -> Target:
+    """Return the target that holds the coordinates of so many vertices."""
     return Target("real", tuple(f"{axis}{vertex}" for vertex in range(vertices) for axis in "xyz"))
 
 
 def scales(count: int) -> Tensor:
+    """Return a different scale for each sample."""
     return torch.linspace(0.5, 1.5, count)
 
 
