@@ -311,12 +311,18 @@ def _mark_constants(packages: set[str]) -> None:
 def _frames() -> Iterator[FrameType]:
     """Yield the frames of the calls between here and the check, innermost first, without those of libraries."""
     frame = sys._getframe(1)
-    while frame is not None and frame.f_code.co_filename == __file__:
+    while frame is not None and (frame.f_code.co_filename, frame.f_code.co_name) != _ENTRY:
         frame = frame.f_back
+    frame = frame and frame.f_back
     while frame is not None and frame.f_code.co_filename != __file__:
-        if frame.f_globals.get("__name__", "").partition(".")[0] not in _LIBRARIES:
+        path, module = frame.f_code.co_filename, frame.f_globals.get("__name__", "")
+        if not path.startswith("<@beartype") and module.partition(".")[0] not in _LIBRARIES:
             yield frame
         frame = frame.f_back
+
+
+_ENTRY = (__file__, "__torch_function__")
+"""File and function through which torch enters `OneDevice`; type checkers may put frames between it and a helper."""
 
 
 def _decided() -> bool:
