@@ -125,7 +125,7 @@ def _reader(file: BinaryIO) -> Any:
 
 
 def _record_size(reader: Any, name: str) -> int:
-    """Return the size of a record in bytes as torch sees it; torch before 2.13 must read the record to know it."""
+    """Return the size of a record in bytes as torch sees it; torch 2.11 must read the record to know it."""
     if hasattr(reader, "get_record_size"):
         return reader.get_record_size(name)
     return len(reader.get_record(name))
