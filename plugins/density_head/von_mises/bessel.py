@@ -1,4 +1,4 @@
-"""The Bessel functions I0 and I1 in the forms of the von Mises density, by the polynomials of coefficients.py."""
+"""The Bessel functions I0 and I1 in the forms of the von Mises density, by the polynomials in coefficients.npz."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -7,10 +7,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from plugins.density_head.von_mises.coefficients import CHAINS, TABLES
+from plugins.density_head.von_mises.coefficients import BORDERS, CHAINS, TABLES
 
 _TABLES = {
-    (getattr(torch, dtype), name): torch.tensor(rows, dtype=getattr(torch, dtype), device="cpu")
+    (getattr(torch, dtype), name): torch.from_numpy(rows).to(getattr(torch, dtype))
     for dtype, functions in TABLES.items()
     for name, rows in functions.items()
 }
@@ -53,9 +53,9 @@ def _place(name: str, v: Tensor) -> tuple[Any, Any, Tensor, Any]:
     Compiled float32 has few pieces, and comparisons choose among their coefficients; otherwise a table is read.
     """
     if v.dtype == torch.float32 and torch.compiler.is_compiling():
-        borders, rows = CHAINS[name]
-        beyond = tuple(v >= border for border in borders[1:-1])
-        spans = list(pairwise(borders))
+        rows = CHAINS[name]
+        beyond = tuple(v >= border for border in BORDERS[1:-1])
+        spans = list(pairwise(BORDERS))
         middle = _chosen([(low + high) / 2 for low, high in spans], beyond, v)
         slope = _chosen([2 / (high - low) for low, high in spans], beyond, v)
         return rows, beyond, (v - middle) * slope, slope

@@ -1,4 +1,4 @@
-"""Generator of coefficients.py, run with `python -m plugins.density_head.von_mises.fit_coefficients`; needs mpmath.
+"""Generator of coefficients.npz, run with `python -m plugins.density_head.von_mises.fit_coefficients`; needs mpmath.
 
 Every function below is smooth on κ ∈ [0, ∞] as a function of v = 2/(κ+2) ∈ [0, 1]. That interval is divided into equal
 pieces, whose number is a power of two, so that v's piece and its position y ∈ [-1, 1] there are found without rounding.
@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import mpmath
+import numpy as np
 
 mpmath.mp.dps = 60
 Real = Any  # an mpmath number: the package declares no types
@@ -150,40 +151,15 @@ def gauss_legendre(count: int) -> list[tuple[float, float]]:
 
 
 def main() -> None:
-    """Write coefficients.py."""
-    lines = [
-        '"""Written by fit_coefficients.py; do not edit.',
-        "",
-        "Per dtype and function: row j holds the coefficient of y^j on each piece of v, v ascending.",
-        "CHAINS: float32 on few unequal pieces, (borders of v, rows).",
-        "NODES: places and weights of Gauss-Legendre quadrature on [0, 1].",
-        '"""',
-        "",
-        "# fmt: off",
-        "TABLES: dict[str, dict[str, tuple[tuple[float, ...], ...]]] = {",
-    ]
-    for dtype in PIECES:
-        lines.append(f"    {dtype!r}: {{")
-        for which, name in enumerate(NAMES):
-            lines.append(f"        {name!r}: (")
-            for row in table(dtype, which):
-                cells = [f"{number!r}," for number in row]
-                lines.append("            (")
-                lines += [f"                {' '.join(cells[i : i + 3])}" for i in range(0, len(cells), 3)]
-                lines.append("            ),")
-            lines.append("        ),")
-        lines.append("    },")
-    lines += ["}", "CHAINS: dict[str, tuple[tuple[float, ...], tuple[tuple[float, ...], ...]]] = {"]
+    """Write coefficients.npz; its keys are explained in coefficients.py."""
+    arrays = {"borders": np.array([float(border) for border in BORDERS])}
     for which, name in enumerate(NAMES):
-        borders = ", ".join(repr(float(border)) for border in BORDERS)
-        lines += [f"    {name!r}: (", f"        ({borders}),", "        ("]
-        lines += [f"            {row!r}," for row in chain(which)]
-        lines += ["        ),", "    ),"]
-    lines += ["}", "NODES: dict[int, tuple[tuple[float, float], ...]] = {"]
+        for dtype in PIECES:
+            arrays[f"table/{dtype}/{name}"] = np.array(table(dtype, which))
+        arrays[f"chain/{name}"] = np.array(chain(which))
     for count in QUADRATURES:
-        lines += [f"    {count}: (", *(f"        {pair!r}," for pair in gauss_legendre(count)), "    ),"]
-    lines.append("}")
-    Path(__file__).with_name("coefficients.py").write_text("\n".join(lines) + "\n", encoding="utf-8")
+        arrays[f"nodes/{count}"] = np.array(gauss_legendre(count))
+    np.savez_compressed(Path(__file__).with_name("coefficients.npz"), **arrays)
 
 
 if __name__ == "__main__":
