@@ -177,7 +177,7 @@ class Data(ABC):
             return torch.stack(items)
         return as_inputs(given, self.input_shape)
 
-    def asked(self, given: Any) -> Batch:
+    def user_batch(self, given: Any) -> Batch:
         """Return the batch that a user gives to a trained model: "input", and the fields that `frame` reads.
 
         Raises:
@@ -226,7 +226,7 @@ class Data(ABC):
         """Return what identifies the data: root, version, samples per split, and a hash of names and labels."""
 
     @abstractmethod
-    def picture(self, inputs: Tensor) -> np.ndarray:
+    def preview(self, inputs: Tensor) -> np.ndarray:
         """Return an image of one input for a person to look at, (height, width, 3) uint8."""
 
 

@@ -65,7 +65,7 @@ class Metric(torchmetrics.Metric, ABC):
 class Mean(Metric):
     """Base class of metrics that are a mean over samples, of one number or several, with its standard error.
 
-    A subclass calls `start` in its constructor, `take_in` in `update` and `mean_and_error` in `compute`. The states are
+    A subclass calls `start` in its constructor, `add_samples` in `update` and `mean_and_error` in `compute`. The states are
     the sums of the numbers and of their squares. They suit numbers that are not negative, where no large mean hides a
     small spread (for scores in [0, 2] float64 resolves a spread of 1e-8).
     """
@@ -80,7 +80,7 @@ class Mean(Metric):
         for name in ("total", "squares"):
             self.add_state(name, torch.zeros(shape, dtype=torch.float64), dist_reduce_fx="sum")
 
-    def take_in(self, numbers: Float[Tensor, "batch *shape"]) -> None:
+    def add_samples(self, numbers: Float[Tensor, "batch *shape"]) -> None:
         """Add the numbers of a batch of samples, (batch, *shape), to the sums."""
         self.count += len(numbers)
         self.total += numbers.sum(0)
@@ -93,10 +93,10 @@ class Mean(Metric):
         return mean, (spread / (self.count - 1).clamp(min=0)).sqrt()
 
 
-class Pictured(ABC):
+class HasFigure(ABC):
     """Second base of a metric that has a figure to show."""
 
-    picture: ClassVar[str]
+    figure_name: ClassVar[str]
     """Name of the figure's file, without a suffix."""
 
     @abstractmethod

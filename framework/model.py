@@ -106,7 +106,7 @@ class Model(Predictor):
                 "Append an encoder that flattens, such as `mlp`."
             )
         self.head = head
-        self.kept: Kept[Tensor] | None = Kept() if head.direct else None
+        self.shared_result: SharedResult[Tensor] | None = SharedResult() if head.direct else None
 
     def forward(self, inputs: Tensor) -> Distribution:
         """Return the density over the target for a batch of inputs."""
@@ -122,7 +122,11 @@ class Model(Predictor):
 
     def raw(self, inputs: Tensor) -> Float[Tensor, "batch size"]:
         """Return the distribution parameters that the head reads, (batch, size)."""
-        return self._raw(inputs) if self.kept is None else self.kept.of(inputs, self._raw)
+        return (
+            self._raw(inputs)
+            if self.shared_result is None
+            else self.shared_result.get_or_compute(inputs, self._raw)
+        )
 
     def _raw(self, inputs: Tensor) -> Tensor:
         raw: Tensor = self.projection(self.encoders(inputs))
@@ -173,12 +177,12 @@ class Backbones(Encoder):
 Computed = TypeVar("Computed")
 
 
-class Kept(Generic[Computed]):
+class SharedResult(Generic[Computed]):
     """The last computed result and the tensor it was computed from; it keeps nothing outside of `one_pass`."""
 
     last: tuple[()] | tuple[Tensor, Computed] | None = None
 
-    def of(self, inputs: Tensor, compute: Callable[[Tensor], Computed]) -> Computed:
+    def get_or_compute(self, inputs: Tensor, compute: Callable[[Tensor], Computed]) -> Computed:
         """Return `compute(inputs)`, or the kept result if it was computed from the very same tensor."""
         if self.last and self.last[0] is inputs:
             return self.last[1]
@@ -199,11 +203,11 @@ class FrozenFrontEnd(Predictor):
         super().__init__()
         self.encoders = nn.Sequential(*encoders)
         self.predictor = predictor
-        self.kept: Kept[Tensor] = Kept()
+        self.shared_result: SharedResult[Tensor] = SharedResult()
 
     def features(self, inputs: Tensor) -> Float[Tensor, "batch *features"]:
         """Return the features that the predictor reads."""
-        return self.kept.of(inputs, self.encoders)
+        return self.shared_result.get_or_compute(inputs, self.encoders)
 
     def forward(self, inputs: Tensor) -> Distribution:
         """Return the predictor's density for the features of a batch of inputs."""
@@ -228,11 +232,11 @@ def one_pass(predictor: Predictor) -> Iterator[None]:
     """Compute shared results once for each tensor of inputs inside the block.
 
     They are reused however often loss and densities are requested. The shared results are fixed features, the raw
-    parameters of direct heads, and what other modules keep in `kept`. The encoders of a direct head give images, which
+    parameters of direct heads, and what other modules keep in `shared_result`. The encoders of a direct head give images, which
     an objective compares as the loss does.
     """
-    found = (getattr(module, "kept", None) for module in predictor.modules())
-    parts = [kept for kept in found if isinstance(kept, Kept)]
+    found = (getattr(module, "shared_result", None) for module in predictor.modules())
+    parts = [kept for kept in found if isinstance(kept, SharedResult)]
     for kept in parts:
         kept.last = ()
     try:
@@ -253,7 +257,7 @@ def learns(predictor: Predictor) -> bool:
     return not fitted_models(predictor) and any(one.requires_grad for one in predictor.parameters())
 
 
-def each_alone(values: Float[Tensor, "batch *member"]) -> Float[Tensor, "batch"]:
+def independent_penalty(values: Float[Tensor, "batch *member"]) -> Float[Tensor, "batch"]:
     """Return a penalty per sample, (batch,), from the penalties of its members, so that each member trains as if alone.
 
     The value is the mean over members, so it is comparable with the penalty of a single model. The gradient is that of
@@ -268,7 +272,7 @@ def each_alone(values: Float[Tensor, "batch *member"]) -> Float[Tensor, "batch"]
     return total + (values.mean(-1) - total).detach()
 
 
-def of_its_own(values: Float[Tensor, "batch"], members: int) -> Float[Tensor, "batch"]:
+def own_sample_penalty(values: Float[Tensor, "batch"], members: int) -> Float[Tensor, "batch"]:
     """Return penalties of samples, each seen by one member only, with gradients scaled by the number of members.
 
     Their mean is the mean of `values`. In each member the gradient of that mean is the gradient of the mean over the

@@ -17,7 +17,7 @@ Share = Annotated[float, Field(ge=0, lt=1)]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Rival:
+class AdversaryOptimizer:
     """Optimiser of Adam's family for an adversary's parameters, which are trained against the predictor's.
 
     Its step is taken together with the predictor's step, from gradients at the same weights. This equals two optimisers
@@ -45,14 +45,14 @@ class Objective(nn.Module, ABC):
     bibtex: ClassVar[str]
     """Citation of the method, as BibTeX."""
 
-    rival: Rival | None = None
+    adversary_optimizer: AdversaryOptimizer | None = None
     """Optimiser of the objective's own parameters, if they are trained against the predictor's.
 
     A discriminator's parameters are an example. Their loss is part of the value that `forward` returns; what a term
     detaches decides which of the two sides it trains. None: the objective's parameters are trained like the
     predictor's.
     """
-    told: Mapping[str, Tensor] = {}
+    logged_terms: Mapping[str, Tensor] = {}
     """Detached scalars of the last batch that are logged beside the loss: each term by its name."""
 
     @abstractmethod

@@ -166,7 +166,7 @@ def true_image(batch: Batch, channel: str) -> Tensor:
     return batch[channel]
 
 
-def answers(target: Target, prediction: Prediction) -> dict[str, Tensor]:
+def table_columns(target: Target, prediction: Prediction) -> dict[str, Tensor]:
     """Return the columns of a table of predictions, (batch,) each, in the user's names and units; angles in degrees.
 
     For images it returns the entropy only, because images are stored beside the table.
@@ -177,11 +177,11 @@ def answers(target: Target, prediction: Prediction) -> dict[str, Tensor]:
         shares = prediction.class_probabilities
         found = {f"p_{name}": shares[:, label] for label, name in enumerate(target.names)}
     else:
-        found = named(target, prediction.point)
+        found = named_columns(target, prediction.point)
     return {**found, "entropy_nats": prediction.entropy}
 
 
-def named(target: Target, values: Tensor, of: str = "") -> dict[str, Tensor]:
+def named_columns(target: Target, values: Tensor, of: str = "") -> dict[str, Tensor]:
     """Return angles (in degrees) or reals, (batch, number), as columns by name.
 
     `of` is a suffix of the names that says what the values are, if they are not the predictions.

@@ -40,7 +40,7 @@ class Target:
         return () if self.kind == "class" else (*self.size, len(self.names))
 
     @property
-    def told(self) -> str:
+    def listed_names(self) -> str:
         """Names of the target for a sentence; if there are very many, the first ones and the number of the others."""
         first = self.names if len(self.names) <= MOST else self.names[: MOST // 4]
         rest = f" and {len(self.names) - len(first)} more" if len(first) < len(self.names) else ""
@@ -55,5 +55,5 @@ class Target:
         if self.kind != kind:
             raise ConfigError(
                 f"{by} describes targets of kind {kind!r}, but this data set's are {self.kind!r} "
-                f"({self.told}). Choose another one, or other data."
+                f"({self.listed_names}). Choose another one, or other data."
             )

@@ -56,7 +56,7 @@ class Uncertainty(Predictor):
         """Calibrate the wrapped predictor, then the wrapper, on the validation split; called once after training."""
 
 
-class Several(ABC):
+class SeveralModels(ABC):
     """Second base of a wrapper that trains several models, each as it would train alone.
 
     Attributes:
@@ -67,11 +67,11 @@ class Several(ABC):
             samples.
     """
 
-    trained: int
+    model_count: int
     own_batches: bool = False
 
     @abstractmethod
-    def clip_each(self, most: float) -> None:
+    def clip_each_model(self, most: float) -> None:
         """Scale the gradient of each model down to the norm `most` if it is longer."""
 
 
@@ -81,21 +81,21 @@ def remarks(predictor: Predictor) -> tuple[str, ...]:
     return tuple(dict.fromkeys(remark for remark in found if remark))
 
 
-def outermost(predictor: Predictor) -> Several | None:
+def outermost(predictor: Predictor) -> SeveralModels | None:
     """Return the outermost wrapper that trains several models, or None if there is none."""
-    found = (one for one in predictor.modules() if isinstance(one, Several) and one.trained > 1)
+    found = (one for one in predictor.modules() if isinstance(one, SeveralModels) and one.model_count > 1)
     return next(found, None)
 
 
-def rows_each(predictor: Predictor, rows: int) -> int:
+def rows_per_model(predictor: Predictor, rows: int) -> int:
     """Return how many rows of a batch each model sees."""
     several = outermost(predictor)
-    return rows // several.trained if several is not None and several.own_batches else rows
+    return rows // several.model_count if several is not None and several.own_batches else rows
 
 
 @contextmanager
 def own_batches(predictor: Predictor, own: bool = True) -> Iterator[None]:
-    """Set `Several.own_batches` of the outermost wrapper inside the block.
+    """Set `SeveralModels.own_batches` of the outermost wrapper inside the block.
 
     True gives each of several models its part of a batch; False gives the whole batch to all of them.
     """

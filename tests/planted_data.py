@@ -95,7 +95,7 @@ class Waves(Data):
     def fingerprint(self) -> Mapping[str, str]:
         return {"waves": f"{self.lengths} {self.noise}"}
 
-    def picture(self, inputs: Tensor) -> np.ndarray:
+    def preview(self, inputs: Tensor) -> np.ndarray:
         return np.zeros((4, 4, 3), np.uint8)
 
 

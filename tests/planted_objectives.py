@@ -9,7 +9,7 @@ from torch import Tensor
 
 from framework.calibration.module_flags import BATCH_NORM, flagged
 from framework.data import Batch
-from framework.model import Predictor, each_alone
+from framework.model import Predictor, independent_penalty
 from framework.objective import Objective
 from framework.target import Target
 from tests.planted_heads import CLASSES, PLACE
@@ -34,13 +34,13 @@ class Confidence(Objective):
         return density.log_prob(target).square().log1p()
 
     def forward(self, predictor: Predictor, batch: Batch) -> Tensor:
-        found = each_alone(self.each(predictor, batch))
+        found = independent_penalty(self.each(predictor, batch))
         return self.weight * (found.mean() if len(found) else found.sum())
 
 
 class Summed(Confidence):
     def forward(self, predictor: Predictor, batch: Batch) -> Tensor:
-        return self.weight * each_alone(self.each(predictor, batch)).sum()
+        return self.weight * independent_penalty(self.each(predictor, batch)).sum()
 
 
 class MeanOfMembers(Confidence):
@@ -69,13 +69,13 @@ class DropsTheLast(Confidence):
 class TellsTheGraph(Confidence):
     def forward(self, predictor: Predictor, batch: Batch) -> Tensor:
         found = super().forward(predictor, batch)
-        self.told = {"confidence": found}
+        self.logged_terms = {"confidence": found}
         return found
 
 
 class TellsEach(Confidence):
     def forward(self, predictor: Predictor, batch: Batch) -> Tensor:
-        self.told = {"confidence": self.each(predictor, batch).detach()}
+        self.logged_terms = {"confidence": self.each(predictor, batch).detach()}
         return super().forward(predictor, batch)
 
 

@@ -14,7 +14,7 @@ from framework.distributions.batch_shapes import Stacked
 from framework.distributions.density import Mixture
 from framework.distributions.protocol import cdf, median
 from framework.distributions.tempering import temper
-from framework.model import Predictor, each_alone
+from framework.model import Predictor, independent_penalty
 from framework.target import Target
 from framework.uncertainty import Uncertainty
 from tests.planted_heads import CLASSES, HEIGHT, ONE, PLACE, Changed
@@ -89,7 +89,7 @@ class Weighted(Uncertainty):
         return Mixture(weights.expand(components.batch_shape), components)
 
     def loss(self, inputs: Tensor, target: Tensor) -> Tensor:
-        return each_alone(torch.stack([model.loss(inputs, target) for model in self.each()], 1))
+        return independent_penalty(torch.stack([model.loss(inputs, target) for model in self.each()], 1))
 
     def training_densities(self, inputs: Tensor) -> Distribution:
         return Stacked([model.training_densities(inputs) for model in self.each()])

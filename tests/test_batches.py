@@ -67,7 +67,7 @@ class Sums(Data):
     def fingerprint(self) -> Mapping[str, str]:
         return {}
 
-    def picture(self, inputs: torch.Tensor) -> np.ndarray:
+    def preview(self, inputs: torch.Tensor) -> np.ndarray:
         return np.zeros((1, 1, 3), np.uint8)
 
 

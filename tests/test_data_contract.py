@@ -175,7 +175,7 @@ class Needles(Data):
         seed = self.data_seed if self.fault == "numbers in the fingerprint" else str(self.data_seed)
         return {"root": str(self.root), "data_seed": seed}
 
-    def picture(self, inputs):
+    def preview(self, inputs):
         canvas = np.zeros((8, 8, 3), np.float64 if self.fault == "pictures of floats" else np.uint8)
         if self.fault == "pictures change the input":
             inputs.zero_()

@@ -10,7 +10,7 @@ from torch.distributions import Categorical, Distribution, Independent, Normal
 
 from framework.distributions.density import Mixture
 from framework.distributions.intervals import middle
-from framework.prediction import Prediction, answers
+from framework.prediction import Prediction, table_columns
 from framework.target import Target
 from framework.testing.devices import OneDevice, Questions, on_one_device
 from framework.testing.finding import Worst
@@ -102,7 +102,7 @@ def test_the_answers_of_a_density_are_on_its_device(
         if target.kind != "class":
             yield "middle", lambda: middle(density, 0.9, 99)
         batch = {"index": mode.receive(torch.arange(2)), "target": density.sample()}
-        yield "answers", lambda: answers(target, Prediction(density, batch))
+        yield "answers", lambda: table_columns(target, Prediction(density, batch))
 
     worst = Worst()
     on_one_device(questions, worst)

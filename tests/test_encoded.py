@@ -76,7 +76,7 @@ class Points(Data):
     def fingerprint(self):
         return {"version": "1"}
 
-    def picture(self, inputs):
+    def preview(self, inputs):
         return np.zeros((1, 1, 3), np.uint8)
 
 
@@ -134,7 +134,7 @@ def test_features_are_computed_once_and_are_the_same_as_in_each_step():
     assert encoded.augment(same) is same
     assert len(encoded.read([])) == 3
     with pytest.raises(ConfigError, match="no picture"):
-        encoded.picture(same["input"])
+        encoded.preview(same["input"])
 
 
 def test_features_that_do_not_fit_into_memory_are_not_held():

@@ -19,7 +19,7 @@ from framework.density_head import DensityHead
 from framework.encoder import Encoder
 from framework.errors import ConfigError
 from framework.model import FrozenFrontEnd, Model, Predictor, one_pass
-from framework.objective import Objective, Rival
+from framework.objective import AdversaryOptimizer, Objective
 from framework.target import Target
 from framework.testing.wrappers import LENGTH, Plain
 from framework.training.batches import Batches
@@ -97,11 +97,11 @@ class Against(Objective):
     def __init__(self, schedule: Literal["constant", "cosine"]) -> None:
         super().__init__()
         self.own = nn.Parameter(torch.tensor([0.5, -1.0]))
-        self.rival = Rival(learning_rate=0.03, schedule=schedule)
+        self.adversary_optimizer = AdversaryOptimizer(learning_rate=0.03, schedule=schedule)
 
     def forward(self, predictor: Predictor, batch: Batch) -> Tensor:
         weight = next(predictor.parameters())
-        self.told = {"against": (self.own.square().sum() + weight.sum()).detach()}
+        self.logged_terms = {"against": (self.own.square().sum() + weight.sum()).detach()}
         return (self.own.detach().sum() * weight).sum() + (
             self.own - weight.detach().mean()
         ).square().sum() * 50

@@ -56,7 +56,7 @@ def bare(built: Predictor, fields: dict[str, Tensor], epochs: int, seed: int, me
     optimizer = OPTIMIZERS["adam"](built.parameters(), lr=LEARNING_RATE)
     dtype = next(built.parameters()).dtype
     several = outermost(built)
-    members = range(several.trained) if several else [member]
+    members = range(several.model_count) if several else [member]
     with own_batches(built):
         for epoch in range(epochs):
             orders = torch.tensor([epoch_order(len(fields["target"]), seed, epoch, one) for one in members])
@@ -73,7 +73,7 @@ def framed(built: Predictor, data: Data, epochs: int, seed: int) -> None:
         built, [], data, OptimizerSettings(name="adam", learning_rate=LEARNING_RATE), seed, {}
     )
     several = outermost(built)
-    orders = several.trained if several else 1
+    orders = several.model_count if several else 1
     batches = Batches(data, batch_size=BATCH, workers=0, seed=seed, orders=orders)
     with tempfile.TemporaryDirectory() as folder:
         trainer = pl.Trainer(

@@ -53,7 +53,7 @@ def alarms(seed: int) -> list[str]:
             failed += [f"{name}, {row.name}: {one}" for one in whole.findings(row) if not one.holds]
     for name, (_, targets) in HEADS.items():
         for target in targets:
-            what = f"{name} of somebody else, {target.told}"
+            what = f"{name} of somebody else, {target.listed_names}"
             failed += [f"{what}: {one}" for one in right_findings(name, target) if not one.holds]
     return failed
 

@@ -132,7 +132,7 @@ class Voxels(NamedTuple):
 def voxels_of(data: CEST, test: dict[str, Tensor]) -> Voxels:
     wanted = data.wanted
     found = fit(test["input"], torch.tensor(data.offsets, dtype=torch.float64), wanted)
-    told = slice(wanted.told)
+    told = slice(wanted.target_count)
     lower, upper = (torch.tensor(side[told]).double() for side in (wanted.lower, wanted.upper))
     target, error = found.parameters[:, told], found.root.square().sum(-1).sqrt()[:, told]
     inside = (target > lower + 1e-9) & (target < upper - 1e-9)

@@ -76,7 +76,7 @@ class Description:
             [
                 f"{self.method or names}, trained on {self.config['data']['name']}{' (synthetic)' * self.synthetic}",
                 f"  reads    {'×'.join(map(str, self.input_shape))} {', '.join(self.columns)}".rstrip(),
-                f"  predicts {unit[self.target.kind]}: {self.target.told}",
+                f"  predicts {unit[self.target.kind]}: {self.target.listed_names}",
                 f"  made of  {names}",
                 f"  from     {self.path}",
                 *(f"  {remark}" for remark in self.remarks),

@@ -102,7 +102,7 @@ def asked_of(model: nn.Module, data: Data, given: Any) -> Batch:
     """Return the batch that a model reads for the user's data; a path may begin with `~`.
 
     Raises:
-        DataError: `Data.asked` refuses the data or fails on them, or they are empty.
+        DataError: `Data.user_batch` refuses the data or fails on them, or they are empty.
     """
     given = _without_tilde(given)
     if hasattr(given, "__len__") and not isinstance(given, str) and not len(given):
@@ -110,7 +110,7 @@ def asked_of(model: nn.Module, data: Data, given: Any) -> Batch:
             f"An empty {type(given).__name__} holds no input. Give at least one file, row or array."
         )
     try:
-        batch = data.asked(given)
+        batch = data.user_batch(given)
     except UserError:
         raise
     except Exception as error:

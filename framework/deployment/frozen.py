@@ -130,7 +130,7 @@ class Frozen:
         """
         frame = None
         if self.data is not None:
-            batch = self.data.asked(inputs)
+            batch = self.data.user_batch(inputs)
             inputs, frame = batch["input"], self.data.frame(batch)
         if self.preceded is not None:
             with torch.no_grad():

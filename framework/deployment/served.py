@@ -31,7 +31,7 @@ from framework.errors import DataError, UserError, quoted, shown
 from framework.evaluation.promises import promised
 from framework.evaluation.splits import BLOCK, predicted
 from framework.model import Predictor
-from framework.prediction import answers, named
+from framework.prediction import named_columns, table_columns
 
 CONTENT, NAME = "base64", "name"
 """Columns of a request with files: the files' bytes, and their names, if the kind of file depends on the name."""
@@ -99,7 +99,7 @@ class Served:
             prediction = predicted(self.predictor, block, samples, Draw(seed, number))
             prediction = prediction.in_frame(self.data.frame(block))
             target = self.description.target
-            found = answers(target, prediction)
+            found = table_columns(target, prediction)
             if target.kind == "image":
                 pictures = [base64.b64encode(png(light)).decode() for light in prediction.image("color")]
                 parts.append(
@@ -110,7 +110,7 @@ class Served:
             if target.kind == "class":
                 labels = {"class": [target.names[label] for label in mode.tolist()]}
             else:
-                labels, found = {}, {**found, **named(target, mode, "_mode")}
+                labels, found = {}, {**found, **named_columns(target, mode, "_mode")}
             numbers = {key: column.numpy() for key, column in found.items()}
             parts.append(pd.DataFrame({**labels, **numbers, **promised(target, prediction)}))
         table = pd.concat(parts, ignore_index=True)

@@ -86,7 +86,7 @@ def require_interval(target: Target, mass: float, by: str) -> None:
         has = {"class": "the probability of each class is a column", "image": "metrics give those of images"}
         raise ConfigError(
             f"{by}={mass:g} gives the ends of intervals of reals and angles, but this model predicts "
-            f"{target.kind} targets ({target.told}): {has[target.kind]}. Leave {by} out."
+            f"{target.kind} targets ({target.listed_names}): {has[target.kind]}. Leave {by} out."
         )
 
 

@@ -18,7 +18,7 @@ from framework.reports.report import report_test
 from framework.runs.run import opened
 from framework.runs.session import calibrate, for_trained, tested
 from framework.target import Target
-from framework.uncertainty import Several
+from framework.uncertainty import SeveralModels
 
 FEW = 2
 """Number of samples on which wrappers are tried before anything is fitted."""
@@ -71,7 +71,7 @@ def chosen(wrappers: Mapping[str, Any]) -> list[dict[str, Any]]:
         )
     found = [resolve("uncertainty", part, f"uncertainty.{key}") for key, part in wrappers.items()]
     for part in found:
-        if issubclass(load("uncertainty", part["name"]), Several):
+        if issubclass(load("uncertainty", part["name"]), SeveralModels):
             raise ConfigError(
                 f"uncertainty={part['name']} trains several models, and a checkpoint holds one. Train it with "
                 "mode=train, or join models that were trained apart with mode=combine mode.members=[...]."

@@ -23,7 +23,7 @@ from framework.distributions.protocol import value_set
 from framework.evaluation.promises import ends, promised, require_interval, require_promised
 from framework.evaluation.splits import BLOCK, predicted
 from framework.model import Predictor
-from framework.prediction import Prediction, answers
+from framework.prediction import Prediction, table_columns
 from framework.runs.run import opened
 from framework.runs.session import for_trained
 from framework.runs.user_files import UNREADABLE, files_in, say_left_out, to_read
@@ -113,7 +113,7 @@ def predictions(
     for number, batch in enumerate(told(loader, "predicting")):
         prediction = predicted(predictor, batch, settings.samples, Draw(settings.seed, number))
         prediction = prediction.in_frame(data.frame(batch))
-        columns = answers(target, prediction)
+        columns = table_columns(target, prediction)
         if isinstance(data, Mapped) and files:
             mapped.append((prediction.point.cpu(), prediction.deviation().cpu()))
         columns = {**columns, **_intervals(target, prediction, mass)}

@@ -63,7 +63,7 @@ def classified(
     """Draw each sample's image, and bars for its most likely classes and the true one.
 
     Args:
-        images: images of the samples, as `Data.picture` gives them.
+        images: images of the samples, as `Data.preview` gives them.
         probability: predicted probabilities.
         label: true classes.
         names: names of the classes.

@@ -72,7 +72,7 @@ def _densities(session: Session) -> Figure:
     chosen = choose(entropy, error, log_density)
     order = [index for row in chosen.values() for index in row]
     return viewing_circles(
-        [data.picture(inputs[index]) for index in order],
+        [data.preview(inputs[index]) for index in order],
         log_density[:, order],
         angles.cpu().numpy(),
         np.where(symmetry == 0, np.nan, truth)[order],
@@ -103,7 +103,7 @@ def _classified(session: Session) -> Figure:
     chosen = choose_classified(probability, label)
     order = [index for row in chosen.values() for index in row]
     return classified(
-        [data.picture(inputs[index]) for index in order],
+        [data.preview(inputs[index]) for index in order],
         probability[order],
         label[order],
         data.target.names,

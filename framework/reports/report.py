@@ -11,7 +11,7 @@ from rich.console import Console
 from framework.errors import UserError
 from framework.evaluation.cost import Cost
 from framework.evaluation.splits import Evaluation, cost, evaluate
-from framework.metric import Pictured
+from framework.metric import HasFigure
 from framework.reports.table import COST_BETTER, COST_COLUMNS, Better, machine, results_table
 from framework.runs.run import Run
 from framework.runs.session import Session
@@ -88,8 +88,8 @@ def _pictures(run: Run, session: Session, found: Evaluation, synthetic: bool) ->
     except UserError as error:
         session.console.print(f"no picture of predictions: {error}", soft_wrap=True, highlight=False)
     for metric in found.metrics:
-        if isinstance(metric, Pictured):
-            picture(run, metric.figure(session.title, synthetic=synthetic), metric.picture)
+        if isinstance(metric, HasFigure):
+            picture(run, metric.figure(session.title, synthetic=synthetic), metric.figure_name)
 
 
 def _results(

@@ -88,7 +88,7 @@ def viewing_circles(
     the density. It ends within an outer circle, which represents the density that is written beside it.
 
     Args:
-        images: images of the samples, as `Data.picture` gives them.
+        images: images of the samples, as `Data.preview` gives them.
         log_density: nats, at `angles`.
         angles: a regular grid over the whole circle, radians.
         truths: true angles, radians; NaN if there is no true direction, which is then not drawn.

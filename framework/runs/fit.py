@@ -74,7 +74,7 @@ def _by_gradient(session: Session, run: Run) -> tuple[float, int]:
     trainer = _trainer(run, keep, session.console)
     batches = session.batches(fed)
     several = outermost(session.predictor)
-    batches.orders = several.trained if several else 1
+    batches.orders = several.model_count if several else 1
     batches.attach(trainer)
     resume = _resumed_from(session, run)
     with sharing_one_fate(trainer, run.stopper, partial(_give_up, run)):

@@ -98,7 +98,7 @@ def fit(
     found = search(measured, begin, damping)
     parameters, cost, status = found.parameters, found.cost, found.status
     again = status == Status.ILL_POSED
-    if start is None and wanted.told > 2 * COUNT:
+    if start is None and wanted.target_count > 2 * COUNT:
         again = status != Status.NOT_FINITE
     if len(lost := again.nonzero().squeeze(1)):
         again = search(measured[lost], second.expand(len(lost), -1), CAREFUL)
@@ -155,7 +155,7 @@ def _careful_root(
 
 
 def density(found: Fit, told: int, shape: torch.Size | tuple[int, ...], zero: Tensor) -> Distribution:
-    """Return the Gaussian over the first `told` parameters.
+    """Return the Gaussian over the first `target_count` parameters.
 
     It has the type of `zero` (*shape, 1), which is added to its mean. The first rows of a lower Cholesky factor are the
     factor of the marginal.

@@ -30,14 +30,14 @@ class Parameters(NamedTuple):
         lower: lower bounds.
         upper: upper bounds.
         start: start of the search.
-        told: number of parameters that are the target; the parameters after them are fitted too.
+        target_count: number of parameters that are the target; the parameters after them are fitted too.
     """
 
     names: tuple[str, ...]
     lower: tuple[float, ...]
     upper: tuple[float, ...]
     start: tuple[float, ...]
-    told: int
+    target_count: int
 
     @classmethod
     def of(cls, preset: Preset) -> "Parameters":
@@ -56,7 +56,7 @@ class Parameters(NamedTuple):
     @property
     def target(self) -> tuple[str, ...]:
         """Names of the target's numbers."""
-        return self.names[: self.told]
+        return self.names[: self.target_count]
 
 
 def _parameters(free: bool) -> Parameters:

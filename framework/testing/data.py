@@ -382,7 +382,7 @@ def _pictures(bench: Workbench, worst: Worst) -> None:
         for number in few(len(split), 3):
             inputs = split[number]["input"]
             before = inputs.clone()
-            drawn = bench.data.picture(inputs)
+            drawn = bench.data.preview(inputs)
             shape, where = np.shape(drawn), f"picture of {name} {number}"
             worst.same(f"{where}: numbers", getattr(drawn, "dtype", type(drawn)), np.dtype(np.uint8))
             worst.count(

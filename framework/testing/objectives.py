@@ -10,7 +10,7 @@ from torch.distributions import Distribution
 from framework.data import Batch
 from framework.distributions.batch_shapes import Stacked
 from framework.errors import ConfigError, UserError
-from framework.model import Predictor, each_alone
+from framework.model import Predictor, independent_penalty
 from framework.objective import Objective
 from framework.target import Target
 from framework.testing.devices import OneDevice, Questions, on_one_device
@@ -59,7 +59,9 @@ class Members(Predictor):
         return self.training_densities(inputs)
 
     def loss(self, inputs: Tensor, target: Tensor) -> Tensor:
-        return each_alone(torch.stack([-network(inputs).log_prob(target) for network in self.networks], 1))
+        return independent_penalty(
+            torch.stack([-network(inputs).log_prob(target) for network in self.networks], 1)
+        )
 
     def training_densities(self, inputs: Tensor) -> Distribution:
         found = [network(inputs) for network in self.networks]
@@ -338,7 +340,7 @@ def _told(build: Make, row: ObjectiveRow, worst: Worst) -> None:
     objective = build(1.0)
     penalty(objective, predictor_of(row), batch_of(row, SAMPLES))
     worst.count(False, "none")
-    for name, term in objective.told.items():
+    for name, term in objective.logged_terms.items():
         worst.same(f"shape of {name}", tuple(term.shape), ())
         worst.count(term.requires_grad, f"{name} holds the graph of the batch")
         worst.finite(name, term)

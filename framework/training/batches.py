@@ -264,7 +264,7 @@ def require_targets(batch: Batch, target: Target) -> Batch:
     if tuple(found.shape) != wanted:
         raise DataError(
             f'The data set gives {wanted[0]} samples a "target" of shape {tuple(found.shape)}: wanted {wanted}, for '
-            f"targets of kind {target.kind!r} ({target.told}). Mend the data set, or its `target`."
+            f"targets of kind {target.kind!r} ({target.listed_names}). Mend the data set, or its `target`."
         )
     if target.kind == "class":
         require_labels(found, len(target.names))

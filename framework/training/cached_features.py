@@ -73,7 +73,7 @@ class CachedFeatures(Data):
         """Return what identifies the data set."""
         return self.data.fingerprint()
 
-    def picture(self, inputs: Tensor) -> np.ndarray:
+    def preview(self, inputs: Tensor) -> np.ndarray:
         """Refuse to draw features."""
         raise ConfigError("Features have no picture; ask the data they were computed from.")
 

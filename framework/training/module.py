@@ -17,7 +17,7 @@ from framework.data import Batch, Data
 from framework.distributions.noise import seed_step
 from framework.errors import ConfigError, NonFiniteAnswer, NonFiniteLoss
 from framework.model import FrozenFrontEnd, Predictor, one_pass
-from framework.objective import Objective, Rival
+from framework.objective import AdversaryOptimizer, Objective
 from framework.tracking.signals import Stopper
 from framework.tracking.tracker import Tracker
 from framework.training.ranks import Share, WholeBatch, gathered, share, summed
@@ -189,10 +189,10 @@ class Training(pl.LightningModule):
             loss = float(self.trainer.callback_metrics["validation/loss"])
             see(self.lr_schedulers(), loss, self.current_epoch + 1)
 
-    def _rivals(self) -> list[tuple[Objective, Rival]]:
+    def _rivals(self) -> list[tuple[Objective, AdversaryOptimizer]]:
         """Return the objectives whose parameters are trained against the predictor, with their optimiser settings."""
         objectives = [one for one in self.objectives if isinstance(one, Objective)]
-        return [(one, one.rival) for one in objectives if one.rival is not None]
+        return [(one, one.adversary_optimizer) for one in objectives if one.adversary_optimizer is not None]
 
     def _own(self) -> list[nn.Parameter]:
         """Return the parameters that the predictor's own optimiser settings train."""
@@ -214,7 +214,7 @@ class Training(pl.LightningModule):
         clipped: set[nn.Parameter] = set()
         several = outermost(self.predictor)
         if isinstance(several, nn.Module) and gradient_clip_algorithm != "value":
-            several.clip_each(gradient_clip_val)
+            several.clip_each_model(gradient_clip_val)
             clipped = set(several.parameters())
         for group in optimizer.param_groups:
             if gradient_clip_algorithm == "value":
@@ -362,7 +362,7 @@ class Report(pl.Callback):
                 f"train/{name}": float(value)
                 for one in pl_module.objectives
                 if isinstance(one, Objective)
-                for name, value in one.told.items()
+                for name, value in one.logged_terms.items()
             }
             self.tracker.log_metrics(
                 {"train/loss": pl_module.last_loss, "train/learning_rate": rate, **told},

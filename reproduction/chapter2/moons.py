@@ -25,7 +25,7 @@ from benchmarks.sweeps import processor_seconds, record
 from framework.configuration.schema import build, resolve
 from framework.distributions.class_probabilities import class_probabilities
 from framework.evaluation.splits import cost, evaluate
-from framework.metric import Pictured
+from framework.metric import HasFigure
 from framework.reports.landscape_picture import Plane, landscapes, probabilities
 from framework.reports.table import Better, aggregate, markdown
 from framework.training.batches import Batches
@@ -250,7 +250,7 @@ def pictures(rows: list[dict[str, Any]]) -> None:
             seed=0,
             device=torch.device("cpu"),
         )
-        drawn = cast(Pictured, found.metrics[0]).figure(METHODS[key], synthetic=True)
+        drawn = cast(HasFigure, found.metrics[0]).figure(METHODS[key], synthetic=True)
         stored = BytesIO()
         drawn.savefig(stored, dpi=110)
         stored.seek(0)

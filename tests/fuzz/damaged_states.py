@@ -471,7 +471,7 @@ def asked(file: Path) -> object:
     data = loading.reader(loading.stored(file)[0])
     try:
         if "height" in data.state_dict():
-            data.picture(torch.zeros(3, 6))
+            data.preview(torch.zeros(3, 6))
         return predictor(np.ones((2, 2), np.float32)).log_prob(torch.zeros(2, dtype=torch.int64))
     except (NonFiniteAnswer, UserError) as error:
         raise DataError(f"{file}: {error}") from error

@@ -59,7 +59,7 @@ def register(
     faces = chosen_body(data.body)[0].faces
     written = []
     for scan in scans:
-        batch = data.asked(scan)
+        batch = data.user_batch(scan)
         local = median(predictor(batch["input"]), 1).unflatten(1, (-1, 3))
         place = batch["centre"], batch["scale"]
         vertices = denormalised(local, *place)[0].numpy()

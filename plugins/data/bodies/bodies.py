@@ -51,7 +51,7 @@ class Bodies(Data):
         found = clouds.pad([self.cloud(file) for file in files])
         return Fields(**normalised(found), index=torch.arange(len(files)))
 
-    def asked(self, given: Any) -> Batch:
+    def user_batch(self, given: Any) -> Batch:
         """Return the batch of scans in metres: files, or an array of one cloud or of a batch, padded with NaN."""
         files = [given] if isinstance(given, str | Path) else given
         if isinstance(files, Sequence) and files and all(isinstance(file, str | Path) for file in files):
@@ -61,7 +61,7 @@ class Bodies(Data):
         return {**found, "input": found["input"].float()}
 
     def inputs(self, given: Any) -> Tensor:
-        return self.asked(given)["input"]
+        return self.user_batch(given)["input"]
 
     def frame(self, batch: Batch) -> Frame:
         """Return the transform of targets into metres, in the coordinates of the scan."""
@@ -72,7 +72,7 @@ class Bodies(Data):
     def augment(self, batch: Batch) -> Batch:
         return batch
 
-    def picture(self, inputs: Tensor) -> np.ndarray:
+    def preview(self, inputs: Tensor) -> np.ndarray:
         return cloud_picture.picture(inputs[..., [2, 0, 1]])  # the third axis of the figure points up
 
 

@@ -92,7 +92,7 @@ def model(checkpoint: str, paths: Mapping[str, str] | None = None) -> tuple[Regi
 
     @torch.no_grad()
     def registered(scan: Path) -> np.ndarray:
-        batch = data.asked(scan)
+        batch = data.user_batch(scan)
         local = median(predictor(batch["input"]), 1).unflatten(1, (-1, 3))
         return denormalised(local, batch["centre"], batch["scale"])[0].float().numpy()
 

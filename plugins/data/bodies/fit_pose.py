@@ -140,7 +140,7 @@ class FitPoseHead(DensityHead, Fitted):
         if target.names != self.figure.names:
             raise ConfigError(
                 f"density_head fit_pose fits {self.figure.source}, whose numbers are {', '.join(self.figure.names)}; "
-                f"the data's are {target.told}. Choose data=pose_from_image, with the same body for both."
+                f"the data's are {target.listed_names}. Choose data=pose_from_image, with the same body for both."
             )
         self.camera = self.figure.camera(height, width)
         self.renderer = renderer

@@ -223,7 +223,7 @@ class HumanScans(Data):
             "sha256": self._digest,
         }
 
-    def picture(self, inputs: Tensor) -> np.ndarray:
+    def preview(self, inputs: Tensor) -> np.ndarray:
         """Return an image of the points that the canonical camera sees, on white: one pixel each, nearest in front."""
         height, width = self.size
         points = inputs.detach().cpu().float()

@@ -9,7 +9,7 @@ from torchmetrics.utilities import dim_zero_cat
 
 from framework.errors import ConfigError
 from framework.geometry.rotation import geodesic_distance
-from framework.metric import Metric, Pictured
+from framework.metric import HasFigure, Metric
 from framework.prediction import Prediction
 from framework.target import Target
 from plugins.data.bodies.body import turns_less_identity
@@ -40,7 +40,7 @@ class Shown(NamedTuple):
     path: Tensor
 
 
-class PoseError(Metric, Pictured):
+class PoseError(Metric, HasFigure):
     """Errors of a body's rotation (geodesic, degrees) and translation (cm), and the share within 2° and 1 cm.
 
     Medians, 95th percentiles and worst cases are reported, because a descent either succeeds or ends in another
@@ -69,7 +69,7 @@ class PoseError(Metric, Pictured):
         "translation_median_cm": "lower",
         "found": "higher",
     }
-    picture: ClassVar[str] = "pose"
+    figure_name: ClassVar[str] = "pose"
     errors: list[Tensor] | Tensor
 
     def __init__(self, target: Target) -> None:
@@ -77,7 +77,7 @@ class PoseError(Metric, Pictured):
         target.require("real", by="metric pose_error")
         if target.names[:6] != PLACE:
             raise ConfigError(
-                f"metric pose_error reads {', '.join(PLACE)}, but the target is {target.told}. Choose "
+                f"metric pose_error reads {', '.join(PLACE)}, but the target is {target.listed_names}. Choose "
                 "data=pose_from_image, or leave this metric out."
             )
         self.add_state("errors", [], dist_reduce_fx="cat")

@@ -186,7 +186,7 @@ class PoseFromImage(Data):
             "sha256": digest.hexdigest(),
         }
 
-    def picture(self, inputs: Tensor) -> np.ndarray:
+    def preview(self, inputs: Tensor) -> np.ndarray:
         return eight_bit(inputs[:3].float()).movedim(0, -1).cpu().numpy()
 
 

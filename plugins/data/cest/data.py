@@ -191,7 +191,7 @@ class CEST(Data, Mapped):
             )
         return Fields(
             input=found.spectra[chosen],
-            target=found.lines[chosen, : self.wanted.told].float(),
+            target=found.lines[chosen, : self.wanted.target_count].float(),
             lines=found.lines[chosen].float(),
             group=found.region[chosen],
             place=found.place[chosen],
@@ -247,7 +247,7 @@ class CEST(Data, Mapped):
             "sha256": self._digest,
         }
 
-    def picture(self, inputs: Tensor) -> np.ndarray:
+    def preview(self, inputs: Tensor) -> np.ndarray:
         return curve(inputs.detach().cpu().double().numpy())
 
 

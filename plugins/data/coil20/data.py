@@ -137,5 +137,5 @@ class COIL20(Data):
             "sha256": self._digest,
         }
 
-    def picture(self, inputs: Tensor) -> np.ndarray:
+    def preview(self, inputs: Tensor) -> np.ndarray:
         return images.picture(inputs)

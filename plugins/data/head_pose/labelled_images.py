@@ -135,7 +135,7 @@ class Heads(Data):
     def fingerprint(self) -> Mapping[str, str]:
         return self.source.fingerprint(self.synthetic) | self._loaded.fingerprint
 
-    def picture(self, inputs: Tensor) -> np.ndarray:
+    def preview(self, inputs: Tensor) -> np.ndarray:
         return images.picture(inputs)
 
 

@@ -122,5 +122,5 @@ class ImagesWithAngles(Data):
         sizes = {split: str(len(table)) for split, table in self._tables.items()}
         return {"root": str(self.root), "version": self.csv, **sizes, "sha256": self._digest}
 
-    def picture(self, inputs: Tensor) -> np.ndarray:
+    def preview(self, inputs: Tensor) -> np.ndarray:
         return images.picture(inputs)

@@ -106,7 +106,7 @@ class LabelledClouds(Data):
     def fingerprint(self) -> Mapping[str, str]:
         return self._fingerprint
 
-    def picture(self, inputs: Tensor) -> np.ndarray:
+    def preview(self, inputs: Tensor) -> np.ndarray:
         return cloud_picture.picture(inputs, self.columns)
 
 

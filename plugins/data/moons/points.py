@@ -71,7 +71,7 @@ class PlanePoints(Data):
     def augment(self, batch: Batch) -> Batch:
         return batch
 
-    def picture(self, inputs: Tensor) -> np.ndarray:
+    def preview(self, inputs: Tensor) -> np.ndarray:
         return picture(inputs, self._splits[0])
 
 

@@ -278,7 +278,7 @@ def test_a_users_points_are_read_without_preparing(name: str, tmp_path: Path) ->
 def test_a_picture_marks_the_point_in_the_cloud(name: str) -> None:
     data = prepared(name)
     for point, row, column in (([0.0, 0.0], 47, 48), ([-4.0, 4.0], 0, 0), ([1e9, -1e9], 95, 95)):
-        picture = data.picture(torch.tensor(point))
+        picture = data.preview(torch.tensor(point))
         assert picture.shape == (SIDE, SIDE, 3)
         black = np.argwhere((picture == 0).all(-1))
         assert [row, column] in black.tolist()

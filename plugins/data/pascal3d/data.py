@@ -242,7 +242,7 @@ class Pascal3D(Data):
             "sha256": self._digest,
         }
 
-    def picture(self, inputs: Tensor) -> np.ndarray:
+    def preview(self, inputs: Tensor) -> np.ndarray:
         return images.picture(inputs)
 
 

@@ -303,7 +303,7 @@ def test_fields_of_a_batch(drawn: Path) -> None:
     assert fields["input"].shape == (count, 3, 32, 32)
     assert torch.all(abs(fields["target"]) <= math.pi + 1e-6)
     assert torch.equal(fields["symmetry"], torch.ones(count, dtype=torch.int64))
-    assert np.array_equal(data.picture(fields["input"][0]), fields["input"][0].permute(1, 2, 0).numpy())
+    assert np.array_equal(data.preview(fields["input"][0]), fields["input"][0].permute(1, 2, 0).numpy())
 
 
 def test_crop_holds_the_object_and_its_margin(drawn: Path) -> None:

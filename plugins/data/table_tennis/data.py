@@ -227,7 +227,7 @@ class TableTennis(Data):
             "sha256": digest.hexdigest(),
         }
 
-    def picture(self, inputs: Tensor) -> np.ndarray:
+    def preview(self, inputs: Tensor) -> np.ndarray:
         return side_view(inputs.unflatten(-1, (self.grid.observed, len(PARTS))).detach().cpu().numpy())
 
 

@@ -160,5 +160,5 @@ class Tabular(Data):
             "sha256": table.digest,
         }
 
-    def picture(self, inputs: Tensor) -> np.ndarray:
+    def preview(self, inputs: Tensor) -> np.ndarray:
         return bars(inputs.detach().cpu().double().numpy())

@@ -64,7 +64,7 @@ class BernoulliHead(DensityHead):
         if len(target.names) != 2:
             raise ConfigError(
                 f"density_head bernoulli describes two classes; this data set has {len(target.names)}: "
-                f"{target.told}. Choose density_head=categorical."
+                f"{target.listed_names}. Choose density_head=categorical."
             )
         self.size = 1
 

@@ -72,7 +72,7 @@ class LorentzianHead(DensityHead, Fitted):
         found = fit(raw.reshape(-1, self.size), self.offsets, self.wanted, most=self.steps)
         zero = (raw * 0).sum(-1, keepdim=True)
         zero = zero.double() if self.scaled else zero
-        return density(found, self.wanted.told, raw.shape[:-1], zero)
+        return density(found, self.wanted.target_count, raw.shape[:-1], zero)
 
     def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
         """Return the negative log-likelihood of each sample, nats."""

@@ -45,7 +45,7 @@ class MatrixFisherHead(DensityHead):
         if target.names != ANGLES:
             raise ConfigError(
                 f"density_head matrix_fisher describes rotations by the three angles {', '.join(ANGLES)}, in this "
-                f"order; this data set's targets are {target.told}. Choose another density_head, or "
+                f"order; this data set's targets are {target.listed_names}. Choose another density_head, or "
                 "other data; von_mises describes any angles."
             )
         self.size = 9

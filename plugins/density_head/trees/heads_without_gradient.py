@@ -28,7 +28,7 @@ def require_class_or_real(target: Target, by: str) -> None:
     if target.kind not in ("class", "real"):
         raise ConfigError(
             f"{by} describes targets of kind 'class' or 'real', but this data set's are {target.kind!r} "
-            f"({target.told}). Choose another density_head, or other data."
+            f"({target.listed_names}). Choose another density_head, or other data."
         )
 
 

@@ -52,7 +52,7 @@ class UniformFloorHead(DensityHead):
         if target.kind == "real":
             raise ConfigError(
                 "density_head uniform_floor needs a bounded target; no density is uniform over the reals "
-                f"({target.told}). Choose the component itself, with its own floor."
+                f"({target.listed_names}). Choose the component itself, with its own floor."
             )
         self.weight = weight
         self.component = require_trained(component)

@@ -45,7 +45,7 @@ class MeanAngularDeviation(Mean):
 
     def update(self, prediction: Prediction) -> None:
         each = deviations(prediction) * (180 / math.pi)
-        self.take_in(torch.cat([each.mean(-1, keepdim=True), each], -1))
+        self.add_samples(torch.cat([each.mean(-1, keepdim=True), each], -1))
 
     def compute(self) -> dict[str, Tensor]:
         mean, error = self.mean_and_error()

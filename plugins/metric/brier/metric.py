@@ -44,7 +44,7 @@ class Brier(Mean):
 
     def update(self, prediction: Prediction) -> None:
         probability = prediction.class_probabilities
-        self.take_in(brier(probability, require_labels(prediction.target, probability.shape[-1])))
+        self.add_samples(brier(probability, require_labels(prediction.target, probability.shape[-1])))
 
     def compute(self) -> dict[str, Tensor]:
         mean, error = self.mean_and_error()

@@ -11,7 +11,7 @@ from torchmetrics.utilities.data import dim_zero_cat
 
 from framework.distributions.class_probabilities import require_labels
 from framework.errors import ConfigError
-from framework.metric import Metric, Pictured
+from framework.metric import HasFigure, Metric
 from framework.prediction import Prediction
 from framework.target import Target
 
@@ -25,7 +25,7 @@ The same probability in float32 differs by a few times 2^-24 from one device to 
 """
 
 
-class CalibrationError(Metric, Pictured):
+class CalibrationError(Metric, HasFigure):
     """Difference between confidence and the share of right predictions in bins of confidence (thesis eq. 2.28-2.31).
 
     - `ece`: expected calibration error in bins of equal width.
@@ -71,7 +71,7 @@ class CalibrationError(Metric, Pictured):
 }"""
     columns: ClassVar[dict[str, str]] = {"ece": "ECE", "ece_equal_mass": "ECE (equal mass)"}
     better: ClassVar[dict[str, Literal["higher", "lower"]]] = {"ece": "lower", "ece_equal_mass": "lower"}
-    picture = "reliability"
+    figure_name = "reliability"
     samples: list[Tensor] | Tensor
 
     def __init__(
@@ -86,7 +86,7 @@ class CalibrationError(Metric, Pictured):
         if probability == "positive" and len(target.names) != 2:
             raise ConfigError(
                 "metric calibration_error with probability=positive reads p(y = 1) of two classes; this data set has "
-                f"{len(target.names)}: {target.told}. Choose probability=predicted."
+                f"{len(target.names)}: {target.listed_names}. Choose probability=predicted."
             )
         self.names = target.names
         self.two = len(target.names) == 2

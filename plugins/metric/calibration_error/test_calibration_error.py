@@ -15,7 +15,7 @@ from torch.distributions import Categorical
 from framework.configuration.schema import build, resolve
 from framework.distributions.class_probabilities import class_probabilities
 from framework.errors import ConfigError, DataError, UserError
-from framework.metric import Pictured
+from framework.metric import HasFigure
 from framework.prediction import Prediction
 from framework.target import Target
 from plugins.metric.calibration_error.metric import NEAR, CalibrationError, equal_mass, equal_width
@@ -260,7 +260,7 @@ def test_the_picture_shows_what_was_seen():
     metric = CalibrationError(TWO, bins=10)
     # 30 at 0.62 of which 12 are right, 10 at 0.98 all right
     metric.update(predicted([[0.38, 0.62]] * 30 + [[0.98, 0.02]] * 10, [1] * 12 + [0] * 28))
-    assert isinstance(metric, Pictured)
+    assert isinstance(metric, HasFigure)
     figure = metric.figure("moons/$nothing$", synthetic=True)
     figure.draw_without_rendering()
     above, below = figure.axes

@@ -8,7 +8,7 @@ from pydantic import Field
 from torch import Tensor
 
 from framework.distributions.checks import refuse_nan
-from framework.metric import Metric, Pictured
+from framework.metric import HasFigure, Metric
 from framework.prediction import Prediction
 from framework.target import Target
 from plugins.metric.coverage.functional import border, covered
@@ -22,7 +22,7 @@ REGION = 0.9
 """Mass of the region whose size is reported."""
 
 
-class Coverage(Metric, Pictured):
+class Coverage(Metric, HasFigure):
     """Share of targets that lie in the highest-density regions of given masses.
 
     The mass h(x, y) of all values that are at least as dense as the target is uniform on [0, 1] where the densities are
@@ -61,7 +61,7 @@ class Coverage(Metric, Pictured):
         "coverage_error": "coverage error",
     }
     better: ClassVar[dict[str, Literal["higher", "lower"]]] = {"coverage_error": "lower"}
-    picture: ClassVar[str] = "coverage"
+    figure_name: ClassVar[str] = "coverage"
     count: Tensor
     inside: Tensor
     size: Tensor

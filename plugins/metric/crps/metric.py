@@ -54,7 +54,7 @@ class CRPS(Mean):
         if target.kind == "class":
             raise ConfigError(
                 "crps measures distances, and classes have none between them (this data set's: "
-                f"{target.told}). Leave this metric out; `brier` is the like of it for classes."
+                f"{target.listed_names}). Leave this metric out; `brier` is the like of it for classes."
             )
         self.samples = samples
         self.unit = "_deg" if target.kind == "angle" else ""
@@ -78,7 +78,7 @@ class CRPS(Mean):
         error = self.factor * torch.stack([score.error for score in scores], -1)
         score = torch.cat([each.mean(-1, keepdim=True), each], -1)
         refuse_nan(score[:, 0], "scores")
-        self.take_in(score)
+        self.add_samples(score)
         # the draws of the marginals are independent: variances add
         self.variance += error.square().sum() / len(self.names) ** 2
 

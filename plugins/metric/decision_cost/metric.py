@@ -143,12 +143,12 @@ def _index(target: Target, number: str | None) -> int:
     if number is None and len(target.names) > 1:
         raise ConfigError(
             f"decision_cost.number is missing: the target has {len(target.names)} numbers, and edges cut one of them. "
-            f"Name one of: {target.told}."
+            f"Name one of: {target.listed_names}."
         )
     if number is not None and number not in target.names:
         raise ConfigError(
             f"decision_cost.number = {number!r} is no number of the target.{did_you_mean(number, target.names)} "
-            f"Known: {target.told}."
+            f"Known: {target.listed_names}."
         )
     return 0 if number is None else target.names.index(number)
 

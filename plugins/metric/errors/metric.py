@@ -42,7 +42,7 @@ class Errors(Mean):
     def update(self, prediction: Prediction) -> None:
         # convert to float64 first, so that the difference is not rounded to float32
         each = self.power(prediction.point.double() - prediction.target.double())
-        self.take_in(torch.cat([each.mean(-1, keepdim=True), each[:, : len(self.names) - 1]], -1))
+        self.add_samples(torch.cat([each.mean(-1, keepdim=True), each[:, : len(self.names) - 1]], -1))
 
     def compute(self) -> dict[str, Tensor]:
         found: dict[str, Tensor] = {}

@@ -8,7 +8,7 @@ from pydantic import Field
 from torch import Tensor
 
 from framework.flights.frames import PARTS, future_frames
-from framework.metric import Metric, Pictured
+from framework.metric import HasFigure, Metric
 from framework.prediction import Prediction
 from framework.target import Target
 from plugins.metric.flight_error.landing import Shown, from_start, landings, last_seen
@@ -22,7 +22,7 @@ SHOWN = 8
 """Largest number of predictions that the figure shows."""
 
 
-class FlightError(Metric, Pictured):
+class FlightError(Metric, HasFigure):
     """Distance between predicted and true positions, centimetres, against time into the future (thesis Figure 4.3).
 
     - `error_cm`, `error_near_cm`, `error_far_cm`: mean error of the point prediction over all predicted frames, at the
@@ -59,7 +59,7 @@ class FlightError(Metric, Pictured):
     better: ClassVar[dict[str, Literal["higher", "lower"]]] = dict.fromkeys(
         ("error_cm", "error_far_cm", "landing_crps_cm"), "lower"
     )
-    picture: ClassVar[str] = "flights"
+    figure_name: ClassVar[str] = "flights"
     count: Tensor
     distance: Tensor
     squares: Tensor

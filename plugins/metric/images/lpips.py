@@ -44,7 +44,7 @@ class LPIPS(PerImage):
     reads: ClassVar[frozenset[str]] = frozenset({"color"})
     columns: ClassVar[dict[str, str]] = {"lpips": "LPIPS", "lpips_masked": "inside"}
     better: ClassVar[dict[str, Literal["higher", "lower"]]] = dict.fromkeys(columns, "lower")
-    picture: ClassVar[str] = "lpips"
+    figure_name: ClassVar[str] = "lpips"
 
     def __init__(
         self, *, backbone: Backbone = "alex", weights: FilePath | None = None, masked: bool = True

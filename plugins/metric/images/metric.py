@@ -61,7 +61,7 @@ class PSNR(PerImage):
     reads: ClassVar[frozenset[str]] = frozenset({"color"})
     columns: ClassVar[dict[str, str]] = {"psnr_db": "PSNR dB", "psnr_masked_db": "inside dB"}
     better: ClassVar[dict[str, Literal["higher", "lower"]]] = dict.fromkeys(columns, "higher")
-    picture: ClassVar[str] = "psnr"
+    figure_name: ClassVar[str] = "psnr"
 
     def __init__(
         self,
@@ -109,7 +109,7 @@ class SSIM(PerImage):
     reads: ClassVar[frozenset[str]] = frozenset({"color"})
     columns: ClassVar[dict[str, str]] = {"ssim": "SSIM", "ssim_masked": "inside"}
     better: ClassVar[dict[str, Literal["higher", "lower"]]] = dict.fromkeys(columns, "higher")
-    picture: ClassVar[str] = "ssim"
+    figure_name: ClassVar[str] = "ssim"
 
     def __init__(self, *, encoding: Encoding = "srgb", masked: bool = True) -> None:
         super().__init__()
@@ -144,7 +144,7 @@ class MSSSIM(PerImage):
     reads: ClassVar[frozenset[str]] = frozenset({"color"})
     columns: ClassVar[dict[str, str]] = {"ms_ssim": "MS-SSIM"}
     better: ClassVar[dict[str, Literal["higher", "lower"]]] = dict.fromkeys(columns, "higher")
-    picture: ClassVar[str] = "ms_ssim"
+    figure_name: ClassVar[str] = "ms_ssim"
 
     def __init__(self, *, encoding: Encoding = "srgb", scales: Annotated[int, Field(ge=1, le=5)] = 5) -> None:
         super().__init__()
@@ -178,7 +178,7 @@ class SilhouetteIoU(PerImage):
     reads: ClassVar[frozenset[str]] = frozenset({"mask"})
     columns: ClassVar[dict[str, str]] = {"silhouette_iou": "silhouette IoU"}
     better: ClassVar[dict[str, Literal["higher", "lower"]]] = dict.fromkeys(columns, "higher")
-    picture: ClassVar[str] = "silhouette_iou"
+    figure_name: ClassVar[str] = "silhouette_iou"
 
     def __init__(self) -> None:
         super().__init__()
@@ -205,7 +205,7 @@ class DepthError(PerImage):
     reads: ClassVar[frozenset[str]] = frozenset({"depth"})
     columns: ClassVar[dict[str, str]] = {"depth_error_m": "depth error m", "depth_unmatched": "unmatched"}
     better: ClassVar[dict[str, Literal["higher", "lower"]]] = dict.fromkeys(columns, "lower")
-    picture: ClassVar[str] = "depth_error"
+    figure_name: ClassVar[str] = "depth_error"
 
     def __init__(self) -> None:
         super().__init__()

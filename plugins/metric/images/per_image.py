@@ -11,7 +11,7 @@ from torchmetrics.utilities import dim_zero_cat
 
 from framework.errors import DataError
 from framework.geometry.light import eight_bit
-from framework.metric import Metric, Pictured
+from framework.metric import HasFigure, Metric
 from framework.prediction import Prediction
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ KEPT = 8
 """Number of random images that are kept beside the worst and the best; the one closest to the median is shown."""
 
 
-class PerImage(Metric, Pictured):
+class PerImage(Metric, HasFigure):
     """Base class of metrics that judge images one by one, in the one channel that `reads` names.
 
     `judge` returns the numbers of one image; images are ranked by the first number. A number is NaN where an image has

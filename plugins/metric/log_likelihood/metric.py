@@ -24,7 +24,7 @@ class Moments(Metric):
         self.add_state("moments", torch.zeros(3, dtype=torch.float64), dist_reduce_fx=merged_moments)
         self.add_state("sampling", torch.zeros(5, dtype=torch.float64), dist_reduce_fx=merged_sampling)
 
-    def take_in(self, log_prob: Float[Tensor, "batch"], estimate: Estimate) -> None:
+    def add_samples(self, log_prob: Float[Tensor, "batch"], estimate: Estimate) -> None:
         """Add the log-likelihoods of a batch and what their estimate says of the sampling."""
         self.moments = merged_moments(torch.stack([self.moments, moments_of(log_prob)]))
         self.sampling = merged_sampling(torch.stack([self.sampling, sampling_of(estimate)]))
@@ -55,7 +55,7 @@ class LogLikelihood(Moments):
     better: ClassVar[dict[str, Literal["higher", "lower"]]] = {"log_likelihood": "higher"}
 
     def update(self, prediction: Prediction) -> None:
-        self.take_in(prediction.log_prob, prediction.estimate)
+        self.add_samples(prediction.log_prob, prediction.estimate)
 
     def compute(self) -> dict[str, Tensor]:
         return summary("log_likelihood", self.moments, self.sampling)
@@ -85,7 +85,9 @@ class NegativeLogLikelihood(Moments):
     better: ClassVar[dict[str, Literal["higher", "lower"]]] = {"nll": "lower"}
 
     def update(self, prediction: Prediction) -> None:
-        self.take_in(refuse_nan(prediction.log_prob, "log-likelihoods of the targets"), prediction.estimate)
+        self.add_samples(
+            refuse_nan(prediction.log_prob, "log-likelihoods of the targets"), prediction.estimate
+        )
 
     def compute(self) -> dict[str, Tensor]:
         found = summary("nll", self.moments, self.sampling)

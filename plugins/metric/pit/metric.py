@@ -9,7 +9,7 @@ from torchmetrics.utilities.data import dim_zero_cat
 
 from framework.distributions.checks import refuse_nan
 from framework.errors import ConfigError
-from framework.metric import Metric, Pictured
+from framework.metric import HasFigure, Metric
 from framework.prediction import Prediction
 from framework.target import Target
 from plugins.metric.pit.functional import cramer_von_mises, kolmogorov_smirnov, transform
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-class PIT(Metric, Pictured):
+class PIT(Metric, HasFigure):
     """Probability integral transform (PIT) F(y) of each number of the target.
 
     It is uniform if forecasts are calibrated.
@@ -53,7 +53,7 @@ class PIT(Metric, Pictured):
 }"""
     columns: ClassVar[dict[str, str]] = {"pit_ks": "PIT KS"}
     better: ClassVar[dict[str, Literal["higher", "lower"]]] = {"pit_ks": "lower"}
-    picture: ClassVar[str] = "pit"
+    figure_name: ClassVar[str] = "pit"
     values: list[Tensor] | Tensor
 
     def __init__(
@@ -67,7 +67,7 @@ class PIT(Metric, Pictured):
         if target.kind == "class":
             raise ConfigError(
                 "pit asks which share of a density lies below the target, and classes have no order (this data "
-                f"set's: {target.told}). Leave this metric out; `coverage` judges classes too."
+                f"set's: {target.listed_names}). Leave this metric out; `coverage` judges classes too."
             )
         self.numbers = len(target.names)
         self.bins = bins

@@ -11,7 +11,7 @@ from torchmetrics.utilities import dim_zero_cat
 
 from framework.distributions.checks import refuse_nan
 from framework.errors import DataError
-from framework.metric import Metric, Pictured
+from framework.metric import HasFigure, Metric
 from framework.prediction import Prediction
 from framework.target import Target
 from plugins.metric.pixel_uncertainty.functional import coverage, rank_correlation, transform
@@ -25,7 +25,7 @@ KEPT = 8
 """Number of random images kept beside the least and the most certain; the one closest to the median is shown."""
 
 
-class PixelUncertainty(Metric, Pictured):
+class PixelUncertainty(Metric, HasFigure):
     """Coverage of the predicted intervals of pixels, and rank correlation of errors with predicted scales.
 
     Each image is judged by itself; the results are means over images, with standard errors:
@@ -72,7 +72,7 @@ class PixelUncertainty(Metric, Pictured):
         "spearman": "higher",
         "spearman_masked": "higher",
     }
-    picture: ClassVar[str] = "pixel_uncertainty"
+    figure_name: ClassVar[str] = "pixel_uncertainty"
     numbers: list[Tensor]
     facts: list[Tensor]
     panels: list[Tensor]

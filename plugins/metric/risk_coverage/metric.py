@@ -10,7 +10,7 @@ from torchmetrics.utilities.data import dim_zero_cat
 from framework.distributions.checks import refuse_nan
 from framework.distributions.circular import angular_distance
 from framework.errors import ConfigError
-from framework.metric import Metric, Pictured
+from framework.metric import HasFigure, Metric
 from framework.prediction import Prediction
 from framework.target import Target
 from plugins.metric.risk_coverage.functional import area, at_coverage, curve
@@ -26,7 +26,7 @@ RISKS = {
 """Kind of target → suffix of the keys, and name of the risk."""
 
 
-class RiskCoverage(Metric, Pictured):
+class RiskCoverage(Metric, HasFigure):
     """Error of the most confident share of predictions, against that share.
 
     The risk is the error rate for classes, the mean absolute error for reals (in their unit, over the numbers of a
@@ -62,7 +62,7 @@ class RiskCoverage(Metric, Pictured):
 }"""
     columns: ClassVar[dict[str, str]] = {"aurc": "AURC", "risk_80": "risk at 80 %"}
     better: ClassVar[dict[str, Literal["higher", "lower"]]] = {"aurc": "lower", "risk_80": "lower"}
-    picture: ClassVar[str] = "risk_coverage"
+    figure_name: ClassVar[str] = "risk_coverage"
     confidences: list[Tensor] | Tensor
     risks: list[Tensor] | Tensor
 
@@ -72,7 +72,7 @@ class RiskCoverage(Metric, Pictured):
         self.confidence = confidence
         if target.kind not in RISKS:
             raise ConfigError(
-                f"metric risk_coverage knows no error of targets of kind {target.kind!r} ({target.told}): wanted "
+                f"metric risk_coverage knows no error of targets of kind {target.kind!r} ({target.listed_names}): wanted "
                 f"{', '.join(RISKS)}. Leave it out."
             )
         self.unit, self.risk_name = RISKS[target.kind]

@@ -80,7 +80,7 @@ class TruePosterior(Metric):
         if target.kind != "angle" or "azimuth" not in target.names:
             raise ConfigError(
                 "true_posterior judges the angle called azimuth; this data set's targets are of kind "
-                f"{target.kind!r}: {target.told}. Leave this metric out."
+                f"{target.kind!r}: {target.listed_names}. Leave this metric out."
             )
         self.azimuth = target.names.index("azimuth")
         self.points = points

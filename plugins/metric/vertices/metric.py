@@ -56,7 +56,7 @@ class VertexError(Mean):
     def update(self, prediction: Prediction) -> None:
         (scale,) = fields(prediction, "vertex_error", {"scale": "metres per unit of the target"})
         distance = distances(prediction.point, prediction.target, scale)
-        self.take_in(distance.mean(1))
+        self.add_samples(distance.mean(1))
         self.histogram += torch.bincount(bins(distance).flatten(), minlength=BINS)
 
     def compute(self) -> dict[str, Tensor]:

@@ -43,7 +43,7 @@ class Viewpoint(Metric):
         if target.kind != "angle" or sorted(target.names) != sorted(ANGLES):
             raise ConfigError(
                 f"viewpoint compares rotations given by the three angles {', '.join(ANGLES)}; this data "
-                f"set's targets are of kind {target.kind!r}: {target.told}. "
+                f"set's targets are of kind {target.kind!r}: {target.listed_names}. "
                 "Leave this metric out; `angular_deviation` judges any angles."
             )
         self.order = [target.names.index(name) for name in ANGLES]

@@ -9,8 +9,8 @@ from torch import Tensor
 from torch.func import functional_call
 
 from framework.data import Batch
-from framework.model import Predictor, each_alone
-from framework.objective import Objective, Rival
+from framework.model import Predictor, independent_penalty
+from framework.objective import AdversaryOptimizer, Objective
 from plugins.objective.images.discriminator import drawn
 from plugins.objective.images.predicted import predicted_images
 
@@ -21,7 +21,7 @@ class PatchGAN(Objective):
     The penalty is κ L_GAN + γ L_FM of thesis eq. 7.6, on patches, at several scales as in Wang et al. 2018, §3.2-3.3.
     Judgements are compared by least squares (Mao et al. 2017, eq. 9): the discriminators minimise ½ E (D(y) - 1)² + ½ E
     D(x)², the predictor E (D(x) - 1)², and L_FM is the mean L1 distance of the discriminators' features of x and y. The
-    discriminators are a `Rival`; their loss is logged as "discriminator".
+    discriminators have an `AdversaryOptimizer`; their loss is logged as "discriminator".
 
     Args:
         weight: κ; the discriminators' own loss is multiplied by it too, which does not affect their optimiser.
@@ -54,7 +54,7 @@ class PatchGAN(Objective):
         self.weight = weight
         self.feature_matching = feature_matching
         self.discriminators = drawn(scales, width, layers, seed)
-        self.rival = Rival(learning_rate=learning_rate, schedule=schedule)
+        self.adversary_optimizer = AdversaryOptimizer(learning_rate=learning_rate, schedule=schedule)
 
     def forward(self, predictor: Predictor, batch: Batch) -> Float[Tensor, ""]:
         """Return the weighted penalty of a batch."""
@@ -72,9 +72,11 @@ class PatchGAN(Objective):
         of_false = [one[-1].square() / 2 for one in caught]
         against = self._mean(of_true, (len(true),)).sum() / max(1, len(true))
         against = against + self._mean(of_false, lead).sum() / max(1, len(false))
-        taken = each_alone(self._mean([(1 - one[-1]).square() for one in fooled], lead)).sum() / count
-        alike = each_alone(self._matching(fooled, judged, lead, wanted.shape[:-3])).sum() / count
-        self.told = {
+        taken = (
+            independent_penalty(self._mean([(1 - one[-1]).square() for one in fooled], lead)).sum() / count
+        )
+        alike = independent_penalty(self._matching(fooled, judged, lead, wanted.shape[:-3])).sum() / count
+        self.logged_terms = {
             "generator": taken.detach(),
             "feature_matching": alike.detach(),
             "discriminator": against.detach(),

@@ -12,7 +12,7 @@ from torch import Tensor
 from framework.configuration.paths import FilePath
 from framework.data import Batch
 from framework.errors import ConfigError
-from framework.model import Predictor, each_alone
+from framework.model import Predictor, independent_penalty
 from framework.objective import Objective
 from plugins.objective.images.predicted import predicted_images
 from plugins.objective.images.vgg import TAPS, VGG, Depth, drawn, trained
@@ -54,8 +54,8 @@ class FeatureDistance(Objective):
             ours = one.unflatten(0, lead)
             theirs = other.unflatten(0, true.shape[:-3])
             distance = distance + 2.0**level * (ours - theirs).abs().mean((-3, -2, -1))
-        mean = each_alone(distance).sum() / max(1, len(images))
-        self.told = {self.term: mean.detach()}
+        mean = independent_penalty(distance).sum() / max(1, len(images))
+        self.logged_terms = {self.term: mean.detach()}
         return self.weight * mean
 
     @torch.no_grad()

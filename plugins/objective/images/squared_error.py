@@ -7,7 +7,7 @@ from pydantic import Field
 from torch import Tensor
 
 from framework.data import Batch
-from framework.model import Predictor, each_alone
+from framework.model import Predictor, independent_penalty
 from framework.objective import Objective
 from plugins.objective.images.predicted import predicted_images
 
@@ -39,6 +39,6 @@ class SquaredError(Objective):
     def forward(self, predictor: Predictor, batch: Batch) -> Float[Tensor, ""]:
         """Return the weighted penalty of a batch."""
         images, true = predicted_images(predictor, batch)
-        mean = each_alone((images - true).square().mean((-3, -2, -1))).sum() / max(1, len(images))
-        self.told = {"squared_error": mean.detach()}
+        mean = independent_penalty((images - true).square().mean((-3, -2, -1))).sum() / max(1, len(images))
+        self.logged_terms = {"squared_error": mean.detach()}
         return self.weight * mean

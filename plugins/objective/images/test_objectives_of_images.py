@@ -143,7 +143,7 @@ def test_features_are_those_of_torchvisions_layout(
         )
     torch.testing.assert_close(found, 2 * wanted)
     assert layers_of(depth, TAPS[depth][-1])[-1][2] == last - 1
-    assert objective.told["perceptual"] == found / 2
+    assert objective.logged_terms["perceptual"] == found / 2
     assert not list(objective.state_dict())
 
 
@@ -193,7 +193,7 @@ def test_the_discriminators_learn_against_the_predictor() -> None:
     objective = PatchGAN(weight=3.0, feature_matching=0.25, width=8)
     found = objective(predictor, batch)
     found.backward()
-    told = objective.told
+    told = objective.logged_terms
     torch.testing.assert_close(found, 3 * (told["generator"] + 0.25 * told["feature_matching"]))
     judge = objective.discriminators
     ours = {name: one.grad.clone() for name, one in judge.named_parameters() if one.grad is not None}
@@ -248,7 +248,7 @@ def test_the_squared_error_is_torchs_and_each_member_has_its_own() -> None:
     objective = SquaredError(weight=3.0)
     wanted = mse_loss(predictor.images, batch["target"])
     torch.testing.assert_close(objective(predictor, batch), 3 * wanted)
-    torch.testing.assert_close(objective.told["squared_error"], wanted.detach())
+    torch.testing.assert_close(objective.logged_terms["squared_error"], wanted.detach())
     members = Given(torch.rand(3, 2, 6, 5, 3))
     found = objective(members, batch)
     slope = torch.autograd.grad(found, members.images)[0]

@@ -13,9 +13,9 @@ from framework.calibration.module_flags import BATCH_NORM, flagged
 from framework.data import Batch, Data
 from framework.datasets.fields import as_batch
 from framework.errors import ConfigError
-from framework.model import Predictor, each_alone
+from framework.model import Predictor, independent_penalty
 from framework.objective import Objective
-from framework.uncertainty import own_batches, rows_each
+from framework.uncertainty import own_batches, rows_per_model
 from plugins.objective.outlier_exposure.divergence import from_uniform, to_ignorance, to_uniform
 
 
@@ -88,12 +88,12 @@ class OutlierExposure(Objective):
     def forward(self, predictor: Predictor, batch: Batch) -> Float[Tensor, ""]:
         """Return the weighted penalty of a batch."""
         inputs = batch["input"]
-        count = rows_each(predictor, len(inputs)) if self.count is None else self.count
+        count = rows_per_model(predictor, len(inputs)) if self.count is None else self.count
         drawn = self._uniform(inputs, count) if self.outliers is None else self._drawn(inputs, count)
         if self.clearance > 0:
             drawn = drawn[clear_of(drawn, inputs, self.clearance)]
         with flagged(predictor, BATCH_NORM, "training", False), own_batches(predictor, False):
-            found = each_alone(self._divergences(predictor.training_densities(drawn)))
+            found = independent_penalty(self._divergences(predictor.training_densities(drawn)))
         return self.weight * found.sum() / max(1, len(drawn))  # no outliers, no penalty
 
     def _divergences(self, density: Distribution) -> Float[Tensor, "batch *member"]:

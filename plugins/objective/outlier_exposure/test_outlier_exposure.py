@@ -341,7 +341,7 @@ class Tiny(Data):
     def fingerprint(self):
         return {}
 
-    def picture(self, inputs):
+    def preview(self, inputs):
         raise AssertionError("nothing is shown")
 
 

@@ -13,15 +13,15 @@ from framework.data import Batch
 from framework.density_head import DensityHead, Fitted
 from framework.distributions.batch_shapes import Stacked
 from framework.errors import ConfigError, UserError
-from framework.model import Kept, Model, Predictor, each_alone, of_its_own
-from framework.uncertainty import Joining, Several, Uncertainty
+from framework.model import Model, Predictor, SharedResult, independent_penalty, own_sample_penalty
+from framework.uncertainty import Joining, SeveralModels, Uncertainty
 from plugins.uncertainty.members.equal_mixture import equal_mixture
 from plugins.uncertainty.members.side_by_side import SideBySide
 
 WORTH_TRYING = (1, 2, 3, 5, 10, 20, 50)
 
 
-class Ensemble(Uncertainty, Joining, Several):
+class Ensemble(Uncertainty, Joining, SeveralModels):
     """T independently trained models; p(y|x) = (1/T) Σ_t p_t(y|x) (thesis eq. 2.17).
 
     They differ in initial weights and in the order of batches. If every encoder vectorises (`Encoder.vectorises`),
@@ -47,10 +47,10 @@ class Ensemble(Uncertainty, Joining, Several):
 
     def __init__(self, model: Callable[[], Predictor], *, members: Annotated[int, Field(ge=1)] = 5) -> None:
         super().__init__()
-        self.trained = members
+        self.model_count = members
         self.members = members
         self.knobs = {"members": tuple(count for count in WORTH_TRYING if count <= members)}
-        self.kept: Kept[Sequence[Tensor]] = Kept()
+        self.shared_result: SharedResult[Sequence[Tensor]] = SharedResult()
         built = [model() for _ in range(members)]
         self.apart = nn.ModuleList()
         self.heads = nn.ModuleList()
@@ -64,9 +64,9 @@ class Ensemble(Uncertainty, Joining, Several):
 
     def forward(self, inputs: Tensor) -> Distribution:
         """Return the mixture of the densities of the members in use."""
-        if not 1 <= self.members <= self.trained:
+        if not 1 <= self.members <= self.model_count:
             raise ConfigError(
-                f"members = {self.members} of an ensemble of {self.trained}: wanted a number from 1 to {self.trained}."
+                f"members = {self.members} of an ensemble of {self.model_count}: wanted a number from 1 to {self.model_count}."
             )
         if self.together is None:
             found = [self._of(index, inputs) for index in range(self.members)]
@@ -80,39 +80,41 @@ class Ensemble(Uncertainty, Joining, Several):
     def loss(self, inputs: Tensor, target: Tensor) -> Float[Tensor, "batch"]:
         """Return the loss of each sample, nats, such that each member trains as it would alone."""
         if self.own_batches:
-            return of_its_own(self._own_losses(inputs, target), self.trained)
+            return own_sample_penalty(self._own_losses(inputs, target), self.model_count)
         if self.together is None:
             losses = torch.stack([member.loss(inputs, target) for member in self._apart()], 1)
         else:
             raw = self.together(inputs)
             if len(self.heads) == 1:
-                wide = target.unsqueeze(1).expand(target.shape[0], self.trained, *target.shape[1:])
+                wide = target.unsqueeze(1).expand(target.shape[0], self.model_count, *target.shape[1:])
                 losses = self._head(0).loss(raw, wide)
             else:
-                parts = [self._head(index).loss(raw[:, index], target) for index in range(self.trained)]
+                parts = [self._head(index).loss(raw[:, index], target) for index in range(self.model_count)]
                 losses = torch.stack(parts, 1)
-        return each_alone(losses)
+        return independent_penalty(losses)
 
     def _own_losses(self, inputs: Tensor, target: Tensor) -> Float[Tensor, "batch"]:
         """Return each member's losses of its own rows."""
         if self.together is None:
-            parts = zip(self._apart(), self._parts(inputs), target.chunk(self.trained), strict=True)
+            parts = zip(self._apart(), self._parts(inputs), target.chunk(self.model_count), strict=True)
             return torch.cat([member.loss(given, wanted) for member, given, wanted in parts])
         raw = self._own_raw(inputs)
-        wanted = target.unflatten(0, (self.trained, -1))
+        wanted = target.unflatten(0, (self.model_count, -1))
         if len(self.heads) == 1:
             return self._head(0).loss(raw, wanted).flatten()
-        return torch.cat([self._head(index).loss(raw[index], wanted[index]) for index in range(self.trained)])
+        return torch.cat(
+            [self._head(index).loss(raw[index], wanted[index]) for index in range(self.model_count)]
+        )
 
     def _parts(self, inputs: Tensor) -> Sequence[Tensor]:
         """Return each member's own rows: the same tensors as long as `one_pass` keeps results computed from them."""
-        return self.kept.of(inputs, lambda given: given.chunk(self.trained))
+        return self.shared_result.get_or_compute(inputs, lambda given: given.chunk(self.model_count))
 
     def _own_raw(self, inputs: Tensor) -> Float[Tensor, "member batch size"]:
         assert self.together is not None
-        return self.together.own(inputs.unflatten(0, (self.trained, -1)))
+        return self.together.own(inputs.unflatten(0, (self.model_count, -1)))
 
-    def clip_each(self, most: float) -> None:
+    def clip_each_model(self, most: float) -> None:
         """Shorten each member's gradient to the norm `most`."""
         for member in self.apart:
             nn.utils.clip_grad_norm_(member.parameters(), most)
@@ -124,7 +126,7 @@ class Ensemble(Uncertainty, Joining, Several):
         if self.together is not None:
             own = self.own_batches
             return self._densities(self._own_raw(inputs).movedim(0, 1) if own else self.together(inputs))
-        parts = self._parts(inputs) if self.own_batches else [inputs] * self.trained
+        parts = self._parts(inputs) if self.own_batches else [inputs] * self.model_count
         found = [member.training_densities(part) for member, part in zip(self._apart(), parts, strict=True)]
         return found[0] if len(found) == 1 else Stacked(found)
 
@@ -138,7 +140,7 @@ class Ensemble(Uncertainty, Joining, Several):
         elif len(self.heads) > 1:
             raw = torch.cat([self.together(batch["input"]) for batch in seen])
             target = torch.cat([batch["target"] for batch in seen])
-            for index in range(self.trained):
+            for index in range(self.model_count):
                 self._head(index).calibrate(raw[:, index], target)
 
     @classmethod
@@ -148,9 +150,9 @@ class Ensemble(Uncertainty, Joining, Several):
 
     def join(self, members: Sequence[Predictor]) -> None:
         """Copy the state of separately trained members into this ensemble."""
-        if len(members) != self.trained:
+        if len(members) != self.model_count:
             raise ConfigError(
-                f"an ensemble of {self.trained} was given {len(members)} members; wanted as many."
+                f"an ensemble of {self.model_count} was given {len(members)} members; wanted as many."
             )
         for index, member in enumerate(members):
             if self.together is None:
@@ -165,7 +167,9 @@ class Ensemble(Uncertainty, Joining, Several):
         try:
             return self._apart()[index](inputs)
         except ValueError as error:  # the message of a head that was given NaN names the row
-            raise UserError(f"member {index} of {self.trained} of the ensemble: {error} {REMEDY}") from error
+            raise UserError(
+                f"member {index} of {self.model_count} of the ensemble: {error} {REMEDY}"
+            ) from error
 
     def _densities(self, raw: Float[Tensor, "batch member size"]) -> Distribution:
         """Return the members' densities, batch_shape (batch, member)."""
@@ -175,7 +179,7 @@ class Ensemble(Uncertainty, Joining, Several):
             others = len(bad[:, 1].unique()) - 1
             more = f" (and {others} other members)" if others else ""
             raise UserError(
-                f"member {index} of {self.trained} of the ensemble{more} gives numbers that are not finite, first for "
+                f"member {index} of {self.model_count} of the ensemble{more} gives numbers that are not finite, first for "
                 f"row {row} of the batch. {REMEDY}"
             )
         if len(self.heads) == 1:

@@ -40,7 +40,7 @@ def ensemble(members=3, seed=0, **kind):
 def members_of(wrapper, **kind):
     """Return each member as a model of its own."""
     found = []
-    for index in range(wrapper.trained):
+    for index in range(wrapper.model_count):
         model = factory(**kind)()
         network(model).load_state_dict(wrapper.together.read(index))
         head = wrapper.heads[min(index, len(wrapper.heads) - 1)]
@@ -148,7 +148,7 @@ def test_each_member_reads_its_own_batches_and_clips_its_own_gradient(kind, clip
         losses[-1].mean().backward()
     torch.testing.assert_close(found, torch.cat(losses), rtol=1e-12, atol=1e-12)
     if clip is not None:
-        whole.clip_each(clip)
+        whole.clip_each_model(clip)
         for model in alone:
             nn.utils.clip_grad_norm_(model.parameters(), clip)
     for index, model in enumerate(alone):

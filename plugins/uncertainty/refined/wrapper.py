@@ -65,7 +65,7 @@ class Refined(Uncertainty):
         start = self.model(inputs)
         if self.steps == 0:
             return start
-        wanted = next((one for one in PRESETS.values() if (one.told,) == start.event_shape), None)
+        wanted = next((one for one in PRESETS.values() if (one.target_count,) == start.event_shape), None)
         if wanted is None or inputs.shape[1:].numel() != len(self.offsets):
             raise ConfigError(
                 f"uncertainty refined fits {len(self.offsets)} offsets by 10 or 15 numbers, but the data have inputs "
@@ -75,7 +75,7 @@ class Refined(Uncertainty):
         spectra = inputs.flatten(1)
         found = fit(spectra, self.offsets, wanted, start=point, most=self.steps)
         zero = (spectra * 0).sum(-1, keepdim=True).to(point.dtype)
-        return density(found, wanted.told, start.batch_shape, zero)
+        return density(found, wanted.target_count, start.batch_shape, zero)
 
     def loss(self, inputs: Tensor, target: Tensor) -> Float[Tensor, "batch"]:
         """Return the wrapped model's loss of each sample, nats."""

@@ -103,7 +103,7 @@ class Dial(Data):
     def fingerprint(self) -> Mapping[str, str]:
         return {"name": "dial", "samples": str(self.samples)}
 
-    def picture(self, inputs: Tensor) -> np.ndarray:
+    def preview(self, inputs: Tensor) -> np.ndarray:
         self.signal.reached(0)
         canvas = np.full((24, 24, 3), 255, dtype=np.uint8)
         column, row = (12 + 9 * inputs.clamp(-1.2, 1.2).numpy() * (1, -1)).astype(int)

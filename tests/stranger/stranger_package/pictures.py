@@ -75,5 +75,5 @@ class Faded(Data):
     def fingerprint(self) -> Mapping[str, str]:
         return {"name": "faded", "samples": str(self.samples)}
 
-    def picture(self, inputs: Tensor) -> np.ndarray:
+    def preview(self, inputs: Tensor) -> np.ndarray:
         return (inputs.clamp(0, 1).movedim(0, -1) * 255).byte().numpy()

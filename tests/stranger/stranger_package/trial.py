@@ -78,7 +78,7 @@ class Trial(Data):
     def fingerprint(self) -> Mapping[str, str]:
         return {"name": "trial", "kind": self.kind}
 
-    def picture(self, inputs: Tensor) -> np.ndarray:
+    def preview(self, inputs: Tensor) -> np.ndarray:
         return np.full((8, 8, 3), 255, dtype=np.uint8)
 
 
