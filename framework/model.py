@@ -232,8 +232,8 @@ def one_pass(predictor: Predictor) -> Iterator[None]:
     """Compute shared results once for each tensor of inputs inside the block.
 
     They are reused however often loss and densities are requested. The shared results are fixed features, the raw
-    parameters of direct heads, and what other modules keep in `shared_result`. The encoders of a direct head give images, which
-    an objective compares as the loss does.
+    parameters of direct heads, and the results that other modules keep in `shared_result`. The encoders of a direct
+    head give images, which an objective compares as the loss does.
     """
     found = (getattr(module, "shared_result", None) for module in predictor.modules())
     parts = [kept for kept in found if isinstance(kept, SharedResult)]

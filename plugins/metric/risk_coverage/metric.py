@@ -72,8 +72,8 @@ class RiskCoverage(Metric, HasFigure):
         self.confidence = confidence
         if target.kind not in RISKS:
             raise ConfigError(
-                f"metric risk_coverage knows no error of targets of kind {target.kind!r} ({target.listed_names}): wanted "
-                f"{', '.join(RISKS)}. Leave it out."
+                f"metric risk_coverage knows no error of targets of kind {target.kind!r} ({target.listed_names}): "
+                f"wanted {', '.join(RISKS)}. Leave it out."
             )
         self.unit, self.risk_name = RISKS[target.kind]
         if target.kind == "angle":

@@ -76,8 +76,8 @@ class SMPLpix(Renderer):
         target, columns = self.description.target, self.description.columns
         if target.kind != "image" or len(target.names) != 3 or columns[: len(COLUMNS)] != COLUMNS:
             raise ConfigError(
-                f"{checkpoint} predicts {target.listed_names} from {', '.join(columns) or 'unnamed numbers'}; renderer smplpix "
-                "wants a model that paints red, green and blue from coloured points, as those of smplpix/quick."
+                f"{checkpoint} predicts {target.listed_names} from {', '.join(columns) or 'unnamed numbers'}; "
+                "renderer smplpix wants a model that paints red, green and blue from coloured points, as those of smplpix/quick."
             )
         self.size = target.size
         for part in self.description.config["encoder"]:

@@ -66,7 +66,8 @@ class Ensemble(Uncertainty, Joining, SeveralModels):
         """Return the mixture of the densities of the members in use."""
         if not 1 <= self.members <= self.model_count:
             raise ConfigError(
-                f"members = {self.members} of an ensemble of {self.model_count}: wanted a number from 1 to {self.model_count}."
+                f"members = {self.members} of an ensemble of {self.model_count}: wanted a number from 1 to "
+                f"{self.model_count}."
             )
         if self.together is None:
             found = [self._of(index, inputs) for index in range(self.members)]
@@ -179,8 +180,8 @@ class Ensemble(Uncertainty, Joining, SeveralModels):
             others = len(bad[:, 1].unique()) - 1
             more = f" (and {others} other members)" if others else ""
             raise UserError(
-                f"member {index} of {self.model_count} of the ensemble{more} gives numbers that are not finite, first for "
-                f"row {row} of the batch. {REMEDY}"
+                f"member {index} of {self.model_count} of the ensemble{more} gives numbers that are not finite, first "
+                f"for row {row} of the batch. {REMEDY}"
             )
         if len(self.heads) == 1:
             return self._head(0)(raw)
