@@ -33,7 +33,7 @@ from framework.spectra.spectrum import COUNT, spectrum
 from framework.target import Target
 from plugins.data.cest.data import CEST
 from plugins.data.cest.maps import maps_of, slice_of
-from plugins.data.cest.maps_picture import pictured
+from plugins.data.cest.maps_picture import maps_figure
 from plugins.data.cest.volumes import read_volume
 from plugins.density_head.lorentzian.head import LorentzianHead
 from plugins.uncertainty.conformal.wrapper import Conformal
@@ -191,7 +191,7 @@ def mapped(network: Predictor, data: CEST, file: Path) -> None:
             parts = [(density.mean, density.stddev) for density in map(model, inputs.split(BLOCK))]
         point, deviation = (torch.cat(part).double().numpy() for part in zip(*parts, strict=True))
         methods[name] = slice_of(maps_of(volume, names, point, deviation), volume)
-    figure = pictured(methods, f"{file.name}: amplitudes of the lines")
+    figure = maps_figure(methods, f"{file.name}: amplitudes of the lines")
     path = saved(figure, HERE.with_name("cest_maps"), True)
     Image.open(path).convert("RGB").quantize(256).save(path, optimize=True)  # a third of the bytes
 

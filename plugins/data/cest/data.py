@@ -28,17 +28,17 @@ from framework.storage.cache import folder
 from framework.storage.files import write_whole
 from framework.storage.generated import generated, read_mark
 from framework.target import Target
-from plugins.data.cest.resampling import resampled
+from plugins.data.cest.resampling import resample
 from plugins.data.cest.spectrum_picture import curve
 from plugins.data.cest.volumes import SUFFIXES, Volume, read_volume
 
 NotNegative = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
-GENERATED, FITTED = "1", "3"
-"""Version of the generator, and of the fit whose results are kept in the cache."""
+GENERATOR_VERSION, FIT_VERSION = "1", "3"
+"""Version of the generator, and of the fit whose results are stored in the cache."""
 FILE = "brain.npz"
 """Name of the volume in a folder."""
 CYCLE = (0, 0, 1, 0, 0, 2)
-"""Splits of the bands of rows in turn: 0 training, 1 validation, 2 test."""
+"""Splits of consecutive bands, repeated over the volume: 0 training, 1 validation, 2 test."""
 _log = logging.getLogger(__name__)
 
 
@@ -46,10 +46,10 @@ class Slice(NamedTuple):
     """Spectra and fitted lines of voxels.
 
     Attributes:
-        spectra: (voxel, offset) float32, at the model's offsets.
-        lines: (voxel, p) float64, all fitted parameters; the first of them are the target.
-        place: (voxel, 3), index of the voxel in the volume.
-        region: (voxel,), number of the region.
+        spectra: Z of the voxels at the model's offsets, (voxel, offset) float32.
+        lines: All fitted parameters, (voxel, p) float64; the first columns are the target.
+        place: Index of each voxel in the volume, (voxel, 3).
+        region: Number of each voxel's region, (voxel,).
     """
 
     spectra: Tensor
@@ -61,23 +61,24 @@ class Slice(NamedTuple):
 class CEST(Data, Mapped):
     """Z-spectra of a volume's voxels; the target is the Lorentzian lines fitted by least squares (thesis §4.1).
 
-    Splits are bands of `band` neighbouring rows (the first axis), in turn training, training, validation, training,
-    training, test. The first row of a band is left out where the band before belongs to another split, so that no voxel
-    has a neighbour in another split. Fits are kept in the cache. Batches also hold "place", (batch, 3), the index of
-    the voxel, and "lines", (batch, p), all fitted parameters.
+    The volume is divided into bands of `band` neighbouring rows (the first axis). Consecutive bands are for training,
+    training, validation, training, training and test. If two neighbouring bands are in different splits, the first row
+    of the second band is left out, so that no voxel has a neighbour in another split. Fits are stored in the cache.
+    Batches also hold "place", (batch, 3), the index of the voxel, and "lines", (batch, p), all fitted parameters.
 
     Args:
-        root: a file, see volumes.py, or a folder with brain.npz; None to generate a slice.
-        preset: "ten" numbers, amplitude and width of five pools, or "fifteen", with their centres.
-        offsets: offsets at which the model reads spectra, ppm, ascending; None for `framework.spectra.offsets.OFFSETS`.
+        root: A volume in a format of volumes.py, or a folder with brain.npz; None to generate a slice.
+        preset: "ten": the target is the amplitude and width of five pools. "fifteen": their centres too.
+        offsets: Offsets at which the model reads spectra, ppm, ascending; None for `framework.spectra.offsets.OFFSETS`.
             Spectra at other offsets are resampled.
-        band: number of rows of a band.
-        noise: greatest standard deviation of the noise that is added to training spectra; it is drawn for each
-            spectrum.
-        shift: greatest shift of a training spectrum's lines, ppm; a fitted centre of water is shifted too.
-        side: side of the generated slice, voxels.
-        data_seed: seed of the generated slice.
-        unreadable: treatment of a bad file in a folder for prediction: list it and leave it out, or refuse the folder.
+        band: Number of rows of a band.
+        noise: Largest standard deviation of the noise that is added to training spectra; the standard deviation is
+            drawn at random for each spectrum.
+        shift: Largest shift of a training spectrum's lines, ppm; the fitted centre of water is shifted with them.
+        side: Side of the generated slice, voxels.
+        data_seed: Seed of the generated slice.
+        unreadable: Treatment of a bad file in a folder for prediction. "skip" lists the file and leaves it out,
+            "error" refuses the folder.
     """
 
     bibtex = """@article{glang2019deepcest,
@@ -103,7 +104,7 @@ class CEST(Data, Mapped):
         data_seed: Annotated[int, Field(ge=0, lt=2**31)] = 0,
         unreadable: Literal["skip", "error"] = "skip",
     ) -> None:
-        self.root, self.given = root, offsets
+        self.root, self.configured_offsets = root, offsets
         self.preset: Preset = preset
         self.band, self.noise, self.shift = band, noise, shift
         self.side, self.data_seed = side, data_seed
@@ -114,7 +115,7 @@ class CEST(Data, Mapped):
     @cached_property
     def offsets(self) -> tuple[float, ...]:
         """Offsets at which the model reads spectra, ppm."""
-        return offsets_of(self.given)
+        return offsets_of(self.configured_offsets)
 
     @property
     def wanted(self) -> Parameters:
@@ -126,18 +127,18 @@ class CEST(Data, Mapped):
         volume = read_volume(file)
         self.skipped = volume.dropped
         if volume.dropped:
-            _log.warning("%s: %d voxels with a number that is not finite are left out.", file, volume.dropped)
+            _log.warning("%s: %d voxels are left out, because a number is not finite.", file, volume.dropped)
         spectra = torch.from_numpy(
-            resampled(volume.spectra, volume.offsets, self.offsets, str(file)).astype(np.float32)
+            resample(volume.spectra, volume.offsets, self.offsets, str(file)).astype(np.float32)
         )
-        found = Slice(
-            spectra, self._fits(spectra), torch.from_numpy(volume.place), torch.from_numpy(volume.region)
+        voxels = Slice(
+            spectra, self._fit(spectra), torch.from_numpy(volume.place), torch.from_numpy(volume.region)
         )
         self.groups = volume.regions
         self.remarks = _remarks(volume, self.offsets)
         self.input_shape = (len(self.offsets),)
         self.columns = tuple(f"{offset:+.4f} ppm" for offset in self.offsets)
-        self._splits = Splits(*(self._split(found, number, file) for number in range(3)))
+        self._splits = Splits(*(self._split(voxels, number, file) for number in range(3)))
         training = self._splits.train.fields["target"].double()  # type: ignore[attr-defined]
         self.target = Target(
             "real",
@@ -145,39 +146,41 @@ class CEST(Data, Mapped):
             tuple(training.mean(0).tolist()),
             tuple(training.std(0, correction=0).clamp(min=1e-6).tolist()),
         )
-        self._digest = _digest(spectra, found.lines.float())
+        self._digest = _digest(spectra, voxels.lines.float())
 
     def _file(self) -> tuple[Path, bool]:
+        """Return the volume's file, and whether it was generated."""
         if self.root is not None:
-            place = Path(self.root).expanduser()
-            file = place / FILE if place.is_dir() else place
+            path = Path(self.root).expanduser()
+            file = path / FILE if path.is_dir() else path
             return file, file.parent.is_dir() and read_mark(file.parent) is not None
         from plugins.data.cest.generator import write_slice
 
-        asked = {"side": self.side, "noise": 0.01, "shift": 0.08, "data_seed": self.data_seed}
-        name = f"{GENERATED}_{self.side}_{self.data_seed}"
-        mark = {"plugin": "cest", "version": GENERATED, **asked}
-        return generated(folder("cest") / name, mark, partial(write_slice, **asked)) / FILE, True
+        settings = {"side": self.side, "noise": 0.01, "shift": 0.08, "data_seed": self.data_seed}
+        name = f"{GENERATOR_VERSION}_{self.side}_{self.data_seed}"
+        mark = {"plugin": "cest", "version": GENERATOR_VERSION, **settings}
+        return generated(folder("cest") / name, mark, partial(write_slice, **settings)) / FILE, True
 
-    def _fits(self, spectra: Tensor) -> Float[Tensor, "voxel p"]:
-        """Return the fits, from the cache if they are kept there."""
+    def _fit(self, spectra: Tensor) -> Float[Tensor, "voxel p"]:
+        """Return the fitted parameters of spectra; read them from the cache if they are stored there."""
         key = hashlib.sha256(
-            spectra.numpy().tobytes() + repr((FITTED, self.wanted, self.offsets)).encode()
+            spectra.numpy().tobytes() + repr((FIT_VERSION, self.wanted, self.offsets)).encode()
         ).hexdigest()[:24]
-        kept = folder("cest_fits") / f"{key}.npz"
-        if kept.is_file():
+        cache_file = folder("cest_fits") / f"{key}.npz"
+        if cache_file.is_file():
             try:
-                return torch.from_numpy(archive(kept.read_bytes())["parameters"])
+                return torch.from_numpy(archive(cache_file.read_bytes())["parameters"])
             except Exception:
-                _log.warning("%s cannot be read; the spectra are fitted again.", kept)
-        found = fit(spectra, torch.tensor(self.offsets), self.wanted).parameters
+                _log.warning("%s cannot be read; the spectra are fitted again.", cache_file)
+        parameters = fit(spectra, torch.tensor(self.offsets), self.wanted).parameters
         stream = io.BytesIO()
-        np.savez(stream, parameters=found.numpy())
-        write_whole(kept, stream.getvalue())
-        return found
+        np.savez(stream, parameters=parameters.numpy())
+        write_whole(cache_file, stream.getvalue())
+        return parameters
 
-    def _split(self, found: Slice, number: int, file: Path) -> Fields:
-        row = found.place[:, 0]
+    def _split(self, voxels: Slice, number: int, file: Path) -> Fields:
+        """Return the voxels of split `number` (0 training, 1 validation, 2 test)."""
+        row = voxels.place[:, 0]
         cycle = torch.tensor(CYCLE)
         first = row - row.min()
         band = first // self.band
@@ -186,15 +189,15 @@ class CEST(Data, Mapped):
         chosen = (split == number) & ~edge
         if not chosen.any():
             raise DataError(
-                f"{file}: {int(row.max() - row.min()) + 1} rows of voxels in bands of {self.band} leave nothing for "
-                f"{Splits._fields[number]}; wanted {len(CYCLE)} bands. Choose a smaller data.band."
+                f"{file}: {int(row.max() - row.min()) + 1} rows of voxels in bands of {self.band} rows leave no voxel "
+                f"for the {Splits._fields[number]} split; {len(CYCLE)} bands are needed. Choose a smaller data.band."
             )
         return Fields(
-            input=found.spectra[chosen],
-            target=found.lines[chosen, : self.wanted.target_count].float(),
-            lines=found.lines[chosen].float(),
-            group=found.region[chosen],
-            place=found.place[chosen],
+            input=voxels.spectra[chosen],
+            target=voxels.lines[chosen, : self.wanted.target_count].float(),
+            lines=voxels.lines[chosen].float(),
+            group=voxels.region[chosen],
+            place=voxels.place[chosen],
             index=torch.arange(int(chosen.sum())),
         )
 
@@ -203,33 +206,33 @@ class CEST(Data, Mapped):
 
     def read(self, files: Sequence[Path]) -> Dataset[Batch]:
         if not files:
-            raise DataError("no file was given; wanted volumes of Z-spectra (.mat, .npz, .nii).")
-        found = []
+            raise DataError("No file was given. Give volumes of Z-spectra (.mat, .npz, .nii).")
+        spectra_of_files = []
         for file in files:
             volume = read_volume(Path(file))
-            found.append(resampled(volume.spectra, volume.offsets, self.offsets, str(file)))
-        spectra = torch.from_numpy(np.concatenate(found).astype(np.float32))
+            spectra_of_files.append(resample(volume.spectra, volume.offsets, self.offsets, str(file)))
+        spectra = torch.from_numpy(np.concatenate(spectra_of_files).astype(np.float32))
         return Fields(input=spectra, index=torch.arange(len(spectra)))
 
     def write_maps(self, file: Path, point: Tensor, deviation: Tensor, folder: Path) -> Sequence[Path]:
-        """Write the maps of the predictions for a volume, and return the files."""
+        """Write the maps of the predictions for a volume and return the paths of the files."""
         from plugins.data.cest.maps import write_maps
 
         return write_maps(file, self.wanted.target, point, deviation, folder, synthetic=self.synthetic)
 
     def augment(self, batch: Batch) -> Batch:
-        """Return a batch with random noise and a random B0 shift of the lines; the fit's residuals are not shifted.
+        """Return a batch with random noise and a random B0 shift of the lines; the residuals of the fit stay in place.
 
-        Strength of noise and shift are cubes of uniform numbers times the greatest value, so that most spectra stay
-        nearly unchanged and some change strongly.
+        The standard deviation of the noise and the shift are the largest value times the cube of a uniform number, so
+        that most spectra stay nearly unchanged and some change strongly.
         """
         spectra, target, lines = batch["input"], batch["target"], batch["lines"]
         if self.shift:
-            moved = self.shift * (2 * torch.rand(len(spectra), device=spectra.device) - 1) ** 3
-            offsets, before = torch.tensor(self.offsets).to(spectra), lines
+            b0_shift = self.shift * (2 * torch.rand(len(spectra), device=spectra.device) - 1) ** 3
+            offsets, fitted_lines = torch.tensor(self.offsets).to(spectra), lines
             lines = lines.clone()
-            lines[:, 2 * COUNT] += moved
-            spectra = spectra + spectrum(lines, offsets) - spectrum(before, offsets)
+            lines[:, 2 * COUNT] += b0_shift
+            spectra = spectra + spectrum(lines, offsets) - spectrum(fitted_lines, offsets)
             target = lines[:, : target.shape[1]]
         if self.noise:
             strength = self.noise * torch.rand(len(spectra), 1, device=spectra.device) ** 3
@@ -239,7 +242,7 @@ class CEST(Data, Mapped):
     def fingerprint(self) -> Mapping[str, str]:
         return {
             "root": str(self.root or "generated"),
-            "version": f"cest {GENERATED}.{FITTED}",
+            "version": f"cest {GENERATOR_VERSION}.{FIT_VERSION}",
             "preset": self.preset,
             "band": str(self.band),
             "left_out": str(self.skipped),
@@ -252,22 +255,23 @@ class CEST(Data, Mapped):
 
 
 def _remarks(volume: Volume, offsets: Sequence[float]) -> tuple[str, ...]:
-    """Return sentences on what of a volume is left out or resampled."""
-    said = []
+    """Return clauses that say which parts of a volume are left out or resampled."""
+    remarks = []
     outside = math.prod(volume.shape) - len(volume.spectra) - volume.dropped
     if outside:
-        said.append(f"left out: {outside} voxels outside the mask, or without a number")
+        remarks.append(f"left out: {outside} voxels outside the mask, or without a number")
     if volume.dropped:
-        said.append(f"left out: {volume.dropped} voxels with a number that is not finite")
+        remarks.append(f"left out: {volume.dropped} voxels of which a number is not finite")
     if volume.unread:
-        said.append(f"left out: {', '.join(volume.unread)} of the file")
+        remarks.append(f"left out: the arrays {', '.join(volume.unread)} of the file")
     if len(volume.offsets) != len(offsets) or not np.allclose(volume.offsets, offsets):
-        said.append(f"{len(volume.offsets)} offsets of the file, resampled at {len(offsets)}")
-    return tuple(said)
+        remarks.append(f"resampled: from the file's {len(volume.offsets)} offsets to {len(offsets)}")
+    return tuple(remarks)
 
 
 def _digest(*tensors: Tensor) -> str:
-    found = hashlib.sha256()
+    """Return the SHA-256 of the tensors' values."""
+    digest = hashlib.sha256()
     for tensor in tensors:
-        found.update(np.ascontiguousarray(tensor.numpy()).tobytes())
-    return found.hexdigest()
+        digest.update(np.ascontiguousarray(tensor.numpy()).tobytes())
+    return digest.hexdigest()

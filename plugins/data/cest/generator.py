@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter
 from framework.spectra.offsets import OFFSETS
 from framework.spectra.spectrum import CENTRES, spectrum
 
-# amplitude and width (ppm) of water, amide, NOE, MT and amine in turn
+# columns: amplitude of water, amide, NOE, MT and amine, then their widths (ppm) in the same order
 TISSUES = np.array(
     [
         [0.76, 0.030, 0.15, 0.12, 0.08, 0.90, 0.8, 4.6, 55.0, 4.5],  # grey matter
@@ -21,7 +21,7 @@ TISSUES = np.array(
         [0.80, 0.050, 0.09, 0.07, 0.10, 1.10, 1.0, 4.8, 50.0, 4.5],  # tumour: more amide, less NOE and MT
     ]
 )
-"""Parameters typical of fits to a human brain at 7 T; those of the tumour follow Zaiss et al. (2015)."""
+"""Typical parameters of fits to a human brain at 7 T; the tumour's parameters follow Zaiss et al. (2015)."""
 VARIATION = 0.08
 """Relative standard deviation of a parameter within a tissue; the variation is smooth over the slice."""
 
@@ -30,18 +30,18 @@ def write_slice(folder: Path, *, side: int, noise: float, shift: float, data_see
     """Write `brain.npz`: spectra (side, side, offset), offsets, mask, region (1: tumour), and the true parameters.
 
     Args:
-        folder: folder of the file.
-        side: side of the slice, voxels.
-        noise: standard deviation of each number of a spectrum.
-        shift: standard deviation of the smooth B0 shift, ppm.
-        data_seed: seed of all draws.
+        folder: Folder of the file.
+        side: Side of the slice, voxels.
+        noise: Standard deviation of the noise on each number of a spectrum.
+        shift: Standard deviation of the smooth B0 shift, ppm.
+        data_seed: Seed of all random numbers.
     """
     generator = np.random.default_rng((data_seed, 42))
 
     def field(smooth: float) -> np.ndarray:
         """Return a smooth random field of mean 0 and standard deviation 1."""
-        found = gaussian_filter(generator.normal(size=(side, side)), smooth * side, mode="reflect")
-        return (found - found.mean()) / found.std()
+        values = gaussian_filter(generator.normal(size=(side, side)), smooth * side, mode="reflect")
+        return (values - values.mean()) / values.std()
 
     row, column = np.mgrid[:side, :side] / (side - 1) * 2 - 1
     radius = np.hypot(row / 0.92, column / 0.76)
@@ -53,9 +53,9 @@ def write_slice(folder: Path, *, side: int, noise: float, shift: float, data_see
     tissue = np.where(tumour & mask, 3, tissue)
     parameters = TISSUES[tissue]
     parameters = parameters * (1 + VARIATION * np.stack([field(0.05) for _ in range(10)], -1))
-    moved = shift * field(0.2)
+    b0_shift = shift * field(0.2)
     numbers = np.concatenate(
-        [parameters, moved[..., None], np.broadcast_to(CENTRES[1:], (side, side, 4))], -1
+        [parameters, b0_shift[..., None], np.broadcast_to(CENTRES[1:], (side, side, 4))], -1
     )
     offsets = np.array(OFFSETS)
     clean = spectrum(torch.from_numpy(numbers.reshape(-1, 15)), torch.from_numpy(offsets)).numpy()

@@ -1,4 +1,4 @@
-"""Maps of the predictions for a volume's voxels, with their standard deviations: files and a figure."""
+"""Maps of the predictions for a volume's voxels and of their standard deviations: files and a figure."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from framework.figures.style import saved
-from plugins.data.cest.maps_picture import SHOWN, Maps, pictured
+from plugins.data.cest.maps_picture import SHOWN, Maps, maps_figure
 from plugins.data.cest.volumes import Volume, read_volume
 
 ASYMMETRIC = 3.5
@@ -19,19 +19,20 @@ ASYMMETRY = "mtr_asymmetry_3.5_ppm"
 def write_maps(
     file: Path, names: Sequence[str], point: Tensor, deviation: Tensor, folder: Path, *, synthetic: bool
 ) -> Sequence[Path]:
-    """Write the predicted maps of a volume, and return the files.
+    """Write the predicted maps of a volume and return the paths of the files.
 
-    The files are `<file>_maps.npz` (a map of each name, one of each name with `_deviation`, and one of the asymmetry;
-    NaN where there is no voxel); for a NIfTI file also `_maps.nii.gz`, with the maps' names beside it; the figure; and
-    a list of bad voxels if there are any.
+    `<file>_maps.npz` holds a map of each predicted number, a map of each standard deviation (its name ends in
+    `_deviation`) and a map of the asymmetry; they are NaN where there is no voxel. `<file>_maps.png` is the figure. For
+    a NIfTI file, `<file>_maps.nii.gz` holds the same maps, and `<file>_maps.txt` their names. Bad voxels, if there are
+    any, are listed in `<file>_maps_left_out.csv`.
 
     Args:
-        file: the volume.
-        names: names of the predicted numbers.
-        point: point predictions (voxel, number), for the file's voxels in their order.
-        deviation: standard deviations, of the same shape.
-        folder: folder of the written files.
-        synthetic: whether the model learnt from generated spectra.
+        file: The volume.
+        names: Names of the predicted numbers.
+        point: Point predictions (voxel, number), with the voxels in the order in which `read_volume` returns them.
+        deviation: Standard deviations of the predictions, (voxel, number).
+        folder: Folder of the written files.
+        synthetic: True if the model was trained on generated spectra.
     """
     volume = read_volume(file)
     maps = maps_of(volume, names, point.double().numpy(), deviation.double().numpy())
@@ -48,8 +49,8 @@ def write_maps(
         bad = stem.with_name(f"{stem.name}_left_out.csv")
         np.savetxt(bad, volume.left_out, "%d", ",", header="x,y,z", comments="")
         written.append(bad)
-    title = f"{file.name}: lines' amplitudes" + ", by a model of synthetic data" * synthetic
-    return [*written, saved(pictured({"": slice_of(maps, volume)}, title), stem, True)]
+    title = f"{file.name}: amplitudes of the lines" + ", by a model of synthetic data" * synthetic
+    return [*written, saved(maps_figure({"": slice_of(maps, volume)}, title), stem, True)]
 
 
 def maps_of(
@@ -58,19 +59,22 @@ def maps_of(
     point: Float[np.ndarray, "voxel number"],
     deviation: Float[np.ndarray, "voxel number"],
 ) -> dict[str, np.ndarray]:
-    """Return maps (x, y, z) by name, NaN where there is no voxel; amplitudes are shares of the unsaturated signal."""
+    """Return the maps (x, y, z) by name, NaN where there is no voxel; amplitudes are shares of the unsaturated signal.
+
+    The maps are the asymmetry, each predicted number, and each standard deviation.
+    """
     columns = {ASYMMETRY: asymmetry(volume)}
     for number, name in enumerate(names):
         columns[name], columns[f"{name}_deviation"] = point[:, number], deviation[:, number]
-    found = {}
+    maps = {}
     for name, values in columns.items():
-        found[name] = np.full(volume.shape, np.nan)
-        found[name][tuple(volume.place.T)] = values
-    return found
+        maps[name] = np.full(volume.shape, np.nan)
+        maps[name][tuple(volume.place.T)] = values
+    return maps
 
 
 def asymmetry(volume: Volume) -> Float[np.ndarray, "voxel"]:
-    """Return Z(-Δω) - Z(Δω) of the measured spectra; B0 is not corrected (Zhou et al. 2003, eq. 1)."""
+    """Return Z(-Δω) - Z(Δω) of the measured spectra, Δω = 3.5 ppm, without B0 correction (Zhou et al. 2003, eq. 1)."""
     left, right = (
         np.array([np.interp(sign * ASYMMETRIC, volume.offsets, spectrum) for spectrum in volume.spectra])
         for sign in (-1, 1)
@@ -79,10 +83,13 @@ def asymmetry(volume: Volume) -> Float[np.ndarray, "voxel"]:
 
 
 def slice_of(maps: Mapping[str, np.ndarray], volume: Volume) -> Maps:
-    """Return the maps to show of the slice with most voxels, cropped to them, each with its deviation."""
-    where = np.bincount(volume.place[:, 2]).argmax()
-    rows, columns = volume.place[volume.place[:, 2] == where, :2].T
-    frame = np.s_[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1, where]
+    """Return the maps that the figure shows, and their standard deviations, of the slice with the most voxels.
+
+    The maps are cropped to the voxels of that slice. The asymmetry has no standard deviation (None).
+    """
+    fullest = np.bincount(volume.place[:, 2]).argmax()
+    rows, columns = volume.place[volume.place[:, 2] == fullest, :2].T
+    frame = np.s_[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1, fullest]
     return {
         name: (maps[name][frame], maps[f"{name}_deviation"][frame])
         for name in SHOWN

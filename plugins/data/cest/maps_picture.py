@@ -15,19 +15,19 @@ SHOWN = {
     "amine_amplitude": "amine, 2 ppm",
     "water_amplitude": "water",
 }
-"""Name of each mapped number and its heading; the asymmetry of the spectra is shown beside them."""
+"""Names of the predicted numbers in the figure, and their headings; the figure also shows the asymmetry."""
 Maps = Mapping[str, tuple[Float[np.ndarray, "row column"], Float[np.ndarray, "row column"] | None]]
-"""Map of each name and map of its standard deviation, NaN outside the brain."""
+"""Name of a number → its map and the map of its standard deviation, NaN outside the brain."""
 SIZE = 2.1
 """Side of a map, inches."""
 
 
-def pictured(methods: Mapping[str, Maps], title: str) -> Figure:
-    """Return a figure with two rows for each method, prediction and standard deviation, in % of the unsaturated signal.
+def maps_figure(methods: Mapping[str, Maps], title: str) -> Figure:
+    """Return a figure with two rows for each method, predictions and standard deviations, in % of the unsaturated signal.
 
-    Contrasts use the rainbow colours that are usual in the field, the asymmetry a scale centred on 0, and standard
-    deviations a sequential scale. The methods of a column share their scales, which end at the 1 % and 99 % quantiles
-    of the first method.
+    Amplitudes use the rainbow colours that are usual in the field, the asymmetry a scale centred on 0, and standard
+    deviations a sequential scale. All methods of a column share one scale, which ends at the 1 % and 99 % quantiles of
+    the first method.
     """
     columns = list(next(iter(methods.values())))
     figure = titled_figure((SIZE * len(columns) + 0.8, (SIZE + 0.35) * 2 * len(methods) + 0.4), title, False)
@@ -40,18 +40,19 @@ def pictured(methods: Mapping[str, Maps], title: str) -> Figure:
                 axis.set(xticks=[], yticks=[])
                 axis.set_frame_on(False)
                 if place == 0:
-                    said = ("predicted", "standard deviation")[row]
-                    axis.set_ylabel(f"{method}\n{said}" if method else said, fontsize=8)
+                    quantity = ("predicted", "standard deviation")[row]
+                    axis.set_ylabel(f"{method}\n{quantity}" if method else quantity, fontsize=8)
                 if values is None or scale is None:
                     axis.set_axis_off()
                     continue
-                shown = axis.imshow(100 * values, **_scale(name in SHOWN, row, 100 * scale))
-                figure.colorbar(shown, ax=axis, shrink=0.8, pad=0.02).ax.tick_params(labelsize=6)
+                drawing = axis.imshow(100 * values, **_scale(name in SHOWN, row, 100 * scale))
+                figure.colorbar(drawing, ax=axis, shrink=0.8, pad=0.02).ax.tick_params(labelsize=6)
         axes[0, place].set_title(f"{SHOWN.get(name, 'asymmetry, 3.5 ppm')}, %", fontsize=8)
     return figure
 
 
 def _scale(contrast: bool, row: int, values: np.ndarray) -> dict[str, object]:
+    """Return colour map and limits for `imshow`; row 0 holds predictions, row 1 standard deviations."""
     low, high = np.nanquantile(values, (0.01, 0.99))
     if row:
         return {"cmap": "magma", "vmin": 0.0, "vmax": high}

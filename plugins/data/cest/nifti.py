@@ -1,4 +1,4 @@
-"""Z-spectra and maps in NIfTI, through nibabel (the extra `nifti`), which nothing else needs."""
+"""Reading of Z-spectra from NIfTI files and writing of maps, with nibabel (the optional dependency `nifti`)."""
 
 import math
 import re
@@ -22,45 +22,52 @@ SECOND = (540).to_bytes(4, "little"), (540).to_bytes(4, "big")
 
 
 def read_nifti(file: Path) -> Mapping[str, np.ndarray]:
-    """Read the images of `file` and their `affine`, the `offsets` beside it, and the `mask` if there is one.
+    """Return the arrays `spectra`, `affine` and `offsets` of a NIfTI file, and its `mask` if there is one.
 
-    Offsets are in `<name>.offsets.txt`; the mask is in `<name>.mask.nii.gz` or `<name>.mask.nii`.
+    The offsets are in `<name>.offsets.txt` in the same folder; the mask is in `<name>.mask.nii.gz` or
+    `<name>.mask.nii`.
 
     Raises:
-        DataError: there is no file of offsets beside it.
+        DataError: The file of offsets is missing or damaged, there are two masks, or shapes do not agree.
         Exception: nibabel's own errors on a damaged file.
     """
     name = re.sub(r"\.nii(\.gz)?$", "", file.name, flags=re.IGNORECASE)
-    beside = file.with_name(f"{name}.offsets.txt")
-    wanted = [f"{name}{end}".lower() for end in MASKS]
-    masks = sorted(other for other in file.parent.iterdir() if other.name.lower() in wanted)
+    offsets_file = file.with_name(f"{name}.offsets.txt")
+    mask_names = [f"{name}{end}".lower() for end in MASKS]
+    masks = sorted(path for path in file.parent.iterdir() if path.name.lower() in mask_names)
     images = _read(file)
-    found = {"spectra": real(images.dataobj, "spectra"), "affine": np.asarray(images.affine)}
-    if not beside.is_file():
+    arrays = {"spectra": real(images.dataobj, "spectra"), "affine": np.asarray(images.affine)}
+    if not offsets_file.is_file():
         raise DataError(
-            f"no {beside.name} beside it; wanted the offsets in ppm, one a line, as many as images."
+            f"The folder of this file holds no {offsets_file.name}. Write the offsets of the images in ppm into such a "
+            "file, one offset a line."
         )
-    with guarded(beside, "offsets", "Wanted: numbers in ppm, one a line, as many as images."):
-        text = decoded(read_bytes(beside))
-        found["offsets"] = np.array(require_numbers_in(words_of(text), text))
-        if len(found["offsets"]) != images.shape[-1]:
+    with guarded(offsets_file, "offsets", "Write one number in ppm a line, one for each image."):
+        text = decoded(read_bytes(offsets_file))
+        arrays["offsets"] = np.array(require_numbers_in(words_of(text), text))
+        if len(arrays["offsets"]) != images.shape[-1]:
             raise DataError(
-                f"{len(found['offsets'])} offsets for {images.shape[-1]} images of {file.name}; wanted one for each."
+                f"The file lists {len(arrays['offsets'])} offsets, but {file.name} holds {images.shape[-1]} images. "
+                "List one offset for each image."
             )
     if len(masks) > 1:
-        raise DataError(f"{masks[0].name} and {masks[1].name} are beside it; wanted one mask. Take one away.")
+        raise DataError(
+            f"The folder of this file holds two masks, {masks[0].name} and {masks[1].name}. Remove one of them."
+        )
     for mask in masks:
-        with guarded(mask, "a mask", "Restore it, or take it away: every voxel with a number is meant then."):
-            found["mask"] = real(_read(mask).dataobj, "mask")
-            if found["mask"].squeeze().shape != found["spectra"][..., 0].squeeze().shape:
+        remedy = "Copy the mask again from its source, or remove the file to read every voxel with a number."
+        with guarded(mask, "a mask", remedy):
+            arrays["mask"] = real(_read(mask).dataobj, "mask")
+            if arrays["mask"].squeeze().shape != arrays["spectra"][..., 0].squeeze().shape:
                 raise DataError(
-                    f"of shape {found['mask'].shape}; wanted {images.shape[:-1]}, that of {file.name}."
+                    f"The mask has shape {arrays['mask'].shape}, but the images of {file.name} have shape "
+                    f"{images.shape[:-1]}. Give a mask of the images' shape."
                 )
-    return found
+    return arrays
 
 
 def write_nifti(file: Path, maps: np.ndarray, affine: np.ndarray) -> None:
-    """Write maps (x, y, z, map), float32, at the place of the spectra."""
+    """Write maps (x, y, z, map) as float32; `affine` maps voxels to millimetres, as in the file of the spectra."""
     nibabel.Nifti1Image(maps.astype(np.float32), affine).to_filename(file)
 
 

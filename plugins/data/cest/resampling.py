@@ -9,48 +9,51 @@ from scipy.interpolate import PchipInterpolator
 from framework.errors import DataError
 
 SAME = 1e-3
-"""Greatest difference, ppm, of offsets that count as the same."""
+"""Largest difference, ppm, of two offsets that count as equal."""
 
 
-def resampled(
-    spectra: Float[np.ndarray, "voxel given"],
-    given: Float[np.ndarray, "given"],
-    wanted: Sequence[float],
-    where: str,
-) -> Float[np.ndarray, "voxel wanted"]:
-    """Return spectra at the model's offsets.
+def resample(
+    spectra: Float[np.ndarray, "voxel measured"],
+    measured: Float[np.ndarray, "measured"],
+    required: Sequence[float],
+    file: str,
+) -> Float[np.ndarray, "voxel required"]:
+    """Return the spectra at the model's offsets.
 
-    Spectra are unchanged where the offsets are the same; otherwise they are interpolated by piecewise cubics that do
+    Spectra whose offsets are already the model's stay unchanged. Others are interpolated by piecewise cubics that do
     not overshoot (Fritsch & Carlson 1980).
 
     Args:
-        spectra: the measured spectra.
-        given: their offsets, ascending, ppm.
-        wanted: the model's offsets, ascending, ppm.
-        where: name of the file, for the message.
+        spectra: The measured spectra.
+        measured: Offsets of the measured spectra, ascending, ppm.
+        required: Offsets of the model, ascending, ppm.
+        file: Name of the file, for the error message.
 
     Raises:
-        DataError: the given offsets do not reach as far as the wanted ones, or are too few to resolve the lines.
+        DataError: The measured offsets do not cover the model's, or are too few to resolve the lines.
     """
-    if len(given) == len(wanted) and np.abs(given - wanted).max() <= SAME:
+    if len(measured) == len(required) and np.abs(measured - required).max() <= SAME:
         return spectra
-    if given[0] > wanted[0] + SAME or given[-1] < wanted[-1] - SAME:
+    if measured[0] > required[0] + SAME or measured[-1] < required[-1] - SAME:
         raise DataError(
-            f"{where}: its {len(given)} offsets reach from {given[0]:g} to {given[-1]:g} ppm, but the model reads "
-            f"{wanted[0]:g} to {wanted[-1]:g} ppm. Train on offsets that both have (data.offsets), or measure further."
+            f"{file}: {len(measured)} offsets were measured, from {measured[0]:g} to {measured[-1]:g} ppm, but the "
+            f"model reads {required[0]:g} to {required[-1]:g} ppm. Train with offsets that were measured "
+            "(data.offsets), or measure a wider range."
         )
-    inside = [offset for offset in wanted if abs(offset) <= 6]
+    near_water = [offset for offset in required if abs(offset) <= 6]
     gaps = (
-        np.diff(given)[np.searchsorted(given, inside).clip(1, len(given) - 1) - 1] if inside else np.zeros(1)
+        np.diff(measured)[np.searchsorted(measured, near_water).clip(1, len(measured) - 1) - 1]
+        if near_water
+        else np.zeros(1)
     )
     if gaps.max() > 1.5:
         raise DataError(
-            f"{where}: within 6 ppm of water its offsets are up to {gaps.max():g} ppm apart, which follows no line; "
-            "wanted at most 1.5 ppm."
+            f"{file}: Within 6 ppm of water, neighbouring offsets are up to {gaps.max():g} ppm apart, which is too far "
+            "to resolve a line. Measure at offsets at most 1.5 ppm apart."
         )
-    ends = np.clip(wanted, given[0], given[-1])
-    found = np.full((len(spectra), len(wanted)), np.nan)
+    clipped = np.clip(required, measured[0], measured[-1])
+    interpolated = np.full((len(spectra), len(required)), np.nan)
     whole = np.isfinite(spectra).all(1)
     if whole.any():
-        found[whole] = PchipInterpolator(given, spectra[whole], axis=1)(ends)
-    return found
+        interpolated[whole] = PchipInterpolator(measured, spectra[whole], axis=1)(clipped)
+    return interpolated

@@ -1,4 +1,4 @@
-"""Rows of the contract: a small slice, generated, and in MATLAB's and NumPy's files."""
+"""Contract-test cases: a small slice, generated, or read from a NumPy or MATLAB file."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,8 +14,8 @@ from plugins.data.cest.generator import write_slice
 def slice_of(folder: Path, data_seed: int = 0) -> dict[str, np.ndarray]:
     """Write a small synthetic slice and return its arrays."""
     write_slice(folder, side=32, noise=0.01, shift=0.05, data_seed=data_seed)
-    with np.load(folder / "brain.npz") as held:
-        return dict(held)
+    with np.load(folder / "brain.npz") as content:
+        return dict(content)
 
 
 def as_numpy(folder: Path) -> Mapping[str, str]:
@@ -26,16 +26,17 @@ def as_numpy(folder: Path) -> Mapping[str, str]:
 
 def as_matlab(folder: Path) -> Mapping[str, str]:
     """Write a slice as `.mat`."""
-    held = slice_of(folder)
+    arrays = slice_of(folder)
     (folder / "brain.npz").unlink()
     savemat(
-        folder / "brain.mat", {"rawData": held["spectra"][:, :, None], "offsets": held["offsets"][:, None]}
+        folder / "brain.mat",
+        {"rawData": arrays["spectra"][:, :, None], "offsets": arrays["offsets"][:, None]},
     )
     return {"root": str(folder / "brain.mat")}
 
 
 def files(folder: Path) -> Sequence[Path]:
-    """Write a part of one slice in a NumPy file, and a part of another in a MATLAB file."""
+    """Write a part of one slice as a NumPy file and a part of another slice as a MATLAB file."""
     first, second = (slice_of(folder, seed)["spectra"][8:16, 8:16] for seed in (1, 2))
     (folder / "brain.npz").unlink()
     np.savez(folder / "mine_1.npz", spectra=first, offsets=OFFSETS)

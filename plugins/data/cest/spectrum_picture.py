@@ -13,7 +13,7 @@ def curve(values: Float[np.ndarray, "offset"]) -> UInt8[np.ndarray, "height widt
     canvas = np.full((HEIGHT, PITCH * len(values), 3), 255, np.uint8)
     top = np.rint((1 - np.nan_to_num(values).clip(0, 1.05) / 1.05) * (HEIGHT - 2)).astype(int)
     for offset, row in enumerate(top):
-        place = slice(offset * PITCH, (offset + 1) * PITCH)
-        canvas[row:, place] = BELOW
-        canvas[row : row + 2, place] = LINE
+        columns = slice(offset * PITCH, (offset + 1) * PITCH)
+        canvas[row:, columns] = BELOW
+        canvas[row : row + 2, columns] = LINE
     return canvas

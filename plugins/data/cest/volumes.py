@@ -1,4 +1,4 @@
-"""Reading of Z-spectra volumes: MATLAB 5 (.mat), NumPy (.npz), and NIfTI (.nii, .nii.gz) beside a list of offsets."""
+"""Reading of volumes of Z-spectra: MATLAB 5 (.mat), NumPy (.npz), and NIfTI (.nii, .nii.gz) with a list of offsets."""
 
 import math
 from collections.abc import Mapping
@@ -18,12 +18,12 @@ SUFFIXES = (".mat", ".npz", ".nii", ".gz")
 SPECTRA = ("spectra", "rawData")
 KNOWN = ("offsets", "M0", "mask", "region", "affine")
 UNSATURATED = 100.0
-"""Offset, ppm, from which nothing is saturated: images there are M0, by which the others are divided."""
+"""Offset, ppm, from which nothing is saturated: images at such offsets are M0, by which the others are divided."""
 PLAUSIBLE = 2.0
-"""Upper limit of a plausible Z, which is about 1 at most; above it, a volume was not divided by M0."""
-WANTED = (
-    "Wanted: `spectra` (or `rawData`), the voxels' axes first and the offsets last, and `offsets` in ppm; where there "
-    "are, `M0` (or images at 100 ppm or more) and `mask`, of the voxels' axes."
+"""Upper limit of a plausible Z, which is about 1 at most; a volume with larger numbers was not divided by M0."""
+LAYOUT = (
+    "A volume holds `spectra` (or `rawData`), with the axes of the voxels first and the offsets last, and `offsets` in "
+    "ppm. It may also hold `M0` (or images at 100 ppm or more) and `mask`, with the axes of the voxels."
 )
 
 
@@ -31,15 +31,15 @@ class Volume(NamedTuple):
     """Z-spectra of the voxels of a volume.
 
     Attributes:
-        offsets: (offset,), ppm, ascending.
-        spectra: (voxel, offset), Z of the voxels within the mask.
-        place: (voxel, 3), index of each voxel in the volume.
-        region: (voxel,), index into `regions`.
-        shape: shape of the whole volume.
-        regions: names of the regions.
-        left_out: (dropped, 3), voxels of the mask with a number that is not finite.
-        affine: for a NIfTI file, the transform from voxels to millimetres; otherwise None.
-        unread: names of other arrays in the file.
+        offsets: Offsets, (offset,), ppm, ascending.
+        spectra: Z of the voxels within the mask, (voxel, offset).
+        place: Index of each voxel in the volume, (voxel, 3).
+        region: Region of each voxel, (voxel,), an index into `regions`.
+        shape: Shape of the whole volume.
+        regions: Names of the regions.
+        left_out: Indices of the voxels of the mask of which a number is not finite, (dropped, 3).
+        affine: Transform from voxels to millimetres, for a NIfTI file; otherwise None.
+        unread: Names of other arrays in the file.
     """
 
     offsets: Float[np.ndarray, "offset"]
@@ -59,28 +59,30 @@ class Volume(NamedTuple):
 
 
 def read_volume(file: Path) -> Volume:
-    """Read the spectra of one file, divided by M0 if the file holds it.
+    """Read the spectra of one file, divided by M0 if the file holds M0.
 
     Raises:
-        DataError: the file is missing, damaged, of another layout, or holds no voxel; the message says what was wanted.
+        DataError: The file is missing, damaged, of another layout, or holds no voxel.
     """
-    with guarded(file, "a volume of Z-spectra", WANTED):
-        found = _found(file)
-        numbers = sum(np.size(values) for values in found.values())
+    with guarded(file, "a volume of Z-spectra", LAYOUT):
+        arrays = _read_arrays(file)
+        numbers = sum(np.size(values) for values in arrays.values())
         size = file.stat().st_size
         require_numbers(numbers, MOST_OF_SPECTRA, size)
-        return _volume(found, size)
+        return _volume(arrays, size)
 
 
-def _found(file: Path) -> Mapping[str, Any]:
+def _read_arrays(file: Path) -> Mapping[str, Any]:
     name = file.name.lower()
     if name.endswith(".mat"):
-        return read_variables(file, remedy=WANTED)
+        return read_variables(file, remedy=LAYOUT)
     if name.endswith(".npz"):
         return archive(read_bytes(file))
     if name.endswith((".nii", ".nii.gz")):
         return _nifti(file)
-    raise DataError(f"a file of suffix {shown(file.suffix) or 'none'}; wanted .mat, .npz, .nii or .nii.gz.")
+    raise DataError(
+        f"The suffix of the file is {shown(file.suffix) or 'empty'}; expected .mat, .npz, .nii or .nii.gz."
+    )
 
 
 def _nifti(file: Path) -> Mapping[str, Any]:
@@ -88,42 +90,49 @@ def _nifti(file: Path) -> Mapping[str, Any]:
         from plugins.data.cest.nifti import read_nifti
     except ImportError as error:
         raise DataError(
-            "NIfTI needs nibabel, which is not installed. pip install -e '.[nifti]', or save the volume as .npz."
+            "Reading NIfTI files needs nibabel, which is not installed. Run pip install -e '.[nifti]', or save the "
+            "volume as .npz."
         ) from error
     return read_nifti(file)
 
 
-def _volume(found: Mapping[str, Any], size: int) -> Volume:
-    name = next((name for name in SPECTRA if name in found), None)
-    if name is None or "offsets" not in found:
-        raise DataError(f"it holds {shown(', '.join(found)) or 'nothing'}. {WANTED}")
-    spectra, offsets = real(found[name], name), real(found["offsets"], "offsets").ravel()
+def _volume(arrays: Mapping[str, Any], size: int) -> Volume:
+    """Return the volume in the arrays of a file of `size` bytes."""
+    name = next((name for name in SPECTRA if name in arrays), None)
+    if name is None or "offsets" not in arrays:
+        raise DataError(f"The file holds {shown(', '.join(arrays)) or 'nothing'}. {LAYOUT}")
+    spectra, offsets = real(arrays[name], name), real(arrays["offsets"], "offsets").ravel()
     if not 2 <= spectra.ndim <= 4 or spectra.shape[-1] != len(offsets):
-        raise DataError(f"{name} is of shape {spectra.shape} for {len(offsets)} offsets. {WANTED}")
+        raise DataError(f"{name} has shape {spectra.shape} for {len(offsets)} offsets. {LAYOUT}")
     if not np.isfinite(offsets).all() or len(np.unique(offsets)) < len(offsets):
-        raise DataError("offsets that are not finite, or stand there twice. Mend the list; it is in ppm.")
+        raise DataError(
+            "Some offsets are not finite or occur twice. Correct the list of offsets; the unit is ppm."
+        )
     require_numbers(math.prod(spectra.shape[:-1]), MOST_VOXELS, size // 4)
     shape = (*spectra.shape[:-1], *(1,) * (4 - spectra.ndim))
     spectra = spectra.reshape(*shape, -1)
-    spectra, offsets = _normalised(spectra, offsets, found.get("M0"))
+    spectra, offsets = _divide_by_m0(spectra, offsets, arrays.get("M0"))
     order = np.argsort(offsets)
     spectra, offsets = spectra[..., order], offsets[order]
-    inside = _mask(found.get("mask"), spectra)
+    inside = _mask(arrays.get("mask"), spectra)
     whole = np.isfinite(spectra).all(-1)
-    kept = inside & whole
+    usable = inside & whole
     if not inside.any():
-        raise DataError("its mask holds no voxel: nowhere is it above 0. Mend it, or leave it out.")
-    if not kept.any():
         raise DataError(
-            f"no voxel of {inside.sum()} within the mask is whole: each has a number that is not finite."
+            "The mask contains no voxel: no number of the mask is above 0. Correct the mask, or leave it out."
         )
-    middle = float(np.median(spectra[kept].max(-1)))
+    if not usable.any():
+        raise DataError(
+            f"None of the {inside.sum()} voxels within the mask can be read: each has a number that is not finite. "
+            "Correct the spectra or the mask."
+        )
+    middle = float(np.median(spectra[usable].max(-1)))
     if not 0 < middle < PLAUSIBLE:
         raise DataError(
-            f"the greatest number of half its spectra is beyond {middle:g}, where Z is about 1: they were not divided "
-            "by M0. Give M0, or images at 100 ppm or more."
+            f"The median of the spectra's largest numbers is {middle:g}, but Z is at most about 1. The spectra were "
+            "not divided by M0. Add M0, or images at 100 ppm or more, to the file."
         )
-    region = found.get("region")
+    region = arrays.get("region")
     regions = ("voxels",) if region is None else ("healthy", "tumour")
     numbers = (
         np.zeros(shape, np.int64)
@@ -131,33 +140,46 @@ def _volume(found: Mapping[str, Any], size: int) -> Volume:
         else real(region, "region").astype(np.int64).reshape(shape)
     )
     if numbers.min() < 0 or numbers.max() >= len(regions):
-        raise DataError(f"regions {numbers.min()} to {numbers.max()}; wanted 0 (healthy) and 1 (tumour).")
-    place = np.argwhere(kept)
+        raise DataError(
+            f"`region` holds the numbers {numbers.min()} to {numbers.max()}; expected 0 (healthy) and 1 (tumour)."
+        )
+    place = np.argwhere(usable)
     left_out = np.argwhere(inside & ~whole)
-    unread = tuple(shown(other, 40) for other in found if other not in (name, *KNOWN))[:12]
+    unread = tuple(shown(other, 40) for other in arrays if other not in (name, *KNOWN))[:12]
     return Volume(
-        offsets, spectra[kept], place, numbers[kept], shape, regions, left_out, found.get("affine"), unread
+        offsets,
+        spectra[usable],
+        place,
+        numbers[usable],
+        shape,
+        regions,
+        left_out,
+        arrays.get("affine"),
+        unread,
     )
 
 
-def _normalised(spectra: np.ndarray, offsets: np.ndarray, given: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return spectra divided by M0, and their offsets; a voxel becomes NaN where M0 is 0."""
+def _divide_by_m0(spectra: np.ndarray, offsets: np.ndarray, m0: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return the saturated spectra divided by M0, and their offsets; voxels whose M0 is 0 become NaN.
+
+    Without `m0`, M0 is the mean of the unsaturated images; without such images the spectra are already divided.
+    """
     far = np.abs(offsets) >= UNSATURATED
     if far.all():
-        raise DataError(f"every offset is {UNSATURATED:g} ppm or more. They are to be in ppm, not in Hz.")
-    if given is not None:
-        whole = real(given, "M0").reshape(*spectra.shape[:-1], 1)
+        raise DataError(f"Every offset is {UNSATURATED:g} ppm or more. Write the offsets in ppm, not in Hz.")
+    if m0 is not None:
+        unsaturated = real(m0, "M0").reshape(*spectra.shape[:-1], 1)
     elif far.any():
-        whole = spectra[..., far].mean(-1, keepdims=True)
+        unsaturated = spectra[..., far].mean(-1, keepdims=True)
     else:
         return spectra, offsets
     with np.errstate(divide="ignore", invalid="ignore"):
-        spectra = np.where(whole > 0, spectra / whole, np.nan)
+        spectra = np.where(unsaturated > 0, spectra / unsaturated, np.nan)
     return spectra[..., ~far], offsets[~far]
 
 
-def _mask(given: Any, spectra: np.ndarray) -> Bool[np.ndarray, "x y z"]:
-    """Return the mask of voxels to read; without a given mask, voxels with any number other than 0."""
-    if given is None:
+def _mask(mask: Any, spectra: np.ndarray) -> Bool[np.ndarray, "x y z"]:
+    """Return which voxels are read: those where `mask` is above 0, or without a mask those with any number but 0."""
+    if mask is None:
         return np.asarray(np.nan_to_num(spectra, nan=1.0).any(-1))
-    return np.asarray(np.nan_to_num(real(given, "mask").reshape(spectra.shape[:-1])) > 0)
+    return np.asarray(np.nan_to_num(real(mask, "mask").reshape(spectra.shape[:-1])) > 0)
