@@ -64,19 +64,19 @@ class DensityHead(nn.Module, ABC):
         torch's global generator, which the framework seeds before every step.
         """
 
-    @abstractmethod
     def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
         """Return the training loss per sample in nats, differentiable in `raw`; the framework takes the mean.
 
-        It is usually `-self(raw).log_prob(target)`; a variational head returns its negative bound.
+        The default is the negative log-likelihood, `-self(raw).log_prob(target)`. A variational head returns its
+        negative bound instead.
         """
+        return -self(raw).log_prob(target)
 
-    @abstractmethod
     def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
         """Fit in place what is not trained by gradient, such as a single global concentration (eq. 3.5).
 
         The framework calls it once after training, in evaluation mode and without gradient, with the whole validation
-        split. Fitted values are buffers, so that the checkpoint stores them. A head with nothing to fit does nothing.
+        split. Fitted values are buffers, so that the checkpoint stores them. The default does nothing.
         """
 
 

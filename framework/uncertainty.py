@@ -30,6 +30,11 @@ class Uncertainty(Predictor):
 
     An example is {"samples": (1, 3, 10, 30)}. They may be set at any time after training. Empty if there is none.
     """
+    model: Predictor
+    """The wrapped predictor; by default `loss`, `training_densities` and `calibrate` are those of this predictor.
+
+    A wrapper of several predictors does not set it, and overrides these methods.
+    """
     remark: str = ""
     """A sentence for the model's user about what `calibrate` found; "" if there is nothing to say.
 
@@ -40,20 +45,23 @@ class Uncertainty(Predictor):
     def forward(self, inputs: Tensor) -> Distribution:
         """Return the density over the target for a batch of inputs."""
 
-    @abstractmethod
     def loss(self, inputs: Tensor, target: Tensor) -> Float[Tensor, "batch"]:
-        """Return the training loss per sample, nats."""
+        """Return the training loss per sample, nats; the default is the loss of `model`."""
+        return self.model.loss(inputs, target)
 
-    @abstractmethod
     def training_densities(self, inputs: Tensor) -> Distribution:
-        """Return the wrapped densities that an objective may shape by gradient.
+        """Return the wrapped densities that an objective may shape by gradient; the default is those of `model`.
 
         Their batch_shape is (batch,) or (batch, member).
         """
+        return self.model.training_densities(inputs)
 
-    @abstractmethod
     def calibrate(self, batches: Iterable[Batch]) -> None:
-        """Calibrate the wrapped predictor, then the wrapper, on the validation split; called once after training."""
+        """Calibrate the wrapped predictor, then the wrapper, on the validation split; called once after training.
+
+        The default calibrates `model` alone.
+        """
+        self.model.calibrate(batches)
 
 
 class SeveralModels(ABC):

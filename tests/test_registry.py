@@ -234,12 +234,12 @@ def test_any_source_is_described_or_called_broken(
 def test_a_class_that_is_not_whole_is_refused(
     fake: list[EntryPoint], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    text = "from framework.density_head import DensityHead\nclass Half(DensityHead):\n    def forward(self, raw): ...\n"
+    text = "from framework.density_head import DensityHead\nclass Half(DensityHead):\n    size = 1\n"
     (tmp_path / "half_for_test.py").write_text(text)
     monkeypatch.syspath_prepend(tmp_path)
     fake.append(entry("half", "half_for_test:Half", "framework.density_head", "half-package"))
     with pytest.raises(
-        ConfigError, match=r"'half'.*half-package 1\.0\) lacks .*loss.*framework\.density_head"
+        ConfigError, match=r"'half'.*half-package 1\.0\) lacks forward, .*framework\.density_head"
     ):
         load("density_head", "half")
 

@@ -36,13 +36,6 @@ class CategoricalHead(DensityHead):
         """Return the density for raw parameters."""
         return classes(require_finite(raw, self.size))
 
-    def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
-        """Return the cross-entropy of each sample, nats."""
-        return -self(raw).log_prob(target)
-
-    def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
-        """Do nothing, since all parameters are trained."""
-
 
 class BernoulliHead(DensityHead):
     """Two classes by a logistic (thesis eq. 2.9-2.11); trains by binary cross-entropy."""
@@ -73,13 +66,6 @@ class BernoulliHead(DensityHead):
         raw = require_finite(raw, self.size)
         # the softmax of (0, r) is the logistic of r (eq. 2.11)
         return classes(torch.cat([torch.zeros_like(raw), raw], -1))
-
-    def loss(self, raw: Float[Tensor, "*batch 1"], target: Tensor) -> Float[Tensor, "*batch"]:
-        """Return the binary cross-entropy of each sample, nats."""
-        return -self(raw).log_prob(target)
-
-    def calibrate(self, raw: Float[Tensor, "batch 1"], target: Tensor) -> None:
-        """Do nothing, since all parameters are trained."""
 
 
 def classes(logits: Float[Tensor, "*batch label"]) -> Categorical:

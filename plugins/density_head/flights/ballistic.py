@@ -140,10 +140,6 @@ class BallisticHead(DensityHead, Fitted):
         # The gradient is 0: the search is not differentiated.
         return build(seen, estimate, raw, (raw * 0).sum(-1, keepdim=True))
 
-    def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
-        """Return the negative log-likelihood of each sample, nats."""
-        return -self(raw).log_prob(target)
-
     @torch.no_grad()
     def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
         """Fit a factor of each number's standard deviation, so that its variance equals the mean squared residual."""

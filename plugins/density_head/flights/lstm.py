@@ -105,10 +105,3 @@ class LSTMHead(DensityHead):
         # a frame's displacement is about a tenth of a metre; the network predicts the change of the last displacement
         width = (0.05 * nn.functional.softplus(numbers[:, 3:])).clamp(max=WIDEST) + LEAST
         return move + 0.1 * numbers[:, :3], width, (hidden, memory)
-
-    def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
-        """Return the negative log-likelihood of each sample, nats."""
-        return -self(raw).log_prob(target)
-
-    def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
-        """Do nothing, since all parameters are trained."""

@@ -97,6 +97,3 @@ class HybridHead(DensityHead):
         # the component's density is relative to the targets' mean and in units of their standard deviations
         scale = (scale / spread.to(mean.device)).to(mean)
         return numbers, mean - scale * location.to(mean), scale
-
-    def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
-        """Do nothing, since all parameters are trained."""

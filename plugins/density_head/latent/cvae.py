@@ -201,9 +201,6 @@ class CVAEHead(DensityHead):
         """Return the negative evidence lower bound of each sample, nats (eq. 3.18)."""
         return -evidence_bound(self.networks(raw), target, self.training_samples)
 
-    def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
-        """Do nothing, since all parameters are trained."""
-
     def networks(self, raw: Float[Tensor, "*batch size"]) -> Networks:
         """Return prior, encoder and decoder, given the features."""
         raw = require_finite(raw, self.size)

@@ -134,10 +134,3 @@ class SCVAEHead(DensityHead):
     ) -> Float[Tensor, "*batch sample number"]:
         """Return the component's raw parameters at every z."""
         return self.decoder(raw.unsqueeze(-2), z)
-
-    def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
-        """Return the negative log-likelihood of each sample, nats (eq. 3.22)."""
-        return -self(raw).log_prob(target)
-
-    def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
-        """Do nothing, since all parameters are trained."""

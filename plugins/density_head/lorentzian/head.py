@@ -74,13 +74,6 @@ class LorentzianHead(DensityHead, Fitted):
         zero = zero.double() if self.scaled else zero
         return density(found, self.wanted.target_count, raw.shape[:-1], zero)
 
-    def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
-        """Return the negative log-likelihood of each sample, nats."""
-        return -self(raw).log_prob(target)
-
-    def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
-        """Do nothing, since the residuals of each fit determine its uncertainty."""
-
 
 def parameters_of(names: tuple[str, ...], by: str) -> Parameters:
     """Return the preset whose target has these names.

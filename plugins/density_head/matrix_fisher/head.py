@@ -54,12 +54,6 @@ class MatrixFisherHead(DensityHead):
         raw = require_finite(raw, self.size)
         return MatrixFisher(parameter_of_raw(raw.unflatten(-1, (3, 3))), raw.dtype)
 
-    def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
-        return -self(raw).log_prob(target)
-
-    def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
-        pass  # all parameters are trained
-
 
 def parameter_of_raw(raw: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
     """Return F = X (1 + |X|²/16)^(3/2), float64, at most LARGEST_PARAMETER in the Frobenius norm |F|.

@@ -66,10 +66,3 @@ class MixtureHead(DensityHead):
                 numbers.clamp(-most, most) + common.clamp(-most, most).unsqueeze(-2) + self.spread.to(raw)
             )
         return Mixture(logits, self.component(numbers))
-
-    def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
-        """Return the negative log-likelihood of each sample, nats."""
-        return -self(raw).log_prob(target)
-
-    def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
-        """Do nothing, since all parameters are trained."""

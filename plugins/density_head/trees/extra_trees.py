@@ -151,10 +151,6 @@ class ExtraTreesHead(DensityHead, Fitted):
         components = IndependentNormals(mean, scale)
         return Mixture(means.new_zeros(means.shape[:-1]), components)
 
-    def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
-        """Return the negative log-likelihood of each sample, nats."""
-        return -self(raw).log_prob(target)
-
     @torch.no_grad()
     def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
         """Fit the widths by maximum likelihood; do nothing for classes."""

@@ -142,10 +142,6 @@ class XGBoostHead(DensityHead, Fitted):
         mean, scale, _ = self.unit.given_back(sums, self.width.to(raw).expand_as(sums))
         return IndependentNormals(mean, scale)
 
-    def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
-        """Return the negative log-likelihood of each sample, nats."""
-        return -self(raw).log_prob(target)
-
     @torch.no_grad()
     def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
         """Set the standard deviations to those of the residuals; do nothing for classes."""

@@ -77,6 +77,3 @@ class UniformFloorHead(DensityHead):
         """Return the uniform density over the component's support; the state of the random generator is kept."""
         with torch.no_grad(), torch.random.fork_rng([raw.device] if raw.is_cuda else []):
             return uniform(self.component(raw))
-
-    def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
-        """Do nothing, since all parameters are trained."""

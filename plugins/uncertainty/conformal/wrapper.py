@@ -9,7 +9,6 @@ import torch
 from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor
-from torch.distributions import Distribution
 
 from framework.calibration.validation import densities, repeatable, require_numbers
 from framework.data import Batch
@@ -97,14 +96,6 @@ class Conformal(Uncertainty):
     def forward(self, inputs: Tensor) -> PredictionSet:
         """Return the density for each input with its prediction set."""
         return PredictionSet(self.model(inputs), self.threshold, self.score, 1 - self.miscoverage)
-
-    def loss(self, inputs: Tensor, target: Tensor) -> Float[Tensor, "batch"]:
-        """Return the wrapped model's loss of each sample, nats."""
-        return self.model.loss(inputs, target)
-
-    def training_densities(self, inputs: Tensor) -> Distribution:
-        """Return the wrapped model's densities in training."""
-        return self.model.training_densities(inputs)
 
     def calibrate(self, batches: Iterable[Batch]) -> None:
         """Calibrate the wrapped model on one half of the batches, and fit the threshold to the other."""

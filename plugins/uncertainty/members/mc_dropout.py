@@ -1,7 +1,7 @@
 """Dropout that stays active in evaluation, and the mixture over its masks."""
 
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Annotated, Any, NamedTuple
 
@@ -12,7 +12,6 @@ from torch import Tensor, nn
 from torch.distributions import Distribution
 
 from framework.calibration.module_flags import flagged
-from framework.data import Batch
 from framework.distributions.batch_shapes import Reshaped, Stacked
 from framework.errors import ConfigError, UserError
 from framework.model import Model, Predictor
@@ -86,18 +85,6 @@ class MCDropout(Uncertainty):
         with flagged(self.model, DROPOUT, "training", True):
             components = self._components(inputs)
         return equal_mixture(components, self.model, inputs.device)
-
-    def loss(self, inputs: Tensor, target: Tensor) -> Float[Tensor, "batch"]:
-        """Return the wrapped model's loss of each sample, nats."""
-        return self.model.loss(inputs, target)
-
-    def training_densities(self, inputs: Tensor) -> Distribution:
-        """Return the wrapped model's densities in training."""
-        return self.model.training_densities(inputs)
-
-    def calibrate(self, batches: Iterable[Batch]) -> None:
-        """Calibrate the wrapped model."""
-        self.model.calibrate(batches)
 
     def _components(self, inputs: Tensor) -> Distribution:
         """Return the densities under S masks each, batch_shape (batch, S)."""

@@ -1,15 +1,13 @@
 """Least-squares fits that start from a network's prediction, as an uncertainty wrapper."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Annotated
 
 import torch
-from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor
 from torch.distributions import Distribution
 
-from framework.data import Batch
 from framework.distributions.protocol import median
 from framework.errors import ConfigError
 from framework.model import Predictor
@@ -76,15 +74,3 @@ class Refined(Uncertainty):
         found = fit(spectra, self.offsets, wanted, start=point, most=self.steps)
         zero = (spectra * 0).sum(-1, keepdim=True).to(point.dtype)
         return density(found, wanted.target_count, start.batch_shape, zero)
-
-    def loss(self, inputs: Tensor, target: Tensor) -> Float[Tensor, "batch"]:
-        """Return the wrapped model's loss of each sample, nats."""
-        return self.model.loss(inputs, target)
-
-    def training_densities(self, inputs: Tensor) -> Distribution:
-        """Return the wrapped model's densities in training."""
-        return self.model.training_densities(inputs)
-
-    def calibrate(self, batches: Iterable[Batch]) -> None:
-        """Calibrate the wrapped model."""
-        self.model.calibrate(batches)

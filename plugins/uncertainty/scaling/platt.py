@@ -81,14 +81,6 @@ class Platt(Uncertainty):
         logits = self.slope * log_prob.double().clamp(min=LEAST) + self.biases
         return RescaledClasses(logits.log_softmax(-1).to(log_prob.dtype), density, self.slope)
 
-    def loss(self, inputs: Tensor, target: Tensor) -> Float[Tensor, "batch"]:
-        """Return the wrapped model's loss of each sample, nats."""
-        return self.model.loss(inputs, target)
-
-    def training_densities(self, inputs: Tensor) -> Distribution:
-        """Return the wrapped model's densities in training."""
-        return self.model.training_densities(inputs)
-
     def calibrate(self, batches: Iterable[Batch]) -> None:
         """Calibrate the wrapped model, then fit slope and biases."""
         seen = repeatable(batches, by="platt")

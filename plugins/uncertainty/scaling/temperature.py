@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Annotated
 
 import torch
-from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor
 from torch.distributions import Distribution
@@ -70,14 +69,6 @@ class Temperature(Uncertainty):
     def forward(self, inputs: Tensor) -> Distribution:
         """Return the tempered density for each input."""
         return temper(self.model(inputs), self.temperature)
-
-    def loss(self, inputs: Tensor, target: Tensor) -> Float[Tensor, "batch"]:
-        """Return the wrapped model's loss of each sample, nats."""
-        return self.model.loss(inputs, target)
-
-    def training_densities(self, inputs: Tensor) -> Distribution:
-        """Return the wrapped model's densities in training."""
-        return self.model.training_densities(inputs)
 
     def calibrate(self, batches: Iterable[Batch]) -> None:
         """Calibrate the wrapped model, then fit the temperature."""
