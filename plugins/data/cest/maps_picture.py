@@ -23,7 +23,7 @@ SIZE = 2.1
 
 
 def maps_figure(methods: Mapping[str, Maps], title: str) -> Figure:
-    """Return a figure with two rows for each method, predictions and standard deviations, in % of the unsaturated signal.
+    """Return a figure: two rows for each method, predictions and standard deviations, in % of the unsaturated signal.
 
     Amplitudes use the rainbow colours that are usual in the field, the asymmetry a scale centred on 0, and standard
     deviations a sequential scale. All methods of a column share one scale, which ends at the 1 % and 99 % quantiles of

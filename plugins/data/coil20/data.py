@@ -27,13 +27,20 @@ GROUPS = ("unique", "look-alikes")
 class COIL20(Data):
     """Columbia Object Image Library: 20 objects seen every 5° of a turntable (Nene, Nayar & Murase 1996).
 
-    Views every `every` degrees are for training, the views in the middle between two of them for validation, and all
-    others for the test; the model must therefore interpolate between views. With `interpolate`, a training batch is
-    drawn at random angles from the objects' appearance manifolds, periodic cubic splines through the training views
-    (Murase & Nayar 1995).
+    The views at multiples of `every` degrees are for training, the views halfway between two training views for
+    validation, and all others for the test; the model must therefore interpolate between views. With `interpolate`,
+    training batches show the objects at random angles, interpolated by the objects' appearance manifolds: periodic
+    cubic splines through the training views (Murase & Nayar 1995).
 
-    Results are also reported separately for the objects that look alike from two opposite sides: objects whose training
-    views half a turn apart are on average closer to one another than neighbouring views.
+    Results are also reported separately for the objects that look alike from two opposite sides: objects of which two
+    training views 180° apart are on average more similar than two neighbouring training views.
+
+    Args:
+        root: Folder that holds COIL20.mat or the processed images, or the path of COIL20.mat.
+        every: Degrees between two training views.
+        image_size: Side of the images, pixels.
+        interpolate: Whether training batches show interpolated views.
+        jitter: Largest random shift, zoom and change of brightness and contrast in training, as a share.
     """
 
     bibtex = """@techreport{nene1996coil20,
@@ -82,15 +89,16 @@ class COIL20(Data):
         self._digest = hashlib.sha256(views.numpy().tobytes()).hexdigest()
 
     def _table(self, views: Tensor, alike: Tensor, chosen: Tensor) -> Fields:
+        """Return the samples of the views where `chosen` (view,) is true, for all objects."""
         objects, count = len(views), int(chosen.sum())
         azimuth = torch.arange(VIEWS)[chosen] * math.radians(STEP_DEG)
         azimuth = torch.where(azimuth >= math.pi, azimuth - 2 * math.pi, azimuth)
-        which = torch.arange(objects).repeat_interleave(count)
+        object_index = torch.arange(objects).repeat_interleave(count)
         return Fields(
             input=views[:, chosen].flatten(0, 1),
             target=azimuth.float().repeat(objects)[:, None],
-            group=alike.long()[which],
-            object=which,
+            group=alike.long()[object_index],
+            object=object_index,
             index=torch.arange(objects * count),
         )
 
@@ -98,34 +106,34 @@ class COIL20(Data):
         return Splits(**self._tables)
 
     def read(self, files: Sequence[Path]) -> Dataset[Batch]:
-        return images.unlabelled(
+        return images.load_unlabelled(
             [Crop(Path(file), None, 0.0, self.image_size, 1, upright=True) for file in files]
         )
 
     def inputs(self, given: Any) -> Tensor:
-        return given_images.inputs(self, given)
+        return given_images.to_inputs(self, given)
 
     def augment(self, batch: Batch) -> Batch:
         if self.interpolate:
-            batch = self._interpolated(batch)
+            batch = self._interpolate(batch)
         if not self.jitter:
             return batch
-        never = torch.zeros(len(batch["target"]), dtype=torch.bool)
-        return {**batch, "input": images.augmented(batch["input"], never, self.jitter)}
+        no_mirror = torch.zeros(len(batch["target"]), dtype=torch.bool)
+        return {**batch, "input": images.augment(batch["input"], no_mirror, self.jitter)}
 
-    def _interpolated(self, batch: Batch) -> Batch:
-        """Return the batch with each object turned at random by up to half a step between two training views."""
+    def _interpolate(self, batch: Batch) -> Batch:
+        """Return the batch with each object rotated by a random angle, at most half the step between training views."""
         target = batch["target"]
         shift = (torch.rand(len(target), 1, device=target.device) - 0.5) * math.radians(self.every)
-        turned = target + shift
-        turn = torch.remainder(turned[:, 0].double() / (2 * math.pi), 1.0)
+        azimuth = target + shift
+        turn = torch.remainder(azimuth[:, 0].double() / (2 * math.pi), 1.0)
         row = (turn * len(self._weights)).long().clamp(max=len(self._weights) - 1).cpu()
-        seen = self._training[batch["object"].cpu()]
-        drawn = torch.einsum("bv,bvchw->bchw", self._weights[row], seen).clamp(0, 255).round()
+        views = self._training[batch["object"].cpu()]
+        interpolated = torch.einsum("bv,bvchw->bchw", self._weights[row], views).clamp(0, 255).round()
         return {
             **batch,
-            "input": drawn.to(batch["input"].dtype).to(batch["input"].device),
-            "target": torch.where(turned >= math.pi, turned - 2 * math.pi, turned),
+            "input": interpolated.to(batch["input"].dtype).to(batch["input"].device),
+            "target": torch.where(azimuth >= math.pi, azimuth - 2 * math.pi, azimuth),
         }
 
     def fingerprint(self) -> Mapping[str, str]:
@@ -138,4 +146,4 @@ class COIL20(Data):
         }
 
     def preview(self, inputs: Tensor) -> np.ndarray:
-        return images.picture(inputs)
+        return images.to_rgb8(inputs)

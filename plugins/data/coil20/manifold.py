@@ -7,14 +7,14 @@ from scipy.interpolate import CubicSpline
 from torch import Tensor
 
 FINE = 1440
-"""Number of angles at which the curve is tabulated: one for every quarter of a degree."""
+"""Number of angles at which the curve is tabulated, one every 0.25°."""
 
 
 def spline_weights(views: int) -> Float[Tensor, "fine views"]:
-    """Return weights of equally spaced views: row i is the periodic cubic spline at (i + 1/2)/FINE of a turn.
+    """Return the weights of equally spaced views: the image at (i + 1/2)/FINE of a turn is row i times the views.
 
-    (Murase & Nayar 1995, §2.2, there in an eigenspace. A spline is linear in its points, so the choice of space does
-    not change it.)
+    The weights are those of a periodic cubic spline through the views (Murase & Nayar 1995, §2.2, where the spline lies
+    in an eigenspace). A spline is linear in its points, so a spline through the images themselves is the same curve.
     """
     points = np.eye(views)
     spline = CubicSpline(np.arange(views + 1) / views, np.vstack([points, points[:1]]), bc_type="periodic")
@@ -22,7 +22,11 @@ def spline_weights(views: int) -> Float[Tensor, "fine views"]:
 
 
 def look_alikes(views: Float[Tensor, "object view 1 side side"]) -> Bool[Tensor, "object"]:
-    """Return which objects have views half a turn apart that are closer than neighbouring ones (mean RMS)."""
+    """Return which objects look alike from opposite sides.
+
+    The root mean square differences of two views 180° apart, averaged over the views, are then smaller than those of
+    two neighbouring views.
+    """
     flat = views.flatten(2)
     half = (flat - flat.roll(flat.shape[1] // 2, 1)).square().mean(-1).sqrt().mean(-1)
     next_view = (flat - flat.roll(1, 1)).square().mean(-1).sqrt().mean(-1)

@@ -1,4 +1,4 @@
-"""Rows of the contract: a blob that moves around a turntable, as the distributed MATLAB file."""
+"""Contract-test cases: a blob that moves around a turntable, in the layout of the distributed MATLAB file."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,14 +11,14 @@ from framework.testing.sample_files import images
 
 
 def turntable(symmetric: bool = False) -> np.ndarray:
-    """Return 20 objects × 72 views (20, 72, 32, 32): a blob that goes round once a turn, or twice if symmetric."""
+    """Return views (20, 72, 32, 32) of 20 blobs that go round once per turn of the table, or twice if symmetric."""
     angle = np.radians(5) * np.arange(72) * (2 if symmetric else 1)
     row, column = np.mgrid[:32, :32]
     views = []
     for number in range(20):
-        place = 16 + 8 * np.stack([np.cos(angle + number), np.sin(angle + number)], -1)
-        gap = (row - place[:, :1, None]) ** 2 + (column - place[:, 1:, None]) ** 2
-        views.append(255 * np.exp(-gap / 40))
+        centre = 16 + 8 * np.stack([np.cos(angle + number), np.sin(angle + number)], -1)
+        squared_distance = (row - centre[:, :1, None]) ** 2 + (column - centre[:, 1:, None]) ** 2
+        views.append(255 * np.exp(-squared_distance / 40))
     return np.stack(views).round().astype(np.uint8)
 
 

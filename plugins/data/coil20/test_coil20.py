@@ -28,7 +28,7 @@ def test_views_angles_and_splits(root):
     coil.prepare()
     views = torch.from_numpy(turntable())
     sizes = []
-    seen = torch.zeros(20, 72, dtype=torch.int64)
+    occurrences = torch.zeros(20, 72, dtype=torch.int64)
     for split, residues in zip(coil.splits(), ({0}, {2}, {1, 3}), strict=True):
         sizes.append(len(split))
         batch = split.__getitems__(range(len(split)))
@@ -36,19 +36,19 @@ def test_views_angles_and_splits(root):
         assert {int(number) % 4 for number in view} == residues
         assert torch.equal(batch["input"][:, 0], views[batch["object"], view])
         assert (batch["target"].abs() <= math.pi).all()
-        seen[batch["object"], view] += 1
+        occurrences[batch["object"], view] += 1
     assert sizes == [360, 360, 720]
-    assert (seen == 1).all()  # every view of every object, once
+    assert (occurrences == 1).all()  # every view of every object is in one split
 
 
 def test_the_processed_images_are_read_like_the_matlab_file(root, tmp_path):
     for number, views in enumerate(turntable(), start=1):
         for view, pixels in enumerate(views):
             Image.fromarray(pixels).save(tmp_path / f"obj{number}__{view}.png")
-    one, other = data(root), data(tmp_path)
-    one.prepare()
-    other.prepare()
-    assert torch.equal(one.splits().train.fields["input"], other.splits().train.fields["input"])
+    from_matlab, from_images = data(root), data(tmp_path)
+    from_matlab.prepare()
+    from_images.prepare()
+    assert torch.equal(from_matlab.splits().train.fields["input"], from_images.splits().train.fields["input"])
     (tmp_path / "obj7__3.png").unlink()
     with pytest.raises(DataError, match=r"obj7__3\.png is missing"):
         data(tmp_path).prepare()
@@ -69,10 +69,10 @@ def test_the_spline_passes_through_its_views_and_closes():
     weights = spline_weights(18).double()
     np.testing.assert_allclose(weights.sum(1), 1, atol=1e-6)
     turn = (np.arange(FINE) + 0.5) / FINE * 2 * np.pi
-    # harmonics up to the third are smooth against 18 views: the spline reproduces them to its own order
+    # 18 views sample harmonics up to the third finely enough for the spline to reproduce them
     for harmonic in (0, 1, 2, 3):
-        found = weights.numpy() @ np.cos(harmonic * np.arange(18) * 2 * np.pi / 18)
-        np.testing.assert_allclose(found, np.cos(harmonic * turn), atol=6e-3)
+        interpolated = weights.numpy() @ np.cos(harmonic * np.arange(18) * 2 * np.pi / 18)
+        np.testing.assert_allclose(interpolated, np.cos(harmonic * turn), atol=6e-3)
 
 
 def test_interpolated_views_show_the_object_at_their_angle(root):
@@ -80,18 +80,18 @@ def test_interpolated_views_show_the_object_at_their_angle(root):
     coil.prepare()
     batch = coil.splits().train.__getitems__(range(360))
     torch.manual_seed(0)
-    turned = coil.augment(batch)
-    shift = torch.remainder(turned["target"] - batch["target"] + math.pi, 2 * math.pi) - math.pi
+    augmented = coil.augment(batch)
+    shift = torch.remainder(augmented["target"] - batch["target"] + math.pi, 2 * math.pi) - math.pi
     assert shift.abs().max() <= math.radians(10) + 1e-5
     assert shift.std() > math.radians(5)
-    # the blob's own angle, from its centre of mass, less the object's starting angle
-    pixels = turned["input"][:, 0].double()
-    place = torch.arange(32.0).double() - 16
-    row, column = (pixels.sum(2) * place).sum(1), (pixels.sum(1) * place).sum(1)
+    # angle of the blob's centre of mass, minus the angle of the object's first view
+    pixels = augmented["input"][:, 0].double()
+    position = torch.arange(32.0).double() - 16
+    row, column = (pixels.sum(2) * position).sum(1), (pixels.sum(1) * position).sum(1)
     azimuth = torch.atan2(column, row) - batch["object"]
-    error = torch.remainder(azimuth - turned["target"][:, 0] + math.pi, 2 * math.pi) - math.pi
+    error = torch.remainder(azimuth - augmented["target"][:, 0] + math.pi, 2 * math.pi) - math.pi
     assert error.abs().max() < math.radians(3)
-    assert (turned["target"].abs() <= math.pi).all()
+    assert (augmented["target"].abs() <= math.pi).all()
 
 
 def test_without_interpolation_and_jitter_a_batch_stays_as_it_is(root):
@@ -121,16 +121,16 @@ def test_the_real_objects():
     assert coil.fingerprint()["look_alikes"] == "3 5 6 8 9 11 14 19"
 
 
-def test_look_alikes_of_a_constant_object_are_none():
+def test_an_object_whose_views_are_all_equal_is_no_look_alike():
     assert not look_alikes(torch.ones(1, 18, 1, 4, 4)).any()
 
 
 @pytest.mark.parametrize(
     "change, message",
     [
-        ({"X": np.zeros((1440, 1024))}, "X came as float64"),
+        ({"X": np.zeros((1440, 1024))}, "X is float64"),
         ({"X": np.zeros((1439, 1024), np.uint8)}, r"\(1439, 1024\)"),
-        ({"Y": np.ones((1440, 1))}, "does not name 20 objects"),
+        ({"Y": np.ones((1440, 1))}, "Y must name 20 objects"),
     ],
 )
 def test_another_matlab_file_is_refused(tmp_path, change, message):
@@ -141,10 +141,10 @@ def test_another_matlab_file_is_refused(tmp_path, change, message):
 
 
 def test_other_folders_and_files_are_refused(tmp_path):
-    with pytest.raises(DataError, match=r"neither COIL20\.mat nor obj1__0\.png"):
+    with pytest.raises(DataError, match=r"holds neither COIL20\.mat nor obj1__0\.png"):
         data(tmp_path).prepare()
     savemat(tmp_path / "COIL20.mat", {"fea": np.zeros(3)})
-    with pytest.raises(DataError, match="holds fea"):
+    with pytest.raises(DataError, match="The file holds fea"):
         data(tmp_path / "COIL20.mat").prepare()
     with pytest.raises(DataError, match=r"data\.root is not set: COIL-20 is published for research"):
         build("data", resolve("data", {"name": "coil20"})).prepare()

@@ -13,49 +13,56 @@ from framework.errors import DataError, shown
 
 OBJECTS, VIEWS, STEP_DEG = 20, 72, 5
 FILE = "COIL20.mat"
-WANTED = (
-    f"Wanted: the folder that holds {FILE} (X 1440 × 1024, Y 1440 × 1), or obj1__0.png to obj20__71.png "
+REMEDY = (
+    f"Set data.root to a folder that holds {FILE} (X 1440 × 1024 uint8, Y 1440 × 1), or obj1__0.png to obj20__71.png "
     "(coil-20-proc)."
 )
 
 
 def read_views(root: str | None, side: int) -> UInt8[Tensor, "object view 1 side side"]:
-    """Read every view of every object; view k is at 5k degrees.
+    """Read every view of every object, `side` pixels a side; view k is at 5k degrees.
 
     Raises:
-        DataError: there is no root, it has neither layout, or a file is missing, unreadable or of another shape.
+        DataError: `root` is None or has neither layout, or a file is missing, unreadable or of another shape.
     """
     if root is None:
         raise DataError(
             "data.root is not set: COIL-20 is published for research by Columbia University and is not generated. "
-            + WANTED
+            + REMEDY
         )
     folder = Path(root).expanduser()
     if folder.is_file():
-        return _matlab(folder, side)
+        return _read_matlab(folder, side)
     if (folder / FILE).is_file():
-        return _matlab(folder / FILE, side)
+        return _read_matlab(folder / FILE, side)
     if (folder / "obj1__0.png").is_file():
-        return _folder(folder, side)
-    raise DataError(f"data.root = {folder}: neither {FILE} nor obj1__0.png is there. {WANTED}")
+        return _read_images(folder, side)
+    raise DataError(f"data.root = {folder} holds neither {FILE} nor obj1__0.png. {REMEDY}")
 
 
-def _matlab(file: Path, side: int) -> Tensor:
-    found = read_variables(file, remedy=WANTED)
-    if "X" not in found or "Y" not in found:
-        raise DataError(f"{file} holds {shown(', '.join(found)) or 'nothing'}. {WANTED}")
-    pixels, labels = np.asarray(found["X"]), np.asarray(found["Y"]).ravel()
+def _read_matlab(file: Path, side: int) -> Tensor:
+    variables = read_variables(file, remedy=REMEDY)
+    if "X" not in variables or "Y" not in variables:
+        raise DataError(
+            f"{file}: The file holds {shown(', '.join(variables)) or 'nothing'}, but X and Y are required. {REMEDY}"
+        )
+    pixels, labels = np.asarray(variables["X"]), np.asarray(variables["Y"]).ravel()
     if (
         pixels.shape != (OBJECTS * VIEWS, 1024)
         or pixels.dtype != np.uint8
         or labels.shape != (OBJECTS * VIEWS,)
     ):
-        raise DataError(f"{file}: X came as {pixels.dtype} {pixels.shape}, Y as {labels.shape}. {WANTED}")
+        raise DataError(
+            f"{file}: X is {pixels.dtype} of shape {pixels.shape}, and Y holds {labels.size} numbers. {REMEDY}"
+        )
     names, counts = np.unique(labels, return_counts=True)
     if names.tolist() != [*range(1, OBJECTS + 1)] or (counts != VIEWS).any():
-        raise DataError(f"{file}: Y does not name {OBJECTS} objects with {VIEWS} views each. {WANTED}")
+        raise DataError(
+            f"{file}: Y must name {OBJECTS} objects with {VIEWS} views each, but does not. {REMEDY}"
+        )
     order = np.argsort(labels, kind="stable")
-    square = pixels[order].reshape(OBJECTS, VIEWS, 1, 32, 32).swapaxes(-1, -2)  # MATLAB stores columns
+    # MATLAB stores an image column by column
+    square = pixels[order].reshape(OBJECTS, VIEWS, 1, 32, 32).swapaxes(-1, -2)
     views = torch.from_numpy(np.ascontiguousarray(square))
     if side == 32:
         return views
@@ -65,14 +72,14 @@ def _matlab(file: Path, side: int) -> Tensor:
     return resized.round().clamp(0, 255).to(torch.uint8).unflatten(0, (OBJECTS, VIEWS))
 
 
-def _folder(folder: Path, side: int) -> Tensor:
-    rows = []
+def _read_images(folder: Path, side: int) -> Tensor:
+    views = []
     for number in range(1, OBJECTS + 1):
         files = [folder / f"obj{number}__{view}.png" for view in range(VIEWS)]
         missing = [file.name for file in files if not file.is_file()]
         if missing:
             raise DataError(
-                f"{folder}: {missing[0]} is missing, and {len(missing) - 1} more of its object. {WANTED}"
+                f"{folder}: {missing[0]} is missing, and so are {len(missing) - 1} other views of this object. {REMEDY}"
             )
-        rows.append(torch.stack([Crop(file, None, 0.0, side, 1).read() for file in files]))
-    return torch.stack(rows)
+        views.append(torch.stack([Crop(file, None, 0.0, side, 1).read() for file in files]))
+    return torch.stack(views)
