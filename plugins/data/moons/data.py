@@ -12,14 +12,14 @@ from plugins.data.moons.points import Draws, PlanePoints, fingerprint, split_of
 
 
 class Moons(PlanePoints):
-    """Two interleaved half circles whose noise makes the classes overlap (thesis Figure 2.2, §2.3.1).
+    """Two interleaved half circles with so much noise that the classes overlap (thesis Figure 2.2, §2.3.1).
 
-    The classes are equally likely, and each batch holds the exact "posterior" of its points, (batch, 2), which no
-    prediction can improve on. The splits are independent draws that depend only on the seed of the data.
+    The classes are equally likely. Each batch holds "posterior", (batch, 2), the exact class probabilities of its
+    points, which no prediction can improve on. The splits are independent draws; `data_seed` determines them.
 
     Args:
-        draws: sizes and seed of the splits.
-        noise: standard deviation of both coordinates, in radii of the half circles.
+        draws: Sizes and seed of the splits.
+        noise: Standard deviation of the noise on either coordinate, in radii of the half circles.
     """
 
     bibtex = """@article{pedregosa2011scikit,
@@ -42,7 +42,7 @@ class Moons(PlanePoints):
         self.draws = draws
         self.noise = noise
 
-    def drawn(self, size: int, split: int) -> Fields:
+    def draw_split(self, size: int, split: int) -> Fields:
         points, label = draw(size, self.noise, self.draws.data_seed, split)
         inputs = torch.from_numpy(points).float()
         exact = posterior(inputs.double().numpy(), self.noise)

@@ -1,9 +1,10 @@
-"""Two interleaved half circles under Gaussian noise: drawing points, and their exact densities and posterior.
+"""Two interleaved half circles with Gaussian noise: random points, their exact densities and their exact posterior.
 
-The upper half of a unit circle about (0, 0) is class 0, the lower half of one about (1, ½) is class 1. A point lies at
-a uniform angle of its class's arc, with normal noise added. Points are in standard units: each coordinate minus its
-mean, divided by its standard deviation, where both are those of the distribution and not of a sample. The arcs are
-mirror images of each other in the origin, and so are the two densities.
+Class 0 is the upper half of a unit circle about (0, 0), class 1 the lower half of a unit circle about (1, ½). A point
+lies at a uniformly distributed angle of the arc of its class, plus normal noise. Points are in standard units: from
+each coordinate its mean is subtracted, and the result is divided by its standard deviation. Both are those of the
+distribution and not of a sample. In these units, reflection through the origin maps each arc and its density to those
+of the other class.
 """
 
 import math
@@ -17,7 +18,7 @@ CENTRE = np.array([0.5, 0.25])
 NODES = 64
 """Number of nodes of the Gauss-Legendre rule on each piece of an arc."""
 DECAY = 40.0
-"""Nats below a piece's largest value at which its integral is cut off: e⁻⁴⁰ is below float64's resolution."""
+"""Nats by which the log of an integrand falls before its integral is cut off: e⁻⁴⁰ is below float64 resolution."""
 
 
 def scale(noise: float) -> np.ndarray:
@@ -29,12 +30,14 @@ def scale(noise: float) -> np.ndarray:
 
 
 def draw(size: int, noise: float, *key: int) -> tuple[Float[np.ndarray, "size 2"], Int[np.ndarray, "size"]]:
-    """Return points in standard units and their classes in turn; a larger draw begins with the points of a smaller one.
+    """Return random points in standard units, and their classes, which alternate.
+
+    With the same key, a larger draw begins with the points of a smaller draw.
 
     Args:
-        size: number of points.
-        noise: standard deviation of the noise, in radii.
-        key: numbers that choose the random stream; other numbers give independent points.
+        size: Number of points.
+        noise: Standard deviation of the noise, in radii.
+        key: Numbers that choose the random stream; other numbers give independent points.
     """
     angles, normals = (np.random.default_rng([*key, part]) for part in range(2))
     angle = math.pi * angles.random(size)
@@ -46,22 +49,23 @@ def draw(size: int, noise: float, *key: int) -> tuple[Float[np.ndarray, "size 2"
 
 def log_density(points: Float[np.ndarray, "*batch 2"], noise: float) -> Float[np.ndarray, "*batch 2"]:
     """Return log p(x | y) for y = 0 and 1, nats, of points in standard units; finite for every finite float32."""
-    distance, around = _seen_from_arcs(points, noise)
-    # |x - (cos θ, sin θ)|² = (d - 1)² + 4 d sin²(t/2), where d is x's distance from the circle's centre
-    along = -((distance - 1) ** 2) / (2 * noise**2)
+    distance, log_integral = _polar_terms(points, noise)
+    # |x - (cos θ, sin θ)|² = (d - 1)² + 4 d sin²(t/2), where d is x's distance from the circle's centre and t the
+    # angle between x and the point of the arc
+    radial = -((distance - 1) ** 2) / (2 * noise**2)
     constant = math.log(math.pi) + math.log(2 * math.pi * noise**2)
-    return along + around - constant + np.log(scale(noise)).sum()
+    return radial + log_integral - constant + np.log(scale(noise)).sum()
 
 
 def log_posterior(points: Float[np.ndarray, "*batch 2"], noise: float) -> Float[np.ndarray, "*batch 2"]:
     """Return log p(y | x) for y = 0 and 1, with equal prior probabilities, of points in standard units."""
-    distance, around = _seen_from_arcs(points, noise)
+    distance, log_integral = _polar_terms(points, noise)
     total = distance.sum(-1)
-    # log p(x | 1) - log p(x | 0) without the cancellation of large squares: for p from the centre of symmetry and
-    # half the circles' distance c, (d₁² - d₀²) = |p - c|² - |p + c|² = -4 p·c
-    apart = -4 * (points * scale(noise)) @ CENTRE / total
-    odds = np.diff(around)[..., 0] - apart * (total - 2) / (2 * noise**2)
-    return np.stack([log_expit(-odds), log_expit(odds)], -1)
+    # log p(x | 1) - log p(x | 0) without the cancellation of large squares: if p is the point measured from the centre
+    # of symmetry, and the circles' centres are -c and c, then d₁² - d₀² = |p - c|² - |p + c|² = -4 p·c
+    difference = -4 * (points * scale(noise)) @ CENTRE / total
+    log_odds = np.diff(log_integral)[..., 0] - difference * (total - 2) / (2 * noise**2)
+    return np.stack([log_expit(-log_odds), log_expit(log_odds)], -1)
 
 
 def posterior(points: Float[np.ndarray, "*batch 2"], noise: float) -> Float[np.ndarray, "*batch 2"]:
@@ -69,22 +73,23 @@ def posterior(points: Float[np.ndarray, "*batch 2"], noise: float) -> Float[np.n
     return np.exp(log_posterior(points, noise))
 
 
-def _seen_from_arcs(
+def _polar_terms(
     points: Float[np.ndarray, "*batch 2"], noise: float
 ) -> tuple[Float[np.ndarray, "*batch 2"], Float[np.ndarray, "*batch 2"]]:
     """Return, for each class, the distance d from its circle's centre, radii, and log ∫ exp(-2 d sin²(t/2) / σ²) dt.
 
-    Here t is the angle between x and a point of the arc. The integrand falls with |t|, and the arc is divided into two
-    pieces of |t|: both start at x's direction if the arc contains it, and otherwise at the arc's ends.
+    Here t is the angle at the circle's centre between x and a point of the arc. The integrand falls with |t|. The arc
+    is divided into two pieces on each of which |t| is monotonic. If the arc contains the direction of x, both pieces
+    start there, at |t| = 0. Otherwise each piece starts at an end of the arc and ends opposite to x, at |t| = π.
     """
     centred = points * scale(noise)
-    seen = np.stack([centred + CENTRE, CENTRE - centred], -2)
-    distance = np.hypot(seen[..., 0], seen[..., 1])
-    direction = np.arctan2(seen[..., 1], seen[..., 0])
-    faced, away = direction >= 0, np.abs(direction)
+    from_centres = np.stack([centred + CENTRE, CENTRE - centred], -2)
+    distance = np.hypot(from_centres[..., 0], from_centres[..., 1])
+    direction = np.arctan2(from_centres[..., 1], from_centres[..., 0])
+    on_arc, to_end = direction >= 0, np.abs(direction)
     pieces = [
-        (np.where(faced, 0.0, away), np.where(faced, away, math.pi)),
-        (np.where(faced, 0.0, math.pi - away), np.where(faced, math.pi - away, math.pi)),
+        (np.where(on_arc, 0.0, to_end), np.where(on_arc, to_end, math.pi)),
+        (np.where(on_arc, 0.0, math.pi - to_end), np.where(on_arc, math.pi - to_end, math.pi)),
     ]
     rate = 2 * distance / noise**2
     first, second = (_log_piece(low, high, rate) for low, high in pieces)
@@ -92,9 +97,9 @@ def _seen_from_arcs(
 
 
 def _log_piece(low: np.ndarray, high: np.ndarray, rate: np.ndarray) -> np.ndarray:
-    """Return log ∫ exp(-rate sin²(t/2)) dt from `low` to `high`, 0 ≤ low ≤ high ≤ π, without its negligible part."""
+    """Return log ∫ exp(-rate sin²(t/2)) dt from `low` to `high`, 0 ≤ low ≤ high ≤ π, without its negligible tail."""
     start = np.sin(low / 2) ** 2
-    width = np.minimum(high - low, _reach(low, rate))
+    width = np.minimum(high - low, _decay_width(low, rate))
     nodes, weights = np.polynomial.legendre.leggauss(NODES)
     total = np.zeros_like(width)
     for node, weight in zip((nodes + 1) / 2, weights / 2, strict=True):
@@ -105,10 +110,11 @@ def _log_piece(low: np.ndarray, high: np.ndarray, rate: np.ndarray) -> np.ndarra
         return np.log(width * total) - rate * start
 
 
-def _reach(low: np.ndarray, rate: np.ndarray) -> np.ndarray:
-    """Return the w at which rate (sin²((low + w)/2) - sin²(low/2)) is DECAY; infinite where it never is.
+def _decay_width(low: np.ndarray, rate: np.ndarray) -> np.ndarray:
+    """Return the w at which rate (sin²((low + w)/2) - sin²(low/2)) equals DECAY; infinite if there is no such w.
 
-    With u = tan(w/2) and e = DECAY / rate: (cos low - e) u² + u sin low - e = 0, solved without cancellation.
+    With u = tan(w/2) and e = DECAY / rate, the equation is (cos low - e) u² + u sin low - e = 0. It is solved without
+    cancellation.
     """
     with np.errstate(divide="ignore", invalid="ignore"):  # at the circle's centre the rate is 0
         small = DECAY / rate

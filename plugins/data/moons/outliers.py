@@ -15,18 +15,18 @@ FEWER = Draws(test=1000)
 
 
 class MoonsOutliers(PlanePoints):
-    """Two discs in the upper left and the lower right corner of [-4, 4]², far from every moon.
+    """Two discs in the upper left and the lower right corner of [-4, 4]², far from either moon.
 
-    A network trained on `moons` has seen no points there and is nevertheless certain (the triangles of thesis Figure
-    2.2; §2.3.1).
+    The training data of `moons` hold no points there, but networks trained on them are nevertheless certain (the
+    triangles of thesis Figure 2.2; §2.3.1).
 
-    Points are uniform on the discs, in the standard units of `moons`. Their targets name the moon on whose side they
-    lie and have no meaning. The splits are independent draws.
+    Points are uniformly distributed on the discs, in the standard units of `moons`. The target of a point is the class
+    of the nearer moon; it has no meaning. The splits are independent draws.
 
     Args:
-        draws: sizes and seed of the splits; points lie on the two discs in turn.
-        corner: the discs' centres are (-corner, corner) and (corner, -corner).
-        radius: radius of the discs.
+        draws: Sizes and seed of the splits; the points lie alternately on the two discs.
+        corner: Coordinate of the discs' centres, (-corner, corner) and (corner, -corner).
+        radius: Radius of the discs.
     """
 
     bibtex = """@phdthesis{prokudin2020robust,
@@ -48,7 +48,7 @@ class MoonsOutliers(PlanePoints):
         self.corner = corner
         self.radius = radius
 
-    def drawn(self, size: int, split: int) -> Fields:
+    def draw_split(self, size: int, split: int) -> Fields:
         # the last 1 makes the stream differ from those of moons with the same seed
         random = np.random.default_rng([self.draws.data_seed, split, 1, 1]).random((size, 2))
         label = np.arange(size) % 2

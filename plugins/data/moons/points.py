@@ -1,4 +1,4 @@
-"""Labelled points of the plane: their splits, their reading from a user's files, and an image of them."""
+"""Labelled points in the plane: splits, reading of a user's files, and an image of the points."""
 
 import hashlib
 from abc import abstractmethod
@@ -25,14 +25,14 @@ DataSeed = Annotated[int, Field(ge=0, lt=2**31)]
 TARGET = Target("class", ("upper", "lower"))
 SIDE = 96
 """Side of the image, pixels."""
-REACH = 4.0
-"""Half the side of the square [-4, 4]² that the image shows, in which thesis §2.3.5 draws outliers."""
+HALF_SIDE = 4.0
+"""Half the side of the square [-4, 4]² that the image shows; thesis §2.3.5 draws outliers in this square."""
 COLOURS = np.array([[31, 119, 180], [255, 127, 14]], np.uint8)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Draws:
-    """Number of points of each split, and the seed of their draws, which does not depend on the seed of the run."""
+    """Number of points of each split, and the seed of their draws; the seed of the run does not change the points."""
 
     train: Size = 500
     validation: Size = 500
@@ -43,7 +43,7 @@ class Draws:
 class PlanePoints(Data):
     """Base class of data sets of labelled points with independent draws in each split.
 
-    A data set adds its constructor, its citation, `drawn` and `fingerprint`.
+    A data set adds its constructor, its citation, `draw_split` and `fingerprint`.
     """
 
     target = TARGET
@@ -55,12 +55,12 @@ class PlanePoints(Data):
     draws: Draws
 
     @abstractmethod
-    def drawn(self, size: int, split: int) -> Fields:
-        """Return `size` points of a split, 0 to 2."""
+    def draw_split(self, size: int, split: int) -> Fields:
+        """Return `size` random points of split number `split` (0 training, 1 validation, 2 test)."""
 
     def prepare(self) -> None:
         sizes = (self.draws.train, self.draws.validation, self.draws.test)
-        self._splits = [self.drawn(size, number) for number, size in enumerate(sizes)]
+        self._splits = [self.draw_split(size, number) for number, size in enumerate(sizes)]
 
     def splits(self) -> Splits:
         return Splits(*self._splits)
@@ -72,11 +72,11 @@ class PlanePoints(Data):
         return batch
 
     def preview(self, inputs: Tensor) -> np.ndarray:
-        return picture(inputs, self._splits[0])
+        return draw_point(inputs, self._splits[0])
 
 
 def split_of(inputs: Float32[Tensor, "size 2"], label: Int[np.ndarray, "size"], **more: Tensor) -> Fields:
-    """Return a split of points with their labels, in one group."""
+    """Return a split of points with their labels and any further fields, all in one group."""
     return Fields(
         input=inputs,
         target=torch.from_numpy(label),
@@ -87,7 +87,7 @@ def split_of(inputs: Float32[Tensor, "size 2"], label: Int[np.ndarray, "size"], 
 
 
 def fingerprint(version: str, splits: Sequence[Fields], **parameters: object) -> dict[str, str]:
-    """Return the parameters and sizes of the draws and a hash of their points, which identify a data set."""
+    """Return what identifies a data set: its parameters, the sizes of its splits, and a hash of its points."""
     digest = hashlib.sha256()
     for split in splits:
         digest.update(split.fields["input"].numpy().tobytes())
@@ -104,34 +104,34 @@ def read_points(files: Sequence[Path]) -> Fields:
     """Read the columns `x` and `y` of CSV files, in standard units, one sample for each row.
 
     Raises:
-        DataError: there is no file, or a file cannot be read, lacks a column, or holds a cell that is not a finite
-            number; the message names it.
+        DataError: There is no file, or a file cannot be read, lacks a column, or holds a cell that is not a finite
+            number; the message names the file.
     """
-    found = []
+    points_of_files = []
     for columns, points in tables(files, ("x", "y"), "A file of points"):
-        wide = np.flatnonzero(np.abs(points).max(-1) > np.finfo(np.float32).max)
-        if len(wide):
-            x, y = points[wide[0]]
+        too_large = np.flatnonzero(np.abs(points).max(-1) > np.finfo(np.float32).max)
+        if len(too_large):
+            x, y = points[too_large[0]]
             raise DataError(
-                f"{columns.file} line {columns.lines[wide[0]]}: ({x:g}, {y:g}) lies beyond single precision "
-                "(3.4e38); wanted points in the units of the training data, some units from 0. Mend it."
+                f"{columns.file} line {columns.lines[too_large[0]]}: The point ({x:g}, {y:g}) lies beyond single "
+                "precision (3.4e38). Give points in the units of the training data, at most a few units from 0."
             )
-        found.append(points)
-    points = np.concatenate(found)
+        points_of_files.append(points)
+    points = np.concatenate(points_of_files)
     return Fields(input=torch.from_numpy(points).float(), index=torch.arange(len(points)))
 
 
-def picture(inputs: Float[Tensor, "2"], among: Fields) -> UInt8[np.ndarray, "side side 3"]:
-    """Return an image of all points of a split in two colours, and a black cross at one point.
+def draw_point(inputs: Float[Tensor, "2"], split: Fields) -> UInt8[np.ndarray, "side side 3"]:
+    """Return an image of all points of a split, coloured by class, with a black cross at the point `inputs`.
 
-    A point outside of the image has its cross at the border.
+    The cross of a point outside of the image lies at the border.
     """
     point = inputs.detach().cpu().double().numpy()
-    cloud, label = among.fields["input"].double().numpy(), among.fields["target"].numpy()
+    cloud, label = split.fields["input"].double().numpy(), split.fields["target"].numpy()
     canvas = np.full((SIDE, SIDE, 3), 255, np.uint8)
     row, column = _pixel(cloud)
     canvas[row, column] = COLOURS[label]
-    row, column = _pixel(point[None].clip(-REACH, REACH))
+    row, column = _pixel(point[None].clip(-HALF_SIDE, HALF_SIDE))
     arm = np.arange(-4, 5)
     for rows, columns in ((row + arm, column + 0 * arm), (row + 0 * arm, column + arm)):
         inside = (rows >= 0) & (rows < SIDE) & (columns >= 0) & (columns < SIDE)
@@ -140,6 +140,6 @@ def picture(inputs: Float[Tensor, "2"], among: Fields) -> UInt8[np.ndarray, "sid
 
 
 def _pixel(points: Float[np.ndarray, "*batch 2"]) -> tuple[np.ndarray, np.ndarray]:
-    """Return row and column of points, with the y axis upwards."""
-    place = ((points + REACH) / (2 * REACH) * SIDE).astype(np.int64).clip(0, SIDE - 1)
-    return SIDE - 1 - place[..., 1], place[..., 0]
+    """Return the row and the column of points in the image, whose y axis points upwards."""
+    pixel = ((points + HALF_SIDE) / (2 * HALF_SIDE) * SIDE).astype(np.int64).clip(0, SIDE - 1)
+    return SIDE - 1 - pixel[..., 1], pixel[..., 0]

@@ -1,4 +1,4 @@
-"""Rows of the contract: small draws of both data sets."""
+"""Contract-test cases: small draws of both data sets."""
 
 from collections.abc import Sequence
 from pathlib import Path

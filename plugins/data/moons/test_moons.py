@@ -28,18 +28,19 @@ def prepared(name: str = "moons", **config: Any) -> Any:
 
 
 def plane(step: float, reach: float = 6.0) -> np.ndarray:
-    """Return grid points of [-reach, reach]²: sums over them are trapezium rules, spectrally exact for smooth
-    densities.
+    """Return grid points of [-reach, reach]².
+
+    A sum over them is the trapezium rule, which converges faster than any power of `step` for smooth densities.
     """
     line = np.arange(-reach, reach + step / 2, step)
     return np.stack(np.meshgrid(line, line), -1).reshape(-1, 2)
 
 
 def by_scipy(point: np.ndarray, noise: float) -> np.ndarray:
-    """Return either class's density: the normal density about the arc's points, integrated over their angle."""
+    """Return the density of each class: the normal density about a point of the arc, averaged over the arc."""
     x, y = point * scale(noise) + CENTRE
     arcs = (lambda t: (math.cos(t), math.sin(t)), lambda t: (1 - math.cos(t), 0.5 - math.sin(t)))
-    found = []
+    densities = []
     for arc in arcs:
 
         def normal(angle: float, arc: Any = arc) -> float:
@@ -48,17 +49,17 @@ def by_scipy(point: np.ndarray, noise: float) -> np.ndarray:
 
         grid = np.linspace(0, math.pi, 41)
         parts = (quad(normal, a, b, epsabs=0, epsrel=1e-12)[0] for a, b in pairwise(grid))
-        found.append(sum(parts) / math.pi * scale(noise).prod())
-    return np.array(found)
+        densities.append(sum(parts) / math.pi * scale(noise).prod())
+    return np.array(densities)
 
 
 def by_mpmath(point: np.ndarray, noise: float) -> list[mpmath.mpf]:
-    """Return the logarithms of the densities with as many digits as distant points need."""
+    """Return the logarithms of both classes' densities, from a 60-digit quadrature."""
     with mpmath.workdps(60):
         spread = mpmath.mpf(noise)
         sides = (mpmath.sqrt(0.75 + spread**2), mpmath.sqrt(0.5625 - 1 / mpmath.pi + spread**2))
         x, y = (mpmath.mpf(float(value)) * side for value, side in zip(point, sides, strict=True))
-        found = []
+        log_densities = []
         for sign in (1, -1):
             across, up = sign * x + 0.5, sign * y + 0.25
             direction = mpmath.atan2(up, across)
@@ -73,15 +74,14 @@ def by_mpmath(point: np.ndarray, noise: float) -> list[mpmath.mpf]:
             cuts = sorted(cuts | {mpmath.mpf(0), +mpmath.pi})
             total = mpmath.quad(lambda t, best=best, exponent=exponent: mpmath.exp(best - exponent(t)), cuts)
             norm = 2 * mpmath.pi**2 * spread**2 / (sides[0] * sides[1])
-            found.append(mpmath.log(total / norm) - best)
-        return found
+            log_densities.append(mpmath.log(total / norm) - best)
+        return log_densities
 
 
 @pytest.mark.parametrize("noise", [0.05, DEFAULT, 1.0])
 def test_densities_and_posterior_agree_with_quadrature_over_the_arc(noise: float) -> None:
-    points = np.random.default_rng(0).uniform(-4, 4, (12, 2)) * min(
-        1, 3 * noise
-    )  # where exp does not underflow
+    # for small noise only points near the arcs, so that exp does not underflow
+    points = np.random.default_rng(0).uniform(-4, 4, (12, 2)) * min(1, 3 * noise)
     wanted = np.array([by_scipy(point, noise) for point in points])
     np.testing.assert_allclose(np.exp(log_density(points, noise)), wanted, rtol=1e-10)
     np.testing.assert_allclose(
@@ -162,15 +162,15 @@ def test_draws_follow_the_density() -> None:
     _, expected, _ = scores(DEFAULT)
     points, label = draw(size, DEFAULT, 5, 0)
     other, other_label = make_moons(size, noise=DEFAULT, random_state=0)
-    others = (other - CENTRE) / scale(DEFAULT)
-    for sample, labels in ((points, label), (others, other_label)):
+    scaled = (other - CENTRE) / scale(DEFAULT)
+    for sample, labels in ((points, label), (scaled, other_label)):
         loss = -log_posterior(sample, DEFAULT)[np.arange(size), labels]
         assert loss.mean() == pytest.approx(expected, abs=4 * loss.std() / size**0.5)
         np.testing.assert_allclose(sample.mean(0), 0, atol=4 / size**0.5)
         np.testing.assert_allclose(sample.std(0), 1, atol=4 / size**0.5)
     joint = [
         log_density(sample, DEFAULT)[np.arange(size), y]
-        for sample, y in ((points, label), (others, other_label))
+        for sample, y in ((points, label), (scaled, other_label))
     ]
     spread = math.hypot(*(part.std() / size**0.5 for part in joint))
     assert abs(joint[0].mean() - joint[1].mean()) < 4 * spread
@@ -189,16 +189,17 @@ def test_the_splits_are_independent_and_depend_on_the_data_seed_alone() -> None:
     assert torch.equal(larger.splits().validation.fields["input"], tables["validation"]["input"])
     given_class = tables["train"]["target"].double()
     assert torch.equal(tables["train"]["target"], tables["validation"]["target"])
-    # both samples hold their classes in turn, which alone correlates them: taken out here
-    rest = [
+    # in both splits the classes alternate, which alone makes them correlated; so the class means are subtracted
+    residuals = [
         (tables[name]["input"].double() - class_means(tables[name], given_class)).numpy()
         for name in ("train", "validation")
     ]
-    correlation = np.corrcoef(rest[0].T, rest[1].T)[:2, 2:]
+    correlation = np.corrcoef(residuals[0].T, residuals[1].T)[:2, 2:]
     assert np.abs(correlation).max() < 4 / 500**0.5
 
 
 def class_means(table: dict[str, torch.Tensor], label: torch.Tensor) -> torch.Tensor:
+    """Return, for each point, the mean of the points of its class, (size, 2)."""
     points = table["input"].double()
     means = torch.stack([points[label == number].mean(0) for number in (0, 1)])
     return means[label.long()]
@@ -215,7 +216,7 @@ def test_a_batch_holds_labels_and_the_posterior_of_its_points() -> None:
     np.testing.assert_allclose(batch["posterior"], wanted, rtol=1e-6)
 
 
-def test_outliers_lie_where_no_moon_is() -> None:
+def test_outliers_lie_far_from_both_moons() -> None:
     data = prepared("moons_outliers")
     points = np.concatenate([split.fields["input"].double().numpy() for split in data.splits()])
     assert len(points) == 500 + 500 + 1000
@@ -227,8 +228,8 @@ def test_outliers_lie_where_no_moon_is() -> None:
     around = np.linspace(0, 2 * math.pi, 721)
     edge = np.array([-3.2, 3.2]) + 0.6 * np.stack([np.cos(around), np.sin(around)], -1)
     assert np.abs(edge).max() < 4
-    # as the README says: density below 2e-7 (0.12 at its peak), at least 5 standard deviations of noise from an arc,
-    # and by Bayes' rule itself sure
+    # as the README says: the density is below 2e-7 (0.12 at its peak), the discs lie at least 5 standard deviations of
+    # the noise from an arc, and the exact posterior is certain
     both = np.exp(logsumexp(log_density(edge, DEFAULT), axis=-1)) / 2
     assert 1e-7 < both.max() < 2e-7
     assert np.exp(logsumexp(log_density(plane(0.05), DEFAULT), axis=-1)).max() / 2 == pytest.approx(
@@ -241,7 +242,7 @@ def test_outliers_lie_where_no_moon_is() -> None:
     assert 1 - posterior(edge, DEFAULT)[:, 0].min() < 4e-6
 
 
-def test_outliers_fit_the_moons_and_are_drawn_apart() -> None:
+def test_outliers_have_the_shapes_of_moons_and_independent_splits() -> None:
     moons, outliers = prepared(), prepared("moons_outliers", radius=0.0, corner=10.0, test=3)
     assert (outliers.target, outliers.input_shape) == (moons.target, moons.input_shape)
     test = outliers.splits().test.fields
@@ -256,7 +257,7 @@ def test_outliers_fit_the_moons_and_are_drawn_apart() -> None:
 
 
 @pytest.mark.parametrize("name", ["moons", "moons_outliers"])
-def test_a_users_points_are_read_without_preparing(name: str, tmp_path: Path) -> None:
+def test_a_users_points_are_read_without_prepare(name: str, tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("y,label,x\n2,upper,1\n-4e3,lower,0.5\n")
     (tmp_path / "b.csv").write_text("x,y\n7,8\n")
     data = build("data", resolve("data", {"name": name}))
@@ -264,13 +265,15 @@ def test_a_users_points_are_read_without_preparing(name: str, tmp_path: Path) ->
     assert read.fields["input"].tolist() == [[1, 2], [0.5, -4000], [7, 8]]
     assert read.fields["input"].dtype == torch.float32
     (tmp_path / "a.csv").write_text("x,y\n1,2\n1,two\n")
-    with pytest.raises(DataError, match=r"a\.csv line 3, column 'y': 'two'; wanted a finite number"):
+    with pytest.raises(DataError, match=r"a\.csv line 3, column 'y': 'two' is no finite number"):
         data.read([tmp_path / "a.csv"])
     (tmp_path / "a.csv").write_text("x,z\n1,2\n")
-    with pytest.raises(DataError, match=r"names 'y', which .*a\.csv does not have"):
+    with pytest.raises(DataError, match=r"names the column 'y', which .*a\.csv does not have"):
         data.read([tmp_path / "a.csv"])
     (tmp_path / "a.csv").write_text("x,y\n1,1e39\n")
-    with pytest.raises(DataError, match=r"a\.csv line 2: \(1, 1e\+39\) lies beyond single precision"):
+    with pytest.raises(
+        DataError, match=r"a\.csv line 2: The point \(1, 1e\+39\) lies beyond single precision"
+    ):
         data.read([tmp_path / "a.csv"])
 
 
