@@ -17,18 +17,19 @@ class UserError(Exception):
 
     def __init__(self, *said: object) -> None:
         super().__init__(
-            *(printable(_sentence(one, type(self))) if isinstance(one, str) else one for one in said)
+            *(escape_unprintable(_sentence(one, type(self))) if isinstance(one, str) else one for one in said)
         )
 
 
-def printable(text: str, kept: str = "\n\t") -> str:
+def escape_unprintable(text: str, kept: str = "\n\t") -> str:
     """Return a text in which unprintable characters, except those in `kept`, are escaped: none controls a terminal."""
     return "".join(
-        letter if letter.isprintable() or letter in kept else repr(letter)[1:-1] for letter in encodable(text)
+        letter if letter.isprintable() or letter in kept else repr(letter)[1:-1]
+        for letter in escape_undecodable(text)
     )
 
 
-def encodable(text: str) -> str:
+def escape_undecodable(text: str) -> str:
     r"""Return a text in which bytes that are not UTF-8, as in names of files, are escaped as \xe9.
 
     Python represents each of them by a lone surrogate (PEP 383), which no text file, font or database accepts.
@@ -70,23 +71,23 @@ class NonFiniteLoss(UserError):
     """Error for a training loss that became NaN or infinite; raised before the optimiser steps."""
 
 
-class NonFiniteAnswer(ValueError):
+class NonFiniteParameters(ValueError):
     """Error for NaN or infinity in the raw parameters that a network gives to a density head."""
 
 
-def shown(damage: object, most: int = 200) -> str:
+def shorten(damage: object, most: int = 200) -> str:
     """Return the content of a file or the message of a library for an error message.
 
     The text is shortened to `most` characters, and characters that control a terminal are escaped.
     """
     text = " ".join(line.strip() for line in str(damage).splitlines())
     text = text if len(text) <= most else text[: most - 1] + "…"
-    return printable(text, kept="")
+    return escape_unprintable(text, kept="")
 
 
-def quoted(damage: object) -> str:
+def quote(damage: object) -> str:
     """Return the result of `shown` in quotation marks."""
-    return shown(repr(damage))
+    return shorten(repr(damage))
 
 
 LIKE = 0.65
@@ -95,24 +96,24 @@ LISTED_WHOLE, LISTED = 24, 8
 """Largest number of names that a message lists in full, and the number of names that it lists if there are more."""
 
 
-def nearest(word: str, known: Iterable[str], likeness: float = LIKE) -> str | None:
+def nearest_name(word: str, known: Iterable[str], likeness: float = LIKE) -> str | None:
     """Return the name most similar to `word`, or None if no name is similar.
 
     'lr' is similar to learning_rate, and 'moons' to moons/everything.
     """
-    word, names = shown(word), list(islice(known, 1000))
+    word, names = shorten(word), list(islice(known, 1000))
     near = get_close_matches(word, names, n=1, cutoff=likeness)
     near = near or [name for name in names if "".join(piece[:1] for piece in name.split("_")) == word]
     near = near or [name for name in names if name.startswith((f"{word.rstrip('/')}/", f"{word}_"))]
     return near[0] if near else None
 
 
-def listed(word: str, known: Iterable[str]) -> str:
+def list_names(word: str, known: Iterable[str]) -> str:
     """Return a list of all names or, if there are many, of those nearest to `word` and the number of the others."""
     names = list(known)
     if len(names) <= LISTED_WHOLE:
         return ", ".join(names)
-    matcher = SequenceMatcher(None, b=shown(word))
+    matcher = SequenceMatcher(None, b=shorten(word))
 
     def likeness(name: str) -> float:
         matcher.set_seq1(name[:200])
@@ -124,5 +125,5 @@ def listed(word: str, known: Iterable[str]) -> str:
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
     """Return ' Did you mean ...?' with a leading space, or "" if no name is near."""
-    near = nearest(word, known)
-    return f" Did you mean {quoted(near)}?" if near else ""
+    near = nearest_name(word, known)
+    return f" Did you mean {quote(near)}?" if near else ""

@@ -10,10 +10,10 @@ from torch import Size, Tensor
 from torch.distributions import Distribution
 
 from framework.data import Batch, Frame
+from framework.distributions.affine import AffineDensity
 from framework.distributions.circular import wrap
 from framework.distributions.class_probabilities import class_probabilities
-from framework.distributions.intervals import DRAWS, Interval, middle
-from framework.distributions.moved import Moved
+from framework.distributions.intervals import DRAWS, Interval, central_interval
 from framework.distributions.noise import Draw
 from framework.distributions.protocol import Estimate, ValueSet, estimate, images, marginal, median
 from framework.errors import DataError
@@ -56,7 +56,7 @@ class Prediction:
         """Return this prediction in the user's unit, given the `Data.frame` of its targets; None changes nothing."""
         if frame is None:
             return self
-        density = Moved(self.density, *(part.to(self.batch["input"]) for part in frame))
+        density = AffineDensity(self.density, *(part.to(self.batch["input"]) for part in frame))
         return Prediction(density, self.batch, self.samples, self.split, self._given, self.reads)
 
     @property
@@ -102,7 +102,7 @@ class Prediction:
         `framework.distributions.intervals` defines it.
         """
         with self._draw("interval"):
-            return middle(self.density, mass, draws)
+            return central_interval(self.density, mass, draws)
 
     def set_size(self, sets: ValueSet) -> Tensor:
         """Return the size of the sets that come with the densities, (batch,).

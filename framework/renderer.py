@@ -82,7 +82,7 @@ class Report:
     channels: frozenset[str]
 
 
-def joined(scenes: Sequence[Scene]) -> Scene:
+def join_scenes(scenes: Sequence[Scene]) -> Scene:
     """Return one scene of several scenes, seen by the camera of the first; vertices and faces keep their order.
 
     A scene without colours gets white ones if another scene has colours.

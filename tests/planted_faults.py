@@ -6,7 +6,7 @@ import torch
 from torch.distributions import constraints
 
 from framework.distributions.circular import circular, wrap
-from framework.distributions.protocol import arc, cdf, each_cdf, marginal
+from framework.distributions.protocol import arc_probability, cdf, marginal, marginal_cdfs
 from plugins.density_head.gaussian.density import Gaussian
 from plugins.density_head.von_mises.density import VonMises
 from tests import planted_answers as wrong
@@ -187,7 +187,7 @@ ALL_FAULTS = (
     Fault(
         "arc of the density at half κ",
         ONE,
-        {"arc": lambda d, a, b: arc(VonMises(d.location, d.concentration / 2), a, b)},
+        {"arc_probability": lambda d, a, b: arc_probability(VonMises(d.location, d.concentration / 2), a, b)},
         "cdf",
     ),
     Fault(
@@ -326,7 +326,7 @@ ALL_FAULTS = (
     Fault(
         "each number of an image at half its scale",
         GREY,
-        {"each_cdf": lambda d, v: each_cdf(d, d.location + 2 * (v - d.location))},
+        {"marginal_cdfs": lambda d, v: marginal_cdfs(d, d.location + 2 * (v - d.location))},
         "cdf",
         {"scale": "number"},
     ),

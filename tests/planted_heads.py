@@ -12,23 +12,23 @@ from framework.density_head import DensityHead
 from framework.distributions.protocol import (
     Estimate,
     Normals,
-    Slope,
-    about,
-    arc,
+    QuadraticBound,
+    arc_probability,
     cdf,
-    each_cdf,
     estimate,
-    exactly,
+    exact_estimate,
     images,
     mahalanobis,
     marginal,
+    marginal_cdfs,
     median,
+    mode_candidates,
     normals,
-    peaks,
+    peak_widths,
     pick,
-    scales,
-    slope,
-    tempered,
+    quadratic_bound,
+    recentre,
+    tempered_density,
 )
 from framework.target import Target
 from framework.testing.densities import CHECKS, examine_densities
@@ -102,12 +102,12 @@ class Changed(Distribution):
 def _(density: Changed, value: Tensor) -> Estimate:
     if "estimate" in density.parts:
         return density.parts["estimate"](density.density, value)
-    return exactly(density, value)
+    return exact_estimate(density, value)
 
 
-@tempered.register
+@tempered_density.register
 def _(density: Changed, temperature: Tensor) -> Distribution:
-    return density.parts.get("tempered", tempered)(density.density, temperature)
+    return density.parts.get("tempered_density", tempered_density)(density.density, temperature)
 
 
 @pick.register
@@ -117,16 +117,16 @@ def _(density: Changed, index: Tensor) -> Distribution:
     return density.parts.get("pick", pick)(density.density, index)
 
 
-@slope.register
-def _(density: Changed, value: Tensor) -> Slope | None:
-    return density.parts.get("slope", slope)(density.density, value)
+@quadratic_bound.register
+def _(density: Changed, value: Tensor) -> QuadraticBound | None:
+    return density.parts.get("quadratic_bound", quadratic_bound)(density.density, value)
 
 
-@about.register
+@recentre.register
 def _(density: Changed, index: tuple[Tensor, ...], place: Tensor) -> Distribution:
     if "log_prob" in density.parts:
-        return about.dispatch(Distribution)(density, index, place)
-    return density.parts.get("about", about)(density.density, index, place)
+        return recentre.dispatch(Distribution)(density, index, place)
+    return density.parts.get("recentre", recentre)(density.density, index, place)
 
 
 @normals.register
@@ -139,14 +139,14 @@ def _(density: Changed, value: Tensor) -> Tensor | None:
     return density.parts.get("mahalanobis", mahalanobis)(density.density, value)
 
 
-@peaks.register
+@mode_candidates.register
 def _(density: Changed) -> Tensor:
-    return density.parts.get("peaks", peaks)(density.density)
+    return density.parts.get("mode_candidates", mode_candidates)(density.density)
 
 
-@scales.register
+@peak_widths.register
 def _(density: Changed) -> Tensor:
-    return density.parts.get("scales", scales)(density.density)
+    return density.parts.get("peak_widths", peak_widths)(density.density)
 
 
 @marginal.register
@@ -166,9 +166,9 @@ def _(density: Changed, value: Tensor) -> Tensor | None:
     return density.parts.get("cdf", cdf)(density.density, value)
 
 
-@each_cdf.register
+@marginal_cdfs.register
 def _(density: Changed, value: Tensor) -> Tensor | None:
-    return density.parts.get("each_cdf", each_cdf)(density.density, value)
+    return density.parts.get("marginal_cdfs", marginal_cdfs)(density.density, value)
 
 
 @images.register
@@ -176,9 +176,9 @@ def _(density: Changed, channels: Collection[str]) -> dict[str, Tensor]:
     return images(density.density, channels)
 
 
-@arc.register
+@arc_probability.register
 def _(density: Changed, start: Tensor, end: Tensor) -> Tensor | None:
-    return density.parts.get("arc", arc)(density.density, start, end)
+    return density.parts.get("arc_probability", arc_probability)(density.density, start, end)
 
 
 class Faulty(DensityHead):

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from framework.calibration.module_flags import BATCH_NORM, flagged
+from framework.calibration.module_flags import BATCH_NORM, set_flag
 from framework.data import Batch
 from framework.model import Predictor, independent_penalty
 from framework.objective import Objective
@@ -26,7 +26,7 @@ class Confidence(Objective):
 
     def each(self, predictor: Predictor, batch: Batch) -> Tensor:
         """Of each sample, (batch,) or (batch, member)."""
-        with flagged(predictor, BATCH_NORM, "track_running_stats", False):  # the loss has counted this batch
+        with set_flag(predictor, BATCH_NORM, "track_running_stats", False):  # the loss has counted this batch
             density = predictor.training_densities(batch["input"])
         target = batch["target"]
         if len(density.batch_shape) == 2:

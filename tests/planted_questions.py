@@ -7,17 +7,17 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from framework.distributions.protocol import (
-    Slope,
-    about,
-    each_cdf,
+    QuadraticBound,
     estimate,
-    exactly,
+    exact_estimate,
     marginal,
+    marginal_cdfs,
     normals,
     one_normal,
+    peak_widths,
     pick,
-    scales,
-    slope,
+    quadratic_bound,
+    recentre,
 )
 from framework.target import Target
 from plugins.density_head.gaussian.density import Gaussian
@@ -34,10 +34,10 @@ def first_row_only(density: Gaussian, index: Tensor) -> Distribution:
     return pick(Gaussian(*(part[:1].expand_as(part) for part in (density.location, density.scale))), index)
 
 
-def changed_slope(density: Distribution, value: Tensor, pull: float, stiffness: float) -> Slope:
-    found = slope(density, value)
+def changed_slope(density: Distribution, value: Tensor, pull: float, stiffness: float) -> QuadraticBound:
+    found = quadratic_bound(density, value)
     assert found is not None
-    return Slope(found.log_prob, pull * found.pull, stiffness * found.stiffness)
+    return QuadraticBound(found.log_prob, pull * found.pull, stiffness * found.stiffness)
 
 
 class NoJacobian(LaplaceHead):
@@ -69,7 +69,7 @@ class LossOfTheStandardised(StudentTHead):
     """Its loss takes the place of the target's unit for the standardised one."""
 
     def loss(self, raw: Tensor, target: Tensor) -> Tensor:
-        return -self(raw).log_prob(self.unit.standardised(target))
+        return -self(raw).log_prob(self.unit.standardise(target))
 
 
 class RootOfScale(LogisticHead):
@@ -100,7 +100,7 @@ class StandardisedDraws(LogisticHead):
     """Draws and the median stay in the standardised unit."""
 
     def forward(self, raw: Tensor) -> Logistic:
-        return Standard(*self.parameters_of(raw), self.unit.standardised)
+        return Standard(*self.parameters_of(raw), self.unit.standardise)
 
 
 class Standard(Logistic):
@@ -211,25 +211,25 @@ FURTHER_FAULTS = (
     *planted_devices.HEADS,
     # estimate
     Fault("estimate 0.05 nats high", ONE,
-          {"estimate": lambda d, v: exactly(d, v)._replace(log_mean=d.log_prob(v) + 0.05)}, "estimate"),
+          {"estimate": lambda d, v: exact_estimate(d, v)._replace(log_mean=d.log_prob(v) + 0.05)}, "estimate"),
     Fault("estimate of a density that draws nothing has an error", HEIGHT,
-          {"estimate": lambda d, v: exactly(d, v)._replace(standard_error=0 * d.log_prob(v) + 0.1)}, "estimate"),
+          {"estimate": lambda d, v: exact_estimate(d, v)._replace(standard_error=0 * d.log_prob(v) + 0.1)}, "estimate"),
     Fault("estimate of classes is debiased by a tenth", CLASSES,
           {"estimate": lambda d, v: estimate(d, v)._replace(debiased=d.log_prob(v) + 0.1)}, "estimate"),
     Fault("estimate of the first value for all", HEIGHT,
-          {"estimate": lambda d, v: exactly(d, v[:1].expand_as(v))}, "estimate"),
+          {"estimate": lambda d, v: exact_estimate(d, v[:1].expand_as(v))}, "estimate"),
     Fault("estimate without the second number", PLACE,
-          {"estimate": lambda d, v: exactly(marginal(d, 0), v[..., :1])}, "estimate"),
+          {"estimate": lambda d, v: exact_estimate(marginal(d, 0), v[..., :1])}, "estimate"),
     # tempered
     Fault("power: σ T instead of σ √T", HEIGHT,
-          {"tempered": lambda d, t: Gaussian(d.location, d.scale * t)}, "tempered: power"),
+          {"tempered_density": lambda d, t: Gaussian(d.location, d.scale * t)}, "tempered: power"),
     Fault("power: κ T instead of κ / T", ONE,
-          {"tempered": lambda d, t: VonMises(d.location, d.concentration * t)}, "tempered: power"),
-    Fault("power: the density itself", HEIGHT, {"tempered": lambda d, t: d}, "tempered: power"),
+          {"tempered_density": lambda d, t: VonMises(d.location, d.concentration * t)}, "tempered: power"),
+    Fault("power: the density itself", HEIGHT, {"tempered_density": lambda d, t: d}, "tempered: power"),
     Fault("power about another place", HEIGHT,
-          {"tempered": lambda d, t: Gaussian(d.location * t, d.scale * t.sqrt())}, "tempered: power"),
+          {"tempered_density": lambda d, t: Gaussian(d.location * t, d.scale * t.sqrt())}, "tempered: power"),
     Fault("power of the first number only", PLACE,
-          {"tempered": lambda d, t: Gaussian(d.location, d.scale * torch.stack([t.sqrt(), t / t]))}, "tempered: power"),
+          {"tempered_density": lambda d, t: Gaussian(d.location, d.scale * torch.stack([t.sqrt(), t / t]))}, "tempered: power"),
     # pick
     Fault("pick: the next item", HEIGHT, {"pick": lambda d, i: pick(d, 1 - i)}, "pick"),
     Fault("pick: the first item always", ONE, {"pick": lambda d, i: pick(d, 0 * i)}, "pick"),
@@ -239,25 +239,25 @@ FURTHER_FAULTS = (
     Fault("a mixture draws the other component", CLASSES, {"pick": lambda d, i: pick(d, 1 - i)},
           "mixture: samples follow log_prob"),
     # slope, about, normals, peaks and scales
-    Fault("slope: half the stiffness", HEIGHT, {"slope": lambda d, v: changed_slope(d, v, 1, 0.5)}, "slope"),
-    Fault("slope: the pull pushes", ONE, {"slope": lambda d, v: changed_slope(d, v, -1, 1)}, "slope"),
+    Fault("slope: half the stiffness", HEIGHT, {"quadratic_bound": lambda d, v: changed_slope(d, v, 1, 0.5)}, "quadratic_bound"),
+    Fault("slope: the pull pushes", ONE, {"quadratic_bound": lambda d, v: changed_slope(d, v, -1, 1)}, "quadratic_bound"),
     Fault("slope: of log_prob without the constant", HEIGHT,
-          {"slope": lambda d, v: slope(d, v)._replace(log_prob=d.log_prob(v) + d.scale.log().sum(-1))}, "slope"),  # pyright: ignore
-    Fault("about: adds the place", HEIGHT, {"about": lambda d, i, p: about(d, i, -p)}, "about"),
-    Fault("about: forgets the place", ONE, {"about": lambda d, i, p: about(d, i, 0 * p)}, "about"),
+          {"quadratic_bound": lambda d, v: quadratic_bound(d, v)._replace(log_prob=d.log_prob(v) + d.scale.log().sum(-1))}, "quadratic_bound"),  # pyright: ignore
+    Fault("about: adds the place", HEIGHT, {"recentre": lambda d, i, p: recentre(d, i, -p)}, "recentre"),
+    Fault("about: forgets the place", ONE, {"recentre": lambda d, i, p: recentre(d, i, 0 * p)}, "recentre"),
     Fault("about: rows in order whatever the index", HEIGHT,
-          {"about": lambda d, i, p: about(d, tuple(one.sort().values for one in i), p)}, "about"),
+          {"recentre": lambda d, i, p: recentre(d, tuple(one.sort().values for one in i), p)}, "recentre"),
     Fault("normals: variances for deviations", HEIGHT,
           {"normals": lambda d: one_normal(d.location, d.scale.square())}, "normals"),
     Fault("normals: about 0", HEIGHT,
           {"normals": lambda d: normals(d)._replace(mean=0 * d.location.double())}, "normals"),  # pyright: ignore
     Fault("distance without the scales", PLACE,
           {"mahalanobis": lambda d, v: (v - d.location).square().sum(-1).double()}, "normals"),
-    Fault("scales: logarithms", HEIGHT, {"scales": lambda d: scales(d).log() - 9}, "peaks and scales"),
-    Fault("peaks without the peak's dimension", HEIGHT, {"peaks": lambda d: d.mode}, "peaks and scales"),
+    Fault("scales: logarithms", HEIGHT, {"peak_widths": lambda d: peak_widths(d).log() - 9}, "mode candidates and peak widths"),
+    Fault("peaks without the peak's dimension", HEIGHT, {"mode_candidates": lambda d: d.mode}, "mode candidates and peak widths"),
     # of several numbers
     Fault("each_cdf at half the scale", IMAGE,
-          {"each_cdf": lambda d, v: each_cdf(d, d.location + 2 * (v - d.location))}, "each_cdf", {"scale": "number"}),
+          {"marginal_cdfs": lambda d, v: marginal_cdfs(d, d.location + 2 * (v - d.location))}, "marginal_cdfs", {"scale": "number"}),
     Fault("mean of the first number for all", POINT, {"mean": lambda d: d.location[..., :1].expand_as(d.location)},
           "mean and variance"),
     Fault("variance of three numbers is the deviation", POINT, {"variance": lambda d: d.scale}, "mean and variance"),

@@ -28,7 +28,7 @@ class Discs(Renderer):
         if "color" in channels and (scene.colors is None or scene.texture is not None):
             raise ValueError('"color" was asked of a scene without colours, or of one with a texture.')
         seen = scene.camera
-        pixels, depth = seen.projected(scene.vertices.double())
+        pixels, depth = seen.project(scene.vertices.double())
         there = pixels.isfinite().all(-1) & depth.isfinite() & (depth >= seen.near)
         pixels, depth = pixels[there], depth[there]
         nearest = torch.full((seen.height, seen.width), torch.inf, dtype=torch.float64)

@@ -11,16 +11,16 @@ from torch.distributions import Distribution, Laplace, StudentT, constraints
 from framework.density_head import DensityHead
 from framework.distributions.circular import circular, wrap
 from framework.distributions.protocol import (
-    arc,
+    arc_length,
+    arc_probability,
     cdf,
-    each_cdf,
     estimate,
-    exactly,
+    exact_estimate,
     marginal,
+    marginal_cdfs,
     median,
     pick,
     take,
-    turn,
 )
 from framework.heads.parameters import require_finite
 from framework.heads.unit import Unit
@@ -50,7 +50,7 @@ class _OfReals(DensityHead):
     def parameters_of(self, raw: Tensor) -> tuple[Tensor, Tensor]:
         place, scale = require_finite(raw, self.size).chunk(2, -1)
         place, scale = place.clamp(-LARGEST, LARGEST), scale.clamp(-SCALES, SCALES).exp()
-        place, scale, _ = self.unit.given_back(place, scale)
+        place, scale, _ = self.unit.to_target_unit(place, scale)
         return place, scale
 
     def loss(self, raw: Tensor, target: Tensor) -> Tensor:
@@ -98,7 +98,7 @@ class Product(Distribution):
         return self.each.entropy().sum(-1)
 
 
-estimate.register(Product, exactly)
+estimate.register(Product, exact_estimate)
 
 
 @marginal.register
@@ -192,7 +192,7 @@ class Logistic(Distribution):
         return (self.width.log() + 2).sum(-1)
 
 
-estimate.register(Logistic, exactly)
+estimate.register(Logistic, exact_estimate)
 
 
 @marginal.register
@@ -210,7 +210,7 @@ def _(density: Logistic, index: Tensor) -> Logistic:
     return Logistic(take(density.place, index), take(density.width, index))
 
 
-@each_cdf.register
+@marginal_cdfs.register
 def _(density: Logistic, value: Tensor) -> Tensor:
     return torch.sigmoid((value.double() - density.place.double()) / density.width.double())
 
@@ -285,7 +285,7 @@ class WrappedNormal(Distribution):
         return torch.where(self.width < 0.1, normal, wide).sum(-1)
 
 
-estimate.register(WrappedNormal, exactly)
+estimate.register(WrappedNormal, exact_estimate)
 
 
 @marginal.register
@@ -304,7 +304,7 @@ def _(density: WrappedNormal, index: Tensor) -> WrappedNormal:
     return WrappedNormal(take(density.place, index), take(density.width, index))
 
 
-@arc.register
+@arc_probability.register
 def _(density: WrappedNormal, start: Tensor, end: Tensor) -> Tensor:
     first = wrap(start.double() - density.place.double())
 
@@ -312,7 +312,7 @@ def _(density: WrappedNormal, start: Tensor, end: Tensor) -> Tensor:
         turned = value + density.turns
         return torch.special.ndtr(turned / density.width.double()).sum(-1)
 
-    return (below(first + turn(start, end)) - below(first)).clamp(0, 1)
+    return (below(first + arc_length(start, end)) - below(first)).clamp(0, 1)
 
 
 class WrappedNormalHead(DensityHead):

@@ -27,7 +27,7 @@ from framework.data import Data
 from framework.datasets import images
 from framework.deployment.served import Served
 from framework.errors import DataError
-from framework.geometry.light import eight_bit
+from framework.geometry.srgb import bytes_from_linear
 from plugins.data.bodies import scan_layout, skins
 from plugins.renderer.rasterizer import scene_files
 from plugins.renderer.rasterizer.sample_scenes import OBJ, PARTS, QUAD, glb
@@ -279,7 +279,7 @@ def pixels(inputs: torch.Tensor) -> np.ndarray:
 def texture(file: Path) -> np.ndarray:
     found = scene_files.read(file)
     assert found.scene.texture is not None, found.notes
-    return eight_bit(found.scene.texture.images[0]).numpy()
+    return bytes_from_linear(found.scene.texture.images[0]).numpy()
 
 
 def of_gltf(case: Case, folder: Path) -> np.ndarray:
@@ -405,7 +405,7 @@ def test_a_body_cut_out_of_its_ground_is_read_from_every_image_with_alpha(name: 
             data.read([written(case, tmp_path)])
         return
     inputs = data.read([written(case, tmp_path)])[0]["input"]
-    shown = eight_bit(inputs[:3] + (1 - inputs[3:])).movedim(0, -1).numpy()
+    shown = bytes_from_linear(inputs[:3] + (1 - inputs[3:])).movedim(0, -1).numpy()
     require_squares(shown, case.seen, case.off, name)
 
 

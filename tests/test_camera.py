@@ -17,7 +17,7 @@ def test_points_are_seen_where_opencv_and_kornia_say() -> None:
     points = torch.randn(50, 3, generator=generator, dtype=torch.float64)
     for azimuth in (-2.0, 0.3, 2.5):
         seen = look_from(azimuth, 0.4, -0.2, distance=6.0, field_of_view=0.8, size=(48, 64))
-        pixels, depth = seen.projected(points)
+        pixels, depth = seen.project(points)
         # docs.opencv.org, calib3d: s (u, v, 1) = K (R | t) (X, Y, Z, 1), x right, y down, z forward
         lens = np.array(
             [[seen.focal[0], 0, seen.principal[0]], [0, seen.focal[1], seen.principal[1]], [0, 0, 1]]
@@ -35,7 +35,7 @@ def test_points_are_seen_where_opencv_and_kornia_say() -> None:
 def test_the_lens_may_be_learned() -> None:
     focal = torch.tensor([50.0, 60.0], requires_grad=True)
     seen = Camera(torch.eye(3), torch.tensor([0.0, 0, 2]), focal, (10.0, 12.0), 24, 20)
-    pixels, _ = seen.projected(torch.tensor([[0.5, 0.25, 0.0]]))
+    pixels, _ = seen.project(torch.tensor([[0.5, 0.25, 0.0]]))
     pixels.sum().backward()
     assert focal.grad is not None
     assert focal.grad.tolist() == [0.25, 0.125]
@@ -55,14 +55,14 @@ def test_canonical_points_are_seen_at_the_same_pixels_and_depths() -> None:
             focal, principal = tuple(focal.tolist()), tuple(principal.tolist())
         camera = Camera(viewpoint_rotation(6 * some(3) - 3), 8 * some(3) - 4, focal, principal, height, width)
         points = 6 * some(4, 9, 3) - 3
-        pixels, depth = camera.projected(points)
+        pixels, depth = camera.project(points)
         plain = canonical_camera(height, width)
-        found = camera.canonical(points)
-        again, same = plain.projected(found)
+        found = camera.to_canonical(points)
+        again, same = plain.project(found)
         assert torch.equal(found[..., 2], depth) and torch.equal(same, depth)  # behind the camera, too
         torch.testing.assert_close(again, pixels, rtol=1e-9, atol=1e-9)
         # the canonical camera's own points stay where they are, and its pixels are those that its docstring says
-        torch.testing.assert_close(plain.canonical(found), found, rtol=1e-12, atol=1e-12)
+        torch.testing.assert_close(plain.to_canonical(found), found, rtol=1e-12, atol=1e-12)
         middle = torch.tensor([width - 1, height - 1]).double() / 2
         torch.testing.assert_close(again, height * found[..., :2] / found[..., 2:] + middle)
 
@@ -76,7 +76,7 @@ def test_canonical_points_have_a_gradient_in_points_and_lens() -> None:
     turned = viewpoint_rotation(torch.tensor([0.3, -0.2, 0.1], dtype=torch.float64))
 
     def seen(points: torch.Tensor, focal: torch.Tensor, principal: torch.Tensor) -> torch.Tensor:
-        return Camera(turned, torch.ones(3), focal, principal, 24, 20).canonical(points)
+        return Camera(turned, torch.ones(3), focal, principal, 24, 20).to_canonical(points)
 
     assert torch.autograd.gradcheck(seen, (points, focal, principal))
 
@@ -97,7 +97,7 @@ def test_whole_numbers_are_seen_where_the_same_floats_are(
     before = torch.get_default_dtype()
     try:
         torch.set_default_dtype(default)
-        for method in (seen.projected, seen.canonical):
+        for method in (seen.project, seen.to_canonical):
             found, wanted = method(points.to(kind)), method(points.to(default))
             torch.testing.assert_close(found, wanted, rtol=0, atol=0)
     finally:
@@ -120,7 +120,7 @@ WRONG["principal"] = WRONG["focal"]
 def test_what_no_camera_is_made_of_gets_a_sentence(name: str, value: object) -> None:
     seen = look_from(0.7, 0.4, -0.2, distance=6.0, field_of_view=0.8, size=(48, 64))
     object.__setattr__(seen, name, value)  # past the type checks that only tests have
-    for method in (seen.projected, seen.canonical):
+    for method in (seen.project, seen.to_canonical):
         with pytest.raises(ValueError, match=rf"camera\.{name} came with .*; wanted the shape \("):
             method(torch.ones(5, 3))
 
@@ -128,11 +128,11 @@ def test_what_no_camera_is_made_of_gets_a_sentence(name: str, value: object) -> 
 @pytest.mark.parametrize("number", [2.0, 2])
 def test_a_lens_may_be_any_two_numbers(number: float) -> None:
     seen = look_from(0.7, 0.4, -0.2, distance=6.0, field_of_view=0.8, size=(48, 64))
-    wanted = replace(seen, focal=(2.0, 2.0), principal=(2.0, 2.0)).projected(torch.ones(5, 3))
+    wanted = replace(seen, focal=(2.0, 2.0), principal=(2.0, 2.0)).project(torch.ones(5, 3))
     for lens in ((number, number), [number, number], np.array([number] * 2), torch.tensor([number] * 2)):
         for name in ("focal", "principal"):
             object.__setattr__(seen, name, lens)
-        torch.testing.assert_close(seen.projected(torch.ones(5, 3)), wanted, rtol=0, atol=0)
+        torch.testing.assert_close(seen.project(torch.ones(5, 3)), wanted, rtol=0, atol=0)
 
 
 @pytest.mark.parametrize("angle", [40.0, 180.0, math.pi, 3.2, 0.0, -0.8, math.nan, math.inf, -math.inf])

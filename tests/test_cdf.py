@@ -11,7 +11,7 @@ from framework.configuration.schema import build, resolve
 from framework.distributions.batch_shapes import Reshaped, Stacked
 from framework.distributions.circular_moments import circular_moments
 from framework.distributions.density import Mixture
-from framework.distributions.protocol import arc, cdf, mahalanobis, marginal, normals, turn
+from framework.distributions.protocol import arc_length, arc_probability, cdf, mahalanobis, marginal, normals
 from framework.target import Target
 from framework.testing.metrics import Cardioid
 
@@ -57,7 +57,7 @@ def test_what_is_not_known_is_none():
         cdf(Mixture(torch.zeros(2, 2), Independent(HalfNormal(torch.full((2, 2, 1), 3.0)), 1)), value) is None
     )
     assert cdf(Stacked([half, normal(value, value + 1)]), value[..., None]) is None
-    assert arc(Cardioid(value), value, value + 1) is None
+    assert arc_probability(Cardioid(value), value, value + 1) is None
     assert mahalanobis(half, value) is None
     assert normals(marginal(normal(torch.zeros(2, 3), torch.ones(2, 3)), 1)) is not None
     assert normals(normal(torch.zeros(2, 3), torch.ones(2, 3))) is None  # of several numbers
@@ -105,7 +105,7 @@ def test_squared_distances_of_joint_normals():
 def test_masses_of_arcs_by_quadrature_and_by_moments(concentration, start, end):
     density = around(torch.tensor([[concentration, 0.0, 0.0]], dtype=WIDE))
     first, last = torch.tensor([[start]], dtype=WIDE), torch.tensor([[end]], dtype=WIDE)
-    low, high = start, start + turn(first, last).item()
+    low, high = start, start + arc_length(first, last).item()
     wide = 10 / math.sqrt(max(concentration, 10))
     peaks = [2 * math.pi * number + side * wide for number in range(-2, 6) for side in (-1, 0, 1)]
     cuts = sorted({low, high, *(peak for peak in peaks if low < peak < high)})
@@ -114,16 +114,16 @@ def test_masses_of_arcs_by_quadrature_and_by_moments(concentration, start, end):
         integrate.quad(lambda x: math.exp(peak - concentration * (1 - math.cos(x))), a, b, epsabs=1e-13)[0]
         for a, b in pairwise(cuts)
     )
-    exact = arc(density, first, last)
+    exact = arc_probability(density, first, last)
     assert exact.item() == pytest.approx(wanted, abs=1e-11)
     seen = circular_moments(density)
     assert seen.resolved.all()
     # of a cut inside a narrow peak the last moments, 1e-4, are what the grid leaves out
-    assert seen.arc(first[:, 0], last[:, 0]).item() == pytest.approx(
+    assert seen.arc_probability(first[:, 0], last[:, 0]).item() == pytest.approx(
         wanted, abs=1e-10 if concentration < 1e3 else 1e-6
     )
     mixed = Mixture(torch.zeros(1, 2), Stacked([density, Reshaped(density, (1,))]))
-    assert arc(mixed, first, last).item() == pytest.approx(wanted, abs=1e-11)
+    assert arc_probability(mixed, first, last).item() == pytest.approx(wanted, abs=1e-11)
 
 
 def test_moments_are_bessel_quotients():
@@ -151,8 +151,8 @@ def test_rounding_calls_no_finer_grid(concentration):
     assert seen.resolved.all()
     assert (len(seen.moments) == 361) == (concentration <= 3500)
     start, end = mean - 0.7 / concentration**0.5, mean + 1.2 / concentration**0.5
-    wanted = arc(around(raw.double()), start.double()[:, None], end.double()[:, None])
-    found = seen.arc(start.double(), end.double())
+    wanted = arc_probability(around(raw.double()), start.double()[:, None], end.double()[:, None])
+    found = seen.arc_probability(start.double(), end.double())
     torch.testing.assert_close(found, wanted, rtol=0, atol=2e-5)
 
 
@@ -175,11 +175,11 @@ def test_a_density_on_a_part_of_the_circle_has_its_mass_there():
     assert seen.resolved.all()
     # of F = 0, rotations are uniform and the elevation has density cos(e)/2
     low, high = torch.tensor([-math.pi], dtype=WIDE), torch.tensor([0.5], dtype=WIDE)
-    assert seen.arc(low, high).item() == pytest.approx((1 + math.sin(0.5)) / 2, abs=2e-5)
+    assert seen.arc_probability(low, high).item() == pytest.approx((1 + math.sin(0.5)) / 2, abs=2e-5)
 
 
 def test_nan_is_passed_on():
     seen = circular_moments(Cardioid(torch.tensor([[0.0], [math.nan]])))
     assert seen.resolved.all()
-    found = seen.arc(torch.zeros(2).double(), torch.ones(2).double())
+    found = seen.arc_probability(torch.zeros(2).double(), torch.ones(2).double())
     assert found.isnan().tolist() == [False, True]

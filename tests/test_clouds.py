@@ -14,8 +14,8 @@ from framework.geometry.clouds import (
     REACH,
     _composed,
     cell_centres,
-    denormalised,
-    normalised,
+    denormalise_clouds,
+    normalise_clouds,
     pad,
     require_normalised,
     sizes,
@@ -118,7 +118,7 @@ def test_normalisation_agrees_with_loops(how, dtype):
     lengths = [40, 1, 2, 17]
     parts = [cloud(length, 5, seed).to(dtype) * 3 + 10 for seed, length in enumerate(lengths)]
     batch = pad(parts)
-    found = normalised(batch, how)
+    found = normalise_clouds(batch, how)
     assert found.clouds.dtype == dtype
     torch.testing.assert_close(found.clouds[..., 3:], batch[..., 3:], rtol=0, atol=0, equal_nan=True)
     for number, length in enumerate(lengths):
@@ -128,7 +128,7 @@ def test_normalisation_agrees_with_loops(how, dtype):
         np.testing.assert_allclose(found.clouds[number, :length, :3].numpy(), local, rtol=0, atol=limit)
         np.testing.assert_allclose(found.centre[number].numpy(), centre.astype(float), rtol=1e-14)
         np.testing.assert_allclose(found.scale[number].item(), float(scale), rtol=1e-13)
-    back = denormalised(found.clouds, found.centre, found.scale)
+    back = denormalise_clouds(found.clouds, found.centre, found.scale)
     torch.testing.assert_close(back, batch, rtol=2 * torch.finfo(dtype).eps, atol=0, equal_nan=True)
 
 
@@ -145,7 +145,7 @@ coordinates = st.floats(-1, 1, width=32)
 @settings(max_examples=150, deadline=None)
 def test_wild_clouds_are_normalised_and_come_back(points, scale, offset, how, dtype):
     batch = ((torch.tensor(points, dtype=torch.float64) + offset) * scale).to(dtype)[None]
-    found = normalised(batch, how)
+    found = normalise_clouds(batch, how)
     local, _, _ = REFERENCES[how](batch[0].double().numpy())
     assert found.clouds.isfinite().all()
     limit = (
@@ -154,7 +154,7 @@ def test_wild_clouds_are_normalised_and_come_back(points, scale, offset, how, dt
     np.testing.assert_allclose(found.clouds[0].double().numpy(), local.astype(float), rtol=1e-6, atol=limit)
     if how == "unit_ball":
         assert found.clouds.norm(dim=-1).max().item() <= 1 + 1e-6
-    back = denormalised(found.clouds, found.centre, found.scale)
+    back = denormalise_clouds(found.clouds, found.centre, found.scale)
     torch.testing.assert_close(
         back, batch, rtol=2e-7 if dtype == torch.float32 else 4e-16, atol=batch.abs().max().item() * 2e-7
     )
@@ -165,10 +165,10 @@ def test_wild_clouds_are_normalised_and_come_back(points, scale, offset, how, dt
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_points_in_one_place_go_to_the_origin_and_come_back(place, dtype, how):
     batch = torch.full((1, 7, 3), place, dtype=dtype)
-    found = normalised(batch, how)
+    found = normalise_clouds(batch, how)
     assert (found.clouds == 0).all()
     assert found.scale.item() == 1
-    assert torch.equal(denormalised(found.clouds, found.centre, found.scale), batch)
+    assert torch.equal(denormalise_clouds(found.clouds, found.centre, found.scale), batch)
 
 
 @given(st.floats(0.01, 0.3), st.floats(8, 1e6), st.integers(0, 99))
@@ -178,9 +178,12 @@ def test_far_outliers_shift_nothing_of_robust(share, distance, seed):
     clean = clean / clean.norm(dim=-1, keepdim=True)
     count = int(share / (1 - share) * len(clean)) + 1
     far = torch.tensor([distance, 0.3, -0.2]) + cloud(count, seed=seed + 1) * 0.1  # all on one side
-    wanted, found = normalised(clean[None], "robust"), normalised(torch.cat([clean, far])[None], "robust")
+    wanted, found = (
+        normalise_clouds(clean[None], "robust"),
+        normalise_clouds(torch.cat([clean, far])[None], "robust"),
+    )
     torch.testing.assert_close(found.clouds[:, :200], wanted.clouds, rtol=0, atol=1e-12)
-    moved = normalised(torch.cat([clean, far])[None], "unit_ball").scale - wanted.scale
+    moved = normalise_clouds(torch.cat([clean, far])[None], "unit_ball").scale - wanted.scale
     assert moved.item() > 1  # eq. 6.2 is shifted
 
 
@@ -190,28 +193,36 @@ def test_robust_is_eq_6_2_where_nothing_is_far():
     # the centre is a mean of up to 500 numbers of at most 1, summed in two orders: each errs by log2(500) half units of
     # rounding (Higham 2002, §4.2), the subtraction, the norm and the division by a few more
     limit = (math.log2(500) + 4) * torch.finfo(torch.float64).eps
-    for found, wanted in zip(normalised(batch, "robust"), normalised(batch, "unit_ball"), strict=True):
+    for found, wanted in zip(
+        normalise_clouds(batch, "robust"), normalise_clouds(batch, "unit_ball"), strict=True
+    ):
         torch.testing.assert_close(found, wanted, rtol=0, atol=limit, equal_nan=True)
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_compiled_and_composed_agree_and_a_gradient_changes_no_bit(dtype):
     batch = pad([cloud(50, 4) * 3 + 2, cloud(1, 4), cloud(20, 4).T.contiguous().T]).to(dtype)
-    plain = normalised(batch, "unit_ball")
+    plain = normalise_clouds(batch, "unit_ball")
     for found, other in zip(plain, _composed(batch, "unit_ball", sizes(batch)), strict=True):
         limit = 4 * torch.finfo(dtype).eps
         torch.testing.assert_close(found, other, rtol=limit, atol=limit, equal_nan=True)
-    for found, traced in zip(plain, normalised(batch.clone().requires_grad_(), "unit_ball"), strict=True):
+    for found, traced in zip(
+        plain, normalise_clouds(batch.clone().requires_grad_(), "unit_ball"), strict=True
+    ):
         assert traced.requires_grad
         torch.testing.assert_close(found, traced.detach(), rtol=0, atol=0, equal_nan=True)
     torch.testing.assert_close(
-        normalised(batch.mT.contiguous().mT, "unit_ball").clouds, plain.clouds, rtol=0, atol=0, equal_nan=True
+        normalise_clouds(batch.mT.contiguous().mT, "unit_ball").clouds,
+        plain.clouds,
+        rtol=0,
+        atol=0,
+        equal_nan=True,
     )
 
 
 def test_none_leaves_clouds_alone():
     batch = pad([cloud(3), cloud(5)]) * 1e6
-    found = normalised(batch, "none")
+    found = normalise_clouds(batch, "none")
     assert found.clouds is batch
     assert (found.centre == 0).all()
     assert (found.scale == 1).all()
@@ -223,7 +234,7 @@ def test_the_gradient_agrees_with_finite_differences_and_padding_has_none(how):
     weights = torch.randn(batch.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
 
     def total(clouds):
-        return normalised(clouds, how).clouds.nan_to_num(0).mul(weights)[:2].sum()
+        return normalise_clouds(clouds, how).clouds.nan_to_num(0).mul(weights)[:2].sum()
 
     (gradient,) = torch.autograd.grad(total(batch), batch)
     assert (gradient[0, 6:] == 0).all()
@@ -238,14 +249,14 @@ def test_the_gradient_agrees_with_finite_differences_and_padding_has_none(how):
 
 def test_the_gradient_of_points_in_one_place_is_finite():
     batch = torch.ones(1, 5, 3, requires_grad=True)
-    normalised(batch, "unit_ball").clouds.sum().backward()
+    normalise_clouds(batch, "unit_ball").clouds.sum().backward()
     assert batch.grad is not None
     assert batch.grad.isfinite().all()
 
 
 def test_what_exceeds_float64_is_refused():
     with pytest.raises(DataError, match="Cloud 1 of the batch is so large"):
-        normalised(torch.stack([cloud(4), cloud(4) * 1e200]), "unit_ball")
+        normalise_clouds(torch.stack([cloud(4), cloud(4) * 1e200]), "unit_ball")
 
 
 def test_clouds_that_were_not_normalised_are_refused():

@@ -19,7 +19,7 @@ from framework.configuration.newest import newest_run
 from framework.configuration.settings import OptimizerSettings, store_experiment
 from framework.distributions.density import Mixture
 from framework.distributions.description import LONGEST, one_line
-from framework.errors import LISTED, LISTED_WHOLE, CheckpointError, listed, nearest
+from framework.errors import LISTED, LISTED_WHOLE, CheckpointError, list_names, nearest_name
 from framework.storage import files
 from framework.storage.closed_pipes import DroppingWriter
 from framework.storage.files import alone, unwritable
@@ -48,13 +48,13 @@ def test_flags_stand_anywhere(flags: list[str], place: int) -> None:
     ],
 )
 def test_only_what_is_near_is_suggested(word: str, known: list[str], wanted: str | None) -> None:
-    assert nearest(word, known) == wanted
+    assert nearest_name(word, known) == wanted
 
 
 @pytest.mark.parametrize("count", [0, 1, LISTED_WHOLE, LISTED_WHOLE + 1, 3000])
 def test_a_long_list_is_cut_to_the_nearest(count: int) -> None:
     names = [f"name{number}" for number in range(count)]
-    text = listed("name7", names)
+    text = list_names("name7", names)
     if count <= LISTED_WHOLE:
         assert text == ", ".join(names)
     else:

@@ -16,7 +16,7 @@ from framework.configuration.schema import build, resolve
 from framework.configuration.settings import settings
 from framework.datasets import images
 from framework.datasets.images import Crop, square
-from framework.errors import ConfigError, DataError, quoted, shown
+from framework.errors import ConfigError, DataError, quote, shorten
 from framework.storage import reading
 from framework.storage.plain_values import read_yaml, require_plain_pickle
 from framework.storage.reading import guarded, inflated
@@ -190,10 +190,10 @@ def test_the_guard_turns_any_error_into_a_sentence_that_names_the_file(tmp_path:
 
 
 def test_damage_is_quoted_in_two_hundred_characters_that_steer_no_terminal() -> None:
-    assert shown("x" * 300) == "x" * 199 + "…"
-    assert shown("a\x1b[31m\ud800b") == "a\\x1b[31m\\ud800b"
-    assert len(quoted("\0" * 10**6)) == 200
-    assert shown("first\n  second") == "first second"
+    assert shorten("x" * 300) == "x" * 199 + "…"
+    assert shorten("a\x1b[31m\ud800b") == "a\\x1b[31m\\ud800b"
+    assert len(quote("\0" * 10**6)) == 200
+    assert shorten("first\n  second") == "first second"
 
 
 def test_inflating_stops_at_the_bound() -> None:

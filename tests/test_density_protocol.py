@@ -42,33 +42,33 @@ from torch.distributions import Categorical, Dirichlet, Distribution, Independen
 
 from framework.configuration.registry import installed
 from framework.configuration.schema import build, resolve
+from framework.distributions.affine import AffineDensity
 from framework.distributions.batch_shapes import Reshaped, Stacked
 from framework.distributions.circular import Circular
 from framework.distributions.circular_moments import circular_moments
 from framework.distributions.class_probabilities import class_probabilities
 from framework.distributions.density import Mixture
-from framework.distributions.moved import Moved
 from framework.distributions.protocol import (
-    about,
-    arc,
+    arc_probability,
     cdf,
-    each_cdf,
     estimate,
     images,
     mahalanobis,
     marginal,
+    marginal_cdfs,
     median,
+    mode_candidates,
     normals,
-    peaks,
+    peak_widths,
     pick,
-    scales,
-    slope,
-    tempered,
+    quadratic_bound,
+    recentre,
+    tempered_density,
     value_set,
 )
 from framework.distributions.tempering import CircularPower, temper
 from framework.errors import UserError
-from framework.geometry.light import light_of
+from framework.geometry.srgb import linear_from_srgb
 from framework.model import Model
 from framework.target import Target
 from framework.testing.balls import CHANNELS, Ball, ball
@@ -124,7 +124,7 @@ class Made:
         try:
             found["tempered"] = temper(found["mixture"], WARM)
         except UserError as error:
-            assert "protocol.tempered.register" in str(error)
+            assert "protocol.tempered_density.register" in str(error)
         return found
 
     @property
@@ -144,7 +144,7 @@ def there_and_back(density: Distribution) -> Distribution:
     like = density.sample()
     location = torch.linspace(-3, 5, like.numel(), dtype=like.dtype).reshape(like.shape)
     scale = 0.1 + location.square()
-    return Moved(Moved(density, location, scale), -location / scale, 1 / scale)
+    return AffineDensity(AffineDensity(density, location, scale), -location / scale, 1 / scale)
 
 
 def restricted(name: str, row: HeadRow) -> bool:
@@ -267,16 +267,16 @@ def shown_or_refused(part: Distribution, density: Distribution) -> None:
 def pictured(kind: str, made: Made, density: Distribution) -> None:
     """An image over every structure: the light of one density's mean, of several the mean of theirs."""
     found = images(density, {"color"})["color"]
-    parts = torch.stack([light_of(part.mean) for part in made.parts], -1)
+    parts = torch.stack([linear_from_srgb(part.mean) for part in made.parts], -1)
     wanted = parts[..., 0] if kind in ("itself", "with a set", "mixture of one") else None
     if kind == "stacked":
-        wanted = torch.stack([light_of(part.mean) for part in made.parts], 1)
+        wanted = torch.stack([linear_from_srgb(part.mean) for part in made.parts], 1)
     elif kind == "reshaped":
         wanted = parts[..., 0].reshape(2, 2, *made.parts[0].event_shape)
     elif kind == "mixture":
         wanted = (parts * share(made.weights)[:, None, None, None]).sum(-1)
     elif kind == "tempered":  # weights and, of some, means are its own
-        inside = light_of(density.components.mean).movedim(1, -1)
+        inside = linear_from_srgb(density.components.mean).movedim(1, -1)
         wanted = (inside * density.log_weights.exp()[:, None, None, None]).sum(-1)
     assert found.shape == (*density.batch_shape, *density.event_shape)
     assert wanted is not None or kind in ("mixture of a fold", "mixture of mixtures")
@@ -338,10 +338,10 @@ def densities(kind: str, made: Made, density: Distribution, value: Tensor) -> No
             close(warm.log_prob(value), power.log_softmax(0).gather(0, value.unsqueeze(0))[0])
         return
     try:
-        warm = tempered(density, WARM)
-        parts = [tempered(part, WARM) for part in made.parts]
+        warm = tempered_density(density, WARM)
+        parts = [tempered_density(part, WARM) for part in made.parts]
     except UserError as error:
-        assert "protocol.tempered.register" in str(error)
+        assert "protocol.tempered_density.register" in str(error)
         return
     if kind != "floored":
         wanted = log_mixed(kind, made, lambda part, at: parts[made.parts.index(part)].log_prob(at))
@@ -442,9 +442,9 @@ def draws(kind: str, made: Made, density: Distribution) -> None:
     noise = (features(picked, made).var(0) + features(whole, made).var(0)).div(count).sqrt()
     assert (gap <= 6 * noise + 0.02).all(), f"{kind}: picked {gap.max()}"
     if made.target.kind != "class":
-        humps = peaks(density)
+        humps = mode_candidates(density)
         assert humps.shape[1:] == density.batch_shape + density.event_shape
-        wanted = [peaks(part) for part in made.parts]
+        wanted = [mode_candidates(part) for part in made.parts]
         if kind in ("mixture", "mixture of mixtures"):
             assert all((humps == peak).flatten(2).all(2).any(0).all() for part in wanted for peak in part)
         elif kind == "stacked":
@@ -458,8 +458,8 @@ def draws(kind: str, made: Made, density: Distribution) -> None:
 
 def bounds(made: Made, density: Distribution, value: Tensor) -> None:
     """slope: where the parts know theirs, the density's own, and what it promises of the density elsewhere."""
-    found = slope(density, value)
-    if any(slope(part, made.value) is None for part in made.parts):
+    found = quadratic_bound(density, value)
+    if any(quadratic_bound(part, made.value) is None for part in made.parts):
         assert found is None
         return
     close(found.log_prob, density.log_prob(value), 1e-12)
@@ -498,7 +498,7 @@ def closed_forms(kind: str, made: Made, density: Distribution, value: Tensor) ->
         one = marginal(density.components, 0)  # that of a latent-variable density is of its mixture
         one = Mixture(density.log_weights, one)
     if made.target.kind == "real":
-        assert arc(one, at, at) is None
+        assert arc_probability(one, at, at) is None
         mass = mass_of(kind, made, lambda part, y: cdf(marginal(part, 0), y[..., :1]))
         agree(cdf(one, at), mass)
         known = normals(one)
@@ -514,22 +514,24 @@ def closed_forms(kind: str, made: Made, density: Distribution, value: Tensor) ->
         moments(kind, made, density)
         return
     assert cdf(one, at) is None and normals(one) is None and mahalanobis(one, at) is None
-    mass = mass_of(kind, made, lambda part, y: arc(marginal(part, 0), y[..., :1], y[..., :1] + 2.0))
-    found = arc(one, at, at + 2.0)
+    mass = mass_of(
+        kind, made, lambda part, y: arc_probability(marginal(part, 0), y[..., :1], y[..., :1] + 2.0)
+    )
+    found = arc_probability(one, at, at + 2.0)
     if mass is not None and kind == "floored":
         mass = 0.9 * mass + 0.1 * 2.0 / (2 * math.pi)
     agree(found, mass)
     if found is not None and isinstance(one.support, Circular):
         seen = circular_moments(one)
-        by_series = seen.arc(at.squeeze(-1), at.squeeze(-1) + 2.0)
+        by_series = seen.arc_probability(at.squeeze(-1), at.squeeze(-1) + 2.0)
         close(found[seen.resolved], by_series[seen.resolved], 1e-6)
 
 
 def each_number(kind: str, made: Made, density: Distribution, value: Tensor) -> None:
     """each_cdf: of an image of the parts' by plain sums, of a few numbers that of each marginal; or None as of them."""
-    found = each_cdf(density, value)
+    found = marginal_cdfs(density, value)
     if made.target.kind == "image":
-        parts = torch.stack([each_cdf(part, made.value) for part in made.parts], 1)
+        parts = torch.stack([marginal_cdfs(part, made.value) for part in made.parts], 1)
         assert found is not None and found.shape == value.shape and found.dtype == torch.float64
         if kind not in ("tempered", "mixture of a fold"):  # densities, or at values, of their own
             close(found, combined(kind, made, parts))
@@ -617,7 +619,7 @@ def warm_of(density: Distribution, other: Distribution) -> list[tuple[Distributi
     try:
         return [(temper(density, WARM), temper(other, WARM))]
     except UserError as error:
-        assert "protocol.tempered.register" in str(error)
+        assert "protocol.tempered_density.register" in str(error)
         return []
 
 
@@ -653,7 +655,7 @@ def test_defaults_do_not_claim_to_be_exact() -> None:
     assert not estimate(ruled_out, value).standard_error.any()
     for question in (
         lambda: cdf(density, value),
-        lambda: arc(density, value, value),
+        lambda: arc_probability(density, value, value),
         lambda: normals(density),
     ):
         assert question() is None
@@ -661,7 +663,7 @@ def test_defaults_do_not_claim_to_be_exact() -> None:
     with pytest.raises(UserError, match=r"protocol\.marginal\.register"):
         marginal(Dirichlet(torch.ones(3)), 0)
     with pytest.raises(UserError, match=r"protocol\.tempered\.register"):
-        tempered(Dirichlet(torch.ones(3)), WARM)
+        tempered_density(Dirichlet(torch.ones(3)), WARM)
 
 
 LOC = torch.linspace(-2, 3, 12, dtype=torch.float64).reshape(2, 2, 3)
@@ -818,7 +820,7 @@ def test_the_distribution_function_of_a_product_is_that_of_its_factors(family: s
     base, reference = FAMILIES[family]
     density = Independent(base, 1)
     value = LOC + torch.tensor([-1e3, -2.0, 0.0, 0.3, 50.0], dtype=torch.float64).reshape(5, 1, 1, 1)
-    found = each_cdf(density, value)
+    found = marginal_cdfs(density, value)
     columns = [cdf(marginal(density, index), value[..., index : index + 1]) for index in range(3)]
     if family == "gamma":
         assert found is None and columns == [None] * 3
@@ -830,7 +832,7 @@ def test_the_distribution_function_of_a_product_is_that_of_its_factors(family: s
     close(found, torch.stack([column for column in columns if column is not None], -1), 1e-12)
     if family != "student":  # which has a third parameter
         single = Independent(type(base)(base.loc.float(), base.scale.float()), 1)
-        assert each_cdf(single, value).dtype == torch.float64
+        assert marginal_cdfs(single, value).dtype == torch.float64
 
 
 def test_what_draws_nothing_says_so() -> None:
@@ -853,7 +855,7 @@ def test_a_moved_normal_density_is_the_normal_density_there() -> None:
             "density_head", resolve("density_head", "gaussian"), target=Target("real", tuple("xyz"[:numbers]))
         )
         gaussian = type(head(torch.zeros(1, head.size)))
-        found = Moved(gaussian(mean, scale), location, unit)
+        found = AffineDensity(gaussian(mean, scale), location, unit)
         wanted = gaussian(location + unit * mean, unit * scale)
         value = wanted.sample()
         questions = [
@@ -867,10 +869,10 @@ def test_a_moved_normal_density_is_the_normal_density_there() -> None:
             lambda one, value=value: cdf(marginal(one, 0), value[..., :1]),
             lambda one, value=value: mahalanobis(one, value),
             lambda one, value=value: temper(one, WARM).log_prob(value),
-            lambda one: peaks(one),
-            lambda one: scales(marginal(one, 0)),
+            lambda one: mode_candidates(one),
+            lambda one: peak_widths(marginal(one, 0)),
             lambda one, value=value: torch.stack(list(normals(marginal(one, 0)))[1:]),
-            lambda one, value=value: about(
+            lambda one, value=value: recentre(
                 marginal(one, 0), (torch.tensor([0, 3]),), value[[0, 3], :1]
             ).log_prob(torch.full((2, 1), 1e-3).double()),
         ]
@@ -883,7 +885,7 @@ def test_a_moved_normal_density_is_the_normal_density_there() -> None:
             torch.manual_seed(seed)
             close(drawn, pick(wanted, chosen).sample())
     with pytest.raises(ValueError, match="wanted three times the same shape"):
-        Moved(wanted, location[:1], unit)
+        AffineDensity(wanted, location[:1], unit)
 
 
 DRAWN = {"gaussian": Target("real", ("x", "y")), "von_mises": Target("angle", ("a",))}
@@ -1002,9 +1004,9 @@ OLD_NAMES = {
     "density": "CHUNK Circular Mixture circular circular_entropy circular_grid marginal median pick take",
     "rearranged": "Reshaped Stacked",
     "circular": "angular_distance circular_mean circular_median grid wrap",
-    "temper": "CircularPower divided log_probabilities temper tempered tempered_classes",
+    "temper": "CircularPower divided log_probabilities temper tempered_classes",
     "monte_carlo": "Estimate estimate",
-    "cdf": "arc cdf turn",
+    "cdf": "cdf",
     "normals": "Normals mahalanobis normals one_normal",
     "circular_moments": "CircularMoments circular_moments",
     "class_probabilities": "class_probabilities require_labels",

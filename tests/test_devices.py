@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.distributions import Categorical, Distribution, Independent, Normal
 
 from framework.distributions.density import Mixture
-from framework.distributions.intervals import middle
+from framework.distributions.intervals import central_interval
 from framework.prediction import Prediction, table_columns
 from framework.target import Target
 from framework.testing.devices import OneDevice, Questions, on_one_device
@@ -100,7 +100,7 @@ def test_the_answers_of_a_density_are_on_its_device(
             density, mode.receive(torch.tensor([[0], [1], [0]])), mode.receive(torch.tensor(1.7))
         )
         if target.kind != "class":
-            yield "middle", lambda: middle(density, 0.9, 99)
+            yield "middle", lambda: central_interval(density, 0.9, 99)
         batch = {"index": mode.receive(torch.arange(2)), "target": density.sample()}
         yield "answers", lambda: table_columns(target, Prediction(density, batch))
 

@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
 
-from framework.errors import DataError, encodable, quoted, shown
-from framework.figures.style import saved
+from framework.errors import DataError, escape_undecodable, quote, shorten
+from framework.figures.style import save_figure
 from framework.geometry import meshes
 from framework.modes.encode import collected, describe
 from framework.reports import table
@@ -35,7 +35,7 @@ def test_a_spelling_is_a_line_of_text_from_which_the_name_is_found(name: bytes) 
     assert len(spelling.encode().splitlines()) == 1
     assert os.fsencode(path_of(spelling)) == os.fsencode(Path(os.fsdecode(name)))
     if spelling == os.fsdecode(name):
-        assert encodable(spelling) == spelling
+        assert escape_undecodable(spelling) == spelling
 
 
 @given(st.sets(BYTES, min_size=2, max_size=5))
@@ -57,14 +57,14 @@ def test_what_is_made_of_a_name_takes_any(name: bytes, tmp_path: Path) -> None:
     text = os.fsdecode(name)
     assert 0 <= meshes.stream(0, text).random() < 1
     assert jobs.hashed(text, "a") != jobs.hashed("a", text)
-    for message in (str(DataError(f"{text}: no")), shown(text), quoted(text)):
+    for message in (str(DataError(f"{text}: no")), shorten(text), quote(text)):
         message.encode()
     figure = Figure()
     figure.suptitle(text.replace("$", r"\$"))
-    saved(figure, tmp_path / "figure", "svg")
+    save_figure(figure, tmp_path / "figure", "svg")
     table.csv([{"class": text, "nll": 1.0}], None, tmp_path / "table.csv")
     with (tmp_path / "table.csv").open(encoding="utf-8", newline="") as stream:
-        assert list(csv.reader(stream))[1][0] == encodable(text).replace("\r", r"\x0d")
+        assert list(csv.reader(stream))[1][0] == escape_undecodable(text).replace("\r", r"\x0d")
 
 
 @pytest.fixture

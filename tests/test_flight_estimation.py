@@ -4,21 +4,21 @@ import numpy as np
 import torch
 from scipy.optimize import least_squares
 
-from framework.flights.estimation import cauchy, estimated, seen_of
+from framework.flights.estimation import cauchy, estimate_states, observed_frames
 from framework.flights.physics import Constants
-from framework.flights.trajectories import flown
+from framework.flights.trajectories import simulate
 from framework.testing.flights import SIGMA, windows_of
 
 
 def test_states_are_those_of_scipys_robust_least_squares() -> None:
     frames, _, _ = windows_of(4)
-    seen = seen_of(frames, 0.016)
-    found = estimated(seen, Constants(), SIGMA, most=200)
+    seen = observed_frames(frames, 0.016)
+    found = estimate_states(seen, Constants(), SIGMA, most=200)
     for row in range(4):
-        there = seen.there[row]
+        there = seen.observed[row]
 
         def residuals(state: np.ndarray, row: int = row, there: torch.Tensor = there) -> np.ndarray:
-            places = flown(torch.from_numpy(state)[None], seen.times[row : row + 1], Constants())[0, :, :3]
+            places = simulate(torch.from_numpy(state)[None], seen.times[row : row + 1], Constants())[0, :, :3]
             apart = ((places - seen.places[row])[there] / SIGMA).flatten()
             return np.concatenate([cauchy(apart)[0].numpy(), state / ([10] * 6 + [60] * 3)])
 
@@ -33,9 +33,9 @@ def test_outliers_do_not_move_the_state() -> None:
     dirty, _, _ = windows_of(40, outliers=True)
     errors = []
     for frames in (clean, dirty):
-        seen = seen_of(frames, 0.016)
-        found = estimated(seen, Constants(), SIGMA)
+        seen = observed_frames(frames, 0.016)
+        found = estimate_states(seen, Constants(), SIGMA)
         times = torch.cat([seen.times, 0.016 * torch.arange(1, 36).double().expand(40, -1)], 1)
-        places = flown(found.state, times, Constants())[:, 20:, :3]
+        places = simulate(found.state, times, Constants())[:, 20:, :3]
         errors.append((places - future).norm(dim=-1).mean(0).median())
     assert errors[1] < 1.5 * errors[0] and errors[0] < 0.05

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from framework.flights.physics import Constants, acceleration, bounced, slip
-from framework.flights.trajectories import flown, flown_with_slopes
+from framework.flights.physics import Constants, acceleration, bounce, slip
+from framework.flights.trajectories import simulate, simulate_with_jacobian
 from framework.testing.flights import START
 from plugins.data.table_tennis.solvers import flight
 
@@ -21,7 +21,7 @@ def starts(count: int) -> np.ndarray:
 
 
 def test_a_fall_with_drag_has_its_closed_form() -> None:
-    found = flown(
+    found = simulate(
         torch.tensor([[0.0, 0, 50, 0, 0, 0, 0, 0, 0]]).double(),
         torch.from_numpy(TIMES)[None],
         Constants(),
@@ -46,7 +46,7 @@ def test_a_bounce_obeys_coulomb_and_makes_no_energy(friction: float) -> None:
     constants = Constants(friction=friction)
     for state in starts(40):
         velocity, spin = (*state[3:5], -3.0), tuple(state[6:])
-        after, turned = bounced(velocity, spin, constants)
+        after, turned = bounce(velocity, spin, constants)
         assert after[2] == pytest.approx(0.88 * 3)
         impulse = np.subtract(after, velocity)
         before, left = slip(velocity, spin, 0.02), slip(after, turned, 0.02)
@@ -69,20 +69,20 @@ def test_a_bounce_obeys_coulomb_and_makes_no_energy(friction: float) -> None:
 def test_many_flights_at_once_are_scipys_one_by_one() -> None:
     states = starts(12)
     moments = np.sort(TIMES + np.random.default_rng(1).uniform(-0.004, 0.004, (12, 60)), 1)
-    found = flown(torch.from_numpy(states), torch.from_numpy(moments), Constants())
+    found = simulate(torch.from_numpy(states), torch.from_numpy(moments), Constants())
     landed = 0
     for state, moment, mine in zip(states, moments, found.numpy(), strict=True):
         path = flight(state, moment, Constants(), method="DOP853", tolerance=1e-12)
         landed += len(path.contacts)
         np.testing.assert_allclose(mine[:, :3], path.states[:, :3], atol=1e-6)
     assert landed >= 8
-    places, slopes = flown_with_slopes(torch.from_numpy(states), torch.from_numpy(moments), Constants())
+    places, slopes = simulate_with_jacobian(torch.from_numpy(states), torch.from_numpy(moments), Constants())
     torch.testing.assert_close(places, found[..., :3])
     for number, size in ((2, 1e-6), (4, 1e-6), (7, 1e-4)):
         shift = torch.zeros(9).double()
         shift[number] = size
         two = [
-            flown(torch.from_numpy(states) + sign * shift, torch.from_numpy(moments), Constants())
+            simulate(torch.from_numpy(states) + sign * shift, torch.from_numpy(moments), Constants())
             for sign in (1, -1)
         ]
         change = (two[0] - two[1])[..., :3] / (2 * size)
@@ -92,9 +92,9 @@ def test_many_flights_at_once_are_scipys_one_by_one() -> None:
 def test_a_ball_comes_to_rest_and_falls_off_the_table() -> None:
     still = torch.tensor([[0.0, -2.0, -0.92, 0, 0, 0, 0, 0, 0]]).double()
     times = torch.arange(0, 4, 0.02, dtype=torch.float64)[None]
-    ended = flown(still, times, Constants())[0, -1]
+    ended = simulate(still, times, Constants())[0, -1]
     assert ended[2] == pytest.approx(-0.93, abs=1e-4)
     rolling = torch.tensor([[0.0, -1.5, -0.93, 0, 1.0, 0, 0, 0, 0]]).double()
-    assert flown(rolling, times[:, :100], Constants())[0, -1, 2] < -1.5
+    assert simulate(rolling, times[:, :100], Constants())[0, -1, 2] < -1.5
     path = flight(still[0].numpy(), times[0, ::20].numpy(), Constants(), method="DOP853")
     assert abs(path.states[-1, 2] + 0.93) < 1e-5 and np.isfinite(path.states).all()

@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.distributions import Distribution, Independent, Normal
 
+from framework.distributions.affine import AffineDensity
 from framework.distributions.batch_shapes import Stacked
 from framework.distributions.density import Mixture
 from framework.distributions.highest import highest
-from framework.distributions.moved import Moved
 from framework.distributions.tempering import CircularPower
 from plugins.density_head.gaussian.density import Gaussian
 from plugins.density_head.von_mises.density import VonMises
@@ -121,7 +121,7 @@ def nested(structure: str, seed: int) -> Distribution:
         place, scale = torch.randn(
             2, ITEMS, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(seed)
         )
-        moved = [Moved(one, shift * place, scale.exp()) for shift, one in enumerate(flat)]
+        moved = [AffineDensity(one, shift * place, scale.exp()) for shift, one in enumerate(flat)]
         return Mixture(torch.zeros(ITEMS, 3), Stacked(moved))
     inner = Mixture(torch.zeros(ITEMS, 2), Stacked(flat[:2]))
     return Mixture(torch.zeros(ITEMS, 2), Stacked([inner, flat[2]]))

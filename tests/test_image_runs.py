@@ -21,7 +21,7 @@ from framework.configuration.paths import paths_of
 from framework.deployment.served import _load_pyfunc
 from framework.encoder import Encoder
 from framework.errors import DataError
-from framework.geometry.light import eight_bit, light_of
+from framework.geometry.srgb import bytes_from_linear, linear_from_srgb
 from plugins.data.bodies.rows import body_file, colored, colored_meshes, scanned
 from plugins.data.bodies.scan_layout import write_registration
 from tests.conftest import Done, Framework, paths_again
@@ -143,7 +143,7 @@ def test_images_are_predicted_loaded_frozen_served_and_trained_further(
             density = model(file)
             assert density.event_shape == (32, 24, 3)
             np.testing.assert_allclose(frozen(file), density.mean.numpy(), atol=1e-5)
-            wanted = eight_bit(light_of(density.mean[0])).numpy().astype(int)
+            wanted = bytes_from_linear(linear_from_srgb(density.mean[0])).numpy().astype(int)
             answered = Image.open(BytesIO(base64.b64decode(served["png"][number])))
             for picture in (pictures[number], np.asarray(answered).astype(int)):
                 assert np.abs(picture - wanted).max() <= 1

@@ -23,11 +23,11 @@ from torch.distributions import (
 )
 
 from framework.configuration.schema import build, resolve
+from framework.distributions.affine import AffineDensity
 from framework.distributions.batch_shapes import Reshaped, Stacked
 from framework.distributions.circular import Circular, circular, wrap
 from framework.distributions.density import Mixture
-from framework.distributions.intervals import DRAWS, Interval, middle
-from framework.distributions.moved import Moved
+from framework.distributions.intervals import DRAWS, Interval, central_interval
 from framework.distributions.tempering import temper
 from framework.target import Target
 from framework.testing.metrics import Cardioid
@@ -117,8 +117,8 @@ def close(found: Tensor, wanted: tuple[float, float], note: str) -> None:
 @pytest.mark.parametrize("mass", MASSES)
 def test_of_reals_are_scipys(dtype: torch.dtype, mass: float) -> None:
     for name, density, exact in reals(dtype):
-        found = middle(density, mass)
-        assert found.low.dtype == torch.float64 and not found.drawn, name
+        found = central_interval(density, mass)
+        assert found.low.dtype == torch.float64 and not found.depends_on_draws, name
         close(torch.cat([found.low, found.high]).flatten(), exact(mass), name)
 
 
@@ -128,21 +128,21 @@ def test_frames_numbers_and_batches_of_other_shapes(dtype: torch.dtype) -> None:
     loc = torch.randn(4, 2, generator=generator).to(dtype)
     scale = torch.rand(4, 2, generator=generator).to(dtype) + 0.1
     pair = Independent(Normal(loc, scale), 1)
-    plain = middle(pair, 0.9)
+    plain = central_interval(pair, 0.9)
     want = stats.norm(loc.double().numpy(), scale.double().numpy()).interval(0.9)
     np.testing.assert_allclose(plain.low.numpy(), want[0], rtol=1e-12)
     np.testing.assert_allclose(plain.high.numpy(), want[1], rtol=1e-12)
     # a year and its unit: in float32 neighbours of 2e9 are 128 apart, and the width is kept
     at, by = torch.full_like(loc, 2e9), torch.full_like(loc, 1e-3)
-    moved = middle(Moved(pair, at, by), 0.9)
+    moved = central_interval(AffineDensity(pair, at, by), 0.9)
     widths = (want[1] - want[0]) * by.double().numpy()
     np.testing.assert_allclose((moved.high - moved.low).numpy(), widths, rtol=1e-3)
     for other in (Reshaped(Independent(Normal(loc[:, :1], scale[:, :1]), 1), (2, 2)),):
-        assert torch.equal(middle(other, 0.9).low.flatten(), plain.low[:, 0])
+        assert torch.equal(central_interval(other, 0.9).low.flatten(), plain.low[:, 0])
     several = Stacked(
         [Independent(Normal(loc[:, :1], scale[:, :1]), 1), Independent(Laplace(loc[:, :1], scale[:, :1]), 1)]
     )
-    ends = middle(several, 0.9)
+    ends = central_interval(several, 0.9)
     np.testing.assert_allclose(ends.low[:, 0, 0].numpy(), want[0][:, 0], rtol=1e-6)
     np.testing.assert_allclose(
         ends.high[:, 1, 0].numpy(),
@@ -165,8 +165,8 @@ def two_halves(found: Interval, law: Callable[[float, float], float], mass: floa
 def test_of_angles_are_scipys_arcs(dtype: torch.dtype, mass: float) -> None:
     grid = [(mean, kappa) for mean in (0.0, 3.1, -2.0) for kappa in (0.0, 1e-2, 1.0, 30.0, 900.0, 1e6, 1e10)]
     loc, concentration = (column(*numbers, dtype=dtype) for numbers in zip(*grid, strict=True))
-    found = middle(VonMises(loc, concentration), mass)
-    assert not found.drawn
+    found = central_interval(VonMises(loc, concentration), mass)
+    assert not found.depends_on_draws
     # SciPy reads concentrations above 50 as normal: there the next term of the expansion is small enough
     exact = [
         2 * stats.vonmises(kappa).ppf((1 + mass) / 2) if kappa else 2 * math.pi * mass for _, kappa in grid
@@ -186,7 +186,7 @@ def test_of_angles_are_scipys_arcs(dtype: torch.dtype, mass: float) -> None:
         parts = (stats.vonmises(kappa, mean) for kappa, mean in zip(kappas, at, strict=True))
         return sum(w * (part.cdf(high) - part.cdf(low)) for w, part in zip(weights, parts, strict=True))
 
-    two_halves(middle(mixture, mass), law, mass, "mixture")
+    two_halves(central_interval(mixture, mass), law, mass, "mixture")
 
 
 @pytest.mark.parametrize("mass", MASSES)
@@ -195,15 +195,15 @@ def test_of_other_angles_follow_from_the_series(mass: float) -> None:
     rho = column(-0.4, 0.0, 0.9)
 
     cardioid = Cardioid(rho)
-    found = middle(cardioid, mass)
-    assert not found.drawn
+    found = central_interval(cardioid, mass)
+    assert not found.depends_on_draws
     value = torch.linspace(-math.pi, math.pi, 20001, dtype=torch.float64)
     for item in range(3):
         dense = cardioid.log_prob(value.reshape(-1, 1, 1).expand(-1, 3, 1))[:, item].exp().numpy()
         inside = torch.remainder(value - found.low[item], 2 * math.pi) <= found.high[item] - found.low[item]
         share = np.trapezoid(np.where(inside.numpy(), dense, 0.0), value.numpy())
         assert share == pytest.approx(mass, abs=3e-4)
-    power = middle(temper(VonMises(column(1.0), column(4.0)), torch.tensor(2.0)), mass)
+    power = central_interval(temper(VonMises(column(1.0), column(4.0)), torch.tensor(2.0)), mass)
     half = stats.vonmises(2.0).ppf((1 + mass) / 2)
     assert ((power.high - power.low).item() / 2) == pytest.approx(half, rel=1e-6)
 
@@ -239,15 +239,15 @@ def test_ends_from_draws_say_their_error(turns: bool) -> None:
     """The errors that are told are those that the ends have: over 150 items, of one angle too narrow for a grid too."""
     torch.manual_seed(0)
     loc, scale = torch.full((150, 1), 2.0, dtype=torch.float64), 1e-7 if turns else 3.0
-    found = middle(Sampled(loc, scale, turns), 0.9)
-    assert found.drawn
+    found = central_interval(Sampled(loc, scale, turns), 0.9)
+    assert found.depends_on_draws
     for end, error, place in ((found.low, found.low_error, 0.05), (found.high, found.high_error, 0.95)):
         residual = (end - (2.0 + scale * stats.norm.ppf(place))) / error
         assert abs(residual.mean().item()) < 0.35
         assert 0.75 < residual.std().item() < 1.3
         exact = scale * math.sqrt(0.05 * 0.95 / DRAWS) / stats.norm.pdf(stats.norm.ppf(place))
         assert error.mean().item() == pytest.approx(exact, rel=0.1)
-    beyond = middle(Sampled(loc[:2], scale, turns), 0.9999)
+    beyond = central_interval(Sampled(loc[:2], scale, turns), 0.9999)
     assert (beyond.low_error == math.inf).all()
 
 
@@ -258,7 +258,7 @@ def test_of_what_is_not_a_number_is_none() -> None:
         Independent(Cauchy(broken, torch.ones_like(broken), validate_args=False), 1, validate_args=False),
         VonMises(broken, torch.ones_like(broken)),
     ):
-        found = middle(density, 0.9)
+        found = central_interval(density, 0.9)
         assert found.low[0].isfinite() and found.low[1].isnan() and found.high[1].isnan()
 
 
@@ -278,7 +278,7 @@ def test_a_part_of_the_circle_has_ends_like_a_line() -> None:
             return (2 * torch.rand((*sample_shape, *self.loc.shape), dtype=self.loc.dtype) - 1).asin()
 
     torch.manual_seed(0)
-    found = middle(Elevation(torch.zeros(3, 1, dtype=torch.float64), 1.0), 0.9)
-    atol = 5 * found.high_error.max().item() if found.drawn else 1e-3
+    found = central_interval(Elevation(torch.zeros(3, 1, dtype=torch.float64), 1.0), 0.9)
+    atol = 5 * found.high_error.max().item() if found.depends_on_draws else 1e-3
     np.testing.assert_allclose(found.high.numpy(), math.asin(0.9), atol=atol)
     np.testing.assert_allclose(found.low.numpy(), -math.asin(0.9), atol=atol)

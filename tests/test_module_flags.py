@@ -1,7 +1,7 @@
 import pytest
 from torch import nn
 
-from framework.calibration.module_flags import flagged
+from framework.calibration.module_flags import set_flag
 
 
 def network():
@@ -15,7 +15,7 @@ def test_a_flag_of_some_kinds_alone_and_only_for_a_while(kinds):
     model = network().eval()
     model[1].train()
     before = [layer.training for layer in model.modules()]
-    with flagged(model, kinds, "training", True):
+    with set_flag(model, kinds, "training", True):
         assert [layer.training for layer in model.modules() if isinstance(layer, kinds)] == [True] * (
             len(kinds) if isinstance(kinds, tuple) else 1
         )
@@ -25,7 +25,7 @@ def test_a_flag_of_some_kinds_alone_and_only_for_a_while(kinds):
 
 def test_an_error_restores_it_too():
     model = network()
-    with pytest.raises(ZeroDivisionError), flagged(model, nn.BatchNorm1d, "track_running_stats", False):
+    with pytest.raises(ZeroDivisionError), set_flag(model, nn.BatchNorm1d, "track_running_stats", False):
         assert not model[2][1].track_running_stats
         _ = 1 / 0
     assert model[2][1].track_running_stats

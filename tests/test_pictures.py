@@ -19,7 +19,7 @@ from scipy.special import logsumexp
 from scipy.stats import vonmises
 
 from framework.distributions.density import Mixture
-from framework.figures.style import saved, titled_figure
+from framework.figures.style import save_figure, titled_figure
 from framework.reports.prediction_pictures import around, deviation
 from framework.reports.table import aggregate
 from framework.reports.tradeoff_picture import Floor, error_against_run_time
@@ -281,7 +281,7 @@ def test_a_figure_is_saved_in_the_format_asked_for_and_the_same_again(
         (tmp_path / f"{again}.of two").mkdir()
         figure = titled_figure((3.0, 2.0), "a · b", True)
         figure.subplots().plot([1, 2], [3, 4])
-        path = saved(figure, tmp_path / f"{again}.of two" / "curve", pictures)
+        path = save_figure(figure, tmp_path / f"{again}.of two" / "curve", pictures)
         contents.append(path.read_bytes())
         assert path.name == f"curve.{pictures if isinstance(pictures, str) else 'png'}"
     assert contents[0] == contents[1] and contents[0].startswith(KINDS[pictures])

@@ -6,7 +6,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from framework.data import Frame
-from framework.distributions.moved import Moved
+from framework.distributions.affine import AffineDensity
 from framework.errors import DataError, UserError
 from framework.evaluation.splits import evaluate
 from framework.metric import Metric
@@ -93,7 +93,7 @@ def test_another_frame_keeps_what_is_read_and_seen() -> None:
     density = Ball(density_about(PLACE, place), place, SIZE)
     prediction = Prediction(density, batch, reads=("color", "depth"))
     moved = prediction.in_frame(Frame(torch.ones(3, 2), torch.full((3, 2), 2.0)))
-    assert isinstance(moved.density, Moved)
+    assert isinstance(moved.density, AffineDensity)
     torch.testing.assert_close(moved.image("color"), ball(place, SIZE)["color"], rtol=0, atol=0)
     assert density.asked == [{"color", "depth"}]
 

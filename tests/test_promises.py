@@ -137,7 +137,7 @@ def test_a_set_is_the_same_wherever_it_is_said(
         else:
             assert predicted[column].tolist() == told
     sets = value_set(freeze(run, paths=paths).density(inputs))
-    assert sets is not None and sets.promised == pytest.approx(PROMISED)
+    assert sets is not None and sets.stated_probability == pytest.approx(PROMISED)
     unit = 180 / math.pi if size.endswith("_deg") else 1.0
     if wrapper != "mc_dropout":  # whose passes differ from call to call
         with torch.no_grad():

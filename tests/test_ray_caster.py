@@ -13,7 +13,7 @@ from torch import Tensor
 
 from framework.configuration.schema import build, resolve
 from framework.geometry.camera import Camera, look_from
-from framework.renderer import Renderer, Scene, Texture, joined
+from framework.renderer import Renderer, Scene, Texture, join_scenes
 from framework.testing.extremes import extremes
 from framework.testing.finding import examined
 from framework.testing.scenes import sphere
@@ -58,7 +58,7 @@ def crowd(camera: Camera, count: int, wrap: str = "repeat", smooth: bool = True)
         place = torch.tensor(random.uniform(-1, 1, 3) * 0.4 * math.log(count)).float()
         body = replace(body, vertices=body.vertices * stretch + place, camera=camera)
         subjects.append(papered(body, wrap, smooth) if number % 2 == 0 else body)
-    return joined(subjects)
+    return join_scenes(subjects)
 
 
 def soup(camera: Camera, count: int, length: float, width: float, away: tuple[float, float]) -> Scene:

@@ -12,7 +12,7 @@ from framework.distributions.batch_shapes import Reshaped, Stacked
 from framework.distributions.circular import circular, wrap
 from framework.distributions.density import Mixture
 from framework.distributions.normals import IndependentNormals, JointNormal
-from framework.distributions.protocol import estimate, marginal, median, tempered
+from framework.distributions.protocol import estimate, marginal, median, tempered_density
 from framework.distributions.tempering import CircularPower, temper
 from framework.errors import UserError
 from framework.target import Target
@@ -190,7 +190,7 @@ def test_a_sampled_mixture_stays_an_estimate():
     mixture = latent.mixture  # asked for before: the tempered one has its own
     warm = temper(latent, hot(2.0))
     assert warm.mixture is not mixture and warm.points is latent.points
-    wanted = tempered(mixture, hot(2.0)).log_prob(warm.mode)
+    wanted = tempered_density(mixture, hot(2.0)).log_prob(warm.mode)
     torch.testing.assert_close(warm.mixture.log_prob(warm.mode), wanted)
 
 

@@ -3,7 +3,7 @@
 from torch import Tensor
 
 from framework.configuration.schema import build, resolve
-from framework.geometry.clouds import normalised
+from framework.geometry.clouds import normalise_clouds
 
 
 def shapes(points: int, models: int, classes: list[str] | None = None) -> tuple[Tensor, bool]:
@@ -19,4 +19,4 @@ def shapes(points: int, models: int, classes: list[str] | None = None) -> tuple[
     data.prepare()
     test = data.splits().test
     clouds = test.__getitems__(range(len(test)))["input"]
-    return normalised(clouds, "unit_ball").clouds, data.synthetic
+    return normalise_clouds(clouds, "unit_ball").clouds, data.synthetic

@@ -28,7 +28,7 @@ from framework.density_head import DensityHead
 from framework.distributions.protocol import estimate
 from framework.evaluation.pareto import front
 from framework.evaluation.tradeoff import run_times
-from framework.figures.style import BLUE, GREEN, RED, saved, titled_figure
+from framework.figures.style import BLUE, GREEN, RED, save_figure, titled_figure
 from framework.reports import table
 from framework.target import Target
 from plugins.density_head.latent.cvae import CVAEHead
@@ -300,7 +300,7 @@ def picture(rows: list[dict[str, object]]) -> None:
         handles=handles, loc="outside lower center", ncols=2, fontsize=9, frameon=False, title=said
     )
     legend.get_title().set(fontsize=9)
-    saved(figure, HERE.with_suffix(""), True)
+    save_figure(figure, HERE.with_suffix(""), True)
 
 
 def curves(

@@ -20,7 +20,7 @@ from torch import Tensor
 from benchmarks.pages import machine, write_page
 from framework.configuration.schema import build, resolve
 from framework.figures.style import COLOURS, GREY, titled_figure
-from framework.geometry.light import eight_bit
+from framework.geometry.srgb import bytes_from_linear
 from framework.renderer import Renderer
 from plugins.data.bodies.descent import Descent
 from plugins.data.bodies.pose_error import place_errors
@@ -129,7 +129,7 @@ def picture(results: dict[str, list[dict[str, np.ndarray]]], number: int) -> Non
 
     def drawn(numbers: np.ndarray) -> np.ndarray:
         scene = source.figure.scene(torch.from_numpy(numbers).double(), camera)
-        return eight_bit(fine(scene)["color"][..., :3]).numpy()
+        return bytes_from_linear(fine(scene)["color"][..., :3]).numpy()
 
     figure = titled_figure((13, 8.5), "A body fitted to its image from 30° and 20 cm off", True)
     halves = figure.subfigures(2, 1, height_ratios=(1, 1.05))

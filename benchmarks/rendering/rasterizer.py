@@ -17,7 +17,7 @@ from benchmarks.rendering import rasterizer_growth, rasterizer_peers
 from benchmarks.timing import first_calls, milliseconds
 from framework.configuration.schema import build, resolve
 from framework.geometry.camera import look_from
-from framework.renderer import Renderer, Scene, joined
+from framework.renderer import Renderer, Scene, join_scenes
 
 HEIGHT, WIDTH = 410, 308
 FOCAL = 600  # pixels
@@ -118,7 +118,9 @@ def renderer(**config: Any) -> Renderer:
 def crowd(drawn: Scene) -> Scene:
     """Five bodies behind one another, the farthest first."""
     back = torch.tensor([0.0, 0.0, 1.0]) @ drawn.camera.rotation
-    return joined([replace(drawn, vertices=drawn.vertices + 0.5 * step * back) for step in (4, 3, 2, 1, 0)])
+    return join_scenes(
+        [replace(drawn, vertices=drawn.vertices + 0.5 * step * back) for step in (4, 3, 2, 1, 0)]
+    )
 
 
 def savings(drawn: Scene) -> list[str]:

@@ -18,7 +18,7 @@ import numpy as np
 
 from benchmarks.pages import read_rows
 from framework.configuration.schema import build, resolve
-from framework.figures.style import COLOURS, MARKERS, saved, titled_figure
+from framework.figures.style import COLOURS, MARKERS, save_figure, titled_figure
 from framework.geometry.camera import look_from
 from framework.renderer import Scene
 from framework.reports.table import Row, csv
@@ -94,7 +94,7 @@ def drawn(rows: Sequence[Row], picture: Path) -> None:
         axes.spines[["top", "right"]].set_visible(False)
     panels[0].set_ylabel("median processor time (ms, one core)")
     panels[0].legend(frameon=False, fontsize=9)
-    saved(figure, picture.with_suffix(""), True)
+    save_figure(figure, picture.with_suffix(""), True)
 
 
 if __name__ == "__main__":

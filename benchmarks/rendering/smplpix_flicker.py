@@ -28,7 +28,7 @@ from benchmarks.pages import machine, write_page
 from framework.configuration.loading import find_checkpoint, stored
 from framework.configuration.schema import build, resolve
 from framework.figures.style import titled_figure
-from framework.geometry.light import eight_bit, encoded
+from framework.geometry.srgb import bytes_from_linear, srgb_from_linear
 from framework.renderer import Renderer, Scene
 from plugins.data.bodies import flow
 from plugins.data.bodies.animate import SPEED, data_of, generated, moving
@@ -122,7 +122,9 @@ def rates(run: str, scene: Scene) -> list[str]:
     """Milliseconds of processor time an image in plain loops of one thread, beside what the run measured of itself."""
     results = json.loads((find_checkpoint(run).parent.parent / "results.json").read_text())
     assert scene.colors is not None
-    points = torch.cat([scene.camera.canonical(scene.vertices), encoded(scene.colors)], 1).numpy()[None]
+    points = torch.cat(
+        [scene.camera.to_canonical(scene.vertices), srgb_from_linear(scene.colors)], 1
+    ).numpy()[None]
     loaded, frozen = framework.load(run), framework.freeze(run)
     drawn = rendered("smplpix", checkpoint=run)
 
@@ -131,7 +133,7 @@ def rates(run: str, scene: Scene) -> list[str]:
         return loaded(points).mean
 
     # on one frozen sample the mean of the image is what the renderer paints, but as files hold it
-    apart = np.abs(eight_bit(drawn(scene)["color"]).numpy() - (frozen(points)[0] * 255).round()).max()
+    apart = np.abs(bytes_from_linear(drawn(scene)["color"]).numpy() - (frozen(points)[0] * 255).round()).max()
     calls: dict[str, Callable[[], object]] = {
         "`framework.freeze(run)(points)`": lambda: frozen(points),
         "`framework.load(run)(points)`": predicted,

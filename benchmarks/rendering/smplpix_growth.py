@@ -20,7 +20,7 @@ from benchmarks.pages import machine, read_rows, write_page
 from benchmarks.rendering.rasterizer_growth import milliseconds, slope
 from framework.configuration.schema import build, resolve
 from framework.encoder import Encoder
-from framework.figures.style import COLOURS, MARKERS, saved, titled_figure
+from framework.figures.style import COLOURS, MARKERS, save_figure, titled_figure
 from framework.reports.table import Row, csv
 from plugins.data.bodies.human_scans import in_front
 from plugins.data.bodies.people import chosen_body
@@ -39,7 +39,7 @@ def person(name: Name) -> Tensor:
     rows = topology(body, whole, name).rows
     vertices = torch.from_numpy(whole.carried(body.template.astype(np.float64))[rows]).float()
     low, high = vertices.min(0).values, vertices.max(0).values
-    return torch.cat([in_front(vertices, *SIZE).canonical(vertices), (vertices - low) / (high - low)], 1)[
+    return torch.cat([in_front(vertices, *SIZE).to_canonical(vertices), (vertices - low) / (high - low)], 1)[
         None
     ]
 
@@ -142,7 +142,7 @@ def drawn(rows: Sequence[Row], picture: Path) -> None:
     axes.grid(alpha=0.3)
     axes.spines[["top", "right"]].set_visible(False)
     figure.legend(loc="outside right center", frameon=False, fontsize=9)
-    saved(figure, picture.with_suffix(""), True)
+    save_figure(figure, picture.with_suffix(""), True)
 
 
 if __name__ == "__main__":

@@ -70,7 +70,7 @@ def body() -> Tensor:
     vertices = torch.tensor(figure()[0])
     camera = look_from(*FRONT, DISTANCE, 2 * math.atan(410 / 2 / 600), SIZES[0])
     low, high = vertices.min(0).values, vertices.max(0).values
-    return torch.cat([camera.canonical(vertices), (vertices - low) / (high - low)], 1).float()[None]
+    return torch.cat([camera.to_canonical(vertices), (vertices - low) / (high - low)], 1).float()[None]
 
 
 def encoder(name: str, shape: tuple[int, ...], **config: Any) -> Encoder:

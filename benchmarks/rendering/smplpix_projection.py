@@ -32,7 +32,7 @@ def points(rings: int, segments: int) -> Tensor:
     vertices = torch.tensor(figure(rings, segments)[0])
     camera = look_from(0.4, 0.15, 0.05, DISTANCE, 2 * math.atan(HEIGHT / 2 / FOCAL), (HEIGHT, WIDTH))
     low, high = vertices.min(0).values, vertices.max(0).values
-    return torch.cat([camera.canonical(vertices), (vertices - low) / (high - low)], 1).float()
+    return torch.cat([camera.to_canonical(vertices), (vertices - low) / (high - low)], 1).float()
 
 
 def made(levels: int = 1, splat: int = 0) -> Projection:

@@ -25,7 +25,7 @@ from benchmarks.timing import ROUNDS, require_idle
 from framework.configuration.loading import load_with_description
 from framework.data import Batch
 from framework.distributions.protocol import marginal
-from framework.figures.style import BLUE, GREEN, GREY, RED, saved, titled_figure
+from framework.figures.style import BLUE, GREEN, GREY, RED, save_figure, titled_figure
 from framework.model import Predictor
 from framework.reports.table import Row, csv, markdown
 from framework.spectra.fit import fit
@@ -174,7 +174,7 @@ def drawn(rows: Sequence[Row]) -> None:
     axis.grid(alpha=0.3)
     axis.spines[["top", "right"]].set_visible(False)
     figure.legend(loc="outside lower center", ncols=2, fontsize=9, frameon=False)
-    saved(figure, HERE, True)
+    save_figure(figure, HERE, True)
 
 
 def mapped(network: Predictor, data: CEST, file: Path) -> None:
@@ -192,7 +192,7 @@ def mapped(network: Predictor, data: CEST, file: Path) -> None:
         point, deviation = (torch.cat(part).double().numpy() for part in zip(*parts, strict=True))
         methods[name] = slice_of(maps_of(volume, names, point, deviation), volume)
     figure = maps_figure(methods, f"{file.name}: amplitudes of the lines")
-    path = saved(figure, HERE.with_name("cest_maps"), True)
+    path = save_figure(figure, HERE.with_name("cest_maps"), True)
     Image.open(path).convert("RGB").quantize(256).save(path, optimize=True)  # a third of the bytes
 
 

@@ -13,7 +13,7 @@ BATCH_NORM = (
 
 
 @contextmanager
-def flagged(
+def set_flag(
     model: nn.Module, kinds: type[nn.Module] | tuple[type[nn.Module], ...], flag: str, value: bool
 ) -> Iterator[None]:
     """Set `flag`, for example "training", to `value` on the model's modules of these kinds while the block runs.

@@ -12,7 +12,7 @@ from framework.errors import UserError
 from framework.model import Predictor
 
 
-def repeatable(batches: Iterable[Batch], by: str) -> list[Batch]:
+def nonempty_batches(batches: Iterable[Batch], by: str) -> list[Batch]:
     """Return batches that can be read repeatedly, both by the wrapped predictor and by the wrapper.
 
     Args:
@@ -32,7 +32,7 @@ def repeatable(batches: Iterable[Batch], by: str) -> list[Batch]:
 
 
 @torch.no_grad()
-def densities(model: Predictor, batches: Sequence[Batch]) -> list[Distribution]:
+def predict_densities(model: Predictor, batches: Sequence[Batch]) -> list[Distribution]:
     """Return the density of each batch, in evaluation mode and without a graph to the weights."""
     training = model.training
     try:

@@ -11,7 +11,7 @@ from framework.configuration.schema import build, parts, resolve
 from framework.data import Data
 from framework.density_head import DensityHead, Fitted
 from framework.encoder import Encoder
-from framework.errors import ConfigError, quoted
+from framework.errors import ConfigError, quote
 from framework.model import FrozenFrontEnd, Model, Predictor
 from framework.objective import Objective
 from framework.target import Target
@@ -47,7 +47,7 @@ def resolve_all(config: Mapping[str, Any]) -> Resolved:
         chosen = config.get(group) or {}
         if not isinstance(chosen, Mapping):
             raise ConfigError(
-                f"{group} = {quoted(chosen)}: wanted a mapping, a name of your own for each {group}."
+                f"{group} = {quote(chosen)}: wanted a mapping, a name of your own for each {group}."
             )
         resolved[group] = [resolve(group, part, f"{group}.{key}") for key, part in chosen.items()]
     outliers = config.get("outliers")

@@ -15,7 +15,7 @@ from framework.configuration.composition import folder, groups, in_quotes, optio
 from framework.configuration.foreign_configs import require_harmless
 from framework.configuration.newest import LAST, newest_run
 from framework.configuration.stored_keys import as_stored
-from framework.errors import ConfigError, did_you_mean, nearest, printable
+from framework.errors import ConfigError, did_you_mean, escape_unprintable, nearest_name
 from framework.tracking.stores import require_no_password
 
 
@@ -42,7 +42,7 @@ def _newest_checkpoint(arguments: list[str]) -> list[str]:
     if f"checkpoint={LAST}" not in arguments or Path(LAST).exists():
         return arguments
     run = newest_run(Path("outputs"))
-    sys.stderr.write(f"checkpoint={LAST} is {printable(str(run), kept='')}\n")
+    sys.stderr.write(f"checkpoint={LAST} is {escape_unprintable(str(run), kept='')}\n")
     return [
         f"checkpoint={in_quotes(str(run))}" if argument == f"checkpoint={LAST}" else argument
         for argument in arguments
@@ -99,7 +99,7 @@ def _setting_like(key: str) -> str:
     }
     if key in groups() or "." in key:
         return key
-    near = key if key in known else nearest(key, known)
+    near = key if key in known else nearest_name(key, known)
     return known[near] if near else key
 
 

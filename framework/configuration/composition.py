@@ -19,7 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from framework.configuration.registry import config_folders
-from framework.errors import ConfigError, did_you_mean, listed, nearest, shown
+from framework.errors import ConfigError, did_you_mean, list_names, nearest_name, shorten
 
 PLURAL = ("encoder", "uncertainty", "objective", "metric")
 """Groups of which an experiment may choose several plugins; their configs are keyed by name."""
@@ -154,7 +154,7 @@ def sentence(error: BaseException) -> str | None:
         wanted = error.missing_cfg_file or ""
         group, _, name = wanted.partition("/")
         known = [str(option) for option in error.options or ()] or options(group)
-        available = f" Available in {group}: {listed(name, known)}." if known else ""
+        available = f" Available in {group}: {list_names(name, known)}." if known else ""
         return f"No configuration {wanted!r}.{did_you_mean(name, known)}{available}"
     if isinstance(error, ValueError) and "Config group override must be" in str(error):
         return (
@@ -197,11 +197,11 @@ def _damaged(error: BaseException) -> str | None:
         mark = cause.problem_mark
         during = f" {cause.context}," if cause.context else ""
         return (
-            f"{mark.name}, line {mark.line + 1}, column {mark.column + 1}:{during} {shown(cause.problem)}. "
+            f"{mark.name}, line {mark.line + 1}, column {mark.column + 1}:{during} {shorten(cause.problem)}. "
             "This cannot be read as YAML; mend it there."
         )
     if cause is not None:
-        return f"{shown(cause)}. This cannot be read as YAML; mend it there."
+        return f"{shorten(cause)}. This cannot be read as YAML; mend it there."
     if isinstance(error, UnicodeDecodeError) and _being_composed(error):
         byte = error.object[error.start]
         return (
@@ -248,12 +248,12 @@ def _unknown(cause: OmegaConfBaseException) -> str:
         path.rpartition(".")[2]: path for path in _paths(OmegaConf.to_container(root, resolve=False))
     }
     beside = [*known, *groups()] if cause.parent_node is root else known
-    near = key if key in elsewhere else nearest(key, beside) or nearest(key, elsewhere, 0.7)
+    near = key if key in elsewhere else nearest_name(key, beside) or nearest_name(key, elsewhere, 0.7)
     if cause.parent_node is root and key in beside:
         return f"No {key} is chosen, so {cause.full_key}... sets nothing. Choose one: {key}=<name>, or {key}=[<name>]."
     hint = f" Did you mean {(near if near in beside else elsewhere[near])!r}?" if near else ""
     return (
-        f"{cause.full_key}: unknown key.{hint} Known keys: {listed(key, known) or 'none'}. "
+        f"{cause.full_key}: unknown key.{hint} Known keys: {list_names(key, known) or 'none'}. "
         f"(+{cause.full_key}=... adds one the plugin knows but its yaml does not show.)"
     )
 

@@ -12,7 +12,7 @@ from framework.configuration.registry import MODEL
 from framework.configuration.schema import check, resolve
 from framework.configuration.settings import Settings
 from framework.data import Data
-from framework.errors import CheckpointError, quoted, shown
+from framework.errors import CheckpointError, quote, shorten
 from framework.storage.limits import LONGEST_NAME, MOST_DRAWN, MOST_DRAWS, MOST_INPUT, MOST_NAMES, MOST_SIDES
 from framework.target import Kind, Target
 
@@ -127,7 +127,9 @@ class Description:
             dict(stored.get("data_state", {})),
             path,
             dropped,
-            tuple(shown(remark, LONGEST_REMARK) for remark in list(stored.get("remarks", ()))[:MOST_REMARKS]),
+            tuple(
+                shorten(remark, LONGEST_REMARK) for remark in list(stored.get("remarks", ()))[:MOST_REMARKS]
+            ),
         )
 
 
@@ -140,7 +142,7 @@ def stored_shape(stored: Sequence[Any]) -> tuple[int, ...]:
     shape = tuple(map(int, stored[: MOST_SIDES + 1]))
     if len(shape) > MOST_SIDES or min(shape, default=0) < 0 or math.prod(shape) > MOST_INPUT:
         raise ValueError(
-            f"inputs of shape {quoted(list(shape))}; at most {MOST_SIDES} sides, and {MOST_INPUT} numbers in all"
+            f"inputs of shape {quote(list(shape))}; at most {MOST_SIDES} sides, and {MOST_INPUT} numbers in all"
         )
     return shape
 
@@ -187,12 +189,12 @@ def stored_target(stored: Mapping[str, Any]) -> Target:
     sizes = {len(location), len(scale)}
     size = tuple(map(int, stored.get("size", ())))
     if kind not in get_args(Kind):
-        raise ValueError(f"a target of kind {quoted(kind)} with the names {quoted(names)}")
+        raise ValueError(f"a target of kind {quote(kind)} with the names {quote(names)}")
     if len(size) != 2 * (kind == "image") or min(size, default=1) < 1:
-        raise ValueError(f"a target of kind {kind!r} and of size {quoted(size)}")
+        raise ValueError(f"a target of kind {kind!r} and of size {quote(size)}")
     if math.prod(size) * len(names) > MOST_INPUT:
         raise ValueError(
-            f"a target of size {quoted(size)} and {len(names)} numbers; at most {MOST_INPUT} in all"
+            f"a target of size {quote(size)} and {len(names)} numbers; at most {MOST_INPUT} in all"
         )
     if (
         sizes not in ({0}, {len(names)})

@@ -8,7 +8,7 @@ import yaml
 from hydra._internal.utils import get_args_parser
 
 from framework.configuration.schema import forbid_targets
-from framework.errors import ConfigError, quoted, shown
+from framework.errors import ConfigError, quote, shorten
 from framework.storage.enclosed import require_enclosed
 from framework.storage.plain_values import read_yaml
 
@@ -44,7 +44,7 @@ def require_harmless(arguments: Sequence[str], groups: Collection[str]) -> None:
         files = [path for path in files if _group(path, folder) in (*groups, *OWN, *[""] * primary)]
         if len(files) > MOST:
             raise ConfigError(
-                f"{shown(folder)} holds {len(files)} configs; wanted {MOST} at most. Give another."
+                f"{shorten(folder)} holds {len(files)} configs; wanted {MOST} at most. Give another."
             )
         for file in files:
             _require_harmless(file, folder, groups)
@@ -74,22 +74,22 @@ def _require_harmless(file: Path, folder: Path, groups: Collection[str]) -> None
     for key, harmless in HARMLESS.items():
         value = content.get(key)
         if value is not None and not (isinstance(value, dict) and set(value) <= set(harmless)):
-            raise _refused(file, f"sets {key}: {quoted(value)}")
+            raise _refused(file, f"sets {key}: {quote(value)}")
     try:
         forbid_targets(content)
     except ConfigError as error:
-        raise ConfigError(f"{shown(file)}: {error}") from error
+        raise ConfigError(f"{shorten(file)}: {error}") from error
     defaults = content.get("defaults") or []
     for entry in defaults if isinstance(defaults, list) else [defaults]:
         for text, name in entry.items() if isinstance(entry, dict) else [(str(entry), "")]:
             group, _, package = str(text).removeprefix("override ").partition("@")
             absolute = group.startswith("/") or not _group(file, folder)
             if _is_own(group.lstrip("/"), package) or ".." in f"{group}{name}":
-                raise _refused(file, f"chooses {quoted(entry)}")
+                raise _refused(file, f"chooses {quote(entry)}")
             first = group.lstrip("/").split("/")[0]
             # other files in the folder, which a sweep may have left, were not checked; Hydra reports missing ones
             if absolute and first not in (*groups, "", "_self_") and _holds(folder, first):
-                raise _refused(file, f"chooses {quoted(entry)}")
+                raise _refused(file, f"chooses {quote(entry)}")
 
 
 def _is_own(group: str, package: str) -> bool:
@@ -105,6 +105,6 @@ def _holds(folder: Path, name: str) -> bool:
 
 def _refused(file: Path, what: str) -> ConfigError:
     return ConfigError(
-        f"{shown(file)} {what}. A config folder may be a stranger's, so it says neither what is run nor where results "
+        f"{shorten(file)} {what}. A config folder may be a stranger's, so it says neither what is run nor where results "
         "go. Take that out, and say it on the command line."
     )

@@ -19,8 +19,8 @@ from framework.configuration.paths import require_said
 from framework.configuration.schema import resolve
 from framework.data import Batch, Data, Frame
 from framework.density_head import Fitted
-from framework.distributions.moved import Moved
-from framework.errors import CheckpointError, ConfigError, DataError, UserError, shown
+from framework.distributions.affine import AffineDensity
+from framework.errors import CheckpointError, ConfigError, DataError, UserError, shorten
 from framework.model import FrozenFrontEnd, Predictor
 from framework.storage import budget
 from framework.storage.checkpoints import latest_good, read
@@ -89,7 +89,7 @@ class User:
     def hears(self, model: nn.Module, inputs: tuple[Tensor], density: Distribution) -> Distribution:
         """Return the density in the frame of its inputs, with the names of the target."""
         frame: Frame | None = self.frames.pop(inputs[0])
-        answer = density if frame is None else Moved(density, *(part.to(inputs[0]) for part in frame))
+        answer = density if frame is None else AffineDensity(density, *(part.to(inputs[0]) for part in frame))
         with suppress(AttributeError):  # a density may have an attribute `names` that cannot be set
             answer.names = self.data.target.names  # type: ignore[attr-defined]
         return answer
@@ -116,7 +116,7 @@ def asked_of(model: nn.Module, data: Data, given: Any) -> Batch:
     except Exception as error:
         # for example for a date or a tensor with a gradient
         raise DataError(
-            f"{type(given).__name__} cannot be read as inputs ({shown(error)}). Give files, an array of numbers, or "
+            f"{type(given).__name__} cannot be read as inputs ({shorten(error)}). Give files, an array of numbers, or "
             "what else the data set of this model takes."
         ) from error
     inputs = batch["input"]

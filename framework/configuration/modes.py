@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from framework.configuration.registry import GROUPS, MODEL
-from framework.errors import ConfigError, shown
+from framework.errors import ConfigError, shorten
 
 EVERYWHERE = ("mode", "seed", "threads", "logger", "hydra")
 """Keys that every command accepts, because scripts pass them to all their commands."""
@@ -133,7 +133,7 @@ def require_read(mode: str, overrides: Sequence[str]) -> None:
         read = MODES[mode].stored if key != name else (*MODES[mode].reads, *EVERYWHERE)
         if not is_below(name, read):
             root = name.partition(".")[0]
-            root = shown(name if any(one.startswith(f"{root}.") for one in read) else root)
+            root = shorten(name if any(one.startswith(f"{root}.") for one in read) else root)
             raise ConfigError(
                 f"{_written(override)}: mode={mode} reads no {root}{_readers(name)}. Leave it out."
             )
@@ -170,7 +170,7 @@ def is_below(key: str, roots: Sequence[str]) -> bool:
 
 def _written(override: str) -> str:
     """Return an override as the user wrote it, without the prefix `stored` that the framework adds."""
-    return shown(override.removeprefix("+stored."))
+    return shorten(override.removeprefix("+stored."))
 
 
 def _readers(key: str) -> str:

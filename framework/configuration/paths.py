@@ -20,7 +20,7 @@ from pydantic import BaseModel
 
 from framework.configuration.registry import GROUPS, MODEL, load
 from framework.configuration.signature import parts, signature
-from framework.errors import ConfigError, did_you_mean, printable, quoted, shown
+from framework.errors import ConfigError, did_you_mean, escape_unprintable, quote, shorten
 from framework.storage.path_marks import FilePath as FilePath
 from framework.storage.path_marks import Mark
 from framework.storage.path_marks import Words as Words
@@ -107,7 +107,7 @@ def without_paths(
                 and not _marked(part.annotation(name))
             ):
                 raise ConfigError(
-                    f"{shown(key)} = {quoted(said[key])} would change a trained model, of which only paths can be said "
+                    f"{shorten(key)} = {quote(said[key])} would change a trained model, of which only paths can be said "
                     "again. Leave it out."
                 )
             value = said[key]
@@ -116,9 +116,9 @@ def without_paths(
     for key in left:
         near = [f"{part.key}.{name}" for part in known for name in (*part.values, *part.paths())]
         raise ConfigError(
-            f"{shown(key)} = {quoted(left[key])}: the stored config has no such part."
+            f"{shorten(key)} = {quote(left[key])}: the stored config has no such part."
             f"{did_you_mean(key, [*near, *dropped])} "
-            f"It has: {', '.join(shown(part.key) for part in known)}."
+            f"It has: {', '.join(shorten(part.key) for part in known)}."
         )
     return found, dropped
 
@@ -159,10 +159,10 @@ def require_said(dropped: Mapping[str, Any], groups: Collection[str], source: st
     """
     needed = {key: value for key, value in dropped.items() if key.partition(".")[0] in groups}
     if needed:
-        named = ", ".join(f"{shown(key)} = {quoted(value)}" for key, value in needed.items())
-        example = ", ".join(f'"{shown(key)}": ...' for key in needed)
+        named = ", ".join(f"{shorten(key)} = {quote(value)}" for key, value in needed.items())
+        example = ", ".join(f'"{shorten(key)}": ...' for key in needed)
         raise ConfigError(
-            f"{shown(source)} names a path: {named}. A checkpoint may come from anybody, so a path in it is used only "
+            f"{shorten(source)} names a path: {named}. A checkpoint may come from anybody, so a path in it is used only "
             f"where you say it again, or another. Add to a command: {' '.join(words(needed))}; to one of a plugin the "
             f"same behind --path; to framework.load or freeze: paths={{{example}}}."
         )
@@ -181,14 +181,14 @@ def require_repeated(stored: Mapping[str, Any], said: Mapping[str, Any], folder:
     """
     for key, value in said.items():
         if key not in stored or not _equal(stored[key], value):
-            has = quoted(stored[key]) if key in stored else "none"
+            has = quote(stored[key]) if key in stored else "none"
             raise ConfigError(
-                f"resume={folder} goes on with that run's own config; {shown(key)} = {quoted(value)} would change it, "
+                f"resume={folder} goes on with that run's own config; {shorten(key)} = {quote(value)} would change it, "
                 f"which has {has}. Give the same, or start a new run."
             )
     missing = {key: value for key, value in stored.items() if key not in said}
     if missing:
-        named = ", ".join(f"{shown(key)} = {quoted(value)}" for key, value in missing.items())
+        named = ", ".join(f"{shorten(key)} = {quote(value)}" for key, value in missing.items())
         raise ConfigError(
             f"resume={folder}: its config names a path: {named}. A run folder may come from anybody, so a path in it "
             f"is used only where the command says it again. Add: {' '.join(words(missing))}"
@@ -197,7 +197,7 @@ def require_repeated(stored: Mapping[str, Any], said: Mapping[str, Any], folder:
 
 def words(paths: Mapping[str, Any]) -> list[str]:
     """Return the arguments that give these paths on a command line, as typed into a shell."""
-    return [shlex.quote(f"{shown(key)}={_typed(value)}") for key, value in paths.items()]
+    return [shlex.quote(f"{shorten(key)}={_typed(value)}") for key, value in paths.items()]
 
 
 def _typed(value: Any) -> str:
@@ -205,7 +205,7 @@ def _typed(value: Any) -> str:
         return "{" + ",".join(f"{_typed(key)}:{_typed(item)}" for key, item in value.items()) + "}"
     if isinstance(value, list | tuple | set):
         return "[" + ",".join(map(_typed, value)) + "]"
-    text = printable(str(value), kept="")
+    text = escape_unprintable(str(value), kept="")
     if isinstance(value, str) and not re.fullmatch(
         r"[A-Za-z0-9_.@-]*/[A-Za-z0-9_./@-]+", text
     ):  # quotes are needed so that it is not read as a number or null

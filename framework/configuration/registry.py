@@ -8,7 +8,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from framework.errors import ConfigError, did_you_mean, listed, quoted
+from framework.errors import ConfigError, did_you_mean, list_names, quote
 
 GROUPS = ("data", "encoder", "density_head", "uncertainty", "objective", "renderer", "metric")
 MODEL = ("encoder", "density_head", "uncertainty")
@@ -69,8 +69,8 @@ def find(group: str, name: str) -> Entry:
         raise ConfigError(refused(group)[name])
     if name not in names:
         raise ConfigError(
-            f"No {group} is called {quoted(name)}.{did_you_mean(name, [*names, *refused(group)])} "
-            f"Installed: {listed(name, names) or 'none'}. "
+            f"No {group} is called {quote(name)}.{did_you_mean(name, [*names, *refused(group)])} "
+            f"Installed: {list_names(name, names) or 'none'}. "
             "A name added to a pyproject.toml counts only after `pip install -e .`."
         )
     return names[name]

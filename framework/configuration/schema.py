@@ -31,7 +31,7 @@ from pydantic_core import to_jsonable_python
 
 from framework.configuration.registry import load
 from framework.configuration.signature import arguments, parts, positional, signature
-from framework.errors import ConfigError, did_you_mean, listed, quoted, shown
+from framework.errors import ConfigError, did_you_mean, list_names, quote, shorten
 from framework.storage.plain_values import is_number
 
 WRITTEN = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
@@ -49,7 +49,7 @@ def forbid_targets(config: Any, path: str = "") -> None:
             here = f"{path}.{key}" if path else str(key)
             if key == "_target_":
                 raise ConfigError(
-                    f"{shown(here)} = {quoted(value)}: `_target_` is refused, since a config must not be able "
+                    f"{shorten(here)} = {quote(value)}: `_target_` is refused, since a config must not be able "
                     "to run code. Write `name: <installed plugin>` instead (`mode=plugins` lists them)."
                 )
             forbid_targets(value, here)
@@ -74,7 +74,7 @@ def resolve(group: str, config: Any, path: str | None = None) -> dict[str, Any]:
         config = {"name": config}
     if not isinstance(config, Mapping):
         raise ConfigError(
-            f"{shown(path)} = {quoted(config)}: wanted the name of a {group}, or a mapping with `name` and "
+            f"{shorten(path)} = {quote(config)}: wanted the name of a {group}, or a mapping with `name` and "
             "its parameters."
         )
     forbid_targets(config, path)
@@ -82,7 +82,7 @@ def resolve(group: str, config: Any, path: str | None = None) -> dict[str, Any]:
     name = values.pop("name", None)
     if not isinstance(name, str):
         raise ConfigError(
-            f"{shown(path)}.name is missing: write the name of a {group} (`mode=plugins` lists them)."
+            f"{shorten(path)}.name is missing: write the name of a {group} (`mode=plugins` lists them)."
         )
     cls = load(group, name)
     checked = _stored(cls, values, path)
@@ -133,9 +133,9 @@ def build(group: str, config: Mapping[str, Any], **context: Any) -> Any:
     try:
         return cls(*given, **arguments(cls, values))
     except ValueError as error:
-        said = " ".join(f"{key}={shown(value)}" for key, value in config.items() if key != "name")
+        said = " ".join(f"{key}={shorten(value)}" for key, value in config.items() if key != "name")
         raise ConfigError(
-            f"{group} {config['name']} does not take {said or 'what it was given'}: {shown(error)} (ValueError at "
+            f"{group} {config['name']} does not take {said or 'what it was given'}: {shorten(error)} (ValueError at "
             f"{_place(error, cls)})."
         ) from error
 
@@ -176,7 +176,7 @@ def _require_numbers(given: Any, read: Any, where: str) -> None:
         for number, (one, other) in enumerate(zip(given, read, strict=True)):
             _require_numbers(one, other, f"{where}[{number}]")
     elif is_number(read) and not isinstance(read, Enum) and _no_number(given):
-        raise ConfigError(f"{shown(where)} = {quoted(given)}: wanted a number. Write one, such as {read}.")
+        raise ConfigError(f"{shorten(where)} = {quote(given)}: wanted a number. Write one, such as {read}.")
 
 
 def _no_number(given: Any) -> bool:
@@ -186,7 +186,7 @@ def _no_number(given: Any) -> bool:
 def _refusal(error: ValidationError, path: str, known: Sequence[str]) -> ConfigError:
     """Return an error that describes the first fault; `known` are the valid keys, for an unknown key."""
     fault = error.errors()[0]
-    where = shown(".".join(filter(None, [path, *(str(item) for item in fault["loc"])])))
+    where = shorten(".".join(filter(None, [path, *(str(item) for item in fault["loc"])])))
     # the second kind comes from a dataclass
     if fault["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
         left = path and fault["input"] is not None and "[" not in where
@@ -197,14 +197,14 @@ def _refusal(error: ValidationError, path: str, known: Sequence[str]) -> ConfigE
     if fault["type"] == "literal_error":
         hint = did_you_mean(str(fault["input"]), re.findall("'([^']*)'", fault.get("ctx", {})["expected"]))
     message = fault["msg"].removeprefix("Value error, ")
-    return ConfigError(f"{where} = {quoted(fault['input'])}: {message}.{hint}")
+    return ConfigError(f"{where} = {quote(fault['input'])}: {message}.{hint}")
 
 
 def _unknown(where: str, key: str, known: Sequence[str], left: bool) -> ConfigError:
     # the key may belong to another plugin that the experiment chose; Hydra cannot delete a key whose value is null
     advice = f" ~{where} leaves out what an experiment sets." if left else ""
     return ConfigError(
-        f"{where}: unknown key.{did_you_mean(key, known)} Known keys: {listed(key, known) or 'none'}.{advice}"
+        f"{where}: unknown key.{did_you_mean(key, known)} Known keys: {list_names(key, known) or 'none'}.{advice}"
     )
 
 
@@ -226,7 +226,7 @@ def _stored(cls: type, values: Mapping[str, Any], path: str) -> dict[str, Any]:
         # NaN does not equal itself, so its text is compared too
         if again[key] != value and repr(again[key]) != repr(value):
             raise ConfigError(
-                f"{shown(f'{path}.{key}')} = {quoted(value)} becomes {quoted(again[key])} when a checkpoint that "
+                f"{shorten(f'{path}.{key}')} = {quote(value)} becomes {quote(again[key])} when a checkpoint that "
                 f"keeps it is read: the annotation changes what it is given. Let {cls.__name__} compute that in its "
                 "constructor."
             )
@@ -254,11 +254,11 @@ def _validated(cls: type, values: Mapping[str, Any], path: str, *, nullable: boo
     models = _models(cls)
     for key in values:
         if key not in models:
-            where = shown(f"{path}.{key}")
+            where = shorten(f"{path}.{key}")
             raise _unknown(where, str(key), list(models), values[key] is not None and "[" not in where)
     for key, (annotation, _) in signature(cls).items():
         if key not in values:
-            raise ConfigError(f"{shown(f'{path}.{key}')} is missing: Field required. Give it a value.")
+            raise ConfigError(f"{shorten(f'{path}.{key}')} is missing: Field required. Give it a value.")
         value = values[key]
         if nullable and value is None:
             found[key] = None
@@ -292,7 +292,7 @@ def _kept(cls: type, values: Mapping[str, Any], path: str) -> dict[str, Any]:
             found[key] = _plain(value)
         except TypeError as error:
             raise ConfigError(
-                f"{shown(f'{path}.{key}')} = {quoted(value)}: {error}, which no checkpoint keeps. Annotate the "
+                f"{shorten(f'{path}.{key}')} = {quote(value)}: {error}, which no checkpoint keeps. Annotate the "
                 f"parameter of {cls.__name__} with numbers, text, paths, enums, or lists, mappings, dataclasses or "
                 "pydantic models of these, and make what it needs of them in its constructor."
             ) from None
@@ -314,8 +314,8 @@ def _models(cls: type) -> dict[str, type[BaseModel]]:
             found[key] = create_model(cls.__name__, __config__=config, value=(kind, Field(alias=key)))
         except Exception as error:  # pydantic raises a dozen kinds
             raise ConfigError(
-                f"{cls.__name__}: the annotation of `{key}`, {shown(annotation)}, cannot be checked: "
-                f"{shown(str(error))} Annotate it with a type: numbers, text, lists, dataclasses, ..."
+                f"{cls.__name__}: the annotation of `{key}`, {shorten(annotation)}, cannot be checked: "
+                f"{shorten(str(error))} Annotate it with a type: numbers, text, lists, dataclasses, ..."
             ) from error
     return found
 

@@ -10,7 +10,7 @@ from functools import cache
 from typing import Any
 
 from framework.configuration.registry import group_of
-from framework.errors import ConfigError, shown
+from framework.errors import ConfigError, shorten
 
 
 class Part(typing.NamedTuple):
@@ -39,7 +39,7 @@ def parts(cls: type) -> dict[str, Part]:
                 found[name] = Part(group, many)
         if name not in found and (group := next(_groups_within(annotation), None)):
             raise ConfigError(
-                f"{cls.__name__}: `{name}` holds plugins of the group {group} as {shown(annotation)}, which no config "
+                f"{cls.__name__}: `{name}` holds plugins of the group {group} as {shorten(annotation)}, which no config "
                 "can name. Annotate it with their base, or with a list or a tuple of that."
             )
     return found
@@ -132,8 +132,8 @@ def _annotation(cls: type, name: str) -> Any:
         return typing.get_type_hints(one, globalns=names, include_extras=True)[name]
     except Exception as error:
         raise ConfigError(
-            f"{cls.__name__}: the annotation of `{name}`, {shown(written)}, cannot be evaluated: "
-            f"{type(error).__name__}: {shown(error)}. A keyword-only parameter is a key of the config, its annotation "
+            f"{cls.__name__}: the annotation of `{name}`, {shorten(written)}, cannot be evaluated: "
+            f"{type(error).__name__}: {shorten(error)}. A keyword-only parameter is a key of the config, its annotation "
             "the key's type: import it where the program runs too, not under `if TYPE_CHECKING`, or mend its name."
         ) from error
 

@@ -22,7 +22,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from framework.errors import DataError, did_you_mean, quoted, shown
+from framework.errors import DataError, did_you_mean, quote, shorten
 from framework.storage import text
 from framework.storage.limits import MOST_TABLE_COLUMNS as MOST_COLUMNS
 from framework.storage.path_marks import Words
@@ -211,14 +211,14 @@ class Chosen(NamedTuple):
 
 def told(chosen: Chosen) -> tuple[str, ...]:
     """Return clauses about the columns left out and the odd ones, for the first lines of a run."""
-    left_out = [f"{quoted(name)} ({why})" for name, why in chosen.left_out.items()]
+    left_out = [f"{quote(name)} ({why})" for name, why in chosen.left_out.items()]
     many = (
         [*left_out[:MOST_TOLD], f"and {len(left_out) - MOST_TOLD} more"]
         if len(left_out) > MOST_TOLD
         else left_out
     )
     said = (f"left out: {', '.join(many)}",) if many else ()
-    return (*said, *(f"{quoted(name)} {why}" for name, why in chosen.odd.items()))
+    return (*said, *(f"{quote(name)} {why}" for name, why in chosen.odd.items()))
 
 
 @contextmanager
@@ -335,7 +335,7 @@ def _named(
             continue
         if any(cells) and not _distinct_whole(cells):
             raise DataError(
-                f"{file}: column {place} has no name, and holds {quoted(next(filter(None, cells)))}, which is no row "
+                f"{file}: column {place} has no name, and holds {quote(next(filter(None, cells)))}, which is no row "
                 "number. Name it in the first line, or take the column out."
             )
         left_out[f"column {place}, without a name"] = "row numbers" if any(cells) else "empty"
@@ -358,7 +358,7 @@ def require(columns: Columns, names: Sequence[str], asked: str) -> None:
         if name not in columns.cells:
             raise DataError(
                 f"{asked} names {name!r}, which {columns.file} does not have.{did_you_mean(name, columns.cells)} "
-                f"Its columns: {shown(', '.join(columns.cells))}."
+                f"Its columns: {shorten(', '.join(columns.cells))}."
             )
 
 
@@ -454,7 +454,7 @@ def _why_no_numbers(columns: Columns, name: str, asked: str) -> str:
         clear = (one for one in wrong if len(one[2].settings) == 1)  # 1,5 has one reading, 1,234 has two
         cell, line, mend = next(clear, wrong[0])
         raise DataError(
-            f"{columns.file} line {line}, column {quoted(name)}: {quoted(cell)} is a number {mend.what}. "
+            f"{columns.file} line {line}, column {quote(name)}: {quote(cell)} is a number {mend.what}. "
             f"{remedy(mend, columns.writing)} Or say with {asked} which columns to read, without this one."
         )
     return f"words; {plain / len(filled):.0%} of the cells are numbers" if plain else "words"
@@ -539,7 +539,7 @@ def numbers(
         value = BOOLEANS.get(cell.lower(), math.nan) if booleans else number(cell, how)
         if value is None or math.isinf(value) or (missing is not None and math.isnan(value)):
             raise DataError(
-                f"{columns.file} line {columns.lines[row]}, column {quoted(name)}: {quoted(cell)}; wanted a finite "
+                f"{columns.file} line {columns.lines[row]}, column {quote(name)}: {quote(cell)}; wanted a finite "
                 f"number. Mend the cell, or take the line out.{_hint(cell, value, columns, missing)}"
             )
         found[row] = value
@@ -568,8 +568,8 @@ def _check_units(columns: Columns, name: str) -> None:
         first = first or (unit, cell)
         if unit != first[0]:
             raise DataError(
-                f"{columns.file} line {line}, column {quoted(name)}: {quoted(cell)}, where the column began with "
-                f"{quoted(first[1])}; wanted one unit in all its cells, or none. Mend the column."
+                f"{columns.file} line {line}, column {quote(name)}: {quote(cell)}, where the column began with "
+                f"{quote(first[1])}; wanted one unit in all its cells, or none. Mend the column."
             )
 
 
@@ -594,7 +594,7 @@ def _check_header(file: Path, header: Sequence[str]) -> None:
         raise DataError(f"{file} is empty or begins with a blank line; wanted names of columns. Write them.")
     if all(name and text.value(name) is not None for name in header):
         raise DataError(
-            f"{file} line 1: {quoted(', '.join(header))} are numbers; wanted the names of the columns there. "
+            f"{file} line 1: {quote(', '.join(header))} are numbers; wanted the names of the columns there. "
             "Write them in a line before."
         )
     try:
@@ -611,6 +611,6 @@ def _check_blanks(file: Path, header: Sequence[str], columns: Sequence[Sequence[
     words = len(header[0].split())
     if len(header) == 1 and words > 1 and all(len(cell.split()) == words for cell in columns[0]):
         raise DataError(
-            f"{file} is separated by blanks: its first line reads {quoted(header[0])}; wanted commas, semicolons, tabs "
+            f"{file} is separated by blanks: its first line reads {quote(header[0])}; wanted commas, semicolons, tabs "
             "or bars. Set data.separator=space where there is that setting, or save it as such."
         )

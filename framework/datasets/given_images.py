@@ -10,7 +10,7 @@ from torch import Tensor
 
 from framework.data import Data
 from framework.datasets.images import plain, square
-from framework.errors import DataError, shown
+from framework.errors import DataError, shorten
 
 
 def inputs(data: Data, given: Any) -> Tensor:
@@ -58,7 +58,7 @@ def _whole(image: Image.Image, shape: tuple[int, ...]) -> UInt8[Tensor, "channel
     except DataError as error:
         raise DataError(f"an image of mode {image.mode}: {error}") from error
     except Exception as error:  # Pillow reads the file only at this point
-        why = shown(error) or type(error).__name__
+        why = shorten(error) or type(error).__name__
         raise DataError(
             f"an image of mode {image.mode} cannot be decoded ({why}). Restore its file."
         ) from error

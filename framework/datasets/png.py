@@ -6,12 +6,12 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
-from framework.geometry.light import eight_bit
+from framework.geometry.srgb import bytes_from_linear
 
 
 def png(light: Float[Tensor, "height width number"]) -> bytes:
     """Return an image in linear RGB as the content of an 8-bit PNG file, grey if it does not have three channels."""
-    numbers = eight_bit(light.cpu()).numpy()
+    numbers = bytes_from_linear(light.cpu()).numpy()
     content = BytesIO()
     Image.fromarray(numbers if numbers.shape[-1] == 3 else numbers[..., 0]).save(content, "PNG")
     return content.getvalue()

@@ -20,9 +20,9 @@ from torch.distributions import Distribution
 from framework.configuration.loading import load_with_description, reader
 from framework.data import Data, Frame
 from framework.deployment.frozen_network import Layer, Network, read, softmax
+from framework.distributions.affine import AffineDensity
 from framework.distributions.class_probabilities import class_probabilities
 from framework.distributions.description import CategoricalDensity
-from framework.distributions.moved import Moved
 from framework.distributions.protocol import median
 from framework.errors import ConfigError
 from framework.model import FrozenFrontEnd, Model, Predictor
@@ -121,7 +121,7 @@ class Frozen:
         """Return the density over the target, with batch_shape (batch,); inputs are the same as for a call."""
         features, network, frame = self._features(inputs)
         density = self._density(features, network)
-        return density if frame is None else Moved(density, *frame)
+        return density if frame is None else AffineDensity(density, *frame)
 
     def _features(self, inputs: Any) -> tuple[Any, Network | None, Frame | None]:
         """Return the features that the inner predictor reads, its network, and the frame of the predictions.

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from framework.errors import quoted, shown
+from framework.errors import quote, shorten
 
 MOST_BODY = 2**26
 """Largest size of the body of a request, bytes."""
@@ -49,11 +49,11 @@ def content_type(headers: Mapping[bytes, bytes]) -> str:
     said = headers.get(b"content-type", b"").decode("latin-1")
     kind, *parameters = (part.strip() for part in said.split(";"))
     if kind.lower() not in ("application/json", "text/csv"):
-        raise Refused(415, f"Content-Type: {quoted(said)} came; wanted application/json or text/csv.")
+        raise Refused(415, f"Content-Type: {quote(said)} came; wanted application/json or text/csv.")
     for parameter in filter(None, parameters):
         name, _, value = parameter.partition("=")
         if name.strip().lower() != "charset" or value.strip(" \"'").lower() not in ("utf-8", "utf8"):
-            raise Refused(415, f"Content-Type: {quoted(said)} came; wanted {kind.lower()}; charset=utf-8.")
+            raise Refused(415, f"Content-Type: {quote(said)} came; wanted {kind.lower()}; charset=utf-8.")
     if headers.get(b"content-encoding", b"identity") != b"identity":
         raise Refused(415, "A compressed body came; wanted one without Content-Encoding.")
     return kind.lower()
@@ -78,7 +78,7 @@ def require_bounded(body: bytes, kind: str) -> None:
     try:
         found = json.loads(text, object_pairs_hook=_unique, parse_constant=_no_constant)
     except (ValueError, RecursionError) as error:  # JSONDecodeError, or an integer of too many digits
-        raise Refused(400, f"The body cannot be read as JSON ({shown(error)}). Mend it.") from None
+        raise Refused(400, f"The body cannot be read as JSON ({shorten(error)}). Mend it.") from None
     _require_form(found)
 
 
@@ -122,16 +122,14 @@ def _require_table(text: str) -> None:
 
 def _require_form(found: object) -> None:
     if not isinstance(found, dict) or len(set(FORMS) & set(found)) != 1:
-        came = (
-            f"a dictionary with the keys {quoted(list(found))}" if isinstance(found, dict) else _name(found)
-        )
+        came = f"a dictionary with the keys {quote(list(found))}" if isinstance(found, dict) else _name(found)
         raise Refused(400, f"{_capital(came)} came; wanted {wanted_of('application/json')}.")
     form = next(name for name in FORMS if name in found)
     for key, value in found.items():
         if key == "params" and value:
             raise Refused(400, "The model has no parameters. Leave 'params' out.")
         if key not in (form, "params"):
-            raise Refused(400, f"Beside {form!r} a key {quoted(key)} came, which is not read. Leave it out.")
+            raise Refused(400, f"Beside {form!r} a key {quote(key)} came, which is not read. Leave it out.")
     given = found[form]
     if form == "dataframe_split":
         _require_split(given)
@@ -151,9 +149,9 @@ def _require_split(given: object) -> None:
         raise Refused(400, f"'dataframe_split' is {_name(given)}; {wanted}.")
     columns, rows, index = given.get("columns"), given.get("data"), given.get("index")
     if not set(given) <= {"columns", "data", "index"} or not isinstance(columns, list):
-        raise Refused(400, f"'dataframe_split' has the keys {quoted(list(given))}; {wanted}.")
+        raise Refused(400, f"'dataframe_split' has the keys {quote(list(given))}; {wanted}.")
     if not all(isinstance(name, str) for name in columns) or len(set(columns)) < len(columns):
-        raise Refused(400, f"'columns' is {quoted(columns)}; wanted names, each once.")
+        raise Refused(400, f"'columns' is {quote(columns)}; wanted names, each once.")
     if not isinstance(rows, list) or not rows:
         raise Refused(400, f"'data' is {_name(rows)}; wanted a row at least.")
     if len(rows) > MOST_ROWS:
@@ -174,7 +172,7 @@ def _require_records(given: object, form: str) -> None:
         raise Refused(413, _too_many(f"{len(given)} rows"))
     for number, row in enumerate(given):
         if not isinstance(row, dict) or (number and row.keys() != given[0].keys()):
-            came = f"has the keys {quoted(list(row))}" if isinstance(row, dict) else f"is {_name(row)}"
+            came = f"has the keys {quote(list(row))}" if isinstance(row, dict) else f"is {_name(row)}"
             raise Refused(
                 400, f"row {number} {came}; wanted {{column: value}}, with the same columns in each row."
             )
@@ -185,7 +183,7 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     if len(found) < len(pairs):
         seen: set[str] = set()
         twice = next(key for key, _ in pairs if key in seen or seen.add(key))  # type: ignore[func-returns-value]
-        raise ValueError(f"the key {quoted(twice)} comes twice in one dictionary")
+        raise ValueError(f"the key {quote(twice)} comes twice in one dictionary")
     return found
 
 

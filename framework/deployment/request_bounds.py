@@ -26,7 +26,7 @@ from framework.deployment.request_bodies import (
     too_large,
     wanted_of,
 )
-from framework.errors import DataError, printable, shown
+from framework.errors import DataError, escape_unprintable, shorten
 
 INVOCATIONS = "/invocations"
 MOST_PASSED_OVER = 2**28
@@ -269,7 +269,7 @@ def _sentence(content: bytes, kind: str) -> str:
         said = str(json.loads(content)["message"])
     except (ValueError, KeyError, TypeError):
         said = ""
-    said = shown(re.split(r"\bError: ", said)[-1], 300)
+    said = shorten(re.split(r"\bError: ", said)[-1], 300)
     return f"The request cannot be read{f' ({said})' if said else ''}; wanted {wanted_of(kind)}."
 
 
@@ -308,7 +308,8 @@ async def _send(
     """
     headers = [(b"content-type", media), (b"content-length", str(len(content)).encode())]
     headers += [
-        (REMARK, printable(remark, kept="").encode("ascii", "backslashreplace")) for remark in remarks
+        (REMARK, escape_unprintable(remark, kept="").encode("ascii", "backslashreplace"))
+        for remark in remarks
     ]
     headers += [(b"connection", b"close")] * close
     await send({"type": "http.response.start", "status": status, "headers": headers})

@@ -27,7 +27,7 @@ from framework.datasets.png import png
 from framework.deployment.request_bodies import MOST_CONTENT, MOST_FILES, MOST_INPUTS, MOST_ROWS
 from framework.deployment.request_bounds import TICKET, bound_server
 from framework.distributions.noise import Draw
-from framework.errors import DataError, UserError, quoted, shown
+from framework.errors import DataError, UserError, quote, shorten
 from framework.evaluation.promises import promised
 from framework.evaluation.splits import BLOCK, predicted
 from framework.model import Predictor
@@ -58,7 +58,7 @@ class Served:
             return self.answer(given)
         except UserError as error:
             # The client must not see the path of the checkpoint on the server.
-            sentence = shown(str(error).replace(self.description.path, "the served model"), 1000)
+            sentence = shorten(str(error).replace(self.description.path, "the served model"), 1000)
             reason: Exception = error
         except Exception as error:
             if ticket is None:
@@ -123,7 +123,7 @@ class Served:
             try:
                 self.answer(sample)
             except Exception as error:  # this data set does not take the sample
-                _log.debug("A made-up sample was refused: %s", shown(error))
+                _log.debug("A made-up sample was refused: %s", shorten(error))
 
     def made_up(self) -> Iterator[Any]:
         """Yield samples as a request may hold them: rows, or files of each kind that the data set reads."""
@@ -268,7 +268,7 @@ def _of_rows(said: str, folder: Path, names: Sequence[str]) -> str:
         if not number or int(number) >= len(names):
             return "the request"
         name = re.split(r"[/\\]", names[int(number)])[-1]
-        return f"row {number}" + (f" ({quoted(name)})" if name else "")
+        return f"row {number}" + (f" ({quote(name)})" if name else "")
 
     said = re.sub(rf"{re.escape(str(folder))}(?:/(\d+)(?:/[\w.…-]*[\w…-])?)?", row, said)
     # A message may have been shortened within a path.

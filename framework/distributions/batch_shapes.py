@@ -11,21 +11,21 @@ from framework.distributions.description import one_line
 from framework.distributions.protocol import (
     Estimate,
     Normals,
-    Slope,
-    about,
-    arc,
+    QuadraticBound,
+    arc_probability,
     cdf,
-    each_cdf,
     estimate,
     images,
     mahalanobis,
     marginal,
+    marginal_cdfs,
     median,
+    mode_candidates,
     normals,
-    peaks,
-    scales,
-    slope,
-    tempered,
+    peak_widths,
+    quadratic_bound,
+    recentre,
+    tempered_density,
 )
 
 
@@ -168,14 +168,14 @@ def _(density: Reshaped, index: int) -> Reshaped:
     return Reshaped(marginal(density.density, index), density.batch_shape)
 
 
-@tempered.register
+@tempered_density.register
 def _(density: Stacked, temperature: Tensor) -> Distribution:
-    return Stacked([tempered(one, temperature) for one in density.densities])
+    return Stacked([tempered_density(one, temperature) for one in density.densities])
 
 
-@tempered.register
+@tempered_density.register
 def _(density: Reshaped, temperature: Tensor) -> Distribution:
-    return Reshaped(tempered(density.density, temperature), density.batch_shape)
+    return Reshaped(tempered_density(density.density, temperature), density.batch_shape)
 
 
 @median.register
@@ -212,30 +212,30 @@ def _(density: Reshaped, value: Tensor) -> Tensor | None:
     return _folded(cdf(density.density, flat), shape)
 
 
-@each_cdf.register
+@marginal_cdfs.register
 def _(density: Stacked, value: Tensor) -> Tensor | None:
     return _stacked(
-        [each_cdf(one, part) for one, part in density.apart(value)], -1 - len(density.event_shape)
+        [marginal_cdfs(one, part) for one, part in density.apart(value)], -1 - len(density.event_shape)
     )
 
 
-@each_cdf.register
+@marginal_cdfs.register
 def _(density: Reshaped, value: Tensor) -> Tensor | None:
     flat, shape = density.inner(value)
-    return _folded(each_cdf(density.density, flat), shape + density.event_shape)
+    return _folded(marginal_cdfs(density.density, flat), shape + density.event_shape)
 
 
-@arc.register
+@arc_probability.register
 def _(density: Stacked, start: Tensor, end: Tensor) -> Tensor | None:
     both = zip(density.apart(start), density.apart(end), strict=True)
-    return _stacked([arc(one, first, last) for (one, first), (_, last) in both])
+    return _stacked([arc_probability(one, first, last) for (one, first), (_, last) in both])
 
 
-@arc.register
+@arc_probability.register
 def _(density: Reshaped, start: Tensor, end: Tensor) -> Tensor | None:
     start, end = torch.broadcast_tensors(start, end)
     flat, shape = density.inner(start)
-    return _folded(arc(density.density, flat, density.inner(end)[0]), shape)
+    return _folded(arc_probability(density.density, flat, density.inner(end)[0]), shape)
 
 
 @mahalanobis.register
@@ -265,24 +265,26 @@ def _(density: Reshaped) -> Normals | None:
     return Normals(*(number.reshape(*density.batch_shape, number.shape[-1]) for number in parts))
 
 
-@slope.register
-def _(density: Stacked, value: Tensor) -> Slope | None:
-    parts = [slope(one, part) for one, part in density.apart(value)]
+@quadratic_bound.register
+def _(density: Stacked, value: Tensor) -> QuadraticBound | None:
+    parts = [quadratic_bound(one, part) for one, part in density.apart(value)]
     known = [part for part in parts if part is not None]
     if len(known) < len(parts):
         return None
     log_prob, *others = zip(*known, strict=True)
-    return Slope(torch.stack(log_prob, -1), *(torch.stack(each, -2) for each in others))
+    return QuadraticBound(torch.stack(log_prob, -1), *(torch.stack(each, -2) for each in others))
 
 
-@slope.register
-def _(density: Reshaped, value: Tensor) -> Slope | None:
+@quadratic_bound.register
+def _(density: Reshaped, value: Tensor) -> QuadraticBound | None:
     flat, shape = density.inner(value)
-    found = slope(density.density, flat)
+    found = quadratic_bound(density.density, flat)
     if found is None:
         return None
     log_prob, *others = found
-    return Slope(log_prob.reshape(shape), *(each.reshape(*shape, *density.event_shape) for each in others))
+    return QuadraticBound(
+        log_prob.reshape(shape), *(each.reshape(*shape, *density.event_shape) for each in others)
+    )
 
 
 @images.register
@@ -299,24 +301,24 @@ def _(density: Reshaped, channels: Collection[str]) -> dict[str, Tensor]:
     return {name: one.reshape(*density.batch_shape, *one.shape[inner:]) for name, one in found.items()}
 
 
-@peaks.register
+@mode_candidates.register
 def _(density: Stacked) -> Tensor:
-    return _beside([peaks(one) for one in density.densities], -1 - len(density.event_shape))
+    return _beside([mode_candidates(one) for one in density.densities], -1 - len(density.event_shape))
 
 
-@peaks.register
+@mode_candidates.register
 def _(density: Reshaped) -> Tensor:
-    return peaks(density.density).reshape(-1, *density.batch_shape, *density.event_shape)
+    return mode_candidates(density.density).reshape(-1, *density.batch_shape, *density.event_shape)
 
 
-@scales.register
+@peak_widths.register
 def _(density: Stacked) -> Tensor:
-    return _beside([scales(one) for one in density.densities], -1)
+    return _beside([peak_widths(one) for one in density.densities], -1)
 
 
-@scales.register
+@peak_widths.register
 def _(density: Reshaped) -> Tensor:
-    return scales(density.density).reshape(-1, *density.batch_shape)
+    return peak_widths(density.density).reshape(-1, *density.batch_shape)
 
 
 def _beside(found: list[Tensor], axis: int) -> Tensor:
@@ -326,23 +328,23 @@ def _beside(found: list[Tensor], axis: int) -> Tensor:
     return torch.stack(same, axis)
 
 
-@about.register
+@recentre.register
 def _(density: Stacked, index: tuple[Tensor, ...], place: Tensor) -> Distribution:
     *item, number = index
     every = torch.arange(len(density.densities), device=number.device)
     if number.shape != every.shape or any(part.shape[-1:] != (1,) for part in (*item, place[..., 0])):
-        return about.dispatch(Distribution)(density, index, place)
+        return recentre.dispatch(Distribution)(density, index, place)
     item = tuple(part.squeeze(-1) for part in item)
-    return Stacked([about(one, item, place.squeeze(-2)) for one in density.densities])
+    return Stacked([recentre(one, item, place.squeeze(-2)) for one in density.densities])
 
 
-@about.register
+@recentre.register
 def _(density: Reshaped, index: tuple[Tensor, ...], place: Tensor) -> Distribution:
     item = torch.zeros((), dtype=torch.int64, device=place.device)
     for part, size in zip(index, density.batch_shape, strict=True):
         item = item * size + part
     inner = density.density
-    return about(inner, torch.unravel_index(item, inner.batch_shape), place)
+    return recentre(inner, torch.unravel_index(item, inner.batch_shape), place)
 
 
 def _stacked(parts: list[Tensor | None], axis: int = -1) -> Tensor | None:

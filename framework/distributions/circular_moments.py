@@ -50,7 +50,7 @@ class CircularMoments:
         first = self.moments[1]
         return torch.where(first.abs() < 1e-6, 0.0, first.angle())
 
-    def arc(self, start: Tensor, end: Tensor) -> Tensor:
+    def arc_probability(self, start: Tensor, end: Tensor) -> Tensor:
         """Return the mass from `start` counter-clockwise to `end`, (*sample, *batch).
 
         The Fourier series of the density is integrated term by term, so the result is as exact as the moments. Both

@@ -14,22 +14,22 @@ from framework.distributions.description import CategoricalDensity
 from framework.distributions.protocol import (
     Estimate,
     Normals,
-    Slope,
-    about,
+    QuadraticBound,
     cdf,
-    each_cdf,
     estimate,
-    exactly,
+    exact_estimate,
     images,
     mahalanobis,
     marginal,
+    marginal_cdfs,
     median,
     normals,
     one_normal,
     pick,
-    slope,
+    quadratic_bound,
+    recentre,
     take,
-    tempered,
+    tempered_density,
 )
 
 for _kind in (
@@ -37,7 +37,7 @@ for _kind in (
     *(torchs.LowRankMultivariateNormal, torchs.Cauchy, torchs.Gumbel, torchs.HalfNormal, torchs.Laplace),
     *(torchs.StudentT, torchs.Uniform, torchs.VonMises, torchs.Weibull),
 ):
-    estimate.register(_kind, exactly)
+    estimate.register(_kind, exact_estimate)
 
 
 @estimate.register
@@ -106,20 +106,20 @@ def _below(base: Distribution, value: Tensor) -> Tensor:
     return torch.from_numpy(stdtr(freedom.cpu().numpy(), standard.cpu().numpy())).to(value.device)
 
 
-@each_cdf.register
+@marginal_cdfs.register
 def _(density: Independent, value: Tensor) -> Tensor | None:
     if isinstance(density.base_dist, _ON_THE_LINE):
         base = _of_each(density.base_dist, Tensor.double)
         if base is not None:
             return _below(base, value.double())
-    return None if len(density.event_shape) == 3 else each_cdf.dispatch(Distribution)(density, value)
+    return None if len(density.event_shape) == 3 else marginal_cdfs.dispatch(Distribution)(density, value)
 
 
 @cdf.register
 def _(density: Independent, value: Tensor) -> Tensor | None:
     known = isinstance(density.base_dist, _ON_THE_LINE) and density.event_shape == (1,)
     # `normals` also handles a normal density of width 0
-    found = each_cdf(density, value) if known and normals(density) is None else None
+    found = marginal_cdfs(density, value) if known and normals(density) is None else None
     return cdf.dispatch(Distribution)(density, value) if found is None else found.squeeze(-1)
 
 
@@ -151,38 +151,38 @@ def _(density: Independent, index: Tensor) -> Distribution:
     return Independent(base, 1, validate_args=False)
 
 
-@slope.register
-def _(density: Independent, value: Tensor) -> Slope | None:
+@quadratic_bound.register
+def _(density: Independent, value: Tensor) -> QuadraticBound | None:
     base = density.base_dist
     if not isinstance(base, Normal) or density.reinterpreted_batch_ndims != 1:
         return None
     stiffness = base.scale.square().reciprocal().expand(torch.broadcast_shapes(value.shape, base.scale.shape))
-    return Slope(density.log_prob(value), (base.loc - value) * stiffness, stiffness)
+    return QuadraticBound(density.log_prob(value), (base.loc - value) * stiffness, stiffness)
 
 
-@about.register
+@recentre.register
 def _(density: Independent, index: tuple[Tensor, ...], place: Tensor) -> Distribution:
     base = density.base_dist
     if not isinstance(base, Normal) or density.reinterpreted_batch_ndims != 1:
-        return about.dispatch(Distribution)(density, index, place)
+        return recentre.dispatch(Distribution)(density, index, place)
     loc, scale = (parameter.double()[index] for parameter in (base.loc, base.scale))
     return Independent(Normal(loc - place, scale, validate_args=False), 1, validate_args=False)
 
 
-@tempered.register
+@tempered_density.register
 def _(density: Independent, temperature: Tensor) -> Distribution:
     # the power of a product is the product of the powers
-    base = tempered(density.base_dist, temperature)
+    base = tempered_density(density.base_dist, temperature)
     return Independent(base, density.reinterpreted_batch_ndims, validate_args=False)
 
 
-@tempered.register
+@tempered_density.register
 def _(density: Normal, temperature: Tensor) -> Distribution:
     # exp(-d²/2σ²)^(1/T) = exp(-d²/2σ²T)
     return Normal(density.loc, density.scale * temperature.sqrt(), validate_args=False)
 
 
-@tempered.register
+@tempered_density.register
 def _(density: MultivariateNormal, temperature: Tensor) -> Distribution:
     scale = density.scale_tril * temperature.sqrt()
     return MultivariateNormal(density.loc, scale_tril=scale, validate_args=False)

@@ -17,23 +17,23 @@ from framework.distributions.picked import PickedMixture
 from framework.distributions.protocol import (
     Estimate,
     Normals,
-    Slope,
-    about,
-    arc,
+    QuadraticBound,
+    arc_probability,
     cdf,
-    each_cdf,
     estimate,
+    estimate_with_error,
     images,
     mahalanobis,
     marginal,
+    marginal_cdfs,
     median,
+    mode_candidates,
     normals,
-    peaks,
+    peak_widths,
     pick,
-    scales,
-    slope,
+    quadratic_bound,
+    recentre,
     take,
-    with_error,
 )
 
 __all__ = [
@@ -45,7 +45,7 @@ __all__ = [
     "circular_grid",
     "marginal",
     "median",
-    "merged",
+    "estimate_of_sum",
     "pick",
     "take",
 ]  # some of these moved to other files; the old import path keeps working
@@ -95,13 +95,13 @@ class Mixture(Distribution):
         return self.components.enumerate_support(expand)[..., 0]
 
     def log_prob(self, value: Tensor) -> Tensor:
-        parts = self.in_parts(value)
+        parts = self.split_values(value)
         if len(parts) > 1:
             return torch.cat([self.log_prob(part) for part in parts])
         spread = value.unsqueeze(-1 - len(self.event_shape))
         return torch.logsumexp(self.log_weights + self.components.log_prob(spread), -1)
 
-    def in_parts(self, value: Tensor) -> Sequence[Tensor]:
+    def split_values(self, value: Tensor) -> Sequence[Tensor]:
         """Return the values (*sample, *batch, *event), split along the first dimension if they would fill the memory.
 
         A grid of angles on many samples with many components is an example.
@@ -143,7 +143,7 @@ class Mixture(Distribution):
             return support.gather(0, self.log_prob(support).argmax(0, keepdim=True)).squeeze(0)
         # take the peaks of every component, also of nested mixtures: a lower peak of one component may become the
         # highest point together with a peak of another component
-        places = peaks(self)
+        places = mode_candidates(self)
         if self.event_shape.numel() > 1 and self.log_weights.shape[-1] <= CROSSED:
             modes = self.components.mode.movedim(-1 - event, 0)  # (K, *batch, *event)
             places = torch.cat([places, crossings(self.components, modes)])
@@ -213,7 +213,7 @@ class Mixture(Distribution):
         return self.components.log_prob(drawn) - mixed
 
 
-def merged(parts: Estimate, log_terms: Tensor, log_sum: Tensor) -> Estimate:
+def estimate_of_sum(parts: Estimate, log_terms: Tensor, log_sum: Tensor) -> Estimate:
     """Return the estimate of log Σ_k t_k from the estimates of log t_k, up to constants, along the last dimension.
 
     The terms must be drawn independently of one another. By the delta method, the squared relative error of the sum is
@@ -231,24 +231,24 @@ def merged(parts: Estimate, log_terms: Tensor, log_sum: Tensor) -> Estimate:
         # a term with no share adds no error, not even an infinite one; an unknown error stays unknown
         silent = (error == 0) | ((share == 0) & ~error.isnan())
         error = torch.where(silent, 0.0, share * error).square().sum(-1).sqrt()
-    return with_error(log_sum, error, parts.samples.sum(-1), parts.unresolved.any(-1))
+    return estimate_with_error(log_sum, error, parts.samples.sum(-1), parts.unresolved.any(-1))
 
 
 @estimate.register
 def _(density: Mixture, value: Tensor) -> Estimate:
     """Return the estimate of a mixture of independent components; of one component its own, to the last bit."""
-    several = density.in_parts(value)
+    several = density.split_values(value)
     if len(several) > 1:
-        return joined([estimate(density, part) for part in several])
+        return concatenate_estimates([estimate(density, part) for part in several])
     parts = estimate(density.components, value.unsqueeze(-1 - len(density.event_shape)))
     if density.log_weights.shape[-1] == 1:
         return parts.each(lambda field: field.squeeze(-1))
     error = parts.standard_error.masked_fill(density.log_weights == -math.inf, 0.0)
     log_terms = density.log_weights + parts.log_mean
-    return merged(parts._replace(standard_error=error), log_terms, torch.logsumexp(log_terms, -1))
+    return estimate_of_sum(parts._replace(standard_error=error), log_terms, torch.logsumexp(log_terms, -1))
 
 
-def joined(parts: Sequence[Estimate]) -> Estimate:
+def concatenate_estimates(parts: Sequence[Estimate]) -> Estimate:
     """Return one estimate from those of several batches, concatenated along the first dimension."""
     return Estimate(*map(torch.cat, zip(*parts, strict=True)))
 
@@ -280,16 +280,16 @@ def _(density: Mixture, value: Tensor) -> Tensor | None:
     return _mixed(density, cdf(density.components, value.unsqueeze(-2)))
 
 
-@each_cdf.register
+@marginal_cdfs.register
 def _(density: Mixture, value: Tensor) -> Tensor | None:
     axis = -1 - len(density.event_shape)
-    parts = each_cdf(density.components, value.unsqueeze(axis))
+    parts = marginal_cdfs(density.components, value.unsqueeze(axis))
     return _mixed(density, None if parts is None else parts.movedim(axis, -1), len(density.event_shape))
 
 
-@arc.register
+@arc_probability.register
 def _(density: Mixture, start: Tensor, end: Tensor) -> Tensor | None:
-    return _mixed(density, arc(density.components, start.unsqueeze(-2), end.unsqueeze(-2)))
+    return _mixed(density, arc_probability(density.components, start.unsqueeze(-2), end.unsqueeze(-2)))
 
 
 def _mixed(density: Mixture, parts: Tensor | None, numbers: int = 0) -> Tensor | None:
@@ -319,15 +319,15 @@ def _(density: Mixture, value: Tensor) -> Tensor | None:
     return None if found is None else found.squeeze(-1)
 
 
-@slope.register
-def _(density: Mixture, value: Tensor) -> Slope | None:
-    parts = slope(density.components, value.unsqueeze(-1 - len(density.event_shape)))
+@quadratic_bound.register
+def _(density: Mixture, value: Tensor) -> QuadraticBound | None:
+    parts = quadratic_bound(density.components, value.unsqueeze(-1 - len(density.event_shape)))
     if parts is None:
         return None
     log_terms = density.log_weights + parts.log_prob
     share = log_terms.softmax(-1).unsqueeze(-1)
     means = (torch.where(share > 0, share * part, 0.0).sum(-2) for part in parts[1:])
-    return Slope(torch.logsumexp(log_terms, -1), *means)
+    return QuadraticBound(torch.logsumexp(log_terms, -1), *means)
 
 
 @pick.register
@@ -354,9 +354,11 @@ def _(density: Reshaped, index: Tensor) -> Distribution:
     return Reshaped(pick(inner, items.reshape(-1)), (*lead, *density.batch_shape[:-1]))
 
 
-@peaks.register
+@mode_candidates.register
 def _(density: Mixture) -> Tensor:
-    found = peaks(density.components).movedim(-1 - len(density.event_shape), 0)  # (K, peak, *batch, *event)
+    found = mode_candidates(density.components).movedim(
+        -1 - len(density.event_shape), 0
+    )  # (K, peak, *batch, *event)
     return found.flatten(0, 1)
 
 
@@ -377,15 +379,15 @@ def _(density: Mixture, channels: Collection[str]) -> dict[str, Tensor]:
     return {"color": (weights * drawn).sum(len(density.batch_shape))}
 
 
-@scales.register
+@peak_widths.register
 def _(density: Mixture) -> Tensor:
-    return scales(density.components).movedim(-1, 0).flatten(0, 1)
+    return peak_widths(density.components).movedim(-1, 0).flatten(0, 1)
 
 
-@about.register
+@recentre.register
 def _(density: Mixture, index: tuple[Tensor, ...], place: Tensor) -> Distribution:
     every = torch.arange(density.log_weights.shape[-1], device=place.device)
-    components = about(
+    components = recentre(
         density.components, (*(part.unsqueeze(-1) for part in index), every), place.unsqueeze(-2)
     )
     return Mixture(density.log_weights.double()[index].expand(components.batch_shape), components)

@@ -5,7 +5,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from framework.distributions.circular import Circular, wrap
-from framework.distributions.protocol import Slope, slope
+from framework.distributions.protocol import QuadraticBound, quadratic_bound
 
 STARTS = 3
 """Number of the given places, the highest ones, from which the search starts."""
@@ -37,7 +37,7 @@ def crossings(components: Distribution, modes: Tensor) -> Tensor:
         modes: modes of the components, (K, *batch, *event).
     """
     # (K, *batch, K, *event): the second component at the first's mode
-    both = slope(components, modes.unsqueeze(-2))
+    both = quadratic_bound(components, modes.unsqueeze(-2))
     if both is None:
         return modes[:0]
     own = both.stiffness.diagonal(dim1=0, dim2=-2).movedim(-1, 0).unsqueeze(-2)
@@ -63,7 +63,7 @@ def _climbed(density: Distribution, place: Tensor, height: Tensor) -> tuple[Tens
     step showed (the secant method). For one number this is Newton's method near the maximum, without a second
     derivative.
     """
-    here = slope(density, place)
+    here = quadratic_bound(density, place)
     if here is None:
         return place, height
     angles = isinstance(density.support, Circular)
@@ -77,7 +77,7 @@ def _climbed(density: Distribution, place: Tensor, height: Tensor) -> tuple[Tens
             break
         there = place + reach.unsqueeze(-1) * step
         there = wrap(there) if angles else there
-        found = slope(density, there)
+        found = quadratic_bound(density, there)
         assert found is not None
         up = rising & (found.log_prob > height)
         # where not even the bound's maximum is higher, only rounding is left
@@ -88,7 +88,7 @@ def _climbed(density: Distribution, place: Tensor, height: Tensor) -> tuple[Tens
         wide = up.unsqueeze(-1)
         place = torch.where(wide, there, place)
         height = torch.where(up, found.log_prob, height)
-        here = Slope(
+        here = QuadraticBound(
             height,
             torch.where(wide, found.pull, here.pull),
             torch.where(wide, found.stiffness, here.stiffness),

@@ -10,12 +10,20 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.distributions import Distribution
 
+from framework.distributions.affine import AffineDensity
 from framework.distributions.batch_shapes import Reshaped
 from framework.distributions.circular import Circular, circular_median, wrap
 from framework.distributions.circular_moments import circular_moments
 from framework.distributions.closed_forms import normal_quantile
-from framework.distributions.moved import Moved
-from framework.distributions.protocol import Normals, arc, cdf, marginal, normals, peaks, scales
+from framework.distributions.protocol import (
+    Normals,
+    arc_probability,
+    cdf,
+    marginal,
+    mode_candidates,
+    normals,
+    peak_widths,
+)
 from framework.errors import UserError
 
 DRAWS = 9999
@@ -54,13 +62,13 @@ class Interval(NamedTuple):
     high_error: Tensor
 
     @property
-    def drawn(self) -> bool:
+    def depends_on_draws(self) -> bool:
         """True if an end depends on random draws."""
         return bool(((self.low_error != 0) | (self.high_error != 0)).any())
 
 
 @torch.no_grad()
-def middle(density: Distribution, mass: float, draws: int = DRAWS) -> Interval:
+def central_interval(density: Distribution, mass: float, draws: int = DRAWS) -> Interval:
     """Return the central interval with the given mass for each number of a density of reals or angles.
 
     Ends are computed from `normals`, `cdf` or `arc`, or from the Fourier series of an angle's density
@@ -71,8 +79,8 @@ def middle(density: Distribution, mass: float, draws: int = DRAWS) -> Interval:
         mass: probability of the interval, in (0, 1).
         draws: number of draws where the ends cannot be computed.
     """
-    if isinstance(density, Moved):  # in float64, so that a location far from 0 costs no digit
-        inner = middle(density.density, mass, draws)
+    if isinstance(density, AffineDensity):  # in float64, so that a location far from 0 costs no digit
+        inner = central_interval(density.density, mass, draws)
         location, scale = density.location.double(), density.scale.double()
         ends = (location + scale * end for end in inner[:2])
         return Interval(*ends, *(scale * error for error in inner[2:]))
@@ -89,7 +97,7 @@ def middle(density: Distribution, mass: float, draws: int = DRAWS) -> Interval:
         parts = [marginal(density, index) for index in range(density.event_shape[0])]
     except UserError:
         return _of_draws(density, mass, draws)
-    found = [middle(part, mass, draws) for part in parts]
+    found = [central_interval(part, mass, draws) for part in parts]
     return Interval(*(torch.cat(ends, -1) for ends in zip(*found, strict=True)))
 
 
@@ -145,7 +153,7 @@ def _of_normals(known: Normals, below: Float[Tensor, "place"]) -> Float[Tensor, 
 
     wanted = below.reshape(-1, *(1,) * (known.mean.dim() - 1))
     center = torch.where(counts, known.mean, 0.0).sum(-1) / counts.sum(-1).clamp(min=1)
-    return reached(mass_below, wanted, low, high, center)
+    return find_crossing(mass_below, wanted, low, high, center)
 
 
 def _outward(
@@ -171,10 +179,10 @@ def _outward(
             break
         step = 2 * step
         low, high = torch.where(above, center - step, low), torch.where(under, center + step, high)
-    return reached(mass_below, wanted, low, high, center)
+    return find_crossing(mass_below, wanted, low, high, center)
 
 
-def reached(
+def find_crossing(
     rising: Callable[[Tensor], Tensor], wanted: Tensor, low: Tensor, high: Tensor, center: Tensor
 ) -> Tensor:
     """Return the place where a function that never falls reaches `wanted`; NaN where the function is NaN.
@@ -241,7 +249,7 @@ def _angle(density: Distribution, mass: float) -> Interval | None:
         def mass_below(value: Tensor) -> Tensor:
             return law(places.expand_as(value), value)
 
-        ends = reached(mass_below, below, places, torch.full_like(places, high), places)
+        ends = find_crossing(mass_below, below, places, torch.full_like(places, high), places)
         return _exact(*(end.reshape(density.batch_shape) for end in ends))
     center = _circular_center(law, flat)
     ahead = _reach(lambda width: law(center.expand_as(width), center + width), mass / 2, center)
@@ -260,7 +268,7 @@ def _reach(
     high = math.pi * NARROWER ** (1.0 - enough)
     low = torch.where(enough < RUNGS, high / NARROWER, 0.0)
     none = torch.zeros_like(center)
-    return reached(mass_within, torch.full_like(center, wanted), low, high, none)
+    return find_crossing(mass_within, torch.full_like(center, wanted), low, high, none)
 
 
 def _arcs(flat: Distribution) -> Callable[[Tensor, Tensor], Tensor]:
@@ -269,10 +277,10 @@ def _arcs(flat: Distribution) -> Callable[[Tensor, Tensor], Tensor]:
     The mass is NaN for items of which it is not known.
     """
     probe = torch.zeros((*flat.batch_shape, 1), dtype=torch.float64, device=flat.sample().device)
-    if arc(flat, probe, probe + 1) is not None:
+    if arc_probability(flat, probe, probe + 1) is not None:
 
         def known(start: Tensor, end: Tensor) -> Tensor:
-            found = arc(flat, start.unsqueeze(-1), end.unsqueeze(-1))
+            found = arc_probability(flat, start.unsqueeze(-1), end.unsqueeze(-1))
             assert found is not None
             return found
 
@@ -280,7 +288,9 @@ def _arcs(flat: Distribution) -> Callable[[Tensor, Tensor], Tensor]:
     series = circular_moments(flat)
 
     def summed(start: Tensor, end: Tensor) -> Tensor:
-        return torch.where(series.resolved, series.arc(*torch.broadcast_tensors(start, end)), math.nan)
+        return torch.where(
+            series.resolved, series.arc_probability(*torch.broadcast_tensors(start, end)), math.nan
+        )
 
     return summed
 
@@ -303,7 +313,7 @@ def _circular_center(law: Callable[[Tensor, Tensor], Tensor], flat: Distribution
     crosses = (behind < 0) & (ends >= 0)
     index = torch.where(crosses, lowest, math.inf).argmin(0, keepdim=True)
     start, stop = nodes.gather(0, index).squeeze(0), last.gather(0, index).squeeze(0)
-    found = reached(
+    found = find_crossing(
         lambda angle: law(angle - math.pi, angle), torch.full_like(start, 0.5), start, stop, start
     )
     # a density without a middle (the uniform one) has no crossing; its mode is as good as any angle
@@ -313,8 +323,8 @@ def _circular_center(law: Callable[[Tensor, Tensor], Tensor], flat: Distribution
 
 def _nodes(flat: Distribution) -> Float[Tensor, "node item"]:
     """Return ascending angles in [-π, π): around the whole circle, and near each peak at steps of its width."""
-    places = wrap(peaks(flat).squeeze(-1).double())
-    width = scales(flat).double().nan_to_num(nan=1.0, posinf=1.0)
+    places = wrap(mode_candidates(flat).squeeze(-1).double())
+    width = peak_widths(flat).double().nan_to_num(nan=1.0, posinf=1.0)
     near = torch.tensor([-3, -1, 0, 1, 3], dtype=torch.float64, device=places.device)
     around = (places + near.reshape(-1, 1, 1) * width).flatten(0, 1)
     even = torch.linspace(-math.pi, math.pi, AROUND + 1, dtype=torch.float64, device=places.device)[:-1]

@@ -40,7 +40,7 @@ def seed_step(seed: int, step: int, stage: str, rank: int = 0) -> None:
     which Python's takes 3. `step` numbers the batches of a stage, not the optimiser's steps: otherwise batches whose
     gradients are accumulated would share their noise.
     """
-    value = hashed(seed, stage, step, rank)
+    value = stable_hash(seed, stage, step, rank)
     # torch.manual_seed is not used: where CUDA is not in use it formats the stack for a later report, 100 µs.
     torch.default_generator.manual_seed(value)
     if torch.cuda.is_initialized():
@@ -49,7 +49,7 @@ def seed_step(seed: int, step: int, stage: str, rank: int = 0) -> None:
     random.seed(value)
 
 
-def hashed(*parts: int | str) -> int:
+def stable_hash(*parts: int | str) -> int:
     """Return 64 bits that depend on every part and are the same on every machine."""
     digest = hashlib.blake2b(as_bytes("|".join(map(str, parts))), digest_size=8).digest()
     return int.from_bytes(digest, "little")

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Independent, MultivariateNormal, Normal
 
-from framework.distributions.protocol import marginal, median, tempered
+from framework.distributions.protocol import marginal, median, tempered_density
 
 
 class IndependentNormals(Independent):
@@ -38,7 +38,7 @@ def _(density: IndependentNormals, index: int) -> IndependentNormals:
     return IndependentNormals(density.mean[..., here], density.base_dist.scale[..., here])
 
 
-@tempered.register
+@tempered_density.register
 def _(density: IndependentNormals, temperature: Tensor) -> IndependentNormals:
     # exp(-d²/2σ²)^(1/T) = exp(-d²/2σ²T)
     return IndependentNormals(density.mean, density.base_dist.scale * temperature.sqrt())
@@ -78,6 +78,6 @@ def _(density: JointNormal, index: int) -> JointNormal:
     return JointNormal(density.loc[..., index : index + 1], deviation[..., None, None])
 
 
-@tempered.register
+@tempered_density.register
 def _(density: JointNormal, temperature: Tensor) -> JointNormal:
     return JointNormal(density.loc, density.root * temperature.sqrt())

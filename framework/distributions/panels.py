@@ -12,7 +12,7 @@ from torch.distributions import Distribution, constraints
 
 from framework.distributions.batch_shapes import Reshaped
 from framework.distributions.circular import Circular, wrap
-from framework.distributions.protocol import about, peaks, scales
+from framework.distributions.protocol import mode_candidates, peak_widths, recentre
 
 AT_ONCE = 2**17
 """Number of components that are evaluated together, and of pairs of peaks that are compared together."""
@@ -95,7 +95,7 @@ def entropy_of_one(density: Distribution) -> Float[Tensor, "*batch"]:
         return density.log_prob(density.sample())
     flat = Reshaped(density, (items,))
     with torch.no_grad():
-        places = peaks(flat).squeeze(-1).double()
+        places = mode_candidates(flat).squeeze(-1).double()
     if len(places) > LARGEST:
         _log.warning(
             "%d densities (%s) have more than %d peaks; their entropies are means over %d draws.",
@@ -151,7 +151,7 @@ def sums_on(density: Distribution, panels: Panels) -> tuple[Tensor, Tensor]:
     half = (panels.high - panels.low) / 2
     v = (panels.high + panels.low) / 2 + half * NODES.to(like).unsqueeze(-1)
     offset, slope = panels.scale * v.sinh(), half * panels.scale * v.cosh()
-    log_prob = about(density, (panels.item,), like.unsqueeze(-1)).log_prob(offset.unsqueeze(-1)).to(like)
+    log_prob = recentre(density, (panels.item,), like.unsqueeze(-1)).log_prob(offset.unsqueeze(-1)).to(like)
     mass = log_prob.exp() * slope
     # p log p → 0 as p → 0; the clamp keeps 0 · (-inf) from being NaN
     both = torch.stack([mass, -mass * log_prob.clamp(min=-1e4)], -1)
@@ -229,7 +229,7 @@ def first_panels(density: Distribution, place: Float[Tensor, "peak item"]) -> Pa
 
 def known_scales(density: Distribution) -> Float[Tensor, "peak item"]:
     """Return the density's `scales`, float64; 1 where a scale is not a finite number above 0."""
-    scale = scales(density).double()
+    scale = peak_widths(density).double()
     return torch.where((scale > 0) & scale.isfinite(), scale, 1.0)
 
 

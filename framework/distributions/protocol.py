@@ -104,7 +104,7 @@ class _Picked(Distribution):
 
 
 @singledispatch
-def about(density: Distribution, index: tuple[Tensor, ...], place: Tensor) -> Distribution:
+def recentre(density: Distribution, index: tuple[Tensor, ...], place: Tensor) -> Distribution:
     """Return the density of X - place, in float64, so that values near the place keep their digits.
 
     X has the density at `index` of the batch. Only `log_prob` of the returned density is used. Default: values are
@@ -116,10 +116,10 @@ def about(density: Distribution, index: tuple[Tensor, ...], place: Tensor) -> Di
         index: int64, one for each batch dimension; broadcast together they have the shape (*items).
         place: (*items, 1).
     """
-    return _About(density, index, place)
+    return _Recentred(density, index, place)
 
 
-class _About(Distribution):
+class _Recentred(Distribution):
     """Items of a batch, each any number of times; the whole batch is evaluated as often as the most frequent item."""
 
     arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
@@ -153,7 +153,7 @@ class _About(Distribution):
 
 
 @singledispatch
-def tempered(density: Distribution, temperature: Tensor) -> Distribution:
+def tempered_density(density: Distribution, temperature: Tensor) -> Distribution:
     """Return the density proportional to p^(1/T), T > 0 a scalar; same shapes and number type, differentiable in T.
 
     Call `tempering.temper` instead, which refuses an invalid T. Default (registered in `tempering`): classes are
@@ -189,7 +189,9 @@ class Estimate(NamedTuple):
         return Estimate(*map(change, self))
 
 
-def with_error(log_mean: Tensor, standard_error: Tensor, samples: Tensor, unresolved: Tensor) -> Estimate:
+def estimate_with_error(
+    log_mean: Tensor, standard_error: Tensor, samples: Tensor, unresolved: Tensor
+) -> Estimate:
     """Return an estimate whose `debiased` follows from its error; -∞ with an infinite error stays -∞."""
     correction = torch.where(standard_error == math.inf, 0.0, standard_error.square() / 2)
     return Estimate(log_mean, log_mean + correction, standard_error, samples, unresolved)
@@ -202,12 +204,12 @@ def estimate(density: Distribution, value: Tensor) -> Estimate:
     Default: log_prob with an error of NaN, "not known", since it is not known whether log_prob draws. A density whose
     log_prob is computed without drawing registers `exactly`; one that draws registers its own function.
     """
-    found = exactly(density, value)
+    found = exact_estimate(density, value)
     unknown = torch.full_like(found.log_mean, math.nan)
-    return with_error(found.log_mean, unknown, found.samples, found.unresolved)
+    return estimate_with_error(found.log_mean, unknown, found.samples, found.unresolved)
 
 
-def exactly(density: Distribution, value: Tensor) -> Estimate:
+def exact_estimate(density: Distribution, value: Tensor) -> Estimate:
     """Return the estimate of a density whose log_prob draws nothing: `estimate.register(Mine, exactly)`."""
     log_prob = density.log_prob(value)
     samples = torch.zeros(log_prob.shape, dtype=torch.int64, device=log_prob.device)
@@ -232,7 +234,7 @@ def cdf(density: Distribution, value: Tensor) -> Tensor | None:
 
 
 @singledispatch
-def each_cdf(density: Distribution, value: Tensor) -> Tensor | None:
+def marginal_cdfs(density: Distribution, value: Tensor) -> Tensor | None:
     """Return P(X_i ≤ y_i) of each number i on its own; float64, in the shape of `value` (*sample, *batch, *event).
 
     Default: for a vector of reals `cdf` of each `marginal`, or None where a `cdf` is not known; for an image None. A
@@ -247,7 +249,7 @@ def each_cdf(density: Distribution, value: Tensor) -> Tensor | None:
 
 
 @singledispatch
-def arc(density: Distribution, start: Tensor, end: Tensor) -> Tensor | None:
+def arc_probability(density: Distribution, start: Tensor, end: Tensor) -> Tensor | None:
     """Return the mass of the arc from `start` counter-clockwise to `end` of a density of one angle; None: not known.
 
     Angles are (*sample, *batch, 1), radians; the mass is float64 (*sample, *batch). The arc is less than a whole turn;
@@ -257,7 +259,7 @@ def arc(density: Distribution, start: Tensor, end: Tensor) -> Tensor | None:
     return None
 
 
-def turn(start: Tensor, end: Tensor) -> Tensor:
+def arc_length(start: Tensor, end: Tensor) -> Tensor:
     """Return the angle from `start` counter-clockwise to `end`, radians in [0, 2π], float64."""
     return torch.remainder(end.double() - start.double(), 2 * math.pi)
 
@@ -295,7 +297,7 @@ def mahalanobis(density: Distribution, value: Tensor) -> Tensor | None:
 
 
 @singledispatch
-def peaks(density: Distribution) -> Tensor:
+def mode_candidates(density: Distribution) -> Tensor:
     """Return places where the density may be highest, (peak, *batch, *event), as candidates without any guarantee.
 
     Default: the mode alone. A density with several peaks registers a candidate for each.
@@ -304,16 +306,16 @@ def peaks(density: Distribution) -> Tensor:
 
 
 @singledispatch
-def scales(density: Distribution) -> Tensor:
+def peak_widths(density: Distribution) -> Tensor:
     """Return the width of each of the `peaks` of a density of one number, (peak, *batch), in the number's unit.
 
     Default: the standard deviation of the normal density with the same height.
     """
-    places = peaks(density)
+    places = mode_candidates(density)
     return (-density.log_prob(places).double()).exp() / math.sqrt(2 * math.pi)
 
 
-class Slope(NamedTuple):
+class QuadraticBound(NamedTuple):
     """A lower bound of log p that touches it (see `slope`): log_prob, its gradient `pull`, and a `stiffness`.
 
     log_prob is (*sample, *batch); `pull` and `stiffness` are (*sample, *batch, *event).
@@ -325,7 +327,7 @@ class Slope(NamedTuple):
 
 
 @singledispatch
-def slope(density: Distribution, value: Tensor) -> Slope | None:
+def quadratic_bound(density: Distribution, value: Tensor) -> QuadraticBound | None:
     """Return a lower bound of log p that touches it at `value` y (*sample, *batch, *event); by default None, not known.
 
     With pull g and stiffness h, the bound for reals is log p(y + d) ≥ log p(y) + Σ (g d - h d²/2), h > 0, and for
@@ -362,7 +364,7 @@ class ValueSet(ABC):
         promised: the least share of targets that the sets are said to contain; None where nothing is said.
     """
 
-    promised: float | None = None
+    stated_probability: float | None = None
 
     @abstractmethod
     def contains(self, value: Tensor) -> Tensor:
@@ -394,6 +396,6 @@ def value_set(density: Distribution) -> ValueSet | None:
     """Return the set that comes with the density.
 
     Default: None, there is no set. Structures return None too: a guarantee for a density does not hold for a mixture, a
-    power or a marginal of it. An affine transform (`moved.Moved`) has the transformed set.
+    power or a marginal of it. An affine transform (`affine.AffineDensity`) has the transformed set.
     """
     return None

@@ -16,13 +16,13 @@ from framework.distributions.density import Mixture
 from framework.distributions.description import CategoricalDensity, one_line
 from framework.distributions.protocol import (
     Estimate,
-    Slope,
+    QuadraticBound,
     estimate,
+    estimate_with_error,
     images,
-    peaks,
-    slope,
-    tempered,
-    with_error,
+    mode_candidates,
+    quadratic_bound,
+    tempered_density,
 )
 from framework.errors import UserError
 
@@ -64,10 +64,10 @@ def temper(density: Distribution, temperature: Float[Tensor, ""]) -> Distributio
         raise ValueError(f"temperature = {value}; wanted a finite number above 0.")
     if value == 1 and not temperature.requires_grad:
         return density
-    return tempered(density, temperature)
+    return tempered_density(density, temperature)
 
 
-@tempered.register(Distribution)
+@tempered_density.register(Distribution)
 def _(density: Distribution, temperature: Tensor) -> Distribution:
     if density.has_enumerate_support and density.event_shape == ():
         return tempered_classes(density, temperature)
@@ -77,12 +77,12 @@ def _(density: Distribution, temperature: Tensor) -> Distribution:
     raise UserError(
         f"No temperature is known for {type(density).__name__} over {tuple(density.event_shape)} numbers: p^(1/T) has "
         "no normaliser in closed form that the framework knows. Register it with "
-        "`framework.distributions.protocol.tempered.register`, "
+        "`framework.distributions.protocol.tempered_density.register`, "
         "or leave out the wrapper that changes the temperature."
     )
 
 
-@tempered.register
+@tempered_density.register
 def _(density: Mixture, temperature: Tensor) -> Distribution:
     """Return the tempered mixture; classes are tempered as a whole, other mixtures keep their weights.
 
@@ -92,7 +92,7 @@ def _(density: Mixture, temperature: Tensor) -> Distribution:
     """
     if density.has_enumerate_support:
         return tempered_classes(density, temperature)
-    return Mixture(density.log_weights, tempered(density.components, temperature))
+    return Mixture(density.log_weights, tempered_density(density.components, temperature))
 
 
 def tempered_classes(density: Distribution, temperature: Tensor) -> "RescaledClasses":
@@ -150,7 +150,7 @@ def _(density: RescaledClasses, value: Tensor) -> Estimate:
             return each.expand(*log_prob.shape, each.shape[-1]).gather(-1, label).squeeze(-1)
 
         told = [of_label(each) for each in (error, found.samples, found.unresolved)]
-    return with_error(log_prob, *told)
+    return estimate_with_error(log_prob, *told)
 
 
 class CircularPower(Distribution):
@@ -193,7 +193,7 @@ class CircularPower(Distribution):
                 raise UserError(
                     f"{type(density).__name__} at temperature {float(temperature.detach()):g} is too narrow for a grid "
                     f"of {MOST_POINTS} angles (its mass is uncertain by {off.max().item():.2g} nats). Register "
-                    "its power with `framework.distributions.protocol.tempered.register`, or raise the temperature's "
+                    "its power with `framework.distributions.protocol.tempered_density.register`, or raise the temperature's "
                     "lower bound."
                 )
             off = self._fill()
@@ -330,13 +330,13 @@ def _cumulated(place: Tensor, height: Float[Tensor, "item node"]) -> Float[Tenso
     return torch.nn.functional.pad(cells.cumsum(-1), (1, 0))
 
 
-@slope.register
-def _(density: CircularPower, value: Tensor) -> Slope | None:
-    found = slope(density.density, value)
+@quadratic_bound.register
+def _(density: CircularPower, value: Tensor) -> QuadraticBound | None:
+    found = quadratic_bound(density.density, value)
     if found is None:
         return None
     pull, stiffness = (part / density.temperature.to(part) for part in found[1:])
-    return Slope(density.power_of(found.log_prob), pull, stiffness)
+    return QuadraticBound(density.power_of(found.log_prob), pull, stiffness)
 
 
 @estimate.register
@@ -351,7 +351,7 @@ def _(density: CircularPower, value: Tensor) -> Estimate:
         around = estimate(density.density, density.angles).standard_error
         of_normaliser = torch.where(around == 0, 0.0, density.mass * around).sum(0)
         error = (found.standard_error + of_normaliser) / density.temperature.to(log_prob)
-    return with_error(log_prob, error, found.samples, found.unresolved)
+    return estimate_with_error(log_prob, error, found.samples, found.unresolved)
 
 
 @images.register
@@ -359,6 +359,6 @@ def _(density: CircularPower, channels: Collection[str]) -> dict[str, Tensor]:
     return images(density.density, channels)  # they show the mode, which a power does not change
 
 
-@peaks.register
+@mode_candidates.register
 def _(density: CircularPower) -> Tensor:
-    return peaks(density.density)  # a power rises and falls where the density does
+    return mode_candidates(density.density)  # a power rises and falls where the density does

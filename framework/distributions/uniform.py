@@ -11,7 +11,15 @@ from framework.distributions.batch_shapes import Reshaped, Stacked
 from framework.distributions.circular import Circular, circular
 from framework.distributions.density import Mixture
 from framework.distributions.description import one_line
-from framework.distributions.protocol import about, arc, estimate, exactly, marginal, pick, turn
+from framework.distributions.protocol import (
+    arc_length,
+    arc_probability,
+    estimate,
+    exact_estimate,
+    marginal,
+    pick,
+    recentre,
+)
 from framework.errors import UserError
 
 
@@ -88,7 +96,7 @@ def _(density: Reshaped) -> Distribution:
     return Reshaped(uniform(density.density), density.batch_shape)
 
 
-estimate.register(UniformAngles, exactly)
+estimate.register(UniformAngles, exact_estimate)
 
 
 @marginal.register
@@ -101,12 +109,12 @@ def _(density: UniformAngles, index: Tensor) -> UniformAngles:
     return UniformAngles(density.like, index.shape, density.event_shape)
 
 
-@about.register
+@recentre.register
 def _(density: UniformAngles, index: tuple[Tensor, ...], place: Tensor) -> UniformAngles:
     shape = torch.broadcast_shapes(place.shape[:-1], *(part.shape for part in index))
     return UniformAngles(place, shape, density.event_shape)
 
 
-@arc.register
+@arc_probability.register
 def _(density: UniformAngles, start: Tensor, end: Tensor) -> Tensor:
-    return turn(start, end).squeeze(-1) / (2 * math.pi)
+    return arc_length(start, end).squeeze(-1) / (2 * math.pi)

@@ -97,19 +97,19 @@ def require_promised(sets: ValueSet, mass: float, by: str) -> None:
         ConfigError: the probabilities differ, or the set has no ends; the message says the probability of the set.
     """
     if (
-        sets.promised is not None
-        and math.isclose(sets.promised, mass, abs_tol=1e-9)
+        sets.stated_probability is not None
+        and math.isclose(sets.stated_probability, mass, abs_tol=1e-9)
         and sets.parts() is not None
     ):
         return
-    if sets.promised is None or sets.parts() is None:
+    if sets.stated_probability is None or sets.parts() is None:
         raise ConfigError(
             f"{by}={mass:g} asks for the ends of an interval, but this model predicts a set in which the target lies, "
             f"and it has no such ends. Leave {by} out: the set's columns are printed without it."
         )
     raise ConfigError(
-        f"{by}={mass:g}, but the sets of this model promise to hold {sets.promised:g} of the targets, and no other "
-        f"interval of it promises anything. Give {by}={sets.promised:g}, or leave it out: the set is printed anyway."
+        f"{by}={mass:g}, but the sets of this model promise to hold {sets.stated_probability:g} of the targets, and no other "
+        f"interval of it promises anything. Give {by}={sets.stated_probability:g}, or leave it out: the set is printed anyway."
     )
 
 

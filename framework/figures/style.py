@@ -8,7 +8,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from framework.errors import encodable
+from framework.errors import escape_undecodable
 
 # Okabe & Ito 2008, distinguishable by colour-blind people; without yellow, which is too pale for lines on white.
 BLUE, RED, GREEN, PURPLE, ORANGE, SKY = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9"
@@ -27,7 +27,7 @@ def titled_figure(size: tuple[float, float], title: str, synthetic: bool) -> Fig
     return figure
 
 
-def saved(figure: Figure, path: Path, pictures: bool | str) -> Path:
+def save_figure(figure: Figure, path: Path, pictures: bool | str) -> Path:
     """Write the figure to `path` with the suffix of its format, and return the path.
 
     The format is the one that the setting `pictures` names, or else PNG. The same figure gives the same bytes. Text in
@@ -37,7 +37,7 @@ def saved(figure: Figure, path: Path, pictures: bool | str) -> Path:
     path = path.with_name(f"{path.name}.{kind}")
     dated = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
     for text in figure.findobj(Text):
-        text.set_text(encodable(text.get_text()))  # fonts draw no byte that is not UTF-8
+        text.set_text(escape_undecodable(text.get_text()))  # fonts draw no byte that is not UTF-8
     with rc_context({"pdf.fonttype": 42, "svg.hashsalt": path.stem}):
         figure.savefig(path, dpi=110, metadata=dated.get(kind))
     return path

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from framework.flights.physics import Constants
-from framework.flights.trajectories import flown_with_slopes
+from framework.flights.trajectories import simulate_with_jacobian
 from framework.least_squares.solver import least_squares
 
 BELIEVED = 50.0
@@ -23,7 +23,7 @@ MOST = torch.tensor([BELIEVED] * 3 + [50.0] * 3 + [1000.0] * 3, dtype=torch.floa
 """Largest absolute values of a state: m, m/s, rad/s."""
 
 
-class Seen(NamedTuple):
+class ObservedFrames(NamedTuple):
     """Observed frames of flights.
 
     Attributes:
@@ -36,7 +36,7 @@ class Seen(NamedTuple):
     places: Tensor
 
     @property
-    def there(self) -> Bool[Tensor, "flight frame"]:
+    def observed(self) -> Bool[Tensor, "flight frame"]:
         """True for each frame that is not missing, (flight, frame)."""
         return ~self.places.isnan().any(-1)
 
@@ -62,7 +62,7 @@ class Prior(NamedTuple):
         return torch.tensor([self.place] * 3 + [self.speed] * 3 + [self.spin] * 3, dtype=torch.float64)
 
 
-def seen_of(frames: Float[Tensor, "flight frame 5"], step: float) -> Seen:
+def observed_frames(frames: Float[Tensor, "flight frame 5"], step: float) -> ObservedFrames:
     """Return the observed frames in double precision.
 
     Args:
@@ -76,11 +76,11 @@ def seen_of(frames: Float[Tensor, "flight frame 5"], step: float) -> Seen:
     times = torch.where(there, frames[..., 0].clamp(slots - step / 2, slots + step / 2), slots)
     first = torch.where(there, times, 0.0).amin(-1, keepdim=True)
     places = torch.where(there.unsqueeze(-1), frames[..., 1:4], torch.nan)
-    return Seen(torch.maximum(times, first), places)
+    return ObservedFrames(torch.maximum(times, first), places)
 
 
-def estimated(
-    seen: Seen,
+def estimate_states(
+    seen: ObservedFrames,
     constants: Constants,
     noise: float,
     prior: Prior = Prior(),  # noqa: B008 - never changed
@@ -103,14 +103,14 @@ def estimated(
     scale = prior.scale.to(seen.times.device)
 
     def model(states: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-        places, slopes = flown_with_slopes(states, seen.times[rows], constants)
+        places, slopes = simulate_with_jacobian(states, seen.times[rows], constants)
         apart = ((places - seen.places[rows]) / noise).flatten(1)
         bent, steep = cauchy(apart)
         jacobian = steep.unsqueeze(-1) * slopes.flatten(1, 2) / noise
         own = torch.diag_embed((1 / scale).expand(len(states), 9))
         return torch.cat([bent, states / scale], 1), torch.cat([jacobian, own], 1)
 
-    begin = guessed(seen, constants.gravity) if start is None else start
+    begin = guess_states(seen, constants.gravity) if start is None else start
     bound = MOST.to(seen.times.device)
     # An error of a tenth of a per cent of a standard deviation does not matter.
     found = least_squares(model, begin, -bound, bound, most=most, decrease=1e-7, step=1e-9)
@@ -129,13 +129,13 @@ def cauchy(apart: Float[Tensor, "*shape"]) -> tuple[Float[Tensor, "*shape"], Flo
     return torch.copysign(root, apart), steep
 
 
-def guessed(seen: Seen, gravity: float) -> Float[Tensor, "flight 9"]:
+def guess_states(seen: ObservedFrames, gravity: float) -> Float[Tensor, "flight 9"]:
     """Return a state at the first frame from medians of slopes between pairs of the first frames.
 
     These are the medians of Theil (1950) and Sen (1968); a third of outliers does not move them. The state has no spin,
     and is 0 if fewer than two frames are observed.
     """
-    there = seen.there & (seen.there.cumsum(-1) <= FIRST)
+    there = seen.observed & (seen.observed.cumsum(-1) <= FIRST)
     since = seen.times - seen.times[:, :1]
     straight = torch.where(there.unsqueeze(-1), seen.places, torch.nan)
     straight = straight + torch.stack([0 * since, 0 * since, gravity / 2 * since.square()], -1)

@@ -72,7 +72,7 @@ def slip(velocity: Vector, spin: Vector, radius: float) -> tuple[Any, Any]:
 
 
 @no_type_check
-def bounced(velocity: Vector, spin: Vector, constants: Constants) -> tuple[Vector, Vector]:
+def bounce(velocity: Vector, spin: Vector, constants: Constants) -> tuple[Vector, Vector]:
     """Return velocity and spin after an instantaneous bounce.
 
     The model is that of Nakashima et al. (2010), for a hollow sphere, I = 2/3 m r². The table's friction stops the slip

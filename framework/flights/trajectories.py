@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from framework.flights.physics import Constants, bounced
+from framework.flights.physics import Constants, bounce
 
 NEWTON = 4
 """Number of Newton steps to the time of a bounce.
@@ -71,7 +71,7 @@ def step(
         until = torch.minimum(until.clamp(min=0), whole)
     there = free(before, until, constants)
     u, v, w, a, b, c = there[:, 3:].unbind(-1)
-    velocity, spin = bounced((u, v, w), (a, b, c), constants)
+    velocity, spin = bounce((u, v, w), (a, b, c), constants)
     level = torch.full_like(u, touching)
     left = torch.stack([there[:, 0], there[:, 1], level, *velocity, *spin], -1)
     risen = free(left, whole - until, constants)
@@ -82,7 +82,7 @@ def step(
     return after.index_put((rows,), torch.where(over.unsqueeze(-1), risen, after[rows]))
 
 
-def flown(
+def simulate(
     start: Float[Tensor, "flight 9"], times: Float[Tensor, "flight time"], constants: Constants
 ) -> Float[Tensor, "flight time 9"]:
     """Return the states of flights at `times`, seconds, not decreasing; `start` is the state at the first time.
@@ -95,7 +95,7 @@ def flown(
     return torch.stack(states, 1)
 
 
-def flown_with_slopes(
+def simulate_with_jacobian(
     start: Float[Tensor, "flight 9"], times: Float[Tensor, "flight time"], constants: Constants
 ) -> tuple[Float[Tensor, "flight time 3"], Float[Tensor, "flight time 3 9"]]:
     """Return positions, and their derivatives with respect to the state at the start.
@@ -107,7 +107,7 @@ def flown_with_slopes(
     flights, time = times.shape
     shift = torch.diag(start.new_tensor([1e-5] * 6 + [1e-3] * 3))
     states = torch.cat([start[:, None], start[:, None] + shift, start[:, None] - shift], 1)  # (flight, 19, 9)
-    found = flown(states.reshape(-1, 9), times.repeat_interleave(19, 0), constants)[..., :3]
+    found = simulate(states.reshape(-1, 9), times.repeat_interleave(19, 0), constants)[..., :3]
     found = found.reshape(flights, 19, time, 3)
     change = (found[:, 1:10] - found[:, 10:]) / (2 * shift.diagonal()[:, None, None])
     return found[:, 0], change.permute(0, 2, 3, 1)

@@ -57,7 +57,7 @@ class Camera:
                     f"camera.{name} came with{numbers}; wanted the shape {wanted}{SAID.get(name, '')}."
                 )
 
-    def projected(
+    def project(
         self, points: Real[Tensor, "*points 3"]
     ) -> tuple[Float[Tensor, "*points 2"], Float[Tensor, "*points"]]:
         """Return pixels (column, row) at which world points are seen, and their depths along the optical axis, metres.
@@ -70,7 +70,7 @@ class Camera:
         seen, focal, principal = self._seen(points)
         return focal * seen[..., :2] / seen[..., 2:] + principal, seen[..., 2]
 
-    def canonical(self, points: Real[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
+    def to_canonical(self, points: Real[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
         """Return world points in coordinates of the `canonical_camera` of the same image size, metres.
 
         That camera sees them at the same pixels and depths, so that a cloud alone determines the view and needs no

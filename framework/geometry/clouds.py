@@ -23,7 +23,7 @@ LOOSE, TIGHT = 2.0, 0.01
 """Bounds on the largest norm of a cloud, relative to a reference; a cloud beyond them was not normalised."""
 
 
-class Normalised(NamedTuple):
+class NormalisedClouds(NamedTuple):
     """Clouds around the origin; centre and scale lead back (`denormalised`).
 
     Attributes:
@@ -87,7 +87,7 @@ def sizes(clouds: Tensor) -> Int[Tensor, "batch"]:
     return counts
 
 
-def filled(clouds: Tensor, sizes: Tensor | None) -> Bool[Tensor, "batch points"]:
+def point_mask(clouds: Tensor, sizes: Tensor | None) -> Bool[Tensor, "batch points"]:
     """Return which rows of clouds with these sizes hold points; all rows if None."""
     if sizes is None:
         return clouds.new_ones(clouds.shape[:2], dtype=torch.bool)
@@ -110,9 +110,9 @@ def pad(clouds: Sequence[Tensor]) -> Float[Tensor, "batch points columns"]:
     return pad_sequence(list(clouds), batch_first=True, padding_value=math.nan)
 
 
-def normalised(
+def normalise_clouds(
     clouds: Float[Tensor, "batch points columns"], how: Normalisation, counts: Tensor | None = None
-) -> Normalised:
+) -> NormalisedClouds:
     """Return clouds around the origin, within the unit ball; differentiable in the clouds.
 
     "unit_ball": the mean of the points is subtracted, then all is divided by the largest norm (eq. 6.2). "robust": as
@@ -134,13 +134,13 @@ def normalised(
     count = len(clouds)
     if how == "none" or count == 0:
         origin = torch.zeros(count, 3, dtype=torch.float64, device=clouds.device)
-        return Normalised(clouds, origin, torch.ones_like(origin[:, 0]))
+        return NormalisedClouds(clouds, origin, torch.ones_like(origin[:, 0]))
     if how == "unit_ball" and clouds.device.type == "cpu":
         found = _compiled(clouds.detach(), counts)
         if clouds.requires_grad and torch.is_grad_enabled():  # adds a gradient and changes no bit
             traced = _composed(clouds, how, counts)
             pairs = zip(found, traced, strict=True)
-            found = Normalised(*(value + (other - other.detach()) for value, other in pairs))
+            found = NormalisedClouds(*(value + (other - other.detach()) for value, other in pairs))
     else:
         found = _composed(clouds, how, counts)
     if clouds.dtype == torch.float64 and not bool(found.scale.isfinite().all()):
@@ -152,7 +152,7 @@ def normalised(
     return found
 
 
-def _compiled(clouds: Tensor, counts: Tensor) -> Normalised:
+def _compiled(clouds: Tensor, counts: Tensor) -> NormalisedClouds:
     """Return the result of "unit_ball" on the CPU, one cloud at a time, in a third of the time of tensor operations."""
     from framework.geometry.clouds_compiled import unit_ball
 
@@ -161,15 +161,15 @@ def _compiled(clouds: Tensor, counts: Tensor) -> Normalised:
     centre = torch.empty(len(clouds), 3, dtype=torch.float64)
     scale = torch.empty(len(clouds), dtype=torch.float64)
     unit_ball(clouds.numpy(), counts.numpy(), made.numpy(), centre.numpy(), scale.numpy())
-    return Normalised(made, centre, scale)
+    return NormalisedClouds(made, centre, scale)
 
 
-def _composed(clouds: Tensor, how: Normalisation, counts: Tensor) -> Normalised:
+def _composed(clouds: Tensor, how: Normalisation, counts: Tensor) -> NormalisedClouds:
     """Return the normalised clouds by operations on tensors, on any device, differentiable."""
     _, points, columns = clouds.shape
     real = None  # a mask of the points, where there is padding
     if not bool((counts == points).all()):
-        real = filled(clouds, counts)[..., None]
+        real = point_mask(clouds, counts)[..., None]
     coordinates = clouds[..., :3].double()
     first = coordinates[:, :1]
     # relative to the first point: clouds far from the origin keep their digits, and equal points are exactly equal
@@ -190,7 +190,7 @@ def _composed(clouds: Tensor, how: Normalisation, counts: Tensor) -> Normalised:
         local = local.where(real, math.nan)
     if columns > 3:
         local = torch.cat([local, clouds[..., 3:]], -1)
-    return Normalised(local, (first + mean)[:, 0], scale)
+    return NormalisedClouds(local, (first + mean)[:, 0], scale)
 
 
 @torch.no_grad()
@@ -205,7 +205,7 @@ def near_middle(
     return near.where(typical > 0, ~distance.isnan())
 
 
-def denormalised(
+def denormalise_clouds(
     points: Float[Tensor, "batch points columns"],
     centre: Float[Tensor, "batch 3"],
     scale: Float[Tensor, "batch"],
@@ -230,7 +230,7 @@ def require_normalised(
         DataError: half of a cloud's points are farther than 2 reaches from the origin (fewer may be outliers that a
             robust normalisation left there), or all are within 0.01 (but not all on it).
     """
-    real = filled(coordinates, counts)
+    real = point_mask(coordinates, counts)
     norm = torch.linalg.vector_norm(coordinates.detach().double(), dim=-1)
     largest = norm.where(real, 0).amax(1) if norm.shape[1] else norm.sum(1)
     far = largest > LOOSE * reach

@@ -13,7 +13,7 @@ compiled = compiler(kept_in("unit_ball", [Path(__file__)]))
 @compiled
 @no_type_check
 def unit_ball(clouds, counts, made, centre, scale):
-    """Fill `made` with eq. 6.2 of each cloud; see `framework.geometry.clouds.normalised`.
+    """Fill `made` with eq. 6.2 of each cloud; see `framework.geometry.clouds.normalise_clouds`.
 
     Args:
         clouds: (cloud, point, column) float32 or float64.

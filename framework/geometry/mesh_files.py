@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
-from framework.errors import shown
+from framework.errors import shorten
 from framework.storage import arrays, text
 from framework.storage.limits import MOST_ANNOUNCED as MOST
 from framework.storage.limits import MOST_COLUMNS, MOST_NUMBERS
@@ -423,7 +423,7 @@ def npz(content: bytes) -> Parsed:
     require_numbers(sum(array.size for array in held.values()), MOST_NUMBERS, len(content))
     key = "points" if "points" in held or len(held) != 1 else next(iter(held))
     if key not in held:
-        raise ValueError(f"wanted an array named points, got {shown(', '.join(held)) or 'nothing'}")
+        raise ValueError(f"wanted an array named points, got {shorten(', '.join(held)) or 'nothing'}")
     points = _points(held.pop(key))
     faces = held.pop("faces", np.empty((0, 3), np.int64))
     if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu":

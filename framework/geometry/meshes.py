@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from framework.errors import DataError, did_you_mean, shown
+from framework.errors import DataError, did_you_mean, shorten
 from framework.geometry import mesh_files
 from framework.geometry.mesh_files import COLOURS, Parsed
 from framework.geometry.ply import ply
@@ -58,7 +58,7 @@ class Mesh:
         if missing:
             raise DataError(
                 f"{self.source} has no column {missing[0]!r}.{did_you_mean(missing[0], self.columns)} Its columns "
-                f"beside x, y, z: {shown(', '.join(self.columns)) or 'none'}. Leave it out, or add it to the file."
+                f"beside x, y, z: {shorten(', '.join(self.columns)) or 'none'}. Leave it out, or add it to the file."
             )
         if not names or self.attributes is None:
             return np.empty((len(self.vertices), 0))

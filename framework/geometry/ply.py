@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Int
 from numpy.typing import NDArray
 
-from framework.errors import quoted, shown
+from framework.errors import quote, shorten
 from framework.geometry.mesh_files import (
     COLOURS,
     MOST,
@@ -79,7 +79,7 @@ def ply(content: bytes) -> Parsed:
     if "tristrips" in names:
         raise ValueError("its faces are strips of triangles; save it with single faces")
     if "vertex" not in names:
-        raise ValueError(f"wanted an element vertex, got {shown(', '.join(sorted(names))) or 'none'}")
+        raise ValueError(f"wanted an element vertex, got {shorten(', '.join(sorted(names))) or 'none'}")
     body = content[end.end() :]
     for element in elements:
         text.require_distinct(column_names([entry.name for entry in element.properties]), "property")
@@ -120,7 +120,7 @@ def _header(content: bytes) -> tuple[str, list[Element]]:
             else:
                 raise ValueError
         except (KeyError, IndexError, ValueError):
-            told = quoted(line.decode("utf-8", "replace").strip())
+            told = quote(line.decode("utf-8", "replace").strip())
             raise ValueError(f"its header has the line {told}, which is not PLY's") from None
     if order is None:
         raise ValueError("its header has no line format")
@@ -231,7 +231,7 @@ def _walked(
                 (count,) = length.unpack_from(body, start)
                 start += length.size
                 if count < 0:
-                    raise ValueError(f"a list of an element {shown(element.name)} has {count} values")
+                    raise ValueError(f"a list of an element {shorten(element.name)} has {count} values")
             if chosen:
                 counts[item], places[item] = count, start
             start += count * width
@@ -276,7 +276,7 @@ def _corners(element: Element) -> Property:
 def _no_list(element: Element) -> None:
     lists = [entry.name for entry in element.properties if entry.length is not None]
     if lists:
-        raise ValueError(f"its vertices have lists ({shown(', '.join(lists))}); wanted single numbers")
+        raise ValueError(f"its vertices have lists ({shorten(', '.join(lists))}); wanted single numbers")
 
 
 def _parsed(vertex: Element, values: NDArray, faces: NDArray) -> Parsed:
@@ -284,7 +284,7 @@ def _parsed(vertex: Element, values: NDArray, faces: NDArray) -> Parsed:
     missing = [name for name in XYZ if name not in names]
     if missing:
         raise ValueError(
-            f"its vertices have no {', '.join(missing)}, only {shown(', '.join(names)) or 'nothing'}"
+            f"its vertices have no {', '.join(missing)}, only {shorten(', '.join(names)) or 'nothing'}"
         )
     if not len(values):
         values = np.empty((0, len(names)))

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from framework.density_head import DensityHead
-from framework.errors import ConfigError, NonFiniteAnswer
+from framework.errors import ConfigError, NonFiniteParameters
 
 
 def require_finite(raw: Tensor, size: int) -> Tensor:
@@ -22,7 +22,9 @@ def require_finite(raw: Tensor, size: int) -> Tensor:
     # If the sum is finite, so is every number. This takes one pass; heads of very many numbers notice a second one.
     if not math.isfinite(float(raw.detach().sum())) and not raw.isfinite().all():
         row = tuple((~raw.isfinite().all(-1)).nonzero()[0].tolist())
-        raise NonFiniteAnswer(f"raw numbers are not finite in batch row {row[0] if len(row) == 1 else row}.")
+        raise NonFiniteParameters(
+            f"raw numbers are not finite in batch row {row[0] if len(row) == 1 else row}."
+        )
     return raw.float() if raw.dtype in (torch.float16, torch.bfloat16) else raw
 
 

@@ -32,13 +32,13 @@ class Unit(NamedTuple):
         """Logarithm of |det| of the map from the head's numbers to the target's, nats."""
         return 0.0 if self.scale is None else float(self.scale.log().sum())
 
-    def standardised(self, target: Tensor) -> Tensor:
+    def standardise(self, target: Tensor) -> Tensor:
         """Return a target in standard deviations, as the head computes."""
         if self.location is None or self.scale is None:
             return target
         return (target.double() - self.location.to(target.device)) / self.scale.to(target.device)
 
-    def given_back(
+    def to_target_unit(
         self, mean: Tensor, scale: Tensor, coefficients: Tensor | None = None
     ) -> tuple[Tensor, Tensor, Tensor | None]:
         """Return the parameters of a Gaussian in the target's own unit; x → l + s x maps φ_ij to s_i φ_ij / s_j."""

@@ -12,7 +12,7 @@ from rich.text import Text
 
 from framework.configuration.config import Config, Options
 from framework.configuration.registry import GROUPS, Entry, installed, origin, package_folders, refused
-from framework.errors import shown
+from framework.errors import shorten
 
 
 def run(config: Config) -> None:
@@ -97,7 +97,7 @@ def _docstring_and_bibtex(path: Path, attribute: str) -> tuple[str, str]:
         return f"(broken: {path.name}{place} does not parse)", ""
     # the file is unreadable, contains a null byte, or nests too deeply
     except (OSError, ValueError, RecursionError, MemoryError) as error:
-        return f"(broken: {path.name} cannot be read: {shown(error)})", ""
+        return f"(broken: {path.name} cannot be read: {shorten(error)})", ""
     for node in tree.body:
         if isinstance(node, ast.ClassDef) and node.name == attribute:
             summary = (ast.get_docstring(node) or "(no description)").partition("\n")[0]

@@ -151,11 +151,11 @@ def report_training(run: Run, session: Session, *, kept_epoch: int) -> None:
 
 def picture(run: Run, figure: "Figure", name: str) -> Path:
     """Save a figure into the run folder, in the format of the settings, and send it to the store; return its path."""
-    from framework.figures.style import saved
+    from framework.figures.style import save_figure
 
     folder = run.folder / "figures"
     folder.mkdir(exist_ok=True)
-    path = saved(figure, folder / name, run.settings.pictures)
+    path = save_figure(figure, folder / name, run.settings.pictures)
     run.tracker.log_artifact(path, "figures")
     return path
 

@@ -14,7 +14,7 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
-from framework.errors import ConfigError, encodable
+from framework.errors import ConfigError, escape_undecodable
 from framework.evaluation.significance import RULE, mean, significantly_best
 
 Row = Mapping[str, object]
@@ -107,7 +107,7 @@ def csv(rows: Sequence[Row], columns: Iterable[str] | None, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", newline="", encoding="utf-8") as file:
         table = writer(file, lineterminator="\n")
-        table.writerow(map(encodable, keys))
+        table.writerow(map(escape_undecodable, keys))
         table.writerows([_raw(row.get(key)) for key in keys] for row in rows)
 
 
@@ -249,7 +249,7 @@ def _raw(value: object) -> object:
     if isinstance(value, bool | np.bool_):
         return "true" if value else "false"
     if isinstance(value, str):
-        return encodable(value).replace("\r", r"\x0d")
+        return escape_undecodable(value).replace("\r", r"\x0d")
     if isinstance(value, Integral) or not isinstance(value, SupportsFloat):
         return "" if value is None else value
     return "" if math.isnan(float(value)) else repr(float(value))

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from framework.configuration.description import Description
 from framework.data import Data, Splits
-from framework.errors import shown
+from framework.errors import shorten
 from framework.target import Target
 
 MOST = 12
@@ -45,8 +45,8 @@ def introduce_model(description: Description, method: str, data: Data | None, co
         data: Prepared data; None if only files of the user are read.
         console: Console to print on.
     """
-    trained_on = shown(description.config["data"]["name"]) + " (synthetic)" * description.synthetic
-    said = [f"model: {shown(method)}, trained on {trained_on}", f"predicts {predicted(description.target)}"]
+    trained_on = shorten(description.config["data"]["name"]) + " (synthetic)" * description.synthetic
+    said = [f"model: {shorten(method)}, trained on {trained_on}", f"predicts {predicted(description.target)}"]
     _say([*said, *([] if data is None else _samples(data)), *description.remarks], console)
 
 
@@ -87,9 +87,7 @@ def threads_line(threads: int, chosen: int | None, cores: Cores, environment: Ma
     if chosen is not None:
         why = f"as threads={chosen} says"
     elif names:
-        why = (
-            f"as {names[0]}={shown(environment[names[0]], 20)} says, which a sweep sets for each of its jobs"
-        )
+        why = f"as {names[0]}={shorten(environment[names[0]], 20)} says, which a sweep sets for each of its jobs"
     else:
         why = "one for each core; threads=1 sets another number"
     busy = f"; the machine's load was {cores.load:.1f} in the last minute" * (cores.load >= BUSY)
@@ -113,7 +111,7 @@ def _samples(data: Data) -> list[str]:
         if isinstance(part, Sized)
     ]
     skipped = f", {data.skipped} left out" if data.skipped else ""
-    return [f"samples: {', '.join(sizes)}{skipped}", *(shown(remark, 1000) for remark in data.remarks)]
+    return [f"samples: {', '.join(sizes)}{skipped}", *(shorten(remark, 1000) for remark in data.remarks)]
 
 
 def _say(said: Sequence[str], console: Console) -> None:
@@ -123,4 +121,4 @@ def _say(said: Sequence[str], console: Console) -> None:
 
 def _listed(names: Sequence[str]) -> str:
     rest = f" and {len(names) - MOST} more" if len(names) > MOST else ""
-    return shown(", ".join(names[:MOST]), 400) + rest
+    return shorten(", ".join(names[:MOST]), 400) + rest

@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from framework.errors import ConfigError, DataError, quoted
+from framework.errors import ConfigError, DataError, quote
 from framework.storage.files import write_whole
 from framework.storage.first_rank import first_rank
 from framework.storage.plain_values import read_json
@@ -51,7 +51,7 @@ def read_record(folder: Path) -> dict[str, Any]:
     if "key" in record and "number" not in record:
         wrong.append("number")
     if wrong:
-        found = quoted(record.get(wrong[0]))
+        found = quote(record.get(wrong[0]))
         raise DataError(f"{path} says {wrong[0]} = {found}; wanted what a sweep writes. {remedy}")
     return record
 

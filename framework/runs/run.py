@@ -16,7 +16,7 @@ import yaml
 from framework.configuration.config import Config
 from framework.configuration.paths import paths_of, words
 from framework.configuration.settings import Settings, store_experiment
-from framework.errors import DataError, UserError, encodable
+from framework.errors import DataError, UserError, escape_undecodable
 from framework.runs.job import PARENT, SYNCED_WITHIN
 from framework.runs.provenance import flatten, package_versions
 from framework.runs.repository import git_commit
@@ -238,7 +238,7 @@ def _record(run: Run, error: BaseException) -> None:
     """Store the traceback in the run folder, and the error message as a tag of the run."""
     path = run.folder / TRACEBACK
     with suppress(OSError):  # on a full disk, the error itself is all that can be reported
-        write_whole(path, encodable("".join(traceback.format_exception(error))).encode())
+        write_whole(path, escape_undecodable("".join(traceback.format_exception(error))).encode())
         run.tracker.log_artifact(path)
     sentence = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
     if isinstance(error, Stopped):

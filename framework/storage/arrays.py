@@ -12,7 +12,7 @@ import numpy as np
 from numpy.lib import format as layout
 from numpy.typing import NDArray
 
-from framework.errors import shown
+from framework.errors import shorten
 from framework.storage.reading import room
 
 MAGIC = b"\x93NUMPY"
@@ -33,7 +33,7 @@ def array(content: bytes) -> NDArray:
     shape, by_columns, kind = HEADERS[version](stream)
     if kind.kind not in KINDS or not kind.itemsize or any(side < 0 for side in shape):
         raise ValueError(
-            f"an array of {shown(kind)} {shown(shape)}; wanted plain numbers or text, no objects"
+            f"an array of {shorten(kind)} {shorten(shape)}; wanted plain numbers or text, no objects"
         )
     count, start = math.prod(shape), stream.tell()  # Python integers cannot overflow
     if count * kind.itemsize > len(content) - start:
@@ -81,12 +81,12 @@ def archive(content: bytes, names: Collection[str] | None = None) -> dict[str, N
         found = {}
         for name, part in chosen.items():
             if part.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-                raise ValueError(f"{shown(name)} is compressed by method {part.compress_type}")
+                raise ValueError(f"{shorten(name)} is compressed by method {part.compress_type}")
             with packed.open(part) as stream:
                 # the size is given because zipfile would otherwise decompress everything, however much it is
                 content = stream.read(part.file_size)
             try:
                 found[name] = array(content)
             except ValueError as error:
-                raise ValueError(f"{shown(name)} cannot be read as plain numbers: {error}") from error
+                raise ValueError(f"{shorten(name)} cannot be read as plain numbers: {error}") from error
         return found

@@ -15,7 +15,7 @@ from typing import Any, BinaryIO, cast
 import torch
 from torch import Tensor
 
-from framework.errors import CheckpointError, shown
+from framework.errors import CheckpointError, shorten
 from framework.storage.files import full, remove_leftovers, replacing
 from framework.storage.plain_tensors import load, require_admitted_pickles, require_dense
 from framework.storage.plain_values import Foreign
@@ -78,14 +78,14 @@ def read(path: Path) -> dict[str, Any]:
                 raise ValueError(f"it holds {type(content).__name__}")
             return content
         except (Foreign, UnpicklingError) as error:
-            named = shown(error) if isinstance(error, Foreign) else "what pickle could make anything of"
+            named = shorten(error) if isinstance(error, Foreign) else "what pickle could make anything of"
             raise CheckpointError(
                 f"The checkpoint {path} holds more than dicts, lists, numbers, strings and dense tensors, namely "
                 f"{named}, which could run code or harm. This framework did not write it: do not use it."
             ) from None
         except Exception as error:  # with a correct checksum and wrong contents, torch raises a dozen kinds
             raise CheckpointError(
-                f"The checkpoint {path} cannot be used: {shown(error)}. {_remedy(path)}"
+                f"The checkpoint {path} cannot be used: {shorten(error)}. {_remedy(path)}"
             ) from error
 
 
@@ -171,7 +171,7 @@ def _require_plain(partial: Path, path: Path, checkpoint: Mapping[str, Any]) -> 
             require_admitted_pickles(file)
         require_dense(checkpoint, partial.stat().st_size)
     except ValueError as error:
-        held = f"it would hold {shown(error)}" if isinstance(error, Foreign) else shown(error)
+        held = f"it would hold {shorten(error)}" if isinstance(error, Foreign) else shorten(error)
         raise CheckpointError(
             f"The checkpoint {path} was not written: {held}, and only dicts, lists, tuples, numbers, strings and dense "
             "tensors are read. Convert these where the state is made."

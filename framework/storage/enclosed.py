@@ -11,7 +11,7 @@ import stat
 from pathlib import Path
 from typing import BinaryIO
 
-from framework.errors import DataError, UserError, shown
+from framework.errors import DataError, UserError, shorten
 
 MOST_ENTRIES = 1_000_000
 """Largest number of files and folders in a run or sweep folder; a folder with more is refused."""
@@ -34,7 +34,7 @@ def require_enclosed(folder: Path, error: type[UserError] = DataError) -> None:
     if not folder.exists():
         return
     if not folder.is_dir():
-        raise error(f"{shown(folder)} is no folder. Give the folder of a run.")
+        raise error(f"{shorten(folder)} is no folder. Give the folder of a run.")
     folders, seen = [os.fspath(folder)], 0
     while folders:
         try:
@@ -43,19 +43,19 @@ def require_enclosed(folder: Path, error: type[UserError] = DataError) -> None:
                     seen += 1
                     status = entry.stat(follow_symlinks=False)
                     if fault := _fault(status):
-                        raise error(f"{shown(entry.path)} is {fault}. {REMEDY}")
+                        raise error(f"{shorten(entry.path)} is {fault}. {REMEDY}")
                     if stat.S_ISDIR(status.st_mode):
                         folders.append(entry.path)
         except FileNotFoundError:  # removed meanwhile by the process that writes there
             continue
         except OSError as refused:
             raise error(
-                f"{shown(refused.filename or folder)} cannot be looked through ({refused.strerror}). Give a "
+                f"{shorten(refused.filename or folder)} cannot be looked through ({refused.strerror}). Give a "
                 "folder that you may read."
             ) from refused
         if seen > MOST_ENTRIES:
             raise error(
-                f"{shown(folder)} holds more than {MOST_ENTRIES:,} files; wanted the folder of a run. Give that one."
+                f"{shorten(folder)} holds more than {MOST_ENTRIES:,} files; wanted the folder of a run. Give that one."
             )
 
 
@@ -73,7 +73,7 @@ def require_plain_within(file: Path, folder: Path, error: type[UserError] = Data
         except FileNotFoundError:
             return
         if fault := _fault(status):
-            raise error(f"{shown(path)} is {fault}. {REMEDY}")
+            raise error(f"{shorten(path)} is {fault}. {REMEDY}")
 
 
 def open_plain(path: Path, flags: int, mode: int = 0o644) -> int:
@@ -91,11 +91,11 @@ def open_plain(path: Path, flags: int, mode: int = 0o644) -> int:
         descriptor = os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, mode)
     except OSError:
         if path.is_symlink():
-            raise DataError(f"{shown(path)} is a link. {REMEDY}") from None
+            raise DataError(f"{shorten(path)} is a link. {REMEDY}") from None
         raise
     if fault := _fault(os.fstat(descriptor)):
         os.close(descriptor)
-        raise DataError(f"{shown(path)} is {fault}. {REMEDY}")
+        raise DataError(f"{shorten(path)} is {fault}. {REMEDY}")
     return descriptor
 
 
@@ -115,7 +115,7 @@ def read_plain(path: Path, most: int) -> bytes:
         size = os.fstat(stream.fileno()).st_size
         if size > most:
             raise DataError(
-                f"{shown(path)} has {size:,} bytes; wanted {most:,} at most. Restore it from its source."
+                f"{shorten(path)} has {size:,} bytes; wanted {most:,} at most. Restore it from its source."
             )
         return stream.read(most + 1)
 

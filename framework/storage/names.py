@@ -8,7 +8,7 @@ import os
 import re
 from pathlib import Path
 
-from framework.errors import encodable
+from framework.errors import escape_undecodable
 
 _UNSAFE = re.compile("[\ud800-\udfff\x00-\x1f\x7f]")
 
@@ -23,7 +23,7 @@ def spelled(name: str | os.PathLike[str]) -> str:
     if "\\x" not in text and not _UNSAFE.search(text):
         return text
     doubled = text.replace("\\", "\\\\")
-    return encodable(re.sub(r"[\x00-\x1f\x7f]", lambda letter: f"\\x{ord(letter[0]):02x}", doubled))
+    return escape_undecodable(re.sub(r"[\x00-\x1f\x7f]", lambda letter: f"\\x{ord(letter[0]):02x}", doubled))
 
 
 def path_of(spelling: str) -> Path:

@@ -14,7 +14,7 @@ from typing import Any, BinaryIO
 import torch
 from torch import Tensor, nn
 
-from framework.errors import shown
+from framework.errors import shorten
 from framework.storage.plain_values import Foreign, instructions, require_plain_pickle
 
 TENSORS = ("_rebuild_tensor", "_rebuild_tensor_v2", "_rebuild_tensor_v3", "_rebuild_parameter")
@@ -174,13 +174,13 @@ def require_dense(content: Any, size: int | float = math.inf) -> None:
 def _require_dense(tensor: Tensor, name: str) -> int:
     """Check one tensor, as `require_dense` does, and return the bytes of its elements."""
     if type(tensor) not in (Tensor, nn.Parameter) or tensor.layout != torch.strided:
-        raise Foreign(f"{shown(name)}, a {type(tensor).__name__} of layout {tensor.layout}")
+        raise Foreign(f"{shorten(name)}, a {type(tensor).__name__} of layout {tensor.layout}")
     if tensor.dtype not in TYPES or tensor.is_nested or tensor.is_conj() or tensor.is_neg():
-        raise Foreign(f"{shown(name)}, a tensor of type {tensor.dtype} that is no array of plain numbers")
+        raise Foreign(f"{shorten(name)}, a tensor of type {tensor.dtype} that is no array of plain numbers")
     size, held = tensor.numel() * tensor.element_size(), tensor.untyped_storage().nbytes()
     if size > held and tensor.numel() > MOST_EXPANDED:
         raise ValueError(
-            f"{shown(name)} has {tensor.numel()} numbers that are views of {held // tensor.element_size()}; "
+            f"{shorten(name)} has {tensor.numel()} numbers that are views of {held // tensor.element_size()}; "
             "wanted each stored (.contiguous())"
         )
     return size

@@ -10,7 +10,7 @@ from typing import Any, TypeGuard
 
 import yaml
 
-from framework.errors import DataError, UserError, quoted, shown
+from framework.errors import DataError, UserError, quote, shorten
 from framework.storage.reading import RESTORE, guarded, read_bytes
 from framework.storage.text import decoded
 
@@ -81,7 +81,7 @@ def plain_numbers(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [plain_numbers(item) for item in value]
     if not is_number(value):
-        raise ValueError(f"wanted a number, got {quoted(value)}")
+        raise ValueError(f"wanted a number, got {quote(value)}")
     return value
 
 
@@ -179,7 +179,7 @@ def require_plain_pickle(pickled: bytes, called: Collection[str] = (), named: Co
             module, _, word = str(argument).partition(" ")
             found = f"{RENAMED.get(module, module)} {word}"
             if found not in called and found not in named:
-                raise Foreign(shown(found.replace(" ", ".", 1)))
+                raise Foreign(shorten(found.replace(" ", ".", 1)))
             stack.append(_Item(name=found))
         elif name in ADDS:
             inner = [stack.pop() for _ in range(ADDS[name])] or _above_mark(stack)

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from framework.errors import DataError, UserError, shown
+from framework.errors import DataError, UserError, shorten
 from framework.storage import limits
 
 RESTORE = "Restore it from its source."
@@ -43,7 +43,7 @@ def guarded(
     except Exception as error:
         if isinstance(error, FileNotFoundError) and not file.exists():
             raise kind(f"{file}: no such file; {missing or f'wanted {wanted}. Mend the path.'}") from None
-        why = shown(error) or type(error).__name__
+        why = shorten(error) or type(error).__name__
         raise kind(f"{file}: cannot be read as {wanted} ({why}). {remedy}") from error
 
 

@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
-from framework.errors import quoted
+from framework.errors import quote
 
 SAVE = "Save it as UTF-8"
 WIDE = (
@@ -114,7 +114,7 @@ def require_distinct(names: Sequence[str], what: str = "column") -> None:
     """
     twice = [name for name, count in Counter(names).items() if count > 1 and name]
     if twice:
-        raise ValueError(f"names the {what} {quoted(twice[0])} twice; wanted each once. Rename one.")
+        raise ValueError(f"names the {what} {quote(twice[0])} twice; wanted each once. Rename one.")
 
 
 def value(word: str) -> float | None:
@@ -285,4 +285,4 @@ def no_number(word: str, where: str = "") -> str:
     """Return an error message for a word where a number was wanted, with a correction if there is one."""
     remedy = mended(word)
     why = f": a number {remedy.what}; write {remedy.number}" if remedy else ""
-    return f"wanted a number, got {quoted(word)}{where}{why}"
+    return f"wanted a number, got {quote(word)}{where}{why}"

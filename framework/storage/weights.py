@@ -14,7 +14,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
-from framework.errors import CheckpointError, ConfigError, shown
+from framework.errors import CheckpointError, ConfigError, shorten
 from framework.storage.plain_tensors import load
 from framework.storage.plain_values import Foreign
 from framework.storage.reading import opened, room
@@ -128,7 +128,7 @@ def _damaged(path: Path, why: str) -> CheckpointError:
 
 
 def _first_line(error: Exception) -> str:
-    return shown((str(error).splitlines() or [type(error).__name__])[0].rstrip("."))
+    return shorten((str(error).splitlines() or [type(error).__name__])[0].rstrip("."))
 
 
 def describe_mismatch(
@@ -226,4 +226,4 @@ def _shape(tensor: Shaped[Tensor, "..."]) -> str:
 
 def _some(names: list[str]) -> str:
     rest = len(names) - LISTED
-    return shown(", ".join(names[:LISTED]), 400) + (f" and {rest} more" if rest > 0 else "")
+    return shorten(", ".join(names[:LISTED]), 400) + (f" and {rest} more" if rest > 0 else "")

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from framework.configuration.settings import store_experiment
-from framework.errors import ConfigError, DataError, did_you_mean, printable, quoted, shown
+from framework.errors import ConfigError, DataError, did_you_mean, escape_unprintable, quote, shorten
 from framework.reports.table import (
     COST_BETTER,
     COST_COLUMNS,
@@ -229,9 +229,9 @@ def _checked(results: Mapping[str, Any], path: Path) -> dict[str, Any]:
     if isinstance(columns, dict):
         wanted |= {key: results[key] is None or is_number(results[key]) for key in columns if key in results}
     if wrong := [key for key, right in wanted.items() if not right]:
-        raise DataError(f"{path} says {shown(wrong[0])} = {quoted(results.get(wrong[0]))}. {RESTORE}")
-    plain = {key: shown(value) if isinstance(value, str) else value for key, value in results.items()}
-    return {**plain, "columns": {key: shown(heading) for key, heading in columns.items()}}
+        raise DataError(f"{path} says {shorten(wrong[0])} = {quote(results.get(wrong[0]))}. {RESTORE}")
+    plain = {key: shorten(value) if isinstance(value, str) else value for key, value in results.items()}
+    return {**plain, "columns": {key: shorten(heading) for key, heading in columns.items()}}
 
 
 def _trial_row(
@@ -278,7 +278,7 @@ def _row(job: Path) -> dict[str, Any] | None:
     results = _results(job) if record.get("status") == "completed" else {}
     if not results:
         return None
-    overrides = [printable(override, kept="") for override in record["overrides"]]
+    overrides = [escape_unprintable(override, kept="") for override in record["overrides"]]
     swept = dict(override.lstrip("+~").split("=", 1) for override in overrides if "=" in override)
     row = {**swept, **results, "overrides": overrides, "folder": str(job)}
     if "batch_size" in swept:
@@ -324,7 +324,7 @@ def _picture(
         by: Keys of method and data, and the keys that were varied.
         folder: Folder of the sweep.
     """
-    from framework.figures.style import saved
+    from framework.figures.style import save_figure
     from framework.reports.tradeoff_picture import error_against_run_time
 
     headings, better = rows[0]["columns"], rows[0]["better"]
@@ -349,7 +349,9 @@ def _picture(
     )
     stored = stored_config(Path(rows[0]["folder"]))
     wanted = stored.get("pictures", True) if isinstance(stored, dict) else True
-    return [saved(figure, folder / "comparison", wanted if wanted in ("png", "pdf", "svg", False) else True)]
+    return [
+        save_figure(figure, folder / "comparison", wanted if wanted in ("png", "pdf", "svg", False) else True)
+    ]
 
 
 def _parent(

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from framework.distributions.circular import Circular, wrap
-from framework.distributions.protocol import peaks
+from framework.distributions.protocol import mode_candidates
 
 RULES = {1: (10, 6), 2: (8, 5)}
 """Gauss-Legendre points per side of the two rules; a box on which their sums differ is split."""
@@ -198,7 +198,7 @@ def boxes(density: Distribution) -> Boxes:
 
     Candidates for peaks are the mode, `peaks` and draws. A box is also split while it may hide a peak or a ridge.
     """
-    humps = peaks(density)[:MOST_PEAKS].double()
+    humps = mode_candidates(density)[:MOST_PEAKS].double()
     drawn = density.sample(torch.Size((24,))).double()
     seen = torch.cat([density.mode.unsqueeze(0).double(), humps, drawn])
     way = _Map(density, seen)

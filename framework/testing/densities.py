@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from framework.distributions.circular import Circular, angular_distance, wrap
-from framework.distributions.protocol import arc, cdf, marginal, median, slope
+from framework.distributions.protocol import arc_probability, cdf, marginal, median, quadratic_bound
 from framework.errors import UserError
 from framework.testing.adaptive import boxes
 from framework.testing.finding import SEED, Finding, Worst, seed
@@ -126,11 +126,11 @@ def _examine_questions(subject: HeadSubject, draws: bool) -> Iterator[Finding]:
     asked: list[tuple[str, float, Callable[[], Distribution], Check, bool]] = [
         ("estimate", 1.0, rows, estimated, True),
         ("pick", 1.0, pairs, picks, True),
-        ("slope", 1.0, rows, slopes, not classes and not draws and kind != "image"),
-        ("about", 1.0, rows, moved_places, one and not draws),
+        ("quadratic_bound", 1.0, rows, slopes, not classes and not draws and kind != "image"),
+        ("recentre", 1.0, rows, moved_places, one and not draws),
         ("normals", 1.0, rows, normal_forms, kind == "real" and not draws),
-        ("peaks and scales", 0.0, rows, candidates, not classes and not draws),
-        ("each_cdf", 1.0, rows, shares_below, kind in ("real", "image") and not draws),
+        ("mode candidates and peak widths", 0.0, rows, candidates, not classes and not draws),
+        ("marginal_cdfs", 1.0, rows, shares_below, kind in ("real", "image") and not draws),
         (
             "mean and variance",
             1.0,
@@ -394,9 +394,9 @@ def mode_is_highest(density: Distribution, worst: Worst) -> None:
 def mode_of_mixture(density: Distribution, worst: Worst) -> None:
     """Check the mode of a mixture; the error is in units of the height that the search may miss.
 
-    That height is 0.05 nats where `slope` leads up from the modes of the components, else log 2 nats.
+    That height is 0.05 nats where `quadratic_bound` leads up from the modes of the components, else log 2 nats.
     """
-    known = density.has_enumerate_support or slope(density, density.mode) is not None
+    known = density.has_enumerate_support or quadratic_bound(density, density.mode) is not None
     inner = Worst()
     mode_is_highest(density, inner)
     worst.see(inner.error / (0.05 if known else math.log(2)), inner.case)
@@ -506,7 +506,9 @@ def masses(density: Distribution, worst: Worst) -> None:
     value = found.way.mode[:, 0] + offset * found.way.scale[:, 0]
     if isinstance(density.support, Circular):
         value = value.clamp(found.way.mode[:, 0] - 3.1, found.way.mode[:, 0] + 3.1)
-        given = arc(density, found.border[:1].unsqueeze(-1).expand(len(offset), -1, 1), value.unsqueeze(-1))
+        given = arc_probability(
+            density, found.border[:1].unsqueeze(-1).expand(len(offset), -1, 1), value.unsqueeze(-1)
+        )
     else:
         given = cdf(density, value.unsqueeze(-1))
     if given is None:

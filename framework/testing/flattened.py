@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution, constraints
 
-from framework.distributions.protocol import cdf, each_cdf, median
+from framework.distributions.protocol import cdf, marginal_cdfs, median
 
 
 def flattened(density: Distribution) -> Distribution:
@@ -62,5 +62,5 @@ def _(density: Flattened, samples: int) -> Tensor:
 @cdf.register
 def _(density: Flattened, value: Tensor) -> Tensor | None:
     """Return the distribution function of an image of one number."""
-    found = each_cdf(density.density, density.image(value))
+    found = marginal_cdfs(density.density, density.image(value))
     return None if found is None else found[..., 0, 0, 0]

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from framework.flights.frames import future_names
 from framework.flights.physics import Constants
-from framework.flights.trajectories import flown
+from framework.flights.trajectories import simulate
 from framework.target import Target
 
 STEP = 0.016
@@ -42,7 +42,7 @@ def windows_of(
         START + random.normal(size=(count, 9)) * [0.1, 0.05, 0.05, 0.3, 0.3, 0.2, 40, 40, 40]
     )
     times = STEP * torch.arange(55, dtype=torch.float64).expand(count, -1)
-    places = flown(states, times, Constants())[..., :3]
+    places = simulate(states, times, Constants())[..., :3]
     seen = places[:, :20] + SIGMA * torch.from_numpy(random.normal(size=(count, 20, 3)))
     there = torch.from_numpy(random.random((count, 20, 1)) > 0.1)
     if outliers:

@@ -17,7 +17,7 @@ from framework.density_head import DensityHead, Fitted
 from framework.distributions.circular import Circular, wrap
 from framework.distributions.density import Mixture
 from framework.distributions.protocol import images, median, pick
-from framework.geometry.light import light_of
+from framework.geometry.srgb import linear_from_srgb
 from framework.target import Target
 from framework.testing.devices import OneDevice, Questions, on_one_device
 from framework.testing.finding import SEED, Finding, Worst, examined, seed
@@ -218,7 +218,7 @@ def _shapes(subject: HeadSubject, worst: Worst) -> None:
             worst.count(angles != (target.kind == "angle"), f"support: {density.support} of {target.kind}")
             if target.kind == "image":
                 shapes["color"] = (images(density, {"color"})["color"].shape, (*batch, *event))
-                light = light_of(density.mean)
+                light = linear_from_srgb(density.mean)
                 worst.same_bits("color: light of the mean", images(density, {"color"})["color"], light)
             if target.kind == "class":
                 labels = density.enumerate_support(expand=False).flatten().tolist()

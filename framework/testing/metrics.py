@@ -20,7 +20,7 @@ from torch.distributions import (
 )
 
 from framework.distributions.circular import circular
-from framework.distributions.protocol import estimate, exactly, marginal, median, pick, take
+from framework.distributions.protocol import estimate, exact_estimate, marginal, median, pick, take
 from framework.errors import UserError
 from framework.metric import Metric
 from framework.prediction import Prediction, Split
@@ -99,7 +99,7 @@ class Cardioid(Distribution):
         return self.event_shape[0] * (math.log(4 * math.pi) - 1 + root - torch.log1p(root))
 
 
-estimate.register(Cardioid, exactly)
+estimate.register(Cardioid, exact_estimate)
 
 
 @marginal.register

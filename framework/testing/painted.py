@@ -29,7 +29,7 @@ def barycentric(renderer: Renderer, worst: Worst) -> None:
     scene = replace(sphere(), colors=None)
     found = renderer(scene, ("barycentric", "face"))
     corners = scene.vertices.double()[scene.faces][found["face"].clamp(min=0).long()]
-    pixels, _ = scene.camera.projected((found["barycentric"].double()[..., None] * corners).sum(-2))
+    pixels, _ = scene.camera.project((found["barycentric"].double()[..., None] * corners).sum(-2))
     y, x = torch.meshgrid(*[torch.arange(side, dtype=torch.float64) for side in SIZE], indexing="ij")
     off = (pixels - torch.stack([x, y], -1)).norm(dim=-1)
     worst.see(off.where(found["face"] >= 0, 0), lambda at: f"pixel {at}: {found['barycentric'][at].tolist()}")
@@ -95,7 +95,7 @@ def wrapped(place: Tensor, count: int, wrap: str) -> Tensor:
 def papered(image: Tensor) -> tuple[Scene, Tensor]:
     """Return a square across the view with an image, repeated and rotated, and its uv at each pixel, float64."""
     scene = square(3.0, side=4.0)
-    pixels, _ = scene.camera.projected(scene.vertices.double())
+    pixels, _ = scene.camera.project(scene.vertices.double())
     slope = torch.tensor([[0.041, 0.013], [-0.017, 0.053]], dtype=torch.float64)
     start = torch.tensor([-1.07, -1.03], dtype=torch.float64)
     y, x = torch.meshgrid(*[torch.arange(side, dtype=torch.float64) for side in SIZE], indexing="ij")

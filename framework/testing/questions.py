@@ -11,21 +11,21 @@ from torch.distributions import Distribution
 from framework.distributions.circular import Circular, wrap
 from framework.distributions.density import Mixture
 from framework.distributions.protocol import (
-    about,
-    arc,
+    arc_probability,
     cdf,
-    each_cdf,
     estimate,
     images,
     mahalanobis,
     marginal,
+    marginal_cdfs,
     median,
+    mode_candidates,
     normals,
-    peaks,
+    peak_widths,
     pick,
-    scales,
-    slope,
-    tempered,
+    quadratic_bound,
+    recentre,
+    tempered_density,
     value_set,
 )
 from framework.errors import UserError
@@ -104,7 +104,7 @@ def powers(density: Distribution, worst: Worst) -> None:
     log_prob = density.log_prob(value).double()
     for temperature in TEMPERATURES:
         try:
-            power = tempered(density, torch.tensor(temperature, dtype=torch.float64))
+            power = tempered_density(density, torch.tensor(temperature, dtype=torch.float64))
         except UserError:
             worst.count(False, "no power is known")
             return
@@ -126,7 +126,7 @@ def powers_of(density: Distribution, worst: Worst, check: Callable[[Distribution
     """Apply a check to the density tempered with each of TEMPERATURES."""
     for temperature in TEMPERATURES:
         try:
-            power = tempered(density, torch.tensor(temperature, dtype=torch.float64))
+            power = tempered_density(density, torch.tensor(temperature, dtype=torch.float64))
         except UserError:
             worst.count(False, "no power is known")
             return
@@ -173,7 +173,7 @@ def slopes(density: Distribution, worst: Worst) -> None:
         log_prob = density.log_prob(value)
         (gradient,) = torch.autograd.grad(log_prob.sum(), value)
     value = value.detach()
-    found = slope(density, value)
+    found = quadratic_bound(density, value)
     if found is None:
         worst.count(False, "not known")
         return
@@ -203,7 +203,7 @@ def moved_places(density: Distribution, worst: Worst) -> None:
     index = torch.arange(2 * rows + 1) % rows
     width = known_widths(density)
     place = density.mode.double()[index] + 0.3 * width[index].unsqueeze(-1)
-    moved = about(density, (index,), place)
+    moved = recentre(density, (index,), place)
     offset = torch.tensor([-3.0, -0.5, 0.0, 0.2, 2.0], dtype=torch.float64)[:, None] * width[index]
     found = moved.log_prob(offset.unsqueeze(-1)).double()
     value = (place + offset.unsqueeze(-1)).to(density.mode.dtype)  # (5, item, 1)
@@ -239,13 +239,13 @@ def normal_forms(density: Distribution, worst: Worst) -> None:
 
 
 def candidates(density: Distribution, worst: Worst) -> None:
-    """Check that `peaks` and `scales` are finite and of the documented shapes, and that all scales are above 0."""
-    places = peaks(density)
+    """Check that `mode_candidates` and `peak_widths` are finite and of the documented shapes, and that all scales are above 0."""
+    places = mode_candidates(density)
     shape = (*density.batch_shape, *density.event_shape)
     worst.same("shape of a peak", tuple(places.shape[1:]), shape)
-    worst.finite("peaks", places)
+    worst.finite("mode_candidates", places)
     if density.event_shape == (1,):
-        widths = scales(density)
+        widths = peak_widths(density)
         worst.same("shape of the scales", tuple(widths.shape), tuple(places.shape[:-1]))
         worst.count(~(widths > 0) | widths.isnan(), "a scale not above 0")
 
@@ -253,7 +253,7 @@ def candidates(density: Distribution, worst: Worst) -> None:
 def shares_below(density: Distribution, worst: Worst) -> None:
     """Check that each_cdf is the share of draws below a value, for each number; in standard errors of MANY draws."""
     value = some_values(density)
-    found = each_cdf(density, value)
+    found = marginal_cdfs(density, value)
     if found is None:
         worst.count(False, "not known")
         return
@@ -352,22 +352,22 @@ def every_question(
     yield "variance", lambda: density.variance
     yield "estimate", lambda: estimate(density, value)
     yield "cdf", lambda: cdf(density, value)
-    yield "each_cdf", lambda: each_cdf(density, value)
-    yield "arc", lambda: arc(density, value - 0.1, value + 0.1)
+    yield "marginal_cdfs", lambda: marginal_cdfs(density, value)
+    yield "arc_probability", lambda: arc_probability(density, value - 0.1, value + 0.1)
     yield "marginal", lambda: answer(marginal(density, 0))
     yield "median", lambda: median(density, 50)
     if density.event_shape == (1,):
         rows = index[:, 0]
         yield (
-            "about",
-            lambda: about(density, (rows,), value[0].double()[rows]).log_prob(value[:, :1].double()),
+            "recentre",
+            lambda: recentre(density, (rows,), value[0].double()[rows]).log_prob(value[:, :1].double()),
         )
-    yield "tempered", lambda: answer(tempered(density, temperature))
+    yield "tempered_density", lambda: answer(tempered_density(density, temperature))
     yield "normals", lambda: normals(density)
     yield "mahalanobis", lambda: mahalanobis(density, value)
-    yield "peaks", lambda: peaks(density)
-    yield "scales", lambda: scales(density)
-    yield "slope", lambda: slope(density, value)
+    yield "mode_candidates", lambda: mode_candidates(density)
+    yield "peak_widths", lambda: peak_widths(density)
+    yield "quadratic_bound", lambda: quadratic_bound(density, value)
     yield "images", lambda: images(density, {"color"})
     yield "value_set", lambda: _of_set(density, value)
     yield "expand", lambda: answer(density.expand(torch.Size((2, *density.batch_shape))))

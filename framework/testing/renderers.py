@@ -268,7 +268,7 @@ def _small(renderer: Renderer, worst: Worst) -> None:
 
 
 def _places(renderer: Renderer, worst: Worst) -> None:
-    """Check that a triangle inside one pixel is drawn at the pixel and depth that `Camera.projected` returns."""
+    """Check that a triangle inside one pixel is drawn at the pixel and depth that `Camera.project` returns."""
     if "mask" not in renderer.channels:
         worst.count(False, "draws no mask")
         return
@@ -283,7 +283,7 @@ def _places(renderer: Renderer, worst: Worst) -> None:
                 torch.cat([(pixels - principal) / focal, torch.ones(3, 1, dtype=torch.float64)], -1) * depth
             )
             world = (inside - seen.translation.double()) @ seen.rotation.double()
-            place, far = seen.projected(world)
+            place, far = seen.project(world)
             worst.count(
                 bool((place - pixels).abs().max() > 1e-4), f"pixel {row, column}: projected to {place}"
             )

@@ -13,7 +13,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import final
 
-from framework.errors import CheckpointError, DataError, encodable, shown
+from framework.errors import CheckpointError, DataError, escape_undecodable, shorten
 from framework.storage.cache import folder as cache_folder
 from framework.storage.enclosed import require_enclosed, require_plain_within
 from framework.storage.files import alone, remove_leftovers, replacing
@@ -130,7 +130,7 @@ class MlflowStore(Store):
                 require_enclosed(file)
         except DataError as error:
             _log.warning(
-                "%s leads out of the run folder %s (%s): it is not sent.", shown(file), self._folder, error
+                "%s leads out of the run folder %s (%s): it is not sent.", shorten(file), self._folder, error
             )
             return
         self._require_own_files(self._files)
@@ -143,7 +143,7 @@ class MlflowStore(Store):
         elif file.exists():
             self._client.log_artifact(self._run_id, str(file), place or None)
         else:
-            _log.warning("%s is gone before it could be stored.", shown(file))
+            _log.warning("%s is gone before it could be stored.", shorten(file))
 
     def _send_model(self, file: Path) -> None:
         """Store the checkpoint as a model that MLflow can serve; it replaces a model sent before."""
@@ -177,7 +177,9 @@ class MlflowStore(Store):
                 if error.error_code != "RESOURCE_DOES_NOT_EXIST":
                     raise
             uri = without_password(info.uri)
-            _log.warning("%s knows no run %s: the run is stored there anew.", shown(uri), shown(info.run_id))
+            _log.warning(
+                "%s knows no run %s: the run is stored there anew.", shorten(uri), shorten(info.run_id)
+            )
         found = self._client.search_runs([experiment_id], f"tags.`{_KEY}` = '{info.key}'", max_results=1)
         return found[0] if found else None
 
@@ -187,7 +189,7 @@ class MlflowStore(Store):
         if info.parent:
             tags["mlflow.parentRunId"] = info.parent
         return self._client.create_run(
-            experiment_id, int(info.started * 1000), tags, encodable(info.run_name)
+            experiment_id, int(info.started * 1000), tags, escape_undecodable(info.run_name)
         )
 
     def _metrics(self, record: Record) -> Iterator[Metric]:
@@ -203,10 +205,11 @@ class MlflowStore(Store):
         tags: dict[str, str | None] = {}
         for record in batch:
             tags |= {
-                self._name(key): value and encodable(value) for key, value in record.get("tags", {}).items()
+                self._name(key): value and escape_undecodable(value)
+                for key, value in record.get("tags", {}).items()
             }
             for name, value in record.get("params", {}).items():
-                key, value = self._name(name), encodable(value)
+                key, value = self._name(name), escape_undecodable(value)
                 before = self._params.get(key, params.get(key))
                 if before is None:
                     params[key] = value
@@ -254,10 +257,10 @@ class MlflowStore(Store):
 
 def _dataset(record: Record) -> DatasetInput:
     """Return the content of MLflow's column `Dataset`: name, digest, and all facts about the data as the profile."""
-    facts: dict[str, str] = {key: encodable(fact) for key, fact in record["facts"].items()}
+    facts: dict[str, str] = {key: escape_undecodable(fact) for key, fact in record["facts"].items()}
     digest = facts.get("sha256") or hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
     dataset = Dataset(
-        encodable(record["dataset"]),
+        escape_undecodable(record["dataset"]),
         digest[:_DIGEST],
         source_type="local",
         source=json.dumps({"root": facts.get("root", "")}),

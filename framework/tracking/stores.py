@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import quote, unquote, urlsplit
 
-from framework.errors import ConfigError, DataError, shown
+from framework.errors import ConfigError, DataError, shorten
 from framework.storage.enclosed import require_enclosed, require_plain_within
 
 SETTING = "MLFLOW_TRACKING_URI"
@@ -56,7 +56,7 @@ def address(named: str | None, folder: Path) -> Address:
     path = sqlite_path(uri)
     if path is not None and re.search(r"[\ud800-\udfff]", str(path)):
         raise ConfigError(
-            f"{shown(path)} lies in a folder whose name is not UTF-8, where MLflow keeps no run. Rename the folder, or "
+            f"{shorten(path)} lies in a folder whose name is not UTF-8, where MLflow keeps no run. Rename the folder, or "
             "choose another store: add logger.uri=sqlite:///<file>, or logger=none."
         )
     return Address(uri, bool(given))
@@ -79,7 +79,7 @@ def confirmed(recorded: str, named: str | None, folder: Path, source: Path) -> A
     for one in own:
         if _same(one.uri, recorded):
             return one
-    told = shown(without_password(recorded))
+    told = shorten(without_password(recorded))
     raise ConfigError(
         f"{source} says that the run goes to {told}. A run folder may be a stranger's, so no store that only the "
         f"folder names is contacted. If that is where you keep runs, say so: add logger.uri={told}"
@@ -104,7 +104,7 @@ def store_uri(uri: str) -> str:
         return f"{sqlite_uri(Path(unquote(path)).expanduser().absolute())}{question}{query}"
     if not re.match(r"(https?|(postgresql|mysql|mssql)(\+\w+)?)://.|databricks", uri):
         raise ConfigError(
-            f"logger.uri={shown(without_password(uri))}: wanted sqlite:///<file>, the http(s)://<host>:<port> of a "
+            f"logger.uri={shorten(without_password(uri))}: wanted sqlite:///<file>, the http(s)://<host>:<port> of a "
             "server, or a postgresql, mysql or mssql address. MLflow no longer keeps runs in plain folders."
         )
     return uri
@@ -156,7 +156,7 @@ def require_own_files(uri: str, locations: tuple[str, ...] = ()) -> None:
         place = Path(unquote(parts.path) if parts.scheme == "file" and not parts.netloc else location)
         if not place.is_relative_to(home) or ".." in place.parts:
             raise DataError(
-                f"The store {path}, which nobody named, keeps files in {shown(without_password(location))}; wanted a "
+                f"The store {path}, which nobody named, keeps files in {shorten(without_password(location))}; wanted a "
                 f"folder in {home}. If the store is yours, name it: add logger.uri={sqlite_uri(path)}"
             )
         require_plain_within(place, path.parent)
@@ -180,7 +180,7 @@ def require_no_password(uri: str) -> None:
     # the user name of an http address may be a token
     if re.search(r"^https?://[^\s/]*@|^\w[\w+]*://[^\s/@]*:[^\s@]*@", uri) or re.search(_SECRET, uri):
         raise ConfigError(
-            f"logger.uri={shown(without_password(uri))} came with a password; wanted none, since commands and configs "
+            f"logger.uri={shorten(without_password(uri))} came with a password; wanted none, since commands and configs "
             f"are stored and other users see them. Put the whole address into the environment variable {SETTING} and "
             "leave logger.uri out; MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD serve for http, too."
         )

@@ -16,7 +16,7 @@ from torch.utils.data import DataLoader, Dataset, Sampler
 from framework.data import Batch, Data
 from framework.datasets.fields import as_batch
 from framework.distributions.class_probabilities import require_labels
-from framework.distributions.noise import hashed
+from framework.distributions.noise import stable_hash
 from framework.errors import ConfigError, DataError
 from framework.storage.progress import tracked
 from framework.target import Target
@@ -110,7 +110,7 @@ def epoch_order(length: int, seed: int | None, epoch: int, member: int = 0) -> l
     """
     if seed is None:
         return list(range(length))
-    generator = torch.Generator().manual_seed(hashed(seed, "order", epoch, *[member] * bool(member)))
+    generator = torch.Generator().manual_seed(stable_hash(seed, "order", epoch, *[member] * bool(member)))
     return torch.randperm(length, generator=generator).tolist()
 
 

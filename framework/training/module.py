@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from framework.configuration.settings import OptimizerSettings
 from framework.data import Batch, Data
 from framework.distributions.noise import seed_step
-from framework.errors import ConfigError, NonFiniteAnswer, NonFiniteLoss
+from framework.errors import ConfigError, NonFiniteLoss, NonFiniteParameters
 from framework.model import FrozenFrontEnd, Predictor, one_pass
 from framework.objective import AdversaryOptimizer, Objective
 from framework.tracking.signals import Stopper
@@ -111,7 +111,7 @@ class Training(pl.LightningModule):
         """Return the predictor's loss per sample; errors of the network become sentences."""
         try:
             return self.learner.loss(batch["input"], batch["target"])
-        except NonFiniteAnswer as answer:
+        except NonFiniteParameters as answer:
             raise NonFiniteLoss(
                 f"After step {self.global_step} (epoch {self.current_epoch}) the network's {answer} Earlier "
                 "checkpoints are kept. Lower optimizer.learning_rate, set trainer.gradient_clip_val, or train in "

@@ -21,7 +21,7 @@ from benchmarks.pages import machine, read_rows
 from framework.configuration.schema import build, resolve
 from framework.datasets.fields import as_batch
 from framework.evaluation.tradeoff import rows, tradeoff
-from framework.figures.style import saved
+from framework.figures.style import save_figure
 from framework.reports.table import Row, csv
 from framework.reports.tradeoff_picture import error_against_run_time
 
@@ -47,7 +47,7 @@ def drawn(found: Sequence[Row]) -> None:
         machine=str(found[0]["machine"]),
         note=NOTE,
     )
-    saved(figure, HERE / "moons_time", True)
+    save_figure(figure, HERE / "moons_time", True)
 
 
 def main() -> None:

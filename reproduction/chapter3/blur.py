@@ -25,7 +25,7 @@ from framework.configuration.schema import build
 from framework.datasets.images import blurred, picture
 from framework.distributions.density import circular_grid
 from framework.distributions.protocol import marginal
-from framework.figures.style import COLOURS, GREY, MARKERS, saved, titled_figure
+from framework.figures.style import COLOURS, GREY, MARKERS, save_figure, titled_figure
 from framework.model import Predictor
 from framework.reports.table import aggregate, csv, markdown
 
@@ -114,7 +114,7 @@ def curves(rows: list[dict[str, object]], path: Path) -> None:
     lower.set_xlabel(f"standard deviation of the Gaussian blur (pixels of {SIDE})")
     figure.supylabel("mean log-likelihood of the pan angle (nats)", fontsize=10)
     upper.legend(fontsize=9, frameon=False)
-    saved(figure, path.with_suffix(""), True)
+    save_figure(figure, path.with_suffix(""), True)
 
 
 def broken(upper: Axes, lower: Axes) -> None:
@@ -163,7 +163,7 @@ def strip(models: dict[str, Predictor], image: torch.Tensor, pan: float, path: P
     grid[1, 0].set_ylabel("density (1 / rad)")
     handles, labels = grid[1, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=9, frameon=False)
-    saved(figure, path.with_suffix(""), True)
+    save_figure(figure, path.with_suffix(""), True)
 
 
 def pans(sweeps: list[Path]) -> list[Path]:

@@ -28,7 +28,7 @@ from benchmarks.pages import machine, read_rows, write_page
 from framework.configuration.schema import build, resolve
 from framework.data import Data
 from framework.distributions.protocol import median
-from framework.figures.style import COLOURS, MARKERS, saved, titled_figure
+from framework.figures.style import COLOURS, MARKERS, save_figure, titled_figure
 from framework.flights.frames import PARTS
 from framework.prediction import Prediction
 from framework.reports.table import Row, csv
@@ -240,7 +240,7 @@ def drawn(rows: Sequence[Row]) -> None:
         fontsize=9,
         frameon=False,
     )
-    saved(figure, HERE.with_suffix(""), True)
+    save_figure(figure, HERE.with_suffix(""), True)
 
 
 def bundles(found: dict[str, Measured]) -> None:

@@ -26,8 +26,8 @@ from torch import Tensor
 
 from benchmarks.clouds.shapes import shapes
 from benchmarks.pages import machine, read_rows, write_page
-from framework.figures.style import COLOURS, MARKERS, saved, titled_figure
-from framework.geometry.clouds import Normalised, sizes
+from framework.figures.style import COLOURS, MARKERS, save_figure, titled_figure
+from framework.geometry.clouds import NormalisedClouds, sizes
 from framework.geometry.nearest import chamfer
 from framework.reports.table import csv, markdown
 from plugins.encoder.bps.basis import Strategy, basis
@@ -69,7 +69,9 @@ def raw(clouds: Tensor, count: int) -> Tensor:
 def cells(clouds: Tensor, side: int) -> Tensor:
     """Centres of the cells a cloud occupies."""
     origin = torch.zeros(len(clouds), 3, dtype=torch.float64)
-    return centres(occupancy(clouds, side), side, Normalised(clouds, origin, torch.ones_like(origin[:, 0])))
+    return centres(
+        occupancy(clouds, side), side, NormalisedClouds(clouds, origin, torch.ones_like(origin[:, 0]))
+    )
 
 
 def nearest_points(clouds: Tensor, strategy: Strategy, count: int) -> Tensor:
@@ -192,7 +194,7 @@ def pictured(rows: list[dict[str, object]], spent: list[dict[str, object]]) -> N
         axes.grid(alpha=0.3)
         axes.spines[["top", "right"]].set_visible(False)
         axes.legend(fontsize=8, frameon=False)
-    saved(figure, HERE.with_suffix(""), True)
+    save_figure(figure, HERE.with_suffix(""), True)
 
 
 def claims(rows: list[dict[str, object]]) -> str:

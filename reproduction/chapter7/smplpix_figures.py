@@ -23,7 +23,7 @@ from framework.configuration.loading import stored
 from framework.configuration.schema import build, resolve
 from framework.figures.style import titled_figure
 from framework.geometry.camera import Camera
-from framework.geometry.light import encoded
+from framework.geometry.srgb import srgb_from_linear
 from framework.renderer import Renderer, Scene
 from plugins.data.bodies import poses
 from plugins.data.bodies.animate import data_of, generated
@@ -173,7 +173,7 @@ def projected(scene: Scene, size: tuple[int, int]) -> np.ndarray:
     config = {"name": "projection", "height": size[0], "width": size[1]}
     encoder = build("encoder", resolve("encoder", config), input_shape=(1, 6), input_columns=())
     assert scene.colors is not None
-    points = torch.cat([scene.camera.canonical(scene.vertices), encoded(scene.colors)], 1)[None]
+    points = torch.cat([scene.camera.to_canonical(scene.vertices), srgb_from_linear(scene.colors)], 1)[None]
     image: Tensor = encoder(points)[0, :3]
     return (255 * image.permute(1, 2, 0)).round().byte().numpy()
 

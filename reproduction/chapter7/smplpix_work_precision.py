@@ -21,7 +21,7 @@ from framework.configuration.description import Description
 from framework.configuration.loading import rebuilt, stored
 from framework.configuration.schema import build, resolve
 from framework.data import Data
-from framework.figures.style import saved
+from framework.figures.style import save_figure
 from framework.model import Predictor
 from framework.reports.table import Row, csv
 from framework.reports.tradeoff_picture import error_against_run_time
@@ -167,7 +167,7 @@ def drawn(rows: Sequence[Row]) -> None:
         machine="one core, processor time",
         note="Bars: standard error over subjects. Numbers beside points: samples of a pixel along each axis.",
     )
-    saved(figure, HERE.with_suffix(""), True)
+    save_figure(figure, HERE.with_suffix(""), True)
 
 
 def trained(run: str) -> str:

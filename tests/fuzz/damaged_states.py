@@ -20,7 +20,7 @@ from framework.configuration.paths import paths_of
 from framework.configuration.registry import installed
 from framework.configuration.schema import build, resolve
 from framework.density_head import DensityHead
-from framework.errors import DataError, NonFiniteAnswer, UserError
+from framework.errors import DataError, NonFiniteParameters, UserError
 from framework.model import Predictor
 from framework.storage import checkpoints
 from framework.storage.checkpoints import TRAILER
@@ -363,7 +363,7 @@ def predicted(file: Path) -> object:
         if isinstance(given, Tensor) and given.shape == (4, *description.input_shape):
             inputs = given
         found = answer(predictor, description.target, inputs)
-    except (NonFiniteAnswer, UserError) as error:  # a sentence, of numbers that no training gives
+    except (NonFiniteParameters, UserError) as error:  # a sentence, of numbers that no training gives
         raise DataError(f"{file}: {error}") from error
     finally:
         compare(told, found)
@@ -473,5 +473,5 @@ def asked(file: Path) -> object:
         if "height" in data.state_dict():
             data.preview(torch.zeros(3, 6))
         return predictor(np.ones((2, 2), np.float32)).log_prob(torch.zeros(2, dtype=torch.int64))
-    except (NonFiniteAnswer, UserError) as error:
+    except (NonFiniteParameters, UserError) as error:
         raise DataError(f"{file}: {error}") from error

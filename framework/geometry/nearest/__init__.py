@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from framework.errors import DataError
-from framework.geometry.clouds import filled
+from framework.geometry.clouds import point_mask
 from framework.geometry.nearest.exponents import MOST
 
 OFTEN = 2**16
@@ -164,7 +164,7 @@ def refuse_bad(points: Tensor, sizes: Tensor | None, name: str) -> None:
     """
     bad = ~points.isfinite().all(-1)
     if sizes is not None:
-        bad &= filled(points, sizes)
+        bad &= point_mask(points, sizes)
     if bad.any():
         cloud, point = bad.nonzero()[0].tolist()
         raise DataError(
@@ -280,7 +280,7 @@ def offsets(
 ) -> Float[Tensor, "batch query 3"]:
     """Return the vectors from the nearest point of the cloud to each query; 0 for queries beyond `query_sizes`."""
     index = nearest(clouds, queries, sizes, query_sizes).index
-    real = None if query_sizes is None else filled(queries, query_sizes)[..., None]
+    real = None if query_sizes is None else point_mask(queries, query_sizes)[..., None]
     if real is not None:
         queries = queries.where(real, 0)  # before anything is subtracted: NaN × 0 is no gradient
     found = queries - clouds.gather(1, index[..., None].expand(-1, -1, 3))

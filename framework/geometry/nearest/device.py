@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from framework.geometry.clouds import filled
+from framework.geometry.clouds import point_mask
 from framework.geometry.nearest.exponents import MOST
 
 PAIRS = 2**24
@@ -30,7 +30,7 @@ def nearest_of(
     if queries.dim() == 2:
         queries = queries.expand(batch, -1, -1)
     # division by a power of two is exact, and no square over- or underflows afterwards
-    real, asking = filled(clouds, sizes), filled(queries, query_sizes)
+    real, asking = point_mask(clouds, sizes), point_mask(queries, query_sizes)
     clouds, queries = clouds.where(real[..., None], 0), queries.where(asking[..., None], 0)
     largest = torch.maximum(clouds.abs().amax((1, 2)), queries.abs().amax((1, 2)))
     exponent = torch.frexp(largest).exponent.clamp(-MOST[clouds.dtype], MOST[clouds.dtype])

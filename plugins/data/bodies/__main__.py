@@ -12,8 +12,8 @@ from framework.configuration.paths import add_option, require_said, said
 from framework.configuration.schema import build, resolve
 from framework.distributions.protocol import median
 from framework.errors import ConfigError
-from framework.figures.style import saved
-from framework.geometry.clouds import denormalised, sizes
+from framework.figures.style import save_figure
+from framework.geometry.clouds import denormalise_clouds, sizes
 from framework.storage.commands import run_command
 from plugins.data.bodies.data import Registration
 from plugins.data.bodies.people import chosen_body
@@ -62,12 +62,12 @@ def register(
         batch = data.user_batch(scan)
         local = median(predictor(batch["input"]), 1).unflatten(1, (-1, 3))
         place = batch["centre"], batch["scale"]
-        vertices = denormalised(local, *place)[0].numpy()
-        cloud = denormalised(batch["input"], *place)[0, : int(sizes(batch["input"]))].numpy()
+        vertices = denormalise_clouds(local, *place)[0].numpy()
+        cloud = denormalise_clouds(batch["input"], *place)[0, : int(sizes(batch["input"]))].numpy()
         stem = folder / f"{scan.stem}_registered"
         write_ply(stem.with_suffix(".ply"), vertices, faces, cloud)
         drawn = figure(vertices, faces, cloud, f"Mesh registered to {scan.name}")
-        written += [stem.with_suffix(".ply"), saved(drawn, stem, True)]
+        written += [stem.with_suffix(".ply"), save_figure(drawn, stem, True)]
     return written
 
 

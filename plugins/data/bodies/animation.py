@@ -13,7 +13,7 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from framework.geometry.camera import Camera, canonical_camera
-from framework.geometry.light import eight_bit, linear
+from framework.geometry.srgb import bytes_from_linear, linear_from_bytes
 from framework.renderer import Renderer, Scene
 from plugins.data.bodies.dressed import Scan
 from plugins.data.bodies.photographs import photographed
@@ -93,7 +93,7 @@ class Generated:
 
 def actor(registration: Registration) -> Actor:
     """Return the person whose mesh a registration is, with colours in linear RGB."""
-    return Actor(registration.faces, linear(registration.colors))
+    return Actor(registration.faces, linear_from_bytes(registration.colors))
 
 
 def orbit(moments: Sequence[Moment], azimuths: Sequence[float], size: tuple[int, int]) -> list[Camera]:
@@ -135,13 +135,13 @@ def _towards(azimuth: float) -> Float[Tensor, "3 3"]:
 def on_white(renderer: Renderer, scene: Scene) -> UInt8[np.ndarray, "height width 3"]:
     """Return an 8-bit sRGB image of the scene on white, for any background colour of the renderer."""
     if renderer.background == 1:
-        return eight_bit(renderer(scene)["color"]).numpy()
+        return bytes_from_linear(renderer(scene)["color"]).numpy()
     assert scene.colors is not None
     cover = torch.ones(len(scene.vertices), 1)  # a fourth channel: share of a pixel that is covered
     drawn = renderer(Scene(scene.vertices, scene.faces, torch.cat([scene.colors, cover], 1), scene.camera))[
         "color"
     ]
-    return eight_bit(drawn[..., :3] + 1 - drawn[..., 3:]).numpy()
+    return bytes_from_linear(drawn[..., :3] + 1 - drawn[..., 3:]).numpy()
 
 
 def photograph(renderer: Renderer, scan: Scan, camera: Camera) -> UInt8[np.ndarray, "height width 3"]:
@@ -154,7 +154,7 @@ def photograph(renderer: Renderer, scan: Scan, camera: Camera) -> UInt8[np.ndarr
     )
     pixels, mask = photographed(renderer, scene, [camera])[0]
     cover = torch.from_numpy(mask).float()[..., None] / 255
-    return eight_bit(linear(torch.from_numpy(pixels)) * cover + 1 - cover).numpy()
+    return bytes_from_linear(linear_from_bytes(torch.from_numpy(pixels)) * cover + 1 - cover).numpy()
 
 
 def columns(

@@ -85,7 +85,7 @@ def normalised(
     batch: Float[Tensor, "batch points columns"], vertices: Float[Tensor, "batch vertex 3"] | None = None
 ) -> Batch:
     """Return the fields "input", "centre" and "scale" of clouds in metres, and "target" of vertices in metres."""
-    found = clouds.normalised(batch[..., :3], "robust")
+    found = clouds.normalise_clouds(batch[..., :3], "robust")
     centre, scale = found.centre.float(), found.scale.float()
     fields = {"input": found.clouds, "centre": centre, "scale": scale}
     if vertices is not None:

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from framework.errors import DataError, shown
+from framework.errors import DataError, shorten
 from framework.storage.arrays import archive
 from framework.storage.files import replacing
 from framework.storage.limits import MOST_DISPLACEMENTS as LARGEST
@@ -85,7 +85,7 @@ def _unpickled(file: Path) -> Mapping[str, Any]:
 def _body(file: Path, found: Mapping[str, Any]) -> Body:
     missing = [name for name in NEEDED if name not in found]
     if missing:
-        names = shown(", ".join(map(str, found))) or "nothing"
+        names = shorten(", ".join(map(str, found))) or "nothing"
         raise DataError(f"{file}: {', '.join(missing)} not in it; it holds {names}. {WANTED}")
     posedirs = found.get("posedirs")
     arrays = {name: _numbers(file, name, found[name]) for name in NEEDED}

@@ -21,7 +21,7 @@ from framework.configuration.schema import build, resolve
 from framework.data import Data
 from framework.distributions.protocol import median
 from framework.errors import ConfigError
-from framework.geometry.clouds import denormalised
+from framework.geometry.clouds import denormalise_clouds
 from framework.geometry.meshes import read
 from framework.geometry.nearest import nearest
 from framework.storage.commands import run_command
@@ -94,7 +94,7 @@ def model(checkpoint: str, paths: Mapping[str, str] | None = None) -> tuple[Regi
     def registered(scan: Path) -> np.ndarray:
         batch = data.user_batch(scan)
         local = median(predictor(batch["input"]), 1).unflatten(1, (-1, 3))
-        return denormalised(local, batch["centre"], batch["scale"])[0].float().numpy()
+        return denormalise_clouds(local, batch["centre"], batch["scale"])[0].float().numpy()
 
     def generated() -> Path:
         require_said(description.dropped, ("data",), description.path)

@@ -15,7 +15,7 @@ from numpy.random import Generator
 from scipy.sparse import csr_matrix
 from scipy.spatial import KDTree
 
-from framework.geometry.light import eight_bit
+from framework.geometry.srgb import bytes_from_linear
 from plugins.data.bodies import skins
 from plugins.data.bodies.anatomy import Anatomy, anatomy
 from plugins.data.bodies.body import Body, BodyModel
@@ -186,7 +186,7 @@ class Wardrobe:
         off = moved + ERROR * noise(self.body.template, 0.25, random)
         vertices = self.sheet.carried(posed + off[:, None] * outwards)
         nearest = np.flatnonzero(seen)[tree.query(vertices)[1]]
-        return Registered(vertices, eight_bit(torch.from_numpy(scan.colors[nearest])).numpy())
+        return Registered(vertices, bytes_from_linear(torch.from_numpy(scan.colors[nearest])).numpy())
 
     def reposed(
         self,

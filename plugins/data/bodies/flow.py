@@ -30,7 +30,7 @@ def flow(
     face = drawn_after["face"].long()
     corners = before.vertices.double()[after.faces.long()[face.clamp(min=0)]]
     weights = drawn_after["barycentric"].double()
-    place, depth = before.camera.projected((weights[..., None] * corners).sum(-2))
+    place, depth = before.camera.project((weights[..., None] * corners).sum(-2))
     there = drawn_before["depth"].double()
     height, width = there.shape
     low = place.nan_to_num(-1.0).clamp(-1, max(height, width)).floor().long()

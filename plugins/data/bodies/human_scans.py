@@ -16,12 +16,12 @@ from torch.utils.data import Dataset
 from framework.configuration.paths import FilePath
 from framework.data import Batch, Data, Splits
 from framework.datasets.fields import Fields
-from framework.errors import ConfigError, DataError, shown
+from framework.errors import ConfigError, DataError, shorten
 from framework.geometry import clouds
 from framework.geometry.camera import Camera, canonical_camera
-from framework.geometry.light import encoded, linear
 from framework.geometry.mesh_files import COLOURS, XYZ
 from framework.geometry.meshes import READERS, read
+from framework.geometry.srgb import linear_from_bytes, srgb_from_linear
 from framework.renderer import Renderer
 from framework.storage.generated import read_mark
 from framework.storage.limits import MOST_INPUT
@@ -190,7 +190,7 @@ class HumanScans(Data):
         whole = type(height) is int and type(width) is int
         if not whole or min(height, width) < 1 or height * width > MOST_INPUT:
             raise DataError(
-                f"human_scans keeps the size of its images, but was given {shown(height)} by {shown(width)}; wanted "
+                f"human_scans keeps the size of its images, but was given {shorten(height)} by {shorten(width)}; wanted "
                 f"two whole numbers of pixels, {MOST_INPUT:,} in all at most. Load another checkpoint, or train anew."
             )
         self.size = (height, width)
@@ -228,7 +228,7 @@ class HumanScans(Data):
         height, width = self.size
         points = inputs.detach().cpu().float()
         points = points[points.isfinite().all(1)]
-        place, depth = canonical_camera(height, width).projected(points[:, :3])
+        place, depth = canonical_camera(height, width).project(points[:, :3])
         image = torch.ones(height * width, 3)
         order = (-depth).argsort(stable=True)  # the nearest last
         column, row = place[order].round().T
@@ -257,7 +257,7 @@ class Photographs(Dataset[Batch]):
         mask = cover >= 0.5
         return {
             "input": _input(registration.vertices, registration.colors, view.camera),
-            "target": encoded(light) if self.shows == "photograph" else mask.float()[..., None],
+            "target": srgb_from_linear(light) if self.shows == "photograph" else mask.float()[..., None],
             "color": light,
             "mask": mask,
             "subject": torch.tensor(number),
@@ -270,7 +270,7 @@ def photograph(view: View) -> tuple[Float[Tensor, "height width 3"], Float[Tenso
     """Return a photograph on white in linear RGB, and the share of each pixel that the subject covers."""
     pixels, mask = scan_layout.read_photograph(view)
     cover = torch.from_numpy(mask).float() / 255
-    return linear(torch.from_numpy(pixels)) * cover[..., None] + (1 - cover[..., None]), cover
+    return linear_from_bytes(torch.from_numpy(pixels)) * cover[..., None] + (1 - cover[..., None]), cover
 
 
 def in_front(vertices: Float[Tensor, "vertices 3"], height: int, width: int) -> Camera:
@@ -298,7 +298,7 @@ def _reordered(colors: Float[Tensor, "batch ... 3"], orders: Tensor) -> Tensor:
 
 
 def _input(vertices: Tensor, colors: Tensor, camera: Camera) -> Float[Tensor, "points 6"]:
-    return torch.cat([camera.canonical(vertices), colors.float() / 255], 1)
+    return torch.cat([camera.to_canonical(vertices), colors.float() / 255], 1)
 
 
 def _common(root: Path, subjects: Sequence[Subject]) -> tuple[tuple[int, int], int]:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from framework.errors import DataError, quoted, shown
+from framework.errors import DataError, quote, shorten
 from framework.storage.limits import MOST_FRAMES as LONGEST
 from framework.storage.reading import guarded, read_bytes
 from framework.storage.text import decoded, line_of_word, require_numbers_in, words_of
@@ -100,7 +100,7 @@ def read(file: Path) -> Motion:
 
 def _whole(word: str, text: str, place: int) -> int:
     if not word.isascii() or not word.isdigit():
-        raise ValueError(f"line {line_of_word(text, place)}: wanted a whole number, got {quoted(word)}")
+        raise ValueError(f"line {line_of_word(text, place)}: wanted a whole number, got {quote(word)}")
     return int(word)
 
 
@@ -122,7 +122,7 @@ def _hierarchy(
         if word in ("ROOT", "JOINT"):
             if (word == "ROOT") != (len(above) == 1) or (word == "ROOT" and names):
                 raise ValueError(
-                    f"{word} {shown(words[place + 1])} stands where none can; wanted a single ROOT"
+                    f"{word} {shorten(words[place + 1])} stands where none can; wanted a single ROOT"
                 )
             parents.append(above[-1])
             above.append(len(names))
@@ -135,14 +135,14 @@ def _hierarchy(
         elif word == "OFFSET":
             offsets[above[-1]] = require_numbers_in(words[place + 1 : place + 4], text, place + 2)
             if len(offsets[above[-1]]) != 3 or not np.isfinite(offsets[above[-1]]).all():
-                raise ValueError(f"the OFFSET of {shown(names[above[-1]])} is not three finite numbers")
+                raise ValueError(f"the OFFSET of {shorten(names[above[-1]])} is not three finite numbers")
             place += 4
         elif word == "CHANNELS":
             count = _whole(words[place + 1], text, place + 2)
             kinds = words[place + 2 : place + 2 + count]
             if len(kinds) != count or not set(kinds) <= CHANNELS or len(set(kinds)) < count:
                 raise ValueError(
-                    f"CHANNELS of {shown(names[above[-1]])}: wanted a number, and so many of "
+                    f"CHANNELS of {shorten(names[above[-1]])}: wanted a number, and so many of "
                     f"{', '.join(sorted(CHANNELS))}"
                 )
             channels[above[-1]] = kinds
@@ -152,7 +152,7 @@ def _hierarchy(
             place += 1
         else:
             line = line_of_word(text, place + 1)
-            raise ValueError(f"line {line}: {shown(word)} stands where a joint's description should go on")
+            raise ValueError(f"line {line}: {shorten(word)} stands where a joint's description should go on")
     if len(above) != 1 or not names:
         raise ValueError("its joints are not closed, or it has none")
     return names, parents, offsets, channels
@@ -209,7 +209,7 @@ def _roles(motion: Motion) -> dict[str, int]:
             if not there:
                 raise DataError(
                     f"A motion has no joint called {' or '.join(called)}; wanted one. Its joints: "
-                    f"{shown(', '.join(motion.names))}. Rename them."
+                    f"{shorten(', '.join(motion.names))}. Rename them."
                 )
             found[f"{side} {role}".strip()] = there[0]
     return found

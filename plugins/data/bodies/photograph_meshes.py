@@ -16,8 +16,8 @@ from framework.configuration.schema import build, resolve
 from framework.data import Splits
 from framework.errors import DataError
 from framework.geometry import meshes
-from framework.geometry.light import linear
 from framework.geometry.meshes import READERS, stream
+from framework.geometry.srgb import linear_from_bytes
 from framework.renderer import Renderer, Scene
 from framework.storage.commands import run_command
 from framework.storage.generated import draw_all, generated
@@ -120,7 +120,7 @@ def write_person(
         ),
     )
     cameras = rig(scan.vertices, views, size, stream(0, folder.name))
-    colors = linear(torch.from_numpy(np.ascontiguousarray(scan_layout.vertex_colors(scan))))
+    colors = linear_from_bytes(torch.from_numpy(np.ascontiguousarray(scan_layout.vertex_colors(scan))))
     faces = torch.from_numpy(scan.faces)
     scene = Scene(torch.from_numpy(scan.vertices).float(), faces, colors, cameras[0])
     scan_layout.write_views(folder, cameras, photographed(renderer, scene, cameras))

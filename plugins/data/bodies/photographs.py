@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from framework.geometry.camera import Camera
-from framework.geometry.light import eight_bit
+from framework.geometry.srgb import bytes_from_linear
 from framework.renderer import Renderer, Scene
 from plugins.data.bodies.scan_layout import Photograph
 
@@ -117,7 +117,7 @@ def _pooled(drawn: Float[Tensor, "height width 4"]) -> Photograph:
     light = torch.where(
         cover[..., None] > 0, found[..., :3] / cover.clamp(min=1e-6)[..., None], 0.5
     )  # grey background
-    return Photograph(eight_bit(light).numpy(), (cover * 255).round().byte().numpy())
+    return Photograph(bytes_from_linear(light).numpy(), (cover * 255).round().byte().numpy())
 
 
 def texture(
@@ -134,4 +134,4 @@ def texture(
     drawn = renderer(scene)["color"]
     outside = (drawn[..., 3] == 0).numpy()
     row, column = np.asarray(distance_transform_edt(outside, return_distances=False, return_indices=True))
-    return eight_bit(drawn[..., :3] / drawn[..., 3:].clamp(min=1e-6)).numpy()[row, column]
+    return bytes_from_linear(drawn[..., :3] / drawn[..., 3:].clamp(min=1e-6)).numpy()[row, column]

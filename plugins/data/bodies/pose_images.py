@@ -20,7 +20,7 @@ from framework.datasets.fields import Fields
 from framework.datasets.images import has_alpha, opened, plain
 from framework.errors import ConfigError, DataError
 from framework.geometry.camera import Camera
-from framework.geometry.light import eight_bit, linear
+from framework.geometry.srgb import bytes_from_linear, linear_from_bytes
 from framework.renderer import Renderer
 from framework.target import Target
 from plugins.data.bodies.figure import Figure, figure_of
@@ -164,7 +164,7 @@ class PoseFromImage(Data):
                 )
             stored = torch.from_numpy(np.array(plain(image, 4, upright=False)))
         cover = stored[..., 3:].float() / 255
-        return torch.cat([linear(stored[..., :3]) * cover, cover], -1).movedim(-1, 0)
+        return torch.cat([linear_from_bytes(stored[..., :3]) * cover, cover], -1).movedim(-1, 0)
 
     def augment(self, batch: Batch) -> Batch:
         return batch
@@ -187,7 +187,7 @@ class PoseFromImage(Data):
         }
 
     def preview(self, inputs: Tensor) -> np.ndarray:
-        return eight_bit(inputs[:3].float()).movedim(0, -1).cpu().numpy()
+        return bytes_from_linear(inputs[:3].float()).movedim(0, -1).cpu().numpy()
 
 
 class Poses(Dataset[Batch]):

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from framework.figures.style import COLOURS, GREY, titled_figure
-from framework.geometry.light import eight_bit
+from framework.geometry.srgb import bytes_from_linear
 from plugins.data.bodies.pose_error import Shown
 
 
@@ -21,7 +21,7 @@ def descents(samples: Mapping[str, Shown], title: str, *, synthetic: bool) -> Fi
         gap = (sample.end - sample.target).abs()
         images = {"start": sample.start, "target": sample.target, "end": sample.end, "|end - target|": gap}
         for axis, (what, image) in zip(row, images.items(), strict=False):
-            axis.imshow(eight_bit(image).numpy())
+            axis.imshow(bytes_from_linear(image).numpy())
             axis.set_title(what)
             axis.set_axis_off()
         row[0].set_title(f"{name}: start")

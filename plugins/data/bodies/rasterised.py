@@ -15,8 +15,8 @@ from framework.encoder import Encoder
 from framework.errors import ConfigError, DataError
 from framework.geometry.camera import canonical_camera
 from framework.geometry.clouds import sizes
-from framework.geometry.light import encoded, light_of
 from framework.geometry.mesh_files import COLOURS, XYZ
+from framework.geometry.srgb import linear_from_srgb, srgb_from_linear
 from framework.renderer import Renderer, Scene
 from plugins.data.bodies import scan_layout
 from plugins.data.bodies.human_scans import HumanScans
@@ -145,7 +145,7 @@ class Rasterised(Encoder):
         found = inputs.new_empty(len(inputs), *self.output_shape)
         for picture, one in zip(found, drawn, strict=True):
             light, cover = one["color"][..., :3], one["color"][..., 3:]
-            shown = 1 - cover if self.ground else encoded(light + (1 - cover))
+            shown = 1 - cover if self.ground else srgb_from_linear(light + (1 - cover))
             picture[: shown.shape[-1]] = shown.movedim(-1, 0)
             if self.depth:
                 nearest, farthest = self.limits
@@ -156,7 +156,7 @@ class Rasterised(Encoder):
         """Return the scene of a cloud; a fourth colour channel of 1 renders as the share of a pixel that is covered."""
         vertices, colors = cloud[:, :3].float(), cloud[:, 3:6].float()
         if self.people is None:
-            paint = torch.cat([light_of(colors), colors.new_ones(len(colors), 1)], 1)
+            paint = torch.cat([linear_from_srgb(colors), colors.new_ones(len(colors), 1)], 1)
             return Scene(vertices, self.faces, paint, self.camera)
         if self.textures is None:
             longest = TEXELS * max(self.camera.height, self.camera.width)

@@ -20,7 +20,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from framework.errors import shown
+from framework.errors import shorten
 
 MULTIARRAY = ("numpy.core.multiarray", "numpy._core.multiarray")
 ALLOWED = {
@@ -90,7 +90,7 @@ def load(content: bytes) -> Any:
     except PickleRefused:
         raise
     except Exception as error:  # a damaged pickle can raise an error of any type
-        raise PickleRefused(f"it is damaged ({type(error).__name__}: {shown(error)})") from error
+        raise PickleRefused(f"it is damaged ({type(error).__name__}: {shorten(error)})") from error
 
 
 def _obeyed(content: bytes) -> Any:
@@ -202,7 +202,7 @@ def _named(module: Any, word: Any) -> _Record:
 
 
 def _refuse(why: str) -> NoReturn:
-    raise PickleRefused(shown(why))
+    raise PickleRefused(shorten(why))
 
 
 class _Plain:

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from framework.configuration.paths import FilePath
 from framework.errors import ConfigError
-from framework.geometry.light import linear
+from framework.geometry.srgb import linear_from_bytes
 from framework.renderer import Renderer, Scene
 from framework.storage import cache
 from framework.storage.generated import draw_all, generated
@@ -149,7 +149,7 @@ class Crowd:
         scan_layout.write_views(folder, views, photographed(self.renderer, scene, views))
         if self.drawing.texture_side and self.wardrobe.uv is not None:
             faces = self.wardrobe.sheet.corners[-1].uv_faces
-            colors = linear(torch.from_numpy(registered.colors[self.wardrobe.vertex_of_place]))
+            colors = linear_from_bytes(torch.from_numpy(registered.colors[self.wardrobe.vertex_of_place]))
             pixels = texture(self.renderer, self.wardrobe.uv, faces, colors, self.drawing.texture_side)
             Image.fromarray(pixels).save(folder / "texture.png")
 

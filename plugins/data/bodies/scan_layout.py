@@ -27,7 +27,7 @@ from torch import Tensor
 
 from framework.data import Splits
 from framework.datasets import images
-from framework.errors import DataError, shown
+from framework.errors import DataError, shorten
 from framework.geometry import meshes
 from framework.geometry.camera import Camera
 from framework.geometry.mesh_files import COLOURS
@@ -108,7 +108,7 @@ def read_splits(root: Path) -> dict[str, tuple[str, ...]]:
                 raise ValueError("it names nobody")
             for name in names:
                 if not NAME.fullmatch(name):
-                    raise ValueError(f"{shown(name)!r} is no name of a folder in {root / 'subjects'}")
+                    raise ValueError(f"{shorten(name)!r} is no name of a folder in {root / 'subjects'}")
                 if name in seen:
                     raise ValueError(
                         f"subject {name} is in {seen[name].name} already; wanted each once, in one split"

@@ -10,7 +10,7 @@ from numpy.random import Generator
 
 from framework.datasets import images
 from framework.errors import DataError
-from framework.geometry.light import linear
+from framework.geometry.srgb import linear_from_bytes
 from framework.storage.reading import guarded, read_bytes
 from plugins.data.bodies.anatomy import Anatomy
 from plugins.data.bodies.fabrics import Color, hue, noise
@@ -57,7 +57,7 @@ def shown(
     pixels: UInt8[np.ndarray, "height width 3"], uv: Float[np.ndarray, "places 2"]
 ) -> Float[np.ndarray, "places 3"]:
     """Return the linear RGB of a skin at texture coordinates, v upwards, interpolated between texels."""
-    light = linear(torch.from_numpy(pixels)).numpy()
+    light = linear_from_bytes(torch.from_numpy(pixels)).numpy()
     height, width = light.shape[:2]
     x = (uv[:, 0] * width - 0.5).clip(0, width - 1.001)
     y = ((1 - uv[:, 1]) * height - 0.5).clip(0, height - 1.001)
@@ -87,7 +87,7 @@ def filled(
         average: function from values of these to their means over neighbours.
         carried: function that interpolates values of these to all vertices.
     """
-    grey = float(linear(torch.tensor(BLANK, dtype=torch.uint8)))
+    grey = float(linear_from_bytes(torch.tensor(BLANK, dtype=torch.uint8)))
     blank = np.asarray(np.abs(colors - grey).max(1) < 0.002)
     face = ~blank & (body.head > 0.5) & (body.on_head[:, 2] > 0.2)
     if not blank.any() or not face.any():

@@ -12,7 +12,7 @@ from framework.configuration.loading import stored
 from framework.configuration.schema import build, resolve
 from framework.errors import ConfigError, DataError
 from framework.geometry.camera import canonical_camera
-from framework.geometry.light import eight_bit
+from framework.geometry.srgb import bytes_from_linear
 from framework.renderer import Scene
 from framework.target import Target
 from framework.testing.contract import contract
@@ -170,7 +170,7 @@ def test_a_generated_person_is_the_data_sets_and_moves(data, person, tmp_path):
 def test_pictures_show_a_mesh_on_white_and_the_data_sets_photograph(data, person, tmp_path):
     Crowd(data.renderer, data.counts, data.drawing, data.data_seed)._write_person(tmp_path, "test", 0)
     view = scan_layout.read_subject(tmp_path, "test_0000", data.topology).views[1]
-    written = eight_bit(photograph(view)[0]).numpy()
+    written = bytes_from_linear(photograph(view)[0]).numpy()
     found = animation.photograph(data.renderer, person.first().scan, view.camera)
     assert (
         np.abs(found.astype(int) - written).max() <= 1
@@ -179,7 +179,7 @@ def test_pictures_show_a_mesh_on_white_and_the_data_sets_photograph(data, person
     drawn = animation.on_white(RENDERER, scene)
     seen = RENDERER(scene, ("mask", "color"))
     assert (drawn[~seen["mask"]] == 255).all()
-    assert torch.equal(torch.from_numpy(drawn)[seen["mask"]], eight_bit(seen["color"])[seen["mask"]])
+    assert torch.equal(torch.from_numpy(drawn)[seen["mask"]], bytes_from_linear(seen["color"])[seen["mask"]])
 
 
 @pytest.mark.parametrize("walks", [False, True])
@@ -207,7 +207,7 @@ def test_cameras_see_all_of_somebody_from_everywhere(person):
     fullest = 0.0
     for camera in animation.orbit(moments, [0.0, 0.5, 1.6, 3.0, -2.0], SIZE):
         assert torch.linalg.det(camera.rotation).item() == pytest.approx(1, abs=1e-5)
-        place, depth = camera.projected(every)
+        place, depth = camera.project(every)
         share = (place - torch.tensor(camera.principal)).abs() * 2 / torch.tensor(SIZE[::-1])
         assert (depth > 0).all() and share.max() < animation.FREE + 1e-4
         fullest = max(fullest, share.max().item())

@@ -9,7 +9,7 @@ from torch.distributions import Independent, Normal
 
 from framework.configuration.schema import build, resolve
 from framework.errors import ConfigError, DataError
-from framework.geometry.light import linear
+from framework.geometry.srgb import linear_from_bytes
 from framework.prediction import Prediction
 from framework.renderer import Renderer
 from framework.target import Target
@@ -218,7 +218,7 @@ def test_own_pictures_are_read_and_others_refused(data, tmp_path):
     found = data.read([tmp_path / "cut.png"])[0]["input"]
     cover = torch.from_numpy(pixels[..., 3:]).float() / 255
     torch.testing.assert_close(
-        found.movedim(0, -1)[..., :3], linear(torch.from_numpy(pixels[..., :3])) * cover
+        found.movedim(0, -1)[..., :3], linear_from_bytes(torch.from_numpy(pixels[..., :3])) * cover
     )
     for name, other in {"rgb.png": pixels[..., :3], "small.png": pixels[:20]}.items():
         Image.fromarray(np.ascontiguousarray(other)).save(tmp_path / name)

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from framework.configuration.schema import build, resolve
 from framework.errors import ConfigError, DataError
-from framework.geometry.clouds import denormalised, sizes
+from framework.geometry.clouds import denormalise_clouds, sizes
 from framework.geometry.meshes import Mesh, read
 from plugins.data.bodies import body_files, poses
 from plugins.data.bodies.body import Body, BodyModel
@@ -144,9 +144,9 @@ def test_points_lie_on_the_body_and_both_in_one_frame(file):
     scans = made.splits().test
     batch = scans.__getitems__(range(5))
     place = batch["centre"].double(), batch["scale"].double()
-    vertices = denormalised(batch["target"].double().unflatten(1, (-1, 3)), *place)
+    vertices = denormalise_clouds(batch["target"].double().unflatten(1, (-1, 3)), *place)
     np.testing.assert_allclose(vertices, scans.model(scans.shape[:5], scans.pose[:5]), atol=1e-6)
-    points = denormalised(batch["input"].double(), *place)
+    points = denormalise_clouds(batch["input"].double(), *place)
     normal, corners = planes(vertices, made.model.faces)
     for cloud, n, c in zip(points, normal, corners, strict=True):
         apart = torch.einsum("fk,pfk->pf", n, cloud[:, None] - c[None, :, 0]).abs()  # from every face's plane
@@ -202,7 +202,7 @@ def test_a_users_scan_is_read_in_metres_without_preparing(file, tmp_path):
     np.save(tmp_path / "b.npy", points[:40])
     batch = data(file).read([tmp_path / "a.npy", tmp_path / "b.npy"]).__getitems__([0, 1])
     assert sizes(batch["input"]).tolist() == [300, 40]
-    back = denormalised(batch["input"].double(), batch["centre"].double(), batch["scale"].double())
+    back = denormalise_clouds(batch["input"].double(), batch["centre"].double(), batch["scale"].double())
     np.testing.assert_allclose(back[1, :40], points[:40], atol=1e-6)
 
 
@@ -309,7 +309,7 @@ def test_a_trained_run_registers_a_users_scan(file, tmp_path):
     assert found["synthetic"]
     assert 0 < found["vertex_error_median_cm"] < 100
     points = prepared(file).splits().test.__getitems__([0])
-    cloud = denormalised(points["input"], points["centre"], points["scale"])[0, :400].numpy()
+    cloud = denormalise_clouds(points["input"], points["centre"], points["scale"])[0, :400].numpy()
     np.save(tmp_path / "me.npy", cloud)
     code, told = command(
         tmp_path, "plugins.data.bodies", "run", "me.npy", "--folder", "meshes", "--path", f"data.body={file}"
@@ -330,8 +330,8 @@ def test_a_trained_run_registers_a_users_scan(file, tmp_path):
     # thesis Table 6.4: a model is tested on FAUST's scans; it was trained on the body of FAUST's registrations
     batch = prepared(file, points=200).splits().test.__getitems__(range(6))
     place = batch["centre"], batch["scale"]
-    meshes = denormalised(batch["target"].unflatten(1, (-1, 3)), *place).numpy()
-    scans = denormalised(batch["input"], *place).numpy()
+    meshes = denormalise_clouds(batch["target"].unflatten(1, (-1, 3)), *place).numpy()
+    scans = denormalise_clouds(batch["input"], *place).numpy()
     for row, number in enumerate((0, 70, 80, 81, 90, 91)):
         training = tmp_path / "faust" / "training"
         write(training / "scans" / f"tr_scan_{number:03}.ply", scans[row][np.isfinite(scans[row]).all(1)])

@@ -202,7 +202,7 @@ def test_what_is_written_is_read_by_the_data_set_and_seen_whole(doll, tmp_path, 
         assert len(data.read([file])) == 3
         np.testing.assert_array_equal(scan_layout.vertex_colors(meshes.read(file)), given.colors)
         for camera in cameras.values():
-            pixel, depth = camera.projected(torch.from_numpy(meshes.read(file).vertices).float())
+            pixel, depth = camera.project(torch.from_numpy(meshes.read(file).vertices).float())
             assert (depth > 0).all() and (pixel > -0.5).all() and (pixel < torch.tensor([29.5, 39.5])).all()
     turned = [
         math.atan2(*(-camera.rotation.T @ camera.translation)[[0, 2]].tolist()) for camera in cameras.values()

@@ -9,7 +9,7 @@ from PIL import Image
 from framework.configuration.schema import build, resolve
 from framework.errors import ConfigError, DataError
 from framework.geometry.camera import Camera
-from framework.geometry.light import eight_bit, encoded, linear
+from framework.geometry.srgb import bytes_from_linear, linear_from_bytes, srgb_from_linear
 from framework.renderer import Scene, Texture
 from framework.storage import cache
 from framework.testing.data_folders import damage
@@ -60,7 +60,7 @@ def test_colours_of_a_registration_are_those_of_the_nearest_points_that_a_scanne
     for scan, found in dressed[:3]:
         for vertex in range(0, len(found.vertices), 4001):
             order = np.linalg.norm(scan.vertices - found.vertices[vertex], axis=1).argsort()
-            colors = eight_bit(torch.from_numpy(scan.colors[order[:1]])).numpy()
+            colors = bytes_from_linear(torch.from_numpy(scan.colors[order[:1]])).numpy()
             # legs under a skirt are nearer than the skirt, but no scanner sees them
             hidden = len(scan.vertices) > len(found.vertices)
             assert hidden or np.array_equal(found.colors[vertex], colors[0])
@@ -91,15 +91,15 @@ def test_blank_parts_of_a_skin_take_the_tone_of_the_face(wardrobe, posed):
     found = skins.filled(
         shown, wardrobe.anatomy, wardrobe.vertices, wardrobe._neighbours.dot, vertices.carried
     )
-    grey = float(linear(torch.tensor(skins.BLANK, dtype=torch.uint8)))
+    grey = float(linear_from_bytes(torch.tensor(skins.BLANK, dtype=torch.uint8)))
     assert (np.abs(shown - grey).max(1) < 0.002).mean() > 0.3
     assert (np.abs(found - grey).max(1) < 0.002).mean() < 0.01
-    tone = linear(torch.tensor([200, 120, 80], dtype=torch.uint8)).numpy()
+    tone = linear_from_bytes(torch.tensor([200, 120, 80], dtype=torch.uint8)).numpy()
     np.testing.assert_allclose(np.median(found[wardrobe.anatomy.along_leg > 0.3], 0), tone, atol=0.01)
 
 
 def test_a_texture_holds_the_colours_of_its_places(wardrobe, dressed):
-    colors = linear(torch.from_numpy(dressed[0][1].colors[wardrobe.vertex_of_place]))
+    colors = linear_from_bytes(torch.from_numpy(dressed[0][1].colors[wardrobe.vertex_of_place]))
     faces = wardrobe.sheet.corners[-1].uv_faces
     pixels = photographs.texture(RENDERER, wardrobe.uv, faces, colors, 512)
     used = np.unique(faces)
@@ -125,7 +125,7 @@ def test_photographs_show_a_point_where_its_camera_says(number):
     (found,) = photographs.photographed(RENDERER, scene, [camera])
     cover = found.mask.astype(float)
     row, column = (np.average(place, weights=cover) for place in np.indices(cover.shape))
-    pixel, depth = camera.projected(torch.from_numpy(centre)[None])
+    pixel, depth = camera.project(torch.from_numpy(centre)[None])
     # the outline of a ball is shifted outwards by (radius / depth)² times its distance from the axis
     assert np.abs(np.array([column, row]) - pixel[0].numpy()).max() < 0.05 + 40 * (0.12 / float(depth)) ** 2
     assert (found.pixels[found.mask > 0] == 255).all() and (found.pixels[found.mask == 0] == 188).all()
@@ -138,7 +138,7 @@ def test_the_rig_sees_everybody_whole_from_different_places(number):
     size = (64, 48) if number % 2 else (48, 64)
     cameras = photographs.rig(people, 12, size, random)
     for camera in cameras:
-        pixel, depth = camera.projected(torch.from_numpy(people))
+        pixel, depth = camera.project(torch.from_numpy(people))
         assert (depth > 0).all()
         margin = photographs.MARGIN * size[0] - 1
         assert (pixel > margin).all()
@@ -196,17 +196,17 @@ def test_the_default_body_is_photographed_with_what_textured_renderers_need(tmp_
         places = scan_layout.read_places(found.folder, topology)
         mesh, camera = subject.registration, subject.views[0].camera
         assert np.array_equal(places.faces, mesh.faces)
-        texture = linear(torch.from_numpy(scan_layout.read_texture(found.folder, "test_0000")))
+        texture = linear_from_bytes(torch.from_numpy(scan_layout.read_texture(found.folder, "test_0000")))
         light, cover = photograph(subject.views[0])
         ones = torch.ones(len(mesh.vertices), 1)
         shares = smooth(Scene(mesh.vertices, mesh.faces, ones, camera))["color"]
         shown = Texture((texture,), torch.from_numpy(places.uv), torch.from_numpy(places.uv_faces))
         for scene in (
-            Scene(mesh.vertices, mesh.faces, linear(mesh.colors), camera),
+            Scene(mesh.vertices, mesh.faces, linear_from_bytes(mesh.colors), camera),
             Scene(mesh.vertices, mesh.faces, None, camera, shown),
         ):
-            drawn = encoded(smooth(scene)["color"] + 1 - shares)
-            errors.append(float((drawn - encoded(light))[cover > 0].square().mean()))
+            drawn = srgb_from_linear(smooth(scene)["color"] + 1 - shares)
+            errors.append(float((drawn - srgb_from_linear(light))[cover > 0].square().mean()))
     few, few_textured, many, many_textured = errors
     assert 10**-3 < many < few < 10**-1.3
     assert few_textured < few and many_textured < many
@@ -268,8 +268,8 @@ def test_supersampling_keeps_the_camera():
     camera = Camera(torch.eye(3), torch.zeros(3), (50.0, 60.0), (7.0, 9.5), 20, 16)
     finer = photographs._finer(camera)
     points = torch.tensor([[0.1, -0.1, 1.0], [0.0, 0.02, 2.0]])
-    pixel, _ = camera.projected(points)
-    torch.testing.assert_close(finer.projected(points)[0], 4 * pixel + 1.5)
+    pixel, _ = camera.project(points)
+    torch.testing.assert_close(finer.project(points)[0], 4 * pixel + 1.5)
 
 
 def test_photographs_want_a_renderer_that_tells_the_subject_from_the_ground():

@@ -10,7 +10,7 @@ from torch.utils.data import default_collate
 
 from framework.configuration.schema import build, resolve
 from framework.errors import DataError
-from framework.geometry.light import light_of
+from framework.geometry.srgb import linear_from_srgb
 from framework.testing.data_folders import damage
 from framework.testing.rows import DAMAGES
 from plugins.data.bodies import scan_layout
@@ -300,5 +300,5 @@ def test_a_mesh_drawn_as_ground_leaves_free_what_its_picture_leaves_white():
     )
     assert drawn.shape == (1, 4, 24, 20) and ground.shape == (1, 2, 24, 20)
     # vertices are black, so that all remaining light is the white background
-    torch.testing.assert_close(light_of(drawn[:, :1]), ground[:, :1], atol=1e-5, rtol=0)
+    torch.testing.assert_close(linear_from_srgb(drawn[:, :1]), ground[:, :1], atol=1e-5, rtol=0)
     assert torch.equal(drawn[:, 3], ground[:, 1]) and 0 < float(ground[:, 0].mean()) < 1

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d
 
 from framework.errors import DataError
-from framework.geometry.light import linear
+from framework.geometry.srgb import linear_from_bytes
 from framework.renderer import Texture
 from framework.storage.reading import read_bytes
 from plugins.data.bodies import scan_layout
@@ -98,7 +98,7 @@ def _known_by(colors: UInt8[Tensor, "vertices 3"]) -> bytes:
 def _light(file: Path, longest: int) -> Float[Tensor, "height width 4"]:
     """Return a texture in linear RGB with a channel of ones, which renders as the share of a pixel that is covered."""
     pixels = scan_layout.read_texture(file.parents[2], file.parent.name)
-    light = linear(torch.from_numpy(pixels))
+    light = linear_from_bytes(torch.from_numpy(pixels))
     times = -(-max(light.shape[:2]) // longest)
     if times > 1:
         size = (-(-light.shape[0] // times), -(-light.shape[1] // times))

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from framework.figures.style import saved
+from framework.figures.style import save_figure
 from plugins.data.cest.maps_picture import SHOWN, Maps, maps_figure
 from plugins.data.cest.volumes import Volume, read_volume
 
@@ -50,7 +50,7 @@ def write_maps(
         np.savetxt(bad, volume.left_out, "%d", ",", header="x,y,z", comments="")
         written.append(bad)
     title = f"{file.name}: amplitudes of the lines" + ", by a model of synthetic data" * synthetic
-    return [*written, saved(maps_figure({"": slice_of(maps, volume)}, title), stem, True)]
+    return [*written, save_figure(maps_figure({"": slice_of(maps, volume)}, title), stem, True)]
 
 
 def maps_of(

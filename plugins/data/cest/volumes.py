@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from framework.datasets.matlab import read_variables
-from framework.errors import DataError, shown
+from framework.errors import DataError, shorten
 from framework.storage.arrays import archive, real
 from framework.storage.limits import MOST_OF_SPECTRA, MOST_VOXELS
 from framework.storage.reading import guarded, read_bytes, require_numbers
@@ -81,7 +81,7 @@ def _read_arrays(file: Path) -> Mapping[str, Any]:
     if name.endswith((".nii", ".nii.gz")):
         return _nifti(file)
     raise DataError(
-        f"The suffix of the file is {shown(file.suffix) or 'empty'}; expected .mat, .npz, .nii or .nii.gz."
+        f"The suffix of the file is {shorten(file.suffix) or 'empty'}; expected .mat, .npz, .nii or .nii.gz."
     )
 
 
@@ -100,7 +100,7 @@ def _volume(arrays: Mapping[str, Any], size: int) -> Volume:
     """Return the volume in the arrays of a file of `size` bytes."""
     name = next((name for name in SPECTRA if name in arrays), None)
     if name is None or "offsets" not in arrays:
-        raise DataError(f"The file holds {shown(', '.join(arrays)) or 'nothing'}. {LAYOUT}")
+        raise DataError(f"The file holds {shorten(', '.join(arrays)) or 'nothing'}. {LAYOUT}")
     spectra, offsets = real(arrays[name], name), real(arrays["offsets"], "offsets").ravel()
     if not 2 <= spectra.ndim <= 4 or spectra.shape[-1] != len(offsets):
         raise DataError(f"{name} has shape {spectra.shape} for {len(offsets)} offsets. {LAYOUT}")
@@ -145,7 +145,7 @@ def _volume(arrays: Mapping[str, Any], size: int) -> Volume:
         )
     place = np.argwhere(usable)
     left_out = np.argwhere(inside & ~whole)
-    unread = tuple(shown(other, 40) for other in arrays if other not in (name, *KNOWN))[:12]
+    unread = tuple(shorten(other, 40) for other in arrays if other not in (name, *KNOWN))[:12]
     return Volume(
         offsets,
         spectra[usable],

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from framework.datasets.images import Crop
 from framework.datasets.matlab import read_variables
-from framework.errors import DataError, shown
+from framework.errors import DataError, shorten
 
 OBJECTS, VIEWS, STEP_DEG = 20, 72, 5
 FILE = "COIL20.mat"
@@ -44,7 +44,7 @@ def _read_matlab(file: Path, side: int) -> Tensor:
     variables = read_variables(file, remedy=REMEDY)
     if "X" not in variables or "Y" not in variables:
         raise DataError(
-            f"{file}: The file holds {shown(', '.join(variables)) or 'nothing'}, but X and Y are required. {REMEDY}"
+            f"{file}: The file holds {shorten(', '.join(variables)) or 'nothing'}, but X and Y are required. {REMEDY}"
         )
     pixels, labels = np.asarray(variables["X"]), np.asarray(variables["Y"]).ravel()
     if (

@@ -13,7 +13,7 @@ import numpy as np
 import scipy.io
 
 from framework.datasets.matlab import read_variables
-from framework.errors import DataError, shown
+from framework.errors import DataError, shorten
 from plugins.data.head_pose.archive import TRAIN_AND_TEST
 
 LABELS = "or_label.mat"
@@ -55,7 +55,7 @@ def _label(file: Path, where: str, entry: Any) -> Label:
         if gaze.size == 1 and gaze.dtype.kind in "iuf":
             return Label(values[-1], float(gaze.item()))
     raise DataError(
-        f"{file}: {where} holds {shown(values)}; wanted a struct of {', '.join(FIELDS)}, gaze a number of degrees. "
+        f"{file}: {where} holds {shorten(values)}; wanted a struct of {', '.join(FIELDS)}, gaze a number of degrees. "
         "Restore it from its source."
     )
 

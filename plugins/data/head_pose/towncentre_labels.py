@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from framework.errors import DataError, quoted, shown
+from framework.errors import DataError, quote, shorten
 from framework.storage.reading import guarded, read_bytes
 from framework.storage.text import decoded, no_number, value
 from plugins.data.head_pose.archive import wrong_layout
@@ -80,7 +80,7 @@ def read_label(file: Path) -> tuple[float, bool]:
         line = next((number for number, (name, _, _) in enumerate(entries, 1) if name.strip() == "pan"), 0)
         why = f" Line {line}: {no_number(fields['pan'])}." if pan is None and line else ""
         raise DataError(
-            f"{file}: {quoted(text)}; wanted two lines, `pan = ` with finite degrees and `valid = ` with 0 or 1.{why} "
+            f"{file}: {quote(text)}; wanted two lines, `pan = ` with finite degrees and `valid = ` with 0 or 1.{why} "
             "Restore it from its source."
         )
     return pan, valid
@@ -92,8 +92,8 @@ def _image(folder: Path, text: str, pictures: Sequence[str]) -> Path:
     names = [name for name in pictures if name.startswith(stem) and not name[len(stem) :][:1].isdigit()]
     if len(names) != 1:
         raise DataError(
-            f"{folder / text}: {len(names)} images have names that start with {quoted(stem)}"
-            f"{': ' if names else ''}{shown(', '.join(names[:3]))}; wanted one. Restore it, or take the label out."
+            f"{folder / text}: {len(names)} images have names that start with {quote(stem)}"
+            f"{': ' if names else ''}{shorten(', '.join(names[:3]))}; wanted one. Restore it, or take the label out."
         )
     return folder / names[0]
 

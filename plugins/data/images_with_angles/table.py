@@ -20,7 +20,7 @@ from framework.datasets.csv_columns import (
     require,
     told,
 )
-from framework.errors import DataError, did_you_mean, quoted, shown
+from framework.errors import DataError, did_you_mean, quote, shorten
 
 Split = Literal["train", "validation", "test"]
 SPLITS: tuple[Split, ...] = ("train", "validation", "test")
@@ -78,7 +78,7 @@ def read_table(
             raise DataError(f"{file} line {number}: no `{FILE}`; wanted the name of an image.")
         if name in first_line:
             raise DataError(
-                f"{file} line {number}: {quoted(written)} stands already in line {first_line[name]}; wanted each "
+                f"{file} line {number}: {quote(written)} stands already in line {first_line[name]}; wanted each "
                 "image once. Take one of the lines out."
             )
         first_line[name] = number
@@ -111,7 +111,7 @@ def _read(file: Path, writing: Writing) -> Columns:
     if FILE not in table.cells:
         raise DataError(
             f"{file} has no column `{FILE}`.{did_you_mean(FILE, table.cells)} Its first line names: "
-            f"{shown(', '.join(table.cells))}. Wanted names, one of them `{FILE}`."
+            f"{shorten(', '.join(table.cells))}. Wanted names, one of them `{FILE}`."
         )
     return table
 
@@ -120,7 +120,7 @@ def _angle_columns(table: Columns, asked: Sequence[str] | None) -> Chosen:
     if asked is None:
         found = numeric_columns(table, (FILE, SPLIT), "data.angle_columns")
         if not found.names:
-            others = "".join(f" {quoted(name)}: {why}." for name, why in list(found.left_out.items())[:8])
+            others = "".join(f" {quote(name)}: {why}." for name, why in list(found.left_out.items())[:8])
             raise DataError(
                 f"{table.file} has no column of numbers beside `{FILE}` and `{SPLIT}`; wanted one for each angle, "
                 f"in degrees. Add one, or name them with data.angle_columns.{others}"
@@ -142,13 +142,13 @@ def _refuse_other_unit(
     wrong = unlike_degrees(values) if angles_in is None else ""
     if wrong:
         raise DataError(
-            f"{file}, column {quoted(column)}: {wrong}. Set data.angles_in=radians, or data.angles_in=degrees if "
+            f"{file}, column {quote(column)}: {wrong}. Set data.angles_in=radians, or data.angles_in=degrees if "
             "degrees they are."
         )
     wrong = unlike_radians(values) if angles_in == "radians" else ""
     if wrong:
         raise DataError(
-            f"{file}, column {quoted(column)}: {wrong}. Leave data.angles_in out, or wrap the angles into one turn."
+            f"{file}, column {quote(column)}: {wrong}. Leave data.angles_in out, or wrap the angles into one turn."
         )
 
 
@@ -156,7 +156,7 @@ def _split(file: Path, number: int, cell: str) -> Split:
     word = cell
     if word not in SPLITS:
         raise DataError(
-            f"{file} line {number}, column `{SPLIT}`: {quoted(word)}; wanted one of {', '.join(SPLITS)}."
+            f"{file} line {number}, column `{SPLIT}`: {quote(word)}; wanted one of {', '.join(SPLITS)}."
             f"{did_you_mean(word, SPLITS)}"
         )
     return cast(Split, word)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from framework.errors import DataError, shown
+from framework.errors import DataError, shorten
 from framework.storage.arrays import archive
 from framework.storage.reading import guarded, read_bytes
 
@@ -47,13 +47,15 @@ def read_archive(root: str | None) -> Archive:
 def _checked(file: Path, held: dict[str, np.ndarray]) -> Archive:
     missing = [name for name in ("points", "offset", "label", "classes") if name not in held]
     if missing:
-        raise DataError(f"{file} holds {shown(', '.join(held)) or 'nothing'}, but no {missing[0]}. {WANTED}")
+        raise DataError(
+            f"{file} holds {shorten(', '.join(held)) or 'nothing'}, but no {missing[0]}. {WANTED}"
+        )
     points, offset, label = held["points"], held["offset"], held["label"]
     identity = held.get("object_id", np.arange(len(label)))
     whole = all(array.ndim == 1 and array.dtype.kind in "iu" for array in (offset, label, identity))
     if points.dtype.kind != "f" or points.ndim != 2 or points.shape[1] != 3 or not whole:
         shapes = ", ".join(f"{name} {array.dtype} {array.shape}" for name, array in held.items())
-        raise DataError(f"{file}: its arrays came as {shown(shapes)}. {WANTED}")
+        raise DataError(f"{file}: its arrays came as {shorten(shapes)}. {WANTED}")
     offset, label = offset.astype(np.int64), label.astype(np.int64)
     ends = len(offset) == len(label) + 1 == len(identity) + 1 and offset[0] == 0 and offset[-1] == len(points)
     if not ends or (np.diff(offset) < 1).any():

@@ -15,7 +15,7 @@ from torch.utils.data import Dataset
 
 from framework.data import Batch, Data, Splits
 from framework.datasets import cloud_picture, images
-from framework.errors import DataError, shown
+from framework.errors import DataError, shorten
 from framework.geometry import meshes
 from framework.geometry.meshes import READERS
 from framework.storage.names import as_bytes, spelled
@@ -139,7 +139,7 @@ def unread(listed: Listed, how: Reading) -> tuple[str, ...]:
         others = [name for name in mesh.columns if name not in how.columns]
         if others:
             said.append(
-                f"left out: the columns {shown(', '.join(others))} of {listed.files[0].name}; data.columns reads them"
+                f"left out: the columns {shorten(', '.join(others))} of {listed.files[0].name}; data.columns reads them"
             )
         if len(mesh.faces):
             said.append(f"the faces of {listed.files[0].name} are read as points drawn from them")

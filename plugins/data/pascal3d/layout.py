@@ -14,7 +14,7 @@ import numpy as np
 
 from framework.datasets.images import Box
 from framework.datasets.matlab import read_variables
-from framework.errors import DataError, quoted
+from framework.errors import DataError, quote
 from framework.storage.reading import guarded, read_bytes
 from framework.storage.text import lines_of
 
@@ -108,7 +108,7 @@ def read_list(file: Path) -> list[str]:
                 continue
             case _:
                 raise DataError(
-                    f"{file} line {number}: {quoted(line)}; wanted an image name, or a name and one of -1, 0, 1. "
+                    f"{file} line {number}: {quote(line)}; wanted an image name, or a name and one of -1, 0, 1. "
                     "Restore the list from the release."
                 )
     return list(dict.fromkeys(names))

@@ -15,7 +15,7 @@ from framework.configuration.paths import FilePath
 from framework.data import Batch, Data, Splits
 from framework.datasets.csv_columns import Writing
 from framework.datasets.fields import Fields
-from framework.errors import DataError, shown
+from framework.errors import DataError, shorten
 from framework.flights.frames import PARTS
 from framework.flights.physics import Constants
 from framework.geometry.meshes import stream
@@ -138,7 +138,7 @@ class TableTennis(Data):
         self.target = Target("real", self.grid.names, tuple(train.mean(0).tolist()), tuple(scale.tolist()))
         self.synthetic = read_mark(root) is not None if root.is_dir() else False
         self.skipped = left_out
-        others = shown(", ".join(self._others))
+        others = shorten(", ".join(self._others))
         said = (
             (others, f"left out: the columns {others}"),
             (self.repeated, f"left out: {self.repeated} repeated flights"),

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from framework.datasets.csv_columns import Writing, numbers, read_columns, require
 from framework.datasets.matlab import read_variables
-from framework.errors import DataError, shown
+from framework.errors import DataError, shorten
 from framework.storage.arrays import real
 
 COLUMNS = ("t", "x", "y", "z")
@@ -111,7 +111,7 @@ def _from_matlab(file: Path) -> list[Flight]:
         tables = [_joined(time, ball) for time, ball in pairs]
     else:
         raise DataError(
-            f"{file} holds {shown(', '.join(found)) or 'nothing'}; wanted ballTrain with a field data, or time and "
+            f"{file} holds {shorten(', '.join(found)) or 'nothing'}; wanted ballTrain with a field data, or time and "
             "ball, as the WAM laboratory's flights. Or write each flight as CSV with the columns t, x, y, z."
         )
     for number, table in enumerate(tables):

@@ -11,7 +11,7 @@ from pydantic import Field
 
 from framework.errors import DataError
 from framework.flights.physics import Constants, Positive
-from framework.flights.trajectories import flown
+from framework.flights.trajectories import simulate
 from framework.geometry.meshes import stream
 from framework.storage import cache
 from framework.storage.generated import draw_all, generated
@@ -127,7 +127,7 @@ def solved(
         DataError: the solver of the stiff contact gave up.
     """
     if what.contact == "bounce":
-        found = flown(torch.from_numpy(starts), torch.from_numpy(times), constants)
+        found = simulate(torch.from_numpy(starts), torch.from_numpy(times), constants)
         return found[..., :3].numpy()
     spring = Spring(frequency=what.frequency, damping=what.damping)
     try:

@@ -10,7 +10,7 @@ from scipy.integrate import BDF, DOP853, LSODA, RK45, OdeSolver, Radau
 from scipy.optimize import brentq
 
 from framework.errors import UserError
-from framework.flights.physics import Constants, acceleration, bounced
+from framework.flights.physics import Constants, acceleration, bounce
 from plugins.data.table_tennis.contact import Spring, pressed, push
 
 Method = Literal["RK45", "DOP853", "LSODA", "BDF", "Radau"]
@@ -60,7 +60,7 @@ def flight(
 
     A flight is a sequence of phases, each with a smooth right-hand side: in the air; in the table and pushed; in the
     table and no longer pushed ("loose"); at rest on it; fallen beside it. The border between two phases is an event,
-    which is located on the solver's dense output. Without a spring a bounce takes no time (`bounced`), and bouncing
+    which is located on the solver's dense output. Without a spring a bounce takes no time (`bounce`), and bouncing
     ends at `REST`.
 
     Args:
@@ -246,6 +246,6 @@ class _Walk:
         if spring is not None:
             return state, "pushed"
         x, y, z, u, v, w, a, b, c = state.tolist()
-        (u, v, w), (a, b, c) = bounced((u, v, w), (a, b, c), constants)
+        (u, v, w), (a, b, c) = bounce((u, v, w), (a, b, c), constants)
         phase = "air" if w > REST else "rest"
         return np.array([x, y, z, u, v, w if phase == "air" else 0.0, a, b, c]), phase

@@ -13,7 +13,7 @@ from torch.utils.data import Dataset
 from framework.configuration.paths import FilePath, Words
 from framework.data import Batch, Data, Splits
 from framework.datasets.csv_columns import LabelledWriting
-from framework.errors import DataError, quoted
+from framework.errors import DataError, quote
 from plugins.data.tabular.picture import bars
 from plugins.data.tabular.table import (
     Kind,
@@ -91,7 +91,7 @@ class Tabular(Data):
         self.groups = table.groups
         self.title = Path(self.path or "").stem
         self.skipped = table.skipped
-        names = ", ".join(map(quoted, self.question.target))
+        names = ", ".join(map(quote, self.question.target))
         self.remarks = (f"predicted: the column {names}, data.kind={self.question.kind}", *table.remarks)
 
     @cached_property

@@ -28,7 +28,7 @@ from framework.datasets.csv_columns import (
 )
 from framework.datasets.fields import Fields
 from framework.distributions.circular import wrap
-from framework.errors import DataError, did_you_mean, quoted, shown
+from framework.errors import DataError, did_you_mean, quote, shorten
 from framework.storage import text
 from framework.storage.arrays import real
 from framework.target import Target
@@ -267,8 +267,8 @@ def _inputs(cells: Columns, question: Question) -> Chosen:
     if not chosen.names:
         raise DataError(
             f"{cells.file} has no column of numbers to read beside {', '.join(question.target)}; its columns: "
-            f"{shown(', '.join(cells.cells))}. Name some with data.columns."
-            + "".join(f" {quoted(name)}: {why}." for name, why in list(chosen.left_out.items())[:8])
+            f"{shorten(', '.join(cells.cells))}. Name some with data.columns."
+            + "".join(f" {quote(name)}: {why}." for name, why in list(chosen.left_out.items())[:8])
         )
     return chosen
 

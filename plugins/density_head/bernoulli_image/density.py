@@ -10,16 +10,16 @@ from torch.nn.functional import logsigmoid
 
 from framework.distributions.description import one_line
 from framework.distributions.protocol import (
-    each_cdf,
     estimate,
-    exactly,
+    exact_estimate,
     images,
+    marginal_cdfs,
     median,
     pick,
     take,
-    tempered,
+    tempered_density,
 )
-from framework.geometry.light import light_of
+from framework.geometry.srgb import linear_from_srgb
 
 
 class BernoulliImage(Distribution):
@@ -80,7 +80,7 @@ class BernoulliImage(Distribution):
         return (size * (-size).sigmoid() - logsigmoid(size)).sum((-3, -2, -1))
 
 
-estimate.register(BernoulliImage, exactly)
+estimate.register(BernoulliImage, exact_estimate)
 
 
 @median.register
@@ -88,7 +88,7 @@ def _(density: BernoulliImage, samples: int) -> Tensor:
     return density.mode
 
 
-@each_cdf.register
+@marginal_cdfs.register
 def _(density: BernoulliImage, value: Tensor) -> Tensor:
     below = (-density.logits.double()).sigmoid()
     return torch.where(value < 0, 0.0, torch.where(value < 1, below, 1.0))
@@ -99,7 +99,7 @@ def _(density: BernoulliImage, index: Tensor) -> BernoulliImage:
     return BernoulliImage(take(density.logits.flatten(-3), index).unflatten(-1, density.event_shape))
 
 
-@tempered.register
+@tempered_density.register
 def _(density: BernoulliImage, temperature: Tensor) -> BernoulliImage:
     # odds^(1/T)
     return BernoulliImage(density.logits / temperature)
@@ -114,5 +114,5 @@ def _(density: BernoulliImage, channels: Collection[str]) -> dict[str, Tensor]:
         or ("mask" in channels and density.event_shape[-1] > 1)
     ):
         return images.dispatch(Distribution)(density, channels)
-    drawn = {"color": lambda: light_of(density.mean), "mask": lambda: density.logits[..., 0] >= 0}
+    drawn = {"color": lambda: linear_from_srgb(density.mean), "mask": lambda: density.logits[..., 0] >= 0}
     return {name: drawn[name]() for name in channels}

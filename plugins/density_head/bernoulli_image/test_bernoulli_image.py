@@ -8,7 +8,7 @@ from framework.distributions.density import Mixture
 from framework.distributions.protocol import images, median, pick
 from framework.distributions.tempering import temper
 from framework.errors import UserError
-from framework.geometry.light import light_of
+from framework.geometry.srgb import linear_from_srgb
 from framework.target import Target
 from plugins.density_head.bernoulli_image.density import BernoulliImage
 from plugins.density_head.bernoulli_image.head import SMALLEST, BernoulliImageHead
@@ -66,7 +66,7 @@ def test_a_mask_is_what_is_rather_there_and_the_colour_the_light_of_its_share() 
     one = density(2)
     drawn = images(one, {"color", "mask"})
     assert drawn["mask"].dtype == torch.bool and torch.equal(drawn["mask"], one.mean[..., 0] >= 0.5)
-    torch.testing.assert_close(drawn["color"], light_of(one.mean))
+    torch.testing.assert_close(drawn["color"], linear_from_srgb(one.mean))
     for density_, channels in ((one, {"depth"}), (density(2, numbers=3), {"mask"})):
         with pytest.raises(UserError, match="draws no"):
             images(density_, channels)

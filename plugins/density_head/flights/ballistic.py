@@ -13,11 +13,18 @@ from torch.distributions import Distribution
 from framework.density_head import DensityHead, Fitted
 from framework.distributions.density import Mixture
 from framework.distributions.normals import IndependentNormals, JointNormal
-from framework.errors import NonFiniteAnswer
-from framework.flights.estimation import Estimate, Prior, Seen, estimated, root, seen_of
+from framework.errors import NonFiniteParameters
+from framework.flights.estimation import (
+    Estimate,
+    ObservedFrames,
+    Prior,
+    estimate_states,
+    observed_frames,
+    root,
+)
 from framework.flights.frames import PARTS, future_frames
 from framework.flights.physics import Constants
-from framework.flights.trajectories import flown, flown_with_slopes
+from framework.flights.trajectories import simulate, simulate_with_jacobian
 from framework.heads.parameters import require_finite
 from framework.storage.weights import require_state
 from framework.target import Target
@@ -110,22 +117,22 @@ class BallisticHead(DensityHead, Fitted):
     def fit(self, features: Float[Tensor, "sample size"], target: Tensor, seed: int) -> None:
         """Fit constants and noise that make whole windows most likely (identification.py)."""
         chosen = torch.linspace(0, len(features) - 1, min(WINDOWS, len(features))).round().long()
-        seen = seen_of(features[chosen].unflatten(-1, (self.observed, len(PARTS))).cpu(), self.step)
+        seen = observed_frames(features[chosen].unflatten(-1, (self.observed, len(PARTS))).cpu(), self.step)
         after = self._after(seen)
         future = target[chosen].double().cpu().unflatten(-1, (self.future, 3))
-        whole = Seen(
+        whole = ObservedFrames(
             torch.cat([seen.times, after], 1),
             torch.cat([seen.places, torch.where(future.abs() < 50, future, torch.nan)], 1),
         )
-        estimate = estimated(whole, self.constants, float(self.noise), self.prior, most=self.steps)
+        estimate = estimate_states(whole, self.constants, float(self.noise), self.prior, most=self.steps)
         self._measure_noise(whole, estimate.state)
         if self.identify:
             numbers, states = identified(whole, self.constants, estimate.state, float(self.noise), self.prior)
             self.found.copy_(numbers)
             self._measure_noise(whole, states)
 
-    def _measure_noise(self, seen: Seen, states: Tensor) -> None:
-        apart = flown(states, seen.times, self.constants)[..., :3] - seen.places
+    def _measure_noise(self, seen: ObservedFrames, states: Tensor) -> None:
+        apart = simulate(states, seen.times, self.constants)[..., :3] - seen.places
         left = apart[~apart.isnan()].abs()
         if len(left):  # the median of |r| is 0.6745 of a normal's standard deviation
             self.noise.copy_((left.median() / 0.6745).clamp(LEAST_NOISE, MOST_NOISE))
@@ -134,8 +141,8 @@ class BallisticHead(DensityHead, Fitted):
         """Return the density for raw parameters."""
         raw = require_finite(raw, self.size)
         flat = raw.detach().reshape(math.prod(raw.shape[:-1]), self.size)
-        seen = seen_of(flat.unflatten(-1, (self.observed, len(PARTS))).cpu(), self.step)
-        estimate = estimated(seen, self.constants, float(self.noise), self.prior, most=self.steps)
+        seen = observed_frames(flat.unflatten(-1, (self.observed, len(PARTS))).cpu(), self.step)
+        estimate = estimate_states(seen, self.constants, float(self.noise), self.prior, most=self.steps)
         build = self._linearised if self.density == "linearised" else self._sampled
         # The gradient is 0: the search is not differentiated.
         return build(seen, estimate, raw, (raw * 0).sum(-1, keepdim=True))
@@ -144,8 +151,8 @@ class BallisticHead(DensityHead, Fitted):
     def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
         """Fit a factor of each number's standard deviation, so that its variance equals the mean squared residual."""
         self.spread.fill_(1.0)
-        seen = seen_of(raw.unflatten(-1, (self.observed, len(PARTS))).cpu(), self.step)
-        estimate = estimated(seen, self.constants, float(self.noise), self.prior, most=self.steps)
+        seen = observed_frames(raw.unflatten(-1, (self.observed, len(PARTS))).cpu(), self.step)
+        estimate = estimate_states(seen, self.constants, float(self.noise), self.prior, most=self.steps)
         mean, factor = self._carried(seen, estimate)
         variance = factor.square().sum(-1) + float(self.noise) ** 2
         ratio = (target.double().cpu() - mean).square() / variance
@@ -155,16 +162,16 @@ class BallisticHead(DensityHead, Fitted):
             weight = len(ratio) / (len(ratio) + 20)
             self.spread.copy_((weight * ratio.mean(0) + (1 - weight) * ratio.mean()).sqrt().clamp(*SPREAD))
 
-    def _after(self, seen: Seen) -> Float[Tensor, "flight time"]:
+    def _after(self, seen: ObservedFrames) -> Float[Tensor, "flight time"]:
         moments = self.step * torch.arange(1, self.future + 1, dtype=torch.float64)
         return moments.expand(len(seen.times), -1)
 
-    def _whole(self, seen: Seen) -> Float[Tensor, "flight time"]:
+    def _whole(self, seen: ObservedFrames) -> Float[Tensor, "flight time"]:
         return torch.cat([seen.times, self._after(seen)], 1)
 
-    def _carried(self, seen: Seen, estimate: Estimate) -> tuple[Tensor, Tensor]:
+    def _carried(self, seen: ObservedFrames, estimate: Estimate) -> tuple[Tensor, Tensor]:
         """Return the mean of the future (flight, number), and a factor F of its covariance F Fᵀ (flight, number, 9)."""
-        places, slopes = flown_with_slopes(estimate.state, self._whole(seen), self.constants)
+        places, slopes = simulate_with_jacobian(estimate.state, self._whole(seen), self.constants)
         mean = places[:, -self.future :].flatten(1)
         self._require_course(mean, estimate)
         return mean, slopes[:, -self.future :].flatten(1, 2) @ root(estimate.covariance)
@@ -177,12 +184,14 @@ class BallisticHead(DensityHead, Fitted):
         """
         finite = estimate.covariance.flatten(1).isfinite().all(-1) & places.flatten(1).isfinite().all(-1)
         if not finite.all():
-            raise NonFiniteAnswer(
+            raise NonFiniteParameters(
                 f"the flight in batch row {int((~finite).nonzero()[0])} has no finite course with step={self.step:g} "
                 f"and {self.constants}. Set density_head.step and density_head.constants to those of the recordings."
             )
 
-    def _linearised(self, seen: Seen, estimate: Estimate, raw: Tensor, zero: Tensor) -> Distribution:
+    def _linearised(
+        self, seen: ObservedFrames, estimate: Estimate, raw: Tensor, zero: Tensor
+    ) -> Distribution:
         mean, factor = self._carried(seen, estimate)
         spread = self.spread.cpu()
         factor = spread.unsqueeze(-1) * factor
@@ -190,7 +199,7 @@ class BallisticHead(DensityHead, Fitted):
         scale, failed = torch.linalg.cholesky_ex(covariance)
         if failed.any():
             deviation, noise = float(factor.square().sum(-1).amax().sqrt()), float(self.noise)
-            raise NonFiniteAnswer(
+            raise NonFiniteParameters(
                 f"the covariance of the flight in batch row {int(failed.nonzero()[0])} is not positive definite: it "
                 f"has deviations of {deviation:.2g} m beside a noise of {noise:.2g} m. No training ends with such "
                 "constants: train the head again, or restore its checkpoint."
@@ -199,7 +208,7 @@ class BallisticHead(DensityHead, Fitted):
         joint = scale.reshape(*shape, *scale.shape[-2:]).to(raw)
         return JointNormal(mean.reshape(*shape, mean.shape[-1]).to(raw) + zero, joint)
 
-    def _sampled(self, seen: Seen, estimate: Estimate, raw: Tensor, zero: Tensor) -> Distribution:
+    def _sampled(self, seen: ObservedFrames, estimate: Estimate, raw: Tensor, zero: Tensor) -> Distribution:
         count, flights = self.samples, len(estimate.state)
         # the same points at every call, so that the density is a fixed function and no random estimate
         points = torch.quasirandom.SobolEngine(9, scramble=True, seed=0).draw(count, dtype=torch.float64)
@@ -207,7 +216,7 @@ class BallisticHead(DensityHead, Fitted):
         self._require_course(estimate.state, estimate)
         states = estimate.state.unsqueeze(1) + noise @ root(estimate.covariance).mT
         times = self._whole(seen).repeat_interleave(count, 0)
-        places = flown(states.reshape(-1, 9), times, self.constants)[:, -self.future :, :3]
+        places = simulate(states.reshape(-1, 9), times, self.constants)[:, -self.future :, :3]
         places = places.reshape(flights, count, 3 * self.future)
         self._require_course(places, estimate)
         middle = places.mean(1, keepdim=True)

@@ -6,9 +6,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from framework.flights.estimation import Prior, Seen, cauchy
+from framework.flights.estimation import ObservedFrames, Prior, cauchy
 from framework.flights.physics import Constants
-from framework.flights.trajectories import flown, flown_with_slopes
+from framework.flights.trajectories import simulate, simulate_with_jacobian
 
 FITTED = ("drag", "lift", "restitution", "friction", "surface")
 """Names of the constants that are identified."""
@@ -42,7 +42,7 @@ def bounds_of(constants: Constants) -> tuple[Float[Tensor, "constant"], Float[Te
 
 
 def identified(
-    seen: Seen, given: Constants, states: Float[Tensor, "flight 9"], noise: float, prior: Prior
+    seen: ObservedFrames, given: Constants, states: Float[Tensor, "flight 9"], noise: float, prior: Prior
 ) -> tuple[Float[Tensor, "constant"], Float[Tensor, "flight 9"]]:
     """Return the constants `FITTED` and the states that fit best, by Levenberg and Marquardt's method.
 
@@ -64,7 +64,7 @@ def identified(
     numbers = numbers.clamp(low, high)
 
     def paths(numbers: Tensor, states: Tensor) -> Tensor:
-        return flown(states, seen.times, with_found(given, numbers))[..., :3]
+        return simulate(states, seen.times, with_found(given, numbers))[..., :3]
 
     def cost(numbers: Tensor, states: Tensor) -> float:
         apart = cauchy((paths(numbers, states) - seen.places) / noise)[0].nan_to_num(0.0)
@@ -74,7 +74,7 @@ def identified(
     linear = None
     for _ in range(ROUNDS):
         if linear is None:
-            places, slopes = flown_with_slopes(states, seen.times, with_found(given, numbers))
+            places, slopes = simulate_with_jacobian(states, seen.times, with_found(given, numbers))
             bent, steep = cauchy((places - seen.places) / noise)
             bent, steep = bent.nan_to_num(0.0).flatten(1), steep.nan_to_num(0.0).unsqueeze(-1) / noise
             shifts = torch.diag(sizes / 1000)

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from framework.configuration.schema import build, resolve
-from framework.errors import ConfigError, NonFiniteAnswer
+from framework.errors import ConfigError, NonFiniteParameters
 from framework.flights.frames import future_names
 from framework.flights.physics import Constants
 from framework.model import Model
@@ -77,7 +77,7 @@ def test_physics_far_from_any_ball_give_a_density_or_a_sentence(
     )
     try:
         log_prob = head(thrown(2)).log_prob(torch.zeros(2, 6))
-    except NonFiniteAnswer as error:
+    except NonFiniteParameters as error:
         assert "in batch row 0" in str(error)
     else:
         assert log_prob.isfinite().all()

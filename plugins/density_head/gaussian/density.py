@@ -11,19 +11,19 @@ from torch.distributions import Distribution, constraints
 from framework.distributions.description import one_line
 from framework.distributions.protocol import (
     Normals,
-    Slope,
-    about,
+    QuadraticBound,
     estimate,
-    exactly,
+    exact_estimate,
     mahalanobis,
     marginal,
     median,
     normals,
     one_normal,
     pick,
-    slope,
+    quadratic_bound,
+    recentre,
     take,
-    tempered,
+    tempered_density,
 )
 
 
@@ -140,7 +140,7 @@ def _times(matrix: Tensor, vector: Tensor) -> Tensor:
     return (matrix * vector.unsqueeze(-2)).sum(-1)
 
 
-estimate.register(Gaussian, exactly)
+estimate.register(Gaussian, exact_estimate)
 
 
 @marginal.register
@@ -158,22 +158,22 @@ def _(density: Gaussian, index: Tensor) -> Gaussian:
     return Gaussian(take(density.location, index), take(density.scale, index), coefficients)
 
 
-@slope.register
-def _(density: Gaussian, value: Tensor) -> Slope:
+@quadratic_bound.register
+def _(density: Gaussian, value: Tensor) -> QuadraticBound:
     residual = value - density.location
     stiffness = density.scale.square().reciprocal().expand(residual.shape)
     if density.coefficients is None:
-        return Slope(density.log_prob(value), -residual * stiffness, stiffness)
+        return QuadraticBound(density.log_prob(value), -residual * stiffness, stiffness)
     # Σ⁻¹ = Aᵀ A, A = (I - φ)/σ; the sums of the absolute values of its rows are a diagonal matrix that is an upper
     # bound (Gershgorin)
     identity = torch.eye(residual.shape[-1], dtype=residual.dtype, device=residual.device)
     root = (identity - density.coefficients) / density.scale.unsqueeze(-1)
     pull = -_times(root.mT, _times(root, residual))
     precision = (root.unsqueeze(-1) * root.unsqueeze(-2)).sum(-3)
-    return Slope(density.log_prob(value), pull, precision.abs().sum(-1).expand(residual.shape))
+    return QuadraticBound(density.log_prob(value), pull, precision.abs().sum(-1).expand(residual.shape))
 
 
-@about.register
+@recentre.register
 def _(density: Gaussian, index: tuple[Tensor, ...], place: Tensor) -> Gaussian:
     location = density.location.double()[index] - place
     return Gaussian(location, density.scale.double()[index].expand_as(location))
@@ -198,7 +198,7 @@ def _(density: Gaussian, value: Tensor) -> Tensor:
     return (residual / density.scale.double()).square().sum(-1)
 
 
-@tempered.register
+@tempered_density.register
 def _(density: Gaussian, temperature: Tensor) -> Gaussian:
     # every e_i is an independent N(0, σ_i²), and exp(-e²/2σ²)^(1/T) = exp(-e²/2σ²T)
     return Gaussian(density.location, density.scale * temperature.sqrt(), density.coefficients)

@@ -89,14 +89,14 @@ class GaussianHead(DensityHead):
         else:
             scale = self.floor + scale_of_raw(raw[..., self.numbers : 2 * self.numbers])
             coefficients = self._coefficients(raw[..., 2 * self.numbers :]) if self.full else None
-        return Gaussian(*self.unit.given_back(mean, scale, coefficients))
+        return Gaussian(*self.unit.to_target_unit(mean, scale, coefficients))
 
     def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
         """Return the negative log-likelihood of each sample, nats; with a fixed scale that for σ = 1."""
         if self.predicted:
             return -self(raw).log_prob(target)
         # σ = 1, whatever was calibrated. Few passes over the numbers, since there may be very many.
-        target = self.unit.standardised(target).to(raw)
+        target = self.unit.standardise(target).to(raw)
         mean, target = torch.broadcast_tensors(self._mean(require_finite(raw, self.size)), target)
         constant = self.numbers * math.log(2 * math.pi) / 2 + self.unit.log_volume
         return mse_loss(mean, target, reduction="none").sum(-1) / 2 + constant
@@ -109,7 +109,7 @@ class GaussianHead(DensityHead):
         if len(raw) == 0:
             raise ValueError("a fixed covariance is calibrated on validation data, but got none of it.")
         residual = (
-            self.unit.standardised(target).double() - self._mean(require_finite(raw, self.size)).double()
+            self.unit.standardise(target).double() - self._mean(require_finite(raw, self.size)).double()
         )
         if not self.full:  # each σ on its own
             self.scale.copy_(residual.square().mean(0).sqrt().clamp(self.floor, WIDEST_SCALE))

@@ -6,7 +6,7 @@ import torch
 from scipy import stats
 
 from framework.configuration.schema import build, resolve
-from framework.distributions.protocol import marginal, pick, slope
+from framework.distributions.protocol import marginal, pick, quadratic_bound
 from framework.errors import ConfigError
 from framework.target import Target
 from plugins.density_head.gaussian.density import Gaussian
@@ -168,7 +168,7 @@ def test_mixed_precision_does_not_round_the_covariance():
     def answers():
         torch.manual_seed(1)
         density = made(raw)
-        return [density.log_prob(value), density.sample(), *slope(density, value)]
+        return [density.log_prob(value), density.sample(), *quadratic_bound(density, value)]
 
     wanted = answers()
     with torch.autocast("cpu", torch.bfloat16):

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.distributions import Distribution
 
 from framework.density_head import DensityHead
-from framework.distributions.moved import Moved
+from framework.distributions.affine import AffineDensity
 from framework.heads.parameters import require_finite, require_trained
 from framework.heads.unit import Unit
 from framework.target import Target
@@ -74,7 +74,7 @@ class HybridHead(DensityHead):
     def forward(self, raw: Float[Tensor, "*batch size"]) -> Distribution:
         """Return the density for raw parameters."""
         numbers, location, scale = self._read(raw)
-        return Moved(self.component(numbers), location, scale)
+        return AffineDensity(self.component(numbers), location, scale)
 
     def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
         """Return the component's loss of the target in the component's frame, plus the logarithm of the unit."""
@@ -88,7 +88,7 @@ class HybridHead(DensityHead):
         assert isinstance(weight, Tensor)
         cut = raw.clamp(-LARGEST, LARGEST)
         mean, log_unit, _ = cut.split([self.numbers, self.numbers, self.size - 2 * self.numbers], -1)
-        read = torch.cat([self.unit.standardised(mean).to(cut), cut[..., self.numbers :]], -1)
+        read = torch.cat([self.unit.standardise(mean).to(cut), cut[..., self.numbers :]], -1)
         numbers = self.network(read.to(weight.dtype))
         scale = self.share * log_unit.clamp(-LARGEST_LOG_UNIT, LARGEST_LOG_UNIT).exp()
         location, spread = self.unit.location, self.unit.scale

@@ -10,16 +10,16 @@ from torch.distributions import Distribution, constraints
 
 from framework.distributions.description import one_line
 from framework.distributions.protocol import (
-    each_cdf,
     estimate,
-    exactly,
+    exact_estimate,
     images,
+    marginal_cdfs,
     median,
     pick,
     take,
-    tempered,
+    tempered_density,
 )
-from framework.geometry.light import light_of
+from framework.geometry.srgb import linear_from_srgb
 
 
 class LaplaceImage(Distribution):
@@ -83,7 +83,7 @@ class LaplaceImage(Distribution):
         return (1 + math.log(2) + self.scale.log()).sum((-3, -2, -1))
 
 
-estimate.register(LaplaceImage, exactly)
+estimate.register(LaplaceImage, exact_estimate)
 
 
 @median.register
@@ -92,7 +92,7 @@ def _(density: LaplaceImage, samples: int) -> Tensor:
     return density.location
 
 
-@each_cdf.register
+@marginal_cdfs.register
 def _(density: LaplaceImage, value: Tensor) -> Tensor:
     away = (value.double() - density.location.double()) / density.scale.double()
     tail = (-away.abs()).exp() / 2
@@ -108,7 +108,7 @@ def _(density: LaplaceImage, index: Tensor) -> LaplaceImage:
     return LaplaceImage(*parts)
 
 
-@tempered.register
+@tempered_density.register
 def _(density: LaplaceImage, temperature: Tensor) -> LaplaceImage:
     # exp(-d/b)^(1/T) = exp(-d/bT)
     return LaplaceImage(density.location, density.scale * temperature)
@@ -118,4 +118,4 @@ def _(density: LaplaceImage, temperature: Tensor) -> LaplaceImage:
 def _(density: LaplaceImage, channels: Collection[str]) -> dict[str, Tensor]:
     if set(channels) != {"color"}:
         return images.dispatch(Distribution)(density, channels)
-    return {"color": light_of(density.location)}
+    return {"color": linear_from_srgb(density.location)}

@@ -6,10 +6,10 @@ from torch.distributions import Independent, Laplace
 
 from framework.distributions import density as density_module
 from framework.distributions.density import Mixture
-from framework.distributions.protocol import each_cdf, images, median, pick
+from framework.distributions.protocol import images, marginal_cdfs, median, pick
 from framework.distributions.tempering import temper
 from framework.errors import ConfigError, UserError
-from framework.geometry.light import encoded, light_of
+from framework.geometry.srgb import linear_from_srgb, srgb_from_linear
 from framework.target import Target
 from plugins.density_head.laplace_image.density import LaplaceImage
 from plugins.density_head.laplace_image.head import LaplaceImageHead
@@ -56,7 +56,7 @@ def test_members_tempering_and_picking_keep_the_shape_of_an_image() -> None:
 def test_the_picture_is_the_light_of_its_numbers_and_that_of_members_their_mean() -> None:
     members = density(2, 3)
     drawn = images(members, {"color"})["color"]
-    torch.testing.assert_close(encoded(drawn), members.location)
+    torch.testing.assert_close(srgb_from_linear(drawn), members.location)
     whole = images(Mixture(torch.zeros(2, 3).double(), members), {"color"})["color"]
     torch.testing.assert_close(whole, drawn.mean(1))
     with pytest.raises(UserError, match="draws no depth"):
@@ -121,7 +121,7 @@ def test_intervals_are_fitted_to_what_is_not_background(mass: float) -> None:
 
     def covered(head: LaplaceImageHead) -> float:
         head.calibrate(raw.flatten(1), target)
-        found = each_cdf(head(raw.flatten(1)), target)[:, 0]
+        found = marginal_cdfs(head(raw.flatten(1)), target)[:, 0]
         return ((2 * found - 1).abs() <= mass + 1e-6).double().mean().item()
 
     assert covered(LaplaceImageHead(TARGET, scale="pixel", cover=mass)) == pytest.approx(mass, abs=0.02)
@@ -137,7 +137,7 @@ def test_other_targets_are_refused() -> None:
 
 def test_light_and_numbers_are_inverse() -> None:
     numbers = torch.linspace(0, 1, 1001, dtype=torch.float64)
-    torch.testing.assert_close(encoded(light_of(numbers)), numbers, rtol=0, atol=1e-6)
+    torch.testing.assert_close(srgb_from_linear(linear_from_srgb(numbers)), numbers, rtol=0, atol=1e-6)
 
 
 def test_the_entropy_of_members_of_large_images_is_drawn_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.distributions import Distribution
 
 from framework.density_head import DensityHead
-from framework.distributions.protocol import tempered
+from framework.distributions.protocol import tempered_density
 from framework.heads.parameters import require_finite, require_trained
 from framework.heads.unit import Unit
 from framework.storage.limits import MOST_DRAWS
@@ -231,7 +231,7 @@ class CVAEHead(DensityHead):
             return torch.cat([value.cos(), value.sin()], -1)
         if self.target.kind == "class":
             return nn.functional.one_hot(value, len(self.target.names))
-        return self.unit.standardised(value)
+        return self.unit.standardise(value)
 
 
 def _rest(hidden: int, numbers: int) -> nn.Sequential:

@@ -11,7 +11,15 @@ from torch import Tensor
 from torch.distributions import Distribution, constraints
 
 from framework.distributions.description import one_line
-from framework.distributions.protocol import Estimate, estimate, marginal, median, peaks, scales, tempered
+from framework.distributions.protocol import (
+    Estimate,
+    estimate,
+    marginal,
+    median,
+    mode_candidates,
+    peak_widths,
+    tempered_density,
+)
 from framework.distributions.tempering import tempered_classes
 from framework.distributions.uniform import uniform
 from plugins.density_head.latent.monte_carlo import (
@@ -201,17 +209,17 @@ def _(density: LatentDensity, samples: int) -> Tensor:
     return median(density.mixture, samples)
 
 
-@peaks.register
+@mode_candidates.register
 def _(density: LatentDensity) -> Tensor:
-    return peaks(density.mixture)
+    return mode_candidates(density.mixture)
 
 
-@scales.register
+@peak_widths.register
 def _(density: LatentDensity) -> Tensor:
-    return scales(density.mixture)
+    return peak_widths(density.mixture)
 
 
-@tempered.register
+@tempered_density.register
 def _(density: LatentDensity, temperature: Tensor) -> Distribution:
     """Return the density with tempered components at the same points; for classes the whole density is tempered."""
     changed = copy.copy(density)
@@ -221,5 +229,5 @@ def _(density: LatentDensity, temperature: Tensor) -> Distribution:
         return tempered_classes(changed, temperature)
     changed.__dict__.pop("mixture", None)  # the cached mixture is that of the untempered components
     changed.latent = density.latent.tempered(temperature)
-    changed._example = tempered(density._example, temperature)
+    changed._example = tempered_density(density._example, temperature)
     return changed

@@ -11,8 +11,8 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from framework.distributions.closed_forms import normal_quantile
-from framework.distributions.density import Mixture, joined
-from framework.distributions.protocol import Estimate, estimate, marginal, tempered
+from framework.distributions.density import Mixture, concatenate_estimates
+from framework.distributions.protocol import Estimate, estimate, marginal, tempered_density
 from framework.distributions.tempering import tempered_classes
 from framework.errors import ConfigError
 
@@ -90,9 +90,9 @@ class SampledMixture(Mixture):
 
 @estimate.register
 def _(density: SampledMixture, value: Tensor) -> Estimate:
-    parts = density.in_parts(value)
+    parts = density.split_values(value)
     if len(parts) > 1:
-        return joined([estimate(density, part) for part in parts])
+        return concatenate_estimates([estimate(density, part) for part in parts])
     log_weights = density.components.log_prob(value.unsqueeze(-1 - len(density.event_shape)))
     log_weights = log_weights.unflatten(-1, (density.replicates, -1))
     return estimated(torch.logsumexp(log_weights, -1).movedim(-1, 0), log_weights.shape[-1])
@@ -103,12 +103,12 @@ def _(density: SampledMixture, index: int) -> Distribution:
     return SampledMixture(density.log_weights, marginal(density.components, index), density.replicates)
 
 
-@tempered.register
+@tempered_density.register
 def _(density: SampledMixture, temperature: Tensor) -> Distribution:
     """Return the mixture of tempered components; of classes the whole is tempered, which keeps the likeliest class."""
     if density.has_enumerate_support:
         return tempered_classes(density, temperature)
-    components = tempered(density.components, temperature)
+    components = tempered_density(density.components, temperature)
     return SampledMixture(density.log_weights, components, density.replicates)
 
 
@@ -197,7 +197,7 @@ def estimate_log_mean(
         log_sums = torch.logaddexp(log_sums[..., more], further)
         done *= 2
     order = torch.cat([rows for rows, _ in finished]).argsort()
-    return joined([part for _, part in finished]).each(lambda field: field[order])
+    return concatenate_estimates([part for _, part in finished]).each(lambda field: field[order])
 
 
 def _log_sums(

@@ -12,7 +12,7 @@ from torch.distributions import Distribution
 
 from framework.density_head import DensityHead
 from framework.distributions.density import Mixture
-from framework.distributions.protocol import tempered
+from framework.distributions.protocol import tempered_density
 from framework.heads.parameters import require_finite, require_trained
 from framework.storage.limits import MOST_DRAWS
 from framework.target import Target

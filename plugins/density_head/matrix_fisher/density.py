@@ -12,7 +12,7 @@ from torch.distributions import Distribution, constraints
 from framework.distributions.circular import Circular, grid
 from framework.distributions.description import one_line
 from framework.distributions.panels import entropy_of_one
-from framework.distributions.protocol import estimate, exactly, marginal, pick, take, tempered
+from framework.distributions.protocol import estimate, exact_estimate, marginal, pick, take, tempered_density
 from framework.distributions.uniform import uniform
 from plugins.density_head.matrix_fisher import angles, functions, quadrature, quaternions
 
@@ -161,8 +161,8 @@ def _log_volume(elevation: Tensor) -> Tensor:
     return torch.log(torch.cos(elevation).abs()) - math.log(VOLUME)
 
 
-estimate.register(MatrixFisher, exactly)
-estimate.register(Angle, exactly)  # quadrature draws nothing
+estimate.register(MatrixFisher, exact_estimate)
+estimate.register(Angle, exact_estimate)  # quadrature draws nothing
 
 
 @marginal.register
@@ -187,7 +187,7 @@ def _(density: MatrixFisher, index: Tensor) -> MatrixFisher:
     return MatrixFisher(chosen, density.dtype)
 
 
-@tempered.register
+@tempered_density.register
 def _(density: MatrixFisher, temperature: Tensor) -> MatrixFisher:
     """Return the power of the density of rotations, exp(tr(FᵀR))^(1/T), which has the parameter F/T.
 

@@ -112,7 +112,7 @@ class ExtraTreesHead(DensityHead, Fitted):
             grown,
         )  # scikit-learn, which a stored forest does not need
 
-        target = target if self.classes else self.unit.standardised(target.double())
+        target = target if self.classes else self.unit.standardise(target.double())
         wanted = target.cpu().numpy()
         arrays = grown(
             single(features).numpy(),
@@ -147,7 +147,7 @@ class ExtraTreesHead(DensityHead, Fitted):
         means = self.mean[torch.from_numpy(leaf).long().to(self.mean.device)]  # (tree, sample, number)
         means = means.movedim(0, 1).to(raw).reshape(*batch, len(root), self.mean.shape[1])
         means = with_gradient_of_0(means, raw)
-        mean, scale, _ = self.unit.given_back(means, self.width.to(raw).expand_as(means))
+        mean, scale, _ = self.unit.to_target_unit(means, self.width.to(raw).expand_as(means))
         components = IndependentNormals(mean, scale)
         return Mixture(means.new_zeros(means.shape[:-1]), components)
 
@@ -160,7 +160,7 @@ class ExtraTreesHead(DensityHead, Fitted):
             raise ValueError("widths are calibrated on validation data, but got none of it.")
         density = self(raw.double())
         assert isinstance(density, Mixture)
-        means, target = map(self.unit.standardised, (density.components.mean, target.double()))
+        means, target = map(self.unit.standardise, (density.components.mean, target.double()))
         width = fitted_width(target.unsqueeze(1) - means)  # of (sample, tree, number)
         self.width.copy_(width.clamp(max=WIDEST))
 

@@ -122,7 +122,7 @@ class XGBoostHead(DensityHead, Fitted):
         }
         if self.classes:
             options["num_class"] = self.classes
-        wanted = target if self.classes else self.unit.standardised(target)
+        wanted = target if self.classes else self.unit.standardise(target)
         matrix = xgboost.DMatrix(single(features).numpy(), wanted.cpu().numpy())
         fitted = xgboost.train(options, matrix, self.rounds, verbose_eval=False)
         stored = torch.frombuffer(fitted.save_raw("ubj"), dtype=torch.uint8)
@@ -139,7 +139,7 @@ class XGBoostHead(DensityHead, Fitted):
         sums = with_gradient_of_0(sums, raw)
         if self.classes:
             return Categorical(logits=sums.log_softmax(-1), validate_args=False)
-        mean, scale, _ = self.unit.given_back(sums, self.width.to(raw).expand_as(sums))
+        mean, scale, _ = self.unit.to_target_unit(sums, self.width.to(raw).expand_as(sums))
         return IndependentNormals(mean, scale)
 
     @torch.no_grad()
@@ -152,7 +152,7 @@ class XGBoostHead(DensityHead, Fitted):
         self._measure_width(raw, target)
 
     def _measure_width(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
-        residual = self.unit.standardised(target.double()) - self._sums(raw).to(target.device)
+        residual = self.unit.standardise(target.double()) - self._sums(raw).to(target.device)
         self.width.copy_(residual.square().mean(0).sqrt().clamp(FLOOR, WIDEST))
 
     def _sums(self, raw: Float[Tensor, "sample size"]) -> Float[Tensor, "sample number"]:

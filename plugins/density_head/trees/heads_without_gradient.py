@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from framework.errors import CheckpointError, ConfigError, UserError, shown
+from framework.errors import CheckpointError, ConfigError, UserError, shorten
 from framework.heads.parameters import require_finite
 from framework.target import Target
 
@@ -103,7 +103,7 @@ def _take_shapes(
         require(head, {name: _array(name, stored[name], buffer) for name, buffer in own.items()})
     except ValueError as error:
         raise CheckpointError(
-            f"The state of {type(head).__name__} is damaged: {shown(error)}. Load another checkpoint, or train anew."
+            f"The state of {type(head).__name__} is damaged: {shorten(error)}. Load another checkpoint, or train anew."
         ) from None
     for name, buffer in own.items():
         setattr(head, name, torch.empty(stored[name].shape, dtype=buffer.dtype, device=buffer.device))

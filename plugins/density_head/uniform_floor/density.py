@@ -8,23 +8,23 @@ from torch import Tensor
 from torch.distributions import Distribution, constraints
 
 from framework.distributions.circular import Circular
-from framework.distributions.density import merged
+from framework.distributions.density import estimate_of_sum
 from framework.distributions.description import one_line
 from framework.distributions.panels import entropy_of_one, has_range
 from framework.distributions.protocol import (
     Estimate,
-    Slope,
-    about,
-    arc,
+    QuadraticBound,
+    arc_probability,
     estimate,
     images,
     marginal,
     median,
-    peaks,
+    mode_candidates,
+    peak_widths,
     pick,
-    scales,
-    slope,
-    tempered,
+    quadratic_bound,
+    recentre,
+    tempered_density,
 )
 from framework.distributions.tempering import tempered_classes
 from framework.distributions.uniform import uniform
@@ -110,32 +110,32 @@ def _(density: Floored, value: Tensor) -> Estimate:
     found = estimate(density.density, value)
     log_sum, above = density.floored(value, found.log_mean)
     # the floor is exact
-    return merged(found.each(lambda field: field.unsqueeze(-1)), above.unsqueeze(-1), log_sum)
+    return estimate_of_sum(found.each(lambda field: field.unsqueeze(-1)), above.unsqueeze(-1), log_sum)
 
 
-@arc.register
+@arc_probability.register
 def _(density: Floored, start: Tensor, end: Tensor) -> Tensor | None:
-    inside, below = arc(density.density, start, end), arc(density.floor, start, end)
+    inside, below = arc_probability(density.density, start, end), arc_probability(density.floor, start, end)
     if inside is None or below is None:
         return None
     return (1 - density.weight) * inside + density.weight * below
 
 
-@slope.register
-def _(density: Floored, value: Tensor) -> Slope | None:
+@quadratic_bound.register
+def _(density: Floored, value: Tensor) -> QuadraticBound | None:
     if isinstance(density.support, Circular) and density.support.ranges is not None:
         return None  # the floor itself has a slope there
-    found = slope(density.density, value)
+    found = quadratic_bound(density.density, value)
     if found is None:
         return None
     log_prob, above = density.floored(value, found.log_prob)
     share = (above - log_prob).exp().unsqueeze(-1)
-    return Slope(log_prob, share * found.pull, share * found.stiffness)
+    return QuadraticBound(log_prob, share * found.pull, share * found.stiffness)
 
 
-@peaks.register
+@mode_candidates.register
 def _(density: Floored) -> Tensor:
-    return peaks(density.density)
+    return mode_candidates(density.density)
 
 
 @images.register
@@ -143,14 +143,16 @@ def _(density: Floored, channels: Collection[str]) -> dict[str, Tensor]:
     return images(density.density, channels)  # drawn at the mode, which a floor does not change
 
 
-@scales.register
+@peak_widths.register
 def _(density: Floored) -> Tensor:
-    return scales(density.density)
+    return peak_widths(density.density)
 
 
-@about.register
+@recentre.register
 def _(density: Floored, index: tuple[Tensor, ...], place: Tensor) -> Floored:
-    return Floored(about(density.density, index, place), density.weight, about(density.floor, index, place))
+    return Floored(
+        recentre(density.density, index, place), density.weight, recentre(density.floor, index, place)
+    )
 
 
 @median.register
@@ -166,7 +168,7 @@ def _(density: Floored, index: Tensor) -> Floored:
     return Floored(pick(density.density, index), density.weight, pick(density.floor, index))
 
 
-@tempered.register
+@tempered_density.register
 def _(density: Floored, temperature: Tensor) -> Distribution:
     """Return the tempered density, as of any mixture.
 
@@ -175,4 +177,4 @@ def _(density: Floored, temperature: Tensor) -> Distribution:
     """
     if density.has_enumerate_support:
         return tempered_classes(density, temperature)
-    return Floored(tempered(density.density, temperature), density.weight, density.floor)
+    return Floored(tempered_density(density.density, temperature), density.weight, density.floor)

@@ -8,18 +8,18 @@ from torch.distributions import Distribution, constraints, register_kl
 from framework.distributions.circular import circular
 from framework.distributions.description import one_line
 from framework.distributions.protocol import (
-    Slope,
-    about,
-    arc,
+    QuadraticBound,
+    arc_length,
+    arc_probability,
     estimate,
-    exactly,
+    exact_estimate,
     marginal,
     median,
     pick,
-    slope,
+    quadratic_bound,
+    recentre,
     take,
-    tempered,
-    turn,
+    tempered_density,
 )
 from plugins.density_head.von_mises import functions, integrals
 
@@ -87,7 +87,7 @@ class VonMises(Distribution):
         return functions.entropy(self.concentration).sum(-1)
 
 
-estimate.register(VonMises, exactly)
+estimate.register(VonMises, exact_estimate)
 
 
 @marginal.register
@@ -101,14 +101,14 @@ def _(density: VonMises, index: Tensor) -> VonMises:
     return VonMises(take(density.location, index), take(density.concentration, index))
 
 
-@slope.register
-def _(density: VonMises, value: Tensor) -> Slope:
+@quadratic_bound.register
+def _(density: VonMises, value: Tensor) -> QuadraticBound:
     # the bound is the density: κ cos(φ + d - μ) = κ cos(φ-μ) cos d - κ sin(φ-μ) sin d
     log_prob, pull, stiffness = functions.slope(value, density.location, density.concentration)
-    return Slope(log_prob.sum(-1), pull, stiffness)
+    return QuadraticBound(log_prob.sum(-1), pull, stiffness)
 
 
-@about.register
+@recentre.register
 def _(density: VonMises, index: tuple[Tensor, ...], place: Tensor) -> VonMises:
     location = density.location.double()[index] - place
     return VonMises(location, density.concentration.double()[index].expand_as(location))
@@ -120,7 +120,7 @@ def _(density: VonMises, samples: int) -> Tensor:
     return density.location
 
 
-@tempered.register
+@tempered_density.register
 def _(density: VonMises, temperature: Tensor) -> VonMises:
     # exp(κ cos)^(1/T) = exp(κ/T cos)
     return VonMises(density.location, density.concentration / temperature)
@@ -134,10 +134,10 @@ def _(first: VonMises, second: VonMises) -> Tensor:
     return parts.sum(-1)
 
 
-@arc.register
+@arc_probability.register
 def _(density: VonMises, start: Tensor, end: Tensor) -> Tensor:
     mean, concentration = density.location.double(), density.concentration.double()
     first = start.double()
     before = integrals.cdf(first, mean, concentration)
-    through = integrals.cdf(first + turn(start, end), mean, concentration)
+    through = integrals.cdf(first + arc_length(start, end), mean, concentration)
     return (through - before).squeeze(-1).clamp(0, 1)

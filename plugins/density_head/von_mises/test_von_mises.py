@@ -13,7 +13,7 @@ from scipy import optimize, stats
 from torch.distributions import kl_divergence
 
 from framework.configuration.schema import build, resolve
-from framework.distributions.protocol import arc, marginal, median, pick
+from framework.distributions.protocol import arc_probability, marginal, median, pick
 from framework.errors import ConfigError
 from framework.target import Target
 from framework.testing.heads import values
@@ -550,8 +550,8 @@ def test_a_concentration_at_its_ends_is_a_number_or_refused(dtype):
         assert (there < -1e37).all() and not there.isnan().any()
         assert density.entropy().tolist() == pytest.approx([0.5 - here[0].item()] * 2, rel=1e-6)
         assert torch.equal(density.sample(), mean)
-        assert arc(density, mean - 0.1, mean + 0.1).tolist() == [1, 1]
-        assert arc(density, mean + 0.1, mean - 0.1).tolist() == [0, 0]
+        assert arc_probability(density, mean - 0.1, mean + 0.1).tolist() == [1, 1]
+        assert arc_probability(density, mean + 0.1, mean - 0.1).tolist() == [0, 0]
         kappa = torch.full_like(mean, kappa).requires_grad_()
         (slope,) = torch.autograd.grad(VonMises(mean, kappa).log_prob(mean).sum(), kappa)
         assert not slope.isnan().any()

@@ -30,7 +30,7 @@ class BPS(Encoder):
             cloud.
         features: features of each basis point, in order: "distance" (1 number, eq. 6.4), "delta" (3, eq. 6.5), and of
             the nearest point "color" (3: red, green, blue), "normal" (3), or the name of a column (1).
-        normalise: as `framework.geometry.clouds.normalised`.
+        normalise: as `framework.geometry.clouds.normalise_clouds`.
         basis_seed: seed of "ball_uniform"; the run's seed has no influence on it.
         rotation_invariant: encode each cloud along its own axes (`plugins.encoder.bps.frame`).
 

@@ -11,8 +11,8 @@ from framework.errors import ConfigError, UserError, did_you_mean
 from framework.geometry.clouds import (
     LOOSE,
     Normalisation,
-    denormalised,
-    normalised,
+    denormalise_clouds,
+    normalise_clouds,
     pad,
     require_normalised,
     sizes,
@@ -39,7 +39,7 @@ class Encoding(NamedTuple):
         features: (batch, k) or (batch, k, 3), by name.
         index: index of the point of each cloud that is nearest to each basis point, the first of equally near ones.
         basis: the basis points.
-        centre, scale: centre and scale of each cloud (framework.geometry.clouds.Normalised).
+        centre, scale: centre and scale of each cloud (framework.geometry.clouds.NormalisedClouds).
         frame: each cloud's own axes as columns, if the encoding is rotation-invariant; else None.
     """
 
@@ -105,7 +105,7 @@ def encode(
         clouds: (batch, points, columns), padded as `framework.geometry.clouds` describes.
         basis: basis points, as `prepared` returns them.
         features: names of the features, in the order of the result.
-        normalise: as of `framework.geometry.clouds.normalised`.
+        normalise: as of `framework.geometry.clouds.normalise_clouds`.
         columns: names of the clouds' columns, if a feature is an attribute.
         rotation_invariant: encode each cloud in its own frame (`plugins.encoder.bps.frame`); normals are rotated with
             it.
@@ -116,7 +116,7 @@ def encode(
     """
     wanted = {feature: columns_of(feature, columns) for feature in features}
     counts = sizes(clouds)
-    local, centre, scale = normalised(clouds, normalise, counts)
+    local, centre, scale = normalise_clouds(clouds, normalise, counts)
     within = 1.0
     if normalise == "none":
         reach = max(1.0, float(basis.points.abs().max()))
@@ -172,7 +172,7 @@ def decode(encoding: Encoding, *, unique: bool = False) -> Float[Tensor, "batch 
     points = encoding.features["delta"] + encoding.basis
     if encoding.frame is not None:
         points = (points.double() @ encoding.frame.mT).to(points.dtype)
-    points = denormalised(points, encoding.centre, encoding.scale)
+    points = denormalise_clouds(points, encoding.centre, encoding.scale)
     if not unique or len(points) == 0:
         return points
     places = [_first_of_each(index) for index in encoding.index]

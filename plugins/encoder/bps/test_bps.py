@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from framework.configuration.schema import build, resolve
 from framework.errors import ConfigError, DataError, UserError
-from framework.geometry.clouds import normalised, pad, sizes
+from framework.geometry.clouds import normalise_clouds, pad, sizes
 from plugins.encoder.bps import encoding
 from plugins.encoder.bps.basis import basis
 from plugins.encoder.bps.encoding import channels, decode, encode, per_point, prepared
@@ -138,7 +138,7 @@ def test_features_agree_with_loops(strategy, normalise, dtype):
     wanted = ["normal", "distance", "echo", "delta", "color", "z"]
     found = encode(clouds, prepared(points), wanted, normalise, COLUMNS)
     assert list(found.features) == wanted
-    local = normalised(clouds, normalise).clouds
+    local = normalise_clouds(clouds, normalise).clouds
     for number, length in enumerate(lengths):
         cloud = local[number, :length].double().numpy()
         distance, delta, index = by_hand(cloud, points.double().numpy())
@@ -177,7 +177,7 @@ def test_wild_clouds(cloud, scale, offset, strategy, count, normalise, dtype):
     clouds = ((torch.tensor(cloud, dtype=torch.float64) + offset) * scale).to(dtype)[None]
     points = basis(strategy, count, 1.0, 13).to(dtype)
     found = encode(clouds, prepared(points), ["distance", "delta"], normalise)
-    local = normalised(clouds, normalise).clouds[0].double().numpy()
+    local = normalise_clouds(clouds, normalise).clouds[0].double().numpy()
     distance, _, _ = by_hand(local, points.double().numpy())
     size = max(1.0, np.abs(local).max())  # the largest norm with far outliers
     limit = 2.5e-7 if dtype == torch.float32 else 1e-14
@@ -277,7 +277,7 @@ def test_single_points_are_joined_with_their_cloud_and_do_not_depend_on_its_plac
     found = encode(clouds, made, ["distance", "delta"])
     joined = per_point(found, points)
     assert joined.shape == (2, 12, 4 * 16 + 3)
-    torch.testing.assert_close(joined[..., -3:], normalised(clouds, "unit_ball").clouds[:, :12])
+    torch.testing.assert_close(joined[..., -3:], normalise_clouds(clouds, "unit_ball").clouds[:, :12])
     assert torch.equal(joined[:, 5, :-3], channels(found).flatten(1))
     moved = per_point(encode(clouds * 7 - 3, made, ["distance", "delta"]), points * 7 - 3)
     torch.testing.assert_close(moved, joined, rtol=0, atol=1e-12)
@@ -482,7 +482,7 @@ def test_a_cloud_that_was_normalised_before_has_a_frame_whatever_its_norms(far, 
 @pytest.mark.parametrize("name", ["solid", "even-solid", "sheet", "sheet 1e-6", "tilted", "even-sheet"])
 def test_frames_have_derivatives_of_second_order(name):
     cloud = shape(name)[::40]
-    clouds = normalised(torch.stack([cloud, cloud @ rotations(1, 2)[0]]), "unit_ball").clouds
+    clouds = normalise_clouds(torch.stack([cloud, cloud @ rotations(1, 2)[0]]), "unit_ball").clouds
     clouds = (0.99 * clouds).requires_grad_()
     sign = frame(clouds.detach())
 
@@ -610,7 +610,7 @@ def test_a_config_out_of_range_is_refused(config):
 
 @pytest.mark.parametrize("factor", [1e8, 1e-8])
 def test_clouds_that_were_not_normalised_are_refused_by_none(factor):
-    clouds = normalised(batch_of([30, 12]), "unit_ball").clouds
+    clouds = normalise_clouds(batch_of([30, 12]), "unit_ball").clouds
     made = encoder(normalise="none").double()
     torch.testing.assert_close(made(clouds), encoder().double()(clouds), rtol=0, atol=1e-6)
     with pytest.raises(DataError, match=r"Cloud 0 of the batch reaches .* encoder bps with normalise=none"):

@@ -8,10 +8,10 @@ from pydantic import Field
 from torch import Tensor
 
 from framework.encoder import Encoder
-from framework.flights.estimation import Prior, estimated, root, seen_of
+from framework.flights.estimation import Prior, estimate_states, observed_frames, root
 from framework.flights.frames import PARTS
 from framework.flights.physics import Constants
-from framework.flights.trajectories import flown_with_slopes
+from framework.flights.trajectories import simulate_with_jacobian
 from plugins.encoder.flights.extrapolation import frames_of
 
 LARGEST = 1e4
@@ -69,11 +69,11 @@ class BallisticEncoder(Encoder):
         """Return the features of the flights."""
         dtype = inputs.dtype if inputs.is_floating_point() else torch.get_default_dtype()
         frames = inputs.double().clamp(-LARGEST, LARGEST).cpu()
-        seen = seen_of(frames.unflatten(-1, (-1, len(PARTS))), self.step)
-        estimate = estimated(seen, self.constants, self.noise, self.prior)
+        seen = observed_frames(frames.unflatten(-1, (-1, len(PARTS))), self.step)
+        estimate = estimate_states(seen, self.constants, self.noise, self.prior)
         moments = self.step * torch.arange(1, self.future + 1, dtype=torch.float64)
         times = torch.cat([seen.times, moments.expand(len(frames), -1)], 1)
-        places, slopes = flown_with_slopes(estimate.state, times, self.constants)
+        places, slopes = simulate_with_jacobian(estimate.state, times, self.constants)
         spread = (slopes[:, -self.future :].flatten(1, 2) @ root(estimate.covariance)).square().sum(-1)
         spread = (spread + self.noise**2).log() / 2
         found = torch.cat([places[:, -self.future :].flatten(1), spread, frames], 1)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from framework.encoder import Encoder
 from framework.errors import ConfigError
-from framework.flights.estimation import Seen, seen_of
+from framework.flights.estimation import ObservedFrames, observed_frames
 from framework.flights.frames import GRAVITY, PARTS
 from plugins.encoder.flights.parabolas_compiled import described
 
@@ -71,13 +71,13 @@ class ExtrapolationEncoder(Encoder):
     def forward(self, inputs: Tensor) -> Float[Tensor, "batch length"]:
         """Return the features of the flights."""
         dtype = inputs.dtype if inputs.is_floating_point() else torch.get_default_dtype()
-        seen = seen_of(inputs.double().unflatten(-1, (-1, len(PARTS))), self.step)
-        seen = Seen(*(part.cpu() for part in seen))
+        seen = observed_frames(inputs.double().unflatten(-1, (-1, len(PARTS))), self.step)
+        seen = ObservedFrames(*(part.cpu() for part in seen))
         moments = self.step * np.arange(1, self.future + 1)
         spans = np.array([max(3, round(share * seen.times.shape[1])) for share in SPANS])
         features = torch.empty(len(inputs), *self.output_shape, dtype=torch.float64)
         described(
-            *(part.contiguous().numpy() for part in (seen.times, seen.places, seen.there)),
+            *(part.contiguous().numpy() for part in (seen.times, seen.places, seen.observed)),
             GRAVITY,
             spans,
             self.noise,

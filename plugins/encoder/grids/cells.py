@@ -8,10 +8,10 @@ from torch import Tensor
 from framework.errors import DataError
 from framework.geometry.clouds import (
     Normalisation,
-    Normalised,
+    NormalisedClouds,
     cell_centres,
-    denormalised,
-    normalised,
+    denormalise_clouds,
+    normalise_clouds,
     pad,
     require_normalised,
     sizes,
@@ -31,14 +31,14 @@ def on_cells(
         DataError: as `framework.geometry.clouds.sizes`; with "none", clouds that were plainly not normalised.
     """
     counts = sizes(clouds)
-    local = normalised(clouds, normalise, counts).clouds
+    local = normalise_clouds(clouds, normalise, counts).clouds
     if normalise == "none":
         require_normalised(local[..., :3], 1.0, counts, by=by)
     return numbers(local, side).reshape(-1, 1, side, side, side)
 
 
 def centres_of(
-    chosen: Bool[Tensor, "batch cells"], like: Tensor, side: int, normalised: Normalised, what: str
+    chosen: Bool[Tensor, "batch cells"], like: Tensor, side: int, normalised: NormalisedClouds, what: str
 ) -> Float[Tensor, "batch points 3"]:
     """Return the centres of the chosen cells in the clouds' own units (§6.4.1).
 
@@ -61,4 +61,4 @@ def centres_of(
             "[-1, 1]³: choose normalise=unit_ball."
         )
     centres = cell_centres(side).to(like)
-    return denormalised(pad([centres[cells] for cells in chosen]), normalised.centre, normalised.scale)
+    return denormalise_clouds(pad([centres[cells] for cells in chosen]), normalised.centre, normalised.scale)

@@ -7,7 +7,7 @@ from pydantic import Field
 from torch import Tensor
 
 from framework.encoder import Encoder
-from framework.geometry.clouds import Normalisation, Normalised, require_clouds
+from framework.geometry.clouds import Normalisation, NormalisedClouds, require_clouds
 from plugins.encoder.grids.cells import centres_of, on_cells
 
 ROUNDING = 1e-6
@@ -22,7 +22,7 @@ class Occupancy(Encoder):
     Args:
         input_shape: (points, columns) of the largest cloud; coordinates in the first three columns.
         side: cells along each edge.
-        normalise: as `framework.geometry.clouds.normalised`. With "robust" far outliers lie in no cell.
+        normalise: as `framework.geometry.clouds.normalise_clouds`. With "robust" far outliers lie in no cell.
 
     Raises:
         ConfigError: an input that is no cloud.
@@ -75,7 +75,7 @@ def occupancy(clouds: Float[Tensor, "batch points columns"], side: int) -> Float
 
 
 def decode(
-    flags: Float[Tensor, "batch cells"], side: int, normalised: Normalised
+    flags: Float[Tensor, "batch cells"], side: int, normalised: NormalisedClouds
 ) -> Float[Tensor, "batch points 3"]:
     """Return the centres of the occupied cells, as `centres_of` returns them."""
     return centres_of(flags > 0, flags, side, normalised, "occupied")

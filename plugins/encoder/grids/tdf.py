@@ -10,7 +10,7 @@ from pydantic import Field
 from torch import Tensor
 
 from framework.encoder import Encoder
-from framework.geometry.clouds import Normalisation, Normalised, require_clouds
+from framework.geometry.clouds import Normalisation, NormalisedClouds, require_clouds
 from plugins.encoder.grids.cells import centres_of, on_cells
 
 
@@ -24,7 +24,7 @@ class TDF(Encoder):
         input_shape: (points, columns) of the largest cloud; coordinates in the first three columns.
         side: cells along each edge.
         truncation: largest distance that is told apart, in edges of a cell.
-        normalise: as `framework.geometry.clouds.normalised`.
+        normalise: as `framework.geometry.clouds.normalise_clouds`.
 
     Raises:
         ConfigError: an input that is no cloud.
@@ -104,7 +104,7 @@ def truncated_distance(
 
 
 def decode(
-    field: Float[Tensor, "batch cells"], side: int, normalised: Normalised
+    field: Float[Tensor, "batch cells"], side: int, normalised: NormalisedClouds
 ) -> Float[Tensor, "batch points 3"]:
     """Return the centres of the cells that are less than the truncation from a point, as `centres_of` returns them."""
     return centres_of(field < 1, field, side, normalised, "near a point")

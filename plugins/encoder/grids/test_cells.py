@@ -5,7 +5,7 @@ import torch
 
 from framework.configuration.schema import build, resolve
 from framework.errors import DataError
-from framework.geometry.clouds import normalised
+from framework.geometry.clouds import normalise_clouds
 from plugins.encoder.grids import occupancy, tdf
 
 NAMES = ("occupancy", "tdf")
@@ -44,4 +44,4 @@ def test_a_cloud_outside_the_cube_does_not_lead_back(numbers, decode, nothing, s
     cells = numbers(far, 4)
     assert (cells == nothing).all()
     with pytest.raises(DataError, match=f"No cell of cloud 0 {said}"):
-        decode(cells, 4, normalised(far, "none"))
+        decode(cells, 4, normalise_clouds(far, "none"))

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from framework.configuration.schema import build, resolve
 from framework.errors import ConfigError
-from framework.geometry.clouds import normalised, pad, sizes
+from framework.geometry.clouds import normalise_clouds, pad, sizes
 from plugins.encoder.grids.occupancy import decode, occupancy
 
 DTYPES = [torch.float32, torch.float64]
@@ -43,7 +43,7 @@ def test_agrees_with_a_loop(normalise, side, dtype):
     found = encoder((200, 5), side=side, normalise=normalise)(clouds)
     assert found.dtype == dtype
     assert found.shape == (3, 1, side, side, side)
-    local = normalised(clouds, normalise).clouds[..., :3].double().numpy()
+    local = normalise_clouds(clouds, normalise).clouds[..., :3].double().numpy()
     for number, length in enumerate(lengths):
         np.testing.assert_array_equal(found[number, 0].numpy(), by_hand(local[number, :length], side))
 
@@ -77,7 +77,7 @@ def test_points_at_the_edge_are_in_and_beyond_it_out():
 def test_cells_lead_back_to_within_half_their_diagonal(dtype):
     lengths, side = [200, 3], 16
     clouds = batch_of(lengths, dtype=dtype)
-    local = normalised(clouds, "unit_ball")
+    local = normalise_clouds(clouds, "unit_ball")
     flags = occupancy(local.clouds, side)
     back = decode(flags, side, local)
     assert back.dtype == dtype

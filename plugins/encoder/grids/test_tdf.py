@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from framework.configuration.schema import build, resolve
 from framework.errors import ConfigError
-from framework.geometry.clouds import normalised, pad, sizes
+from framework.geometry.clouds import normalise_clouds, pad, sizes
 from plugins.encoder.grids.tdf import decode, truncated_distance
 
 DTYPES = [torch.float32, torch.float64]
@@ -43,7 +43,7 @@ def test_agrees_with_a_loop(side, truncation, dtype):
     found = encoder((100, 5), side=side, truncation=truncation)(clouds)
     assert found.dtype == dtype
     assert found.shape == (3, 1, side, side, side)
-    local = normalised(clouds, "unit_ball").clouds[..., :3].double().numpy()
+    local = normalise_clouds(clouds, "unit_ball").clouds[..., :3].double().numpy()
     for number, length in enumerate(lengths):
         wanted = by_hand(local[number, :length], side, truncation)
         limit = (
@@ -87,7 +87,7 @@ def test_the_gradient_agrees_with_finite_differences_and_is_finite_at_a_centre()
 def test_cells_lead_back_to_within_the_truncation():
     lengths, side = [200, 3], 16
     clouds = batch_of(lengths)
-    local = normalised(clouds, "unit_ball")
+    local = normalise_clouds(clouds, "unit_ball")
     field = truncated_distance(local.clouds, side, 1.0)
     back = decode(field, side, local)
     counts = sizes(back)

@@ -30,7 +30,7 @@ class DeepSets(Encoder):
         dropout: probability of dropping a number before and after each layer that follows the maximum.
         points: largest number of points that are read of a cloud, the first ones; None for all. 100 is the thesis's
             "micro".
-        normalise: as of framework.geometry.clouds.normalised.
+        normalise: as of framework.geometry.clouds.normalise_clouds.
         attributes: whether columns after x, y, z are read too.
 
     Raises:

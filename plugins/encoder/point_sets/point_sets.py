@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from framework.errors import ConfigError
-from framework.geometry.clouds import Normalisation, normalised, require_clouds, sizes
+from framework.geometry.clouds import Normalisation, normalise_clouds, require_clouds, sizes
 
 AT_ONCE = 2**12
 """Number of points that a CPU takes through a network together: more leave its caches (2^16 are half as fast)."""
@@ -35,7 +35,7 @@ class Reading(NamedTuple):
     Attributes:
         columns: number of columns, the first ones.
         most: largest number of points of a cloud, the first ones; None for all.
-        normalise: as of `framework.geometry.clouds.normalised`.
+        normalise: as of `framework.geometry.clouds.normalise_clouds`.
     """
 
     columns: int
@@ -81,7 +81,7 @@ def points_of(
 
     Args:
         clouds: (batch, points, columns).
-        normalise: as of `framework.geometry.clouds.normalised`; it reads all points.
+        normalise: as of `framework.geometry.clouds.normalise_clouds`; it reads all points.
         columns: number of columns that are read, the first ones.
         most: largest number of points that are read of a cloud, the first ones; None for all.
         dtype: dtype of the points returned.
@@ -90,7 +90,7 @@ def points_of(
         DataError: as `framework.geometry.clouds.sizes`.
     """
     counts = sizes(clouds)
-    points = normalised(clouds, normalise, counts).clouds[:, :most, :columns].to(dtype)
+    points = normalise_clouds(clouds, normalise, counts).clouds[:, :most, :columns].to(dtype)
     counts = counts if most is None else counts.clamp(max=most)
     if even(counts, points.shape[1]):
         return points.flatten(0, 1), counts

@@ -34,7 +34,7 @@ class PointNet(Encoder):
         widths: outputs of each layer after the maximum; the last is the length of the features.
         dropout: probability of dropping an output of the last layer.
         points: largest number of points that are read of a cloud, the first ones; None for all.
-        normalise: as of framework.geometry.clouds.normalised.
+        normalise: as of framework.geometry.clouds.normalise_clouds.
         attributes: whether columns after x, y, z are read too; the first matrix does not change them.
 
     Raises:

@@ -70,7 +70,7 @@ class PointNet2(Encoder):
         width: factor of the published widths of all layers.
         dropout: probability of dropping an output of each of the two last layers.
         points: largest number of points that are read of a cloud, the first ones; None for all.
-        normalise: as of framework.geometry.clouds.normalised.
+        normalise: as of framework.geometry.clouds.normalise_clouds.
         attributes: whether columns after x, y, z are read too.
 
     Raises:

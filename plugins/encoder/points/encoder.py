@@ -7,7 +7,7 @@ from pydantic import Field
 from torch import Tensor
 
 from framework.encoder import Encoder
-from framework.geometry.clouds import Normalisation, normalised, require_clouds, sizes
+from framework.geometry.clouds import Normalisation, normalise_clouds, require_clouds, sizes
 from plugins.encoder.points.subset import Choice, chosen
 
 
@@ -20,7 +20,7 @@ class Points(Encoder):
         input_shape: (points, columns) of the largest cloud; coordinates in the first three columns.
         points: number of points; smaller clouds repeat theirs.
         choice: "random", or "farthest" from the points chosen before (`plugins.encoder.points.subset`).
-        normalise: as `framework.geometry.clouds.normalised`; it reads the whole cloud.
+        normalise: as `framework.geometry.clouds.normalise_clouds`; it reads the whole cloud.
         seed: seed of "random"; the run's seed has no influence on it.
 
     Raises:
@@ -58,6 +58,6 @@ class Points(Encoder):
     def forward(self, inputs: Float[Tensor, "batch points columns"]) -> Float[Tensor, "batch *features"]:
         """Return the chosen points of the clouds."""
         counts = sizes(inputs)
-        clouds = normalised(inputs, self.normalise, counts).clouds
+        clouds = normalise_clouds(inputs, self.normalise, counts).clouds
         index = chosen(clouds, counts, self.points, self.choice, self.seed)
         return clouds.gather(1, index[..., None].expand(-1, -1, clouds.shape[2]))

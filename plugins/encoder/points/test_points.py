@@ -3,7 +3,7 @@ import torch
 
 from framework.configuration.schema import build, resolve
 from framework.errors import ConfigError
-from framework.geometry.clouds import normalised, pad
+from framework.geometry.clouds import normalise_clouds, pad
 
 DTYPES = [torch.float32, torch.float64]
 
@@ -26,7 +26,7 @@ def test_points_are_those_of_the_normalised_cloud_with_their_attributes(normalis
     clouds = batch_of(lengths, 5, dtype)
     found = encoder((40, 5), points=count, choice=choice, normalise=normalise)(clouds)
     assert found.dtype == dtype
-    local = normalised(clouds, normalise).clouds
+    local = normalise_clouds(clouds, normalise).clouds
     for number, length in enumerate(lengths):
         rows = [local[number, :length].tolist().index(row) for row in found[number].tolist()]
         if length >= count:

@@ -149,13 +149,13 @@ def test_a_camera_sees_points_where_the_encoder_shows_its_canonical_points():
         turned = viewpoint_rotation(some(3) - 0.5)
         camera = Camera(turned, torch.tensor([0.0, 0, 3]), focal, principal, height, width)
         world, color = 2 * some(30, 3) - 1, some(30, 3)
-        pixels, depth = camera.projected(world)
+        pixels, depth = camera.project(world)
         clear = ((pixels - pixels.floor() - 0.5).abs() > 1e-6).all(
             1
         )  # away from edges, where rounding may decide
         world, color, pixels, depth = world[clear], color[clear], pixels[clear].round().long(), depth[clear]
         found = encoder((30, 6), height=height, width=width)(
-            torch.cat([camera.canonical(world), color], 1)[None]
+            torch.cat([camera.to_canonical(world), color], 1)[None]
         )[0]
         wanted = torch.ones(4, height, width, dtype=torch.float64)
         for number in depth.argsort(descending=True).tolist():

@@ -11,7 +11,7 @@ from torch.distributions import Distribution
 from framework.distributions.checks import refuse_nan
 from framework.distributions.circular import Circular
 from framework.distributions.circular_moments import circular_moments
-from framework.distributions.protocol import arc, cdf, turn
+from framework.distributions.protocol import arc_length, arc_probability, cdf
 
 NOTHING = 1e-9
 """Threshold below which the mass of an arc from a grid is rounding: it counts as 0, also at infinite cost.
@@ -77,7 +77,7 @@ def region_probabilities(
 ) -> Float[Tensor, "batch region"]:
     """Return the masses of the regions into which edges cut a line or a circle, float64; see `regions`.
 
-    The masses are exact where `protocol.cdf`, `protocol.arc` or `circular_moments` are exact; otherwise they are shares
+    The masses are exact where `protocol.cdf`, `protocol.arc_probability` or `circular_moments` are exact; otherwise they are shares
     of `samples` draws.
 
     Args:
@@ -105,7 +105,7 @@ def regions(value: Tensor, edges: Float[Tensor, "edge"], *, around: bool) -> Int
     if not around:
         return torch.bucketize(value.double().contiguous(), edges, right=True)
     # an angle that was set to an edge may lie below that edge after rounding to float32
-    ahead = torch.remainder(turn(edges[0], value) + 1e-7, 2 * math.pi)
+    ahead = torch.remainder(arc_length(edges[0], value) + 1e-7, 2 * math.pi)
     return torch.bucketize(ahead, edges - edges[0] + 1e-12, right=True) - 1
 
 
@@ -124,10 +124,10 @@ def _arcs(density: Distribution, edges: Tensor) -> Tensor:
     start, end = (
         e.reshape(-1, *(1,) * len(density.batch_shape)).expand(shape) for e in (edges, edges.roll(-1))
     )
-    known = arc(density, start.unsqueeze(-1), end.unsqueeze(-1))
+    known = arc_probability(density, start.unsqueeze(-1), end.unsqueeze(-1))
     if known is not None:
         return known.movedim(0, -1)
     seen = circular_moments(density)
-    found = seen.arc(start, end)
+    found = seen.arc_probability(start, end)
     found = torch.where(found < NOTHING, 0.0, found)
     return torch.where(seen.resolved, found, torch.inf).movedim(0, -1)

@@ -7,7 +7,7 @@ from pydantic import Field
 from torch import Tensor
 
 from framework.errors import DataError
-from framework.geometry.light import encoded
+from framework.geometry.srgb import srgb_from_linear
 from plugins.metric.images import functional
 from plugins.metric.images.per_image import PerImage
 
@@ -17,7 +17,7 @@ Encoding = Literal["srgb", "linear"]
 
 def compared(light: Float[Tensor, "height width number"], encoding: Encoding) -> Tensor:
     """Return the colours in the given encoding, clipped to [0, 1] as a file would clip them, float64."""
-    return encoded(light.double()) if encoding == "srgb" else light.double().clamp(0, 1)
+    return srgb_from_linear(light.double()) if encoding == "srgb" else light.double().clamp(0, 1)
 
 
 def require_side(image: Tensor, least: int, remedy: str) -> None:

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchmetrics.utilities import dim_zero_cat
 
 from framework.errors import DataError
-from framework.geometry.light import eight_bit
+from framework.geometry.srgb import bytes_from_linear
 from framework.metric import HasFigure, Metric
 from framework.prediction import Prediction
 
@@ -96,7 +96,9 @@ class PerImage(Metric, HasFigure):
                 pairs.append(self.pairs[place])
             else:
                 pair = torch.stack([predicted[place - old], true[place - old]])
-                pairs.append((eight_bit(pair.float()) if self._channel == "color" else pair).unsqueeze(0))
+                pairs.append(
+                    (bytes_from_linear(pair.float()) if self._channel == "color" else pair).unsqueeze(0)
+                )
         self.pairs, self.facts = pairs, [facts[place] for place in stay]
 
     @property

@@ -15,7 +15,7 @@ from torchmetrics.functional.image import structural_similarity_index_measure
 
 from framework.configuration.schema import build, resolve
 from framework.errors import ConfigError, DataError, UserError
-from framework.geometry.light import eight_bit, encoded
+from framework.geometry.srgb import bytes_from_linear, srgb_from_linear
 from framework.prediction import Prediction
 from framework.target import Target
 from framework.testing.balls import Ball, ball
@@ -251,7 +251,7 @@ def test_what_cannot_be_compared_gets_a_sentence():
     with pytest.raises(DataError, match=r"float64 \(3, 12, 12, 3\) and true ones float64 \(3, 12, 12, 1\)"):
         psnr.update(colors(near, true[..., :1], mask))
     with pytest.raises(DataError, match=r"true ones uint8 .*light, not 8-bit"):
-        psnr.update(colors(near, eight_bit(true), mask))
+        psnr.update(colors(near, bytes_from_linear(true), mask))
     for wrong in (math.nan, math.inf, -math.inf):
         bad = near.clone()
         bad[1, 3, 4, 0] = wrong
@@ -278,11 +278,11 @@ def test_what_cannot_be_compared_gets_a_sentence():
 def test_light_has_a_gradient_and_ends_where_files_do():
     light = torch.tensor([0.0, 1e-4, 0.0031308, 0.01, 0.5, 1.0], dtype=torch.float64, requires_grad=True)
     theirs = kornia.color.linear_rgb_to_rgb(light.detach().expand(3, 1, 6))[0, 0]
-    torch.testing.assert_close(encoded(light).detach(), theirs, rtol=0, atol=1e-8)
-    (slope,) = torch.autograd.grad(encoded(light).sum(), light)
+    torch.testing.assert_close(srgb_from_linear(light).detach(), theirs, rtol=0, atol=1e-8)
+    (slope,) = torch.autograd.grad(srgb_from_linear(light).sum(), light)
     assert slope.isfinite().all() and (slope > 0).all()
-    assert torch.autograd.gradcheck(encoded, light.detach()[[1, 3, 4]].requires_grad_())
-    assert encoded(torch.tensor([-1.0, 2.0])).tolist() == pytest.approx([0, 1], abs=1e-7)
+    assert torch.autograd.gradcheck(srgb_from_linear, light.detach()[[1, 3, 4]].requires_grad_())
+    assert srgb_from_linear(torch.tensor([-1.0, 2.0])).tolist() == pytest.approx([0, 1], abs=1e-7)
 
 
 def test_images_kept_are_the_same_in_whatever_order_they_came():

@@ -12,7 +12,7 @@ from torchmetrics.functional.image import lpips as theirs
 
 from framework.configuration.schema import build, resolve
 from framework.errors import CheckpointError, ConfigError, DataError
-from framework.geometry.light import encoded
+from framework.geometry.srgb import srgb_from_linear
 from framework.testing.finding import require
 from framework.testing.metrics import examine_metric
 from framework.testing.rows import MetricRow
@@ -91,7 +91,7 @@ def test_lpips_is_its_formula_over_the_frame_and_on_white(backbone, size, whole,
     mask[1] = False
     metric = lpips(backbone=backbone, weights=file)
     found = measured(metric, colors(near, true, mask))
-    one, other = (encoded(image).movedim(-1, 1) for image in (near, true))
+    one, other = (srgb_from_linear(image).movedim(-1, 1) for image in (near, true))
     frame = [by_hand(backbone, state, *pair) for pair in zip(one, other, strict=True)]
     assert found["lpips"] == pytest.approx(sum(frame) / 2, rel=1e-5)
     white = [torch.where(mask[0], image[0], 1.0) for image in (one, other)]

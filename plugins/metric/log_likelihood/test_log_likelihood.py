@@ -12,7 +12,7 @@ from sklearn.metrics import log_loss
 from torch.distributions import Categorical, Distribution, Independent, Normal
 
 from framework.configuration.schema import build, resolve
-from framework.distributions.protocol import Estimate, estimate, exactly
+from framework.distributions.protocol import Estimate, estimate, exact_estimate
 from framework.errors import UserError
 from framework.prediction import Prediction
 from plugins.metric.log_likelihood.metric import LogLikelihood, merged_moments, moments_of
@@ -31,7 +31,7 @@ class Known(Distribution):
         return self.values
 
 
-estimate.register(Known, exactly)
+estimate.register(Known, exact_estimate)
 
 
 class Untold(Known):

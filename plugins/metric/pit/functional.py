@@ -9,7 +9,7 @@ from torch.distributions import Distribution
 
 from framework.distributions.circular import Circular, circular_mean
 from framework.distributions.circular_moments import circular_moments
-from framework.distributions.protocol import arc, cdf, turn
+from framework.distributions.protocol import arc_length, arc_probability, cdf
 
 
 def transform(density: Distribution, value: Float[Tensor, "batch 1"], samples: int) -> Float[Tensor, "batch"]:
@@ -34,14 +34,14 @@ def _circular(density: Distribution, value: Tensor, samples: int) -> Tensor:
     if not bool(seen.resolved.all()):
         drawn = density.sample(torch.Size((samples,))).double().squeeze(-1)
         start = torch.where(seen.resolved, start, circular_mean(drawn, 0) - math.pi)
-    known = arc(density, start.unsqueeze(-1), value)
+    known = arc_probability(density, start.unsqueeze(-1), value)
     if known is not None:
         return known
     at = value.squeeze(-1)
-    found = seen.arc(start, at)
+    found = seen.arc_probability(start, at)
     if drawn is None:
         return found
-    return torch.where(seen.resolved, found, _rank(turn(start, drawn) - turn(start, at)))
+    return torch.where(seen.resolved, found, _rank(arc_length(start, drawn) - arc_length(start, at)))
 
 
 def _rank(ahead: Float[Tensor, "samples batch"]) -> Float[Tensor, "batch"]:

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.distributions import Distribution
 
-from framework.distributions.protocol import each_cdf
+from framework.distributions.protocol import marginal_cdfs
 from framework.errors import UserError
 
 
@@ -37,11 +37,11 @@ def transform(density: Distribution, value: Tensor, steps: int) -> Transform:
     """
     value = value.double()
     half = 0.5 / steps if steps else 0.0
-    low, high = (each_cdf(density, value + side) for side in (-half, half))
+    low, high = (marginal_cdfs(density, value + side) for side in (-half, half))
     if low is None or high is None:
         raise UserError(
             f"{type(density).__name__} over {tuple(density.event_shape)} knows no distribution function of each of its "
-            "numbers. Register one with `framework.distributions.protocol.each_cdf.register`, or leave out this metric."
+            "numbers. Register one with `framework.distributions.protocol.marginal_cdfs.register`, or leave out this metric."
         )
     if steps:
         low, high = low.masked_fill(value < half, 0.0), high.masked_fill(value > 1 - half, 1.0)

@@ -9,7 +9,7 @@ from torch import Tensor
 from torchmetrics.utilities import dim_zero_cat
 
 from framework.errors import ConfigError, DataError
-from framework.geometry.clouds import denormalised
+from framework.geometry.clouds import denormalise_clouds
 from framework.metric import Mean, Metric
 from framework.prediction import Prediction
 from framework.target import Target
@@ -101,7 +101,7 @@ class CorrespondenceError(Metric):
         }
         centre, scale, subject = fields(prediction, "correspondence", wanted)
         for name, mesh in (("registered", prediction.point), ("truth", prediction.target)):
-            getattr(self, name).append(denormalised(mesh.unflatten(1, (-1, 3)), centre, scale))
+            getattr(self, name).append(denormalise_clouds(mesh.unflatten(1, (-1, 3)), centre, scale))
         self.subject.append(subject)
 
     def compute(self) -> dict[str, Tensor]:

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor
 
-from framework.calibration.module_flags import BATCH_NORM, flagged
+from framework.calibration.module_flags import BATCH_NORM, set_flag
 from framework.data import Batch
 from framework.errors import ConfigError, DataError, NonFiniteLoss
 from framework.model import Predictor
@@ -56,7 +56,7 @@ class Adversarial(Objective):
         """Return the weighted penalty of a batch."""
         inputs = as_floats(batch["input"], predictor)
         # x' is not part of the training distribution, so that it must not enter the running moments
-        with flagged(predictor, BATCH_NORM, "track_running_stats", False):
+        with set_flag(predictor, BATCH_NORM, "track_running_stats", False):
             moved = inputs + self.epsilon * self._direction(predictor, inputs, batch)
             if batch["input"].dtype == torch.uint8:
                 moved = moved.clamp(0, 1)

@@ -3,7 +3,7 @@
 from jaxtyping import Float
 from torch import Tensor
 
-from framework.calibration.module_flags import BATCH_NORM, flagged
+from framework.calibration.module_flags import BATCH_NORM, set_flag
 from framework.data import Batch
 from framework.errors import ConfigError
 from framework.model import Predictor
@@ -22,7 +22,7 @@ def predicted_images(
     Raises:
         ConfigError: the target is no image of red, green and blue.
     """
-    with flagged(
+    with set_flag(
         predictor, BATCH_NORM, "track_running_stats", False
     ):  # the loss has already updated the moments with these inputs
         densities = predictor.training_densities(batch["input"])

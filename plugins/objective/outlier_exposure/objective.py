@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 from torch.utils.data import DataLoader
 
-from framework.calibration.module_flags import BATCH_NORM, flagged
+from framework.calibration.module_flags import BATCH_NORM, set_flag
 from framework.data import Batch, Data
 from framework.datasets.fields import as_batch
 from framework.errors import ConfigError
@@ -92,7 +92,7 @@ class OutlierExposure(Objective):
         drawn = self._uniform(inputs, count) if self.outliers is None else self._drawn(inputs, count)
         if self.clearance > 0:
             drawn = drawn[clear_of(drawn, inputs, self.clearance)]
-        with flagged(predictor, BATCH_NORM, "training", False), own_batches(predictor, False):
+        with set_flag(predictor, BATCH_NORM, "training", False), own_batches(predictor, False):
             found = independent_penalty(self._divergences(predictor.training_densities(drawn)))
         return self.weight * found.sum() / max(1, len(drawn))  # no outliers, no penalty
 

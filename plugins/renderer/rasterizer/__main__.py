@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from PIL import ImageColor
 
-from framework.errors import ConfigError, DataError, did_you_mean, quoted, shown
+from framework.errors import ConfigError, DataError, did_you_mean, quote, shorten
 from framework.geometry.camera import Camera
 from framework.renderer import Report
 from framework.storage.commands import run_command
@@ -46,7 +46,7 @@ class Parser(argparse.ArgumentParser):
     """An argument parser that reports a mistake in one sentence, without printing the usage first."""
 
     def error(self, message: str) -> NoReturn:
-        message = shown(message)
+        message = shorten(message)
         if message.startswith("unrecognized arguments: "):
             message += "." + did_you_mean(message.split()[2].partition("=")[0], self._option_string_actions)
         raise ConfigError(f"{message}{'' if message[-1] in '.?' else '.'} --help says what there is.")
@@ -65,7 +65,7 @@ def number(
         if not low <= value <= high:
             what = "a whole number" if kind is int else "a number"
             raise argparse.ArgumentTypeError(
-                f"{quoted(text)} came; wanted {what} from {low:g} to {high:g}{unit}"
+                f"{quote(text)} came; wanted {what} from {low:g} to {high:g}{unit}"
             )
         return value
 
@@ -84,7 +84,7 @@ def size(text: str) -> tuple[int, int]:
         side.isdecimal() and 1 <= int(side) <= turntable.LONGEST_SIDE for side in sides
     ):
         raise argparse.ArgumentTypeError(
-            f"{quoted(text)} came; wanted WIDTHxHEIGHT in pixels, each from 1 to {turntable.LONGEST_SIDE}, as 640x480"
+            f"{quote(text)} came; wanted WIDTHxHEIGHT in pixels, each from 1 to {turntable.LONGEST_SIDE}, as 640x480"
         )
     return int(sides[1]), int(sides[0])
 
@@ -97,7 +97,7 @@ def background(text: str) -> tuple[int, int, int] | None:
         red, green, blue, *_ = ImageColor.getrgb(text)
     except ValueError:
         raise argparse.ArgumentTypeError(
-            f"{quoted(text)} came; wanted a colour, as white or #20a0ff, or transparent."
+            f"{quote(text)} came; wanted a colour, as white or #20a0ff, or transparent."
             + did_you_mean(text, ["transparent", *ImageColor.colormap])
         ) from None
     return red, green, blue
@@ -109,7 +109,7 @@ def channel(text: str) -> str:
     if text not in known:
         near = did_you_mean(text, known)
         raise argparse.ArgumentTypeError(
-            f"{quoted(text)} came; wanted one of {', '.join(known)}.{near}".rstrip(".")
+            f"{quote(text)} came; wanted one of {', '.join(known)}.{near}".rstrip(".")
         )
     return text
 

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
-from framework.errors import DataError, quoted, shown
+from framework.errors import DataError, quote, shorten
 from framework.renderer import Wrap
 from framework.storage.limits import MOST_JOINT_SETS, MOST_PARTS
 from framework.storage.reading import guarded
@@ -46,13 +46,13 @@ def read(file: Path) -> Subject:
         document = opened(file)
         version = str(document.content["asset"]["version"])
         if not version.startswith("2."):
-            raise ValueError(f"it is of version {quoted(version)}; wanted 2.0")
+            raise ValueError(f"it is of version {quote(version)}; wanted 2.0")
         missing = [
             one for one in document.content.get("extensionsRequired", ()) if not one.startswith(UNDERSTOOD)
         ]
         if missing:
             raise DataError(
-                f"{file}: it needs {shown(', '.join(missing))}, which is not understood; save it without, e.g. with "
+                f"{file}: it needs {shorten(', '.join(missing))}, which is not understood; save it without, e.g. with "
                 "neither compressed geometry nor compressed textures."
             )
         unknown = [
@@ -60,7 +60,7 @@ def read(file: Path) -> Subject:
         ]
         if unknown:
             document.notes.append(
-                f"it uses {shown(', '.join(unknown))}, which is not understood: what that adds is left out."
+                f"it uses {shorten(', '.join(unknown))}, which is not understood: what that adds is left out."
             )
         if len(document.content.get("scenes", ())) > 1:
             document.notes.append("its other scenes are left out.")
@@ -72,7 +72,7 @@ def read(file: Path) -> Subject:
                 )
             parts = list(_parts(document, above))
         except KeyError as error:
-            raise ValueError(f"{shown(error)} is missing, or none of what may stand there") from error
+            raise ValueError(f"{shorten(error)} is missing, or none of what may stand there") from error
         return subject(parts, "y", document.notes)
 
 
@@ -199,7 +199,7 @@ def _part(document: Document, primitive: dict[str, Any]) -> Part:
     described = document.item("accessors", attributes["POSITION"])
     if "extensions" in primitive and not {"bufferView", "sparse"} & described.keys():
         raise DataError(
-            f"its vertices are stored by {shown(', '.join(primitive['extensions']))} alone, which is not understood; "
+            f"its vertices are stored by {shorten(', '.join(primitive['extensions']))} alone, which is not understood; "
             "wanted them without compression. Save it so."
         )
     vertices = document.numbers(attributes["POSITION"], 3).astype(np.float64)
@@ -235,7 +235,7 @@ def _triangles(order: Int[np.ndarray, "corners"], mode: Any) -> Int[np.ndarray, 
         return order[np.stack([inner, inner + 1 + inner % 2, inner + 2 - inner % 2], 1)]
     if mode == FAN:
         return order[np.stack([inner + 1, inner + 2, np.zeros_like(inner)], 1)]
-    raise ValueError(f"its mode is {quoted(mode)}; wanted 4, 5 or 6: triangles")
+    raise ValueError(f"its mode is {quote(mode)}; wanted 4, 5 or 6: triangles")
 
 
 def _material(
@@ -306,9 +306,9 @@ def _image(document: Document, texture: dict[str, Any]):
         )
         if file is None:
             return None
-        content, name = document.of_file(file), shown(uri, 60)
+        content, name = document.of_file(file), shorten(uri, 60)
     elif uri is not None:
-        content, name = document.referred(uri), shown(uri, 60)
+        content, name = document.referred(uri), shorten(uri, 60)
     else:
         content, name = bytes(document.view(image["bufferView"])[0]), f"{number}"
     return document.pictures.decode(number, content, name)

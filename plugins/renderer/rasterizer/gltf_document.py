@@ -14,7 +14,7 @@ from urllib.parse import unquote
 import numpy as np
 from numpy.typing import NDArray
 
-from framework.errors import quoted, shown
+from framework.errors import quote, shorten
 from framework.storage.limits import SCENE_BYTES, UNFOLDED_TIMES
 from framework.storage.plain_values import plain_numbers
 from framework.storage.reading import guarded, read_bytes
@@ -44,7 +44,7 @@ class Document:
         """
         items = self.content.get(kind, [])
         if not isinstance(number, int) or isinstance(number, bool) or not 0 <= number < len(items):
-            raise ValueError(f"it names number {quoted(number)} of its {kind}, of which it has {len(items)}")
+            raise ValueError(f"it names number {quote(number)} of its {kind}, of which it has {len(items)}")
         return items[number]
 
     def buffer(self, number: int) -> bytes:
@@ -62,7 +62,7 @@ class Document:
             else:
                 extensions = ", ".join(described.get("extensions", {}))
                 why = (
-                    f", but stored by {shown(extensions)}, which is not understood; save it without"
+                    f", but stored by {shorten(extensions)}, which is not understood; save it without"
                     if extensions
                     else ""
                 )
@@ -74,7 +74,7 @@ class Document:
         if address.startswith("data:"):
             head, _, body = address.partition(",")
             if not head.endswith(";base64"):
-                raise ValueError(f"it holds data as {quoted(head[-20:])}; wanted base64")
+                raise ValueError(f"it holds data as {quote(head[-20:])}; wanted base64")
             return base64.b64decode(body, validate=True)
         return self.of_file(beside(self.folder, unquote(address, errors="surrogateescape")))
 
@@ -106,7 +106,7 @@ class Document:
         """
         described = self.item("accessors", number)
         if WIDTHS.get(described["type"]) != width:
-            raise ValueError(f"wanted {width} numbers each, got {quoted(described['type'])}")
+            raise ValueError(f"wanted {width} numbers each, got {quote(described['type'])}")
         count, kind = whole(described["count"]), np.dtype(NUMBERS[described["componentType"]])
         self.bounded(count * width * 8)
         found = np.zeros((count, width), kind)
@@ -199,5 +199,5 @@ def numbers(value: Any) -> NDArray:
 def whole(value: Any) -> int:
     """Return a value of the description if it is an integer from 0."""
     if not isinstance(value, int) or isinstance(value, bool) or value < 0:
-        raise ValueError(f"wanted a whole number from 0, got {quoted(value)}")
+        raise ValueError(f"wanted a whole number from 0, got {quote(value)}")
     return value

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from framework.errors import DataError, quoted
+from framework.errors import DataError, quote
 from framework.geometry import mesh_files
 from framework.geometry.mesh_files import continued, placed, text_lines
 from framework.renderer import Wrap
@@ -196,7 +196,7 @@ def _texture(material: Material, words: list[str], library: Path) -> None:
             words = words[1 + OPTIONS[words[0]] :]
         else:
             raise ValueError(
-                f"its texture has the option {quoted(words[0])}, which is not understood; save it without"
+                f"its texture has the option {quote(words[0])}, which is not understood; save it without"
             )
     if words:
         material.texture, material.library = " ".join(words).strip(), library

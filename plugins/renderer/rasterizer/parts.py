@@ -13,10 +13,10 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from framework.datasets import images
-from framework.errors import DataError, quoted, shown
+from framework.errors import DataError, quote, shorten
 from framework.geometry.camera import look_from
-from framework.geometry.light import linear
-from framework.renderer import Scene, Texture, Wrap, joined
+from framework.geometry.srgb import linear_from_bytes
+from framework.renderer import Scene, Texture, Wrap, join_scenes
 from framework.storage.limits import FEW_TEXELS, MOST_TEXELS, TEXELS_PER_BYTE
 
 Axis = Literal["y", "z"]
@@ -88,7 +88,7 @@ def subject(parts: Sequence[Part], up: Axis, notes: Sequence[str] = ()) -> Subje
         if np.abs(part.vertices).max() > FARTHEST:
             raise DataError(f"a coordinate is beyond {FARTHEST:g}; wanted metres. Scale it down.")
     wrap, smooth = _wrap(parts), all(part.smooth for part in parts if part.image is not None)
-    scene = joined([_scene(part, wrap, smooth) for part in parts])
+    scene = join_scenes([_scene(part, wrap, smooth) for part in parts])
     plain = [torch.full((len(part.vertices),), _plain(part)) for part in parts]
     return Subject(scene, torch.cat(plain), up, tuple(dict.fromkeys(notes)))
 
@@ -172,14 +172,14 @@ class Pictures:
             raise DataError(f"the texture {name}: {error}") from error
         except Exception as error:
             raise DataError(
-                f"the texture {name} cannot be read as an image ({shown(error) or type(error).__name__}). Restore it."
+                f"the texture {name} cannot be read as an image ({shorten(error) or type(error).__name__}). Restore it."
             ) from error
         self._decoded[key] = torch.from_numpy(light)
         return self._decoded[key]
 
 
 def _light(pixels: UInt8[np.ndarray, "*any"]) -> Float[np.ndarray, "*any"]:
-    return linear(torch.arange(256, dtype=torch.uint8)).numpy()[pixels]
+    return linear_from_bytes(torch.arange(256, dtype=torch.uint8)).numpy()[pixels]
 
 
 def beside(folder: Path, name: str) -> Path:
@@ -197,7 +197,7 @@ def beside(folder: Path, name: str) -> Path:
         inside = False
     if not plain or not inside:
         raise DataError(
-            f"it names {quoted(name)}; wanted a file in its own folder, since others are not read. Copy it there."
+            f"it names {quote(name)}; wanted a file in its own folder, since others are not read. Copy it there."
         )
     return folder / plain
 
@@ -222,13 +222,15 @@ def drawn_without(folder: Path, name: str, what: str, notes: list[str]) -> Path 
         last = plain.rpartition("/")[2]
         file = beside(folder, last) if last.strip(".") else None
         if file is None or not file.exists():
-            notes.append(f"its {what} in another folder, {shown(name)}, which is not read: drawn without.")
+            notes.append(f"its {what} in another folder, {shorten(name)}, which is not read: drawn without.")
             return None
-        notes.append(f"its {what} in another folder, {shown(name)}; {shown(file.name)} beside it is read.")
+        notes.append(
+            f"its {what} in another folder, {shorten(name)}; {shorten(file.name)} beside it is read."
+        )
         return file
     file = beside(folder, name)
     if file.exists():  # anything but a regular file is refused where it is read
         return file
     thing, _, verb = what.rpartition(" ")
-    notes.append(f"its {thing} {shown(name)} {verb} not beside it: drawn without.")
+    notes.append(f"its {thing} {shorten(name)} {verb} not beside it: drawn without.")
     return None

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from framework.errors import ConfigError, DataError, shown
+from framework.errors import ConfigError, DataError, shorten
 from framework.geometry.camera import Camera
-from framework.geometry.light import eight_bit, linear
+from framework.geometry.srgb import bytes_from_linear, linear_from_bytes
 from framework.renderer import Scene
 from framework.storage.files import replacing
 from plugins.renderer.rasterizer.parts import Subject
@@ -119,9 +119,9 @@ def color(
     if background is None:
         plain = light / covered.clamp(min=1e-6)
         alpha = (255 * covered).round().to(torch.uint8)
-        return torch.cat([eight_bit(plain), alpha], -1).numpy()
-    behind = linear(torch.tensor(background, dtype=torch.uint8))
-    return eight_bit(light + (1 - covered) * behind).numpy()
+        return torch.cat([bytes_from_linear(plain), alpha], -1).numpy()
+    behind = linear_from_bytes(torch.tensor(background, dtype=torch.uint8))
+    return bytes_from_linear(light + (1 - covered) * behind).numpy()
 
 
 def depth(drawn: Float[Tensor, "height width"]) -> NDArray[np.uint16]:
@@ -248,7 +248,7 @@ def _film(file: Path, frames: Iterator[NDArray], rate: int) -> None:
             status = process.wait()
         if status != 0:
             said.seek(0)
-            words = shown(said.read().decode("utf-8", "replace").strip()) or "nothing"
+            words = shorten(said.read().decode("utf-8", "replace").strip()) or "nothing"
             raise DataError(
                 f"ffmpeg ended with {status} and said: {words}. Ask for a .gif, or install another ffmpeg."
             )

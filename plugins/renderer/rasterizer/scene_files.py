@@ -10,8 +10,8 @@ from jaxtyping import Float
 
 from framework.errors import DataError, did_you_mean
 from framework.geometry import meshes
-from framework.geometry.light import linear
 from framework.geometry.mesh_files import COLOURS
+from framework.geometry.srgb import linear_from_bytes
 from framework.storage.reading import guarded, read_bytes
 from plugins.renderer.rasterizer import gltf, obj_materials
 from plugins.renderer.rasterizer.parts import Axis, Part, Pictures, Subject, drawn_without, subject
@@ -59,7 +59,7 @@ def _colors(mesh: meshes.Mesh) -> Float[np.ndarray, "vertices 3"] | None:
     if not set(COLOURS) <= set(mesh.columns):
         return None
     stored = np.round(255 * mesh.attribute(COLOURS)).astype(np.uint8)
-    return linear(torch.from_numpy(stored)).double().numpy()
+    return linear_from_bytes(torch.from_numpy(stored)).double().numpy()
 
 
 def _textured(file: Path, mesh: meshes.Mesh, part: Part, notes: list[str]) -> Part:

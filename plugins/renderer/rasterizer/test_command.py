@@ -17,7 +17,7 @@ from PIL import Image
 
 from framework.errors import ConfigError, DataError, UserError
 from framework.geometry.camera import look_from
-from framework.geometry.light import linear
+from framework.geometry.srgb import linear_from_bytes
 from plugins.renderer.rasterizer import pictures, turntable
 from plugins.renderer.rasterizer.__main__ import main
 from plugins.renderer.rasterizer.renderer import Rasterizer
@@ -110,9 +110,11 @@ def test_edges_are_blended_in_light_and_transparent_pictures_know_their_share(
     assert clear.shape == (40, 48, 4) and {0, 255} < set(clear[..., 3].ravel().tolist())
     share = torch.from_numpy(clear[..., 3:] / 255)
     for text in ("#000000", "#ffffff", "#40c0f0"):
-        behind = linear(torch.tensor([*bytes.fromhex(text[1:])], dtype=torch.uint8))
-        light = linear(torch.from_numpy(clear[..., :3].copy())) * share + behind * (1 - share)
-        opaque = linear(torch.from_numpy(np.array(drawn(cube, tmp_path, *options, "--background", text))))
+        behind = linear_from_bytes(torch.tensor([*bytes.fromhex(text[1:])], dtype=torch.uint8))
+        light = linear_from_bytes(torch.from_numpy(clear[..., :3].copy())) * share + behind * (1 - share)
+        opaque = linear_from_bytes(
+            torch.from_numpy(np.array(drawn(cube, tmp_path, *options, "--background", text)))
+        )
         assert float((light - opaque).abs().max()) < 0.02
 
 
@@ -147,7 +149,7 @@ def test_a_sphere_of_one_colour_is_lit_from_the_camera(tmp_path: Path) -> None:
     pixels = drawn(
         tmp_path / "ball.stl", tmp_path, "--distance", "50", "--fov", "2.6", "--background", "black"
     )
-    shown = linear(torch.from_numpy(np.array(pixels))).numpy()[..., 0] / 0.55
+    shown = linear_from_bytes(torch.from_numpy(np.array(pixels))).numpy()[..., 0] / 0.55
     rows, columns = np.mgrid[:40, :48]
     radius = 20 / math.tan(math.radians(1.3)) / 50
     square = ((rows - 19.5) ** 2 + (columns - 23.5) ** 2) / radius**2
@@ -175,11 +177,11 @@ def test_the_camera_is_that_of_look_from_and_sees_all_of_the_subject() -> None:
         found = turntable.looking_at(around, "z", angles, 7.0, fov, size)
         wanted = look_from(*angles, 7.0, fov, size)
         points = torch.from_numpy(random.normal(size=(5, 3)))
-        for ours, theirs in zip(found.projected(points + centre), wanted.projected(points), strict=True):
+        for ours, theirs in zip(found.project(points + centre), wanted.project(points), strict=True):
             torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-4)
         fitted = turntable.looking_at(around, "y", angles, None, fov, size)
         rim = torch.nn.functional.normalize(torch.from_numpy(random.normal(size=(5_000, 3))), dim=1)
-        places, depths = fitted.projected(around.radius * rim + centre)
+        places, depths = fitted.project(around.radius * rim + centre)
         assert (depths > fitted.near).all()
         far = (places - torch.tensor(fitted.principal)).abs().amax(0)
         share = far / torch.tensor([size[1] / 2, size[0] / 2])

@@ -10,7 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from framework.renderer import Scene, joined
+from framework.renderer import Scene, join_scenes
 from plugins.renderer.rasterizer.drawing import Gradient, Saving
 from plugins.renderer.rasterizer.renderer import Rasterizer
 from plugins.renderer.rasterizer.test_extreme import (
@@ -244,7 +244,7 @@ def test_of_nothing_at_all_comes_the_background_and_no_slope(gradient: Gradient)
         assert all(slope is None or (slope == 0).all() for slope in slopes)
     empty = Scene(torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.int64), torch.zeros(0, 3), ahead(1, 1))
     assert (Rasterizer(gradient=gradient)(empty)["color"] == 0).all()
-    assert (Rasterizer(gradient=gradient)(joined([empty, empty]), ("face",))["face"] == -1).all()
+    assert (Rasterizer(gradient=gradient)(join_scenes([empty, empty]), ("face",))["face"] == -1).all()
 
 
 @pytest.mark.parametrize("gradient", KINDS)

@@ -24,7 +24,7 @@ def test_pictures_are_those_of_plain_torch(seed: int, cull: bool, supersampling:
     """Compare scenes without faces that the near plane cuts, since plain torch leaves these out."""
     random = np.random.default_rng(seed)
     scene = crowd(seen(float(random.uniform(5, 9)), (40, 50)), random)
-    _, depth = scene.camera.projected(scene.vertices)
+    _, depth = scene.camera.project(scene.vertices)
     scene = replace(scene, camera=replace(scene.camera, near=min(1e-3, float(depth[depth > 0].min()))))
     whole = (depth[scene.faces] > 0).all(1)
     cover = scene.texture

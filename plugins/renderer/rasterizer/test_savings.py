@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from framework.geometry.camera import Camera, look_from
-from framework.renderer import Scene, Texture, joined
+from framework.renderer import Scene, Texture, join_scenes
 from plugins.renderer.rasterizer import canvas
 from plugins.renderer.rasterizer.drawing import Gradient, Saving
 from plugins.renderer.rasterizer.renderer import Rasterizer
@@ -41,7 +41,7 @@ def crowd(camera: Camera, random: np.random.Generator, count: int = 3) -> Scene:
             uv = torch.tensor(random.uniform(0, 1, (len(vertices), 2)), dtype=torch.float32)
             subject = replace(subject, texture=Texture((image,), uv, faces))
         subjects.append(subject)
-    return joined(subjects)
+    return join_scenes(subjects)
 
 
 def alike(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> bool:
@@ -118,7 +118,7 @@ def test_what_did_not_change_is_not_computed_again() -> None:
 def by_hand(scene: Scene, cull: bool) -> dict[str, int]:
     """Count what happens to the faces of a scene in front of the near plane, one by one."""
     camera = scene.camera
-    pixels, depth = camera.projected(scene.vertices.double())
+    pixels, depth = camera.project(scene.vertices.double())
     assert (depth >= camera.near).all()
     corner = (pixels * 256).round().numpy()[scene.faces.numpy()]
     counts = {"flat": 0, "back": 0, "outside": 0, "drawn": 0}
@@ -177,14 +177,14 @@ def test_faces_out_of_view_behind_and_hidden_are_counted() -> None:
     corners = torch.tensor([[-4.0, -4, 2], [4, -4, 2], [4, 4, 2], [-4, 4, 2]]).double()
     wall = (corners - scene.camera.translation) @ scene.camera.rotation.double()
     before = Scene(wall, torch.tensor([[0, 1, 2], [0, 2, 3]]), torch.rand(4, 3).double(), scene.camera)
-    both = joined([scene, before])
+    both = join_scenes([scene, before])
     close = Rasterizer(savings=SAVINGS)
     picture = close(both, ("color", "face"))
     assert alike(picture, Rasterizer(savings=())(both, ("color", "face")))
     assert (picture["face"] >= len(faces)).all()
     assert close.report is not None and close.report.left_out["hidden"] > 0.8 * len(faces)
     floor = torch.tensor([[-90.0, -90, -1.5], [90, -90, -1.5], [90, 90, -1.5], [-90, 90, -1.5]]).double()
-    under = joined([scene, replace(before, vertices=floor), replace(before, vertices=floor + 0.01)])
+    under = join_scenes([scene, replace(before, vertices=floor), replace(before, vertices=floor + 0.01)])
     assert alike(
         close(under, ("face",)), Rasterizer(savings=())(under, ("face",))
     )  # what the near plane cuts

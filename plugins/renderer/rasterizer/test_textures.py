@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from framework.geometry.camera import look_from
-from framework.renderer import Scene, Texture, Wrap, joined
+from framework.renderer import Scene, Texture, Wrap, join_scenes
 from plugins.renderer.rasterizer.renderer import Rasterizer
 from plugins.renderer.rasterizer.test_gradient import blob, camera
 
@@ -91,7 +91,7 @@ def test_joined_subjects_show_what_each_shows_alone() -> None:
     wide = look_from(0.3, 0.2, 0.1, distance=9.0, field_of_view=0.6, size=(70, 90))
     subjects = [replace(subject, camera=wide) for subject in subjects]
     renderer = Rasterizer()
-    whole = renderer(joined(subjects), ("color", "face", "uv"))
+    whole = renderer(join_scenes(subjects), ("color", "face", "uv"))
     seen = 0
     for number, subject in enumerate(subjects):
         alone = renderer(subject, ("color", "face", "uv"))
@@ -108,7 +108,7 @@ def test_joined_subjects_show_what_each_shows_alone() -> None:
 def test_joining_keeps_what_subjects_have(colored: bool, textured: bool) -> None:
     vertices, faces, colors = blob(4)
     plain = Scene(vertices, faces, colors if colored else None, camera())
-    scene = joined([plain, replace(plain, texture=covered().texture if textured else None), plain])
+    scene = join_scenes([plain, replace(plain, texture=covered().texture if textured else None), plain])
     assert len(scene.vertices) == 3 * len(vertices) and scene.faces.max() == 3 * len(vertices) - 1
     assert (scene.colors is not None) == colored and (scene.texture is not None) == textured
     if scene.texture is not None:
@@ -144,7 +144,7 @@ def test_joined_indices_are_those_of_int64_whatever_types_came(
             object.__setattr__(part, name, value)
         return scene
 
-    found = joined([subject(count, kind, textured[0]), subject(100, other, textured[1])])
+    found = join_scenes([subject(count, kind, textured[0]), subject(100, other, textured[1])])
     # the same small numbers as int64, moved by hand
     first, last = subject(count, kind, True), subject(100, other, True)
     assert first.texture is not None and first.texture.shown is not None
@@ -166,12 +166,12 @@ def test_joined_indices_are_those_of_int64_whatever_types_came(
 def test_subjects_of_other_channels_are_not_joined() -> None:
     vertices, faces, colors = blob(4)
     with pytest.raises(ValueError, match="1 and 3 channels; wanted as many"):
-        joined([Scene(vertices, faces, colors[:, :1], camera()), covered()])
+        join_scenes([Scene(vertices, faces, colors[:, :1], camera()), covered()])
     with pytest.raises(ValueError, match="no scene came"):
-        joined([])
+        join_scenes([])
     other = covered(wrap="clamp")
     with pytest.raises(ValueError, match="different wrap or smooth"):
-        joined([covered(), other])
+        join_scenes([covered(), other])
 
 
 @pytest.mark.parametrize("road", [Rasterizer.__call__, Rasterizer.on_device])

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from framework.errors import DataError, did_you_mean, quoted
+from framework.errors import DataError, did_you_mean, quote
 from framework.geometry.camera import Camera, focal_length
 from framework.geometry.rotation import about_z, viewpoint_rotation
 from framework.renderer import Scene
@@ -116,7 +116,7 @@ def read_camera(file: Path) -> Camera:
     found = _values(file)
     unknown = [key for key in found if key not in KEYS]
     if unknown or len(found) < len(KEYS):
-        wrong = f"{quoted(unknown[0])} is no part of it" if unknown else "a part is missing"
+        wrong = f"{quote(unknown[0])} is no part of it" if unknown else "a part is missing"
         near = did_you_mean(str(unknown[0]), KEYS) if unknown else ""
         raise DataError(f"{file}: {wrong}; wanted a camera's {', '.join(KEYS)}.{near}")
     lens, rotation = _numbers(file, found, "K", (3, 3)), _numbers(file, found, "R", (3, 3))
@@ -125,7 +125,7 @@ def read_camera(file: Path) -> Camera:
     sides = isinstance(size, list) and len(size) == 2 and all(type(side) is int for side in size)
     if not sides or not all(1 <= side <= LONGEST_SIDE for side in size):
         raise DataError(
-            f"{file}: its size is {quoted(size)}; wanted [width, height], whole pixels from 1 to {LONGEST_SIDE}."
+            f"{file}: its size is {quote(size)}; wanted [width, height], whole pixels from 1 to {LONGEST_SIDE}."
         )
     wanted = torch.zeros(3, 3, dtype=torch.float64)
     wanted[0, 0], wanted[1, 1], wanted[:2, 2], wanted[2, 2] = lens[0, 0], lens[1, 1], lens[:2, 2], 1.0
@@ -172,6 +172,6 @@ def _numbers(file: Path, found: dict[str, Any], key: str, shape: tuple[int, ...]
         numbers = torch.empty(0)
     if numbers.shape != shape or not bool(numbers.isfinite().all()):
         raise DataError(
-            f"{file}: its {key} is {quoted(found[key])}; wanted {' x '.join(map(str, shape))} finite numbers."
+            f"{file}: its {key} is {quote(found[key])}; wanted {' x '.join(map(str, shape))} finite numbers."
         )
     return numbers

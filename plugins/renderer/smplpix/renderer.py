@@ -13,8 +13,8 @@ from framework.configuration.loading import rebuilt, stored
 from framework.configuration.paths import FilePath, flat
 from framework.distributions.protocol import images
 from framework.errors import CheckpointError, ConfigError, DataError
-from framework.geometry.light import encoded
 from framework.geometry.mesh_files import COLOURS, XYZ
+from framework.geometry.srgb import srgb_from_linear
 from framework.model import Predictor
 from framework.renderer import Renderer, Scene
 
@@ -28,7 +28,7 @@ class SMPLpix(Renderer):
     """Renderer that paints a scene with the trained network of a run of `smplpix/quick` or a similar experiment.
 
     The camera may be any camera: vertices are transformed to the canonical camera of its image size, which sees them at
-    the same pixels (`Camera.canonical`). Faces matter only to a run that paints over a rasterised mesh, which then
+    the same pixels (`Camera.to_canonical`). Faces matter only to a run that paints over a rasterised mesh, which then
     draws the faces of its own topology. A run of projected points also draws sets of points; it leaves out vertices
     that are not finite or nearer than the near plane.
 
@@ -143,8 +143,8 @@ def cloud(scene: Scene) -> Float[Tensor, "points 6"]:
     assert scene.colors is not None
     if not len(scene.vertices):
         return torch.zeros(1, len(COLUMNS))
-    points = scene.camera.canonical(scene.vertices.detach().cpu()).float()
-    found = torch.cat([points, encoded(scene.colors.detach().cpu().float())], 1)
+    points = scene.camera.to_canonical(scene.vertices.detach().cpu()).float()
+    found = torch.cat([points, srgb_from_linear(scene.colors.detach().cpu().float())], 1)
     seen = found.isfinite().all(1) & (found[:, 2] >= float(scene.camera.near))
     return found.where(seen[:, None], 0.0)
 

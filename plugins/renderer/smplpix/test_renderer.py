@@ -8,7 +8,7 @@ from framework.configuration.schema import build, resolve
 from framework.distributions.protocol import images
 from framework.errors import CheckpointError, ConfigError
 from framework.geometry.camera import canonical_camera, look_from
-from framework.geometry.light import encoded, light_of
+from framework.geometry.srgb import linear_from_srgb, srgb_from_linear
 from framework.renderer import Scene
 from framework.testing.scenes import sphere
 from plugins.renderer.smplpix.rows import NEAR, SLIM, UNET, checkpoint, seeing
@@ -63,7 +63,7 @@ def root(folder):
 def given(scene):
     """Return the input that a user of the loaded run passes."""
     assert scene.colors is not None
-    return torch.cat([scene.camera.canonical(scene.vertices), encoded(scene.colors)], 1)[None]
+    return torch.cat([scene.camera.to_canonical(scene.vertices), srgb_from_linear(scene.colors)], 1)[None]
 
 
 @pytest.mark.parametrize("size", [SIZE, OTHER])
@@ -84,14 +84,14 @@ def test_it_draws_what_the_loaded_run_predicts(encoders, size, members, tmp_path
             density = loaded(given(scene))
         assert torch.equal(found, images(density, ("color",))["color"][0])
         if members == 1:
-            assert torch.equal(found, light_of(density.mean[0]))  # the numbers of the file, as light
+            assert torch.equal(found, linear_from_srgb(density.mean[0]))  # the numbers of the file, as light
         assert found.max() - found.min() > 0.01 and found.shape == (*size, 3)
 
 
 def test_a_camera_anywhere_sees_what_the_canonical_one_sees(tmp_path):
     drawn = renderer(checkpoint(tmp_path / "run.ckpt", ENCODERS["projection, slim"], SIZE))
     scene = replace(MESH, vertices=MESH.vertices.double(), camera=seen_from(SIZE))
-    pixels, depth = scene.camera.projected(scene.vertices)
+    pixels, depth = scene.camera.project(scene.vertices)
     clear = ((pixels + 0.5) - (pixels + 0.5).round()).abs().amin(1) > 1e-3  # rounding decides no pixel
     plain = canonical_camera(*SIZE)
     across = (pixels - torch.tensor(plain.principal)) / torch.tensor(plain.focal)
@@ -106,7 +106,7 @@ def test_what_must_not_be_seen_is_not(tmp_path):
     drawn = renderer(checkpoint(tmp_path / "run.ckpt", ENCODERS["projection, slim"], SIZE))
     scene = replace(MESH, camera=replace(seen_from(SIZE), near=3.0))
     assert scene.colors is not None
-    _, depth = scene.camera.projected(scene.vertices)
+    _, depth = scene.camera.project(scene.vertices)
     vertices, bad = scene.vertices.clone(), torch.arange(len(depth)) % 7 == 0
     vertices[bad] = torch.tensor([torch.nan, torch.inf, 0.0])
     good = (depth >= 3.0) & ~bad

@@ -11,7 +11,7 @@ from torch.distributions import Distribution
 from framework.distributions.batch_shapes import Reshaped
 from framework.distributions.circular import Circular, grid, wrap
 from framework.distributions.panels import first_in_cell, known_scales
-from framework.distributions.protocol import peaks
+from framework.distributions.protocol import mode_candidates
 
 FOLD = 12
 """Nodes for each factor e of the distance from a peak: neighbours are 8 % of that distance apart."""
@@ -210,8 +210,8 @@ class Line:
         return torch.cat(chosen)
 
     def _candidates(self) -> Float[Tensor, "candidate item"]:
-        """Return one of the density's `peaks` in each quarter of their scale, since hundreds may lie on one hump."""
-        places = peaks(self.density).squeeze(-1).double()
+        """Return one of the density's `mode_candidates` in each quarter of their scale, since hundreds may lie on one hump."""
+        places = mode_candidates(self.density).squeeze(-1).double()
         if self.closed:
             places = wrap(places)
         order = places.sort(0)

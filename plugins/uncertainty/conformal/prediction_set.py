@@ -62,7 +62,7 @@ class PredictionSet(Mixture, ValueSet):
         promised: float | None = None,
     ) -> None:
         self.density = density
-        self.promised = promised
+        self.stated_probability = promised
         self.threshold = threshold
         self.score: Score = score
         # The dtype of log_prob: for classes that of one label's, otherwise that of an empty sample.

@@ -11,7 +11,7 @@ from torch.distributions import Categorical, Independent, MultivariateNormal, No
 from framework.configuration.schema import build, resolve
 from framework.distributions.batch_shapes import Reshaped, Stacked
 from framework.distributions.density import Mixture, circular_grid
-from framework.distributions.protocol import estimate, marginal, median, peaks, scales
+from framework.distributions.protocol import estimate, marginal, median, mode_candidates, peak_widths
 from framework.distributions.tempering import temper
 from framework.errors import UserError
 from framework.target import Target
@@ -464,5 +464,5 @@ def test_a_latent_density_shows_its_components_humps(name):
     torch.manual_seed(3)
     density = head(3 * torch.randn(6, head.size))
     mixture = density if isinstance(density, Mixture) else density.mixture
-    torch.testing.assert_close(peaks(density), peaks(mixture))
-    torch.testing.assert_close(scales(density), scales(mixture))
+    torch.testing.assert_close(mode_candidates(density), mode_candidates(mixture))
+    torch.testing.assert_close(peak_widths(density), peak_widths(mixture))

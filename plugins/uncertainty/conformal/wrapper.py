@@ -10,7 +10,7 @@ from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor
 
-from framework.calibration.validation import densities, repeatable, require_numbers
+from framework.calibration.validation import nonempty_batches, predict_densities, require_numbers
 from framework.data import Batch
 from framework.errors import UserError
 from framework.model import Predictor
@@ -99,14 +99,17 @@ class Conformal(Uncertainty):
 
     def calibrate(self, batches: Iterable[Batch]) -> None:
         """Calibrate the wrapped model on one half of the batches, and fit the threshold to the other."""
-        theirs, mine = halves(repeatable(batches, by="conformal"))
+        theirs, mine = halves(nonempty_batches(batches, by="conformal"))
         if not mine:
             raise UserError(
                 "conformal shares the validation split with what it wraps, and got one sample of it; wanted 2 or more. "
                 "Give the data set a larger validation split."
             )
         self.model.calibrate(theirs)
-        sets = [PredictionSet(density, self.threshold, self.score) for density in densities(self.model, mine)]
+        sets = [
+            PredictionSet(density, self.threshold, self.score)
+            for density in predict_densities(self.model, mine)
+        ]
         scores = torch.cat([one.scores(batch["target"]) for one, batch in zip(sets, mine, strict=True)])
         require_numbers(scores, mine, "score")
         self.threshold.fill_(threshold(scores, self.miscoverage))

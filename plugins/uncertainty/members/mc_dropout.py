@@ -11,7 +11,7 @@ from pydantic import Field
 from torch import Tensor, nn
 from torch.distributions import Distribution
 
-from framework.calibration.module_flags import flagged
+from framework.calibration.module_flags import set_flag
 from framework.distributions.batch_shapes import Reshaped, Stacked
 from framework.errors import ConfigError, UserError
 from framework.model import Model, Predictor
@@ -82,7 +82,7 @@ class MCDropout(Uncertainty):
             return self.model(inputs)
         if self.samples < 1:
             raise ConfigError(f"uncertainty mc_dropout: samples = {self.samples}; wanted 1 or more.")
-        with flagged(self.model, DROPOUT, "training", True):
+        with set_flag(self.model, DROPOUT, "training", True):
             components = self._components(inputs)
         return equal_mixture(components, self.model, inputs.device)
 

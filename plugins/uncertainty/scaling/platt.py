@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.distributions import Distribution
 
-from framework.calibration.validation import densities, repeatable, require_numbers
+from framework.calibration.validation import nonempty_batches, predict_densities, require_numbers
 from framework.data import Batch
 from framework.distributions.tempering import RescaledClasses, log_probabilities
 from framework.model import Predictor
@@ -83,9 +83,9 @@ class Platt(Uncertainty):
 
     def calibrate(self, batches: Iterable[Batch]) -> None:
         """Calibrate the wrapped model, then fit slope and biases."""
-        seen = repeatable(batches, by="platt")
+        seen = nonempty_batches(batches, by="platt")
         self.model.calibrate(seen)
-        found = densities(self.model, seen)
+        found = predict_densities(self.model, seen)
         log_prob = torch.cat([log_probabilities(density) for density in found]).detach().double()
         require_numbers(log_prob.sum(-1), seen, "class probabilities")
         label = torch.cat([batch["target"] for batch in seen])

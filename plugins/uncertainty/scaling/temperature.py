@@ -10,7 +10,7 @@ from pydantic import Field
 from torch import Tensor
 from torch.distributions import Distribution
 
-from framework.calibration.validation import densities, repeatable, require_numbers
+from framework.calibration.validation import nonempty_batches, predict_densities, require_numbers
 from framework.data import Batch
 from framework.distributions.tempering import temper
 from framework.model import Predictor
@@ -72,9 +72,9 @@ class Temperature(Uncertainty):
 
     def calibrate(self, batches: Iterable[Batch]) -> None:
         """Calibrate the wrapped model, then fit the temperature."""
-        seen = repeatable(batches, by="temperature")
+        seen = nonempty_batches(batches, by="temperature")
         self.model.calibrate(seen)
-        found = fit(densities(self.model, seen), seen, self.lower, self.upper)
+        found = fit(predict_densities(self.model, seen), seen, self.lower, self.upper)
         self.temperature.fill_(found)
         rows = sum(len(batch["target"]) for batch in seen)
         self.remark = f"temperature: {found:.3g}, the likeliest of {rows} validation rows."

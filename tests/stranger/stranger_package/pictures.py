@@ -11,7 +11,7 @@ from torch import Tensor
 
 from framework.data import Batch, Data, Splits
 from framework.errors import DataError
-from framework.geometry.light import light_of
+from framework.geometry.srgb import linear_from_srgb
 from framework.target import Target
 from stranger_package.data import Signal
 
@@ -58,7 +58,7 @@ class Faded(Data):
         return Fields(
             input=self.inputs[rows],
             target=self.images[rows],
-            color=light_of(self.images[rows]),
+            color=linear_from_srgb(self.images[rows]),
             mask=self.masks[rows],
             index=torch.arange(count),
             group=torch.zeros(count, dtype=torch.int64),

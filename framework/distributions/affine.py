@@ -11,27 +11,27 @@ from framework.distributions.description import one_line
 from framework.distributions.protocol import (
     Estimate,
     Normals,
-    Slope,
+    QuadraticBound,
     ValueSet,
-    about,
     cdf,
     estimate,
     images,
     mahalanobis,
     marginal,
     median,
+    mode_candidates,
     normals,
-    peaks,
+    peak_widths,
     pick,
-    scales,
-    slope,
+    quadratic_bound,
+    recentre,
     take,
-    tempered,
+    tempered_density,
     value_set,
 )
 
 
-class Moved(Distribution):
+class AffineDensity(Distribution):
     """The density of location + scale · Y, number by number.
 
     Args:
@@ -96,51 +96,51 @@ class Moved(Distribution):
 
 
 @marginal.register
-def _(density: Moved, index: int) -> Moved:
+def _(density: AffineDensity, index: int) -> AffineDensity:
     here = slice(index, index + 1)
     inner = marginal(density.density, index)
-    return Moved(inner, density.location[..., here], density.scale[..., here])
+    return AffineDensity(inner, density.location[..., here], density.scale[..., here])
 
 
 @median.register
-def _(density: Moved, samples: int) -> Tensor:
+def _(density: AffineDensity, samples: int) -> Tensor:
     return density.outer(median(density.density, samples))
 
 
 @pick.register
-def _(density: Moved, index: Tensor) -> Moved:
+def _(density: AffineDensity, index: Tensor) -> AffineDensity:
     place = (take(number, index) for number in (density.location, density.scale))
-    return Moved(pick(density.density, index), *place)
+    return AffineDensity(pick(density.density, index), *place)
 
 
-@about.register
-def _(density: Moved, index: tuple[Tensor, ...], place: Tensor) -> Moved:
+@recentre.register
+def _(density: AffineDensity, index: tuple[Tensor, ...], place: Tensor) -> AffineDensity:
     # X - place = scale · (Y - y) with y = (place - location) / scale
     location, scale = (number.double()[index] for number in (density.location, density.scale))
-    inner = about(density.density, index, (place - location) / scale)
+    inner = recentre(density.density, index, (place - location) / scale)
     scale = scale.expand((*inner.batch_shape, 1))
-    return Moved(inner, torch.zeros_like(scale), scale)
+    return AffineDensity(inner, torch.zeros_like(scale), scale)
 
 
-@tempered.register
-def _(density: Moved, temperature: Tensor) -> Moved:
-    return Moved(tempered(density.density, temperature), density.location, density.scale)
+@tempered_density.register
+def _(density: AffineDensity, temperature: Tensor) -> AffineDensity:
+    return AffineDensity(tempered_density(density.density, temperature), density.location, density.scale)
 
 
 @estimate.register
-def _(density: Moved, value: Tensor) -> Estimate:
+def _(density: AffineDensity, value: Tensor) -> Estimate:
     found = estimate(density.density, density.inner(value))
     down = density.log_volume
     return found._replace(log_mean=found.log_mean - down, debiased=found.debiased - down)
 
 
 @cdf.register
-def _(density: Moved, value: Tensor) -> Tensor | None:
+def _(density: AffineDensity, value: Tensor) -> Tensor | None:
     return cdf(density.density, density.inner(value))
 
 
 @normals.register
-def _(density: Moved) -> Normals | None:
+def _(density: AffineDensity) -> Normals | None:
     found = normals(density.density)
     if found is None:
         return None
@@ -149,35 +149,35 @@ def _(density: Moved) -> Normals | None:
 
 
 @mahalanobis.register
-def _(density: Moved, value: Tensor) -> Tensor | None:
+def _(density: AffineDensity, value: Tensor) -> Tensor | None:
     return mahalanobis(density.density, density.inner(value))
 
 
-@slope.register
-def _(density: Moved, value: Tensor) -> Slope | None:
-    found = slope(density.density, density.inner(value))
+@quadratic_bound.register
+def _(density: AffineDensity, value: Tensor) -> QuadraticBound | None:
+    found = quadratic_bound(density.density, density.inner(value))
     if found is None:
         return None
     pull, stiffness = found.pull / density.scale, found.stiffness / density.scale.square()
-    return Slope(found.log_prob - density.log_volume, pull, stiffness)
+    return QuadraticBound(found.log_prob - density.log_volume, pull, stiffness)
 
 
 @images.register
-def _(density: Moved, channels: Collection[str]) -> dict[str, Tensor]:
+def _(density: AffineDensity, channels: Collection[str]) -> dict[str, Tensor]:
     return images(density.density, channels)  # the transform changes numbers, not what an image shows
 
 
-@peaks.register
-def _(density: Moved) -> Tensor:
-    return density.outer(peaks(density.density))
+@mode_candidates.register
+def _(density: AffineDensity) -> Tensor:
+    return density.outer(mode_candidates(density.density))
 
 
-@scales.register
-def _(density: Moved) -> Tensor:
-    return scales(density.density) * density.scale[..., 0]
+@peak_widths.register
+def _(density: AffineDensity) -> Tensor:
+    return peak_widths(density.density) * density.scale[..., 0]
 
 
-class MovedSet(ValueSet):
+class AffineSet(ValueSet):
     """The set of Y, transformed by X = location + scale · Y.
 
     Args:
@@ -185,10 +185,10 @@ class MovedSet(ValueSet):
         density: the density of X.
     """
 
-    def __init__(self, inner: ValueSet, density: Moved) -> None:
+    def __init__(self, inner: ValueSet, density: AffineDensity) -> None:
         self.inner = inner
         self.density = density
-        self.promised = inner.promised
+        self.stated_probability = inner.stated_probability
 
     def contains(self, value: Tensor) -> Tensor:
         return self.inner.contains(self.density.inner(value))
@@ -211,6 +211,6 @@ class MovedSet(ValueSet):
 
 
 @value_set.register
-def _(density: Moved) -> MovedSet | None:
+def _(density: AffineDensity) -> AffineSet | None:
     found = value_set(density.density)
-    return None if found is None else MovedSet(found, density)
+    return None if found is None else AffineSet(found, density)
