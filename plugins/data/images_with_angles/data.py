@@ -16,16 +16,25 @@ from framework.datasets import given_images, images
 from framework.datasets.csv_columns import Writing
 from framework.datasets.images import Crop
 from framework.errors import DataError, did_you_mean
-from framework.storage.names import spelled
+from framework.storage.names import spell_name
 from framework.target import Target
 from plugins.data.images_with_angles.table import SPLITS, Table, read_table
 
 
 class ImagesWithAngles(Data):
-    """Your own folder of images with a CSV table of their angles.
+    """A user's own folder of images, with a CSV table of their angles.
 
-    Angles are degrees unless `angles_in` says radians. `mirror` names the angles that change sign in a mirror image; if
-    it names any, half of the training images are mirrored.
+    Args:
+        root: Folder of the images.
+        csv: Path of the table, relative to `root`.
+        angle_columns: Columns of the table to predict, in this order; None for every column of numbers.
+        angles_in: Unit of the angles in the table; None means degrees, and a column that looks like radians is refused.
+        image_size: Side of the square inputs, pixels.
+        grayscale: Whether images are read in grey.
+        mirror: Angles that change sign in a mirror image; if it names any, half of the training images are mirrored.
+        jitter: Largest share by which training images are shifted, scaled and made brighter or darker.
+        skip_unreadable: Whether images that cannot be read are left out and counted; otherwise they are an error.
+        writing: How the table is written.
     """
 
     bibtex = """@misc{images_with_angles,
@@ -66,12 +75,12 @@ class ImagesWithAngles(Data):
         for name in self.mirror:
             if name not in table.columns:
                 raise DataError(
-                    f"data.mirror names {name!r}, which is no angle.{did_you_mean(name, table.columns)} "
-                    f"The angles: {', '.join(table.columns)}."
+                    f"data.mirror names {name!r}, which is no angle of the table.{did_you_mean(name, table.columns)} "
+                    f"The angles are {', '.join(table.columns)}."
                 )
         self.target = Target("angle", table.columns)
         self.input_shape = (self.channels, self.image_size, self.image_size)
-        self.groups = (spelled(root.resolve().name),)
+        self.groups = (spell_name(root.resolve().name),)
         self.synthetic = False
         self._signs = [-1.0 if name in self.mirror else 1.0 for name in table.columns] if self.mirror else []
         self._digest = hashlib.sha256(repr((table.columns, table.rows)).encode()).hexdigest()
@@ -84,20 +93,24 @@ class ImagesWithAngles(Data):
             },
             skip_unreadable=self.skip_unreadable,
         )
-        for split, found in self._tables.items():
-            if len(found) == 0:
+        for split, samples in self._tables.items():
+            if len(samples) == 0:
                 raise DataError(
                     f"The {split} split is empty ({len(table.rows)} images in all, {self.skipped} unreadable). Add "
-                    f"images, or say with a column `split` which are for {', '.join(SPLITS)}."
+                    f"images, or assign each image to {', '.join(SPLITS)} in a column `split` of the table."
                 )
 
     def _labels(self) -> tuple[Path, Table]:
         """Return the folder, and the table that was read from it."""
         if self.root is None:
-            raise DataError("data.root is not set; wanted the folder that holds your images and their table.")
+            raise DataError(
+                "data.root is not set. Set data.root to the folder that holds your images and their table."
+            )
         root = Path(self.root).expanduser()
         if not root.is_dir():
-            raise DataError(f"data.root = {root}: no such folder; wanted the one that holds your images.")
+            raise DataError(
+                f"data.root = {root} does not exist or is no folder. Set data.root to the folder of your images."
+            )
         return root, read_table(root / self.csv, self.angle_columns, self.angles_in, self.writing)
 
     def check_files(self) -> None:
@@ -110,17 +123,17 @@ class ImagesWithAngles(Data):
         return Splits(**self._tables)
 
     def read(self, files: Sequence[Path]) -> Dataset[Batch]:
-        return images.unlabelled([self._crop(Path(file)) for file in files])
+        return images.load_unlabelled([self._crop(Path(file)) for file in files])
 
     def inputs(self, given: Any) -> Tensor:
-        return given_images.inputs(self, given)
+        return given_images.to_inputs(self, given)
 
     def augment(self, batch: Batch) -> Batch:
-        return images.varied(batch, self._signs, self.jitter)
+        return images.vary(batch, self._signs, self.jitter)
 
     def fingerprint(self) -> Mapping[str, str]:
         sizes = {split: str(len(table)) for split, table in self._tables.items()}
         return {"root": str(self.root), "version": self.csv, **sizes, "sha256": self._digest}
 
     def preview(self, inputs: Tensor) -> np.ndarray:
-        return images.picture(inputs)
+        return images.to_rgb8(inputs)

@@ -1,4 +1,4 @@
-"""Rows of the contract: images of noise, in colour and mirrored, and grey with splits from the table."""
+"""Contract-test cases: images of noise, in colour and mirrored, or grey with splits from the table."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -14,7 +14,7 @@ def write(folder: Path, split: bool = False) -> Mapping[str, str]:
     for number in range(40):
         file = noise_image(folder / f"{number:03d}.png", number)
         part = ("train", "validation", "test")[number % 3]
-        pan = 10 * number if number >= 30 else number / 8  # which may be degrees or radians
+        pan = 10 * number if number >= 30 else number / 8  # acceptable as degrees and as radians
         lines.append(f"{file.name},{pan},{-number / 4}" + f",{part}" * split)
     (folder / "angles.csv").write_text("\n".join(lines), encoding="utf-8")
     return {"root": str(folder)}

@@ -1,4 +1,4 @@
-"""Reading of the table beside the images: a line for each file, with its angles and optionally its split."""
+"""Reading of the table of the images, which has a line for each image with its angles and optionally its split."""
 
 import hashlib
 import math
@@ -11,14 +11,14 @@ import numpy as np
 
 from framework.datasets.angles import unlike_degrees, unlike_radians
 from framework.datasets.csv_columns import (
-    Chosen,
+    ColumnChoice,
     Columns,
     Writing,
+    describe_choice,
     numbers,
     numeric_columns,
     read_columns,
     require,
-    told,
 )
 from framework.errors import DataError, did_you_mean, quote, shorten
 
@@ -29,7 +29,7 @@ FILE, SPLIT = "file", "split"
 
 
 class Row(NamedTuple):
-    """One image; its angles are in radians, in the order of the table's columns."""
+    """One image: its file, its split, and its angles in radians, in the order of `Table.columns`."""
 
     file: str
     split: Split
@@ -37,12 +37,12 @@ class Row(NamedTuple):
 
 
 class Table(NamedTuple):
-    """Rows and columns of a table of angles.
+    """Content of a table of angles.
 
     Attributes:
-        columns: names of the angles.
-        rows: one row for each image.
-        remarks: sentences on columns that were left out.
+        columns: Names of the angles.
+        rows: Rows of the table, one for each image.
+        remarks: Clauses about columns that were left out.
     """
 
     columns: tuple[str, ...]
@@ -58,37 +58,43 @@ def read_table(
 ) -> Table:
     """Read and check a CSV file.
 
-    Without `columns`, every column is an angle whose cells are mostly numbers, except row numbers. Without `angles_in`
-    the angles are degrees, and a column that looks like radians is refused.
+    Without `columns`, every column whose cells are mostly numbers is an angle, except a column of row numbers. Without
+    `angles_in` the angles are degrees, and a column that looks like radians is refused.
 
     Raises:
-        DataError: the file is missing, or a header, cell or file name is wrong; the message names the line.
+        DataError: The file is missing, or a header, cell or file name is wrong; the message names the line.
     """
     table = _read(file, writing or Writing())
     chosen = _angle_columns(table, columns)
     values = {column: numbers(table, column, missing="").tolist() for column in chosen.names}
     for column in chosen.names:
         _refuse_other_unit(file, column, np.array(values[column]), angles_in)
-    turn = math.radians if angles_in != "radians" else float
+    to_radians = math.radians if angles_in != "radians" else float
     first_line: dict[str, int] = {}
     rows = []
-    for index, (number, written) in enumerate(zip(table.lines, table.cells[FILE], strict=True)):
-        name = posixpath.normpath(written) if written else ""  # `./a.png` is `a.png`: one image in one split
+    for index, (number, path) in enumerate(zip(table.lines, table.cells[FILE], strict=True)):
+        # `./a.png` and `a.png` are the same image, which must be in one split only
+        name = posixpath.normpath(path) if path else ""
         if not name:
-            raise DataError(f"{file} line {number}: no `{FILE}`; wanted the name of an image.")
+            raise DataError(
+                f"{file} line {number}: The column `{FILE}` is empty. Write the name of an image there."
+            )
         if name in first_line:
             raise DataError(
-                f"{file} line {number}: {quote(written)} stands already in line {first_line[name]}; wanted each "
-                "image once. Take one of the lines out."
+                f"{file} line {number}: {quote(path)} is already listed in line {first_line[name]}. Remove one of the "
+                "two lines."
             )
         first_line[name] = number
         split = _split(file, number, table.cells[SPLIT][index]) if SPLIT in table.cells else split_of(name)
-        rows.append(Row(name, split, tuple(turn(values[column][index]) for column in chosen.names)))
-    return Table(chosen.names, rows, told(chosen))
+        rows.append(Row(name, split, tuple(to_radians(values[column][index]) for column in chosen.names)))
+    return Table(chosen.names, rows, describe_choice(chosen))
 
 
 def split_of(name: str) -> Split:
-    """Return train (70 %), validation or test (15 % each) by a hash of the name: new images never move old ones."""
+    """Return train (70 %), validation (15 %) or test (15 %), chosen by a hash of the name.
+
+    Adding images therefore never moves other images to another split.
+    """
     share = int.from_bytes(hashlib.sha256(name.encode()).digest()[:8]) / 2**64
     for split in SPLITS:
         share -= SHARES[split]
@@ -98,42 +104,45 @@ def split_of(name: str) -> Split:
 
 
 def _read(file: Path, writing: Writing) -> Columns:
-    """Return the table's cells, which include a column of files.
+    """Return the cells of a table, after checking that it has a column of file names.
 
     Raises:
-        DataError: `read_columns` raises it, or there is no such column.
+        DataError: The table cannot be read, or has no such column.
     """
     missing = (
-        f"wanted a table with a column `{FILE}` and a column for each angle. Write it, or name another with "
-        "data.csv."
+        f"expected a table with a column `{FILE}` and a column for each angle. Write such a table, or set data.csv to "
+        "the path of another table."
     )
     table = read_columns(file, writing, missing)
     if FILE not in table.cells:
         raise DataError(
-            f"{file} has no column `{FILE}`.{did_you_mean(FILE, table.cells)} Its first line names: "
-            f"{shorten(', '.join(table.cells))}. Wanted names, one of them `{FILE}`."
+            f"{file} has no column `{FILE}`.{did_you_mean(FILE, table.cells)} Its first line names "
+            f"{shorten(', '.join(table.cells))}. Name the column of the images `{FILE}`."
         )
     return table
 
 
-def _angle_columns(table: Columns, asked: Sequence[str] | None) -> Chosen:
-    if asked is None:
-        found = numeric_columns(table, (FILE, SPLIT), "data.angle_columns")
-        if not found.names:
-            others = "".join(f" {quote(name)}: {why}." for name, why in list(found.left_out.items())[:8])
+def _angle_columns(table: Columns, requested: Sequence[str] | None) -> ColumnChoice:
+    """Return the columns of angles: those requested, or all columns of numbers."""
+    if requested is None:
+        choice = numeric_columns(table, (FILE, SPLIT), "data.angle_columns")
+        if not choice.names:
+            reasons = "".join(f" {quote(name)}: {why}." for name, why in list(choice.left_out.items())[:8])
             raise DataError(
-                f"{table.file} has no column of numbers beside `{FILE}` and `{SPLIT}`; wanted one for each angle, "
-                f"in degrees. Add one, or name them with data.angle_columns.{others}"
+                f"{table.file} has no column of numbers besides `{FILE}` and `{SPLIT}`, but needs one for each angle, "
+                f"in degrees. Add such columns, or list their names in data.angle_columns.{reasons}"
             )
-        return found
-    require(table, asked, "data.angle_columns")
-    if not asked:
+        return choice
+    require(table, requested, "data.angle_columns")
+    if not requested:
         raise DataError(
-            "data.angle_columns is empty; wanted the name of at least one column, or null for all."
+            "data.angle_columns is empty. List the name of at least one column, or set it to null for all columns."
         )
-    names = tuple(dict.fromkeys(asked))
-    others = [name for name in table.cells if name not in (*names, FILE, SPLIT)]
-    return Chosen(names, dict(table.left_out) | dict.fromkeys(others, "not named in data.angle_columns"), {})
+    names = tuple(dict.fromkeys(requested))
+    unread = [name for name in table.cells if name not in (*names, FILE, SPLIT)]
+    return ColumnChoice(
+        names, dict(table.left_out) | dict.fromkeys(unread, "not named in data.angle_columns"), {}
+    )
 
 
 def _refuse_other_unit(
@@ -143,20 +152,20 @@ def _refuse_other_unit(
     if wrong:
         raise DataError(
             f"{file}, column {quote(column)}: {wrong}. Set data.angles_in=radians, or data.angles_in=degrees if "
-            "degrees they are."
+            "the angles are in degrees."
         )
     wrong = unlike_radians(values) if angles_in == "radians" else ""
     if wrong:
         raise DataError(
-            f"{file}, column {quote(column)}: {wrong}. Leave data.angles_in out, or wrap the angles into one turn."
+            f"{file}, column {quote(column)}: {wrong}. Leave data.angles_in out, or wrap the angles to one turn."
         )
 
 
-def _split(file: Path, number: int, cell: str) -> Split:
-    word = cell
+def _split(file: Path, number: int, word: str) -> Split:
+    """Return the split that a cell in line `number` names."""
     if word not in SPLITS:
         raise DataError(
-            f"{file} line {number}, column `{SPLIT}`: {quote(word)}; wanted one of {', '.join(SPLITS)}."
+            f"{file} line {number}, column `{SPLIT}`: {quote(word)} is no split. Write one of {', '.join(SPLITS)}."
             f"{did_you_mean(word, SPLITS)}"
         )
     return cast(Split, word)

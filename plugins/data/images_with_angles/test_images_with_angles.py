@@ -20,15 +20,18 @@ from plugins.data.images_with_angles.data import ImagesWithAngles
 from plugins.data.images_with_angles.table import SPLITS, split_of
 
 
-def folder(place: Path, table: str | None = None, images: int = 40) -> Path:
-    """Write images whose red is their number, and a table of their pan (10° × number) and tilt (-number)."""
+def write_folder(root: Path, table: str | None = None, images: int = 40) -> Path:
+    """Write images and their table into a folder, and return it.
+
+    The red value of an image is its number; its pan is 10° × number and its tilt is -1° × number.
+    """
     lines = ["file,pan,tilt,note"]
     for number in range(images):
         name = f"{number:03d}.png"
-        Image.fromarray(np.full((6, 9, 3), (number, 50, 200), np.uint8)).save(place / name)
+        Image.fromarray(np.full((6, 9, 3), (number, 50, 200), np.uint8)).save(root / name)
         lines.append(f"{name},{10 * number},{-number},text")
-    (place / "angles.csv").write_text(table if table is not None else "\n".join(lines), encoding="utf-8")
-    return place
+    (root / "angles.csv").write_text(table if table is not None else "\n".join(lines), encoding="utf-8")
+    return root
 
 
 def prepared(root: Path, **config: Any) -> ImagesWithAngles:
@@ -45,12 +48,12 @@ def fields(data: ImagesWithAngles, split: str) -> Mapping[str, torch.Tensor]:
 
 
 def test_whole_folder(tmp_path: Path) -> None:
-    data = prepared(folder(tmp_path))
+    data = prepared(write_folder(tmp_path))
     assert data.target.kind == "angle"
-    assert data.target.names == ("pan", "tilt")  # the note is no number
+    assert data.target.names == ("pan", "tilt")  # the column `note` holds no numbers
     assert data.input_shape == (3, 8, 8)
     assert data.groups == (tmp_path.name,)
-    seen = []
+    all_numbers = []
     for split in SPLITS:
         table = fields(data, split)
         numbers = table["input"][:, 0, 0, 0].tolist()
@@ -59,13 +62,13 @@ def test_whole_folder(tmp_path: Path) -> None:
             assert math.cos(target[0] - math.radians(10 * number)) == pytest.approx(1)
             assert target[1] == pytest.approx(-math.radians(number))
             assert split_of(f"{number:03d}.png") == split
-        seen += numbers
-    assert sorted(seen) == list(range(40))
+        all_numbers += numbers
+    assert sorted(all_numbers) == list(range(40))
 
 
 def test_columns_splits_and_grey(tmp_path: Path) -> None:
     table = "file , split,yaw,roll\n000.png,train,370,5\n001.png,test,-190,6\n002.png,validation,0,7\n\n"
-    data = prepared(folder(tmp_path, table, 3), angle_columns=["roll", "yaw", "roll"], grayscale=True)
+    data = prepared(write_folder(tmp_path, table, 3), angle_columns=["roll", "yaw", "roll"], grayscale=True)
     assert data.target.names == ("roll", "yaw")
     assert data.input_shape == (1, 8, 8)
     for split, roll, yaw in (("train", 5, 10), ("test", 6, 170), ("validation", 7, 0)):
@@ -85,32 +88,36 @@ def test_split_by_name_is_70_15_15_and_never_moves() -> None:
 LINES = [f"{number:03d}.png,{10 * number},{number}" for number in range(30)]
 
 
-def table_with(line: str, header: str = "file,pan,tilt", place: int = 3) -> str:
-    return "\n".join([header, *LINES[:place], line, *LINES[place:]])
+def table_with(line: str, header: str = "file,pan,tilt", index: int = 3) -> str:
+    """Return a table with one more line after the first `index` lines of samples."""
+    return "\n".join([header, *LINES[:index], line, *LINES[index:]])
 
 
 @pytest.mark.parametrize(
     ("table", "message"),
     [
-        ("", r"is empty or begins with a blank line; wanted names"),
+        ("", r"is empty or begins with a blank line, but the first line must name the columns"),
         ("files,pan\n000.png,3", r"has no column `file`\. Did you mean 'files'\?"),
         ("file,pan\n000.png,3;4", r"no column of numbers .* 'pan': words"),
-        ("file,pan", r"no row below its first line; wanted one for each sample"),
+        ("file,pan", r"no row below its first line, but one row per sample is expected"),
         ("file,pan,pan\n000.png,3,4", r"names the column 'pan' twice"),
-        ("file,note\n000.png,hello", r"has no column of numbers beside `file` and `split`"),
-        (table_with("777.png,abc,4"), r"line 5, column 'pan': 'abc'; wanted a finite number"),
-        (table_with("777.png,,4"), r"line 5, column 'pan': ''; wanted a finite number"),
-        (table_with("777.png,1_0,4"), r"line 5, column 'pan': '1_0'; wanted a finite number"),
-        (table_with("777.png,3,nan"), r"line 5, column 'tilt': 'nan'; wanted a finite number"),
-        (table_with("777.png,-inf,3"), r"line 5, column 'pan': '-inf'; wanted a finite number"),
-        (table_with("777.png,3"), r"line 5: 2 cells; wanted 3"),
-        (table_with("777.png,3,4,5"), r"line 5: 4 cells; wanted 3"),
-        (table_with("  ,3,4"), r"line 5: no `file`; wanted the name of an image"),
-        (table_with("001.png,3,4"), r"line 5: '001\.png' stands already in line 3"),
-        (table_with("./001.png,3,4"), r"line 5: '\./001\.png' stands already in line 3"),
-        (table_with("a/..//001.png,3,4"), r"line 5: 'a/\.\.//001\.png' stands already in line 3"),
-        ('file,pan\n"000.png,3', r"cannot be read .* wanted UTF-8 text"),
-        ("file,pan,split\n000.png,3,trian", r"line 2, column `split`: 'trian'; .* Did you mean 'train'\?"),
+        ("file,note\n000.png,hello", r"has no column of numbers besides `file` and `split`"),
+        (table_with("777.png,abc,4"), r"line 5, column 'pan': 'abc' is no finite number"),
+        (table_with("777.png,,4"), r"line 5, column 'pan': '' is no finite number"),
+        (table_with("777.png,1_0,4"), r"line 5, column 'pan': '1_0' is no finite number"),
+        (table_with("777.png,3,nan"), r"line 5, column 'tilt': 'nan' is no finite number"),
+        (table_with("777.png,-inf,3"), r"line 5, column 'pan': '-inf' is no finite number"),
+        (table_with("777.png,3"), r"line 5: the line has 2 cells, but the first line names 3"),
+        (table_with("777.png,3,4,5"), r"line 5: the line has 4 cells, but the first line names 3"),
+        (table_with("  ,3,4"), r"line 5: The column `file` is empty\. Write the name of an image"),
+        (table_with("001.png,3,4"), r"line 5: '001\.png' is already listed in line 3"),
+        (table_with("./001.png,3,4"), r"line 5: '\./001\.png' is already listed in line 3"),
+        (table_with("a/..//001.png,3,4"), r"line 5: 'a/\.\.//001\.png' is already listed in line 3"),
+        ('file,pan\n"000.png,3', r"cannot be read .* Save it as UTF-8 text"),
+        (
+            "file,pan,split\n000.png,3,trian",
+            r"line 2, column `split`: 'trian' is no split.* Did you mean 'train'\?",
+        ),
         (
             "file,pan,split\n000.png,3,train",
             r"The validation split is empty \(1 images in all, 0 unreadable\)",
@@ -119,31 +126,33 @@ def table_with(line: str, header: str = "file,pan,tilt", place: int = 3) -> str:
 )
 def test_wrong_tables_are_refused(tmp_path: Path, table: str, message: str) -> None:
     with pytest.raises(DataError, match=message):
-        prepared(folder(tmp_path, table, 30))
+        prepared(write_folder(tmp_path, table, 30))
 
 
-def test_what_is_missing_is_said(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"labels\.csv: no such file; wanted a table .* data\.csv"):
-        prepared(folder(tmp_path), csv="labels.csv")
-    with pytest.raises(DataError, match=r"names 'pam', which .* does not have\. Did you mean 'pan'\?"):
+def test_messages_about_missing_names_suggest_a_remedy(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"labels\.csv does not exist; expected a table .* data\.csv"):
+        prepared(write_folder(tmp_path), csv="labels.csv")
+    with pytest.raises(
+        DataError, match=r"names the column 'pam', which .* does not have\. Did you mean 'pan'\?"
+    ):
         prepared(tmp_path, angle_columns=["pam"])
-    with pytest.raises(DataError, match=r"column 'note': 'text'; wanted a finite number"):
+    with pytest.raises(DataError, match=r"column 'note': 'text' is no finite number"):
         prepared(tmp_path, angle_columns=["note"])
     with pytest.raises(DataError, match="angle_columns is empty"):
         prepared(tmp_path, angle_columns=[])
     with pytest.raises(
-        DataError, match=r"data\.mirror names 'pam', which is no angle\. Did you mean 'pan'\?"
+        DataError, match=r"data\.mirror names 'pam', which is no angle of the table\. Did you mean 'pan'\?"
     ):
         prepared(tmp_path, mirror=["pam"])
     (tmp_path / "angles.csv").write_bytes("file,pan\nä.png,3".encode("latin-1"))
-    with pytest.raises(DataError, match=r"angles\.csv: cannot be read .* wanted UTF-8 text"):
+    with pytest.raises(DataError, match=r"angles\.csv: cannot be read .* Save it as UTF-8 text"):
         prepared(tmp_path)
 
 
 def test_table_written_by_a_spreadsheet(tmp_path: Path) -> None:
     """Check that a byte-order mark, carriage returns, quotes and blank lines are accepted."""
     text = "file,pan\r\n" + "".join(f'"{n:03d}.png", {10 * n}.5\r\n,\r\n' for n in range(40))
-    folder(tmp_path)
+    write_folder(tmp_path)
     (tmp_path / "angles.csv").write_bytes(b"\xef\xbb\xbf" + text.encode())
     data = prepared(tmp_path)
     assert sum(len(fields(data, split)["index"]) for split in SPLITS) == 40
@@ -155,9 +164,9 @@ def radians_table(values: Sequence[float]) -> str:
 
 def test_radians_are_noticed(tmp_path: Path) -> None:
     values = np.linspace(-3.1, 3.1, 40).round(4).tolist()
-    message = r"looks like radians; wanted degrees\. Set data\.angles_in=radians"
+    message = r"looks like radians, but degrees are expected\. Set data\.angles_in=radians"
     with pytest.raises(DataError, match=message):
-        prepared(folder(tmp_path, radians_table(values)))
+        prepared(write_folder(tmp_path, radians_table(values)))
     for unit, factor in (("radians", 1.0), ("degrees", math.pi / 180)):
         data = prepared(tmp_path, angles_in=unit)
         targets = torch.cat([fields(data, split)["target"] for split in SPLITS])
@@ -170,7 +179,7 @@ def test_radians_are_noticed(tmp_path: Path) -> None:
 )
 def test_small_degrees_are_not_refused_without_reason(tmp_path: Path, values: list[float]) -> None:
     rows = [f"{index:03d}.png,{value},{SPLITS[index % 3]}" for index, value in enumerate(values)]
-    prepared(folder(tmp_path, "file,pan,split\n" + "\n".join(rows)))
+    prepared(write_folder(tmp_path, "file,pan,split\n" + "\n".join(rows)))
 
 
 def test_augment_changes_the_sign_of_the_named_angles_only(tmp_path: Path) -> None:
@@ -178,7 +187,7 @@ def test_augment_changes_the_sign_of_the_named_angles_only(tmp_path: Path) -> No
         "input": torch.randint(0, 256, (64, 3, 8, 8), dtype=torch.uint8),
         "target": torch.rand(64, 2) + 0.1,
     }
-    data = prepared(folder(tmp_path), mirror=["tilt"], jitter=0.0)
+    data = prepared(write_folder(tmp_path), mirror=["tilt"], jitter=0.0)
     varied = data.augment(batch)
     flipped = (255 * varied["input"] - batch["input"].flip(-1)).abs().amax((1, 2, 3)) < 0.01
     assert 15 < int(flipped.sum()) < 50
@@ -190,7 +199,7 @@ def test_augment_changes_the_sign_of_the_named_angles_only(tmp_path: Path) -> No
 
 
 def test_read_gives_inputs_as_the_splits_hold_them(tmp_path: Path) -> None:
-    data = prepared(folder(tmp_path), grayscale=True)
+    data = prepared(write_folder(tmp_path), grayscale=True)
     names = [name for name in ("000.png", "001.png", "002.png", "003.png") if split_of(name) == "train"]
     read = data.read([tmp_path / name for name in names])
     assert isinstance(read, Fields)
@@ -210,7 +219,7 @@ def test_config_out_of_range(key: str, value: Any) -> None:
 def test_any_text_for_a_table_is_refused_with_a_sentence(
     tmp_path_factory: pytest.TempPathFactory, text: str
 ) -> None:
-    place = tmp_path_factory.mktemp("any")
-    (place / "angles.csv").write_text("file,pan\n" + text, encoding="utf-8", errors="replace", newline="")
+    root = tmp_path_factory.mktemp("any")
+    (root / "angles.csv").write_text("file,pan\n" + text, encoding="utf-8", errors="replace", newline="")
     with pytest.raises(DataError):
-        prepared(place)
+        prepared(root)
