@@ -66,8 +66,8 @@ class Mean(Metric):
     """Base class of metrics that are a mean over samples, of one number or several, with its standard error.
 
     A subclass calls `start` in its constructor, `add_samples` in `update` and `mean_and_error` in `compute`. The states
-    are the sums of the numbers and of their squares. They suit numbers that are not negative, where no large mean hides a
-    small spread (for scores in [0, 2] float64 resolves a spread of 1e-8).
+    are the sums of the numbers and of their squares. They suit numbers that are not negative, where no large mean hides
+    a small spread (for scores in [0, 2] float64 resolves a spread of 1e-8).
     """
 
     count: Tensor

@@ -229,7 +229,8 @@ FURTHER_FAULTS = (
     Fault("power about another place", HEIGHT,
           {"tempered_density": lambda d, t: Gaussian(d.location * t, d.scale * t.sqrt())}, "tempered: power"),
     Fault("power of the first number only", PLACE,
-          {"tempered_density": lambda d, t: Gaussian(d.location, d.scale * torch.stack([t.sqrt(), t / t]))}, "tempered: power"),
+          {"tempered_density": lambda d, t: Gaussian(d.location, d.scale * torch.stack([t.sqrt(), t / t]))},
+          "tempered: power"),
     # pick
     Fault("pick: the next item", HEIGHT, {"pick": lambda d, i: pick(d, 1 - i)}, "pick"),
     Fault("pick: the first item always", ONE, {"pick": lambda d, i: pick(d, 0 * i)}, "pick"),
@@ -238,11 +239,15 @@ FURTHER_FAULTS = (
           {"pick": lambda d, i: pick(Gaussian(d.location, d.scale.flip(-2)), i)}, "pick"),
     Fault("a mixture draws the other component", CLASSES, {"pick": lambda d, i: pick(d, 1 - i)},
           "mixture: samples follow log_prob"),
-    # slope, about, normals, peaks and scales
-    Fault("slope: half the stiffness", HEIGHT, {"quadratic_bound": lambda d, v: changed_slope(d, v, 1, 0.5)}, "quadratic_bound"),
-    Fault("slope: the pull pushes", ONE, {"quadratic_bound": lambda d, v: changed_slope(d, v, -1, 1)}, "quadratic_bound"),
+    # quadratic_bound, recentre, normals, mode_candidates and peak_widths
+    Fault("slope: half the stiffness", HEIGHT,
+          {"quadratic_bound": lambda d, v: changed_slope(d, v, 1, 0.5)}, "quadratic_bound"),
+    Fault("slope: the pull pushes", ONE,
+          {"quadratic_bound": lambda d, v: changed_slope(d, v, -1, 1)}, "quadratic_bound"),
     Fault("slope: of log_prob without the constant", HEIGHT,
-          {"quadratic_bound": lambda d, v: quadratic_bound(d, v)._replace(log_prob=d.log_prob(v) + d.scale.log().sum(-1))}, "quadratic_bound"),  # pyright: ignore
+          {"quadratic_bound":
+           lambda d, v: quadratic_bound(d, v)._replace(log_prob=d.log_prob(v) + d.scale.log().sum(-1))},  # pyright: ignore
+          "quadratic_bound"),
     Fault("about: adds the place", HEIGHT, {"recentre": lambda d, i, p: recentre(d, i, -p)}, "recentre"),
     Fault("about: forgets the place", ONE, {"recentre": lambda d, i, p: recentre(d, i, 0 * p)}, "recentre"),
     Fault("about: rows in order whatever the index", HEIGHT,
@@ -253,11 +258,14 @@ FURTHER_FAULTS = (
           {"normals": lambda d: normals(d)._replace(mean=0 * d.location.double())}, "normals"),  # pyright: ignore
     Fault("distance without the scales", PLACE,
           {"mahalanobis": lambda d, v: (v - d.location).square().sum(-1).double()}, "normals"),
-    Fault("scales: logarithms", HEIGHT, {"peak_widths": lambda d: peak_widths(d).log() - 9}, "mode candidates and peak widths"),
-    Fault("peaks without the peak's dimension", HEIGHT, {"mode_candidates": lambda d: d.mode}, "mode candidates and peak widths"),
+    Fault("scales: logarithms", HEIGHT, {"peak_widths": lambda d: peak_widths(d).log() - 9},
+          "mode candidates and peak widths"),
+    Fault("peaks without the peak's dimension", HEIGHT, {"mode_candidates": lambda d: d.mode},
+          "mode candidates and peak widths"),
     # of several numbers
     Fault("each_cdf at half the scale", IMAGE,
-          {"marginal_cdfs": lambda d, v: marginal_cdfs(d, d.location + 2 * (v - d.location))}, "marginal_cdfs", {"scale": "number"}),
+          {"marginal_cdfs": lambda d, v: marginal_cdfs(d, d.location + 2 * (v - d.location))}, "marginal_cdfs",
+          {"scale": "number"}),
     Fault("mean of the first number for all", POINT, {"mean": lambda d: d.location[..., :1].expand_as(d.location)},
           "mean and variance"),
     Fault("variance of three numbers is the deviation", POINT, {"variance": lambda d: d.scale}, "mean and variance"),

@@ -43,9 +43,9 @@ __all__ = [
     "circular",
     "circular_entropy",
     "circular_grid",
+    "estimate_of_sum",
     "marginal",
     "median",
-    "estimate_of_sum",
     "pick",
     "take",
 ]  # some of these moved to other files; the old import path keeps working

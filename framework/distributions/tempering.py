@@ -193,8 +193,8 @@ class CircularPower(Distribution):
                 raise UserError(
                     f"{type(density).__name__} at temperature {float(temperature.detach()):g} is too narrow for a grid "
                     f"of {MOST_POINTS} angles (its mass is uncertain by {off.max().item():.2g} nats). Register "
-                    "its power with `framework.distributions.protocol.tempered_density.register`, or raise the temperature's "
-                    "lower bound."
+                    "its power with `framework.distributions.protocol.tempered_density.register`, or raise the "
+                    "temperature's lower bound."
                 )
             off = self._fill()
 

@@ -108,8 +108,9 @@ def require_promised(sets: ValueSet, mass: float, by: str) -> None:
             f"and it has no such ends. Leave {by} out: the set's columns are printed without it."
         )
     raise ConfigError(
-        f"{by}={mass:g}, but the sets of this model promise to hold {sets.stated_probability:g} of the targets, and no other "
-        f"interval of it promises anything. Give {by}={sets.stated_probability:g}, or leave it out: the set is printed anyway."
+        f"{by}={mass:g}, but the sets of this model promise to hold {sets.stated_probability:g} of the targets, "
+        f"and no other interval of it promises anything. Give {by}={sets.stated_probability:g}, or leave it out: the "
+        "set is printed anyway."
     )
 
 

@@ -539,9 +539,9 @@ def require_fit(data: Data, description: Description) -> None:
     found = data.input_shape, data.target.kind, data.target.names, data.target.size
     if wanted != found:
         raise CheckpointError(
-            f"{description.path} reads inputs of shape {wanted[0]} and predicts {wanted[1]} ({target.listed_names}), but "
-            f"the data has inputs of shape {found[0]} and targets {found[1]} ({data.target.listed_names}). Give the data "
-            "it was trained on."
+            f"{description.path} reads inputs of shape {wanted[0]} and predicts {wanted[1]} ({target.listed_names}), "
+            f"but the data has inputs of shape {found[0]} and targets {found[1]} ({data.target.listed_names}). Give the "
+            "data it was trained on."
         )
 
 

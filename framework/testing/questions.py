@@ -239,7 +239,7 @@ def normal_forms(density: Distribution, worst: Worst) -> None:
 
 
 def candidates(density: Distribution, worst: Worst) -> None:
-    """Check that `mode_candidates` and `peak_widths` are finite and of the documented shapes, and that all scales are above 0."""
+    """Check that `mode_candidates` and `peak_widths` are finite and of the documented shapes, and all widths above 0."""
     places = mode_candidates(density)
     shape = (*density.batch_shape, *density.event_shape)
     worst.same("shape of a peak", tuple(places.shape[1:]), shape)

@@ -105,7 +105,7 @@ class Networks(Latent):
         """Return a copy with tempered components."""
         return replace(
             self,
-            component=lambda raw: tempered(self.component(raw), temperature),
+            component=lambda raw: tempered_density(self.component(raw), temperature),
             rows=lambda index: self.rows(index).tempered(temperature),
         )
 

@@ -62,7 +62,7 @@ class Networks(Latent):
 
     def tempered(self, temperature: Tensor) -> "Networks":
         """Return a copy with tempered components."""
-        return replace(self, component=lambda raw: tempered(self.component(raw), temperature))
+        return replace(self, component=lambda raw: tempered_density(self.component(raw), temperature))
 
 
 class SCVAEHead(DensityHead):

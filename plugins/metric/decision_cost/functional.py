@@ -77,8 +77,8 @@ def region_probabilities(
 ) -> Float[Tensor, "batch region"]:
     """Return the masses of the regions into which edges cut a line or a circle, float64; see `regions`.
 
-    The masses are exact where `protocol.cdf`, `protocol.arc_probability` or `circular_moments` are exact; otherwise they are shares
-    of `samples` draws.
+    The masses are exact where `protocol.cdf`, `protocol.arc_probability` or `circular_moments` are exact;
+    otherwise they are shares of `samples` draws.
 
     Args:
         density: density of one real or one angle, batch_shape (batch,).

@@ -41,7 +41,8 @@ def transform(density: Distribution, value: Tensor, steps: int) -> Transform:
     if low is None or high is None:
         raise UserError(
             f"{type(density).__name__} over {tuple(density.event_shape)} knows no distribution function of each of its "
-            "numbers. Register one with `framework.distributions.protocol.marginal_cdfs.register`, or leave out this metric."
+            "numbers. Register one with `framework.distributions.protocol.marginal_cdfs.register`, or leave out "
+            "this metric."
         )
     if steps:
         low, high = low.masked_fill(value < half, 0.0), high.masked_fill(value > 1 - half, 1.0)

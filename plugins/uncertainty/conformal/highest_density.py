@@ -210,7 +210,7 @@ class Line:
         return torch.cat(chosen)
 
     def _candidates(self) -> Float[Tensor, "candidate item"]:
-        """Return one of the density's `mode_candidates` in each quarter of their scale, since hundreds may lie on one hump."""
+        """Return one of the `mode_candidates` in each quarter of their scale, since hundreds may lie on one hump."""
         places = mode_candidates(self.density).squeeze(-1).double()
         if self.closed:
             places = wrap(places)
