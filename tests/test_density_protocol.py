@@ -662,7 +662,7 @@ def test_defaults_do_not_claim_to_be_exact() -> None:
     assert mahalanobis(density, value) is value_set(density) is None
     with pytest.raises(UserError, match=r"protocol\.marginal\.register"):
         marginal(Dirichlet(torch.ones(3)), 0)
-    with pytest.raises(UserError, match=r"protocol\.tempered\.register"):
+    with pytest.raises(UserError, match=r"protocol\.tempered_density\.register"):
         tempered_density(Dirichlet(torch.ones(3)), WARM)
 
 

@@ -540,8 +540,8 @@ def require_fit(data: Data, description: Description) -> None:
     if wanted != found:
         raise CheckpointError(
             f"{description.path} reads inputs of shape {wanted[0]} and predicts {wanted[1]} ({target.listed_names}), "
-            f"but the data has inputs of shape {found[0]} and targets {found[1]} ({data.target.listed_names}). Give the "
-            "data it was trained on."
+            f"but the data has inputs of shape {found[0]} and targets {found[1]} ({data.target.listed_names}). Give "
+            "the data it was trained on."
         )
 
 

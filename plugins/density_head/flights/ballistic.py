@@ -180,7 +180,7 @@ class BallisticHead(DensityHead, Fitted):
         """Require flights with a finite course; implausible physical constants lead to infinite ones.
 
         Raises:
-            NonFiniteAnswer: the message names the first such row.
+            NonFiniteParameters: the message names the first such row.
         """
         finite = estimate.covariance.flatten(1).isfinite().all(-1) & places.flatten(1).isfinite().all(-1)
         if not finite.all():

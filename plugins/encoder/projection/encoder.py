@@ -184,8 +184,8 @@ class Projection(Encoder):
     """Coloured points as the image that the canonical camera sees (`framework.geometry.camera`).
 
     Clouds hold x, y, z in that camera's coordinates, metres (`Camera.to_canonical` converts from any camera). Then
-    follow red, green, blue: numbers in [0, 1] as files hold them, not linear RGB. Further columns are not read. Features are
-    (4 · levels, height, width), five channels more with `splat`, of the clouds' dtype; see `project`.
+    follow red, green, blue: numbers in [0, 1] as files hold them, not linear RGB. Further columns are not read.
+    Features are (4 · levels, height, width), five channels more with `splat`, of the clouds' dtype; see `project`.
 
     Args:
         input_shape: (points, columns) of the largest cloud.

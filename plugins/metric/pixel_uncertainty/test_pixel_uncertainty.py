@@ -159,7 +159,7 @@ def test_what_it_cannot_judge_gets_a_sentence() -> None:
         build("metric", resolve("metric", {"name": "pixel_uncertainty"}), target=Target("real", ("x",)))
     with pytest.raises(DataError, match="looks inside the true mask too"):
         measured(laplaces(place, wide), value, masked=True)
-    with pytest.raises(UserError, match=r"protocol\.each_cdf\.register"):
+    with pytest.raises(UserError, match=r"protocol\.marginal_cdfs\.register"):
         measured(Independent(HalfNormal(torch.full_like(value, 5.0)), 3), value)
     place[1, 0, 0, 0] = torch.nan
     with pytest.raises(
