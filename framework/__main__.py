@@ -5,17 +5,17 @@ import sys
 
 
 def forget_working_directory() -> None:
-    """Take away the entry of `sys.path` that `python -m` puts first, in the processes that this one starts as well.
+    """Remove the working directory, which `python -m` puts first, from `sys.path` of this process and of its children.
 
-    The working directory may be an unpacked archive that brings a `yaml.py` or `hydra_plugins/`. It stays where the
-    framework itself lives there.
+    The working directory may be an unpacked archive that contains a `yaml.py` or `hydra_plugins/`. It is kept if it is
+    the folder that contains the framework.
     """
-    own = os.path.realpath(os.path.join(os.path.dirname(__file__), os.pardir))  # noqa: PTH118, PTH120 - no import
+    framework_folder = os.path.realpath(os.path.join(os.path.dirname(__file__), os.pardir))  # noqa: PTH118, PTH120 - no import
     try:
-        here = os.path.realpath(os.getcwd())  # noqa: PTH109
+        working_directory = os.path.realpath(os.getcwd())  # noqa: PTH109
     except OSError:  # it was deleted
         return
-    if sys.path and os.path.realpath(sys.path[0]) == here != own:
+    if sys.path and os.path.realpath(sys.path[0]) == working_directory != framework_folder:
         del sys.path[0]
         os.environ["PYTHONSAFEPATH"] = "1"
 

@@ -47,8 +47,9 @@ def _run() -> None:
     spec = find_spec("plugins")
     if spec is None or not spec.origin or Path(spec.origin).resolve() != expected:
         raise ConfigError(
-            f"The package `plugins` was found at {spec and spec.origin}, not at {expected}: a file or folder of that "
-            "name hides it. Rename it, take its folder out of PYTHONPATH, or use `python -P -m framework`."
+            f"The package `plugins` was found at {spec and spec.origin}, not at {expected}: a file or folder of "
+            "that name hides it. Rename that file or folder, remove its parent folder from PYTHONPATH, or use "
+            "`python -P -m framework`."
         )
     if sys.argv[1:] == ["mode=plugins"]:  # needs no config, so it makes no run folder
         from framework.modes.plugins import show

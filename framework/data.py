@@ -23,7 +23,7 @@ README describes.
 "symmetry", int64, is optional. A data set sets it if it knows the symmetry of an object, for example of a generated
 one. The figures of densities read it. The value n means that the object looks the same after 1/n of a turn about its
 vertical axis, so that n values of the first angle are equally right. 1 means no symmetry, and so does a missing field.
-0 means that every turn looks the same, so that the object has no direction.
+0 means that the object looks the same after every turn, so that it has no direction.
 
 "color", "mask" and "depth" are optional too. They hold the true image in the layout of
 `framework.renderer.Renderer.channels`, and metrics of images read them.
@@ -159,31 +159,33 @@ class Data(ABC):
             DataError: there is no file, or a file cannot be read; the message names that file.
         """
 
-    def inputs(self, given: Any) -> Tensor:
+    def inputs(self, user_data: Any) -> Tensor:
         """Return the inputs that a user gives to a trained model as a batch; works without `prepare`.
 
         The default calls `read` on files, and takes an array of inputs, or of one input, as it is. A data set overrides
         this method if it scales its inputs, or if its users have another format at hand (a table, an image).
 
         Raises:
-            DataError: `given` is neither files nor an array of inputs, or the array has another shape.
+            DataError: `user_data` is neither files nor an array of inputs, or the array has another shape.
         """
-        files = [given] if isinstance(given, str | Path) else given
+        files = [user_data] if isinstance(user_data, str | Path) else user_data
         if isinstance(files, Sequence) and files and all(isinstance(item, str | Path) for item in files):
             dataset = self.read([Path(item) for item in files])
             items = [dataset[index]["input"] for index in range(len(dataset))]  # type: ignore[arg-type]
             if len({item.shape for item in items}) > 1:
-                raise DataError("These files give inputs of different sizes. Give them one by one.")
+                raise DataError(
+                    "The files hold inputs of different sizes, which form no batch. Give the files one by one."
+                )
             return torch.stack(items)
-        return as_inputs(given, self.input_shape)
+        return as_inputs(user_data, self.input_shape)
 
-    def user_batch(self, given: Any) -> Batch:
+    def user_batch(self, user_data: Any) -> Batch:
         """Return the batch that a user gives to a trained model: "input", and the fields that `frame` reads.
 
         Raises:
             DataError: as in `inputs`.
         """
-        return {"input": self.inputs(given)}
+        return {"input": self.inputs(user_data)}
 
     def frame(self, batch: Batch) -> Frame | None:
         """Return the frames of the samples of a batch, with which predictions are mapped to the user's unit.
@@ -208,8 +210,8 @@ class Data(ABC):
         """
         if state:
             raise DataError(
-                f"{type(self).__name__} keeps nothing beside its config, but was given {', '.join(state)}. Give the "
-                "data that the model was trained on."
+                f"{type(self).__name__} has no stored state, but the model's data set has stored {', '.join(state)}. "
+                "Give the data that the model was trained on."
             )
 
     @abstractmethod
@@ -231,7 +233,7 @@ class Data(ABC):
 
 
 class Mapped(ABC):
-    """Second base of a data set whose samples are places in one file, of which maps can be drawn.
+    """Second base of a data set whose samples are positions in one file, such that predictions can be drawn as maps.
 
     An example is a data set whose samples are the voxels of a volume.
     """
@@ -251,38 +253,41 @@ class Mapped(ABC):
         """
 
 
-def as_inputs(given: Any, shape: tuple[int, ...]) -> Tensor:
+def as_inputs(user_data: Any, shape: tuple[int, ...]) -> Tensor:
     """Return an array, or whatever NumPy can turn into an array, as a batch of inputs of `shape`.
 
     One input becomes a batch of one. Clouds, of shape (points, columns), may have any number of points.
 
     Raises:
-        DataError: `given` is no array of numbers, or has another shape.
+        DataError: `user_data` is no array of numbers, or has another shape.
     """
-    wanted = "×".join(["any number", str(shape[-1])] if len(shape) == 2 else map(str, shape)) or "one number"
+    expected_shape = (
+        "×".join(["any number", str(shape[-1])] if len(shape) == 2 else map(str, shape)) or "one number"
+    )
     try:
-        found = (
-            given
-            if isinstance(given, Tensor)
-            else torch.from_numpy(np.require(given, requirements=["C", "W"]))
+        inputs = (
+            user_data
+            if isinstance(user_data, Tensor)
+            else torch.from_numpy(np.require(user_data, requirements=["C", "W"]))
         )
     except (TypeError, ValueError) as error:
         raise DataError(
-            f"{type(given).__name__} is no input of this model; wanted an array of inputs of shape {wanted}, or files."
+            f"Got an object of type {type(user_data).__name__}, but the model reads files or an array of inputs of "
+            f"shape {expected_shape}."
         ) from error
-    if found.is_complex():
+    if inputs.is_complex():
         raise DataError(
-            "complex numbers are no input of this model; wanted real ones. Give their magnitudes, say."
+            "Got complex numbers, but the model reads real numbers. Give their magnitudes, for example."
         )
-    if found.dim() == len(shape):
-        found = found[None]
+    if inputs.dim() == len(shape):
+        inputs = inputs[None]
     fixed = shape[1:] if len(shape) == 2 else shape
-    if found.dim() != len(shape) + 1 or tuple(found.shape[found.dim() - len(fixed) :]) != tuple(fixed):
+    if inputs.dim() != len(shape) + 1 or tuple(inputs.shape[inputs.dim() - len(fixed) :]) != tuple(fixed):
         raise DataError(
-            f"an array of shape {'×'.join(map(str, found.shape))} is no batch of inputs of shape {wanted}; give "
-            f"(batch, {', '.join(map(str, shape))}), or one input."
+            f"Got an array of shape {'×'.join(map(str, inputs.shape))}, but the model reads inputs of shape "
+            f"{expected_shape}. Give an array of shape (batch, {', '.join(map(str, shape))}), or one input."
         )
-    return found
+    return inputs
 
 
 def _from_three_methods(data: Any) -> Splits:

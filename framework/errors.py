@@ -1,4 +1,4 @@
-"""The errors that a user can cause; each message says what came, what was wanted and what to do."""
+"""Errors that a user can cause; each message says what the framework got, what it requires and what to do."""
 
 import re
 from collections.abc import Iterable
@@ -7,24 +7,27 @@ from itertools import islice
 
 
 class UserError(Exception):
-    """An error that the user can mend. It is printed as a sentence, without a stack trace.
+    """An error that the user can correct. Its message is printed without a stack trace.
 
     Characters that control a terminal are escaped, because a message may quote a file of another person.
 
-    If a worker of a `DataLoader` raises such an error, torch raises a new one of the same class whose message is the
-    worker's stack trace. Only the sentence is kept of that message.
+    If a worker of a `DataLoader` raises such an error, torch raises a new error of the same class whose message is the
+    worker's stack trace. The constructor then keeps only the original message.
     """
 
-    def __init__(self, *said: object) -> None:
+    def __init__(self, *arguments: object) -> None:
         super().__init__(
-            *(escape_unprintable(_sentence(one, type(self))) if isinstance(one, str) else one for one in said)
+            *(
+                escape_unprintable(_sentence(argument, type(self))) if isinstance(argument, str) else argument
+                for argument in arguments
+            )
         )
 
 
-def escape_unprintable(text: str, kept: str = "\n\t") -> str:
-    """Return a text in which unprintable characters, except those in `kept`, are escaped: none controls a terminal."""
+def escape_unprintable(text: str, allowed: str = "\n\t") -> str:
+    """Return a text in which unprintable characters, except those in `allowed`, are escaped: none controls a terminal."""
     return "".join(
-        letter if letter.isprintable() or letter in kept else repr(letter)[1:-1]
+        letter if letter.isprintable() or letter in allowed else repr(letter)[1:-1]
         for letter in escape_undecodable(text)
     )
 
@@ -42,17 +45,17 @@ def _written_out(letter: re.Match[str]) -> str:
     return f"\\x{number - 0xDC00:02x}" if 0xDC80 <= number <= 0xDCFF else f"\\u{number:04x}"
 
 
-def _sentence(said: str, kind: type[UserError]) -> str:
+def _sentence(message: str, kind: type[UserError]) -> str:
     """Return the error's message, extracted from the text that `torch._utils.ExceptionWrapper` makes of the error."""
-    if not re.match(r"Caught \w+ in .*\.\nOriginal Traceback \(most recent call last\):\n", said):
-        return said
+    if not re.match(r"Caught \w+ in .*\.\nOriginal Traceback \(most recent call last\):\n", message):
+        return message
     # The trace of an error that was raised from another one follows the other's trace.
     between = r"\n\n(?:The above|During handling of the above) exception,? .*:\n\n(?=Traceback )"
-    trace = re.split(between, said)[-1].removesuffix("\n")
+    trace = re.split(between, message)[-1].removesuffix("\n")
     # Every line before the sentence is indented. The line of a class defined in a script names no module.
     name = rf"(?:{re.escape(kind.__module__)}\.)?{re.escape(kind.__qualname__)}"
-    found = re.search(rf"^{name}(?:: (.*))?\Z", trace, re.DOTALL | re.MULTILINE)
-    return (found[1] or "") if found else said
+    match = re.search(rf"^{name}(?:: (.*))?\Z", trace, re.DOTALL | re.MULTILINE)
+    return (match[1] or "") if match else message
 
 
 class ConfigError(UserError):
@@ -75,28 +78,28 @@ class NonFiniteParameters(ValueError):
     """Error for NaN or infinity in the raw parameters that a network gives to a density head."""
 
 
-def shorten(damage: object, most: int = 200) -> str:
-    """Return the content of a file or the message of a library for an error message.
+def shorten(content: object, limit: int = 200) -> str:
+    """Return the content of a file, or the message of a library, as a short text for an error message.
 
-    The text is shortened to `most` characters, and characters that control a terminal are escaped.
+    The text is shortened to `limit` characters, and characters that control a terminal are escaped.
     """
-    text = " ".join(line.strip() for line in str(damage).splitlines())
-    text = text if len(text) <= most else text[: most - 1] + "…"
-    return escape_unprintable(text, kept="")
+    text = " ".join(line.strip() for line in str(content).splitlines())
+    text = text if len(text) <= limit else text[: limit - 1] + "…"
+    return escape_unprintable(text, allowed="")
 
 
-def quote(damage: object) -> str:
-    """Return the result of `shown` in quotation marks."""
-    return shorten(repr(damage))
+def quote(content: object) -> str:
+    """Return the representation of an object, shortened as by `shorten`, for an error message."""
+    return shorten(repr(content))
 
 
-LIKE = 0.65
+LEAST_SIMILARITY = 0.65
 """Smallest similarity of a name that is suggested: 'resnet' and 'unet' have 0.6, 'mpl' and 'mlp' 0.67."""
 LISTED_WHOLE, LISTED = 24, 8
 """Largest number of names that a message lists in full, and the number of names that it lists if there are more."""
 
 
-def nearest_name(word: str, known: Iterable[str], likeness: float = LIKE) -> str | None:
+def nearest_name(word: str, known: Iterable[str], likeness: float = LEAST_SIMILARITY) -> str | None:
     """Return the name most similar to `word`, or None if no name is similar.
 
     'lr' is similar to learning_rate, and 'moons' to moons/everything.
@@ -109,7 +112,7 @@ def nearest_name(word: str, known: Iterable[str], likeness: float = LIKE) -> str
 
 
 def list_names(word: str, known: Iterable[str]) -> str:
-    """Return a list of all names or, if there are many, of those nearest to `word` and the number of the others."""
+    """Return all names as a text or, if there are many, the names most similar to `word` and the number of the others."""
     names = list(known)
     if len(names) <= LISTED_WHOLE:
         return ", ".join(names)
@@ -124,6 +127,6 @@ def list_names(word: str, known: Iterable[str]) -> str:
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """Return ' Did you mean ...?' with a leading space, or "" if no name is near."""
+    """Return ' Did you mean ...?' with a leading space, or "" if no name is similar."""
     near = nearest_name(word, known)
     return f" Did you mean {quote(near)}?" if near else ""

@@ -34,7 +34,7 @@ class Metric(torchmetrics.Metric, ABC):
     """Splits whose predictions `update` receives.
 
     With "outliers" it also receives the predictions on the test split of the config's `outliers`; `prediction.split`
-    tells the two apart. No predictions are made on outliers that no metric reads.
+    tells which of the two it is. No predictions are made on outliers if no metric reads them.
     """
     reads: ClassVar[frozenset[str]] = frozenset()
     """Channels of `Prediction.image` that `update` requests; the true images are `Prediction.true_image`.
@@ -94,14 +94,14 @@ class Mean(Metric):
 
 
 class HasFigure(ABC):
-    """Second base of a metric that has a figure to show."""
+    """Second base of a metric that has a figure."""
 
     figure_name: ClassVar[str]
     """Name of the figure's file, without a suffix."""
 
     @abstractmethod
     def figure(self, title: str, *, synthetic: bool) -> "Figure":
-        """Return the figure of the batches seen; called after `compute`.
+        """Return the figure of all batches so far; called after `compute`.
 
         The method imports the module that draws, so that a metric that is only computed loads no Matplotlib.
         """

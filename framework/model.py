@@ -79,19 +79,21 @@ class Model(Predictor):
             if any(True for _ in self.encoders.parameters()):
                 raise ConfigError(
                     f"{type(head).__name__} is fitted to all features at once and gives encoders no gradient, but "
-                    f"{' and '.join(type(encoder).__name__ for encoder in encoders)} learn. Leave those out."
+                    f"{' and '.join(type(encoder).__name__ for encoder in encoders)} have parameters that must be "
+                    "trained. Leave these encoders out."
                 )
             if head.size and math.prod(shape) != head.size:
                 raise ConfigError(
-                    f"{type(head).__name__} reads {head.size:,} numbers a sample, but gets {math.prod(shape):,}, of "
-                    f"shape {tuple(shape)}. Set its sizes to those of the data."
+                    f"{type(head).__name__} reads {head.size:,} numbers per sample, but gets {math.prod(shape):,}, of "
+                    f"shape {tuple(shape)}. Set the sizes of the density head to those of the data."
                 )
             self.projection: nn.Module = nn.Flatten()
         elif head.direct:
             if math.prod(shape) != head.size:
                 raise ConfigError(
                     f"The last encoder gives {'×'.join(map(str, shape))} numbers, but {type(head).__name__} reads "
-                    f"{head.size:,} as they are. Choose an encoder that gives as many, or change its channels."
+                    f"{head.size:,} numbers, without a linear layer in between. Choose an encoder that gives as many, or "
+                    "change the channels of the encoder."
                 )
             self.projection = nn.Flatten()
         elif beside:
@@ -102,7 +104,7 @@ class Model(Predictor):
                 nn.init.zeros_(self.projection.weight)
         else:
             raise ConfigError(
-                f"The last encoder ends in features of shape {shape}; wanted a vector. "
+                f"The last encoder returns features of shape {shape}, but the density head requires a vector. "
                 "Append an encoder that flattens, such as `mlp`."
             )
         self.head = head
@@ -159,8 +161,8 @@ class Backbones(Encoder):
         shape = networks[0][-1].output_shape if networks[0] else ()
         if len(shape) != 1:
             raise ConfigError(
-                f"A head with {len(sizes)} backbones wants encoders that end in a vector; the last one's features are "
-                f"of shape {shape}. Append an encoder that flattens, such as `mlp`."
+                f"A density head with {len(sizes)} backbones requires encoders that return a vector, but the last "
+                f"encoder returns features of shape {shape}. Append an encoder that flattens, such as `mlp`."
             )
         self.networks = nn.ModuleList(
             nn.Sequential(*network, nn.Linear(shape[0], size))
@@ -178,18 +180,18 @@ Computed = TypeVar("Computed")
 
 
 class SharedResult(Generic[Computed]):
-    """The last computed result and the tensor it was computed from; it keeps nothing outside of `one_pass`."""
+    """Cache of the last computed result and of the tensor from which it was computed; empty outside of `one_pass`."""
 
     last: tuple[()] | tuple[Tensor, Computed] | None = None
 
     def get_or_compute(self, inputs: Tensor, compute: Callable[[Tensor], Computed]) -> Computed:
-        """Return `compute(inputs)`, or the kept result if it was computed from the very same tensor."""
+        """Return `compute(inputs)`, or the cached result if it was computed from the same tensor object."""
         if self.last and self.last[0] is inputs:
             return self.last[1]
-        found = compute(inputs)
+        result = compute(inputs)
         if self.last is not None:
-            self.last = (inputs, found)
-        return found
+            self.last = (inputs, result)
+        return result
 
 
 @final
@@ -235,30 +237,32 @@ def one_pass(predictor: Predictor) -> Iterator[None]:
     parameters of direct heads, and the results that other modules keep in `shared_result`. The encoders of a direct
     head give images, which an objective compares as the loss does.
     """
-    found = (getattr(module, "shared_result", None) for module in predictor.modules())
-    parts = [kept for kept in found if isinstance(kept, SharedResult)]
-    for kept in parts:
-        kept.last = ()
+    candidates = (getattr(module, "shared_result", None) for module in predictor.modules())
+    caches = [cache for cache in candidates if isinstance(cache, SharedResult)]
+    for cache in caches:
+        cache.last = ()
     try:
         yield
     finally:
-        for kept in parts:
-            kept.last = None
+        for cache in caches:
+            cache.last = None
 
 
 def fitted_models(predictor: Predictor) -> list[Model]:
     """Return the models whose head is fitted at once (`Fitted`), also those inside wrappers."""
-    found = [module for module in predictor.modules() if isinstance(module, Model)]
-    return [model for model in found if isinstance(model.head, Fitted)]
+    models = [module for module in predictor.modules() if isinstance(module, Model)]
+    return [model for model in models if isinstance(model.head, Fitted)]
 
 
 def learns(predictor: Predictor) -> bool:
     """Return whether a predictor is trained by gradient: it has such parameters, and no head that is fitted at once."""
-    return not fitted_models(predictor) and any(one.requires_grad for one in predictor.parameters())
+    return not fitted_models(predictor) and any(
+        parameter.requires_grad for parameter in predictor.parameters()
+    )
 
 
 def independent_penalty(values: Float[Tensor, "batch *member"]) -> Float[Tensor, "batch"]:
-    """Return a penalty per sample, (batch,), from the penalties of its members, so that each member trains as if alone.
+    """Return a penalty per sample, (batch,), from the penalties of the members, such that each member trains as if alone.
 
     The value is the mean over members, so it is comparable with the penalty of a single model. The gradient is that of
     the sum, so the gradient of each member is neither divided by the number of members nor changed by the others.
@@ -273,7 +277,7 @@ def independent_penalty(values: Float[Tensor, "batch *member"]) -> Float[Tensor,
 
 
 def own_sample_penalty(values: Float[Tensor, "batch"], members: int) -> Float[Tensor, "batch"]:
-    """Return penalties of samples, each seen by one member only, with gradients scaled by the number of members.
+    """Return penalties of samples that one member each sees, with gradients multiplied by the number of members.
 
     Their mean is the mean of `values`. In each member the gradient of that mean is the gradient of the mean over the
     member's own samples.

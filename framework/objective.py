@@ -20,8 +20,8 @@ Share = Annotated[float, Field(ge=0, lt=1)]
 class AdversaryOptimizer:
     """Optimiser of Adam's family for an adversary's parameters, which are trained against the predictor's.
 
-    Its step is taken together with the predictor's step, from gradients at the same weights. This equals two optimisers
-    whose losses are both computed before either of them steps. Its gradients are clipped separately.
+    The step of this optimiser is taken together with the predictor's step, from gradients at the same weights. This
+    equals two optimisers whose losses are both computed before either of them steps. Gradients are clipped separately.
 
     Attributes:
         learning_rate: factor on its steps.
@@ -48,12 +48,12 @@ class Objective(nn.Module, ABC):
     adversary_optimizer: AdversaryOptimizer | None = None
     """Optimiser of the objective's own parameters, if they are trained against the predictor's.
 
-    A discriminator's parameters are an example. Their loss is part of the value that `forward` returns; what a term
-    detaches decides which of the two sides it trains. None: the objective's parameters are trained like the
-    predictor's.
+    The parameters of a discriminator are an example. Their loss is part of the value that `forward` returns. A term
+    trains only the side, predictor or adversary, whose values it does not detach. None: the objective's parameters are
+    trained by the predictor's optimiser.
     """
     logged_terms: Mapping[str, Tensor] = {}
-    """Detached scalars of the last batch that are logged beside the loss: each term by its name."""
+    """Detached scalars of the last batch that are logged beside the loss, by the name of the term."""
 
     @abstractmethod
     def forward(self, predictor: Predictor, batch: Batch) -> Float[Tensor, ""]:

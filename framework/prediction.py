@@ -49,7 +49,7 @@ class Prediction:
         self.samples = samples
         self.split: Split = split
         self.reads = frozenset(reads)
-        self._given = draw
+        self._noise_source = draw
         self._draw = draw or (lambda purpose: nullcontext())
 
     def in_frame(self, frame: Frame | None) -> "Prediction":
@@ -57,7 +57,7 @@ class Prediction:
         if frame is None:
             return self
         density = AffineDensity(self.density, *(part.to(self.batch["input"]) for part in frame))
-        return Prediction(density, self.batch, self.samples, self.split, self._given, self.reads)
+        return Prediction(density, self.batch, self.samples, self.split, self._noise_source, self.reads)
 
     @property
     def target(self) -> Tensor:
@@ -160,8 +160,8 @@ def true_image(batch: Batch, channel: str) -> Tensor:
     """
     if channel not in batch:
         raise DataError(
-            f"The true {channel!r} of every image was asked for, but batches have only {', '.join(batch)}. "
-            "Choose data that give it, or leave out the metric that reads it."
+            f"A metric reads the true {channel!r} of every image, but the batches have only {', '.join(batch)}. "
+            f"Choose data that have {channel!r}, or leave out the metric."
         )
     return batch[channel]
 
@@ -172,13 +172,13 @@ def table_columns(target: Target, prediction: Prediction) -> dict[str, Tensor]:
     For images it returns the entropy only, because images are stored beside the table.
     """
     if target.kind == "image":
-        found = {}
+        columns = {}
     elif target.kind == "class":
         shares = prediction.class_probabilities
-        found = {f"p_{name}": shares[:, label] for label, name in enumerate(target.names)}
+        columns = {f"p_{name}": shares[:, label] for label, name in enumerate(target.names)}
     else:
-        found = named_columns(target, prediction.point)
-    return {**found, "entropy_nats": prediction.entropy}
+        columns = named_columns(target, prediction.point)
+    return {**columns, "entropy_nats": prediction.entropy}
 
 
 def named_columns(target: Target, values: Tensor, of: str = "") -> dict[str, Tensor]:

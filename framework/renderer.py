@@ -92,44 +92,45 @@ def join_scenes(scenes: Sequence[Scene]) -> Scene:
             `smooth`.
     """
     if not scenes:
-        raise ValueError("no scene came; wanted one or more to join.")
+        raise ValueError("Got no scene to join; expected at least one.")
     paints = [scene.colors for scene in scenes if scene.colors is not None]
     paints += [image for scene in scenes if scene.texture is not None for image in scene.texture.images]
     if len({paint.shape[-1] for paint in paints}) > 1:
         raise ValueError(
-            f"colours came with {' and '.join(sorted({str(paint.shape[-1]) for paint in paints}))} channels; wanted as "
-            "many in all scenes."
+            f"The scenes have colours with {' and '.join(sorted({str(paint.shape[-1]) for paint in paints}))} channels; "
+            "expected the same number of channels in all scenes."
         )
     counts = [len(scene.vertices) for scene in scenes]
     first = accumulate(counts[:-1], initial=0)
-    faces = [_moved(scene.faces, start) for scene, start in zip(scenes, first, strict=True)]
+    faces = [_add_offset(scene.faces, start) for scene, start in zip(scenes, first, strict=True)]
     colors = None
     if any(scene.colors is not None for scene in scenes):
         channels = next(scene.colors.shape[1] for scene in scenes if scene.colors is not None)
         white = [scene.vertices.new_ones(len(scene.vertices), channels) for scene in scenes]
         colors = torch.cat(
             [
-                one if (given := scene.colors) is None else given
-                for scene, one in zip(scenes, white, strict=True)
+                white_colors if scene.colors is None else scene.colors
+                for scene, white_colors in zip(scenes, white, strict=True)
             ]
         )
     vertices = torch.cat([scene.vertices for scene in scenes])
-    return Scene(vertices, torch.cat(faces), colors, scenes[0].camera, _joined_textures(scenes))
+    return Scene(vertices, torch.cat(faces), colors, scenes[0].camera, _join_textures(scenes))
 
 
-def _moved(indices: Tensor, by: int) -> Tensor:
+def _add_offset(indices: Tensor, by: int) -> Tensor:
     """Return indices plus an offset. Small integer types become int64, since 200 + 100 is 44 in uint8."""
     return (indices if indices.is_floating_point() else indices.long()) + by
 
 
-def _joined_textures(scenes: Sequence[Scene]) -> Texture | None:
+def _join_textures(scenes: Sequence[Scene]) -> Texture | None:
     """Return one texture for the joined faces of several scenes, or None if no scene has a texture."""
     textures = [scene.texture for scene in scenes if scene.texture is not None]
     if not textures:
         return None
     if len({(texture.wrap, texture.smooth) for texture in textures}) > 1:
         raise ValueError(
-            "textures came with different wrap or smooth; wanted the same in one scene: draw them apart, or change one."
+            "The textures have different wrap or smooth, but one scene has only one value of each. Draw the scenes "
+            "separately, or change a texture."
         )
     images: list[Tensor] = []
     places, faces, shown = [], [], []
@@ -141,13 +142,20 @@ def _joined_textures(scenes: Sequence[Scene]) -> Texture | None:
             shown.append(scene.faces.new_full((len(scene.faces),), -1, dtype=torch.int64))
             continue
         of_faces = texture.faces.new_zeros(len(texture.faces)) if texture.shown is None else texture.shown
-        shown.append(torch.where(of_faces < 0, of_faces, _moved(of_faces, len(images))))
-        faces.append(_moved(texture.faces, corners))
+        shown.append(torch.where(of_faces < 0, of_faces, _add_offset(of_faces, len(images))))
+        faces.append(_add_offset(texture.faces, corners))
         places.append(texture.uv)
         images += texture.images
         corners += len(texture.uv)
-    one = textures[0]
-    return Texture(tuple(images), torch.cat(places), torch.cat(faces), torch.cat(shown), one.wrap, one.smooth)
+    first_texture = textures[0]
+    return Texture(
+        tuple(images),
+        torch.cat(places),
+        torch.cat(faces),
+        torch.cat(shown),
+        first_texture.wrap,
+        first_texture.smooth,
+    )
 
 
 class Renderer(ABC):
@@ -213,5 +221,5 @@ class Renderer(ABC):
 
         Raises:
             ValueError: the renderer cannot draw a channel; or "color" is requested of a scene without colours; or
-                shapes or indices do not fit. The message says what came and what was wanted.
+                shapes or indices do not fit. The message says what the renderer got and what it requires.
         """

@@ -8,7 +8,7 @@ from framework.errors import ConfigError
 Kind = Literal["angle", "real", "class", "image"]
 """Kinds of targets; `Target` describes them."""
 MOST = 40
-"""Largest number of names that a sentence lists in full."""
+"""Largest number of names that a message lists in full."""
 
 
 @dataclass(frozen=True)
@@ -41,19 +41,19 @@ class Target:
 
     @property
     def listed_names(self) -> str:
-        """Names of the target for a sentence; if there are very many, the first ones and the number of the others."""
+        """Names of the target as a text for a message; of very many names, the first ones and the number of the others."""
         first = self.names if len(self.names) <= MOST else self.names[: MOST // 4]
         rest = f" and {len(self.names) - len(first)} more" if len(first) < len(self.names) else ""
         return ", ".join(first) + rest
 
     def require(self, kind: Kind, by: str) -> None:
-        """Refuse a target whose kind is not `kind`, the one that `by` can describe.
+        """Refuse a target of another kind than `kind`, which is the only kind that the plugin `by` can describe.
 
         Raises:
             ConfigError: the kinds differ.
         """
         if self.kind != kind:
             raise ConfigError(
-                f"{by} describes targets of kind {kind!r}, but this data set's are {self.kind!r} "
-                f"({self.listed_names}). Choose another one, or other data."
+                f"{by} describes targets of kind {kind!r}, but the targets of this data set are of kind "
+                f"{self.kind!r} ({self.listed_names}). Choose another plugin for this target, or other data."
             )

@@ -68,7 +68,7 @@ class SeveralModels(ABC):
     """Second base of a wrapper that trains several models, each as it would train alone.
 
     Attributes:
-        trained: number of models.
+        model_count: number of models.
         own_batches: True if `loss` and `training_densities` are given one batch per model, concatenated in the order of
             the models and equally long, and each model sees its own batch only. Densities then have the batch_shape
             (rows of each batch, member). It is set while training on one device, where each model has its own order of
@@ -79,24 +79,28 @@ class SeveralModels(ABC):
     own_batches: bool = False
 
     @abstractmethod
-    def clip_each_model(self, most: float) -> None:
-        """Scale the gradient of each model down to the norm `most` if it is longer."""
+    def clip_each_model(self, max_norm: float) -> None:
+        """Scale the gradient of each model down to the norm `max_norm` if its norm is larger."""
 
 
 def remarks(predictor: Predictor) -> tuple[str, ...]:
     """Return the remarks that the wrappers of a predictor made at calibration, the innermost last."""
-    found = (one.remark for one in predictor.modules() if isinstance(one, Uncertainty))
-    return tuple(dict.fromkeys(remark for remark in found if remark))
+    notes = (module.remark for module in predictor.modules() if isinstance(module, Uncertainty))
+    return tuple(dict.fromkeys(remark for remark in notes if remark))
 
 
 def outermost(predictor: Predictor) -> SeveralModels | None:
     """Return the outermost wrapper that trains several models, or None if there is none."""
-    found = (one for one in predictor.modules() if isinstance(one, SeveralModels) and one.model_count > 1)
-    return next(found, None)
+    candidates = (
+        module
+        for module in predictor.modules()
+        if isinstance(module, SeveralModels) and module.model_count > 1
+    )
+    return next(candidates, None)
 
 
 def rows_per_model(predictor: Predictor, rows: int) -> int:
-    """Return how many rows of a batch each model sees."""
+    """Return the number of rows of a batch that each model sees."""
     several = outermost(predictor)
     return rows // several.model_count if several is not None and several.own_batches else rows
 

@@ -133,10 +133,10 @@ class Needles(Data):
     def state_dict(self):
         return {"moment": datetime(2020, 1, 1)} if self.fault == "a state that is not plain" else {}
 
-    def inputs(self, given):
+    def inputs(self, user_data):
         if self.fault == "anything is an input":
             return torch.zeros(1, 2)
-        return Data.inputs(self, given)
+        return Data.inputs(self, user_data)
 
     def read(self, files):
         if self.fault == "read wants prepare":

@@ -287,7 +287,10 @@ def test_what_does_not_fit_an_image_gets_a_sentence(framework: Framework) -> Non
     for wrong, wanted in (
         (("encoder.slim.colors=1",), "gives 1×16×12 numbers, but LaplaceImageHead reads 576 as they are"),
         (("density_head.scale=pixel",), "gives 3×16×12 numbers, but LaplaceImageHead reads 768 as they are"),
-        (("density_head=gaussian",), "describes targets of kind 'real', but this data set's are 'image'"),
+        (
+            ("density_head=gaussian",),
+            "describes targets of kind 'real', but the targets of this data set are of kind 'image'",
+        ),
         (("metric=[rmse]",), "kind"),
     ):
         refused = framework(*SQUARES, *wrong, folder="refused")

@@ -115,7 +115,7 @@ uncertainty.ensemble.members=3 | No uncertainty is chosen
 metrics=[accuracy] | Did you mean 'metric'?
 metric=[acuracy] | Did you mean 'accuracy'?
 experiment=moons/vanilla_128 metric=[accuracy,psnr] | CategoricalDensity of event_shape () draws no color
-data=moons density_head=extra_trees metric=[psnr] | The true 'color' of every image was asked for
+data=moons density_head=extra_trees metric=[psnr] | A metric reads the true 'color' of every image
 objective=[outlier] | Did you mean 'outlier_exposure'?
 renderer=zbufer | Did you mean 'zbuffer'?
 experiment=moons/vanilla_128 density_head=scvae | density_head scvae, of which

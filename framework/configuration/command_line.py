@@ -42,7 +42,7 @@ def _newest_checkpoint(arguments: list[str]) -> list[str]:
     if f"checkpoint={LAST}" not in arguments or Path(LAST).exists():
         return arguments
     run = newest_run(Path("outputs"))
-    sys.stderr.write(f"checkpoint={LAST} is {escape_unprintable(str(run), kept='')}\n")
+    sys.stderr.write(f"checkpoint={LAST} is {escape_unprintable(str(run), allowed='')}\n")
     return [
         f"checkpoint={in_quotes(str(run))}" if argument == f"checkpoint={LAST}" else argument
         for argument in arguments

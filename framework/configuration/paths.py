@@ -205,7 +205,7 @@ def _typed(value: Any) -> str:
         return "{" + ",".join(f"{_typed(key)}:{_typed(item)}" for key, item in value.items()) + "}"
     if isinstance(value, list | tuple | set):
         return "[" + ",".join(map(_typed, value)) + "]"
-    text = escape_unprintable(str(value), kept="")
+    text = escape_unprintable(str(value), allowed="")
     if isinstance(value, str) and not re.fullmatch(
         r"[A-Za-z0-9_.@-]*/[A-Za-z0-9_./@-]+", text
     ):  # quotes are needed so that it is not read as a number or null

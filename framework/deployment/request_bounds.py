@@ -308,7 +308,7 @@ async def _send(
     """
     headers = [(b"content-type", media), (b"content-length", str(len(content)).encode())]
     headers += [
-        (REMARK, escape_unprintable(remark, kept="").encode("ascii", "backslashreplace"))
+        (REMARK, escape_unprintable(remark, allowed="").encode("ascii", "backslashreplace"))
         for remark in remarks
     ]
     headers += [(b"connection", b"close")] * close

@@ -278,7 +278,7 @@ def _row(job: Path) -> dict[str, Any] | None:
     results = _results(job) if record.get("status") == "completed" else {}
     if not results:
         return None
-    overrides = [escape_unprintable(override, kept="") for override in record["overrides"]]
+    overrides = [escape_unprintable(override, allowed="") for override in record["overrides"]]
     swept = dict(override.lstrip("+~").split("=", 1) for override in overrides if "=" in override)
     row = {**swept, **results, "overrides": overrides, "folder": str(job)}
     if "batch_size" in swept:

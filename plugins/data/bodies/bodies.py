@@ -51,17 +51,17 @@ class Bodies(Data):
         found = clouds.pad([self.cloud(file) for file in files])
         return Fields(**normalised(found), index=torch.arange(len(files)))
 
-    def user_batch(self, given: Any) -> Batch:
+    def user_batch(self, user_data: Any) -> Batch:
         """Return the batch of scans in metres: files, or an array of one cloud or of a batch, padded with NaN."""
-        files = [given] if isinstance(given, str | Path) else given
+        files = [user_data] if isinstance(user_data, str | Path) else user_data
         if isinstance(files, Sequence) and files and all(isinstance(file, str | Path) for file in files):
             return fetched(self.read([Path(file) for file in files]), range(len(files)))
-        clouds = as_inputs(given, self.input_shape)
+        clouds = as_inputs(user_data, self.input_shape)
         found = normalised(clouds if clouds.is_floating_point() else clouds.double())
         return {**found, "input": found["input"].float()}
 
-    def inputs(self, given: Any) -> Tensor:
-        return self.user_batch(given)["input"]
+    def inputs(self, user_data: Any) -> Tensor:
+        return self.user_batch(user_data)["input"]
 
     def frame(self, batch: Batch) -> Frame:
         """Return the transform of targets into metres, in the coordinates of the scan."""

@@ -110,8 +110,8 @@ class COIL20(Data):
             [Crop(Path(file), None, 0.0, self.image_size, 1, upright=True) for file in files]
         )
 
-    def inputs(self, given: Any) -> Tensor:
-        return given_images.to_inputs(self, given)
+    def inputs(self, user_data: Any) -> Tensor:
+        return given_images.to_inputs(self, user_data)
 
     def augment(self, batch: Batch) -> Batch:
         if self.interpolate:

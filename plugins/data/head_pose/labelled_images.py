@@ -126,8 +126,8 @@ class Heads(Data):
     def read(self, files: Sequence[Path]) -> Dataset[Batch]:
         return self.reading.own(files)
 
-    def inputs(self, given: Any) -> Tensor:
-        return given_images.inputs(self, given)
+    def inputs(self, user_data: Any) -> Tensor:
+        return given_images.inputs(self, user_data)
 
     def augment(self, batch: Batch) -> Batch:
         return images.varied(batch, self.signs, self.reading.jitter)

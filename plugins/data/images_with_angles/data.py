@@ -125,8 +125,8 @@ class ImagesWithAngles(Data):
     def read(self, files: Sequence[Path]) -> Dataset[Batch]:
         return images.load_unlabelled([self._crop(Path(file)) for file in files])
 
-    def inputs(self, given: Any) -> Tensor:
-        return given_images.to_inputs(self, given)
+    def inputs(self, user_data: Any) -> Tensor:
+        return given_images.to_inputs(self, user_data)
 
     def augment(self, batch: Batch) -> Batch:
         return images.vary(batch, self._signs, self.jitter)

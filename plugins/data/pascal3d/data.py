@@ -227,8 +227,8 @@ class Pascal3D(Data):
         side = self.framing.image_size
         return images.unlabelled([Crop(Path(file), None, 0.0, side, upright=True) for file in files])
 
-    def inputs(self, given: Any) -> Tensor:
-        return given_images.inputs(self, given)
+    def inputs(self, user_data: Any) -> Tensor:
+        return given_images.inputs(self, user_data)
 
     def augment(self, batch: Batch) -> Batch:
         return images.varied(batch, MIRRORED if self.variation.mirror else (), self.variation.jitter)

@@ -192,15 +192,15 @@ class TableTennis(Data):
             )
         return torch.from_numpy(found).float()
 
-    def inputs(self, given: Any) -> Tensor:
+    def inputs(self, user_data: Any) -> Tensor:
         """Return inputs from files, from one flight as an array (frame, 4) of t, x, y, z, or from ready inputs."""
-        if isinstance(given, np.ndarray) and given.ndim == 2 and given.shape[1] == 4:
+        if isinstance(user_data, np.ndarray) and user_data.ndim == 2 and user_data.shape[1] == 4:
             try:
-                table = real(given, "the given flight")
+                table = real(user_data, "the given flight")
             except ValueError as error:
                 raise DataError(f"{error}.") from error
             return self._last(Flight("the given flight", table[:, 0], table[:, 1:]))[None]
-        return Data.inputs(self, given)
+        return Data.inputs(self, user_data)
 
     def augment(self, batch: Batch) -> Batch:
         """Return the batch with frames hidden at random; the last frame stays visible."""

@@ -126,11 +126,13 @@ class Tabular(Data):
     def read(self, files: Sequence[Path]) -> Dataset[Batch]:
         return read(files, self._reading, self.writing)
 
-    def inputs(self, given: Any) -> Tensor:
+    def inputs(self, user_data: Any) -> Tensor:
         """Return standardised inputs (row, column) from a CSV file, a DataFrame, a mapping by column, or an array."""
-        if isinstance(given, str | Path) or (isinstance(given, list) and isinstance(given[0], str | Path)):
-            return Data.inputs(self, given)
-        return of_rows(given, self._reading)
+        if isinstance(user_data, str | Path) or (
+            isinstance(user_data, list) and isinstance(user_data[0], str | Path)
+        ):
+            return Data.inputs(self, user_data)
+        return of_rows(user_data, self._reading)
 
     @property
     def _reading(self) -> Reading:

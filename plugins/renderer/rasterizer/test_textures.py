@@ -167,7 +167,7 @@ def test_subjects_of_other_channels_are_not_joined() -> None:
     vertices, faces, colors = blob(4)
     with pytest.raises(ValueError, match="1 and 3 channels; wanted as many"):
         join_scenes([Scene(vertices, faces, colors[:, :1], camera()), covered()])
-    with pytest.raises(ValueError, match="no scene came"):
+    with pytest.raises(ValueError, match="Got no scene to join"):
         join_scenes([])
     other = covered(wrap="clamp")
     with pytest.raises(ValueError, match="different wrap or smooth"):

@@ -115,12 +115,12 @@ class Ensemble(Uncertainty, Joining, SeveralModels):
         assert self.together is not None
         return self.together.own(inputs.unflatten(0, (self.model_count, -1)))
 
-    def clip_each_model(self, most: float) -> None:
-        """Shorten each member's gradient to the norm `most`."""
+    def clip_each_model(self, max_norm: float) -> None:
+        """Shorten each member's gradient to the norm `max_norm`."""
         for member in self.apart:
-            nn.utils.clip_grad_norm_(member.parameters(), most)
+            nn.utils.clip_grad_norm_(member.parameters(), max_norm)
         if self.together is not None:
-            self.together.clip_each(most, list(self.heads) if len(self.heads) > 1 else [])
+            self.together.clip_each(max_norm, list(self.heads) if len(self.heads) > 1 else [])
 
     def training_densities(self, inputs: Tensor) -> Distribution:
         """Return the members' densities in training, batch_shape (batch, member), or (batch,) for one."""
