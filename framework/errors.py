@@ -25,7 +25,7 @@ class UserError(Exception):
 
 
 def escape_unprintable(text: str, allowed: str = "\n\t") -> str:
-    """Return a text in which unprintable characters, except those in `allowed`, are escaped: none controls a terminal."""
+    """Return a text whose unprintable characters, except those in `allowed`, are escaped: none controls a terminal."""
     return "".join(
         letter if letter.isprintable() or letter in allowed else repr(letter)[1:-1]
         for letter in escape_undecodable(text)
@@ -112,7 +112,7 @@ def nearest_name(word: str, known: Iterable[str], likeness: float = LEAST_SIMILA
 
 
 def list_names(word: str, known: Iterable[str]) -> str:
-    """Return all names as a text or, if there are many, the names most similar to `word` and the number of the others."""
+    """Return all names as a text; of many names, those most similar to `word` and the number of the others."""
     names = list(known)
     if len(names) <= LISTED_WHOLE:
         return ", ".join(names)

@@ -92,8 +92,8 @@ class Model(Predictor):
             if math.prod(shape) != head.size:
                 raise ConfigError(
                     f"The last encoder gives {'×'.join(map(str, shape))} numbers, but {type(head).__name__} reads "
-                    f"{head.size:,} numbers, without a linear layer in between. Choose an encoder that gives as many, or "
-                    "change the channels of the encoder."
+                    f"{head.size:,} numbers without a linear layer in between. Choose an encoder that gives as many, "
+                    "or change the channels of the encoder."
                 )
             self.projection = nn.Flatten()
         elif beside:
@@ -262,7 +262,7 @@ def learns(predictor: Predictor) -> bool:
 
 
 def independent_penalty(values: Float[Tensor, "batch *member"]) -> Float[Tensor, "batch"]:
-    """Return a penalty per sample, (batch,), from the penalties of the members, such that each member trains as if alone.
+    """Return a penalty per sample, (batch,), from those of the members, such that each member trains as if alone.
 
     The value is the mean over members, so it is comparable with the penalty of a single model. The gradient is that of
     the sum, so the gradient of each member is neither divided by the number of members nor changed by the others.

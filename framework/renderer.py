@@ -97,8 +97,8 @@ def join_scenes(scenes: Sequence[Scene]) -> Scene:
     paints += [image for scene in scenes if scene.texture is not None for image in scene.texture.images]
     if len({paint.shape[-1] for paint in paints}) > 1:
         raise ValueError(
-            f"The scenes have colours with {' and '.join(sorted({str(paint.shape[-1]) for paint in paints}))} channels; "
-            "expected the same number of channels in all scenes."
+            f"The scenes have colours with {' and '.join(sorted({str(paint.shape[-1]) for paint in paints}))} "
+            "channels; expected the same number of channels in all scenes."
         )
     counts = [len(scene.vertices) for scene in scenes]
     first = accumulate(counts[:-1], initial=0)

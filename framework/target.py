@@ -41,7 +41,7 @@ class Target:
 
     @property
     def listed_names(self) -> str:
-        """Names of the target as a text for a message; of very many names, the first ones and the number of the others."""
+        """Names of the target for a message; of very many names, the first ones and the number of the others."""
         first = self.names if len(self.names) <= MOST else self.names[: MOST // 4]
         rest = f" and {len(self.names) - len(first)} more" if len(first) < len(self.names) else ""
         return ", ".join(first) + rest
