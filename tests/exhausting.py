@@ -314,7 +314,7 @@ def textured(sides: list[tuple[int, int]]) -> bytes:
 
 def bombs() -> dict[str, tuple[Callable[[], bytes], Callable[[Path], object]]]:
     """Files, each with what writes and what reads it."""
-    from plugins.data.bodies import body_files, motion
+    from framework.bodies import body_files, motion
     from plugins.data.cest.volumes import read_volume
     from plugins.renderer.rasterizer import scene_files
 

@@ -24,11 +24,11 @@ import plugins
 from framework.configuration import registry
 from framework.configuration.schema import build, resolve
 from framework.data import Data
-from framework.datasets import images
+from framework.datasets import images, scan_layout
 from framework.deployment.served import Served
 from framework.errors import DataError
 from framework.geometry.srgb import bytes_from_linear
-from plugins.data.bodies import scan_layout, skins
+from plugins.data.human_scans import skins
 from plugins.renderer.rasterizer import scene_files
 from plugins.renderer.rasterizer.sample_scenes import OBJ, PARTS, QUAD, glb
 

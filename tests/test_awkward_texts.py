@@ -14,6 +14,7 @@ import nibabel
 import numpy as np
 import pytest
 
+from framework.bodies import motion
 from framework.datasets.csv_columns import (
     LabelledWriting,
     Writing,
@@ -26,7 +27,6 @@ from framework.datasets.csv_columns import (
 from framework.errors import DataError
 from framework.geometry import meshes
 from framework.storage import text
-from plugins.data.bodies import motion
 from plugins.data.cest.volumes import read_volume
 from plugins.data.head_pose import towncentre_labels
 from plugins.data.images_with_angles.table import read_table

@@ -59,7 +59,9 @@ def closed_output(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 def test_the_programs_are_found() -> None:
     assert programs() >= OF_OUR_OWN | GENERATORS
-    assert {"framework/__main__.py", "plugins/data/bodies/__main__.py"} <= {*PROGRAMS} and len(PROGRAMS) >= 7
+    assert {"framework/__main__.py", "plugins/data/registration/__main__.py"} <= {*PROGRAMS} and len(
+        PROGRAMS
+    ) >= 7
 
 
 @pytest.mark.parametrize("program", PROGRAMS)

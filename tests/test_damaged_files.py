@@ -86,8 +86,8 @@ def test_every_reader_of_the_project_is_among_them() -> None:
 
 READING = (".read_text", ".read_bytes", "Image.open", ".loadmat")
 OWN_CACHE = {
-    "plugins/data/bodies/default_body.py",
-    "plugins/data/bodies/topologies.py",
+    "framework/bodies/default_body.py",
+    "framework/bodies/topologies.py",
     "plugins/data/labelled_clouds/reading.py",
 }
 """They guard what the project keeps in its own cache, where `archive` reads it, which is among the readers."""

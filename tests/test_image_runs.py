@@ -18,12 +18,13 @@ import framework as package
 from framework.configuration.assembly import build_data, build_predictor, resolve_all
 from framework.configuration.composition import plain
 from framework.configuration.paths import paths_of
+from framework.datasets.scan_layout import write_registration
 from framework.deployment.served import _load_pyfunc
 from framework.encoder import Encoder
 from framework.errors import DataError
 from framework.geometry.srgb import bytes_from_linear, linear_from_srgb
-from plugins.data.bodies.rows import body_file, colored, colored_meshes, scanned
-from plugins.data.bodies.scan_layout import write_registration
+from framework.testing.bodies import body_file, colored, scanned
+from plugins.data.human_scans.rows import colored_meshes
 from tests.conftest import Done, Framework, paths_again
 from tests.test_composition import composed
 

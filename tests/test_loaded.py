@@ -49,7 +49,7 @@ KINDS = {
         "metric=[vertex_error]",
     ),
 }
-HOMES = {"point_cloud_folder": "labelled_clouds", "registration": "bodies"}
+HOMES = {"point_cloud_folder": "labelled_clouds"}
 
 
 QUICK = (

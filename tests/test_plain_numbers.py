@@ -10,6 +10,7 @@ import yaml
 
 from framework.configuration.schema import resolve
 from framework.configuration.settings import settings
+from framework.datasets.scan_layout import read_cameras
 from framework.errors import UserError
 from framework.runs.job import RECORD, VALUE, read_record
 from framework.storage.plain_values import read_yaml
@@ -17,7 +18,6 @@ from framework.sweeps.comparison import _results
 from framework.sweeps.jobs import Job
 from framework.tracking.journal import _record
 from framework.tracking.run_info import SIDECAR, RunInfo, read_run_info
-from plugins.data.bodies.scan_layout import read_cameras
 from plugins.renderer.rasterizer.gltf import read as read_gltf
 from plugins.renderer.rasterizer.turntable import read_camera
 

@@ -264,11 +264,11 @@ def test_a_strangers_folder_does_nothing_but_say_a_sentence(
 
 
 PLUGIN_COMMANDS = {
-    "plugins.data.bodies": ["{run}", "{run}/results.json", "--folder={out}"],
-    "plugins.data.bodies.animate": ["{run}", "--out={out}/film.gif"],
-    "plugins.data.bodies.correspond": ["{run}", "--out={out}"],
-    "plugins.data.bodies.repose": ["{run}", "--out={out}", "--body={run}/results.json", "--random=1"],
-    "plugins.data.bodies.photograph_meshes": ["{run}", "{out}/root"],
+    "plugins.data.registration": ["{run}", "{run}/results.json", "--folder={out}"],
+    "plugins.data.human_scans.animate": ["{run}", "--out={out}/film.gif"],
+    "plugins.data.registration.correspond": ["{run}", "--out={out}"],
+    "plugins.data.human_scans.repose": ["{run}", "--out={out}", "--body={run}/results.json", "--random=1"],
+    "plugins.data.human_scans.photograph_meshes": ["{run}", "{out}/root"],
     "plugins.renderer.rasterizer": ["{run}/results.json", "--out={out}/picture.png"],
 }
 """Every command of a plugin, given a stranger's folder."""

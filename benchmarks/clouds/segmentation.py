@@ -18,14 +18,14 @@ from matplotlib.patches import Patch
 from torch import Tensor, nn
 
 from benchmarks.pages import machine, write_page
+from framework.bodies import poses
+from framework.bodies.body import Body
+from framework.bodies.people import chosen_body
 from framework.configuration.schema import build, resolve
 from framework.figures.style import titled_figure
 from framework.geometry.clouds import sizes
 from framework.geometry.nearest import nearest
 from framework.reports.table import markdown
-from plugins.data.bodies import poses
-from plugins.data.bodies.body import Body
-from plugins.data.bodies.people import chosen_body
 from plugins.encoder.bps.basis import basis
 from plugins.encoder.bps.encoding import Basis, encode, per_point, prepared
 

@@ -21,10 +21,11 @@ from benchmarks.pages import machine, write_page
 from framework.configuration.schema import build, resolve
 from framework.figures.style import COLOURS, GREY, titled_figure
 from framework.geometry.srgb import bytes_from_linear
+from framework.heads.posed_body import scene_of
 from framework.renderer import Renderer
-from plugins.data.bodies.descent import Descent
-from plugins.data.bodies.pose_error import place_errors
-from plugins.data.bodies.pose_images import PoseFromImage
+from plugins.data.pose_from_image.data import PoseFromImage
+from plugins.density_head.fit_pose.descent import Descent
+from plugins.metric.pose_error.metric import place_errors
 
 HERE = Path(__file__)
 STARTS = 100
@@ -55,9 +56,9 @@ def measure(gradient: str) -> None:
     source = data()
     test = source.splits().test
     descent = Descent(
-        source.figure,
+        source.body_model,
         renderer(**GRADIENTS[gradient]),
-        source.figure.camera(*source.input_shape[1:]),
+        source.body_model.camera(*source.input_shape[1:]),
         **OPTIONS,
     )
     folder = KEPT / gradient
@@ -73,13 +74,13 @@ def measure(gradient: str) -> None:
         seconds = time.process_time() - began
         np.savez(
             file,
-            numbers=fit.numbers,
+            numbers=fit.parameters,
             path=fit.path,
             target=sample["target"],
             difference=fit.difference,
             seconds=seconds,
         )
-        degrees, centimetres = place_errors(fit.numbers, sample["target"])
+        degrees, centimetres = place_errors(fit.parameters, sample["target"])
         sys.stdout.write(f"{gradient} {number}: {degrees:.2f}°, {centimetres:.2f} cm, {seconds:.1f} s\n")
         sys.stdout.flush()
 
@@ -124,11 +125,11 @@ def table(results: dict[str, list[dict[str, np.ndarray]]]) -> list[str]:
 def picture(results: dict[str, list[dict[str, np.ndarray]]], number: int) -> None:
     """Above start, target and ends of one start; below the median errors of all, against steps and seconds."""
     source = data()
-    camera = source.figure.camera(*source.input_shape[1:])
+    camera = source.body_model.camera(*source.input_shape[1:])
     fine = renderer(supersampling=8)
 
     def drawn(numbers: np.ndarray) -> np.ndarray:
-        scene = source.figure.scene(torch.from_numpy(numbers).double(), camera)
+        scene = scene_of(source.body_model, torch.from_numpy(numbers).double(), camera)
         return bytes_from_linear(fine(scene)["color"][..., :3]).numpy()
 
     figure = titled_figure((13, 8.5), "A body fitted to its image from 30° and 20 cm off", True)

@@ -12,16 +12,16 @@ from numpy.random import Generator
 from torch import Tensor
 
 from benchmarks.pages import machine, write_page
-from plugins.data.bodies import poses
-from plugins.data.bodies.body import BodyModel
-from plugins.data.bodies.dressed import Wardrobe
-from plugins.data.bodies.people import adults, chosen_body
-from plugins.data.bodies.repose import Subject, subject
-from plugins.data.bodies.scan_generator import a_pose
-from plugins.data.bodies.scan_layout import Registration
-from plugins.data.bodies.shape_space import in_few_shapes
-from plugins.data.bodies.topologies import Name, in_topology, topology
-from plugins.data.bodies.unposing import unposed
+from framework.bodies import poses
+from framework.bodies.body import BodyModel
+from framework.bodies.people import adults, chosen_body
+from framework.bodies.shape_space import in_few_shapes
+from framework.bodies.topologies import Name, in_topology, topology
+from framework.bodies.unposing import unposed
+from framework.datasets.scan_layout import RegisteredMesh
+from plugins.data.human_scans.dressed import Wardrobe
+from plugins.data.human_scans.repose import Subject, subject
+from plugins.data.human_scans.scan_generator import a_pose
 
 PEOPLE, POSES = 4, 2
 SHAPES = ((0, -2.0), (0, 2.0), (1, -2.0), (1, 2.0), (2, -2.0), (2, 2.0))
@@ -54,11 +54,11 @@ class Truth:
         return poses.rotations(self.body, self.where, movements)
 
     @torch.no_grad()
-    def registered(self, person: int, shape: Tensor, pose: np.ndarray, name: Name) -> Registration:
+    def registered(self, person: int, shape: Tensor, pose: np.ndarray, name: Name) -> RegisteredMesh:
         posed = self.model(shape, torch.from_numpy(pose).float())[0]
         _, found = self.wardrobe.dress(posed.numpy(), None, np.random.default_rng(person))
         mesh = topology(self.body, self.wardrobe.sheet, name)
-        return Registration(
+        return RegisteredMesh(
             torch.from_numpy(found.vertices[mesh.rows]).float(),
             torch.from_numpy(found.colors[mesh.rows]),
             torch.from_numpy(mesh.faces),
@@ -73,7 +73,7 @@ def apart(one: Tensor, other: Tensor) -> Tensor:
 
 @torch.no_grad()
 def told(
-    truth: Truth, given: Registration, shape: Tensor, stood: np.ndarray, other: np.ndarray, name: Name
+    truth: Truth, given: RegisteredMesh, shape: Tensor, stood: np.ndarray, other: np.ndarray, name: Name
 ) -> Tensor:
     """In another pose, where nothing has to be found: with the true pose and shape."""
     surface = truth.wardrobe.sheet

@@ -30,9 +30,9 @@ from framework.configuration.schema import build, resolve
 from framework.figures.style import titled_figure
 from framework.geometry.srgb import bytes_from_linear, srgb_from_linear
 from framework.renderer import Renderer, Scene
-from plugins.data.bodies import flow
-from plugins.data.bodies.animate import SPEED, data_of, generated, moving
-from plugins.data.bodies.animation import on_white, orbit, photograph
+from plugins.data.human_scans import flow
+from plugins.data.human_scans.animate import SPEED, data_of, generated, moving
+from plugins.data.human_scans.animation import on_white, orbit, photograph
 
 SUBJECTS = ("test_0000", "test_0003", "test_0005")
 FRAMES, START, AZIMUTH = 20, 0.5, math.radians(35)

@@ -18,13 +18,13 @@ from torch import Tensor
 
 from benchmarks.pages import machine, read_rows, write_page
 from benchmarks.rendering.rasterizer_growth import milliseconds, slope
+from framework.bodies.people import chosen_body
+from framework.bodies.topologies import Name, sheet, topology
 from framework.configuration.schema import build, resolve
 from framework.encoder import Encoder
 from framework.figures.style import COLOURS, MARKERS, save_figure, titled_figure
 from framework.reports.table import Row, csv
-from plugins.data.bodies.human_scans import in_front
-from plugins.data.bodies.people import chosen_body
-from plugins.data.bodies.topologies import Name, sheet, topology
+from plugins.data.human_scans.data import in_front
 from plugins.encoder.unets.canvas import fast_bfloat16
 
 SIZE = (410, 308)

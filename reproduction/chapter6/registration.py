@@ -27,12 +27,12 @@ import framework
 from benchmarks.pages import machine, write_page
 from benchmarks.sweeps import by_the_clock, record, settings
 from benchmarks.timing import milliseconds
+from framework.bodies.default_body import default_body
 from framework.configuration.schema import build, resolve
 from framework.distributions.protocol import median
 from framework.reports.table import format_number
-from plugins.data.bodies.correspond import Registered, answered, model
-from plugins.data.bodies.default_body import default_body
-from plugins.data.bodies.faust import Challenge
+from plugins.data.registration.correspond import Registered, answered, model
+from plugins.data.registration.faust import Challenge
 
 HERE = Path(__file__).parent
 RANKS = (16, 32, 48, 64, 96, 128)
@@ -207,7 +207,7 @@ def table_64(runs: list[Path]) -> list[str]:
 
 
 def picture(run: Path, scan: Path) -> None:
-    from plugins.data.bodies.__main__ import register
+    from plugins.data.registration.__main__ import register
 
     with tempfile.TemporaryDirectory() as folder, torch.no_grad():
         written = register(str(run), [scan], Path(folder))

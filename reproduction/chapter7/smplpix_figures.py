@@ -19,18 +19,18 @@ from torch import Tensor
 
 from benchmarks.pages import machine, write_page
 from benchmarks.rendering.smplpix_flicker import rendered, training
+from framework.bodies import poses
+from framework.bodies.shape_space import in_few_shapes
 from framework.configuration.loading import stored
 from framework.configuration.schema import build, resolve
 from framework.figures.style import titled_figure
 from framework.geometry.camera import Camera
 from framework.geometry.srgb import srgb_from_linear
 from framework.renderer import Renderer, Scene
-from plugins.data.bodies import poses
-from plugins.data.bodies.animate import data_of, generated
-from plugins.data.bodies.animation import Generated, Moment, actor, on_white, orbit, photograph
-from plugins.data.bodies.human_scans import HumanScans
-from plugins.data.bodies.repose import shape_change, subject
-from plugins.data.bodies.shape_space import in_few_shapes
+from plugins.data.human_scans.animate import data_of, generated
+from plugins.data.human_scans.animation import Generated, Moment, actor, on_white, orbit, photograph
+from plugins.data.human_scans.data import HumanScans
+from plugins.data.human_scans.repose import shape_change, subject
 
 HERE = Path(__file__).resolve()
 TRUTH = "photograph"
@@ -39,7 +39,7 @@ VIEWS = tuple(math.radians(degrees) for degrees in (0, 60, 120, 180, 240, 300))
 FRONT = math.radians(25)
 POSES = 5
 SHAPES = ("0=-2", "0=2", "1=-2", "1=2", "2=-2", "2=2")
-"""Directions and standard deviations, as plugins.data.bodies.repose has them."""
+"""Directions and standard deviations, as plugins.data.human_scans.repose has them."""
 DARKER = 3
 """Errors are drawn so many times as large."""
 

@@ -14,8 +14,10 @@ import torch
 from safetensors.torch import save as to_safetensors
 
 from framework import modes
+from framework.bodies import body_files, motion
 from framework.configuration import loading
 from framework.configuration.config import Config
+from framework.datasets import scan_layout
 from framework.datasets.csv_columns import mostly_numbers, numbers, read_columns
 from framework.datasets.images import Crop
 from framework.geometry import meshes
@@ -25,14 +27,15 @@ from framework.sweeps import jobs
 from framework.testing import sample_files
 from framework.tracking.journal import Journal
 from framework.tracking.run_info import read_run_info
-from plugins.data.bodies import body_files, faust, motion, scan_layout, skins
-from plugins.data.bodies.pose_images import PoseFromImage
 from plugins.data.cest.volumes import read_volume
 from plugins.data.coil20.views import read_views
 from plugins.data.head_pose import caviar_labels, idiap_labels, towncentre_labels
+from plugins.data.human_scans import skins
 from plugins.data.images_with_angles.table import read_table
 from plugins.data.labelled_clouds.archive import read_archive
 from plugins.data.pascal3d import layout
+from plugins.data.pose_from_image.data import PoseFromImage
+from plugins.data.registration import faust
 from plugins.data.table_tennis import recordings
 from plugins.renderer.rasterizer import sample_scenes as scenes
 from plugins.renderer.rasterizer import scene_files, turntable
@@ -178,7 +181,7 @@ def people() -> Iterator[Reader]:
     colors = np.arange(3 * len(VERTICES), dtype=np.uint8).reshape(-1, 3)
     parts = (torch.from_numpy(part) for part in (VERTICES.astype(np.float32), colors, FACES.astype(np.int64)))
     mesh = written(
-        "a.ply", lambda file: scan_layout.write_registration(file, scan_layout.Registration(*parts))
+        "a.ply", lambda file: scan_layout.write_registration(file, scan_layout.RegisteredMesh(*parts))
     )
     places = [
         npz(

@@ -1,0 +1,135 @@
+"""Files of body models: the published layout (`v_template`, `shapedirs` and so on) in .npz or .pkl, and our own.
+
+The published models with linear blend skinning use this layout: `v_template` (V, 3), `shapedirs` (V, 3, B),
+`J_regressor` (J, V), `weights` (V, J), `kintree_table` (2, J) whose first row holds parents, `f` (F, 3), and in most
+files `posedirs` (V, 3, 9 (J - 1)), or with 4 (J - 1) + 1 features. Other keys are not read. Pickles are read by
+framework.bodies.restricted_pickle, which runs nothing that a file names.
+"""
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from framework.bodies import restricted_pickle
+from framework.bodies.body import Body
+from framework.errors import DataError, shorten
+from framework.storage.arrays import archive
+from framework.storage.files import replacing
+from framework.storage.limits import MOST_DISPLACEMENTS as LARGEST
+from framework.storage.limits import MOST_NUMBERS
+from framework.storage.reading import guarded, read_bytes, require_numbers
+
+NEEDED = ("v_template", "shapedirs", "J_regressor", "weights", "kintree_table", "f")
+OWN = ("template", "faces", "weights", "parents", "joints", "shapes", "joint_shapes")
+WANTED = f"Wanted: {', '.join(NEEDED)}, and posedirs for a body with pose blend shapes, as arrays."
+
+
+def read(file: Path) -> Body:
+    """Read a body model from a file in the published layout.
+
+    Raises:
+        DataError: the file does not exist, has another format, holds something other than arrays and plain values, or
+            an array is missing or has another shape. The message names the cause.
+    """
+    with guarded(file, "a body model", missing="wanted a body model. Mend the path."):
+        if file.suffix == ".npz":
+            content = read_bytes(file)
+            found = archive(content, (*NEEDED, "posedirs"))
+            require_numbers(sum(array.size for array in found.values()), MOST_NUMBERS, len(content))
+            return _body(file, found)
+        if file.suffix == ".pkl":
+            return _body(file, _unpickled(file))
+    raise DataError(f"{file}: wanted a body model whose name ends in .npz or .pkl.")
+
+
+def save(body: Body, file: Path) -> None:
+    """Write a body as an .npz of our own layout, whole or not at all."""
+    arrays = {name: np.asarray(getattr(body, name)) for name in OWN}
+    arrays |= {"source": np.array(body.source), "names": np.array(body.names, dtype=np.str_)}
+    for name in ("pose_shapes", "uv", "uv_faces"):
+        if getattr(body, name) is not None:
+            arrays[name] = getattr(body, name)
+    with replacing(file) as part, part.open("wb") as stream:
+        np.savez(stream, allow_pickle=False, **arrays)
+
+
+def load(file: Path) -> Body:
+    """Read a body that `save` wrote.
+
+    Raises:
+        DataError: the file is missing or damaged.
+    """
+    with guarded(file, "a body", "Delete it: it is made anew."):
+        arrays = archive(read_bytes(file))
+        parents = tuple(int(parent) for parent in arrays.pop("parents"))
+        names = tuple(str(name) for name in arrays.pop("names"))
+        return Body(source=str(arrays.pop("source")), parents=parents, names=names, **arrays)
+
+
+def _unpickled(file: Path) -> Mapping[str, Any]:
+    try:
+        found = restricted_pickle.load(read_bytes(file))
+    except restricted_pickle.PickleRefused as error:
+        raise DataError(
+            f"{file}: refused as a pickle: {error}. Only arrays are read from pickles; nothing in this file was run. "
+            f"{WANTED}"
+        ) from error
+    if not isinstance(found, dict):
+        raise DataError(f"{file}: holds {type(found).__name__}. {WANTED}")
+    return found
+
+
+def _body(file: Path, found: Mapping[str, Any]) -> Body:
+    missing = [name for name in NEEDED if name not in found]
+    if missing:
+        names = shorten(", ".join(map(str, found))) or "nothing"
+        raise DataError(f"{file}: {', '.join(missing)} not in it; it holds {names}. {WANTED}")
+    posedirs = found.get("posedirs")
+    arrays = {name: _numbers(file, name, found[name]) for name in NEEDED}
+    template, shapes, regressor = arrays["v_template"], arrays["shapedirs"], arrays["J_regressor"]
+    if shapes.ndim == 2:  # a model with a single coefficient
+        shapes = shapes[..., None]
+    table = arrays["kintree_table"]
+    if (
+        template.ndim != 2
+        or shapes.shape[:2] != template.shape
+        or table.ndim != 2
+        or regressor.shape != (table.shape[1], len(template))
+        or not template.size
+        or len(regressor) * math.prod(shapes.shape[1:]) > LARGEST
+    ):
+        shapes = ", ".join(f"{name} {array.shape}" for name, array in arrays.items())
+        raise DataError(f"{file}: {shapes} do not fit together. {WANTED}")
+    wanted = template.dtype
+    return Body(
+        source=str(file),
+        template=template,
+        faces=arrays["f"].astype(np.int64),
+        weights=arrays["weights"].astype(wanted),
+        # the root's parent is -1, which reads as a large number if it was stored unsigned
+        parents=tuple(
+            -1 if not 0 <= parent < table.shape[1] else int(parent) for parent in table[0].tolist()
+        ),
+        # joints are linear in the vertices (Loper et al. 2015, eq. 10), so each coefficient displaces them as well
+        joints=(regressor @ template).astype(wanted),
+        shapes=shapes.astype(wanted),
+        joint_shapes=np.einsum("jv,vcs->jcs", regressor, shapes).astype(wanted),
+        pose_shapes=None if posedirs is None else _numbers(file, "posedirs", posedirs).astype(wanted),
+    )
+
+
+def _numbers(file: Path, name: str, value: Any) -> np.ndarray:
+    # lists are refused: nested lists that repeat one another would expand into an array of unlimited size
+    if not isinstance(value, np.ndarray | np.generic | int | float | str):
+        raise DataError(f"{file}: {name} is {type(value).__name__}; wanted an array. {WANTED}")
+    array = np.asarray(value)
+    if array.dtype.kind not in "iuf" or not np.isfinite(array).all():
+        raise DataError(
+            f"{file}: {name} is {array.dtype} {array.shape} with numbers that are not finite, or no numbers. {WANTED}"
+        )
+    if array.dtype.kind == "f":
+        return array.astype(np.float32 if array.dtype.itemsize <= 4 else np.float64)
+    return array if name in ("f", "kintree_table") else array.astype(np.float64)

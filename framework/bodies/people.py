@@ -1,0 +1,72 @@
+"""Random people: draws of shape and pose, for the default body or a body from a file."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from framework.bodies import body_files, poses
+from framework.bodies.body import Body, with_joints
+from framework.bodies.default_body import Traits, default_body
+
+
+class Drawn(NamedTuple):
+    """Shape coefficients and joint rotations of each person, in the form that BodyModel takes."""
+
+    shape: Float[Tensor, "person shape"]
+    pose: Float[Tensor, "person joint 3"]
+
+
+@dataclass(frozen=True)
+class People:
+    """Distribution of random people.
+
+    Attributes:
+        body: body model of all people.
+        traits: traits of the default body; None for a body from a file.
+        spread: standard deviation of the first ten shape coefficients of a body from a file.
+    """
+
+    body: Body
+    traits: Traits | None
+    spread: float
+
+    def draw(self, count: int, random: np.random.Generator) -> Drawn:
+        """Return `count` random people, of the body's dtype."""
+        if self.traits is None:
+            shape = random.normal(0, self.spread, (count, min(10, self.body.shapes.shape[2])))
+        else:
+            shape = self.traits.coefficients(
+                torch.from_numpy(adults(self.traits.labels, count, random))
+            ).numpy()
+        pose = poses.rotations(self.body, poses.skeleton(self.body), poses.draw(count, random))
+        dtype = self.body.template.dtype
+        return Drawn(torch.from_numpy(shape.astype(dtype)), torch.from_numpy(pose.astype(dtype)))
+
+
+def chosen_body(file: str | None) -> tuple[Body, Traits | None]:
+    """Return the body of a file unchanged; or the default body with the joints that poses rotate, and its traits."""
+    if file is not None:
+        return body_files.read(Path(file).expanduser()), None
+    body, traits = default_body()
+    return with_joints(body, poses.JOINTS), traits
+
+
+def adults(
+    labels: Sequence[str], count: int, random: np.random.Generator
+) -> Float[np.ndarray, "person trait"]:
+    """Return random traits of adults: gender and age uniform (2/3 is young, 1 old), else normal within 0.05…0.95."""
+    found = random.random((count, len(labels)))
+    for place, label in enumerate(labels):
+        if label == "age":
+            low, high = 0.6, 0.95
+            found[:, place] = low + (high - low) * found[:, place]
+        elif label != "gender":
+            spread = 0.09 if label == "height" else 0.22
+            found[:, place] = random.normal(0.5, spread, count).clip(0.05, 0.95)
+    return found

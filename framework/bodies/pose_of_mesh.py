@@ -1,0 +1,162 @@
+"""Pose and shape of a registered mesh, whose vertices are those of the body, by nonlinear least squares."""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from framework.bodies.body import Body, BodyModel
+from framework.errors import DataError
+
+OFF = 0.01
+"""Standard deviation of vertices from the model's, metres: clothes, hair, errors of the registration."""
+INDEPENDENT = 35
+"""Number of independent vertex errors of a mesh of any size: errors of vertices under one garment are alike."""
+BENT = 0.7
+"""Standard deviation of the angles of joints except the root, radians; it shares a bend among neighbouring joints."""
+STEPS = 60
+ENOUGH = 1e-6
+"""Step, metres and radians, below which the search ends."""
+MOST = 2_500
+"""Largest number of vertices that are used; evenly spread vertices of a finer mesh suffice."""
+STEP = 1e-5
+"""Step of the differences: radians, metres, standard deviations of shape."""
+TOGETHER = 24
+"""Number of parameters by which the model is differentiated at once."""
+
+
+class Found(NamedTuple):
+    """Fit of a body to a mesh, in the form that BodyModel takes, float64, a batch of one.
+
+    Attributes:
+        shape: shape coefficients.
+        pose: joint rotations, axis times angle, radians.
+        translation: translation of the whole body, metres.
+        error: root mean square distance of vertices, metres.
+    """
+
+    shape: Float[Tensor, "1 shape"]
+    pose: Float[Tensor, "1 joint 3"]
+    translation: Float[Tensor, "1 3"]
+    error: float
+
+
+class _Problem(NamedTuple):
+    """Least-squares problem; its parameters are pose, translation and shape, in this order."""
+
+    model: BodyModel
+    vertices: Float[Tensor, "vertex 3"]
+    prior: Float[Tensor, "number"]
+
+    def parts(self, numbers: Float[Tensor, "batch number"]) -> tuple[Tensor, Tensor, Tensor]:
+        turned = 3 * len(self.model.parents)
+        pose, translation, shape = numbers.tensor_split((turned, turned + 3), 1)
+        return shape, pose.unflatten(1, (-1, 3)), translation
+
+    def apart(self, numbers: Float[Tensor, "number"]) -> Float[Tensor, "vertex 3"]:
+        return self.model(*self.parts(numbers[None]))[0] - self.vertices
+
+    def cost(self, numbers: Float[Tensor, "number"]) -> float:
+        return float(self.apart(numbers).square().sum() + (self.prior * numbers.square()).sum())
+
+    def derivatives(self, numbers: Float[Tensor, "number"]) -> Float[Tensor, "coordinate number"]:
+        """Return central differences, one row of a batch for each parameter: some ten digits in float64."""
+        found = []
+        for steps in (STEP * torch.eye(len(numbers)).to(numbers)).split(TOGETHER):
+            after, before = (self.model(*self.parts(numbers + sign * steps)) for sign in (1, -1))
+            found.append((after - before).flatten(1) / (2 * STEP))
+        return torch.cat(found).T
+
+
+@torch.no_grad()
+def pose_of(body: Body, vertices: Float[Tensor, "vertex 3"], usual: float = 1.0) -> Found:
+    """Return the most probable pose, shape and translation of a mesh, metres (Levenberg-Marquardt; Moré 1978).
+
+    The search starts from the rotations of each joint's vertices, so that any pose is found, also of a person upside
+    down. The shape coefficients of `body` have standard deviation 1. `usual` is the weight of the prior on pose and
+    shape; with 0 only the vertices count.
+
+    Raises:
+        DataError: the mesh has another number of vertices, or numbers that are not finite.
+    """
+    if len(vertices) != len(body.template) or not vertices.isfinite().all():
+        raise DataError(
+            f"A mesh has {len(vertices)} vertices, {int((~vertices.isfinite()).any(1).sum())} of them not finite; "
+            f"wanted the {len(body.template)} of {body.source}, metres. Register it to that body."
+        )
+    step = -(-len(vertices) // MOST)
+    looked_at = {
+        name: getattr(body, name)[::step]
+        for name in ("template", "weights", "shapes", "pose_shapes")
+        if getattr(body, name) is not None
+    }
+    model = BodyModel(replace(body, faces=body.faces[:0], uv=None, uv_faces=None, **looked_at)).double()
+    vertices = vertices[::step].double()
+    joints, shapes = len(body.parents), body.shapes.shape[-1]
+    prior = vertices.new_full((joints + 1, 3), BENT**-2)
+    prior[[body.parents.index(-1), -1]] = 0  # rotation and translation of the whole body are free
+    prior = torch.cat([prior.flatten(), vertices.new_ones(shapes)]) * (
+        usual * OFF**2 * len(vertices) / INDEPENDENT
+    )
+    problem = _Problem(model, vertices, prior)
+    start = torch.cat([rotations_of(model, vertices).flatten(), vertices.new_zeros(3 + shapes)])
+    start[3 * joints :][:3] = -problem.apart(start).mean(0)
+    numbers = _least(problem, start)
+    error = float(problem.apart(numbers).square().sum(1).mean().sqrt())
+    return Found(*problem.parts(numbers[None]), error)
+
+
+def _least(problem: _Problem, numbers: Float[Tensor, "number"]) -> Float[Tensor, "number"]:
+    damping, cost = 1e-3, problem.cost(numbers)
+    for _ in range(STEPS):
+        slopes = problem.derivatives(numbers)
+        curvature = slopes.T @ slopes + problem.prior.diag()
+        uphill = slopes.T @ problem.apart(numbers).flatten() + problem.prior * numbers
+        while True:
+            # parameters without influence have no curvature of their own
+            scaled = curvature + (damping * curvature.diagonal() + 1e-9).diag()
+            step = -torch.linalg.solve(scaled, uphill)
+            tried = problem.cost(numbers + step)
+            if tried <= cost or damping > 1e10:
+                break
+            damping *= 4
+        if tried > cost:
+            break
+        numbers, cost, damping = numbers + step, tried, max(damping / 9, 1e-12)
+        if float(step.abs().max()) < ENOUGH:
+            break
+    return numbers
+
+
+def rotations_of(model: BodyModel, vertices: Float[Tensor, "vertex 3"]) -> Float[Tensor, "joint 3"]:
+    """Return the rotation of each joint relative to its parent's: axis times angle, radians.
+
+    It is the rotation that best maps the template's vertices that follow the joint to their positions in the mesh
+    (Kabsch 1976). The root's is that of all vertices. Joints with too few vertices to determine a rotation follow their
+    parents.
+    """
+    template = model.template.unflatten(0, (3, -1)).T
+    upright = torch.eye(3).to(vertices)
+    turned = [upright] * len(model.parents)
+    found = torch.zeros(len(model.parents), 3).to(vertices)
+    for level, parents in model.levels:
+        for joint, parent in zip(level, parents, strict=True):
+            above = turned[parent] if parent >= 0 else upright
+            weights = model.weights[joint].square() if parent >= 0 else torch.ones_like(model.weights[joint])
+            total = weights.sum()
+            turned[joint] = above
+            if total < 3:
+                continue
+            one, other = (points - weights @ points / total for points in (template, vertices))
+            left, values, right = torch.linalg.svd(other.T @ (weights[:, None] * one))
+            if values[1] < 1e-3 * values[0]:  # vertices on a line do not determine the rotation about it
+                continue
+            mirror = torch.ones_like(values)
+            mirror[2] = torch.linalg.det(left @ right).sign()
+            turned[joint] = left @ mirror.diag() @ right
+            local = Rotation.from_matrix((above.T @ turned[joint]).numpy())
+            found[joint] = torch.from_numpy(local.as_rotvec())
+    return found

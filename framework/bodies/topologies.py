@@ -1,0 +1,269 @@
+"""Meshes of one body with fewer or more vertices: a subset of its vertices, or its vertices and midpoints of its edges.
+
+The vertices of all of them are rows of one finely split surface, so that values of that surface (colours, positions)
+hold for each mesh.
+"""
+
+import hashlib
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from framework.bodies.body import Body
+from framework.bodies.decimation import Decimated, decimated
+from framework.errors import DataError
+from framework.storage import cache as cached
+from framework.storage.arrays import archive
+from framework.storage.generated import generated
+from framework.storage.reading import guarded, read_bytes
+
+VERSION = 1
+"""Version of the cached decimations; any change of them takes a new number."""
+Name = Literal["7k", "14k", "27k", "110k"]
+COUNTS: dict[Name, int] = {"7k": 6_890, "27k": 27_578, "110k": 110_312}
+"""Numbers of vertices; the first two are the thesis's (Table 7.1). "14k" is the unchanged default body."""
+
+
+class Corners(NamedTuple):
+    """Triangles of vertices, and the same triangles of texture coordinates."""
+
+    faces: Int[np.ndarray, "faces 3"]
+    uv_faces: Int[np.ndarray, "faces 3"]
+
+
+class Split(NamedTuple):
+    """A mesh after edges were split.
+
+    Attributes:
+        corners: its triangles.
+        pairs, uv_pairs: the two old vertices, and the two old texture coordinates, around each new one.
+    """
+
+    corners: Corners
+    pairs: Int[np.ndarray, "new 2"]
+    uv_pairs: Int[np.ndarray, "new_places 2"]
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """The body's surface after all edges were split in the middle, once for each stage.
+
+    Attributes:
+        corners: triangles of the body, and those after each stage.
+        pairs, uv_pairs: for each stage the ends of the split edges, whose midpoints follow the earlier vertices
+            (texture coordinates).
+    """
+
+    corners: tuple[Corners, ...]
+    pairs: tuple[Int[np.ndarray, "_new 2"], ...]
+    uv_pairs: tuple[Int[np.ndarray, "_new 2"], ...]
+
+    @property
+    def faces(self) -> Int[np.ndarray, "faces 3"]:
+        """Return the triangles after the last stage."""
+        return self.corners[-1].faces
+
+    def carried(self, values: np.ndarray, stages: int | None = None) -> np.ndarray:
+        """Return values of the body's vertices interpolated to those of the sheet (after the first `stages`)."""
+        return _carried(values, self.pairs[:stages])
+
+    def carried_uv(self, uv: Float[np.ndarray, "place 2"]) -> Float[np.ndarray, "places 2"]:
+        """Return the body's texture coordinates interpolated to those of the sheet."""
+        return _carried(uv, self.uv_pairs)
+
+
+@dataclass(frozen=True)
+class Topology:
+    """A mesh whose vertices are rows of a sheet.
+
+    Attributes:
+        rows: rows of the sheet's vertices.
+        faces: rows of `rows`, corners counter-clockwise seen from outside.
+        uv_rows: rows of the sheet's texture coordinates.
+        uv_faces: rows of `uv_rows`.
+    """
+
+    rows: Int[np.ndarray, "vertices"]
+    faces: Int[np.ndarray, "_faces 3"]
+    uv_rows: Int[np.ndarray, "places"]
+    uv_faces: Int[np.ndarray, "_faces 3"]
+
+
+def sheet(body: Body, stages: int = 2) -> Sheet:
+    """Return the body's surface with edges split in `stages` stages.
+
+    For a body without texture coordinates, the numbers of its vertices take their role.
+    """
+    corners = [Corners(body.faces, body.faces if body.uv_faces is None else body.uv_faces)]
+    places = len(body.template) if body.uv is None else len(body.uv)
+    pairs, uv_pairs, count = [], [], len(body.template)
+    for _ in range(stages):
+        found = split(corners[-1], count, places)
+        corners.append(found.corners)
+        pairs.append(found.pairs)
+        uv_pairs.append(found.uv_pairs)
+        count, places = count + len(found.pairs), places + len(found.uv_pairs)
+    return Sheet(tuple(corners), tuple(pairs), tuple(uv_pairs))
+
+
+def topology(body: Body, surface: Sheet, name: Name) -> Topology:
+    """Return one of the meshes.
+
+    A body with too few vertices stays unchanged, or has each edge split once at most.
+    """
+    vertices, places = len(body.template), len(body.template if body.uv is None else body.uv)
+    wanted = COUNTS.get(name, vertices)
+    if name == "7k":
+        if vertices > wanted:
+            return _compact(*_decimated(body, surface.corners[0], wanted))
+        return _compact(np.arange(vertices), *surface.corners[0])
+    stage = 1 if name == "110k" else 0
+    for pairs, uv_pairs in zip(surface.pairs[:stage], surface.uv_pairs[:stage], strict=True):
+        vertices, places = vertices + len(pairs), places + len(uv_pairs)
+    pairs = surface.pairs[stage]
+    ends = surface.carried(body.template.astype(np.float64), stage)[pairs]
+    lengths = ((ends[:, 0] - ends[:, 1]) ** 2).sum(1)
+    longest = np.argsort(-lengths, kind="stable")[: max(wanted - vertices, 0)]
+    chosen = np.zeros(len(pairs), bool)
+    chosen[longest] = True
+    corners = split(surface.corners[stage], vertices, places, chosen, numbered_as_all=True).corners
+    rows = np.concatenate([np.arange(vertices), vertices + np.flatnonzero(chosen)])
+    return _compact(rows, *corners)
+
+
+def recognised(
+    body: Body, vertices: int, faces: Int[np.ndarray, "faces 3"], source: str
+) -> tuple[Sheet, Topology]:
+    """Return the sheet and the topology of the body that a mesh has.
+
+    Raises:
+        DataError: no mesh of the body has this number of vertices, or the one that has it has other triangles.
+    """
+    for name in ("14k", "7k", "27k", "110k"):
+        # decimation takes seconds, so it is done only if the number of vertices matches
+        if name == "7k" and not vertices == COUNTS["7k"] < len(body.template):
+            continue
+        surface = sheet(body, {"7k": 0, "110k": 2}.get(name, 1))
+        mesh = topology(body, surface, name)
+        if len(mesh.rows) != vertices:
+            continue
+        ours, theirs = (np.unique(np.sort(corners, 1), axis=0) for corners in (mesh.faces, faces))
+        if np.array_equal(ours, theirs):
+            return surface, mesh
+        raise DataError(
+            f"{source}: it has the {vertices} vertices of {body.source}, but other triangles, so that its vertices are "
+            "in another order. Give a mesh registered to that body, or the body that it is registered to."
+        )
+    raise DataError(
+        f"{source}: no mesh of {body.source} has {vertices} vertices; it has {len(body.template)}, and decimated or "
+        f"split {', '.join(map(str, COUNTS.values()))}. Give the body that this mesh is registered to."
+    )
+
+
+def in_topology(body: Body, surface: Sheet, mesh: Topology) -> Body:
+    """Return a body with the vertices of a mesh, without texture coordinates.
+
+    Each vertex has the template, shapes and skinning weights of its point on the body's surface; at a midpoint they are
+    the means of the edge's ends. Vertices of a decimated mesh are the body's own. On a bent surface, the skinned
+    midpoint is not quite the middle of its edge.
+    """
+    parts = {
+        part: surface.carried(getattr(body, part))[mesh.rows]
+        for part in ("template", "weights", "shapes", "pose_shapes")
+        if getattr(body, part) is not None
+    }
+    return replace(body, faces=mesh.faces, uv=None, uv_faces=None, **parts)
+
+
+def split(
+    corners: Corners,
+    vertices: int,
+    places: int,
+    chosen: Bool[np.ndarray, "edge"] | None = None,
+    *,
+    numbered_as_all: bool = False,
+) -> Split:
+    """Split edges, all or those chosen (in the order of `edges`), in the middle.
+
+    Midpoints are numbered from `vertices` and `places` on, the numbers of existing vertices and texture coordinates.
+    With `numbered_as_all`, edges that are not split also take a number, which stays unused.
+    """
+    pairs, sides = edges(corners.faces)
+    uv_pairs, uv_sides = edges(corners.uv_faces)
+    marked = np.ones(len(pairs), bool) if chosen is None else chosen
+    uv_marked = np.zeros(len(uv_pairs), bool)
+    uv_marked[uv_sides[marked[sides]]] = True
+    parts = []
+    for faces, first, numbers, which in (
+        (corners.faces, vertices, sides, marked),
+        (corners.uv_faces, places, uv_sides, uv_marked),
+    ):
+        middle = first + (np.arange(len(which)) if numbered_as_all else np.cumsum(which) - 1)
+        parts.append(_triangles(faces, middle[numbers], marked[sides]))
+    return Split(Corners(*parts), pairs[marked], uv_pairs[uv_marked])
+
+
+def edges(faces: Int[np.ndarray, "faces 3"]) -> tuple[Int[np.ndarray, "edge 2"], Int[np.ndarray, "faces 3"]]:
+    """Return all edges, lower end first, in ascending order, and the numbers of each triangle's sides.
+
+    The first side of a triangle leads from its first to its second corner.
+    """
+    sides = np.sort(np.stack([faces, np.roll(faces, -1, 1)], -1), -1).reshape(-1, 2)
+    keys = sides[:, 0] * (faces.max(initial=0) + 1) + sides[:, 1]
+    _, first, numbers = np.unique(keys, return_index=True, return_inverse=True)
+    return sides[first], numbers.reshape(-1, 3)
+
+
+def _triangles(faces: np.ndarray, middle: np.ndarray, marked: np.ndarray) -> Int[np.ndarray, "triangles 3"]:
+    """Return the triangles after their marked sides are split at the vertices `middle`."""
+    count = marked.sum(1)
+    # corners are rotated so that a single marked side is the first, and of two marked sides neither is the last
+    shift = np.where(count == 1, marked.argmax(1), np.where(count == 2, (~marked).argmax(1) + 1, 0)) % 3
+    order = (np.arange(3) + shift[:, None]) % 3
+    a, b, c = np.take_along_axis(faces, order, 1).T
+    m, n, o = np.take_along_axis(middle, order, 1).T
+    patterns = {
+        0: [(a, b, c)],
+        1: [(a, m, c), (m, b, c)],
+        2: [(m, b, n), (a, m, n), (a, n, c)],
+        3: [(a, m, o), (m, b, n), (o, n, c), (m, n, o)],
+    }
+    found = [
+        np.stack([corner[count == number] for corner in triangle], 1)
+        for number, triangles in patterns.items()
+        for triangle in triangles
+    ]
+    return np.concatenate(found)
+
+
+def _carried(values: np.ndarray, stages: tuple[np.ndarray, ...]) -> np.ndarray:
+    for pairs in stages:
+        values = np.concatenate([values, (values[pairs[:, 0]] + values[pairs[:, 1]]) / 2])
+    return values
+
+
+def _compact(rows: np.ndarray, faces: np.ndarray, uv_faces: np.ndarray) -> Topology:
+    """Return the topology with triangles in the numbers of its rows, and with the used texture coordinates alone."""
+    place = np.zeros(max(faces.max(initial=0), rows.max(initial=0)) + 1, np.int64)
+    place[rows] = np.arange(len(rows))
+    uv_rows, uv_numbers = np.unique(uv_faces, return_inverse=True)
+    return Topology(rows, place[faces], uv_rows, uv_numbers.reshape(-1, 3))
+
+
+def _decimated(body: Body, corners: Corners, count: int) -> Decimated:
+    """Return a decimated body from the cache, because decimation takes some seconds."""
+    digest = hashlib.sha256(np.ascontiguousarray(body.template).tobytes())
+    for part in corners:
+        digest.update(np.ascontiguousarray(part).tobytes())
+    mark = {"decimated": digest.hexdigest(), "vertices": count, "version": VERSION}
+    root = cached.folder("body") / f"decimated-{digest.hexdigest()[:12]}-{count}-{VERSION}"
+
+    def write(folder: Path) -> None:
+        np.savez(folder / "mesh.npz", **decimated(body.template, *corners, count)._asdict())
+
+    generated(root, mark, write)
+    with guarded(root / "mesh.npz", "a decimated body", f"Delete {root}: it is made anew."):
+        return Decimated(**archive(read_bytes(root / "mesh.npz"), Decimated._fields))

@@ -1,1 +1,0 @@
-"""Data sets of registered bodies: scans of synthetic people, and FAUST."""

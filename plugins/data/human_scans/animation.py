@@ -1,0 +1,186 @@
+"""Generated people in many poses, cameras that orbit them, and rendered images of both side by side."""
+
+import copy
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int, UInt8
+from PIL import Image, ImageDraw, ImageFont
+from torch import Tensor
+
+from framework.bodies.topologies import Name
+from framework.datasets.scan_layout import RegisteredMesh
+from framework.geometry.camera import Camera, canonical_camera
+from framework.geometry.srgb import bytes_from_linear, linear_from_bytes
+from framework.renderer import Renderer, Scene
+from plugins.data.human_scans.dressed import Scan
+from plugins.data.human_scans.photographs import photographed
+from plugins.data.human_scans.scan_generator import Crowd
+
+LOOK_DOWN = math.radians(8)
+FREE = 0.92
+"""Largest share of an image's height or width that a person fills."""
+CAPTION = 16  # pixels
+SAYS = "synthetic"
+
+
+class Moment(NamedTuple):
+    """State of a person at one time: the registration's vertices, metres, and the scan, or None without one."""
+
+    vertices: Float[Tensor, "vertices 3"]
+    scan: Scan | None
+
+
+@dataclass(frozen=True)
+class Actor:
+    """Person who is drawn repeatedly: triangles, and the linear RGB of each vertex."""
+
+    faces: Int[Tensor, "faces 3"]
+    colors: Float[Tensor, "vertices 3"]
+
+    def scene(self, moment: Moment, camera: Camera) -> Scene:
+        """Return the scene in which the camera sees the person at this moment."""
+        return Scene(moment.vertices, self.faces, self.colors, camera)
+
+
+class Generated:
+    """Person of a generated data set, who can take any pose.
+
+    The registration is the one to the scan in the first pose, reposed: its distances from the body and its colours do
+    not change. The scan is generated anew in each pose, with the same clothes, hair and light, and with the shading of
+    the pose.
+
+    Attributes:
+        stood: the pose that photographs of the data set show.
+        registration: the mesh on the topology, as the data set has it.
+    """
+
+    def __init__(self, crowd: Crowd, split: str, number: int, name: Name) -> None:
+        self.crowd, self.wardrobe = crowd, crowd.wardrobe
+        self.shape, self.stood, skin, self._random = crowd.person(split, number)
+        self._bare = crowd.posed(self.shape, self.stood)
+        self.worn = self.wardrobe.clothes(skin, self._random)
+        random = copy.deepcopy(self._random)
+        scan, seen = self.wardrobe.scanned(self._bare, self.worn, random)
+        self._registered = self.wardrobe.registered(self._bare, scan, seen, random)
+        mesh = crowd.meshes[name]
+        self._rows = mesh.rows
+        self.registration = RegisteredMesh(
+            torch.from_numpy(self._registered.vertices[mesh.rows]).float(),
+            torch.from_numpy(self._registered.colors[mesh.rows]),
+            torch.from_numpy(mesh.faces),
+        )
+        self._first = Moment(self.registration.vertices, scan)
+        self._floor = float(self.registration.vertices[:, 1].min())
+
+    def first(self) -> Moment:
+        """Return the person in the pose of the data set."""
+        return self._first
+
+    def at(self, pose: Float[np.ndarray, "joint 3"]) -> Moment:
+        """Return the person in a pose, moved vertically so that the feet are on the floor."""
+        bare = self.crowd.posed(self.shape, torch.from_numpy(pose)[None])
+        scan, _ = self.wardrobe.scanned(bare, self.worn, copy.deepcopy(self._random))
+        vertices = self.wardrobe.reposed(self._registered.vertices, self._bare, bare)[self._rows]
+        up = np.array([0.0, self._floor - vertices[:, 1].min(), 0.0])
+        moved = Scan(scan.vertices + up, scan.faces, scan.colors)
+        return Moment(torch.from_numpy(vertices + up).float(), moved)
+
+
+def actor(registration: RegisteredMesh) -> Actor:
+    """Return the person whose mesh a registration is, with colours in linear RGB."""
+    return Actor(registration.faces, linear_from_bytes(registration.colors))
+
+
+def orbit(moments: Sequence[Moment], azimuths: Sequence[float], size: tuple[int, int]) -> list[Camera]:
+    """Return cameras that look at the middle of all moments, at the smallest common distance that shows each whole.
+
+    Args:
+        moments: the states that all cameras have to show whole.
+        azimuths: radians; 0 is in front (z), larger angles turn to the subject's left (x).
+        size: (height, width), pixels.
+    """
+    every = torch.cat(
+        [found.vertices for found in {id(one.vertices): one for one in moments}.values()]
+    ).double()
+    middle = (every.amin(0) + every.amax(0)) / 2
+    plain = canonical_camera(*size)
+    # a point is in view if focal |x| / (z + distance) is at most half the free width
+    steep = torch.tensor(plain.focal, dtype=torch.float64) * 2 / FREE / torch.tensor(size[::-1])
+    rotations = [_towards(azimuth) for azimuth in azimuths]
+    away = 0.0
+    for rotation in {tuple(one.flatten().tolist()): one for one in rotations}.values():
+        seen = (every - middle) @ rotation.T
+        away = max(away, float((steep * seen[:, :2].abs() - seen[:, 2:]).max()))
+    ahead = torch.tensor([0.0, 0.0, away], dtype=torch.float64)
+    return [
+        Camera(turn.float(), (ahead - turn @ middle).float(), plain.focal, plain.principal, *size)
+        for turn in rotations
+    ]
+
+
+def _towards(azimuth: float) -> Float[Tensor, "3 3"]:
+    """Return the rotation from world to camera (x right, y down, z forward) of a camera looking down by LOOK_DOWN."""
+    sine, cosine = math.sin(azimuth), math.cos(azimuth)
+    level = math.cos(LOOK_DOWN)
+    back = torch.tensor([level * sine, math.sin(LOOK_DOWN), level * cosine], dtype=torch.float64)
+    right = torch.tensor([cosine, 0.0, -sine], dtype=torch.float64)
+    return torch.stack([right, torch.linalg.cross(right, back), -back])
+
+
+def on_white(renderer: Renderer, scene: Scene) -> UInt8[np.ndarray, "height width 3"]:
+    """Return an 8-bit sRGB image of the scene on white, for any background colour of the renderer."""
+    if renderer.background == 1:
+        return bytes_from_linear(renderer(scene)["color"]).numpy()
+    assert scene.colors is not None
+    cover = torch.ones(len(scene.vertices), 1)  # a fourth channel: share of a pixel that is covered
+    drawn = renderer(Scene(scene.vertices, scene.faces, torch.cat([scene.colors, cover], 1), scene.camera))[
+        "color"
+    ]
+    return bytes_from_linear(drawn[..., :3] + 1 - drawn[..., 3:]).numpy()
+
+
+def photograph(renderer: Renderer, scan: Scan, camera: Camera) -> UInt8[np.ndarray, "height width 3"]:
+    """Return a photograph of the scan as those of the data set, 8-bit sRGB, on white."""
+    scene = Scene(
+        torch.from_numpy(scan.vertices).float(),
+        torch.from_numpy(scan.faces),
+        torch.from_numpy(scan.colors).float(),
+        camera,
+    )
+    pixels, mask = photographed(renderer, scene, [camera])[0]
+    cover = torch.from_numpy(mask).float()[..., None] / 255
+    return bytes_from_linear(linear_from_bytes(torch.from_numpy(pixels)) * cover + 1 - cover).numpy()
+
+
+def columns(
+    actor: Actor,
+    moments: Sequence[Moment],
+    cameras: Sequence[Camera],
+    renderers: Mapping[str, Renderer],
+    camera_of_truth: Renderer,
+) -> Iterator[dict[str, UInt8[np.ndarray, "height width 3"]]]:
+    """Yield for each frame the image of each renderer by its name, and the "photograph" if the scan is known."""
+    for moment, camera in zip(moments, cameras, strict=True):
+        scene = actor.scene(moment, camera)
+        found = {name: on_white(renderer, scene) for name, renderer in renderers.items()}
+        if moment.scan is not None:
+            found["photograph"] = photograph(camera_of_truth, moment.scan, camera)
+        yield found
+
+
+def side_by_side(pictures: Mapping[str, UInt8[np.ndarray, "height width 3"]], synthetic: bool) -> Image.Image:
+    """Return one image of all images in a row with their names below, and with a note if they are synthetic."""
+    height, width = next(iter(pictures.values())).shape[:2]
+    sheet = Image.new("RGB", (width * len(pictures), height + CAPTION), "white")
+    pen, font = ImageDraw.Draw(sheet), ImageFont.load_default(11)
+    for number, (name, pixels) in enumerate(pictures.items()):
+        sheet.paste(Image.fromarray(pixels), (number * width, 0))
+        pen.text((number * width + 5, height + 1), name, "black", font)
+    if synthetic:
+        pen.text((sheet.width - 5, height + 1), SAYS, (150, 0, 0), font, anchor="ra")
+    return sheet

@@ -1,0 +1,267 @@
+"""A dressed person's scan, and the smooth body registered to it.
+
+The scan has what photographs show: cloth with thickness and wrinkles, hair, shading. The registration is the body,
+moved smoothly towards the scan, with the colours of the scan's nearest points. A renderer gets the registration (thesis
+§7.3.1).
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int, UInt8
+from numpy.random import Generator
+from scipy.sparse import csr_matrix
+from scipy.spatial import KDTree
+
+from framework.bodies.body import Body, BodyModel
+from framework.bodies.topologies import Sheet, edges, sheet
+from framework.geometry.srgb import bytes_from_linear
+from plugins.data.human_scans import skins
+from plugins.data.human_scans.anatomy import Anatomy, anatomy
+from plugins.data.human_scans.fabrics import noise
+from plugins.data.human_scans.garments import Skirt, outfit
+from plugins.data.human_scans.hair import Hair, Piece, hair, tied
+from plugins.data.human_scans.hanging import hung
+
+FURTHEST = 0.05
+"""Largest distance of a registration from the bare body, metres."""
+STEPS, BLUR = 4, 3
+"""Number of steps of a registration, and number of means over neighbours after each step."""
+ERROR = 0.0015
+"""Standard deviation of the remaining error of a registration, metres."""
+
+
+@dataclass(frozen=True)
+class Scan:
+    """Mesh that photographs show; metres, linear RGB that includes the shading by the scanner's light.
+
+    Attributes:
+        vertices, faces, colors: the body's sheet, and skirt and hair that hang beside it.
+    """
+
+    vertices: Float[np.ndarray, "vertices 3"]
+    faces: Int[np.ndarray, "faces 3"]
+    colors: Float[np.ndarray, "vertices 3"]
+
+
+@dataclass(frozen=True)
+class Registered:
+    """The smooth body on every vertex of the sheet; each topology uses some of them. Metres, 8-bit sRGB."""
+
+    vertices: Float[np.ndarray, "sheet 3"]
+    colors: UInt8[np.ndarray, "sheet 3"]
+
+
+class Clothes(NamedTuple):
+    """A person's clothes and hair, independent of the pose.
+
+    Attributes:
+        colors: linear RGB of each vertex of the sheet.
+        raised: distance of cloth and hair from the skin, metres.
+        cover: share of the body's shape that cloth hides.
+        skirt: skirt that hangs beside the body, or None.
+        hair: hair of the person.
+    """
+
+    colors: Float[np.ndarray, "sheet 3"]
+    raised: Float[np.ndarray, "sheet"]
+    cover: Float[np.ndarray, "sheet"]
+    skirt: Skirt | None
+    hair: Hair
+
+
+class Wardrobe:
+    """Clothing of posed people of one body; holds what is the same for all of them.
+
+    Args:
+        stages: how often the body's edges are split for the scan.
+    """
+
+    def __init__(self, body: Body, stages: int = 2) -> None:
+        self.body = body
+        self.model = BodyModel(body)
+        self.sheet: Sheet = sheet(body, stages)
+        self.anatomy: Anatomy = anatomy(body, self.sheet.carried)
+        self.faces = self.sheet.faces
+        self._spread = _spread(self.faces, len(self.anatomy.place))
+        self._own_spread = _spread(body.faces, len(body.template))
+        self._neighbours = _neighbours(body.faces, len(body.template))
+        self.vertices = len(body.template)
+        self.uv = None if body.uv is None else self.sheet.carried_uv(body.uv)
+        places = self.sheet.corners[-1].uv_faces
+        self._place_of = np.zeros(len(self.anatomy.place), np.int64)
+        self._place_of[self.faces.ravel()] = places.ravel()
+        self.vertex_of_place = np.zeros(places.max() + 1 if self.uv is None else len(self.uv), np.int64)
+        self.vertex_of_place[places.ravel()] = self.faces.ravel()
+
+    def dress(
+        self,
+        posed: Float[np.ndarray, "vertices 3"],
+        skin: UInt8[np.ndarray, "height width 3"] | None,
+        random: Generator,
+    ) -> tuple[Scan, Registered]:
+        """Return scan and registration of a posed body with random clothes, hair and skin.
+
+        `skin` is an image of a skin in the body's texture layout; None: the skin is painted by procedure.
+        """
+        scan, seen = self.scanned(posed, self.clothes(skin, random), random)
+        return scan, self.registered(posed, scan, seen, random)
+
+    def clothes(self, skin: UInt8[np.ndarray, "height width 3"] | None, random: Generator) -> Clothes:
+        """Return random clothes, hair and skin, which do not depend on the pose."""
+        where = self.anatomy
+        worn = outfit(where, random)
+        grown = hair(where, random)
+        if skin is None or self.uv is None:
+            colors = skins.painted(where, random)
+        else:
+            colors = skins.shown(skin, self.uv)[self._place_of]
+            colors = skins.filled(colors, where, self.vertices, self._neighbours.dot, self.sheet.carried)
+            colors = skins.with_eyes(where, colors, random)
+        raised = np.zeros(len(where.place))
+        cover = np.zeros(len(where.place))
+        for garment in worn.garments:
+            colors = np.where((garment.inside > 0)[:, None], garment.colors, colors)
+            raised = raised + garment.raised()
+            cover = np.maximum(cover, (garment.inside / 0.03).clip(0, 1))
+        colors = colors + grown.share[:, None] * (grown.colors - colors)
+        return Clothes(colors, raised + grown.raised, cover, worn.skirt, grown)
+
+    def scanned(
+        self, posed: Float[np.ndarray, "vertices 3"], worn: Clothes, random: Generator
+    ) -> tuple[Scan, Bool[np.ndarray, "points"]]:
+        """Return the scan of a dressed person in a pose, and which of its points a scanner sees."""
+        where = self.anatomy
+        draped = self.sheet.carried(self._smoothed(posed, worn.cover[: self.vertices]))
+        vertices = draped + worn.raised[:, None] * self.normals(draped)
+        pieces = [Piece(vertices, self.faces, worn.colors)]
+        hidden = np.zeros(len(vertices), bool)
+        if worn.skirt is not None:
+            held = np.flatnonzero(where.arms[: self.vertices] < 0.3)
+            piece = hung(
+                worn.skirt, vertices[held], np.abs(where.place[held, 1] - where.waist) < 0.03, random
+            )
+            pieces.append(piece)
+            low, high = piece.vertices[:, 1].min() + 0.01, piece.vertices[:, 1].max() - 0.01
+            hidden = (where.arms < 0.3) & (vertices[:, 1] > low) & (vertices[:, 1] < high)
+        locks = tied(worn.hair.style, worn.hair.color, *self._head(posed), random)
+        if locks is not None:
+            pieces.append(locks)
+        light = Light(random)
+        lit = [
+            light.on(piece, self.normals(piece.vertices) if piece is pieces[0] else _normals(piece))
+            for piece in pieces
+        ]
+        starts = np.cumsum([0, *(len(piece.vertices) for piece in pieces)])
+        scan = Scan(
+            np.concatenate([piece.vertices for piece in pieces]),
+            np.concatenate([piece.faces + start for piece, start in zip(pieces, starts, strict=False)]),
+            np.concatenate(lit).clip(0, 1),
+        )
+        seen = np.concatenate([~hidden, *(np.ones(len(piece.vertices), bool) for piece in pieces[1:])])
+        return scan, seen
+
+    def normals(self, vertices: Float[np.ndarray, "sheet 3"]) -> Float[np.ndarray, "sheet 3"]:
+        """Return unit normals of the sheet's vertices, outwards, means over their faces by area."""
+        return _unit(self._spread @ _cross(vertices, self.faces))
+
+    def registered(self, posed: np.ndarray, scan: Scan, seen: np.ndarray, random: Generator) -> Registered:
+        """Return the body moved towards the nearest points of the scan, with their colours, as a registration.
+
+        Vertices move along their normals, no farther than FURTHEST, and each as its neighbours do. Details thinner than
+        some edges (wrinkles, hems), or too far from the body (a wide skirt, a tail of hair), are therefore only in the
+        scan.
+        """
+        points = scan.vertices[seen]
+        tree = KDTree(points, balanced_tree=False, compact_nodes=False)
+        outwards = self._outwards(posed)
+        moved = np.zeros(len(posed))
+        for _ in range(STEPS):
+            now = posed + moved[:, None] * outwards
+            moved = moved + ((points[tree.query(now)[1]] - now) * outwards).sum(1)
+            for _ in range(BLUR):
+                moved = self._neighbours @ moved.clip(-0.01, FURTHEST)
+        off = moved + ERROR * noise(self.body.template, 0.25, random)
+        vertices = self.sheet.carried(posed + off[:, None] * outwards)
+        nearest = np.flatnonzero(seen)[tree.query(vertices)[1]]
+        return Registered(vertices, bytes_from_linear(torch.from_numpy(scan.colors[nearest])).numpy())
+
+    def reposed(
+        self,
+        registration: Float[np.ndarray, "sheet 3"],
+        stood: Float[np.ndarray, "vertices 3"],
+        posed: Float[np.ndarray, "vertices 3"],
+    ) -> Float[np.ndarray, "sheet 3"]:
+        """Return a registration of the pose `stood` in another pose, at the same distances along the body's normals."""
+        off = ((registration[: self.vertices] - stood) * self._outwards(stood)).sum(1)
+        return self.sheet.carried(posed + off[:, None] * self._outwards(posed))
+
+    def _outwards(self, posed: np.ndarray) -> Float[np.ndarray, "vertices 3"]:
+        return _unit(self._own_spread @ _cross(posed, self.body.faces))
+
+    def _smoothed(self, posed: np.ndarray, cover: np.ndarray) -> np.ndarray:
+        """Return the body without the details that cloth hides.
+
+        Each step blurs, and then undoes the shrinking that blurring causes (Taubin 1995).
+        """
+        found = posed.astype(np.float64)
+        for _ in range(12):
+            for weight in (0.5, -0.53):
+                found = found + weight * cover[:, None] * (self._neighbours @ found - found)
+        return found
+
+    def _head(self, posed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the affine transform from the template's head to the posed head, and the former's bounding box."""
+        head = self.anatomy.head[: self.vertices] > 0.9
+        if head.sum() < 4:
+            head = np.ones(self.vertices, bool)
+        template = self.body.template[head].astype(np.float64)
+        given = np.concatenate([template, np.ones((len(template), 1))], 1)
+        found = np.linalg.lstsq(given, posed[head].astype(np.float64), rcond=None)[0]
+        return found, np.stack([template.min(0), template.max(0)], 1)
+
+
+class Light:
+    """Light of a scanner: ambient light, stronger from above, and light from one side."""
+
+    def __init__(self, random: Generator) -> None:
+        turn, lift = random.uniform(0, 2 * np.pi), random.uniform(0.3, 0.9)
+        self.towards = np.array([np.cos(lift) * np.sin(turn), np.sin(lift), np.cos(lift) * np.cos(turn)])
+        self.key = random.uniform(0.35, 0.6)
+
+    def on(self, piece: Piece, normals: Float[np.ndarray, "vertices 3"]) -> Float[np.ndarray, "vertices 3"]:
+        """Return the linear RGB that a matt surface of these colours reflects."""
+        around = 0.62 + 0.22 * normals[:, 1]
+        side = ((normals @ self.towards + 0.3) / 1.3).clip(0, 1)
+        return piece.colors * (around + self.key * side)[:, None]
+
+
+def _cross(vertices: np.ndarray, faces: np.ndarray) -> Float[np.ndarray, "faces 3"]:
+    x, y, z = vertices.T[:, faces.T]  # shape of each: (corner, face)
+    p, q, r = (along[1:] - along[:1] for along in (x, y, z))  # from the first corner to the others
+    return np.stack([q[0] * r[1] - r[0] * q[1], r[0] * p[1] - p[0] * r[1], p[0] * q[1] - q[0] * p[1]], 1)
+
+
+def _normals(piece: Piece) -> Float[np.ndarray, "vertices 3"]:
+    spread = _spread(piece.faces, len(piece.vertices))
+    return _unit(spread @ _cross(piece.vertices, piece.faces))
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
+
+
+def _spread(faces: np.ndarray, vertices: int) -> csr_matrix:
+    """Return the matrix that sums values of faces to each of their vertices."""
+    columns = np.repeat(np.arange(len(faces)), 3)
+    return csr_matrix((np.ones(len(columns)), (faces.ravel(), columns)), (vertices, len(faces)))
+
+
+def _neighbours(faces: np.ndarray, vertices: int) -> csr_matrix:
+    """Return the matrix that averages values over every vertex and its neighbours."""
+    (one, other), own = edges(faces)[0].T, np.arange(vertices)
+    rows = np.concatenate([one, other, own])
+    share = 1 / np.bincount(rows, minlength=vertices)
+    return csr_matrix((share[rows], (rows, np.concatenate([other, one, own]))), (vertices, vertices))

@@ -1,0 +1,130 @@
+"""`python -m plugins.data.human_scans.photograph_meshes <meshes> <root>` makes data of `human_scans` from meshes.
+
+<meshes> holds the folders train, validation and test. Each of them has `<name>_scan.ply` (.obj, ...), which photographs
+show, and `<name>_registration.ply`, which renderers get, all of one topology. Metres, y up, facing z, vertex colours.
+"""
+
+import argparse
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from framework.configuration.schema import build, resolve
+from framework.data import Splits
+from framework.datasets import scan_layout
+from framework.datasets.scan_layout import RegisteredMesh
+from framework.errors import DataError
+from framework.geometry import meshes
+from framework.geometry.meshes import READERS, stream
+from framework.geometry.srgb import linear_from_bytes
+from framework.renderer import Renderer, Scene
+from framework.storage.commands import run_command
+from framework.storage.generated import draw_all, generated
+from plugins.data.human_scans.photographs import photographed, rig
+
+Pair = tuple[Path, Path]
+"""Paths of a scan and of its registration."""
+
+
+def main(arguments: list[str]) -> None:
+    """Write the root, whole or not at all.
+
+    Raises:
+        UserError: a mesh is missing, cannot be read or has no colours; the root exists already.
+    """
+    parser = argparse.ArgumentParser(
+        prog="python -m plugins.data.human_scans.photograph_meshes", description=__doc__
+    )
+    parser.add_argument("meshes", type=Path, help="folder with train, validation and test")
+    parser.add_argument("root", type=Path, help="folder to make")
+    parser.add_argument("--views", type=int, default=12, help="photographs of each; default: 12")
+    parser.add_argument(
+        "--size", type=int, nargs=2, default=(256, 192), help="height and width; default: 256 192"
+    )
+    parser.add_argument("--topology", default="7k", help="the word for data.topology; default: 7k")
+    parser.add_argument("--renderer", default="rasterizer", help="what draws; default: rasterizer")
+    given = parser.parse_args(arguments)
+    renderer: Renderer = build("renderer", resolve("renderer", {"name": given.renderer}))
+    if given.root.exists():
+        raise DataError(
+            f"{given.root} is there already; wanted a folder that is not. Name another, or remove it."
+        )
+    people = pairs(given.meshes)
+    count = sum(map(len, people.values()))
+    mark = {
+        "photographed": str(given.meshes),
+        "people": count,
+        "views": given.views,
+        "size": list(given.size),
+    }
+
+    def write(root: Path) -> None:
+        scan_layout.write_splits(root, {split: list(some) for split, some in people.items()})
+        everyone = [(name, pair) for some in people.values() for name, pair in some.items()]
+
+        def one(number: int) -> None:
+            name, pair = everyone[number]
+            write_person(
+                root / "subjects" / name, pair, given.topology, renderer, given.views, tuple(given.size)
+            )
+
+        draw_all(len(everyone), one, "people")
+
+    generated(given.root, mark, write)
+    sys.stdout.write(f"{given.root}: {count} people\n")
+
+
+def pairs(folder: Path) -> Mapping[str, Mapping[str, Pair]]:
+    """Return the paths of scan and registration of each person, by split and name.
+
+    Raises:
+        DataError: a split has no scans, a scan no registration, or two people have one name.
+    """
+    found: dict[str, dict[str, Pair]] = {}
+    for split in Splits._fields:
+        files = {
+            file.stem: file for file in sorted((folder / split).glob("*")) if file.suffix.lower() in READERS
+        }
+        scans = [stem for stem in files if stem.endswith("_scan")]
+        if not scans:
+            raise DataError(
+                f"{folder / split}: no scan; wanted files like ann_scan.ply and ann_registration.ply there."
+            )
+        found[split] = {}
+        for stem in scans:
+            name = stem.removesuffix("_scan")
+            if f"{name}_registration" not in files:
+                raise DataError(f"{files[stem]}: no registration; wanted {name}_registration.ply beside it.")
+            if any(name in others for others in found.values()):
+                raise DataError(
+                    f"{files[stem]}: {name} is there twice; wanted a name of its own for everybody."
+                )
+            found[split][name] = files[stem], files[f"{name}_registration"]
+    return found
+
+
+def write_person(
+    folder: Path, pair: Pair, topology: str, renderer: Renderer, views: int, size: tuple[int, int]
+) -> None:
+    """Write photographs of a scan from camera positions that depend on its name alone, and its registration."""
+    scan, registration = (meshes.read(file) for file in pair)
+    scan_layout.write_registration(
+        folder / f"registration_{topology}.ply",
+        RegisteredMesh(
+            torch.from_numpy(registration.vertices).float(),
+            torch.from_numpy(scan_layout.vertex_colors(registration)),
+            torch.from_numpy(registration.faces),
+        ),
+    )
+    cameras = rig(scan.vertices, views, size, stream(0, folder.name))
+    colors = linear_from_bytes(torch.from_numpy(np.ascontiguousarray(scan_layout.vertex_colors(scan))))
+    faces = torch.from_numpy(scan.faces)
+    scene = Scene(torch.from_numpy(scan.vertices).float(), faces, colors, cameras[0])
+    scan_layout.write_views(folder, cameras, photographed(renderer, scene, cameras))
+
+
+if __name__ == "__main__":
+    run_command(main)

@@ -1,0 +1,234 @@
+"""`python -m plugins.data.human_scans.repose <registration> ... --out <folder>` changes the pose and shape of people.
+
+A registration is a mesh with vertex colours in one of the body's topologies, or a subject's folder of `human_scans`.
+The command finds its pose and shape, takes it back to the rest pose, and writes it in each requested pose and shape,
+with cameras, so that a trained renderer can draw it (thesis Figures 7.4 and 7.5):
+
+    python -m framework mode=predict checkpoint=<run> mode.files=<folder>
+
+Each mesh is written with its root over the origin and its lowest vertex at the original height: metres, y up, facing z.
+"""
+
+import argparse
+import math
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from framework.bodies import motion, poses
+from framework.bodies.body import Body, BodyModel
+from framework.bodies.people import chosen_body
+from framework.bodies.pose_of_mesh import Found, pose_of
+from framework.bodies.shape_space import in_few_shapes
+from framework.bodies.topologies import in_topology, recognised
+from framework.bodies.unposing import unposed
+from framework.datasets import scan_layout
+from framework.datasets.scan_layout import RegisteredMesh
+from framework.errors import DataError, did_you_mean
+from framework.geometry.camera import Camera
+from framework.storage.commands import run_command
+from plugins.data.human_scans.data import in_front
+from plugins.data.human_scans.scan_generator import RAISED
+
+Poses = dict[str, Float[np.ndarray, "joint 3"]]
+"""Joint rotations of each pose, by the name of the pose."""
+
+
+@dataclass(frozen=True)
+class Subject:
+    """Model of one person: the body's with offsets in the rest pose (the thesis's template of a subject).
+
+    Attributes:
+        model: body model, float64, in the registration's topology.
+        found: pose, shape and translation of the registration.
+        offsets: displacements of its vertices from the model's in the rest pose, metres.
+        folded: number of vertices that are the model's own along some direction, see framework.bodies.unposing.
+    """
+
+    model: BodyModel
+    registration: RegisteredMesh
+    found: Found
+    offsets: Float[Tensor, "1 vertex 3"]
+    folded: int
+
+    @torch.no_grad()
+    def posed(
+        self, pose: Float[np.ndarray, "joint 3"] | None = None, change: Float[Tensor, "shape"] | None = None
+    ) -> RegisteredMesh:
+        """Return the person in a pose (None: as registered), with a change of shape coefficients."""
+        shape = self.found.shape if change is None else self.found.shape + change
+        turned = self.found.pose if pose is None else torch.from_numpy(pose)[None]
+        vertices = self.model(shape, turned, offsets=self.offsets)[0]
+        vertices -= self.model.posed_joints(shape, turned)[
+            0, self.model.parents.index(-1)
+        ] * vertices.new_tensor([1.0, 0.0, 1.0])
+        vertices[:, 1] += self.registration.vertices[:, 1].min() - vertices[:, 1].min()
+        return replace(self.registration, vertices=vertices.float())
+
+
+def subject(body: Body, few: Body, registration: RegisteredMesh, source: str) -> Subject:
+    """Return the model of a person.
+
+    `body` is the unchanged body; `few` has few shape coefficients, see framework.bodies.shape_space. `source` names
+    the mesh in messages.
+
+    Raises:
+        DataError: the mesh is of another body.
+    """
+    surface, mesh = recognised(body, len(registration.vertices), registration.faces.numpy(), source)
+    own = in_topology(few, surface, mesh)
+    found = pose_of(own, registration.vertices)
+    model = BodyModel(own).double()
+    back = unposed(model, registration.vertices.double()[None], *found[:3])
+    return Subject(model, registration, found, back.offsets, int(back.folded.sum()))
+
+
+def a_pose_with(changes: str) -> Float[np.ndarray, "1 movement"]:
+    """Return the movements, degrees, of an A-pose with some of them replaced: "left raise=90,left elbow=60".
+
+    Raises:
+        DataError: no movement has such a name, or an angle is no number.
+    """
+    ranges = [*poses.CENTRAL.values(), *2 * (*poses.SIDED.values(),)]
+    found = dict(zip(poses.MOVEMENTS, (float(limits[0]) for limits in ranges), strict=True))
+    found |= {f"{side} raise": RAISED for side in ("left", "right")}
+    for name, degrees in _numbers(changes).items():
+        if name not in found:
+            raise DataError(
+                f"There is no movement {name!r}.{did_you_mean(name, found)} There are {', '.join(found)}."
+            )
+        found[name] = degrees
+    return np.array([list(found.values())])
+
+
+def _numbers(text: str) -> dict[str, float]:
+    found = {}
+    for part in text.split(","):
+        name, _, number = part.partition("=")
+        try:
+            found[name.strip()] = float(number)
+        except ValueError:
+            raise DataError(f"{part!r}: wanted a name and a number, as in left elbow=60.") from None
+        if not abs(found[name.strip()]) <= 1e4:
+            raise DataError(f"{part!r}: wanted a number of at most 10000.")
+    return found
+
+
+def asked_poses(body: Body, given: argparse.Namespace) -> Poses:
+    """Return all poses that the arguments ask for."""
+    where = poses.skeleton(body)
+    found: Poses = {}
+    for number, changes in enumerate(given.pose):
+        rest = changes == "rest"
+        turned = None if rest else poses.rotations(body, where, a_pose_with(changes))[0]
+        found[f"pose_{number}"] = np.zeros((len(body.parents), 3)) if turned is None else turned
+    if given.random:
+        drawn = poses.draw(given.random, np.random.default_rng(given.seed))
+        turned = poses.rotations(body, where, drawn)
+        found |= {f"random_{number:03}": pose for number, pose in enumerate(turned)}
+    if given.motion is not None:
+        moving = motion.read(given.motion)
+        frames = given.frames or list(range(len(moving.rotations)))
+        if wrong := [frame for frame in frames if not 0 <= frame < len(moving.rotations)]:
+            raise DataError(
+                f"{given.motion}: it has no frame {wrong[0]}; wanted numbers from 0 to {len(moving.rotations) - 1}."
+            )
+        turned = motion.poses_of(body, moving, frames)
+        found |= {f"frame_{frame:05}": pose for frame, pose in zip(frames, turned, strict=True)}
+    return found
+
+
+def shape_change(text: str, count: int) -> Float[Tensor, "shape"]:
+    """Return the shape coefficients of a text such as "0=-2,3=1".
+
+    Raises:
+        DataError: the text has another form, or a direction does not exist.
+    """
+    found = torch.zeros(count, dtype=torch.float64)
+    for name, number in _numbers(text).items():
+        if not name.isdecimal() or int(name) >= count:
+            raise DataError(f"--shape {text}: {name!r} is no direction; wanted 0 to {count - 1}, as in 0=-2.")
+        found[int(name)] = number
+    return found
+
+
+def around(vertices: Float[Tensor, "vertex 3"], views: int, size: tuple[int, int]) -> dict[str, Camera]:
+    """Return cameras that see all vertices, at equal angles around the vertical, the first in front."""
+    found = {}
+    for view in range(views):
+        angle = 2 * math.pi * view / views
+        sine, cosine = math.sin(angle), math.cos(angle)
+        turn = torch.tensor([[cosine, 0.0, -sine], [0.0, 1.0, 0.0], [sine, 0.0, cosine]])
+        one = in_front(vertices @ turn.T, *size)
+        found[f"{view:03}"] = replace(one, rotation=one.rotation @ turn)
+    return found
+
+
+def read(file: Path, topology: str) -> tuple[str, RegisteredMesh]:
+    """Return name and mesh of a registration, or of a subject's folder."""
+    if file.is_dir():
+        return file.resolve().name, scan_layout.read_registration(file / f"registration_{topology}.ply")
+    return file.stem, scan_layout.read_registration(file)
+
+
+def main(arguments: list[str]) -> None:
+    """Write `<name>_<pose>.ply` for each pose and shape, and cameras.json.
+
+    Raises:
+        UserError: a mesh cannot be read, has no colours or is of another body; a pose or shape does not exist.
+    """
+    parser = argparse.ArgumentParser(
+        prog="python -m plugins.data.human_scans.repose",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("registrations", nargs="+", type=Path, help="meshes, or folders of subjects")
+    parser.add_argument("--out", type=Path, required=True, help="folder for what is written")
+    parser.add_argument(
+        "--pose", action="append", default=[], help="'rest', or an A-pose with 'left raise=90,right knee=40'"
+    )
+    parser.add_argument("--random", type=int, default=0, help="so many random poses")
+    parser.add_argument("--seed", type=int, default=0, help="of random poses; default: 0")
+    parser.add_argument("--motion", type=Path, help="a BVH file")
+    parser.add_argument("--frames", type=int, nargs="+", help="of the motion, from 0; default: all")
+    parser.add_argument(
+        "--shape", action="append", default=[], help="'0=-2': along this direction, in standard deviations"
+    )
+    parser.add_argument("--body", help="file of the body model; default: the default body")
+    parser.add_argument("--topology", default="7k", help="of a subject's folder; default: 7k")
+    parser.add_argument("--views", type=int, default=1, help="cameras around; default: 1")
+    parser.add_argument(
+        "--size", type=int, nargs=2, default=(256, 192), help="height and width; default: 256 192"
+    )
+    given = parser.parse_args(arguments)
+    body, traits = chosen_body(given.body)
+    few = in_few_shapes(body, traits)
+    changes = {f"shape_{text}": shape_change(text, few.shapes.shape[-1]) for text in given.shape}
+    wanted = asked_poses(body, given)
+    written: dict[str, RegisteredMesh] = {}
+    for file in given.registrations:
+        name, registration = read(file, given.topology)
+        if f"{name}_registration" in written:
+            raise DataError(f"{file}: {name} is there twice; wanted a name of its own for everybody.")
+        one = subject(body, few, registration, str(file))
+        sys.stdout.write(
+            f"{name}: {len(registration.vertices)} vertices, {1000 * one.found.error:.1f} mm from the body in the pose "
+            f"found; {one.folded} folded so far that they were not unposed\n"
+        )
+        written[f"{name}_registration"] = one.posed()
+        written |= {f"{name}_{pose}": one.posed(turned) for pose, turned in wanted.items()}
+        written |= {f"{name}_{text}": one.posed(change=change) for text, change in changes.items()}
+    for name, mesh in written.items():
+        scan_layout.write_registration(given.out / f"{name}.ply", mesh)
+    every = torch.cat([mesh.vertices for mesh in written.values()])
+    scan_layout.write_cameras(given.out / "cameras.json", around(every, given.views, tuple(given.size)))
+    sys.stdout.write(f"{given.out}: {len(written)} meshes, {given.views} cameras\n")
+
+
+if __name__ == "__main__":
+    run_command(main)

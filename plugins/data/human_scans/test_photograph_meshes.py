@@ -1,0 +1,64 @@
+import shutil
+
+import pytest
+import torch
+
+from framework.configuration.schema import build, resolve
+from framework.datasets import scan_layout
+from framework.errors import DataError
+from framework.testing.bodies import colored
+from plugins.data.human_scans import photograph_meshes
+from plugins.data.human_scans.rows import SMALL
+
+SMALLER = ["--views", "3", "--size", "20", "16", "--topology", "mine"]
+
+
+@pytest.fixture
+def given(tmp_path):
+    folder = tmp_path / "given"
+    for split, names in {"train": ("ann", "bob"), "validation": ("dan",), "test": ("eve",)}.items():
+        for number, name in enumerate(names):
+            scan_layout.write_registration(folder / split / f"{name}_scan.ply", colored(number))
+            scan_layout.write_registration(folder / split / f"{name}_registration.ply", colored(number + 5))
+    return folder
+
+
+def test_meshes_become_a_root(given, tmp_path, capsys):
+    root = tmp_path / "root"
+    photograph_meshes.main([str(given), str(root), *SMALLER])
+    assert "4 people" in capsys.readouterr().out
+    found = build(
+        "data", resolve("data", {"name": "human_scans", **SMALL, "root": str(root), "topology": "mine"})
+    )
+    found.prepare()
+    assert found.synthetic and found.size == (20, 16)
+    assert [len(split) for split in found.splits()] == [6, 3, 3]
+    read = scan_layout.read_subject(root, "bob", "mine").mesh
+    assert torch.equal(read.vertices, colored(6).vertices) and torch.equal(read.colors, colored(6).colors)
+    with pytest.raises(DataError, match="is there already"):
+        photograph_meshes.main([str(given), str(root), *SMALLER])
+
+
+WRONG = {
+    "no registration": (
+        lambda folder: (folder / "train/bob_registration.ply").unlink(),
+        "bob_scan.ply: no registration",
+    ),
+    "no scans": (lambda folder: shutil.rmtree(folder / "test"), "test: no scan"),
+    "twice": (
+        lambda folder: [
+            shutil.copy(folder / f"train/ann_{what}.ply", folder / "test")
+            for what in ("scan", "registration")
+        ],
+        "ann is there twice",
+    ),
+    "no mesh": (lambda folder: (folder / "validation/dan_scan.ply").write_text("dan"), "dan_scan.ply"),
+}
+
+
+@pytest.mark.parametrize("spoil, words", WRONG.values(), ids=WRONG)
+def test_what_is_wrong_is_said_and_nothing_is_left(given, tmp_path, spoil, words):
+    spoil(given)
+    with pytest.raises(DataError, match=words):
+        photograph_meshes.main([str(given), str(tmp_path / "root"), *SMALLER])
+    assert not (tmp_path / "root").exists()

@@ -1,0 +1,75 @@
+"""`python -m plugins.data.registration <checkpoint> <scan> ...` registers meshes to scans: PLY files and figures."""
+
+import argparse
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+import torch
+
+from framework.bodies.people import chosen_body
+from framework.configuration.loading import load_with_description
+from framework.configuration.paths import add_option, require_said, said
+from framework.configuration.schema import build, resolve
+from framework.distributions.protocol import median
+from framework.errors import ConfigError
+from framework.figures.style import save_figure
+from framework.geometry.clouds import denormalise_clouds, sizes
+from framework.storage.commands import run_command
+from plugins.data.registration.data import Registration
+from plugins.data.registration.result import figure, write_ply
+
+
+def main(arguments: list[str]) -> None:
+    """Write `<folder>/<scan>_registered.ply` and `.png` for each scan, in metres and in the coordinates of the scan.
+
+    Raises:
+        UserError: the checkpoint is of another data set, or a file cannot be read.
+    """
+    parser = argparse.ArgumentParser(prog="python -m plugins.data.registration", description=__doc__)
+    parser.add_argument("checkpoint", help="run folder, checkpoint file or MLflow run id")
+    parser.add_argument("scans", nargs="+", type=Path, help="meshes or clouds, metres, y up, facing z")
+    parser.add_argument(
+        "--folder", type=Path, default=Path("outputs"), help="where to write; default: outputs"
+    )
+    add_option(parser)
+    given = parser.parse_intermixed_args(arguments)
+    given.folder.mkdir(parents=True, exist_ok=True)
+    for file in register(given.checkpoint, given.scans, given.folder, said(given.path)):
+        sys.stdout.write(f"{file}\n")
+
+
+@torch.no_grad()
+def register(
+    checkpoint: str, scans: list[Path], folder: Path, paths: Mapping[str, str] | None = None
+) -> list[Path]:
+    """Register a mesh to each scan and return the paths of the written files, two for each scan.
+
+    `paths` is the argument of the same name of `framework.load`.
+    """
+    predictor, description = load_with_description(checkpoint, paths=paths)
+    part = description.config["data"]
+    if part["name"] != "registration":
+        raise ConfigError(
+            f"{checkpoint} was trained on data {part['name']!r}; wanted a model trained on `registration`, which says "
+            "what body its vertices are of."
+        )
+    require_said(description.dropped, ("data",), description.path)
+    data: Registration = build("data", resolve("data", part))
+    faces = chosen_body(data.body)[0].faces
+    written = []
+    for scan in scans:
+        batch = data.user_batch(scan)
+        local = median(predictor(batch["input"]), 1).unflatten(1, (-1, 3))
+        place = batch["centre"], batch["scale"]
+        vertices = denormalise_clouds(local, *place)[0].numpy()
+        cloud = denormalise_clouds(batch["input"], *place)[0, : int(sizes(batch["input"]))].numpy()
+        stem = folder / f"{scan.stem}_registered"
+        write_ply(stem.with_suffix(".ply"), vertices, faces, cloud)
+        drawn = figure(vertices, faces, cloud, f"Mesh registered to {scan.name}")
+        written += [stem.with_suffix(".ply"), save_figure(drawn, stem, True)]
+    return written
+
+
+if __name__ == "__main__":
+    run_command(main)

@@ -1,0 +1,143 @@
+"""`python -m plugins.data.registration.correspond <run> [<FAUST>]` writes results for the challenges of FAUST.
+
+Without a folder people are generated in FAUST's layout (synthetic), whose true correspondences are known.
+"""
+
+import argparse
+import sys
+from collections.abc import Callable, Mapping
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+from zipfile import ZIP_DEFLATED, ZipFile
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+
+from framework.configuration.loading import load_with_description
+from framework.configuration.paths import add_option, require_said, said
+from framework.configuration.schema import build, resolve
+from framework.data import Data
+from framework.distributions.protocol import median
+from framework.errors import ConfigError
+from framework.geometry.clouds import denormalise_clouds
+from framework.geometry.meshes import read
+from framework.geometry.nearest import nearest
+from framework.storage.commands import run_command
+from framework.storage.generated import read_mark
+from plugins.data.registration.faust import CHALLENGES, Challenge, pairs, test_registration, test_scan
+from plugins.data.registration.faust_generator import people_root
+
+Registered = Callable[[Path], Float[np.ndarray, "vertex 3"]]
+"""Function from a scan's file to the vertices registered to it, metres."""
+
+
+class Answered(NamedTuple):
+    """Result of one challenge.
+
+    Attributes:
+        file: a zip of one text file for each pair: x, y, z, metres, on the second scan for each vertex of the first.
+        pairs: number of pairs.
+        error_cm: mean error over the vertices, centimetres, of each pair whose true registrations exist.
+    """
+
+    file: Path
+    pairs: int
+    error_cm: list[float]
+
+
+def main(arguments: list[str]) -> None:
+    """Write `<out>/intra.zip` and `inter.zip`; print errors if the truth is known.
+
+    Raises:
+        UserError: the checkpoint is of another data set, or a file cannot be read.
+    """
+    parser = argparse.ArgumentParser(
+        prog="python -m plugins.data.registration.correspond", description=__doc__
+    )
+    parser.add_argument("checkpoint", help="run folder, checkpoint file or MLflow run id")
+    parser.add_argument("root", nargs="?", help="the folder that holds FAUST's `test`; none: generated")
+    parser.add_argument("--out", type=Path, default=Path("outputs/faust"), help="default: outputs/faust")
+    add_option(parser)
+    given = parser.parse_intermixed_args(arguments)
+    registered, generated = model(given.checkpoint, said(given.path))
+    folder = generated() if given.root is None else Path(given.root).expanduser()
+    marked = "" if read_mark(folder) is None else " (synthetic)"
+    for challenge in CHALLENGES:
+        found = answered(registered, folder, challenge, given.out)
+        error = "not available, FAUST keeps its registrations to itself"
+        if found.error_cm:
+            error = (
+                f"{np.mean(found.error_cm):.2f} cm, of the worst pair {max(found.error_cm):.2f} cm{marked}"
+            )
+        sys.stdout.write(f"{challenge}: {found.pairs} pairs in {found.file}; error {error}\n")
+
+
+def model(checkpoint: str, paths: Mapping[str, str] | None = None) -> tuple[Registered, Callable[[], Path]]:
+    """Return the registration function of a trained model, and a function that returns the root of generated people.
+
+    The second function generates people of the model's body in FAUST's layout on its first call. `checkpoint` and
+    `paths` are the arguments of the same names of `framework.load`.
+
+    Raises:
+        ConfigError: the checkpoint is of another data set.
+    """
+    predictor, description = load_with_description(checkpoint, paths=paths)
+    part = description.config["data"]
+    if part["name"] not in ("registration", "faust"):
+        raise ConfigError(
+            f"{checkpoint} was trained on data {part['name']!r}; wanted a model trained on `registration` or `faust`, "
+            "whose target is a mesh."
+        )
+    data: Data = build("data", resolve("data", part))
+
+    @torch.no_grad()
+    def registered(scan: Path) -> np.ndarray:
+        batch = data.user_batch(scan)
+        local = median(predictor(batch["input"]), 1).unflatten(1, (-1, 3))
+        return denormalise_clouds(local, batch["centre"], batch["scale"])[0].float().numpy()
+
+    def generated() -> Path:
+        require_said(description.dropped, ("data",), description.path)
+        return people_root(part.get("body"))
+
+    return registered, generated
+
+
+def answered(registered: Registered, root: Path, challenge: Challenge, out: Path) -> Answered:
+    """Compute the correspondences of every pair through registered meshes, and write them to `<out>/<challenge>.zip`.
+
+    A vertex of the first scan is mapped to the nearest vertex of the mesh registered to it, and from there to the
+    vertex of the same number of the mesh registered to the second scan (thesis §6.5.2). `registered` is called once for
+    each scan.
+
+    Raises:
+        DataError: the challenge has no pairs, or a scan cannot be read.
+    """
+    mesh_of = cache(registered)
+    given = pairs(root, challenge)
+    out.mkdir(parents=True, exist_ok=True)
+    file, errors = out / f"{challenge}.zip", []
+    with ZipFile(file, "w", ZIP_DEFLATED) as archive:
+        for pair in given:
+            first, second = (mesh_of(test_scan(root, one)) for one in pair)
+            thought = second[_nearest(first, read(test_scan(root, pair.first)).vertices)]
+            lines = [f"{x:.6f} {y:.6f} {z:.6f}\n" for x, y, z in thought.tolist()]
+            archive.writestr(f"{pair}.txt", "".join(lines))
+            truths = [test_registration(root, one) for one in pair]
+            if all(truth.is_file() for truth in truths):
+                here, there = (read(truth).vertices for truth in truths)
+                gap = np.linalg.norm(second[_nearest(first, here)] - there, axis=1)
+                errors.append(100 * float(gap.mean()))
+    return Answered(file, len(given), errors)
+
+
+def _nearest(vertices: np.ndarray, points: np.ndarray) -> Int[np.ndarray, "points"]:
+    """Return the number of the vertex nearest to each point."""
+    reference, asked = (torch.from_numpy(part).float()[None] for part in (vertices, points))
+    return nearest(reference, asked).index[0].numpy()
+
+
+if __name__ == "__main__":
+    run_command(main)

@@ -1,0 +1,67 @@
+"""Scans of random people, computed when they are fetched."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from framework.bodies.body import BodyModel
+from framework.bodies.people import Drawn
+from framework.data import Batch
+from framework.geometry import clouds
+from framework.geometry.meshes import Mesh
+from plugins.data.registration.scanned_bodies import normalised
+from plugins.data.registration.scanner import KINDS, Scanner, scan
+
+
+class Scans(Dataset[Batch]):
+    """Bodies that are posed and scanned when they are fetched.
+
+    Args:
+        people: shape and pose of every body, for `model`.
+        kind: kind of every scan, as an index of KINDS.
+        seed: seed of the scans, which also depend on the sample's number.
+        precision: dtype of the targets.
+    """
+
+    def __init__(
+        self,
+        model: BodyModel,
+        people: Drawn,
+        kind: Tensor,
+        scanner: Scanner,
+        seed: tuple[int, int],
+        precision: torch.dtype,
+    ) -> None:
+        self.model = model
+        self.shape, self.pose = people
+        self.kind = kind
+        self.scanner = scanner
+        self.seed = seed
+        self.precision = precision
+
+    def __len__(self) -> int:
+        return len(self.shape)
+
+    def __getitem__(self, index: int) -> Batch:
+        return {name: values[0] for name, values in self.__getitems__([index]).items()}
+
+    @torch.no_grad()
+    def __getitems__(self, indices: Sequence[int]) -> Batch:
+        chosen = torch.tensor(list(indices), dtype=torch.int64)
+        vertices = self.model(self.shape[chosen], self.pose[chosen])
+        faces = self.model.faces.numpy()
+        seen = [
+            scan(
+                Mesh(f"body {index}", one.double().numpy(), faces),
+                KINDS[int(self.kind[index])],
+                self.scanner,
+                np.random.default_rng([*self.seed, index]),
+            )
+            for index, one in zip(indices, vertices, strict=True)
+        ]
+        fields = normalised(clouds.pad([torch.from_numpy(points).float() for points in seen]), vertices)
+        fields["target"] = fields["target"].to(self.precision)
+        return {**fields, "group": self.kind[chosen], "index": chosen}

@@ -1,0 +1,271 @@
+"""Fit of a body to an image by gradient descent through a differentiable renderer, from coarse to fine.
+
+The loss is the squared difference of two images, colours and silhouette, plus a weak prior on the pose. The images are
+drawn at a fraction of the size and blurred, so that edges that are far apart also have a gradient. The gradient is the
+renderer's. Steps are quasi-Newton (BFGS with Powell's damping; Nocedal & Wright 2006, procedure 18.2). The Hessian
+approximation starts from the optical flow of the rendered image: the change of a pixel is its gradient along rows and
+columns times the motion of the surface there (Lucas & Kanade 1981). The body model gives the derivatives of that motion
+in closed form.
+"""
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.ndimage import distance_transform_edt
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+from framework.bodies.parametric import ParametricBody
+from framework.geometry.camera import Camera
+from framework.heads.posed_body import BodyFit, scene_of
+from framework.renderer import Renderer
+
+
+class Stage(NamedTuple):
+    """Settings of one level of the image pyramid.
+
+    Attributes:
+        part: its size is 1/part of the whole image's.
+        blur: standard deviation, in its own pixels.
+        pull: weight of the prior: of the squared parameters, in units of their standard deviations, in a loss that sums
+            over pixels of the whole image.
+    """
+
+    part: int
+    blur: float
+    pull: float
+
+
+STAGES = (
+    Stage(4, 2.0, 10.0),
+    Stage(4, 2.0, 1.0),
+    Stage(4, 1.0, 0.3),
+    Stage(2, 1.0, 0.03),
+    Stage(2, 0.7, 0.003),
+    Stage(1, 1.5, 1e-4),
+    Stage(1, 0.8, 0.0),
+)
+AGAIN_FROM = 2
+"""Stage at which a restart from another pose begins."""
+AFRESH = 6
+"""Number of steps after which the Hessian approximation is computed anew from the optical flow."""
+DAMPING, LEAST = 0.01, 1e-3
+"""Damping of the Hessian approximation: this share of its diagonal plus this constant is added to the diagonal."""
+LONGEST = (0.2, 0.08)
+"""Longest step of a rotation (radians) and a translation (metres); for other parameters it is their spread."""
+SHORTER, TRIES = 0.4, 6
+"""Factor by which a step that raises the loss is shortened, and the largest number of trials."""
+CONVERGED, IN_A_ROW = 5e-4, 3
+"""Relative decrease of the loss below which a step is small, and number of small steps in a row that end a stage."""
+
+
+class Descent:
+    """Estimator of a body's parameters from images.
+
+    Args:
+        body_model: body that the images show.
+        renderer: differentiable renderer that draws it.
+        camera: camera of the images.
+        steps: largest number of steps of a stage.
+        restarts: largest number of restarts from other poses while the images differ by more than `enough`.
+        enough: root mean square difference of colours at which no restart is needed.
+    """
+
+    def __init__(
+        self,
+        body_model: ParametricBody,
+        renderer: Renderer,
+        camera: Camera,
+        *,
+        steps: int,
+        restarts: int,
+        enough: float,
+    ) -> None:
+        self.body_model, self.renderer, self.camera = body_model, renderer, camera
+        self.steps, self.restarts, self.enough = steps, restarts, enough
+        self.stiffness = torch.cat([body_model.spread.new_zeros(6), body_model.spread[6:] ** -2])
+        self.longest = torch.cat(
+            [*(body_model.spread.new_full((3,), most) for most in LONGEST), body_model.spread[6:]]
+        )
+
+    def __call__(self, picture: Float[Tensor, "height width 4"]) -> BodyFit:
+        """Return the best fit of all starts; an image's fit depends on nothing but the image."""
+        began = time.process_time()
+        random = torch.Generator().manual_seed(0)
+        best = self._once(picture, torch.zeros_like(self.stiffness), STAGES, began)
+        path = [best.path]
+        for _ in range(self.restarts):
+            if best.difference <= self.enough:
+                break
+            start = best.parameters.clone()
+            start[6:] = self.body_model.spread[6:] * torch.randn(
+                len(start) - 6, generator=random, dtype=start.dtype
+            )
+            other = self._once(picture, self._limited(start), STAGES[AGAIN_FROM:], began)
+            path.append(other.path)
+            best = min(best, other, key=lambda fit: fit.difference)
+        return BodyFit(best.parameters, best.difference, torch.cat(path))
+
+    def _once(self, picture: Tensor, start: Tensor, stages: Sequence[Stage], began: float) -> BodyFit:
+        numbers, path = start, []
+        loss = 0.0
+        for stage in stages:
+            camera = smaller(self.camera, stage.part)
+            aim = blurred(reduced(picture, stage.part), stage.blur)
+
+            def look(
+                at: Tensor, stage: Stage = stage, camera: Camera = camera, aim: Tensor = aim
+            ) -> tuple[float, Tensor]:
+                return self._loss(at, stage, camera, aim)
+
+            loss, slope = look(numbers)
+            curvature, age, small = torch.empty(0), AFRESH, 0
+            for _ in range(self.steps):
+                if age == AFRESH:
+                    curvature, age = self._curvature(numbers, stage), 0
+                direction = -torch.linalg.solve(curvature, slope)
+                length = min(1.0, 1 / float((direction.abs() / self.longest).max()))
+                lower = False
+                for _ in range(TRIES):
+                    there = self._limited(numbers + length * direction)
+                    found, along = look(there)
+                    curvature = updated(curvature, there - numbers, along - slope)
+                    if lower := found < loss:
+                        break
+                    length *= SHORTER
+                if not lower and age == 0:
+                    break
+                age = age + 1 if lower else AFRESH
+                if not lower:
+                    continue
+                small = small + 1 if loss - found < CONVERGED * loss else 0
+                numbers, loss, slope = there, found, along
+                path.append(torch.cat([numbers.new_tensor([loss, time.process_time() - began]), numbers]))
+                if small == IN_A_ROW:
+                    break
+        unpulled = loss - stages[-1].pull * float((numbers.square() * self.stiffness).sum())
+        steps = torch.stack(path) if path else numbers.new_zeros(0, 2 + len(numbers))
+        return BodyFit(numbers, (max(unpulled, 0.0) / picture.numel()) ** 0.5, steps)
+
+    def _loss(
+        self, numbers: Tensor, stage: Stage, camera: Camera, aim: Tensor
+    ) -> tuple[float, Float[Tensor, "number"]]:
+        """Return the loss of a stage and its gradient."""
+        with torch.enable_grad():
+            given = numbers.detach().requires_grad_()
+            drawn = self.renderer(scene_of(self.body_model, given, camera))["color"]
+            loss = (blurred(drawn, stage.blur) - aim).square().sum().double() * stage.part**2
+            loss = loss + stage.pull * (given.square() * self.stiffness).sum()
+            (slope,) = torch.autograd.grad(loss, given)
+        return float(loss.detach()), slope
+
+    def _limited(self, numbers: Tensor) -> Tensor:
+        least, most = self.body_model.limits.unbind(1)
+        return torch.minimum(torch.maximum(numbers, least), most)
+
+    def _curvature(self, numbers: Tensor, stage: Stage) -> Float[Tensor, "number number"]:
+        """Return the damped Gauss-Newton approximation of the Hessian of the loss.
+
+        It is twice the sum of outer products of the derivatives of the stage's blurred pixels.
+        """
+        slopes = self._flow(numbers, stage)
+        found = 2 * stage.part**2 * (slopes.T @ slopes).double() + (2 * stage.pull * self.stiffness).diag()
+        return found + (DAMPING * found.diag() + LEAST).diag()
+
+    @torch.no_grad()
+    def _flow(self, numbers: Tensor, stage: Stage) -> Float[Tensor, "pixel number"]:
+        """Return the derivatives of every colour of a stage's pixels by every parameter, from the optical flow."""
+        camera, body_model = self.camera, self.body_model
+        drawn = self.renderer(scene_of(body_model, numbers, camera), ("color", "face"))
+        color, face = drawn["color"], drawn["face"].numpy()
+        height, width = camera.height // stage.part, camera.width // stage.part
+        if (face < 0).all():
+            return color.new_zeros(height * width * 4, len(numbers))
+        across, down = torch.zeros_like(color), torch.zeros_like(color)
+        across[:, 1:-1] = (color[:, 2:] - color[:, :-2]) / 2
+        down[1:-1] = (color[2:] - color[:-2]) / 2
+        # a pixel beside the body changes with the nearest part of the body
+        nearest = distance_transform_edt(face < 0, return_distances=False, return_indices=True)
+        assert isinstance(nearest, np.ndarray)
+        shown = torch.from_numpy(face[tuple(nearest)])
+        row, column = ((across != 0) | (down != 0)).any(-1).nonzero(as_tuple=True)
+        vertex, which = body_model.faces[shown[row, column].long(), 0].long().unique(return_inverse=True)
+        motion = self._motion(numbers, vertex)[which]
+        flow = torch.stack([across[row, column], down[row, column]], -1) @ motion  # (pixel, 4, number)
+        place = (row // stage.part) * width + column // stage.part
+        small = color.new_zeros(height * width, flow[0].numel())
+        small.index_add_(0, place, flow.flatten(1) / stage.part**2)
+        return blurred(small.view(height, width, -1), stage.blur).reshape(-1, len(numbers))
+
+    def _motion(self, numbers: Tensor, vertex: Tensor) -> Float[Tensor, "vertex 2 number"]:
+        """Return the derivatives of the pixel coordinates of some vertices by every parameter."""
+        camera = self.camera
+        rotation = camera.rotation
+        seen = self.body_model.placed(numbers, vertex) @ rotation.T + camera.translation
+        along = torch.einsum("ab,vbp->vap", rotation, self.body_model.slopes(numbers, vertex))
+        focal = torch.as_tensor(camera.focal)[:, None]
+        part = (seen[:, :2] / seen[:, 2:])[..., None]
+        return focal * (along[:, :2] - part * along[:, 2:]) / seen[:, 2:, None]
+
+
+def updated(
+    curvature: Float[Tensor, "number number"], step: Float[Tensor, "number"], change: Float[Tensor, "number"]
+) -> Float[Tensor, "number number"]:
+    """Return the Hessian approximation after a step; `change` is that of the gradient. It stays positive definite."""
+    expected = curvature @ step
+    square = float(step @ expected)
+    if not square > 0:
+        return curvature
+    seen = float(step @ change)
+    if seen < 0.2 * square:
+        share = 0.8 * square / (square - seen)
+        change = share * change + (1 - share) * expected
+    return (
+        curvature - torch.outer(expected, expected) / square + torch.outer(change, change) / (step @ change)
+    )
+
+
+def smaller(camera: Camera, part: int) -> Camera:
+    """Return a camera of the same view whose pixels are each the mean of part × part pixels."""
+    (x, y), (column, row) = camera.focal, camera.principal
+    return replace(
+        camera,
+        focal=(float(x) / part, float(y) / part),
+        principal=((float(column) + 0.5) / part - 0.5, (float(row) + 0.5) / part - 0.5),
+        height=camera.height // part,
+        width=camera.width // part,
+    )
+
+
+def reduced(
+    picture: Float[Tensor, "height width channels"], part: int
+) -> Float[Tensor, "_height _width channels"]:
+    """Return the means of part × part pixels."""
+    return avg_pool2d(picture.movedim(-1, 0), part).movedim(0, -1)
+
+
+def blurred(
+    picture: Float[Tensor, "height width channels"], deviation: float
+) -> Float[Tensor, "height width channels"]:
+    """Return the image convolved with a Gaussian that is cut at three standard deviations; `deviation` is in pixels.
+
+    The image is taken to be black beyond its border.
+    """
+    height, width, _ = picture.shape
+    rows = (gaussian(height, deviation) @ picture.flatten(1)).view_as(picture)
+    return gaussian(width, deviation) @ rows
+
+
+@cache
+def gaussian(length: int, deviation: float) -> Float[Tensor, "length length"]:
+    """Return the convolution of this many pixels as a matrix, which is faster than a convolution for few pixels."""
+    apart = torch.arange(length)[:, None] - torch.arange(length)
+    weights = (-0.5 * (apart / deviation).square()).exp().where(apart.abs() <= round(3 * deviation), 0.0)
+    reach = torch.arange(-round(3 * deviation), round(3 * deviation) + 1)
+    return weights / (-0.5 * (reach / deviation).square()).exp().sum()

@@ -1,0 +1,1 @@
+"""Rendered image of a registered mesh."""

@@ -1,0 +1,179 @@
+"""Encoder `rasterised`: the rendered image of a registered mesh, as a baseline or as input of a learned renderer."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import torch
+from jaxtyping import Float
+from pydantic import Field
+from torch import Tensor
+
+from framework.bodies.people import chosen_body
+from framework.bodies.topologies import Name, sheet, topology
+from framework.configuration.paths import FilePath
+from framework.data import Data
+from framework.datasets import scan_layout
+from framework.datasets.scan_layout import SubjectFolder
+from framework.encoder import Encoder
+from framework.errors import ConfigError, DataError
+from framework.geometry.camera import canonical_camera
+from framework.geometry.clouds import sizes
+from framework.geometry.mesh_files import COLOURS, XYZ
+from framework.geometry.srgb import linear_from_srgb, srgb_from_linear
+from framework.renderer import Renderer, Scene
+from plugins.encoder.rasterised.textures import Textures
+
+COLUMNS = (*XYZ, *COLOURS)
+Metres = Annotated[float, Field(gt=0, le=1e6)]
+TEXELS = 4
+"""Largest number of texels along a side of a texture for each pixel of the image's longer side.
+
+Finer textures are averaged. For the default body some 6 × 6 texels then lie in a pixel, so that with `supersampling` 4
+the samples skip no texel.
+"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Picture:
+    """Settings of the rendered image.
+
+    Attributes:
+        height, width: pixels.
+        ground: whether a single channel, the share of a pixel that the mesh leaves free, replaces the colours.
+        depth: whether there is a further channel, 0 at `nearest` and 1 at `farthest` and beyond.
+        nearest, farthest: metres.
+    """
+
+    height: Annotated[int, Field(ge=8, le=4096)] = 256
+    width: Annotated[int, Field(ge=8, le=4096)] = 192
+    ground: bool = False
+    depth: bool = False
+    nearest: Metres = 1.0
+    farthest: Metres = 5.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Registered:
+    """Mesh whose vertices the points are; the settings are those of the same names of the data."""
+
+    topology: Name = "7k"
+    root: FilePath | None = None
+    body: FilePath | None = None
+
+
+class Rasterised(Encoder):
+    """Rendered image of a registered body with vertex colours or a texture, on white, in the canonical camera.
+
+    Inputs are those of `human_scans`, whose vertices are in the order of the topology. Colours are interpolated and
+    averaged in linear RGB. Textures lie in the folder of the data and are read when they are first drawn. Features are
+    (3, height, width), sRGB numbers as files hold them, in the inputs' dtype; with `depth` (4, height, width), as those
+    of `encoder=projection`. A network may read them in place of points. With `ground` the image is the silhouette
+    alone, black on white.
+
+    Args:
+        input_shape: (points, columns).
+        input_columns: names of the columns, if the data name them.
+        renderer: draws the mesh.
+        textures: the `human_scans` with the textures of all subjects that occur; None: vertex colours are drawn.
+        picture, mesh: settings of the image and of the mesh.
+
+    Raises:
+        ConfigError: the input is no cloud of coloured points, the renderer lacks a channel, or `textures` is other
+            data.
+        DataError: the mesh is not available; or, from `forward`, a texture.
+    """
+
+    fixed = True
+    bibtex = """@inproceedings{kato2018neural,
+  author = {Kato, Hiroharu and Ushiku, Yoshitaka and Harada, Tatsuya},
+  title = {Neural {3D} mesh renderer},
+  booktitle = {Conference on Computer Vision and Pattern Recognition},
+  year = {2018}
+}"""
+
+    def __init__(
+        self,
+        input_shape: tuple[int, ...],
+        input_columns: tuple[str, ...] = (),
+        *,
+        renderer: Renderer = "rasterizer",  # pyright: ignore[reportArgumentType]  # built by the framework
+        textures: Data | None = None,
+        picture: Picture,
+        mesh: Registered,
+    ) -> None:
+        super().__init__()
+        if len(input_shape) != 2 or input_shape[1] < len(COLUMNS) or input_columns[:6] not in ((), COLUMNS):
+            raise ConfigError(
+                f"encoder rasterised got inputs of shape {input_shape}; wanted (points, columns) whose first six "
+                f"columns are {', '.join(COLUMNS)}. Choose data=human_scans, or another encoder."
+            )
+        if textures is not None and not isinstance(textures, SubjectFolder):
+            raise ConfigError(
+                f"encoder.rasterised.textures = {type(textures).__name__} has none; wanted human_scans, say ${{data}}."
+            )
+        if missing := {"color", "depth", *(["uv"] if textures else [])} - renderer.channels:
+            raise ConfigError(
+                f"encoder.rasterised.renderer = {type(renderer).__name__} draws no {' and '.join(sorted(missing))}; "
+                "choose another renderer."
+            )
+        if not picture.nearest < picture.farthest:
+            raise ConfigError(
+                f"encoder rasterised got nearest={picture.nearest:g} and farthest={picture.farthest:g}; wanted nearest "
+                "below farthest, metres from the camera."
+            )
+        self.renderer = renderer
+        self.people, self.topology = textures, mesh.topology
+        self.textures: Textures | None = None
+        self.camera = canonical_camera(picture.height, picture.width)
+        self.ground, self.depth = picture.ground, picture.depth
+        self.limits = (picture.nearest, picture.farthest)
+        self.faces = faces_of(mesh)  # no buffer: meshes are drawn on the CPU on any device of the model
+        self.output_shape = ((1 if picture.ground else 3) + picture.depth, picture.height, picture.width)
+
+    @torch.no_grad()
+    def forward(self, inputs: Float[Tensor, "batch points columns"]) -> Float[Tensor, "batch *features"]:
+        sizes(inputs)  # refuses inputs that are no clouds
+        if len(inputs) and inputs.shape[1] <= int(self.faces.max()):
+            raise DataError(
+                f"A mesh of {inputs.shape[1]} vertices came; the topology has {int(self.faces.max()) + 1}. Set "
+                "encoder.rasterised.topology to that of the data."
+            )
+        scenes = [self._scene(cloud, row) for row, cloud in enumerate(inputs.cpu())]
+        channels = ("color", "depth") if self.depth else ("color",)
+        drawn = self.renderer.batch(scenes, channels)
+        found = inputs.new_empty(len(inputs), *self.output_shape)
+        for picture, one in zip(found, drawn, strict=True):
+            light, cover = one["color"][..., :3], one["color"][..., 3:]
+            shown = 1 - cover if self.ground else srgb_from_linear(light + (1 - cover))
+            picture[: shown.shape[-1]] = shown.movedim(-1, 0)
+            if self.depth:
+                nearest, farthest = self.limits
+                picture[-1] = ((one["depth"] - nearest) / (farthest - nearest)).clamp(0, 1)
+        return found
+
+    def _scene(self, cloud: Float[Tensor, "points columns"], row: int) -> Scene:
+        """Return the scene of a cloud; a fourth colour channel of 1 renders as the share of a pixel that is covered."""
+        vertices, colors = cloud[:, :3].float(), cloud[:, 3:6].float()
+        if self.people is None:
+            paint = torch.cat([linear_from_srgb(colors), colors.new_ones(len(colors), 1)], 1)
+            return Scene(vertices, self.faces, paint, self.camera)
+        if self.textures is None:
+            longest = TEXELS * max(self.camera.height, self.camera.width)
+            self.textures = Textures(self.people.place, self.topology, self.faces, longest)
+        return Scene(vertices, self.faces, None, self.camera, self.textures.of(colors, row))
+
+
+def faces_of(mesh: Registered) -> Tensor:
+    """Return the triangles of a topology: of generated people, or of the first registration in a folder.
+
+    Raises:
+        DataError: the body, or the folder's meshes, are not available.
+    """
+    if mesh.root is None:
+        chosen, _ = chosen_body(mesh.body)
+        return torch.from_numpy(topology(chosen, sheet(chosen), mesh.topology).faces.copy()).int()
+    folder = Path(mesh.root).expanduser()
+    subject = scan_layout.read_splits(folder)["train"][0]
+    file = folder / "subjects" / subject / f"registration_{mesh.topology}.ply"
+    return scan_layout.read_registration(file).faces.int()

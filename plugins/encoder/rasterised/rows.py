@@ -1,0 +1,48 @@
+"""Rows of the contract: rendered images of a doll, and of people with textures."""
+
+from pathlib import Path
+
+import torch
+
+from framework.testing.bodies import DOLL, FOLDER, colored, scanned
+from framework.testing.rows import EncoderRow
+
+
+def seen(count: int) -> torch.Tensor:
+    """Return inputs of `count` subjects, in turn, 3 m in front of the camera."""
+    people = [colored(number % 6) for number in range(count)]
+    clouds = [torch.cat([one.vertices * 2 + torch.tensor([0, -2, 3]), one.colors / 255], 1) for one in people]
+    return torch.stack(clouds) if clouds else torch.empty(0, 40, 6)
+
+
+SCANNED = scanned(Path(FOLDER.name) / "scans")
+ROWS = {
+    "rasterised": (
+        EncoderRow("a doll", (132, 6), {**DOLL, "renderer": "rasterizer", "height": 16, "width": 12}),
+        EncoderRow(
+            "a doll, its depth",
+            (132, 6),
+            {**DOLL, "renderer": "rasterizer", "height": 9, "width": 14, "depth": True},
+        ),
+        EncoderRow(
+            "six people's textures",
+            (40, 6),
+            {
+                **SCANNED,
+                "renderer": "rasterizer",
+                "height": 24,
+                "width": 18,
+                "textures": {"name": "human_scans", **SCANNED},
+            },
+            leave_out={
+                "finite on extreme inputs": "of constant colours there is nobody; test_textures.py has others"
+            },
+            inputs=seen,
+        ),
+        EncoderRow(
+            "a doll, its silhouette",
+            (132, 6),
+            {**DOLL, "renderer": "rasterizer", "height": 9, "width": 14, "ground": True},
+        ),
+    ),
+}

@@ -1,0 +1,1 @@
+"""Errors of a body's rotation and translation."""

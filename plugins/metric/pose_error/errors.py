@@ -1,0 +1,43 @@
+"""Errors of a body's rotation and translation, and what the figure shows of a fitted image."""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from framework.bodies.body import turns_less_identity
+from framework.geometry.rotation import geodesic_distance
+
+NEAR = (2.0, 1.0)
+"""Errors in degrees and centimetres up to which a body counts as found."""
+
+
+class FittedImage(NamedTuple):
+    """Content of the figure for one sample.
+
+    Attributes:
+        start, target, end: images, (height, width, 3), linear RGB.
+        degrees, centimetres: error of rotation and translation at the end.
+        path: one row for each accepted step: loss, processor time (seconds), degrees, centimetres.
+    """
+
+    start: Tensor
+    target: Tensor
+    end: Tensor
+    degrees: float
+    centimetres: float
+    path: Tensor
+
+
+def place_errors(
+    found: Float[Tensor, "*batch number"], wanted: Float[Tensor, "*#batch number"]
+) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
+    """Return the degrees between two rotations and the centimetres between two translations, float64."""
+    found, wanted = found.double(), wanted.double().expand_as(found)
+    one, other = (
+        turns_less_identity(numbers[..., :3]) + torch.eye(3, dtype=torch.float64, device=numbers.device)
+        for numbers in (found, wanted)
+    )
+    apart = torch.linalg.vector_norm(found[..., 3:6] - wanted[..., 3:6], dim=-1)
+    return torch.rad2deg(geodesic_distance(one, other)), 100 * apart
