@@ -18,11 +18,11 @@ from framework.bodies import motion
 from framework.datasets.csv_columns import (
     LabelledWriting,
     Writing,
+    describe_choice,
     numbers,
     numeric_columns,
     read_columns,
     tables,
-    told,
 )
 from framework.errors import DataError
 from framework.geometry import meshes
@@ -208,7 +208,8 @@ def test_numbers_are_read_right_or_refused_by_line(tmp_path: Path, name: str) ->
             assert str(tmp_path) in said, f"{name}, {word}: {said}"
             assert f"line {reader.line}" in said.lower() or "finite" in said, f"{name}, {word}: {said}"
             assert any(
-                remedy in said for remedy in ("write", "Write", "Mend", "Save", "Wanted:", "Restore")
+                remedy in said
+                for remedy in ("write", "Write", "Mend", "Correct", "Save", "Wanted:", "Restore", "Copy")
             ), said
         else:
             assert number is not None, f"{name}: {word!r} is read as {found}"
@@ -287,7 +288,7 @@ def test_row_numbers_are_no_inputs_and_no_angles(tmp_path: Path, name: str, star
     columns = read_columns(file, LabelledWriting())
     chosen = numeric_columns(columns, ("file", "y"), "data.columns")
     assert chosen.names == ("a",)
-    assert any("row numbers" in said for said in told(chosen))
+    assert any("row numbers" in said for said in describe_choice(chosen))
     table = read_table(file, None, "degrees")
     assert table.columns == ("a", "y")
     assert any("row numbers" in said for said in table.remarks)
@@ -300,7 +301,7 @@ def test_a_column_that_counts_the_rows_under_another_name_is_said(tmp_path: Path
     file.write_text("azimuth,file\n" + "".join(f"{row},{row}.png\n" for row in range(30)), encoding="utf-8")
     table = read_table(file, None, "degrees")
     assert table.columns == ("azimuth",)
-    assert "'azimuth' counts the rows from 0 to 29; data.angle_columns leaves it out" in table.remarks
+    assert "'azimuth' counts the rows from 0 to 29; set data.angle_columns to leave it out" in table.remarks
 
 
 WRITTEN = {

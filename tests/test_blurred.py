@@ -8,7 +8,7 @@ import torch
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
-from framework.datasets.images import Crop, blurred
+from framework.datasets.images import Crop, blur
 
 
 @pytest.mark.parametrize("deviation", [0.1, 0.5, 1.0, 2.3, 8.0, 40.0])
@@ -17,8 +17,8 @@ def test_blur_is_scipys(deviation: float, size: tuple[int, int]) -> None:
     """Also where the kernel reaches over the whole image several times."""
     pixels = np.random.default_rng(0).random((2, 3, *size))
     expected = gaussian_filter(pixels, (0, 0, deviation, deviation), mode="reflect", truncate=4)
-    np.testing.assert_allclose(blurred(torch.from_numpy(pixels), deviation), expected, atol=1e-13)
-    single = blurred(torch.from_numpy(pixels).float(), deviation)
+    np.testing.assert_allclose(blur(torch.from_numpy(pixels), deviation), expected, atol=1e-13)
+    single = blur(torch.from_numpy(pixels).float(), deviation)
     assert single.dtype == torch.float32
     np.testing.assert_allclose(single, expected, atol=1e-6)
 
@@ -27,18 +27,18 @@ def test_whole_numbers_are_rounded() -> None:
     pixels = np.random.default_rng(1).integers(0, 256, (3, 20, 30), dtype=np.uint8)
     pixels[:, :10] = 255
     expected = gaussian_filter(pixels.astype(float), (0, 1.7, 1.7), mode="reflect", truncate=4)
-    result = blurred(torch.from_numpy(pixels), 1.7)
+    result = blur(torch.from_numpy(pixels), 1.7)
     assert result.dtype == torch.uint8
     assert abs(result.numpy() - expected).max() < 0.501
 
 
 def test_no_blur_is_the_same_tensor_and_a_flat_image_stays_flat() -> None:
     pixels = torch.randint(0, 256, (3, 8, 8), dtype=torch.uint8)
-    assert blurred(pixels, 0.0) is pixels
+    assert blur(pixels, 0.0) is pixels
     flat = torch.full((3, 7, 11), 255, dtype=torch.uint8)
     for deviation in (1e-300, 0.3, 3.0, 300.0):
-        assert torch.equal(blurred(flat, deviation), flat)
-    assert torch.equal(blurred(pixels, 0.1), pixels)  # a kernel of one pixel
+        assert torch.equal(blur(flat, deviation), flat)
+    assert torch.equal(blur(pixels, 0.1), pixels)  # a kernel of one pixel
 
 
 def test_crop_is_blurred_after_it_was_scaled(tmp_path: Path) -> None:
@@ -46,5 +46,5 @@ def test_crop_is_blurred_after_it_was_scaled(tmp_path: Path) -> None:
     Image.fromarray(pixels).save(tmp_path / "one.png")
     sharp = Crop(tmp_path / "one.png", None, 0.0, 20).read()
     smooth = Crop(tmp_path / "one.png", None, 0.0, 20, blur=1.5).read()
-    assert torch.equal(smooth, blurred(sharp, 1.5))
+    assert torch.equal(smooth, blur(sharp, 1.5))
     assert not torch.equal(smooth, sharp)

@@ -19,7 +19,7 @@ def test_the_picture_shows_the_nearer_of_two_points_and_its_colour():
     colours = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, 1, 0], [0, 1, 0]])
     for order in ([0, 1, 2, 3], [1, 0, 3, 2]):
         cloud = torch.cat([places, colours], 1)[order]
-        image = cloud_picture.picture(cloud, ("x", "y", "z", *COLOURS), side=101)
+        image = cloud_picture.draw_cloud(cloud, ("x", "y", "z", *COLOURS), side=101)
         assert image.shape == (101, 101, 3)
         red, blue = ((image == colour).all(-1) for colour in ([255, 0, 0], [0, 0, 153]))
         assert red[47:54, 47:54].sum() == red.sum() == 21  # the whole disc
@@ -31,11 +31,11 @@ def test_up_is_up_and_the_padding_is_not_seen():
     stick = torch.stack([torch.zeros(200), torch.zeros(200), torch.linspace(0, 1, 200)], 1)
     cap = torch.tensor([[0.2, 0, 1.0], [-0.2, 0, 1.0]]).repeat(20, 1)
     cloud = torch.cat([stick, cap])
-    image = cloud_picture.picture(cloud)
+    image = cloud_picture.draw_cloud(cloud)
     dark = (image < 255).any(-1)
     assert dark[:40].sum() > dark[-40:].sum()
     padded = torch.cat([cloud, torch.full((500, 3), math.nan)])
-    np.testing.assert_array_equal(cloud_picture.picture(padded), image)
+    np.testing.assert_array_equal(cloud_picture.draw_cloud(padded), image)
 
 
 @pytest.mark.parametrize(
@@ -49,4 +49,4 @@ def test_up_is_up_and_the_padding_is_not_seen():
     ],
 )
 def test_any_cloud_has_a_picture(cloud):
-    assert cloud_picture.picture(cloud).dtype == np.uint8
+    assert cloud_picture.draw_cloud(cloud).dtype == np.uint8

@@ -41,15 +41,18 @@ def test_an_empty_cell_in_a_table_of_one_column_is_a_row(tmp_path: Path) -> None
         ("\na,b\n1,2", "is empty or begins with a blank line"),
         ("a,b", "has no row below its first line"),
         ("a,b\n,\n\n", "has no row below its first line"),
-        ("a b\n1 2\n3 4", r"is separated by blanks: its first line reads 'a b'; wanted commas"),
-        ("1,2\n3,4", r"line 1: '1, 2' are numbers; wanted the names of the columns"),
+        ("a b\n1 2\n3 4", r"is separated by blanks: its first line is 'a b'. Commas"),
+        ("1,2\n3,4", r"line 1: '1, 2' are numbers, but the first line must name the columns"),
         ("a,b,a\n1,2,3", "names the column 'a' twice"),
-        (",a\nx,1", r"column 1 has no name, and holds 'x', which is no row number"),
-        ("a,b\n1,5,2\n", r"line 2: 3 cells; wanted 2, .* a decimal comma stands in quotation marks"),
-        ("a,b\n1,2\n1,2,3", "line 3: 3 cells; wanted 2"),
-        ("a,b\n1,2\n1\n", "line 3: 1 cells; wanted 2"),
+        (",a\nx,1", r"column 1 has no name, but holds 'x', which is no row number"),
+        (
+            "a,b\n1,5,2\n",
+            r"line 2: the line has 3 cells, but the first line names 2 .* with a decimal comma in quotation marks",
+        ),
+        ("a,b\n1,2\n1,2,3", "line 3: the line has 3 cells, but the first line names 2"),
+        ("a,b\n1,2\n1\n", "line 3: the line has 1 cells, but the first line names 2"),
         ('a,b\n1,"2', "cannot be read"),
-        (b"a,b\n\xe4,2", "cannot be read .* wanted UTF-8 text"),
+        (b"a,b\n\xe4,2", "cannot be read .* Save it as UTF-8 text"),
     ],
 )
 def test_wrong_files_are_refused(tmp_path: Path, content: str | bytes, message: str) -> None:
@@ -58,7 +61,7 @@ def test_wrong_files_are_refused(tmp_path: Path, content: str | bytes, message: 
 
 
 def test_missing_files_and_folders_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"none\.csv: no such file; wanted a CSV table"):
+    with pytest.raises(DataError, match=r"none\.csv: no such file; a CSV table is expected"):
         read_columns(tmp_path / "none.csv")
     with pytest.raises(DataError, match="cannot be read"):
         read_columns(tmp_path)
@@ -67,14 +70,14 @@ def test_missing_files_and_folders_are_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("cell", "message"),
     [
-        ("abc", r"line 4, column 'a': 'abc'; wanted a finite number"),
-        ("", r"line 4, column 'a': ''; .* Or set it to skip\."),
-        ("NA", r"'NA'; .* Or set it to skip\."),
-        ("nan", r"'nan'; .* Or set it to skip\."),
-        ("-inf", r"'-inf'; wanted a finite number\. Mend the cell, or take the line out\.$"),
-        ("1e999", "'1e999'; wanted a finite number"),
-        ("1_0", "'1_0'; wanted a finite number"),
-        ('"1,5"', r"'1,5'; .* It is a number with a decimal comma\. Write 1\.5"),
+        ("abc", r"line 4, column 'a': 'abc' is no finite number"),
+        ("", r"line 4, column 'a': '' is no finite number.* Or set it to skip\."),
+        ("NA", r"'NA' is no finite number.* Or set it to skip\."),
+        ("nan", r"'nan' is no finite number.* Or set it to skip\."),
+        ("-inf", r"'-inf' is no finite number, which is required\. Correct the cell, or remove the line\.$"),
+        ("1e999", "'1e999' is no finite number"),
+        ("1_0", "'1_0' is no finite number"),
+        ('"1,5"', r"'1,5' is no finite number.* The cell is a number with a decimal comma\. Write 1\.5"),
     ],
 )
 def test_cells_that_are_no_finite_number_are_named(tmp_path: Path, cell: str, message: str) -> None:
@@ -100,7 +103,9 @@ def test_columns_of_numbers_are_told_from_columns_of_words(tmp_path: Path) -> No
 def test_a_name_that_is_no_column_is_refused_with_the_nearest(tmp_path: Path) -> None:
     columns = read_columns(written(tmp_path, "height,width\n1,2\n"))
     require(columns, ("width", "height"), "data.columns")
-    with pytest.raises(DataError, match=r"data\.columns names 'heigth', .* Did you mean 'height'\?"):
+    with pytest.raises(
+        DataError, match=r"data\.columns names the column 'heigth', .* Did you mean 'height'\?"
+    ):
         require(columns, ("heigth",), "data.columns")
 
 

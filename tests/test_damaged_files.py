@@ -15,7 +15,7 @@ from framework.configuration.registry import installed
 from framework.configuration.schema import build, resolve
 from framework.configuration.settings import settings
 from framework.datasets import images
-from framework.datasets.images import Crop, square
+from framework.datasets.images import Crop, cut_square
 from framework.errors import ConfigError, DataError, quote, shorten
 from framework.storage import reading
 from framework.storage.plain_values import read_yaml, require_plain_pickle
@@ -132,10 +132,10 @@ def test_a_strip_is_scaled_before_it_is_padded(tmp_path: Path, monkeypatch: pyte
     for pixels in (smooth, smooth.transpose(1, 0, 2)):
         picture = Image.fromarray(np.ascontiguousarray(pixels))
         box = (0.0, 0.0, float(picture.width), float(picture.height))
-        wanted = square(picture, box, 0.1, 16)
+        wanted = cut_square(picture, box, 0.1, 16)
         with monkeypatch.context() as patched:
             patched.setattr(images, "MOST_PADDED", 400**2)
-            found = square(picture, box, 0.1, 16)
+            found = cut_square(picture, box, 0.1, 16)
         assert wanted is not None and found is not None
         assert np.abs(found.astype(float) - wanted).max() <= 12
         assert np.abs(found.astype(float) - wanted).mean() <= 2

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from framework.datasets import images
-from framework.datasets.images import Crop, augmented, picture, square, varied
+from framework.datasets.images import Crop, augment, cut_square, to_rgb8, vary
 from framework.errors import DataError
 
 
@@ -35,7 +35,7 @@ def test_square_lies_where_it_should_to_a_part_of_a_pixel(
     """A crop of a ramp is the ramp at the crop's sample centres; pixel i covers [i, i + 1]."""
     left, top, right, bottom = box
     half = (0.5 + margin) * max(right - left, bottom - top)
-    pixels = square(ramp(100, 80), box, margin, side)
+    pixels = cut_square(ramp(100, 80), box, margin, side)
     assert pixels is not None
     centers = 2 * half * (np.arange(side) + 0.5) / side - half
     x, y = (left + right) / 2 + centers - 0.5, (top + bottom) / 2 + centers - 0.5
@@ -47,14 +47,14 @@ def test_square_lies_where_it_should_to_a_part_of_a_pixel(
 
 def test_shrinking_averages_instead_of_skipping() -> None:
     checks = Image.fromarray((255 * (np.indices((64, 64)).sum(0) % 2)).astype(np.uint8))
-    pixels = square(checks, (0.0, 0.0, 64.0, 64.0), 0.0, 8)
+    pixels = cut_square(checks, (0.0, 0.0, 64.0, 64.0), 0.0, 8)
     assert pixels is not None
     assert pixels.shape == (1, 8, 8)
     assert abs(pixels[:, 1:-1, 1:-1].astype(int) - 127).max() <= 2
 
 
 def test_beyond_the_border_the_border_is_repeated() -> None:
-    pixels = square(ramp(20, 40), (0.0, 0.0, 20.0, 40.0), 0.0, 40)  # 10 columns are missing on each side
+    pixels = cut_square(ramp(20, 40), (0.0, 0.0, 20.0, 40.0), 0.0, 40)  # 10 columns are missing on each side
     assert pixels is not None
     np.testing.assert_array_equal(pixels[0, 5, :10], 0)
     np.testing.assert_array_equal(pixels[0, 5, 10:30], 2 * np.arange(20))
@@ -74,7 +74,7 @@ coordinate = st.floats(-1e6, 1e6) | st.sampled_from([math.nan, math.inf, -math.i
 def test_any_box_gives_a_square_or_nothing(
     box: tuple[float, float, float, float], margin: float, size: tuple[int, int], side: int
 ) -> None:
-    pixels = square(ramp(*size), box, margin, side)
+    pixels = cut_square(ramp(*size), box, margin, side)
     left, top, right, bottom = box
     overlaps = max(left, 0) < min(right, size[0]) and max(top, 0) < min(bottom, size[1])
     if not (overlaps and all(map(math.isfinite, box))):
@@ -154,7 +154,7 @@ def test_damaged_files_are_named(tmp_path: Path, suffix: str) -> None:
 
 def test_floating_point_images_are_refused(tmp_path: Path) -> None:
     Image.fromarray(np.zeros((4, 4), np.float32)).save(tmp_path / "one.tiff")
-    with pytest.raises(DataError, match="floating-point numbers of unknown range; wanted 8 or 16 bits"):
+    with pytest.raises(DataError, match="floating-point numbers of unknown range, but 8 or 16 bits"):
         Crop(tmp_path / "one.tiff", None, 0.0, 4).read()
 
 
@@ -193,10 +193,10 @@ def test_long_lists_of_faults_are_cut() -> None:
 def test_augmented_without_jitter_is_the_image_or_its_mirror_image() -> None:
     pixels = torch.randint(0, 256, (6, 3, 5, 8), dtype=torch.uint8)
     mirrored = torch.tensor([True, False, True, False, False, True])
-    varied = augmented(pixels, mirrored, 0.0)
+    result = augment(pixels, mirrored, 0.0)
     expected = torch.where(mirrored[:, None, None, None], pixels.flip(-1), pixels) / 255
-    torch.testing.assert_close(varied, expected, rtol=0, atol=1e-6)
-    torch.testing.assert_close(augmented(pixels / 255, mirrored, 0.0), expected, rtol=0, atol=1e-6)
+    torch.testing.assert_close(result, expected, rtol=0, atol=1e-6)
+    torch.testing.assert_close(augment(pixels / 255, mirrored, 0.0), expected, rtol=0, atol=1e-6)
 
 
 def test_augmented_against_scipy() -> None:
@@ -205,7 +205,7 @@ def test_augmented_against_scipy() -> None:
     pixels = torch.randint(0, 256, (batch, 3, height, width), dtype=torch.uint8)
     mirrored = torch.arange(batch) % 2 == 0
     torch.manual_seed(3)
-    varied = augmented(pixels, mirrored, jitter).numpy()
+    result = augment(pixels, mirrored, jitter).numpy()
     torch.manual_seed(3)
     amount = ((2 * torch.rand(5, batch) - 1) * jitter).double().numpy()
     for index in range(batch):
@@ -219,7 +219,7 @@ def test_augmented_against_scipy() -> None:
             source = pixels[index, channel].double().numpy() / 255
             moved = scipy.ndimage.map_coordinates(source, places, order=1, mode="nearest")
             expected = np.clip((moved - 0.5) * contrast + 0.5 + brightness, 0, 1)
-            np.testing.assert_allclose(varied[index, channel], expected, atol=2e-6)
+            np.testing.assert_allclose(result[index, channel], expected, atol=2e-6)
 
 
 def test_augmented_is_the_same_while_a_model_of_float64_trains() -> None:
@@ -229,7 +229,7 @@ def test_augmented_is_the_same_while_a_model_of_float64_trains() -> None:
         for kind in (torch.float32, torch.float64):
             torch.set_default_dtype(kind)
             torch.manual_seed(0)
-            found.append(augmented(pixels, torch.tensor([True, False, True, False]), 0.1))
+            found.append(augment(pixels, torch.tensor([True, False, True, False]), 0.1))
     finally:
         torch.set_default_dtype(torch.float32)
     assert torch.equal(*found)
@@ -237,14 +237,14 @@ def test_augmented_is_the_same_while_a_model_of_float64_trains() -> None:
 
 def test_augmented_takes_an_empty_batch() -> None:
     none = torch.empty((0, 3, 8, 8), dtype=torch.uint8)
-    assert augmented(none, torch.empty(0, dtype=torch.bool), 0.1).shape == (0, 3, 8, 8)
+    assert augment(none, torch.empty(0, dtype=torch.bool), 0.1).shape == (0, 3, 8, 8)
 
 
 def test_augmentation_mirrors_half_of_a_batch_and_signs_its_angles() -> None:
     torch.manual_seed(0)
     pixels = torch.randint(0, 256, (200, 3, 8, 8), dtype=torch.uint8)
     batch = {"input": pixels, "target": torch.rand(200, 2) + 0.1, "index": torch.arange(200)}
-    result = varied(batch, (-1.0, 1.0), 0.0)
+    result = vary(batch, (-1.0, 1.0), 0.0)
     flipped = (255 * result["input"] - pixels.flip(-1)).abs().amax((1, 2, 3)) < 0.01
     same = (255 * result["input"] - pixels).abs().amax((1, 2, 3)) < 0.01
     assert torch.all(same ^ flipped)
@@ -252,8 +252,8 @@ def test_augmentation_mirrors_half_of_a_batch_and_signs_its_angles() -> None:
     expected = torch.where(flipped[:, None], batch["target"] * torch.tensor([-1.0, 1.0]), batch["target"])
     assert torch.equal(result["target"], expected)
     assert result["index"] is batch["index"]
-    assert varied(batch, (), 0.0) is batch
-    shaken = varied(batch, (), 0.1)
+    assert vary(batch, (), 0.0) is batch
+    shaken = vary(batch, (), 0.1)
     assert torch.equal(shaken["target"], batch["target"])
     assert not torch.equal(255 * shaken["input"], pixels.float())
 
@@ -261,8 +261,8 @@ def test_augmentation_mirrors_half_of_a_batch_and_signs_its_angles() -> None:
 def test_picture_of_grey_and_of_floating_point_images() -> None:
     grey = torch.tensor([[[0.0, 1.0], [0.5, 2.0]]])
     expected = np.array([[0, 255], [128, 255]], np.uint8)[..., None].repeat(3, axis=2)
-    np.testing.assert_array_equal(picture(grey), expected)
-    np.testing.assert_array_equal(picture(torch.from_numpy(expected).permute(2, 0, 1)), expected)
+    np.testing.assert_array_equal(to_rgb8(grey), expected)
+    np.testing.assert_array_equal(to_rgb8(torch.from_numpy(expected).permute(2, 0, 1)), expected)
 
 
 @pytest.mark.skipif("REAL_DATA_ROOT" not in os.environ, reason="REAL_DATA_ROOT is not set")

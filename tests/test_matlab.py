@@ -11,7 +11,7 @@ import pytest
 import scipy.io
 from scipy.io.matlab import mat_struct
 
-from framework.datasets.matlab import read_variables, variables
+from framework.datasets.matlab import parse_variables, read_variables
 from framework.errors import DataError
 
 
@@ -50,15 +50,15 @@ def test_damage_is_named_or_harmless(tmp_path: Path, compressed: bool) -> None:
     assert refused > 100
     for length in range(0, len(whole), 61):
         with pytest.raises((ValueError, zlib.error)):
-            variables(whole[: length or 1])
+            parse_variables(whole[: length or 1])
 
 
 def test_other_versions_and_complex_numbers_are_refused(tmp_path: Path) -> None:
     (tmp_path / "new.mat").write_bytes(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + bytes(400))
-    with pytest.raises(DataError, match=r"new\.mat: a MATLAB 7\.3 file; wanted version 5"):
+    with pytest.raises(DataError, match=r"new\.mat: got a MATLAB 7\.3 file, but version 5"):
         read_variables(tmp_path / "new.mat")
     with pytest.raises(ValueError, match="no header of a MATLAB 5 file"):
-        variables(b"text" * 99)
+        parse_variables(b"text" * 99)
     scipy.io.savemat(tmp_path / "complex.mat", {"labels": 1j})
     with pytest.raises(DataError, match=r"complex\.mat: .*complex numbers"):
         read_variables(tmp_path / "complex.mat", ["labels"])
@@ -87,7 +87,7 @@ def same(found: Any, wanted: Any) -> None:
 
 def compared(content: bytes) -> None:
     wanted = scipy.io.loadmat(io.BytesIO(content), squeeze_me=True, struct_as_record=False)
-    found = variables(content)
+    found = parse_variables(content)
     names = [name for name in wanted if not name.startswith("__")]
     assert list(found) == names
     for name in names:
@@ -122,7 +122,7 @@ def test_everything_that_labels_may_hold_is_read_as_scipy_reads_it(compressed: b
 def test_what_is_no_label_is_none_and_what_is_not_asked_for_may_be_anything() -> None:
     stream = io.BytesIO()
     scipy.io.savemat(stream, {"sparse": scipy.sparse.eye(3), "complex": 1j, "gaze": 7})
-    assert variables(stream.getvalue(), ["gaze", "sparse"]) == {"gaze": 7, "sparse": None}
+    assert parse_variables(stream.getvalue(), ["gaze", "sparse"]) == {"gaze": 7, "sparse": None}
 
 
 def bomb(size: int) -> bytes:
@@ -134,9 +134,9 @@ def bomb(size: int) -> bytes:
 
 def test_what_unfolds_to_far_more_than_the_file_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("framework.storage.reading.SMALL", 2**20)
-    assert not variables(bomb(2**20 - 200))["labels"].any()
+    assert not parse_variables(bomb(2**20 - 200))["labels"].any()
     with pytest.raises(ValueError, match="unfolds to more than"):
-        variables(bomb(2**22))
+        parse_variables(bomb(2**22))
 
 
 def test_sides_that_the_data_do_not_have_are_refused_before_anything_is_allocated() -> None:
@@ -153,7 +153,7 @@ def test_sides_that_the_data_do_not_have_are_refused_before_anything_is_allocate
             refused = 0
             for place in places:
                 try:
-                    variables(whole[:place] + new + whole[place + 4 :])
+                    parse_variables(whole[:place] + new + whole[place + 4 :])
                 except ValueError:
                     refused += 1
             assert refused

@@ -12,18 +12,18 @@ from framework.geometry.mesh_files import COLOURS
 AZIMUTH, ELEVATION = math.radians(-55), math.radians(25)
 """Direction of the camera, radians: x points forward to the left, y back to the right, z up."""
 SPREAD = 0.8
-"""Radius of a point's disc, relative to the side of the square that each of the points has if they fill the image."""
+"""Radius of a point's disc, as a share of the side of a square, if one such square per point would fill the image."""
 NEAR, FAR = np.array([20.0, 40.0, 90.0]), np.array([190.0, 205.0, 225.0])
 """Colours of the nearest and the farthest point, RGB in 0…255."""
 
 
-def picture(
+def draw_cloud(
     cloud: Float[Tensor, "points columns"], columns: Sequence[str] = (), side: int = 160
 ) -> UInt8[np.ndarray, "side side 3"]:
     """Draw a point cloud in orthographic projection from obliquely above, z up, on white.
 
-    Nearer points hide farther ones and are darker. Rows that are not finite (padding) are left out. Points have their
-    own colours if `columns` names them.
+    Nearer points hide farther ones and are darker. Rows that are not finite (padding) are left out. Points are drawn in
+    their own colours if `columns`, the names of the cloud's columns, includes the colours.
     """
     table = cloud.detach().cpu().double().numpy()
     table = table[np.isfinite(table[:, :3]).all(1)]
@@ -37,12 +37,12 @@ def picture(
     right = points @ [-sin_a, cos_a, 0.0]
     up = points @ [-sin_e * cos_a, -sin_e * sin_a, cos_e]
     depth = points @ [cos_e * cos_a, cos_e * sin_a, sin_e]  # towards the viewer
-    reach = max(np.abs(right).max(), np.abs(up).max(), 1e-9)
-    scale = (side / 2 - side / 40 - 1) / reach
+    extent = max(np.abs(right).max(), np.abs(up).max(), 1e-9)
+    scale = (side / 2 - side / 40 - 1) / extent
     row = np.rint(side / 2 - up * scale).astype(np.int64)
     column = np.rint(side / 2 + right * scale).astype(np.int64)
-    far = np.ptp(depth)
-    share = ((depth - depth.min()) / far if far > 0 else np.ones_like(depth))[:, None]
+    depth_range = np.ptp(depth)
+    share = ((depth - depth.min()) / depth_range if depth_range > 0 else np.ones_like(depth))[:, None]
     if set(COLOURS) <= set(columns):
         own = table[:, [list(columns).index(name) for name in COLOURS]].clip(0, 1)
         colour = 255 * own * (0.6 + 0.4 * share)
@@ -50,8 +50,8 @@ def picture(
         colour = FAR + (NEAR - FAR) * share
     # Each point covers a disc so large that the sides of a box look closed. The nearest point wins a pixel.
     radius = min(max(SPREAD * side / math.sqrt(len(points)), 1.0), side / 40)
-    reached = np.arange(-math.floor(radius), math.floor(radius) + 1)
-    steps = np.stack(np.meshgrid(reached, reached), -1).reshape(-1, 2)
+    offsets = np.arange(-math.floor(radius), math.floor(radius) + 1)
+    steps = np.stack(np.meshgrid(offsets, offsets), -1).reshape(-1, 2)
     steps = steps[(steps**2).sum(1) <= radius**2]
     pixel = ((row + steps[:, :1]) * side + column + steps[:, 1:]).clip(0, side * side - 1)
     nearest = np.full(side * side, -np.inf)

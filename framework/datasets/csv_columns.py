@@ -1,9 +1,9 @@
 """A CSV table of numbers and words, by columns; error messages name the line and the column.
 
-`framework.storage.text` decides which words are numbers. `Writing` is the part of the config that says how a user's
-table is written. A column that holds no numbers is reported (`Chosen.left_out`): it holds words, row numbers, or
-nothing. A column whose cells would be numbers in another notation is refused, and the message names the setting that
-reads it.
+`framework.storage.text` decides which words are numbers. `Writing` is the part of the config that describes the
+notation of a user's table. A column that holds no numbers is reported (`ColumnChoice.left_out`): it holds words, row
+numbers, or nothing. A column whose cells would be numbers in another notation is refused, and the message names the
+setting that reads it.
 """
 
 import csv
@@ -45,7 +45,7 @@ INDEX = re.compile(
 
 MOST_LOOKED_AT = 2000
 """Number of cells of a column of words, evenly spaced, that are checked for numbers in another notation."""
-MOST_TOLD = 12
+MOST_LISTED = 12
 """Largest number of columns that a sentence lists."""
 Separator = Literal["comma", "semicolon", "tab", "bar", "space", ",", ";", "\t", "|", " "]
 SEPARATORS = {"comma": ",", "semicolon": ";", "tab": "\t", "bar": "|", "space": " "}
@@ -60,11 +60,10 @@ GROUPING = {
 
 @dataclass(frozen=True, kw_only=True)
 class Writing:
-    """Settings that say how a user's table is written.
+    """Settings for the notation of a user's table.
 
     Attributes:
-        separator: the sign between cells; None takes the sign found in the first line, out of commas, semicolons, tabs
-            and bars.
+        separator: the sign between cells; None takes the comma, semicolon, tab or bar that the first line contains.
         decimal: the decimal sign.
         thousands: the sign between groups of three digits; None: no sign.
         units: units that may stand beside the numbers of a column ("%", "$", "kg"). They are removed: 5% becomes 5.
@@ -78,7 +77,8 @@ class Writing:
     def __post_init__(self) -> None:
         if self.thousands and GROUPING[self.thousands] == self.sign:
             raise DataError(
-                f"data.decimal and data.thousands are both {self.thousands}; wanted two signs. Change one."
+                f"data.decimal and data.thousands are both {self.thousands}, but the two signs must differ. Change "
+                "one of them."
             )
 
     @property
@@ -93,17 +93,17 @@ class Writing:
 
     @property
     def missing(self) -> frozenset[str]:
-        """Words, in small letters, of cells that hold nothing."""
+        """Words, in small letters, that mark a cell without a value."""
         return MISSING
 
     @cached_property
     def plain(self) -> bool:
-        """True if numbers are written as programs write them."""
+        """True if numbers have a decimal point, no sign between groups of digits and no unit."""
         return self.sign == "." and self.thousands is None and not self.units
 
     def standard(self, cell: str) -> str:
-        """Return the number in a cell as programs write it; a word is returned as a word."""
-        return self._ungrouped(self.split_unit(cell)[0])
+        """Return the number in a cell as text that `float` reads; a cell that holds no number is not such text."""
+        return self._plain_notation(self.split_unit(cell)[0])
 
     def split_unit(self, cell: str) -> tuple[str, str]:
         """Return a cell without its unit, and the unit, "" if the cell has none."""
@@ -116,10 +116,10 @@ class Writing:
                 return cell.removesuffix(unit).strip(), unit
         return cell, ""
 
-    def _ungrouped(self, cell: str) -> str:
-        """Return a cell with a decimal point and without signs between groups of digits.
+    def _plain_notation(self, cell: str) -> str:
+        """Return a number with a decimal point and without signs between groups of digits.
 
-        A cell with digits that does not fit the notation gets a leading "_", so that it is no number.
+        A cell with digits that does not fit the notation gets a leading "_", so that it is not read as a number.
         """
         if self.sign == "." and self.thousands is None:
             return cell
@@ -128,27 +128,27 @@ class Writing:
             re.escape(self.sign),
         )
         whole = rf"\d{{1,3}}(?:{between}\d{{3}})+|\d+" if between else r"\d+"
-        found = re.fullmatch(rf"([+-]?)({whole})?(?:{sign}(\d*))?((?:[eEdD][+-]?\d+)?)", cell)
-        if found is None:
+        parts = re.fullmatch(rf"([+-]?)({whole})?(?:{sign}(\d*))?((?:[eEdD][+-]?\d+)?)", cell)
+        if parts is None:
             return f"_{cell}" if any(letter.isdigit() for letter in cell) else cell
-        figures = re.sub(between, "", found[2] or "") if between else found[2] or ""
-        return f"{found[1]}{figures}.{found[3] or ''}{found[4]}"
+        digits = re.sub(between, "", parts[2] or "") if between else parts[2] or ""
+        return f"{parts[1]}{digits}.{parts[3] or ''}{parts[4]}"
 
 
 @dataclass(frozen=True, kw_only=True)
 class LabelledWriting(Writing):
-    """Settings that say how a table with missing numbers and labels is written.
+    """Settings for the notation of a table with labels and missing numbers.
 
     Attributes:
-        missing_words: words of cells that hold nothing, in addition to empty cells; None: those in MISSING. [] allows
-            empty cells only, for tables where "none" or "NA" is a label.
+        missing_words: words that mark a cell without a value, in addition to empty cells; None: the words in MISSING.
+            With [] only empty cells are missing, for tables where "none" or "NA" is a label.
     """
 
     missing_words: list[Words] | None = None
 
     @cached_property
     def missing(self) -> frozenset[str]:
-        """Words, in small letters, of cells that hold nothing."""
+        """Words, in small letters, that mark a cell without a value."""
         return MISSING if self.missing_words is None else frozenset(["", *map(str.lower, self.missing_words)])
 
 
@@ -162,8 +162,8 @@ class Columns:
     Attributes:
         file: the file of the table.
         cells: cells by column name, without surrounding blanks.
-        lines: number of the line on which each row ends.
-        writing: how the table is written; None: as programs write it, and no setting can change this.
+        lines: for each row, the number of the line on which it ends.
+        writing: notation of the table; None: decimal points and no units, which no setting can change.
         left_out: columns without a name that were left out, with the reason.
     """
 
@@ -174,34 +174,34 @@ class Columns:
     left_out: Mapping[str, str] = field(default_factory=dict)
 
     @property
-    def how(self) -> Writing:
-        """Settings of the table; those of programs if it has none."""
+    def notation(self) -> Writing:
+        """Notation of the table; `PLAIN` if the table has no settings."""
         return self.writing or PLAIN
 
-    def written(self, name: str) -> Writing:
-        """Return how a column is written.
+    def notation_of(self, name: str) -> Writing:
+        """Return the notation of one column.
 
-        A table with decimal commas may hold a column with decimal points. A column counts as such if it has points that
-        do not group digits, and no comma.
+        In a table with decimal commas, a column may have decimal points. This is assumed if it contains no comma, and
+        points that do not group digits.
         """
-        how = self.how
-        if how.sign != ",":
-            return how
+        notation = self.notation
+        if notation.sign != ",":
+            return notation
         cells = [cell.lstrip("+-") for cell in self.cells[name]]
         points = [cell for cell in cells if "." in cell]
         if not points or any("," in cell for cell in cells):
-            return how
+            return notation
         grouped = all(re.fullmatch(GROUPED_BY_POINTS, cell) for cell in points)
-        return how if grouped else replace(how, decimal="point", thousands=None)
+        return notation if grouped else replace(notation, decimal="point", thousands=None)
 
 
-class Chosen(NamedTuple):
-    """Chosen columns of numbers.
+class ColumnChoice(NamedTuple):
+    """The columns of a table that are read as numbers.
 
     Attributes:
         names: names of the chosen columns.
         left_out: reason why each other column is left out, by name.
-        odd: what is odd about a chosen column, by name.
+        odd: remark about a chosen column that may not be meant as a number, by name.
     """
 
     names: tuple[str, ...]
@@ -209,32 +209,32 @@ class Chosen(NamedTuple):
     odd: dict[str, str]
 
 
-def told(chosen: Chosen) -> tuple[str, ...]:
-    """Return clauses about the columns left out and the odd ones, for the first lines of a run."""
+def describe_choice(chosen: ColumnChoice) -> tuple[str, ...]:
+    """Return remarks about the columns left out and the odd ones, for the first lines of a run."""
     left_out = [f"{quote(name)} ({why})" for name, why in chosen.left_out.items()]
-    many = (
-        [*left_out[:MOST_TOLD], f"and {len(left_out) - MOST_TOLD} more"]
-        if len(left_out) > MOST_TOLD
+    listed = (
+        [*left_out[:MOST_LISTED], f"and {len(left_out) - MOST_LISTED} more"]
+        if len(left_out) > MOST_LISTED
         else left_out
     )
-    said = (f"left out: {', '.join(many)}",) if many else ()
-    return (*said, *(f"{quote(name)} {why}" for name, why in chosen.odd.items()))
+    remarks = (f"left out: {', '.join(listed)}",) if listed else ()
+    return (*remarks, *(f"{quote(name)} {why}" for name, why in chosen.odd.items()))
 
 
 @contextmanager
 def csv_rows(file: Path, missing: str, writing: Writing | None = None) -> Iterator[Any]:
-    """Open a CSV file, UTF-8 with or without a byte-order mark, and give its rows as lists of cells.
+    """Open a CSV file, UTF-8 with or without a byte-order mark, and yield an iterator of rows, each a list of cells.
 
     Args:
         file: path of the table.
         missing: end of the message about a file that does not exist.
-        writing: how it is written.
+        writing: notation of the table.
 
     Raises:
         DataError: the file is missing or unreadable.
     """
     with (
-        guarded(file, "a table", "Save it as the wanted UTF-8 text, a row a line.", missing),
+        guarded(file, "a table", "Save it as UTF-8 text with one row on each line.", missing),
         opened(file) as stream,
     ):
         text.plain(stream.peek(text.LOOKED_AT))
@@ -248,8 +248,8 @@ def csv_rows(file: Path, missing: str, writing: Writing | None = None) -> Iterat
 
 def _rows(lines: io.TextIOWrapper, writing: Writing) -> Any:
     first = lines.readline()
-    told = re.fullmatch(r"sep=(.)\s*", first)  # Excel states its separator so
-    sign = told[1] if told else writing.delimiter or _separator(first)
+    stated = re.fullmatch(r"sep=(.)\s*", first)  # the line in which Excel states the separator
+    sign = stated[1] if stated else writing.delimiter or _separator(first)
     rest = _with_first(first, lines)
     if sign == " ":
         return csv.reader(rest, strict=True, delimiter=" ", skipinitialspace=True)
@@ -262,14 +262,14 @@ def _with_first(first: str, lines: io.TextIOWrapper) -> Iterator[str]:
 
 
 def _separator(first: str) -> str:
-    """Return the sign that separates the names of a first line; a comma if no sign does."""
+    """Return the sign that separates the names of the first line; a comma if there is no such sign."""
     outside = re.sub(r'"[^"]*"', "", first)
     counts = {sign: outside.count(sign) for sign in ",;\t|"}
     return "," if counts[","] or not any(counts.values()) else max(counts, key=counts.__getitem__)
 
 
 def read_columns(
-    file: Path, writing: Writing | None = None, missing: str = "wanted a CSV table. Mend the path."
+    file: Path, writing: Writing | None = None, missing: str = "a CSV table is expected. Correct the path."
 ) -> Columns:
     """Read a CSV file, UTF-8 with or without a byte-order mark, with column names in its first line.
 
@@ -277,7 +277,7 @@ def read_columns(
 
     Args:
         file: path of the table.
-        writing: how it is written; None: as programs write it.
+        writing: notation of the table; None: decimal points and no units.
         missing: end of the message about a file that does not exist.
 
     Raises:
@@ -290,7 +290,7 @@ def read_columns(
             names = next(reader, [])
         if len(names) > MOST_COLUMNS:
             raise DataError(
-                f"{file} has {len(names)} columns; wanted at most {MOST_COLUMNS}. Leave some out."
+                f"{file} has {len(names)} columns, but at most {MOST_COLUMNS} are allowed. Leave some out."
             )
         header = [text.column_name(cell) for cell in names]
         _check_header(file, header)
@@ -302,120 +302,125 @@ def read_columns(
                 continue
             if len(cells) != len(header):
                 raise DataError(
-                    f"{file} line {reader.line_num}: {len(cells)} cells; wanted {len(header)}, as many as the "
-                    f"first line names. Mend that line.{_why_other_width(header, cells, writing)}"
+                    f"{file} line {reader.line_num}: the line has {len(cells)} cells, but the first line names "
+                    f"{len(header)} columns. Correct that line.{_why_other_width(header, cells, writing)}"
                 )
             for column, cell in zip(columns, cells, strict=True):
                 column.append(cell.strip())
             lines.append(reader.line_num)
     if not lines:
-        raise DataError(f"{file} has no row below its first line; wanted one for each sample. Add them.")
+        raise DataError(
+            f"{file} has no row below its first line, but one row per sample is expected. Add the rows."
+        )
     _check_blanks(file, header, columns)
-    return _named(file, header, columns, lines, writing)
+    return _select_named(file, header, columns, lines, writing)
 
 
 def _why_other_width(header: Sequence[str], cells: Sequence[str], writing: Writing | None) -> str:
-    """Return a hint why a row has another number of cells than the first line, or ""."""
+    """Return a possible reason why a row has another number of cells than the first line; "" if none is known."""
     if len(cells) > len(header) and sum(cell.strip().isdigit() for cell in cells) > len(header) // 2 + 1:
-        return " Where commas separate cells, a decimal comma stands in quotation marks."
+        return " If commas separate the cells, put numbers with a decimal comma in quotation marks."
     return (
-        " Or its rows begin with numbers that the first line does not name."
+        " Or name the first column too: the rows may begin with row numbers that the first line does not name."
         if len(cells) == len(header) + 1
         else ""
     )
 
 
-def _named(
+def _select_named(
     file: Path, header: Sequence[str], columns: list[list[str]], lines: list[int], writing: Writing | None
 ) -> Columns:
     """Return the columns that have names; a column without a name must hold row numbers or nothing."""
     left_out: dict[str, str] = {}
-    for place, (name, cells) in enumerate(zip(header, columns, strict=True), 1):
+    for position, (name, cells) in enumerate(zip(header, columns, strict=True), 1):
         if name:
             continue
-        if any(cells) and not _distinct_whole(cells):
+        if any(cells) and not _is_distinct_whole(cells):
             raise DataError(
-                f"{file}: column {place} has no name, and holds {quote(next(filter(None, cells)))}, which is no row "
-                "number. Name it in the first line, or take the column out."
+                f"{file}: column {position} has no name, but holds {quote(next(filter(None, cells)))}, which is no "
+                "row number. Name the column in the first line, or remove it."
             )
-        left_out[f"column {place}, without a name"] = "row numbers" if any(cells) else "empty"
-    kept = {name: cells for name, cells in zip(header, columns, strict=True) if name}
-    return Columns(file, kept, lines, writing, left_out)
+        left_out[f"column {position}, without a name"] = "row numbers" if any(cells) else "empty"
+    named = {name: cells for name, cells in zip(header, columns, strict=True) if name}
+    return Columns(file, named, lines, writing, left_out)
 
 
-def require(columns: Columns, names: Sequence[str], asked: str) -> None:
-    """Refuse names that are not columns of the table.
+def require(columns: Columns, names: Sequence[str], setting: str) -> None:
+    """Raise an error if a name is not a column of the table.
 
     Args:
         columns: the table.
         names: the names to check.
-        asked: the setting that names them, for example "data.columns".
+        setting: the setting that names them, for example "data.columns".
 
     Raises:
-        DataError: a name is no column; the message says the nearest column name.
+        DataError: a name is no column; the message suggests the most similar column name.
     """
     for name in names:
         if name not in columns.cells:
             raise DataError(
-                f"{asked} names {name!r}, which {columns.file} does not have.{did_you_mean(name, columns.cells)} "
-                f"Its columns: {shorten(', '.join(columns.cells))}."
+                f"{setting} names the column {name!r}, which {columns.file} does not "
+                f"have.{did_you_mean(name, columns.cells)} Its columns: {shorten(', '.join(columns.cells))}."
             )
 
 
 def tables(
-    files: Sequence[Path], names: Sequence[str], asked: str, writing: Writing | None = None
+    files: Sequence[Path], names: Sequence[str], setting: str, writing: Writing | None = None
 ) -> Iterator[tuple[Columns, Float[np.ndarray, "rows names"]]]:
-    """Read a user's own files one after the other and yield each with its columns of these names as numbers.
+    """Read a user's files one by one; yield each table, and the named columns as an array of numbers.
 
     Args:
         files: the tables.
         names: names of the columns, in order.
-        asked: the setting that names the columns.
-        writing: how the tables are written. If it is given, TRUE and FALSE are read as 1 and 0, as in a training table.
+        setting: the setting that names the columns.
+        writing: notation of the tables. If it is given, TRUE and FALSE are read as 1 and 0, as in a training table.
 
     Raises:
         DataError: there is no file; or as in `read_columns`, `require` and `numbers`.
     """
     if not files:
-        raise DataError(f"No file was given; wanted at least one CSV table with {', '.join(names)}.")
+        raise DataError(
+            f"No file was given, but at least one CSV table with the columns {', '.join(names)} is required."
+        )
     for file in files:
         columns = read_columns(Path(file), writing)
-        require(columns, names, asked)
-        found = [numbers(columns, name, missing="", booleans=writing is not None) for name in names]
-        yield columns, np.stack(found, -1)
+        require(columns, names, setting)
+        values = [numbers(columns, name, missing="", booleans=writing is not None) for name in names]
+        yield columns, np.stack(values, -1)
 
 
-def numeric_columns(columns: Columns, but: Collection[str], asked: str) -> Chosen:
+def numeric_columns(columns: Columns, but: Collection[str], setting: str) -> ColumnChoice:
     """Return the columns that hold numbers, or TRUE and FALSE, for a table whose columns the user did not name.
 
     Args:
         columns: the table.
-        but: columns that have another meaning.
-        asked: the setting that names columns, for example "data.columns".
+        but: columns that are used for something else and are skipped.
+        setting: the setting that names columns, for example "data.columns".
 
     Raises:
-        DataError: most cells of a column are numbers in another notation; the message says how to read them.
+        DataError: most cells of a column are numbers in another notation; the message names the setting that reads
+            them.
     """
     names: list[str] = []
     left_out, odd = dict(columns.left_out), {}
     for name, cells in columns.cells.items():
         if name in but:
             continue
-        counted = _counts_rows(cells)
-        if INDEX.fullmatch(name) and _distinct_whole(cells):
-            left_out[name] = f"row numbers; {asked} reads it"
+        is_row_count = _is_row_count(cells)
+        if INDEX.fullmatch(name) and _is_distinct_whole(cells):
+            left_out[name] = f"row numbers; name it in {setting} to read it"
         elif mostly_numbers(columns, name) or is_boolean(columns, name):
             names.append(name)
             if is_boolean(columns, name):
                 odd[name] = "holds TRUE and FALSE, read as 1 and 0"
-            elif counted:
-                odd[name] = f"counts the rows from {cells[0]} to {cells[-1]}; {asked} leaves it out"
+            elif is_row_count:
+                odd[name] = f"counts the rows from {cells[0]} to {cells[-1]}; set {setting} to leave it out"
         else:
-            left_out[name] = _why_no_numbers(columns, name, asked)
-    return Chosen(tuple(names), left_out, odd)
+            left_out[name] = _why_no_numbers(columns, name, setting)
+    return ColumnChoice(tuple(names), left_out, odd)
 
 
-def _counts_rows(cells: Sequence[str]) -> bool:
+def _is_row_count(cells: Sequence[str]) -> bool:
     """Return whether a column numbers the rows of a table that has more than ENOUGH_ROWS rows."""
     if len(cells) <= ENOUGH_ROWS or cells[0] not in ("0", "1"):
         return False
@@ -423,94 +428,100 @@ def _counts_rows(cells: Sequence[str]) -> bool:
     return all(cell == str(number) for number, cell in enumerate(cells, start))
 
 
-def _distinct_whole(cells: Sequence[str]) -> bool:
+def _is_distinct_whole(cells: Sequence[str]) -> bool:
     """Return whether all cells are whole numbers and no number occurs twice."""
     values = [text.value(cell) for cell in cells]
     whole = all(value is not None and math.isfinite(value) and value.is_integer() for value in values)
     return whole and len(set(values)) == len(values)
 
 
-def _why_no_numbers(columns: Columns, name: str, asked: str) -> str:
+def _why_no_numbers(columns: Columns, name: str, setting: str) -> str:
     """Return the reason why a column holds no numbers.
 
     Raises:
         DataError: more than half of its cells are numbers, or would be numbers in another notation.
     """
-    how = columns.written(name)
+    notation = columns.notation_of(name)
     filled = [
         (cell, line)
         for cell, line in zip(columns.cells[name], columns.lines, strict=True)
-        if cell.lower() not in how.missing
+        if cell.lower() not in notation.missing
     ]
     if not filled:
         return "empty"
     filled = filled[:: -(-len(filled) // MOST_LOOKED_AT)]
-    plain = sum(number(cell, how) is not None for cell, _ in filled)
-    found = [(cell, line, _mended(cell, how)) for cell, line in filled if number(cell, how) is None]
-    units = Counter(mend.unit for _, _, mend in found if mend is not None and mend.unit)
+    plain = sum(number(cell, notation) is not None for cell, _ in filled)
+    words = [
+        (cell, line, _other_reading(cell, notation))
+        for cell, line in filled
+        if number(cell, notation) is None
+    ]
+    units = Counter(mend.unit for _, _, mend in words if mend is not None and mend.unit)
     unit = max(units, key=units.__getitem__, default="")
-    wrong = [(cell, line, mend) for cell, line, mend in found if mend is not None and mend.unit in ("", unit)]
+    wrong = [(cell, line, mend) for cell, line, mend in words if mend is not None and mend.unit in ("", unit)]
     if wrong and 2 * (plain + len(wrong)) > len(filled):
-        clear = (one for one in wrong if len(one[2].settings) == 1)  # 1,5 has one reading, 1,234 has two
+        # Prefer a cell with one reading: 1,5 has one, 1,234 has two.
+        clear = (entry for entry in wrong if len(entry[2].settings) == 1)
         cell, line, mend = next(clear, wrong[0])
         raise DataError(
             f"{columns.file} line {line}, column {quote(name)}: {quote(cell)} is a number {mend.what}. "
-            f"{remedy(mend, columns.writing)} Or say with {asked} which columns to read, without this one."
+            f"{remedy(mend, columns.writing)} Or list the columns to read in {setting}, without this one."
         )
     return f"words; {plain / len(filled):.0%} of the cells are numbers" if plain else "words"
 
 
-def _mended(cell: str, writing: Writing) -> text.Mended | None:
-    """Return how a cell that is no number in the table's notation could be read as a number; None if it cannot."""
+def _other_reading(cell: str, writing: Writing) -> text.Mended | None:
+    """Return the number that a cell holds in another notation than the table's; None if it holds none."""
     if not writing.plain and text.value(cell) is not None:
-        figures = cell.lstrip("+-")
-        grouped = writing.sign == "," and re.fullmatch(GROUPED_BY_POINTS, figures)
-        way = ({"thousands": "point"},) if grouped else ()
-        number = cell.replace(".", "") if grouped else f"{cell} as the other columns are written"
-        return text.Mended("with a point, which here is no decimal sign", number, way)
+        digits = cell.lstrip("+-")
+        grouped = writing.sign == "," and re.fullmatch(GROUPED_BY_POINTS, digits)
+        settings = ({"thousands": "point"},) if grouped else ()
+        number = cell.replace(".", "") if grouped else f"{cell} in the notation of the other columns"
+        return text.Mended("with a point, which is no decimal sign in this table", number, settings)
     return text.mended(cell)
 
 
 def remedy(mend: text.Mended, writing: Writing | None) -> str:
-    """Return the advice on a number that is written in another notation than the table's."""
+    """Return advice for a number in another notation than the table's: settings that read it, or how to write it."""
     if writing is None or not mend.settings:
         return f"Write {mend.number}."
     ways = [
-        " ".join(shlex.quote(f"data.{key}={value}") for key, value in one.items()) for one in mend.settings
+        " ".join(shlex.quote(f"data.{key}={value}") for key, value in options.items())
+        for options in mend.settings
     ]
     if len(ways) == 1:
-        return f"Set {ways[0]} to read it as {mend.number}, or write that."
+        return f"Set {ways[0]} to read the cell as {mend.number}, or write {mend.number}."
     pairs = zip(ways, mend.number.split(" or "), strict=False)
-    return f"Set {', or '.join(f'{way} to read it as {number}' for way, number in pairs)}."
+    return f"Set {', or '.join(f'{way} to read the cell as {number}' for way, number in pairs)}."
 
 
 def is_boolean(columns: Columns, name: str) -> bool:
-    """Return whether all cells of a column that are not missing say TRUE or FALSE, in any case."""
-    cells, missing = columns.cells[name], columns.how.missing
+    """Return whether every cell of a column that is not missing is TRUE or FALSE, in large or small letters."""
+    cells, missing = columns.cells[name], columns.notation.missing
     first = next((cell for cell in cells if cell.lower() not in missing), "")
     return first.lower() in BOOLEANS and {cell.lower() for cell in cells} - missing <= BOOLEANS.keys()
 
 
 def mostly_numbers(columns: Columns, name: str) -> bool:
-    """Return whether more than half of the cells of a column that are not empty are numbers; False if all are empty."""
-    how = columns.written(name)
-    if _all_finite(columns.cells[name], how) is not None:
+    """Return whether more than half of a column's filled cells are numbers; False if no cell is filled."""
+    notation = columns.notation_of(name)
+    if _all_finite(columns.cells[name], notation) is not None:
         return True
-    filled = [cell for cell in columns.cells[name] if cell.lower() not in how.missing]
-    return 2 * sum(_said(cell, how) is not None for cell in filled) > len(filled)
+    filled = [cell for cell in columns.cells[name] if cell.lower() not in notation.missing]
+    return 2 * sum(_parse_number(cell, notation) is not None for cell in filled) > len(filled)
 
 
 def number(cell: str, writing: Writing = PLAIN) -> float | None:
     """Return the number in a cell, which may be infinite; NaN if the cell is missing; None if it is a word."""
     if cell.lower() in writing.missing:
         return math.nan
-    return _said(cell, writing)
+    return _parse_number(cell, writing)
 
 
-def _said(cell: str, writing: Writing) -> float | None:
+def _parse_number(cell: str, writing: Writing) -> float | None:
     """Return the number in a cell that is not missing; None if it is a word."""
-    found = text.value(cell if writing.plain else writing.standard(cell))
-    return None if found is not None and math.isnan(found) else found
+    value = text.value(cell if writing.plain else writing.standard(cell))
+    return None if value is not None and math.isnan(value) else value
 
 
 def numbers(
@@ -521,60 +532,61 @@ def numbers(
     Args:
         columns: the table.
         name: name of the column.
-        missing: None allows missing numbers; otherwise a clause for the message that says what else could be done about
-            a missing number.
-        booleans: read TRUE and FALSE as 1 and 0, if all cells are one of them.
+        missing: None allows missing numbers. A text refuses them and is added to the message as an alternative, such as
+            "set data.missing to ..."; "" adds nothing.
+        booleans: read TRUE and FALSE as 1 and 0 if all cells are TRUE or FALSE.
 
     Raises:
-        DataError: a cell is a word, is infinite, or is missing and must not be; or only some numbers have a unit. The
-            message names the first such cell.
+        DataError: a cell is a word, is infinite, or is missing although `missing` is a text; or only some numbers have
+            a unit. The message names the first such cell.
     """
-    how = columns.written(name)
-    plain = _all_finite(columns.cells[name], how)
+    notation = columns.notation_of(name)
+    plain = _all_finite(columns.cells[name], notation)
     if plain is not None:
         return plain
     booleans = booleans and is_boolean(columns, name)
-    found = np.empty(len(columns.lines))
+    values = np.empty(len(columns.lines))
     for row, cell in enumerate(columns.cells[name]):
-        value = BOOLEANS.get(cell.lower(), math.nan) if booleans else number(cell, how)
+        value = BOOLEANS.get(cell.lower(), math.nan) if booleans else number(cell, notation)
         if value is None or math.isinf(value) or (missing is not None and math.isnan(value)):
             raise DataError(
-                f"{columns.file} line {columns.lines[row]}, column {quote(name)}: {quote(cell)}; wanted a finite "
-                f"number. Mend the cell, or take the line out.{_hint(cell, value, columns, missing)}"
+                f"{columns.file} line {columns.lines[row]}, column {quote(name)}: {quote(cell)} is no finite "
+                "number, which is required. Correct the cell, or remove the "
+                f"line.{_hint(cell, value, columns, missing)}"
             )
-        found[row] = value
+        values[row] = value
     _check_units(columns, name)
-    return found
+    return values
 
 
 def _hint(cell: str, value: float | None, columns: Columns, missing: str | None) -> str:
-    """Return a clause that says what else could be done about a cell without a finite number, or ""."""
+    """Return a further remedy for a cell without a finite number, with a leading space; "" if there is none."""
     if value is not None:
         return f" Or {missing}." if math.isnan(value) and missing else ""
-    mend = _mended(cell, columns.how)
-    return f" It is a number {mend.what}. {remedy(mend, columns.writing)}" if mend else ""
+    mend = _other_reading(cell, columns.notation)
+    return f" The cell is a number {mend.what}. {remedy(mend, columns.writing)}" if mend else ""
 
 
 def _check_units(columns: Columns, name: str) -> None:
-    """Refuse a column whose numbers do not all have the same unit, or no unit."""
-    how = columns.how
-    if not how.units:
+    """Raise an error if some numbers of a column have another unit than the first number, or no unit."""
+    notation = columns.notation
+    if not notation.units:
         return
     first: tuple[str, str] | None = None
     for cell, line in zip(columns.cells[name], columns.lines, strict=True):
-        if cell.lower() in how.missing:
+        if cell.lower() in notation.missing:
             continue
-        unit = how.split_unit(cell)[1]
+        unit = notation.split_unit(cell)[1]
         first = first or (unit, cell)
         if unit != first[0]:
             raise DataError(
-                f"{columns.file} line {line}, column {quote(name)}: {quote(cell)}, where the column began with "
-                f"{quote(first[1])}; wanted one unit in all its cells, or none. Mend the column."
+                f"{columns.file} line {line}, column {quote(name)}: {quote(cell)} has another unit than "
+                f"{quote(first[1])}, the first number of the column. Use one unit in all cells of the column, or none."
             )
 
 
 def _all_finite(cells: Sequence[str], writing: Writing = PLAIN) -> Float[np.ndarray, "rows"] | None:
-    """Return the cells as `number` reads them, several times as fast; None unless all are finite numbers."""
+    """Return the cells as `number` reads them, several times as fast; None if any cell is no finite number."""
     joined = "".join(cells)
     if "_" in joined:
         return None
@@ -583,19 +595,22 @@ def _all_finite(cells: Sequence[str], writing: Writing = PLAIN) -> Float[np.ndar
             return None
         cells = "\n".join(cells).replace(",", ".").split("\n")
     try:
-        found = np.fromiter(map(float, cells), np.float64, len(cells))
+        values = np.fromiter(map(float, cells), np.float64, len(cells))
     except ValueError:
         return None
-    return found if np.isfinite(found).all() else None
+    return values if np.isfinite(values).all() else None
 
 
 def _check_header(file: Path, header: Sequence[str]) -> None:
     if not any(header):
-        raise DataError(f"{file} is empty or begins with a blank line; wanted names of columns. Write them.")
+        raise DataError(
+            f"{file} is empty or begins with a blank line, but the first line must name the columns. Write their "
+            "names."
+        )
     if all(name and text.value(name) is not None for name in header):
         raise DataError(
-            f"{file} line 1: {quote(', '.join(header))} are numbers; wanted the names of the columns there. "
-            "Write them in a line before."
+            f"{file} line 1: {quote(', '.join(header))} are numbers, but the first line must name the columns. "
+            "Insert a line with the names."
         )
     try:
         text.require_distinct(header)
@@ -604,13 +619,13 @@ def _check_header(file: Path, header: Sequence[str]) -> None:
 
 
 def _check_blanks(file: Path, header: Sequence[str], columns: Sequence[Sequence[str]]) -> None:
-    """Refuse a table whose cells are separated by blanks.
+    """Raise an error if the cells of a table are separated by blanks.
 
-    Such a table has a single column, and each of its lines holds equally many words.
+    Such a table is read as a single column, in which every cell holds equally many words.
     """
     words = len(header[0].split())
     if len(header) == 1 and words > 1 and all(len(cell.split()) == words for cell in columns[0]):
         raise DataError(
-            f"{file} is separated by blanks: its first line reads {quote(header[0])}; wanted commas, semicolons, tabs "
-            "or bars. Set data.separator=space where there is that setting, or save it as such."
+            f"{file} is separated by blanks: its first line is {quote(header[0])}. Commas, semicolons, tabs or bars "
+            "are expected. Set data.separator=space if the data set has that setting, or save the file with commas."
         )

@@ -1,4 +1,4 @@
-"""A data set that is held in memory as named tensors and fetched one batch at a time."""
+"""A data set in memory: named tensors that are indexed once per batch."""
 
 from collections.abc import Mapping, Sequence
 
@@ -18,7 +18,7 @@ class Fields(Dataset[dict[str, Tensor]]):
     def __init__(self, **fields: Tensor) -> None:
         lengths = {name: len(tensor) for name, tensor in fields.items()}
         if len(set(lengths.values())) != 1:
-            raise ValueError(f"fields differ in length: {lengths}; wanted one length.")
+            raise ValueError(f"The fields have the lengths {lengths}, but all must have the same length.")
         self.fields = fields
         self.length = next(iter(lengths.values()))
 
@@ -32,12 +32,12 @@ class Fields(Dataset[dict[str, Tensor]]):
         return {name: tensor[list(indices)] for name, tensor in self.fields.items()}
 
 
-def fetched(dataset: Dataset[Batch], indices: Sequence[int]) -> Batch:
-    """Return the samples `indices` as a batch, fetched at once if the dataset can do so, as a loader fetches them."""
+def fetch(dataset: Dataset[Batch], indices: Sequence[int]) -> Batch:
+    """Return the samples `indices` as a batch, as a loader does: with `__getitems__` if the dataset has that method."""
     at_once = getattr(dataset, "__getitems__", None)
     return as_batch(at_once(indices) if at_once else [dataset[index] for index in indices])
 
 
 def as_batch(items: Mapping[str, Tensor] | list[Batch]) -> Batch:
-    """Return samples as a batch: the result of a dataset's `__getitems__` as it is, or single items stacked."""
+    """Return samples as a batch: the result of `__getitems__` unchanged, or a list of single samples stacked."""
     return dict(items) if isinstance(items, Mapping) else default_collate(items)

@@ -1,8 +1,8 @@
 """Reader for MATLAB 5 files that may be damaged: numbers, text, cells and structs.
 
-SciPy's reader can crash the process on a file with a wrong byte in it (seen with SciPy 1.17), so none of it is used.
-Every element must lie within the element that holds it, and must hold as much data as its dimensions say, before memory
-is allocated. The format: MathWorks, MAT-File Format (R2023b).
+SciPy's reader is not used, because a file with one wrong byte can crash the process (observed with SciPy 1.17). Before
+memory is allocated, every element must lie within its parent element and hold as much data as its dimensions state.
+The format: MathWorks, MAT-File Format (R2023b).
 """
 
 import math
@@ -20,21 +20,21 @@ from framework.storage.reading import RESTORE, guarded, inflated, read_bytes, ro
 
 HEADER_BYTES = 128
 NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
-"""NumPy types by the types of elements that hold numbers, table 1-1."""
+"""NumPy types of numeric elements, by element type (table 1-1 of the format)."""
 LETTERS = {1: "latin-1", 2: "latin-1", 4: "utf-16", 16: "utf-8", 17: "utf-16", 18: "utf-32"}
-"""Encodings by the types of elements that hold text, table 1-1."""
+"""Encodings of text elements, by element type (table 1-1)."""
 UNSIGNED, MATRIX, COMPRESSED = 6, 14, 15
-"""Types of elements, table 1-1."""
+"""Element types (table 1-1)."""
 CELL, STRUCT, CHAR, NUMERIC, OPAQUE = 1, 2, 4, range(6, 16), 17
-"""Classes of arrays, table 1-3."""
+"""Array classes (table 1-3)."""
 COMPLEX = 0x0800
-"""Flag of an array of complex numbers."""
+"""Flag bit of an array of complex numbers."""
 NAME_WITHIN = 512
 """Number of bytes at the beginning of a variable that hold its flags, at most 32 dimensions and its name."""
 
 
 def read_variables(file: Path, names: Sequence[str] | None = None, remedy: str = RESTORE) -> dict[str, Any]:
-    """Read the named variables of a file, or all; `variables` describes the result.
+    """Read the named variables of a file, or all if `names` is None; see `parse_variables` for the result.
 
     Raises:
         DataError: the file does not exist, is damaged, or is of version 7.3.
@@ -42,27 +42,27 @@ def read_variables(file: Path, names: Sequence[str] | None = None, remedy: str =
     with guarded(file, "a MATLAB file", remedy):
         content = read_bytes(file)
         if content[124:HEADER_BYTES] in (b"\x00\x02IM", b"\x02\x00MI"):
-            raise DataError(f"{file}: a MATLAB 7.3 file; wanted version 5. Save it with '-v7'.")
-        return variables(content, names)
+            raise DataError(f"{file}: got a MATLAB 7.3 file, but version 5 is required. Save it with '-v7'.")
+        return parse_variables(content, names)
 
 
-def variables(content: bytes, names: Sequence[str] | None = None) -> dict[str, Any]:
-    """Return the named variables in a file's bytes, or all.
+def parse_variables(content: bytes, names: Sequence[str] | None = None) -> dict[str, Any]:
+    """Return the named variables in the bytes of a file, or all if `names` is None.
 
     Dimensions of length 1 are removed, and a single value is returned without an array. Numbers keep their stored type,
-    a struct becomes a dict, and text becomes a string. Contents that label files do not use (sparse matrices, objects,
-    functions) become None.
+    a struct becomes a dict, and text becomes a string. Sparse matrices, objects and functions, which label files do not
+    use, become None.
 
     Raises:
-        ValueError, zlib.error: the file is damaged, or a requested variable holds complex numbers.
+        ValueError, zlib.error: the file is damaged, or one of the variables holds complex numbers.
     """
     order = {b"IM": "<", b"MI": ">"}.get(content[126:HEADER_BYTES])
     if order is None:
-        raise ValueError("no header of a MATLAB 5 file")
+        raise ValueError("the file has no header of a MATLAB 5 file")
     (version,) = struct.unpack_from(f"{order}H", content, 124)
     if version != 0x0100:
-        raise ValueError(f"version {version:#06x} instead of 0x0100")
-    reader, found = _Reader(order), {}
+        raise ValueError(f"the format version is {version:#06x} instead of 0x0100")
+    reader, result = _Reader(order), {}
     position, left = HEADER_BYTES, room(len(content))
     while position < len(content):
         kind, start, position = reader.element(content, position, len(content))
@@ -77,13 +77,13 @@ def variables(content: bytes, names: Sequence[str] | None = None) -> dict[str, A
                 left -= len(whole)
             kind, start, end = reader.element(whole, 0, len(whole))
             if kind != MATRIX:
-                raise ValueError(f"an element of type {kind} for a variable")
-            found[name] = reader.array(whole, start, end, 0)
-    return found
+                raise ValueError(f"a variable is stored as an element of type {kind} instead of {MATRIX}")
+            result[name] = reader.array(whole, start, end, 0)
+    return result
 
 
 class _Head(NamedTuple):
-    """The beginning of an array; the array's data follow at `position`."""
+    """Header of an array, whose data begin at `position`."""
 
     kind: int
     complex: bool
@@ -93,34 +93,36 @@ class _Head(NamedTuple):
 
 
 class _Reader:
-    """Parser of the elements of one file, with the byte order `order` ("<" or ">")."""
+    """Parser of the elements of one file with byte order "<" or ">"."""
 
     def __init__(self, order: str) -> None:
         self.order = order
         self.arrays = 0
 
     def element(self, content: bytes, position: int, limit: int) -> tuple[int, int, int]:
-        """Read the tag at `position` and return the element's type and the first byte and the end of its data.
+        """Read the tag at `position`; return the element's type, and the positions where its data begin and end.
 
-        The data must end at `limit` or before.
+        Data that end after `limit` raise a ValueError.
         """
         if position + 8 > limit:
             raise ValueError(f"the file ends within an element at byte {position}")
         kind, size = struct.unpack_from(f"{self.order}II", content, position)
         start = position + 8
-        if kind >> 16:  # four bytes at most, in the second half of the tag
+        if kind >> 16:  # small element: at most four bytes of data, in the second half of the tag
             kind, size, start = kind & 0xFFFF, kind >> 16, position + 4
             if size > 4:
-                raise ValueError(f"a small element of {size} bytes at byte {position}")
+                raise ValueError(f"a small element at byte {position} has {size} bytes instead of at most 4")
         if start + size > limit:
-            raise ValueError(f"an element of {size} bytes at byte {position} reaches beyond what holds it")
+            raise ValueError(
+                f"an element of {size} bytes at byte {position} extends beyond the element that contains it"
+            )
         return kind, start, start + size
 
     def head(self, content: bytes, start: int, end: int) -> _Head:
         """Read flags, dimensions and name of the array that begins at `start`."""
         kind, first, last = self.element(content, start, end)
         if kind != UNSIGNED or last - first != 8:
-            raise ValueError(f"an array without its flags at byte {start}")
+            raise ValueError(f"the array at byte {start} has no flags")
         (flags,) = struct.unpack_from(f"{self.order}I", content, first)
         if flags & 0xFF == OPAQUE:
             return _Head(OPAQUE, False, (), "", end)
@@ -128,24 +130,26 @@ class _Reader:
         _, first, last = self.element(content, position, end)
         shape = tuple(map(int, sides))
         if not 2 <= len(shape) <= 32 or min(shape) < 0:
-            raise ValueError(f"an array of the sides {shape}")
+            raise ValueError(
+                f"an array has the dimensions {shape}; 2 to 32 dimensions, none negative, are allowed"
+            )
         name = content[first:last].decode("latin-1")
-        return _Head(flags & 0xFF, bool(flags & COMPLEX), shape, name, _padded(last))
+        return _Head(flags & 0xFF, bool(flags & COMPLEX), shape, name, _align(last))
 
     def numbers(self, content: bytes, position: int, limit: int) -> tuple[np.ndarray, int]:
         """Return the numbers of the element at `position`, and the position of the next element."""
         kind, start, end = self.element(content, position, limit)
         if kind not in NUMBERS:
-            raise ValueError(f"an element of type {kind} at byte {position}; wanted numbers")
-        return np.frombuffer(content[start:end], self.order + NUMBERS[kind]), _padded(end)
+            raise ValueError(f"the element at byte {position} has type {kind} instead of numbers")
+        return np.frombuffer(content[start:end], self.order + NUMBERS[kind]), _align(end)
 
     def array(self, content: bytes, start: int, end: int, depth: int) -> Any:
-        """Return the array between the bytes `start` and `end`, with all arrays inside it."""
+        """Return the array between the bytes `start` and `end`, including all arrays inside it."""
         if start == end:
             return np.empty(0)
         head = self.head(content, start, end)
         if head.complex:
-            raise ValueError(f"complex numbers at byte {start}")
+            raise ValueError(f"the array at byte {start} holds complex numbers, which are not supported")
         count, position = math.prod(head.shape), head.position
         if head.kind in NUMERIC:
             values, _ = self.numbers(content, position, end)
@@ -159,18 +163,20 @@ class _Reader:
             self.arrays += count * max(len(fields), 1)
             if depth == DEEPEST or self.arrays > MOST_ARRAYS:
                 raise ValueError(
-                    f"more than {MOST_ARRAYS} arrays, or arrays more than {DEEPEST} deep in others"
+                    f"the file has more than {MOST_ARRAYS} arrays, or arrays nested deeper than {DEEPEST} levels"
                 )
             values = np.empty(count, object)
             for number in range(count):
-                held = {}
+                entry = {}
                 for field in fields:
                     kind, first, last = self.element(content, position, end)
                     if kind != MATRIX:
-                        raise ValueError(f"an element of type {kind} at byte {position}; wanted an array")
-                    held[field] = self.array(content, first, last, depth + 1)
-                    position = _padded(last)
-                values[number] = held if head.kind == STRUCT else held[""]
+                        raise ValueError(
+                            f"the element at byte {position} has type {kind} instead of an array"
+                        )
+                    entry[field] = self.array(content, first, last, depth + 1)
+                    position = _align(last)
+                values[number] = entry if head.kind == STRUCT else entry[""]
             values = values.reshape(head.shape, order="F")
         else:
             return None
@@ -179,31 +185,33 @@ class _Reader:
         return values.item() if count == 1 else values.squeeze()
 
     def text(self, content: bytes, position: int, limit: int, shape: tuple[int, ...]) -> str | np.ndarray:
-        """Return text, or an array of the rows of text."""
+        """Return a character array as a string, or as an array of strings if it has several rows."""
         kind, start, end = self.element(content, position, limit)
         if kind not in LETTERS or len(shape) != 2:
-            raise ValueError(f"text of type {kind} and shape {shape} at byte {position}")
+            raise ValueError(
+                f"the text at byte {position} has type {kind} and shape {shape}, which is not supported"
+            )
         wide = {"<": "-le", ">": "-be"}[self.order] if LETTERS[kind] in ("utf-16", "utf-32") else ""
         letters = content[start:end].decode(LETTERS[kind] + wide)
         rows, columns = shape
         if rows < 2 or not columns:
             return letters.rstrip("\0")
         if len(letters) != rows * columns:
-            raise ValueError(f"{len(letters)} letters for text of shape {shape}")
+            raise ValueError(f"a text of shape {shape} has {len(letters)} characters")
         return np.array([letters[row::rows] for row in range(rows)])
 
     def fields(self, content: bytes, position: int, limit: int) -> tuple[list[str], int]:
-        """Return the field names of a struct, which are padded to one length, and the position of its values."""
+        """Return the field names of a struct and the position of its values; stored names are padded to one length."""
         lengths, position = self.numbers(content, position, limit)
         _, start, end = self.element(content, position, limit)
         length = int(lengths[0]) if len(lengths) == 1 else 0
         if length < 1 or (end - start) % length:
-            raise ValueError(f"names of fields at byte {start} that are not of one length")
+            raise ValueError(f"the field names at byte {start} do not have one common length")
         names = content[start:end].decode("latin-1")
         parts = [names[first : first + length] for first in range(0, len(names), length)]
-        return [part.partition("\0")[0] for part in parts], _padded(end)
+        return [part.partition("\0")[0] for part in parts], _align(end)
 
 
-def _padded(position: int) -> int:
+def _align(position: int) -> int:
     """Return the next position that is a multiple of 8."""
     return -(-position // 8) * 8

@@ -1,4 +1,4 @@
-"""Images as the content of PNG files."""
+"""Encoding of images as PNG files."""
 
 from io import BytesIO
 
@@ -9,8 +9,8 @@ from torch import Tensor
 from framework.geometry.srgb import bytes_from_linear
 
 
-def png(light: Float[Tensor, "height width number"]) -> bytes:
-    """Return an image in linear RGB as the content of an 8-bit PNG file, grey if it does not have three channels."""
+def encode_png(light: Float[Tensor, "height width number"]) -> bytes:
+    """Return the content of an 8-bit PNG file for an image in linear RGB; grey if it does not have three channels."""
     numbers = bytes_from_linear(light.cpu()).numpy()
     content = BytesIO()
     Image.fromarray(numbers if numbers.shape[-1] == 3 else numbers[..., 0]).save(content, "PNG")

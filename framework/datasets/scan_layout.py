@@ -254,7 +254,7 @@ def _camera(name: str, view: Mapping[str, Any]) -> Camera:
 def _checked_view(folder: Path, name: str, camera: Camera) -> View:
     view = View(name, folder / "images" / f"{name}.png", folder / "masks" / f"{name}.png", camera)
     for file in (view.image, view.mask):
-        with images.opened(file) as image:
+        with images.open_image(file) as image:
             _check_size(file, image, camera)
             if tail(file)[-8:] != PNG_END:
                 raise ValueError("it is cut short, or no PNG")
@@ -284,9 +284,9 @@ def read_photograph(view: View) -> Photograph:
     """
     found = []
     for file, channels in ((view.image, 3), (view.mask, 1)):
-        with images.opened(file) as image:
+        with images.open_image(file) as image:
             _check_size(file, image, view.camera)
-            found.append(np.array(images.plain(image, channels, upright=False)))
+            found.append(np.array(images.decode(image, channels, upright=False)))
     return Photograph(*found)
 
 
@@ -319,8 +319,8 @@ def read_texture(root: Path, name: str) -> UInt8[np.ndarray, "height width 3"]:
     Raises:
         DataError: the file is missing or damaged.
     """
-    with images.opened(root / "subjects" / name / "texture.png") as image:
-        return np.array(images.plain(image, 3, upright=False))
+    with images.open_image(root / "subjects" / name / "texture.png") as image:
+        return np.array(images.decode(image, 3, upright=False))
 
 
 def write_registration(file: Path, mesh: RegisteredMesh) -> None:

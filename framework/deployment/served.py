@@ -23,7 +23,7 @@ from PIL import Image
 from framework.configuration.description import Description
 from framework.configuration.loading import asked_of, load_with_description, reader
 from framework.data import Batch, Data
-from framework.datasets.png import png
+from framework.datasets.png import encode_png
 from framework.deployment.request_bodies import MOST_CONTENT, MOST_FILES, MOST_INPUTS, MOST_ROWS
 from framework.deployment.request_bounds import TICKET, bound_server
 from framework.distributions.noise import Draw
@@ -101,7 +101,9 @@ class Served:
             target = self.description.target
             found = table_columns(target, prediction)
             if target.kind == "image":
-                pictures = [base64.b64encode(png(light)).decode() for light in prediction.image("color")]
+                pictures = [
+                    base64.b64encode(encode_png(light)).decode() for light in prediction.image("color")
+                ]
                 parts.append(
                     pd.DataFrame({"png": pictures, **{key: one.numpy() for key, one in found.items()}})
                 )

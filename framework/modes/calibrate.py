@@ -10,7 +10,7 @@ from torch import Tensor
 from framework.configuration.config import Config, Options
 from framework.configuration.registry import load
 from framework.configuration.schema import build, resolve
-from framework.datasets.fields import fetched
+from framework.datasets.fields import fetch
 from framework.distributions.protocol import value_set
 from framework.errors import ConfigError
 from framework.model import FrozenFrontEnd, Predictor
@@ -48,7 +48,7 @@ def run(config: Config) -> None:
     parts = {**session.parts, "uncertainty": [*session.parts["uncertainty"], *wrappers]}
     method = " + ".join([session.method, *(part["name"] for part in wrappers)])
     splits = session.data.splits()
-    inputs = fetched(splits.validation, range(min(FEW, len(splits.validation))))["input"]  # type: ignore[arg-type]
+    inputs = fetch(splits.validation, range(min(FEW, len(splits.validation))))["input"]  # type: ignore[arg-type]
     predictor = around_trained(session.predictor, wrappers, session.target, inputs)
     session = tested(replace(session, parts=parts, method=method, predictor=predictor))
     with opened(session.config) as run:

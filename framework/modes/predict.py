@@ -16,7 +16,7 @@ from torch import Tensor
 from framework.configuration.config import Config, Options
 from framework.configuration.settings import Settings
 from framework.data import Data, Mapped
-from framework.datasets.png import png
+from framework.datasets.png import encode_png
 from framework.distributions.intervals import DRAWS
 from framework.distributions.noise import Draw
 from framework.distributions.protocol import value_set
@@ -124,7 +124,7 @@ def predictions(
             elif target.kind == "image":
                 file = images / f"{len(rows):05}.png"
                 images.mkdir(exist_ok=True)
-                file.write_bytes(png(prediction.image("color")[row]))
+                file.write_bytes(encode_png(prediction.image("color")[row]))
                 values = {"image": f"{images.name}/{file.name}", **values}
             rows.append({"sample": names[len(rows)], **values})
     errors = [key for key in rows[0] if key.endswith(ERRORS)] if mass else []

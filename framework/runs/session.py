@@ -45,7 +45,7 @@ from framework.configuration.registry import load
 from framework.configuration.schema import resolve
 from framework.configuration.settings import Settings, device_of
 from framework.data import Batch, Data, Mapped
-from framework.datasets.fields import fetched
+from framework.datasets.fields import fetch
 from framework.density_head import Fitted
 from framework.distributions.noise import seed_step
 from framework.errors import CheckpointError, ConfigError, UserError
@@ -376,7 +376,7 @@ def rehearse(session: Session) -> None:
 
 def _few(dataset: Dataset[Batch], most: int) -> Batch:
     """Return a batch of the first samples, at most `most`."""
-    return fetched(dataset, range(min(most, len(dataset))))  # type: ignore[arg-type]
+    return fetch(dataset, range(min(most, len(dataset))))  # type: ignore[arg-type]
 
 
 @contextmanager
@@ -484,7 +484,7 @@ def _reading(
         ConfigError: The choice has no effect, since the model alone reads the first files in the same way.
     """
     samples = read(files)
-    found, wanted = tuple(fetched(samples, range(1))["input"].shape[1:]), description.input_shape
+    found, wanted = tuple(fetch(samples, range(1))["input"].shape[1:]), description.input_shape
     free = len(wanted) == 2  # a point cloud has any number of points
     if found[free:] != wanted[free:] or len(found) != len(wanted):
         raise CheckpointError(
@@ -515,7 +515,7 @@ def _by_itself(description: Description, files: Sequence[Path]) -> Dataset[Batch
 def _same_samples(one: Dataset[Batch] | None, other: Dataset[Batch]) -> bool:
     if one is None or len(one) != len(other):  # type: ignore[arg-type]
         return False
-    first, second = (fetched(each, range(min(BLOCK, len(each)))) for each in (one, other))  # type: ignore[arg-type]
+    first, second = (fetch(each, range(min(BLOCK, len(each)))) for each in (one, other))  # type: ignore[arg-type]
     return first.keys() == second.keys() and all(torch.equal(first[key], second[key]) for key in first)
 
 

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from framework.data import Batch, Data
-from framework.datasets.fields import fetched
+from framework.datasets.fields import fetch
 from framework.target import Target
 from framework.testing.data_files import (
     damaged_files,
@@ -172,7 +172,7 @@ def _samples(bench: Workbench, worst: Worst) -> None:
         if len(split) <= FEW:
             continue
         for asked in batches(numbers(split), [256]):
-            _together(data, fetched(split, asked), asked, f"{name} {asked[0]} to {asked[-1]}", worst)
+            _together(data, fetch(split, asked), asked, f"{name} {asked[0]} to {asked[-1]}", worst)
 
 
 def _together(data: Data, batch: Batch, asked: Sequence[int], where: str, worst: Worst) -> None:
@@ -273,7 +273,7 @@ def _radians(bench: Workbench, worst: Worst) -> None:
     """Check that no angle is beyond a turn, which most likely means degrees."""
     for name, split in parts(bench.data).items():
         for asked in batches(numbers(split), [64]):
-            largest = fetched(split, asked)["target"].abs().flatten(1).amax(-1)
+            largest = fetch(split, asked)["target"].abs().flatten(1).amax(-1)
             worst.see(largest, lambda at, name=name, asked=asked: f"{name} {asked[at[0]]}")
 
 
@@ -332,7 +332,7 @@ def _fetching(bench: Workbench, worst: Worst) -> None:
             "one twice": [[*order[-2:], *order[-2:], *order[-40:]]],
         }.items():
             for part in asked:
-                found = marks(fetched(split, part))
+                found = marks(fetch(split, part))
                 worst.same(f"{name}, {what}: samples of a batch of {len(part)}", len(found), len(part))
                 for number, one in zip(part, found, strict=False):
                     equal_marks(one, wanted[number], f"{name} {number} of {len(part)}, {what}", worst)
@@ -344,14 +344,14 @@ def _owned(bench: Workbench, worst: Worst) -> None:
         order = list(bench.contents[name].marks)
         wanted = [bench.contents[name].marks[number] for number in order[:16]]
         single = split[order[0]]
-        kept = fetched(split, order[:16])
-        _ = fetched(split, order[-16:])
+        kept = fetch(split, order[:16])
+        _ = fetch(split, order[-16:])
         for number, found, one in zip(order, marks(kept), wanted, strict=False):
             equal_marks(found, one, f"{name} {number} after another batch was fetched", worst)
         _ = split[order[-1]]
         found = marks({key: value[None] for key, value in single.items()})[0]
         equal_marks(found, wanted[0], f"{name} {order[0]} after another sample was fetched", worst)
-        again = fetched(split, order[:16])
+        again = fetch(split, order[:16])
         for key in ("input", "target"):
             shared = kept[key].untyped_storage().data_ptr() == again[key].untyped_storage().data_ptr()
             worst.count(shared, f"{name}: {key} of two batches is one memory: what augment writes stays")
@@ -394,7 +394,7 @@ def _pictures(bench: Workbench, worst: Worst) -> None:
 def _on_one_device(bench: Workbench, worst: Worst) -> None:
     """Check `augment` for mixed devices: batches are on the model's device, attributes of the data set on the CPU."""
     data, train = bench.data, parts(bench.data)["train"]
-    batch = fetched(train, list(range(min(8, len(train)))))
+    batch = fetch(train, list(range(min(8, len(train)))))
 
     def questions(mode: OneDevice) -> Questions:
         mode.keep(dict(vars(data)))
@@ -412,7 +412,7 @@ def _augment(bench: Workbench, worst: Worst) -> None:
     if len(train) > 16:
         sizes.append((min(300, len(train)), usual))
     for size, kind in sizes:
-        batch = fetched(train, list(range(size)))
+        batch = fetch(train, list(range(size)))
         if kind != usual:  # as the trainer does
             batch = {
                 key: value.to(kind) if value.is_floating_point() else value for key, value in batch.items()
@@ -461,5 +461,5 @@ def _workers(bench: Workbench, worst: Worst) -> None:
             equal_fields(copy[number], split[number], f"{name} {number} of a copy", worst)
         wanted = bench.contents[name].marks
         asked = list(wanted)[-300:]
-        for number, one in zip(asked, marks(fetched(copy, asked)), strict=True):
+        for number, one in zip(asked, marks(fetch(copy, asked)), strict=True):
             equal_marks(one, wanted[number], f"{name} {number} of a copy", worst)

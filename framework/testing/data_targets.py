@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from framework.data import Data
-from framework.datasets.fields import fetched
+from framework.datasets.fields import fetch
 from framework.testing.data_samples import batches, numbers, parts, trimmed
 from framework.testing.finding import SEED, Worst
 
@@ -34,7 +34,7 @@ def belong(data: Data, worst: Worst) -> None:
             continue
         inputs, targets = [], []
         for part in batches(asked, [64]):
-            batch = fetched(split, part)
+            batch = fetch(split, part)
             inputs.append(torch.stack([_numbers(one) for one in batch["input"]]))
             targets.append(_targets(data, batch["target"]))
         x, y = torch.cat(inputs), torch.cat(targets)

@@ -22,7 +22,7 @@ from matplotlib.axes import Axes
 from benchmarks.pages import machine, read_rows, write_page
 from framework.configuration.loading import load_with_description
 from framework.configuration.schema import build
-from framework.datasets.images import blurred, picture
+from framework.datasets.images import blur, to_rgb8
 from framework.distributions.density import circular_grid
 from framework.distributions.protocol import marginal
 from framework.figures.style import COLOURS, GREY, MARKERS, save_figure, titled_figure
@@ -49,7 +49,7 @@ COLUMNS = {"method": "method", "n": "seeds"} | {f"blur_{d:g}": f"σ = {d:g}" for
 
 
 def seen(images: torch.Tensor, deviation: float) -> torch.Tensor:
-    return blurred(images, deviation * images.shape[-1] / SIDE)
+    return blur(images, deviation * images.shape[-1] / SIDE)
 
 
 @torch.no_grad()
@@ -142,7 +142,7 @@ def strip(models: dict[str, Predictor], image: torch.Tensor, pan: float, path: P
     grid = figure.subplots(2, len(shown), height_ratios=(1, 1.2))
     for column, deviation in enumerate(shown):
         one = seen(image, deviation)
-        grid[0, column].imshow(picture(one))
+        grid[0, column].imshow(to_rgb8(one))
         grid[0, column].set_axis_off()
         grid[0, column].set_title(f"blur of {deviation:g} px")
         axes = grid[1, column]

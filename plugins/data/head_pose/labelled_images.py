@@ -56,7 +56,7 @@ class Reading:
 
     def own(self, files: Sequence[Path]) -> Fields | Crops:
         """Return a user's own files without labels, rotated as their EXIF entries say."""
-        return images.unlabelled(
+        return images.load_unlabelled(
             [Crop(Path(file), None, 0.0, self.image_size, upright=True) for file in files]
         )
 
@@ -127,16 +127,16 @@ class Heads(Data):
         return self.reading.own(files)
 
     def inputs(self, user_data: Any) -> Tensor:
-        return given_images.inputs(self, user_data)
+        return given_images.to_inputs(self, user_data)
 
     def augment(self, batch: Batch) -> Batch:
-        return images.varied(batch, self.signs, self.reading.jitter)
+        return images.vary(batch, self.signs, self.reading.jitter)
 
     def fingerprint(self) -> Mapping[str, str]:
         return self.source.fingerprint(self.synthetic) | self._loaded.fingerprint
 
     def preview(self, inputs: Tensor) -> np.ndarray:
-        return images.picture(inputs)
+        return images.to_rgb8(inputs)
 
 
 def halves(samples: Sequence[Labelled]) -> tuple[list[Labelled], list[Labelled]]:
@@ -196,7 +196,7 @@ def _refuse_wrong_labels(samples: Mapping[str, Sequence[Labelled]]) -> None:
     ]
     if wrong:
         raise DataError(
-            f"{len(wrong)} images have an angle that is not finite:{images.listed(wrong)}\n"
+            f"{len(wrong)} images have an angle that is not finite:{images.list_lines(wrong)}\n"
             "Mend these labels, or take the images out."
         )
 

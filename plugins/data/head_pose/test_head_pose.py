@@ -219,7 +219,7 @@ def test_generated_sets_have_the_published_shares(name: str, sizes: list[int]) -
 def test_generated_data_that_are_damaged_are_to_be_deleted(cache: Path, name: str) -> None:
     prepared(name, None, images=20)
     next(cache.rglob("*.jpg")).write_bytes(b"")
-    with pytest.raises(DataError, match=rf"Delete {cache}/{name}: the data are generated anew"):
+    with pytest.raises(DataError, match=rf"Delete {cache}/{name}; the next run generates the data again"):
         prepared(name, None, images=20)
 
 

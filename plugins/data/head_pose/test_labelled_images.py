@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 
 from framework.datasets import images
-from framework.datasets.images import Crops, blurred
+from framework.datasets.images import Crops, blur
 from framework.errors import DataError
 from plugins.data.head_pose.labelled_images import SPLITS, Labelled, Loaded, Reading, halves, load
 
@@ -84,7 +84,7 @@ def test_only_the_test_split_is_blurred(
     assert smooth.fingerprint["sha256"] == sharp.fingerprint["sha256"]
     for split in SPLITS:
         for index in range(len(sharp.tables[split])):
-            expected = blurred(sharp.tables[split][index]["input"], 1.2 if split == "test" else 0.0)
+            expected = blur(sharp.tables[split][index]["input"], 1.2 if split == "test" else 0.0)
             assert torch.equal(smooth.tables[split][index]["input"], expected)
 
 
@@ -100,7 +100,7 @@ def test_unreadable_images_are_named_or_skipped(tmp_path: Path) -> None:
     assert message.endswith("data.skip_unreadable=true to leave them out.")
     for part in ("a label that cannot be read", "0.png: cannot be read as an image", "10.png: no such file"):
         assert part in message
-    with pytest.raises(DataError, match=r"\nDelete /the/cache: the data are generated anew\.$"):
+    with pytest.raises(DataError, match=r"\nDelete /the/cache; the next run generates the data again\.$"):
         read(chosen, [label], generated_in=Path("/the/cache"))
     splits = read(chosen, [label], skip_unreadable=True)
     assert splits.skipped == 3

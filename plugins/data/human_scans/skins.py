@@ -49,8 +49,8 @@ def read(file: Path) -> UInt8[np.ndarray, "height width 3"]:
     Raises:
         DataError: the file is damaged.
     """
-    with images.opened(file) as image:
-        return np.array(images.plain(image, 3, upright=False))
+    with images.open_image(file) as image:
+        return np.array(images.decode(image, 3, upright=False))
 
 
 def shown(

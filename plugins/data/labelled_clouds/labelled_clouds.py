@@ -107,7 +107,7 @@ class LabelledClouds(Data):
         return self._fingerprint
 
     def preview(self, inputs: Tensor) -> np.ndarray:
-        return cloud_picture.picture(inputs, self.columns)
+        return cloud_picture.draw_cloud(inputs, self.columns)
 
 
 def loaded(

@@ -225,13 +225,13 @@ class Pascal3D(Data):
 
     def read(self, files: Sequence[Path]) -> Dataset[Batch]:
         side = self.framing.image_size
-        return images.unlabelled([Crop(Path(file), None, 0.0, side, upright=True) for file in files])
+        return images.load_unlabelled([Crop(Path(file), None, 0.0, side, upright=True) for file in files])
 
     def inputs(self, user_data: Any) -> Tensor:
-        return given_images.inputs(self, user_data)
+        return given_images.to_inputs(self, user_data)
 
     def augment(self, batch: Batch) -> Batch:
-        return images.varied(batch, MIRRORED if self.variation.mirror else (), self.variation.jitter)
+        return images.vary(batch, MIRRORED if self.variation.mirror else (), self.variation.jitter)
 
     def fingerprint(self) -> Mapping[str, str]:
         generated_root = f"synthetic, seed {self.drawing.generator_seed}"
@@ -243,7 +243,7 @@ class Pascal3D(Data):
         }
 
     def preview(self, inputs: Tensor) -> np.ndarray:
-        return images.picture(inputs)
+        return images.to_rgb8(inputs)
 
 
 def reason_to_exclude(annotation: Annotation, include_occluded: bool) -> str | None:
@@ -273,7 +273,7 @@ def _refuse_wrong_labels(samples: Mapping[str, Sequence[Sample]]) -> None:
     ]
     if wrong:
         raise DataError(
-            f"{len(wrong)} objects have an angle that is not finite; wanted degrees:{images.listed(wrong)}\n"
+            f"{len(wrong)} objects have an angle that is not finite; wanted degrees:{images.list_lines(wrong)}\n"
             "Mend these annotations, or take the images off their lists."
         )
 

@@ -180,7 +180,7 @@ def test_image_is_found_by_either_suffix_and_by_the_recorded_name(tmp_path: Path
         (b"not a matrix at all" * 20, r"one\.mat: cannot be read as a MATLAB file"),
         (
             b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + bytes(400),
-            r"one\.mat: a MATLAB 7\.3 file; .* '-v7'",
+            r"one\.mat: got a MATLAB 7\.3 file, .* '-v7'",
         ),
     ],
     ids=["missing", "empty", "text", "7.3"],
@@ -475,7 +475,9 @@ def test_generated_data_that_are_damaged_are_to_be_deleted(
     monkeypatch.setenv("FRAMEWORK_CACHE", str(tmp_path))
     data = prepared(None, images=20)
     next(tmp_path.rglob("car_pascal/*.mat")).write_bytes(b"")
-    with pytest.raises(DataError, match=rf"Delete {tmp_path}/pascal3d: the data are generated anew"):
+    with pytest.raises(
+        DataError, match=rf"Delete {tmp_path}/pascal3d; the next run generates the data again"
+    ):
         data.prepare()
 
 

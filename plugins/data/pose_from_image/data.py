@@ -18,7 +18,7 @@ from framework.bodies.parametric import ImageSide, ParametricBody, parametric_bo
 from framework.configuration.paths import FilePath
 from framework.data import Batch, Data, Splits
 from framework.datasets.fields import Fields
-from framework.datasets.images import has_alpha, opened, plain
+from framework.datasets.images import decode, has_alpha, open_image
 from framework.errors import ConfigError, DataError
 from framework.geometry.camera import Camera
 from framework.geometry.srgb import bytes_from_linear, linear_from_bytes
@@ -156,13 +156,13 @@ class PoseFromImage(Data):
 
     def _picture_of(self, file: Path) -> Float[Tensor, "4 height width"]:
         _, height, width = self.input_shape
-        with opened(file) as image:
+        with open_image(file) as image:
             if not has_alpha(image) or image.size != (width, height):
                 raise DataError(
                     f"{file}: {image.width} × {image.height} pixels, mode {image.mode}; wanted {width} × {height} and "
                     "an alpha channel that says how much of a pixel is body. Cut the body out and scale the picture."
                 )
-            stored = torch.from_numpy(np.array(plain(image, 4, upright=False)))
+            stored = torch.from_numpy(np.array(decode(image, 4, upright=False)))
         cover = stored[..., 3:].float() / 255
         return torch.cat([linear_from_bytes(stored[..., :3]) * cover, cover], -1).movedim(-1, 0)
 

@@ -13,7 +13,7 @@ from torch.utils.data import Dataset
 
 from framework.data import Batch, Data, Frame, Splits, as_inputs
 from framework.datasets import cloud_picture
-from framework.datasets.fields import Fields, fetched
+from framework.datasets.fields import Fields
 from framework.errors import DataError
 from framework.geometry import clouds
 from framework.geometry.mesh_files import XYZ
@@ -73,7 +73,7 @@ class Bodies(Data):
         return batch
 
     def preview(self, inputs: Tensor) -> np.ndarray:
-        return cloud_picture.picture(inputs[..., [2, 0, 1]])  # the third axis of the figure points up
+        return cloud_picture.draw_cloud(inputs[..., [2, 0, 1]])  # the third axis of the figure points up
 
 
 def target_of(vertices: int) -> Target:

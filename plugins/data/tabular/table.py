@@ -13,10 +13,11 @@ from torch import Tensor
 from framework.data import Splits, as_inputs
 from framework.datasets.angles import unlike_degrees, unlike_radians
 from framework.datasets.csv_columns import (
-    Chosen,
+    ColumnChoice,
     Columns,
     LabelledWriting,
     Writing,
+    describe_choice,
     is_boolean,
     number,
     numbers,
@@ -24,7 +25,6 @@ from framework.datasets.csv_columns import (
     read_columns,
     require,
     tables,
-    told,
 )
 from framework.datasets.fields import Fields
 from framework.distributions.circular import wrap
@@ -160,7 +160,9 @@ def load(
     names = tuple(name for name, same in zip(columns, constant.tolist(), strict=True) if same)
     skipped = len(whole) - len(rows)
     reading = Reading(columns, scaling)
-    return Table(target, reading, names, groups, Splits(**parts), sizes, skipped, digest, told(taken))
+    return Table(
+        target, reading, names, groups, Splits(**parts), sizes, skipped, digest, describe_choice(taken)
+    )
 
 
 def read(files: Sequence[Path], reading: Reading, writing: Writing | None = None) -> Fields:
@@ -251,7 +253,7 @@ def as_float32(
     return torch.from_numpy(narrow)
 
 
-def _inputs(cells: Columns, question: Question) -> Chosen:
+def _inputs(cells: Columns, question: Question) -> ColumnChoice:
     require(cells, question.target, "data.target")
     if question.columns is not None:
         require(cells, question.columns, "data.columns")
@@ -273,11 +275,11 @@ def _inputs(cells: Columns, question: Question) -> Chosen:
     return chosen
 
 
-def _named(cells: Columns, question: Question, columns: tuple[str, ...]) -> Chosen:
+def _named(cells: Columns, question: Question, columns: tuple[str, ...]) -> ColumnChoice:
     """Return the columns that are named, and list all others as left out."""
     known = (*columns, *question.target, SPLIT, GROUP)
     others = [name for name in cells.cells if name not in known]
-    return Chosen(columns, dict(cells.left_out) | dict.fromkeys(others, "not among those to read"), {})
+    return ColumnChoice(columns, dict(cells.left_out) | dict.fromkeys(others, "not among those to read"), {})
 
 
 def _targets(cells: Columns, question: Question, otherwise: str | None) -> tuple[np.ndarray, np.ndarray]:
@@ -293,7 +295,7 @@ def _targets(cells: Columns, question: Question, otherwise: str | None) -> tuple
         return values, np.asarray(np.isnan(values).any(-1))
     name = question.target[0]
     labels = cells.cells[name]
-    absent = np.array([label.lower() in cells.how.missing for label in labels])
+    absent = np.array([label.lower() in cells.notation.missing for label in labels])
     if otherwise is not None and absent.any():
         row = int(absent.argmax())
         what = f"{labels[row]!r}, which says that there is no label" if labels[row] else "no label"
@@ -327,7 +329,7 @@ def _groups(file: Path, cells: Columns, rows: np.ndarray) -> tuple[tuple[str, ..
     if GROUP not in cells.cells:
         return (file.stem,), torch.zeros(len(rows), dtype=torch.int64)
     words = [cells.cells[GROUP][row] for row in rows]
-    absent = [place for place, word in enumerate(words) if word.lower() in cells.how.missing]
+    absent = [place for place, word in enumerate(words) if word.lower() in cells.notation.missing]
     if absent:
         word = words[absent[0]]
         why = f" ({word!r})" if word else ""

@@ -149,17 +149,17 @@ def with_cell(cell: str, line: int = 5, column: int = 0) -> str:
         ("x,x,class\n1,2,a", "names the column 'x' twice"),
         (
             "x,klass\n1,a",
-            r"data\.target names 'class', which .*mine\.csv does not have\. Did you mean 'klass'\?",
+            r"data\.target names the column 'class', which .*mine\.csv does not have\. Did you mean 'klass'\?",
         ),
         ("word,class\na,b\nc,d", "has no column of numbers to read beside class"),
-        (with_cell("abc"), r"mine\.csv line 5, column 'x': 'abc'; wanted a finite number"),
+        (with_cell("abc"), r"mine\.csv line 5, column 'x': 'abc' is no finite number"),
         (
             with_cell(""),
-            r"line 5, column 'x': ''; wanted .* Or set data\.missing=skip to leave such rows out",
+            r"line 5, column 'x': '' is no finite number.* Or set data\.missing=skip to leave such rows out",
         ),
-        (with_cell("nan", 7, 1), r"line 7, column 'y': 'nan'; wanted"),
-        (with_cell("-inf", 7, 1), r"line 7, column 'y': '-inf'; wanted"),
-        (with_cell("1,2"), r"line 5: 4 cells; wanted 3"),
+        (with_cell("nan", 7, 1), r"line 7, column 'y': 'nan' is no finite number"),
+        (with_cell("-inf", 7, 1), r"line 7, column 'y': '-inf' is no finite number"),
+        (with_cell("1,2"), r"line 5: the line has 4 cells, but the first line names 3"),
         (with_cell("", 9, 2), r"line 9, column 'class': no label\. Write it, or set data\.missing=skip"),
         ("x,class\n" + "1,a\n" * 9, "every row is 'a'; wanted two classes or more"),
         (with_cell("c", 4, 2), r"line 4, column 'class': no training row is 'c'"),
@@ -217,7 +217,7 @@ def test_angles_in_the_other_unit_are_refused(tmp_path: Path, kind: str) -> None
     text = "x,angle\n" + "\n".join(f"{row * row},{value}" for row, value in enumerate(written))
     file = table(tmp_path, text)
     other = {"degrees": "radians", "radians": "degrees"}[kind]
-    with pytest.raises(DataError, match=rf"column 'angle': .* looks like {other}; .* Set data\.kind={other}"):
+    with pytest.raises(DataError, match=rf"column 'angle': .* looks like {other}, .* Set data\.kind={other}"):
         prepared(file, target="angle", kind=kind)
     data = prepared(file, target="angle", kind=other)
     angle, line = (fields(data, "train")[name] for name in ("target", "line"))
@@ -238,20 +238,22 @@ def test_what_is_read_predicted_and_left_out_is_said(tmp_path: Path) -> None:
     assert data.columns == ("a", "flag")
     assert data.remarks == (
         "predicted: the column 'class', data.kind=class",
-        "left out: 'Unnamed: 0' (row numbers; data.columns reads it), 'note' (words), 'none' (empty)",
+        "left out: 'Unnamed: 0' (row numbers; name it in data.columns to read it), 'note' (words), 'none' (empty)",
         "'flag' holds TRUE and FALSE, read as 1 and 0",
     )
 
 
 def test_wrong_questions_are_refused(tmp_path: Path) -> None:
     file = table(tmp_path)
-    with pytest.raises(DataError, match=r"data\.columns names 'nomber', .* Did you mean 'number'\?"):
+    with pytest.raises(
+        DataError, match=r"data\.columns names the column 'nomber', .* Did you mean 'number'\?"
+    ):
         prepared(file, columns=["nomber"])
     with pytest.raises(DataError, match=r"data\.columns names 'class', which is what is to be predicted"):
         prepared(file, columns=["number", "class"])
-    with pytest.raises(DataError, match=r"line 2, column 'word': 'a'; wanted a finite number"):
+    with pytest.raises(DataError, match=r"line 2, column 'word': 'a' is no finite number"):
         prepared(file, columns=["word"])
-    with pytest.raises(DataError, match=r"line 2, column 'class': 'cat'; wanted a finite number"):
+    with pytest.raises(DataError, match=r"line 2, column 'class': 'cat' is no finite number"):
         prepared(file, kind="real")
     with pytest.raises(DataError, match=r"data\.target = \['class', 'word'\] with data\.kind=class"):
         prepared(file, target=["class", "word"])
@@ -292,11 +294,11 @@ def test_read_uses_the_training_rows_and_needs_no_prepare(tmp_path: Path) -> Non
     assert torch.equal(read.fields["input"], torch.cat([test["input"], test["input"]]))
     other.write_text("number\n3\n")
     with pytest.raises(
-        DataError, match=r"The trained model names 'square', which .*other\.csv does not have"
+        DataError, match=r"The trained model names the column 'square', which .*other\.csv does not have"
     ):
         fresh.read([other])
     other.write_text("number,square\n3,9\n4,\n")
-    with pytest.raises(DataError, match=r"other\.csv line 3, column 'square': ''; wanted a finite number"):
+    with pytest.raises(DataError, match=r"other\.csv line 3, column 'square': '' is no finite number"):
         fresh.read([other])
 
 

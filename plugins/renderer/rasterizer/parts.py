@@ -156,7 +156,7 @@ class Pictures:
             DataError: the content is no image, or too large.
         """
         try:
-            with images.of_stream(BytesIO(content)) as image:
+            with images.open_stream(BytesIO(content)) as image:
                 self._texels += image.width * image.height
                 self._bytes += len(content)
                 most = min(MOST_TEXELS, max(FEW_TEXELS, TEXELS_PER_BYTE * self._bytes))
@@ -166,7 +166,7 @@ class Pictures:
                         "Make it smaller."
                     )
                 light = np.empty((image.height, image.width, 3), np.float32)
-                for top, strip in images.colors(image):
+                for top, strip in images.decode_opaque(image):
                     light[top : top + len(strip)] = _light(strip)
         except DataError as error:
             raise DataError(f"the texture {name}: {error}") from error
