@@ -1004,7 +1004,7 @@ OLD_NAMES = {
     "density": "CHUNK Circular Mixture circular circular_entropy circular_grid marginal median pick take",
     "rearranged": "Reshaped Stacked",
     "circular": "angular_distance circular_mean circular_median grid wrap",
-    "temper": "CircularPower divided log_probabilities temper tempered_classes",
+    "temper": "CircularPower log_probabilities temper tempered_classes",
     "monte_carlo": "Estimate estimate",
     "cdf": "cdf",
     "normals": "Normals mahalanobis normals one_normal",

@@ -1,5 +1,5 @@
-"""Densities that belong to no single method, and the questions that every density can be asked (`protocol`)."""
+"""Densities that belong to no single method, and the functions that are defined for every density (`protocol`)."""
 
-# These imports register the answers of torch's densities and all defaults, whichever file is imported first.
+# These imports register the functions of torch's densities and all defaults, whichever file is imported first.
 from framework.distributions import closed_forms as closed_forms
 from framework.distributions import tempering as tempering

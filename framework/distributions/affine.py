@@ -1,4 +1,4 @@
-"""The affine transform X = location + scale · Y of a density of reals; Y's density answers the questions about X."""
+"""The density of an affine transform X = location + scale · Y of real numbers, computed from the density of Y."""
 
 from collections.abc import Collection
 from typing import ClassVar
@@ -32,7 +32,7 @@ from framework.distributions.protocol import (
 
 
 class AffineDensity(Distribution):
-    """The density of location + scale · Y, number by number.
+    """The density of X = location + scale · Y, number by number.
 
     Args:
         density: density of Y, over n real numbers.
@@ -49,7 +49,7 @@ class AffineDensity(Distribution):
         if len(density.event_shape) != 1 or location.shape != shape or scale.shape != shape:
             raise ValueError(
                 f"location {tuple(location.shape)} and scale {tuple(scale.shape)} do not fit a density over "
-                f"{tuple(shape)}; wanted three times the same shape, (*batch, number)."
+                f"{tuple(shape)}; expected the same shape (*batch, number) for all three."
             )
         self.density = density
         self.location = location
@@ -97,9 +97,9 @@ class AffineDensity(Distribution):
 
 @marginal.register
 def _(density: AffineDensity, index: int) -> AffineDensity:
-    here = slice(index, index + 1)
+    column = slice(index, index + 1)
     inner = marginal(density.density, index)
-    return AffineDensity(inner, density.location[..., here], density.scale[..., here])
+    return AffineDensity(inner, density.location[..., column], density.scale[..., column])
 
 
 @median.register
@@ -109,15 +109,15 @@ def _(density: AffineDensity, samples: int) -> Tensor:
 
 @pick.register
 def _(density: AffineDensity, index: Tensor) -> AffineDensity:
-    place = (take(number, index) for number in (density.location, density.scale))
-    return AffineDensity(pick(density.density, index), *place)
+    parameters = (take(number, index) for number in (density.location, density.scale))
+    return AffineDensity(pick(density.density, index), *parameters)
 
 
 @recentre.register
-def _(density: AffineDensity, index: tuple[Tensor, ...], place: Tensor) -> AffineDensity:
-    # X - place = scale · (Y - y) with y = (place - location) / scale
+def _(density: AffineDensity, index: tuple[Tensor, ...], origin: Tensor) -> AffineDensity:
+    # X - origin = scale · (Y - y) with y = (origin - location) / scale
     location, scale = (number.double()[index] for number in (density.location, density.scale))
-    inner = recentre(density.density, index, (place - location) / scale)
+    inner = recentre(density.density, index, (origin - location) / scale)
     scale = scale.expand((*inner.batch_shape, 1))
     return AffineDensity(inner, torch.zeros_like(scale), scale)
 
@@ -129,9 +129,11 @@ def _(density: AffineDensity, temperature: Tensor) -> AffineDensity:
 
 @estimate.register
 def _(density: AffineDensity, value: Tensor) -> Estimate:
-    found = estimate(density.density, density.inner(value))
+    inner_estimate = estimate(density.density, density.inner(value))
     down = density.log_volume
-    return found._replace(log_mean=found.log_mean - down, debiased=found.debiased - down)
+    return inner_estimate._replace(
+        log_mean=inner_estimate.log_mean - down, debiased=inner_estimate.debiased - down
+    )
 
 
 @cdf.register
@@ -141,11 +143,13 @@ def _(density: AffineDensity, value: Tensor) -> Tensor | None:
 
 @normals.register
 def _(density: AffineDensity) -> Normals | None:
-    found = normals(density.density)
-    if found is None:
+    inner_normals = normals(density.density)
+    if inner_normals is None:
         return None
     location, scale = density.location.double(), density.scale.double()
-    return Normals(found.log_weights, location + scale * found.mean, scale * found.scale)
+    return Normals(
+        inner_normals.log_weights, location + scale * inner_normals.mean, scale * inner_normals.scale
+    )
 
 
 @mahalanobis.register
@@ -155,11 +159,11 @@ def _(density: AffineDensity, value: Tensor) -> Tensor | None:
 
 @quadratic_bound.register
 def _(density: AffineDensity, value: Tensor) -> QuadraticBound | None:
-    found = quadratic_bound(density.density, density.inner(value))
-    if found is None:
+    inner_bound = quadratic_bound(density.density, density.inner(value))
+    if inner_bound is None:
         return None
-    pull, stiffness = found.pull / density.scale, found.stiffness / density.scale.square()
-    return QuadraticBound(found.log_prob - density.log_volume, pull, stiffness)
+    pull, stiffness = inner_bound.pull / density.scale, inner_bound.stiffness / density.scale.square()
+    return QuadraticBound(inner_bound.log_prob - density.log_volume, pull, stiffness)
 
 
 @images.register
@@ -200,17 +204,17 @@ class AffineSet(ValueSet):
         return self.inner.empty()
 
     def parts(self) -> list[list[int]] | list[list[tuple[float, float]]] | None:
-        found = self.inner.parts()
-        if found is None:
+        inner_parts = self.inner.parts()
+        if inner_parts is None:
             return None
         location, scale = (
-            one.double().flatten().tolist() for one in (self.density.location, self.density.scale)
+            number.double().flatten().tolist() for number in (self.density.location, self.density.scale)
         )
-        frames = zip(found, location, scale, strict=True)
+        frames = zip(inner_parts, location, scale, strict=True)
         return [[(at + by * part[0], at + by * part[1]) for part in parts] for parts, at, by in frames]  # type: ignore[index]
 
 
 @value_set.register
 def _(density: AffineDensity) -> AffineSet | None:
-    found = value_set(density.density)
-    return None if found is None else AffineSet(found, density)
+    inner_set = value_set(density.density)
+    return None if inner_set is None else AffineSet(inner_set, density)

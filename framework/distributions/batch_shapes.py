@@ -1,4 +1,4 @@
-"""Densities with a changed batch_shape: several densities side by side, or one reshaped batch; wrappers mix these."""
+"""Densities with a changed batch_shape: several densities side by side, or one reshaped batch."""
 
 from collections.abc import Collection, Sequence
 from typing import ClassVar
@@ -30,7 +30,7 @@ from framework.distributions.protocol import (
 
 
 class Stacked(Distribution):
-    """K densities of one batch_shape side by side, with batch_shape (*batch, K), the form that a Mixture reads.
+    """K densities of one batch_shape side by side, with batch_shape (*batch, K), as a Mixture reads them.
 
     Args:
         densities: at least one; all have the same batch_shape, event_shape and support.
@@ -42,9 +42,11 @@ class Stacked(Distribution):
 
     def __init__(self, densities: Sequence[Distribution]) -> None:
         first = densities[0]
-        shapes = {(tuple(one.batch_shape), tuple(one.event_shape)) for one in densities}
+        shapes = {(tuple(density.batch_shape), tuple(density.event_shape)) for density in densities}
         if len(shapes) > 1:
-            raise ValueError(f"densities differ in (batch_shape, event_shape): {sorted(shapes)}; wanted one.")
+            raise ValueError(
+                f"The densities have different (batch_shape, event_shape): {sorted(shapes)}; expected equal shapes."
+            )
         self.densities = tuple(densities)
         self.has_enumerate_support = first.has_enumerate_support
         shape = torch.Size((*first.batch_shape, len(densities)))
@@ -56,8 +58,8 @@ class Stacked(Distribution):
 
     def enumerate_support(self, expand: bool = True) -> Tensor:
         """Return every class, (class, *batch, K), or (class, *1) without `expand`."""
-        found = self.densities[0].enumerate_support(expand).unsqueeze(-1)
-        return found.expand(*found.shape[:-1], len(self.densities)) if expand else found
+        labels = self.densities[0].enumerate_support(expand).unsqueeze(-1)
+        return labels.expand(*labels.shape[:-1], len(self.densities)) if expand else labels
 
     @property
     def _axis(self) -> int:
@@ -65,10 +67,10 @@ class Stacked(Distribution):
         return -1 - len(self.event_shape)
 
     def log_prob(self, value: Tensor) -> Tensor:
-        return torch.stack([density.log_prob(part) for density, part in self.apart(value)], -1)
+        return torch.stack([density.log_prob(part) for density, part in self.pair_with_values(value)], -1)
 
-    def apart(self, value: Tensor) -> list[tuple[Distribution, Tensor]]:
-        """Return each density with its own part of the values (*sample, *batch, K or 1, *event)."""
+    def pair_with_values(self, value: Tensor) -> list[tuple[Distribution, Tensor]]:
+        """Return a pair for each density: the density, and its part of the values (*sample, *batch, K or 1, *event)."""
         wide = value.expand(*value.shape[: self._axis], len(self.densities), *self.event_shape)
         return list(zip(self.densities, wide.unbind(self._axis), strict=True))
 
@@ -108,7 +110,7 @@ class Reshaped(Distribution):
         shape = torch.Size(batch_shape)
         if shape.numel() != density.batch_shape.numel():
             raise ValueError(
-                f"a batch of shape {tuple(density.batch_shape)} cannot be read as {tuple(shape)}; wanted as many items."
+                f"A batch of shape {tuple(density.batch_shape)} cannot be read as {tuple(shape)}; expected as many items."
             )
         self.density = density
         self.has_enumerate_support = density.has_enumerate_support
@@ -120,8 +122,8 @@ class Reshaped(Distribution):
 
     def enumerate_support(self, expand: bool = True) -> Tensor:
         """Return every class, (class, *batch), or (class, *1) without `expand`."""
-        found = self.density.enumerate_support(expand=False).reshape(-1, *(1,) * len(self.batch_shape))
-        return found.expand(-1, *self.batch_shape) if expand else found
+        labels = self.density.enumerate_support(expand=False).reshape(-1, *(1,) * len(self.batch_shape))
+        return labels.expand(-1, *self.batch_shape) if expand else labels
 
     def log_prob(self, value: Tensor) -> Tensor:
         flat, shape = self.inner(value)
@@ -160,7 +162,7 @@ class Reshaped(Distribution):
 
 @marginal.register
 def _(density: Stacked, index: int) -> Stacked:
-    return Stacked([marginal(one, index) for one in density.densities])
+    return Stacked([marginal(inner, index) for inner in density.densities])
 
 
 @marginal.register
@@ -170,7 +172,7 @@ def _(density: Reshaped, index: int) -> Reshaped:
 
 @tempered_density.register
 def _(density: Stacked, temperature: Tensor) -> Distribution:
-    return Stacked([tempered_density(one, temperature) for one in density.densities])
+    return Stacked([tempered_density(inner, temperature) for inner in density.densities])
 
 
 @tempered_density.register
@@ -181,7 +183,7 @@ def _(density: Reshaped, temperature: Tensor) -> Distribution:
 @median.register
 def _(density: Stacked, samples: int) -> Tensor:
     axis = -1 - len(density.event_shape)
-    return torch.stack([median(one, samples) for one in density.densities], axis)
+    return torch.stack([median(inner, samples) for inner in density.densities], axis)
 
 
 @median.register
@@ -191,62 +193,63 @@ def _(density: Reshaped, samples: int) -> Tensor:
 
 @estimate.register
 def _(density: Stacked, value: Tensor) -> Estimate:
-    parts = [estimate(one, part) for one, part in density.apart(value)]
+    parts = [estimate(inner, part) for inner, part in density.pair_with_values(value)]
     return Estimate(*(torch.stack(fields, -1) for fields in zip(*parts, strict=True)))
 
 
 @estimate.register
 def _(density: Reshaped, value: Tensor) -> Estimate:
     flat, shape = density.inner(value)
-    return estimate(density.density, flat).each(lambda field: field.reshape(shape))
+    return estimate(density.density, flat).map_fields(lambda field: field.reshape(shape))
 
 
 @cdf.register
 def _(density: Stacked, value: Tensor) -> Tensor | None:
-    return _stacked([cdf(one, part) for one, part in density.apart(value)])
+    return _stack([cdf(inner, part) for inner, part in density.pair_with_values(value)])
 
 
 @cdf.register
 def _(density: Reshaped, value: Tensor) -> Tensor | None:
     flat, shape = density.inner(value)
-    return _folded(cdf(density.density, flat), shape)
+    return _reshape(cdf(density.density, flat), shape)
 
 
 @marginal_cdfs.register
 def _(density: Stacked, value: Tensor) -> Tensor | None:
-    return _stacked(
-        [marginal_cdfs(one, part) for one, part in density.apart(value)], -1 - len(density.event_shape)
+    return _stack(
+        [marginal_cdfs(inner, part) for inner, part in density.pair_with_values(value)],
+        -1 - len(density.event_shape),
     )
 
 
 @marginal_cdfs.register
 def _(density: Reshaped, value: Tensor) -> Tensor | None:
     flat, shape = density.inner(value)
-    return _folded(marginal_cdfs(density.density, flat), shape + density.event_shape)
+    return _reshape(marginal_cdfs(density.density, flat), shape + density.event_shape)
 
 
 @arc_probability.register
 def _(density: Stacked, start: Tensor, end: Tensor) -> Tensor | None:
-    both = zip(density.apart(start), density.apart(end), strict=True)
-    return _stacked([arc_probability(one, first, last) for (one, first), (_, last) in both])
+    both = zip(density.pair_with_values(start), density.pair_with_values(end), strict=True)
+    return _stack([arc_probability(inner, first, last) for (inner, first), (_, last) in both])
 
 
 @arc_probability.register
 def _(density: Reshaped, start: Tensor, end: Tensor) -> Tensor | None:
     start, end = torch.broadcast_tensors(start, end)
     flat, shape = density.inner(start)
-    return _folded(arc_probability(density.density, flat, density.inner(end)[0]), shape)
+    return _reshape(arc_probability(density.density, flat, density.inner(end)[0]), shape)
 
 
 @mahalanobis.register
 def _(density: Stacked, value: Tensor) -> Tensor | None:
-    return _stacked([mahalanobis(one, part) for one, part in density.apart(value)])
+    return _stack([mahalanobis(inner, part) for inner, part in density.pair_with_values(value)])
 
 
 @mahalanobis.register
 def _(density: Reshaped, value: Tensor) -> Tensor | None:
     flat, shape = density.inner(value)
-    return _folded(mahalanobis(density.density, flat), shape)
+    return _reshape(mahalanobis(density.density, flat), shape)
 
 
 @normals.register
@@ -267,43 +270,48 @@ def _(density: Reshaped) -> Normals | None:
 
 @quadratic_bound.register
 def _(density: Stacked, value: Tensor) -> QuadraticBound | None:
-    parts = [quadratic_bound(one, part) for one, part in density.apart(value)]
+    parts = [quadratic_bound(inner, part) for inner, part in density.pair_with_values(value)]
     known = [part for part in parts if part is not None]
     if len(known) < len(parts):
         return None
-    log_prob, *others = zip(*known, strict=True)
-    return QuadraticBound(torch.stack(log_prob, -1), *(torch.stack(each, -2) for each in others))
+    log_prob, *bounds = zip(*known, strict=True)
+    return QuadraticBound(torch.stack(log_prob, -1), *(torch.stack(field, -2) for field in bounds))
 
 
 @quadratic_bound.register
 def _(density: Reshaped, value: Tensor) -> QuadraticBound | None:
     flat, shape = density.inner(value)
-    found = quadratic_bound(density.density, flat)
-    if found is None:
+    bound = quadratic_bound(density.density, flat)
+    if bound is None:
         return None
-    log_prob, *others = found
+    log_prob, *bounds = bound
     return QuadraticBound(
-        log_prob.reshape(shape), *(each.reshape(*shape, *density.event_shape) for each in others)
+        log_prob.reshape(shape), *(field.reshape(*shape, *density.event_shape) for field in bounds)
     )
 
 
 @images.register
 def _(density: Stacked, channels: Collection[str]) -> dict[str, Tensor]:
-    parts = [images(one, channels) for one in density.densities]
+    parts = [images(inner, channels) for inner in density.densities]
     axis = len(density.batch_shape) - 1
     return {name: torch.stack([part[name] for part in parts], axis) for name in parts[0]}
 
 
 @images.register
 def _(density: Reshaped, channels: Collection[str]) -> dict[str, Tensor]:
-    inner = len(density.density.batch_shape)
-    found = images(density.density, channels)
-    return {name: one.reshape(*density.batch_shape, *one.shape[inner:]) for name, one in found.items()}
+    inner_dimensions = len(density.density.batch_shape)
+    inner_images = images(density.density, channels)
+    return {
+        name: image.reshape(*density.batch_shape, *image.shape[inner_dimensions:])
+        for name, image in inner_images.items()
+    }
 
 
 @mode_candidates.register
 def _(density: Stacked) -> Tensor:
-    return _beside([mode_candidates(one) for one in density.densities], -1 - len(density.event_shape))
+    return _stack_padded(
+        [mode_candidates(inner) for inner in density.densities], -1 - len(density.event_shape)
+    )
 
 
 @mode_candidates.register
@@ -313,7 +321,7 @@ def _(density: Reshaped) -> Tensor:
 
 @peak_widths.register
 def _(density: Stacked) -> Tensor:
-    return _beside([peak_widths(one) for one in density.densities], -1)
+    return _stack_padded([peak_widths(inner) for inner in density.densities], -1)
 
 
 @peak_widths.register
@@ -321,36 +329,39 @@ def _(density: Reshaped) -> Tensor:
     return peak_widths(density.density).reshape(-1, *density.batch_shape)
 
 
-def _beside(found: list[Tensor], axis: int) -> Tensor:
-    """Stack tensors (peak, …) of several densities; a density with fewer peaks repeats its first peak."""
-    most = max(len(one) for one in found)
-    same = [torch.cat([one, one[:1].expand(most - len(one), *one.shape[1:])]) for one in found]
-    return torch.stack(same, axis)
+def _stack_padded(candidates: list[Tensor], axis: int) -> Tensor:
+    """Return the stacked tensors (peak, …) of several densities; a density with fewer peaks repeats its first peak."""
+    largest_count = max(len(tensor) for tensor in candidates)
+    padded = [
+        torch.cat([tensor, tensor[:1].expand(largest_count - len(tensor), *tensor.shape[1:])])
+        for tensor in candidates
+    ]
+    return torch.stack(padded, axis)
 
 
 @recentre.register
-def _(density: Stacked, index: tuple[Tensor, ...], place: Tensor) -> Distribution:
+def _(density: Stacked, index: tuple[Tensor, ...], origin: Tensor) -> Distribution:
     *item, number = index
     every = torch.arange(len(density.densities), device=number.device)
-    if number.shape != every.shape or any(part.shape[-1:] != (1,) for part in (*item, place[..., 0])):
-        return recentre.dispatch(Distribution)(density, index, place)
+    if number.shape != every.shape or any(part.shape[-1:] != (1,) for part in (*item, origin[..., 0])):
+        return recentre.dispatch(Distribution)(density, index, origin)
     item = tuple(part.squeeze(-1) for part in item)
-    return Stacked([recentre(one, item, place.squeeze(-2)) for one in density.densities])
+    return Stacked([recentre(inner, item, origin.squeeze(-2)) for inner in density.densities])
 
 
 @recentre.register
-def _(density: Reshaped, index: tuple[Tensor, ...], place: Tensor) -> Distribution:
-    item = torch.zeros((), dtype=torch.int64, device=place.device)
+def _(density: Reshaped, index: tuple[Tensor, ...], origin: Tensor) -> Distribution:
+    item = torch.zeros((), dtype=torch.int64, device=origin.device)
     for part, size in zip(index, density.batch_shape, strict=True):
         item = item * size + part
     inner = density.density
-    return recentre(inner, torch.unravel_index(item, inner.batch_shape), place)
+    return recentre(inner, torch.unravel_index(item, inner.batch_shape), origin)
 
 
-def _stacked(parts: list[Tensor | None], axis: int = -1) -> Tensor | None:
+def _stack(parts: list[Tensor | None], axis: int = -1) -> Tensor | None:
     known = [part for part in parts if part is not None]
     return torch.stack(known, axis) if len(known) == len(parts) else None
 
 
-def _folded(found: Tensor | None, shape: torch.Size) -> Tensor | None:
-    return None if found is None else found.reshape(shape)
+def _reshape(result: Tensor | None, shape: torch.Size) -> Tensor | None:
+    return None if result is None else result.reshape(shape)

@@ -6,21 +6,21 @@ from torch import Tensor
 from framework.errors import UserError
 
 
-def refuse_nan(values: Float[Tensor, "batch"], what: str) -> Float[Tensor, "batch"]:
+def refuse_nan(values: Float[Tensor, "batch"], quantity: str) -> Float[Tensor, "batch"]:
     """Return `values`, one per sample, unchanged if none is NaN.
 
     Args:
         values: the numbers that are checked.
-        what: name of the numbers in the plural, for the message: "entropies of the test split".
+        quantity: name of the numbers in the plural, for the message, such as "entropies of the test split".
 
     Raises:
         UserError: some values are NaN; the message says how many, and which is the first.
     """
-    wrong = values.isnan()
-    if wrong.any():
+    is_nan = values.isnan()
+    if is_nan.any():
         raise UserError(
-            f"{int(wrong.sum())} of {len(values)} {what} in this batch are NaN, the first in row "
-            f"{int(wrong.nonzero()[0])}; wanted numbers. A mean over the others would hide it: check the density "
-            "head or wrapper that predicts them (`mode=check`), or leave this metric out."
+            f"{int(is_nan.sum())} of {len(values)} {quantity} in this batch are NaN, the first in row "
+            f"{int(is_nan.nonzero()[0])}. A mean over the other rows would hide this fault. Check the density head or "
+            "the uncertainty wrapper that predicts them (`mode=check`), or leave this metric out."
         )
     return values

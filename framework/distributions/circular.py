@@ -33,10 +33,10 @@ circular = Circular()
 
 def wrap(angle: Tensor) -> Tensor:
     """Return the equivalent angle in [-π, π), radians."""
-    turn = 2 * math.pi
-    wrapped = torch.remainder(angle + math.pi, turn) - math.pi
+    whole_turn = 2 * math.pi
+    wrapped = torch.remainder(angle + math.pi, whole_turn) - math.pi
     # remainder may round up to a whole turn for tiny negative arguments
-    return torch.where(wrapped >= math.pi, wrapped - turn, wrapped)
+    return torch.where(wrapped >= math.pi, wrapped - whole_turn, wrapped)
 
 
 def angular_distance(first: Tensor, second: Tensor) -> Tensor:
@@ -60,12 +60,12 @@ def circular_median(samples: Float[Tensor, "samples *batch"]) -> Float[Tensor, "
     """
     count = samples.shape[0]
     if count == 0:
-        raise ValueError("circular_median needs at least one sample, got none.")
+        raise ValueError("circular_median got no sample, but it requires at least one.")
     # float64: prefix sums over many samples cancel in float32
     angle = wrap(samples.double()).movedim(0, -1).contiguous()
     angle, _ = angle.sort(-1)
-    turn = 2 * math.pi
-    twice = torch.cat([angle, angle + turn], -1)
+    whole_turn = 2 * math.pi
+    twice = torch.cat([angle, angle + whole_turn], -1)
     prefix = torch.nn.functional.pad(twice.cumsum(-1), (1, 0))
     start = torch.arange(count, device=angle.device).expand_as(angle)
     end = torch.searchsorted(twice, angle + math.pi, right=True).clamp(max=count + start)
@@ -73,7 +73,7 @@ def circular_median(samples: Float[Tensor, "samples *batch"]) -> Float[Tensor, "
     total = prefix.gather(-1, start + count) - prefix.gather(-1, start)
     near = prefix.gather(-1, end) - prefix.gather(-1, start)
     behind = count - ahead
-    cost = (near - ahead * angle) + (behind * (angle + turn) - (total - near))
+    cost = (near - ahead * angle) + (behind * (angle + whole_turn) - (total - near))
     best = torch.where(
         angle[..., -1:].isnan(), count - 1, cost.argmin(-1, keepdim=True)
     )  # NaN is sorted last

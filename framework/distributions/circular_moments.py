@@ -34,8 +34,8 @@ class CircularMoments:
 
     Args:
         moments: the moments; m_0 is 1.
-        resolved: whether the grid resolved the density. Where it did not, the moments are meaningless, and draws must
-            be used instead. A density that is NaN counts as resolved.
+        resolved: true where the grid resolved the density. Elsewhere the moments are meaningless, and draws must be
+            used instead. A density that is NaN counts as resolved.
     """
 
     def __init__(self, moments: Complex[Tensor, "harmonic *batch"], resolved: Bool[Tensor, "*batch"]) -> None:
@@ -51,23 +51,23 @@ class CircularMoments:
         return torch.where(first.abs() < 1e-6, 0.0, first.angle())
 
     def arc_probability(self, start: Tensor, end: Tensor) -> Tensor:
-        """Return the mass from `start` counter-clockwise to `end`, (*sample, *batch).
+        """Return the probability of the arc from `start` counter-clockwise to `end`, (*sample, *batch).
 
         The Fourier series of the density is integrated term by term, so the result is as exact as the moments. Both
         angles are (*sample, *batch), radians.
         """
-        turn = torch.remainder(end - start, 2 * math.pi)
-        return self._series(turn, start).clamp(0, 1)
+        length = torch.remainder(end - start, 2 * math.pi)
+        return self._series(length, start).clamp(0, 1)
 
-    def _series(self, turn: Tensor, start: Tensor) -> Tensor:
+    def _series(self, length: Tensor, start: Tensor) -> Tensor:
         if start.dim() > self.resolved.dim():
-            pairs = zip(turn, start.expand_as(turn), strict=True)
+            pairs = zip(length, start.expand_as(length), strict=True)
             return torch.stack([self._series(*pair) for pair in pairs])
-        ends = torch.polar(torch.ones_like(self.order), -self.order * (start + turn))
+        ends = torch.polar(torch.ones_like(self.order), -self.order * (start + length))
         starts = torch.polar(torch.ones_like(self.order), -self.order * start)
         # ∫ Re(m_n e^{-inφ}) dφ = Re(i m_n e^{-inφ} / n) = -Im(m_n e^{-inφ}) / n
         parts = -(self.moments[1:] * (ends - starts)).imag / self.order
-        return turn / (2 * math.pi) + parts.sum(0) / math.pi
+        return length / (2 * math.pi) + parts.sum(0) / math.pi
 
     def distance(self, value: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
         """Return E d(X, y), with d the angular distance, radians: d(θ) = π/2 - 4/π Σ cos(nθ)/n² over odd n."""
@@ -84,7 +84,7 @@ class CircularMoments:
         """Return the density on equally spaced angles from -π, interpolated by the Fourier series.
 
         Args:
-            finer: how many times as many angles are used as the grid of the moments had.
+            finer: number of angles as a multiple of the number of angles on the grid of the moments.
             slope: if true, return the derivative of the density per radian instead.
         """
         count = 2 * (len(self.moments) - 1) * finer
@@ -112,10 +112,10 @@ def circular_moments(density: Distribution) -> CircularMoments:
     moments, resolved = _on_grid(density, POINTS[0])
     if bool(resolved.all()):
         return CircularMoments(moments, resolved)
-    fine, found = _on_grid(density, POINTS[1])
+    fine, fine_resolved = _on_grid(density, POINTS[1])
     wide = torch.zeros_like(fine)
     wide[: len(moments)] = moments
-    return CircularMoments(torch.where(resolved, wide, fine), resolved | found)
+    return CircularMoments(torch.where(resolved, wide, fine), resolved | fine_resolved)
 
 
 def _on_grid(density: Distribution, points: int) -> tuple[Tensor, Tensor]:
@@ -134,5 +134,5 @@ def _on_grid(density: Distribution, points: int) -> tuple[Tensor, Tensor]:
     moments = torch.fft.rfft(mass / total, dim=0).conj().resolve_conj()
     moments[1::2] *= -1  # the grid begins at -π
     last = moments[-max(2, points // 40) :].abs().amax(0)
-    seen = ((total - 1).abs() < MASS_GAP) & (last < largest)
-    return moments, seen | total.isnan()
+    grid_resolves = ((total - 1).abs() < MASS_GAP) & (last < largest)
+    return moments, grid_resolves | total.isnan()

@@ -30,20 +30,20 @@ def class_probabilities(density: Distribution) -> Float64[Tensor, "batch class"]
     """
     if not density.has_enumerate_support or tuple(density.event_shape):
         raise UserError(
-            f"Class probabilities were asked of a {type(density).__name__} with event_shape "
-            f"{tuple(density.event_shape)}, which does not list classes; wanted a density over classes, such as "
-            "density_head=categorical predicts. Leave out the metric that reads them, or choose such a head."
+            f"A metric reads class probabilities, but the model predicts a {type(density).__name__} with event_shape "
+            f"{tuple(density.event_shape)}, which is no density over classes. Choose a density head that predicts "
+            "classes, such as density_head=categorical, or leave the metric out."
         )
-    found = estimate(density, density.enumerate_support())
-    log_prob = found.log_mean.double().T
+    estimates = estimate(density, density.enumerate_support())
+    log_prob = estimates.log_mean.double().T
     total = refuse_nan(log_prob.exp().sum(-1), "predicted distributions over classes")
-    drawn = (found.samples > 0).any(0) & (log_prob > -math.inf).any(-1)
-    wrong = ~((total - 1).abs() < LARGEST_DEFECT) & ~drawn
+    is_drawn = (estimates.samples > 0).any(0) & (log_prob > -math.inf).any(-1)
+    wrong = ~((total - 1).abs() < LARGEST_DEFECT) & ~is_drawn
     if wrong.any():
         raise UserError(
-            f"{int(wrong.sum())} of {len(total)} predicted distributions over classes do not sum to 1: that of row "
-            f"{int(wrong.nonzero()[0])} sums to {total[wrong][0].item():.6g}. Mend log_prob of the density head or "
-            "wrapper that predicts them (`mode=check`)."
+            f"{int(wrong.sum())} of {len(total)} predicted distributions over classes do not sum to 1: the "
+            f"distribution in row {int(wrong.nonzero()[0])} sums to {total[wrong][0].item():.6g}. Correct log_prob of "
+            "the density head or the uncertainty wrapper that predicts them (`mode=check`)."
         )
     return log_prob.softmax(-1)
 
@@ -57,8 +57,8 @@ def require_labels(target: Real[Tensor, "batch"], classes: int) -> Real[Tensor, 
     wrong = ~((target >= 0) & (target < classes))
     if wrong.any():
         raise DataError(
-            f"{int(wrong.sum())} of {len(target)} targets of this batch are no class: that of row "
-            f"{int(wrong.nonzero()[0])} is {target[wrong][0].item():g}, wanted 0 to {classes - 1}. Mend the data's "
-            "labels."
+            f"{int(wrong.sum())} of {len(target)} targets of this batch are no class index: the target in row "
+            f"{int(wrong.nonzero()[0])} is {target[wrong][0].item():g}, but indices go from 0 to {classes - 1}. "
+            "Correct the labels of the data."
         )
     return target

@@ -1,4 +1,4 @@
-"""Closed-form answers of torch's own densities to the questions of `protocol`, and the normal quantile."""
+"""The functions of `protocol` in closed form for torch's own densities, and the normal quantile."""
 
 import inspect
 from collections.abc import Callable, Collection
@@ -46,9 +46,9 @@ def _(density: Independent, value: Tensor) -> Estimate:
     factors = estimate(density.base_dist, value)
     count = density.reinterpreted_batch_ndims
     if count:
-        factors = factors.each(lambda field: field.flatten(-count))
+        factors = factors.map_fields(lambda field: field.flatten(-count))
     else:
-        factors = factors.each(lambda field: field.unsqueeze(-1))
+        factors = factors.map_fields(lambda field: field.unsqueeze(-1))
     log_mean, debiased = factors.log_mean.sum(-1), factors.debiased.sum(-1)
     error = factors.standard_error.square().sum(-1).sqrt()
     return Estimate(log_mean, debiased, error, factors.samples.sum(-1), factors.unresolved.any(-1))
@@ -68,19 +68,19 @@ def _(density: Independent, index: int) -> Distribution:
         return density
     if density.reinterpreted_batch_ndims == 0:
         return marginal(density.base_dist, index)
-    base = _of_each(density.base_dist, lambda parameter: parameter[..., index : index + 1])
+    base = _change_parameters(density.base_dist, lambda parameter: parameter[..., index : index + 1])
     if base is None or density.reinterpreted_batch_ndims != 1:
         return marginal.dispatch(Distribution)(density, index)
     return Independent(base, 1, validate_args=False)
 
 
-def _of_each(density: Distribution, change: Callable[[Tensor], Tensor]) -> Distribution | None:
-    """Return a torch density over one number with `change` applied to each of its parameters; None where unknown.
+def _change_parameters(density: Distribution, change: Callable[[Tensor], Tensor]) -> Distribution | None:
+    """Return a torch density of one number with `change` applied to each of its parameters, or None if this is not known.
 
-    This is known where every parameter of the constructor is a tensor with one number for each item of the batch. A
-    mixture or a density that was transformed by hand has other parts.
+    It is known if every parameter of the constructor is a tensor with one number for each item of the batch. It is not
+    known for a mixture or a transformed density, which have other parts.
     """
-    kind: Any = next(one for one in type(density).__mro__ if getattr(torchs, one.__name__, None) is one)
+    kind: Any = next(base for base in type(density).__mro__ if getattr(torchs, base.__name__, None) is base)
     names = {*inspect.signature(kind.__init__).parameters} - {"self", "validate_args"}
     # one of the two was given; torch computes the other with rounding errors
     if {"probs", "logits"} <= names:
@@ -95,8 +95,8 @@ def _of_each(density: Distribution, change: Callable[[Tensor], Tensor]) -> Distr
     return kind(**changed, validate_args=False)
 
 
-def _below(base: Distribution, value: Tensor) -> Tensor:
-    """Return the distribution function of one of `_ON_THE_LINE`, float64; SciPy gives Student's, which torch lacks."""
+def _distribution_function(base: Distribution, value: Tensor) -> Tensor:
+    """Return P(X ≤ value) of a density of `_ON_THE_LINE`, float64; of Student's t by SciPy, because torch has none."""
     if not isinstance(base, torchs.StudentT):
         return base.cdf(value)
     # imported here, since importing SciPy is slow and most commands do not need it
@@ -109,9 +109,9 @@ def _below(base: Distribution, value: Tensor) -> Tensor:
 @marginal_cdfs.register
 def _(density: Independent, value: Tensor) -> Tensor | None:
     if isinstance(density.base_dist, _ON_THE_LINE):
-        base = _of_each(density.base_dist, Tensor.double)
+        base = _change_parameters(density.base_dist, Tensor.double)
         if base is not None:
-            return _below(base, value.double())
+            return _distribution_function(base, value.double())
     return None if len(density.event_shape) == 3 else marginal_cdfs.dispatch(Distribution)(density, value)
 
 
@@ -119,17 +119,17 @@ def _(density: Independent, value: Tensor) -> Tensor | None:
 def _(density: Independent, value: Tensor) -> Tensor | None:
     known = isinstance(density.base_dist, _ON_THE_LINE) and density.event_shape == (1,)
     # `normals` also handles a normal density of width 0
-    found = marginal_cdfs(density, value) if known and normals(density) is None else None
-    return cdf.dispatch(Distribution)(density, value) if found is None else found.squeeze(-1)
+    probabilities = marginal_cdfs(density, value) if known and normals(density) is None else None
+    return cdf.dispatch(Distribution)(density, value) if probabilities is None else probabilities.squeeze(-1)
 
 
 @marginal.register
 def _(density: MultivariateNormal, index: int) -> MultivariateNormal:
     if density.event_shape == (1,) and index == 0:
         return density
-    here = slice(index, index + 1)
-    scale = density.variance[..., here].sqrt().unsqueeze(-1)
-    return MultivariateNormal(density.loc[..., here], scale_tril=scale, validate_args=False)
+    column = slice(index, index + 1)
+    scale = density.variance[..., column].sqrt().unsqueeze(-1)
+    return MultivariateNormal(density.loc[..., column], scale_tril=scale, validate_args=False)
 
 
 @median.register
@@ -145,7 +145,7 @@ def _(density: Categorical, index: Tensor) -> Distribution:
 
 @pick.register
 def _(density: Independent, index: Tensor) -> Distribution:
-    base = _of_each(density.base_dist, lambda parameter: take(parameter, index))
+    base = _change_parameters(density.base_dist, lambda parameter: take(parameter, index))
     if base is None or density.reinterpreted_batch_ndims != 1:
         return pick.dispatch(Distribution)(density, index)
     return Independent(base, 1, validate_args=False)
@@ -161,12 +161,12 @@ def _(density: Independent, value: Tensor) -> QuadraticBound | None:
 
 
 @recentre.register
-def _(density: Independent, index: tuple[Tensor, ...], place: Tensor) -> Distribution:
+def _(density: Independent, index: tuple[Tensor, ...], origin: Tensor) -> Distribution:
     base = density.base_dist
     if not isinstance(base, Normal) or density.reinterpreted_batch_ndims != 1:
-        return recentre.dispatch(Distribution)(density, index, place)
+        return recentre.dispatch(Distribution)(density, index, origin)
     loc, scale = (parameter.double()[index] for parameter in (base.loc, base.scale))
-    return Independent(Normal(loc - place, scale, validate_args=False), 1, validate_args=False)
+    return Independent(Normal(loc - origin, scale, validate_args=False), 1, validate_args=False)
 
 
 @tempered_density.register
@@ -225,6 +225,6 @@ def _(density: MultivariateNormal, value: Tensor) -> Tensor:
     return standard.squeeze(-1).square().sum(-1)
 
 
-def normal_quantile(place: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-    """Return z with Φ(z) = place; places of [0, 1) that float64 cannot tell from an end become ±8.2, never infinite."""
-    return torch.special.ndtri(place.clamp(2.0**-54, 1 - 2.0**-53))
+def normal_quantile(probability: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+    """Return z with Φ(z) = probability; where float64 cannot tell the probability from 0 or 1, z is ±8.2, not infinite."""
+    return torch.special.ndtri(probability.clamp(2.0**-54, 1 - 2.0**-53))

@@ -48,7 +48,7 @@ __all__ = [
     "median",
     "pick",
     "take",
-]  # some of these moved to other files; the old import path keeps working
+]  # some of these are defined in other files now; the old import path keeps working
 
 circular_entropy = entropy_of_one
 CHUNK = 2**20
@@ -79,7 +79,7 @@ class Mixture(Distribution):
         if log_weights.shape != components.batch_shape:
             raise ValueError(
                 f"log_weights of shape {tuple(log_weights.shape)} do not fit components with batch_shape "
-                f"{tuple(components.batch_shape)}; wanted the same shape, the last dimension the components."
+                f"{tuple(components.batch_shape)}; expected the same shape, with the components in the last dimension."
             )
         self.log_weights = torch.log_softmax(log_weights, -1)
         self.components = components
@@ -159,8 +159,8 @@ class Mixture(Distribution):
     def variance(self) -> Tensor:
         """The variance of each real number, by the law of total variance."""
         _, offset, shares = self._moments()
-        apart = offset - (shares * offset).sum(self._axis, keepdim=True)
-        return (shares * (self.components.variance + apart.square())).sum(self._axis)
+        deviation = offset - (shares * offset).sum(self._axis, keepdim=True)
+        return (shares * (self.components.variance + deviation.square())).sum(self._axis)
 
     @property
     def _axis(self) -> int:
@@ -175,7 +175,7 @@ class Mixture(Distribution):
         """
         if self.has_enumerate_support or isinstance(self.support, Circular):
             raise NotImplementedError(
-                "Angles and classes have no mean; ask mode, median or circular_moments."
+                "Angles and classes have no mean. Use mode, median or circular_moments instead."
             )
         means = self.components.mean
         # offsets from one mean: float32 weights sum to 1 only to 1e-7, a large error for means far from 0
@@ -198,19 +198,24 @@ class Mixture(Distribution):
             return -(log_prob.exp() * log_prob.clamp(min=-1e4)).sum(0)
         if has_range(self):
             return entropy_of_one(self)
-        each = max(2, 1024 // count)
+        draws_per_component = max(2, 1024 // count)
         size = self.log_weights.numel() * self.event_shape.numel()
         at_once = max(1, LARGEST // max(1, size))
-        surprise = torch.cat([self._surprise(min(at_once, each - done)) for done in range(0, each, at_once)])
-        found = self.components.entropy() + surprise.mean(0)
-        return (self.log_weights.exp() * found).sum(-1)
+        surprise = torch.cat(
+            [
+                self._surprise(min(at_once, draws_per_component - start))
+                for start in range(0, draws_per_component, at_once)
+            ]
+        )
+        cross_entropies = self.components.entropy() + surprise.mean(0)
+        return (self.log_weights.exp() * cross_entropies).sum(-1)
 
     def _surprise(self, draws: int) -> Tensor:
         """Return log p_k - log f at `draws` draws of each component, (draw, *batch, component)."""
-        drawn = self.components.sample(torch.Size((draws,)))
-        values = drawn.movedim(-1 - len(self.event_shape), 1).flatten(0, 1)
+        samples = self.components.sample(torch.Size((draws,)))
+        values = samples.movedim(-1 - len(self.event_shape), 1).flatten(0, 1)
         mixed = self.log_prob(values).unflatten(0, (draws, self.log_weights.shape[-1])).movedim(1, -1)
-        return self.components.log_prob(drawn) - mixed
+        return self.components.log_prob(samples) - mixed
 
 
 def estimate_of_sum(parts: Estimate, log_terms: Tensor, log_sum: Tensor) -> Estimate:
@@ -242,7 +247,7 @@ def _(density: Mixture, value: Tensor) -> Estimate:
         return concatenate_estimates([estimate(density, part) for part in several])
     parts = estimate(density.components, value.unsqueeze(-1 - len(density.event_shape)))
     if density.log_weights.shape[-1] == 1:
-        return parts.each(lambda field: field.squeeze(-1))
+        return parts.map_fields(lambda field: field.squeeze(-1))
     error = parts.standard_error.masked_fill(density.log_weights == -math.inf, 0.0)
     log_terms = density.log_weights + parts.log_mean
     return estimate_of_sum(parts._replace(standard_error=error), log_terms, torch.logsumexp(log_terms, -1))
@@ -274,25 +279,29 @@ def _(density: Mixture, samples: int) -> Tensor:
 
 @cdf.register
 def _(density: Mixture, value: Tensor) -> Tensor | None:
-    found = cdf.dispatch(Distribution)(density, value)
-    if found is not None:
-        return found
-    return _mixed(density, cdf(density.components, value.unsqueeze(-2)))
+    probabilities = cdf.dispatch(Distribution)(density, value)
+    if probabilities is not None:
+        return probabilities
+    return _weighted_mean(density, cdf(density.components, value.unsqueeze(-2)))
 
 
 @marginal_cdfs.register
 def _(density: Mixture, value: Tensor) -> Tensor | None:
     axis = -1 - len(density.event_shape)
     parts = marginal_cdfs(density.components, value.unsqueeze(axis))
-    return _mixed(density, None if parts is None else parts.movedim(axis, -1), len(density.event_shape))
+    return _weighted_mean(
+        density, None if parts is None else parts.movedim(axis, -1), len(density.event_shape)
+    )
 
 
 @arc_probability.register
 def _(density: Mixture, start: Tensor, end: Tensor) -> Tensor | None:
-    return _mixed(density, arc_probability(density.components, start.unsqueeze(-2), end.unsqueeze(-2)))
+    return _weighted_mean(
+        density, arc_probability(density.components, start.unsqueeze(-2), end.unsqueeze(-2))
+    )
 
 
-def _mixed(density: Mixture, parts: Tensor | None, numbers: int = 0) -> Tensor | None:
+def _weighted_mean(density: Mixture, parts: Tensor | None, numbers: int = 0) -> Tensor | None:
     """Return the weighted mean of the components' `parts`, (*sample, *batch, *number, K)."""
     if parts is None:
         return None
@@ -315,8 +324,8 @@ def _(density: Mixture) -> Normals | None:
 def _(density: Mixture, value: Tensor) -> Tensor | None:
     if density.log_weights.shape[-1] > 1:
         return None
-    found = mahalanobis(density.components, value.unsqueeze(-2))
-    return None if found is None else found.squeeze(-1)
+    distance = mahalanobis(density.components, value.unsqueeze(-2))
+    return None if distance is None else distance.squeeze(-1)
 
 
 @quadratic_bound.register
@@ -356,27 +365,27 @@ def _(density: Reshaped, index: Tensor) -> Distribution:
 
 @mode_candidates.register
 def _(density: Mixture) -> Tensor:
-    found = mode_candidates(density.components).movedim(
+    candidates = mode_candidates(density.components).movedim(
         -1 - len(density.event_shape), 0
     )  # (K, peak, *batch, *event)
-    return found.flatten(0, 1)
+    return candidates.flatten(0, 1)
 
 
 @images.register
 def _(density: Mixture, channels: Collection[str]) -> dict[str, Tensor]:
     """Return the images of a single component; for several components over images, their mean.
 
-    Several components over other targets have no image: components that are each drawn at their own point prediction do
+    Several components over other targets have no image: components whose images show their own point predictions do
     not show the point prediction of the mixture.
     """
     if density.log_weights.shape[-1] == 1:
         axis = len(density.batch_shape)
-        return {name: found.squeeze(axis) for name, found in images(density.components, channels).items()}
+        return {name: image.squeeze(axis) for name, image in images(density.components, channels).items()}
     if len(density.event_shape) != 3 or set(channels) != {"color"}:
         return images.dispatch(Distribution)(density, channels)
-    drawn = images(density.components, channels)["color"]
+    component_images = images(density.components, channels)["color"]
     weights = density.log_weights.exp()[..., None, None, None]
-    return {"color": (weights * drawn).sum(len(density.batch_shape))}
+    return {"color": (weights * component_images).sum(len(density.batch_shape))}
 
 
 @peak_widths.register
@@ -385,10 +394,10 @@ def _(density: Mixture) -> Tensor:
 
 
 @recentre.register
-def _(density: Mixture, index: tuple[Tensor, ...], place: Tensor) -> Distribution:
-    every = torch.arange(density.log_weights.shape[-1], device=place.device)
+def _(density: Mixture, index: tuple[Tensor, ...], origin: Tensor) -> Distribution:
+    every = torch.arange(density.log_weights.shape[-1], device=origin.device)
     components = recentre(
-        density.components, (*(part.unsqueeze(-1) for part in index), every), place.unsqueeze(-2)
+        density.components, (*(part.unsqueeze(-1) for part in index), every), origin.unsqueeze(-2)
     )
     return Mixture(density.log_weights.double()[index].expand(components.batch_shape), components)
 
@@ -401,7 +410,7 @@ def circular_grid(density: Distribution, points: int = 360) -> tuple[Tensor, Ten
     """
     if tuple(density.event_shape) != (1,):
         raise ValueError(
-            f"wanted the density of one angle, got event_shape {tuple(density.event_shape)}; use marginal()."
+            f"Expected a density of one angle, but got event_shape {tuple(density.event_shape)}. Use marginal()."
         )
     # an empty sample has the density's dtype and device
     like = density.sample(torch.Size((0,)))

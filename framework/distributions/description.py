@@ -16,12 +16,12 @@ def one_line(self: Distribution) -> str:
     The function draws and integrates nothing. Densities use it as their `__repr__`.
     """
     batch, event = (tuple(shape) for shape in (self.batch_shape, self.event_shape))
-    said = [f"batch={batch}", f"event={event}"]
+    parts = [f"batch={batch}", f"event={event}"]
     names = getattr(self, "names", ())
     if names:
-        said.append(f"names={', '.join(map(str, names[:WHOLE]))}{', …' * (len(names) > WHOLE)}")
-    said += _parameters(self)
-    line = f"{type(self).__name__}({', '.join(said)})"
+        parts.append(f"names={', '.join(map(str, names[:WHOLE]))}{', …' * (len(names) > WHOLE)}")
+    parts += _parameters(self)
+    line = f"{type(self).__name__}({', '.join(parts)})"
     return line if len(line) <= LONGEST else f"{line[: LONGEST - 2]}…)"
 
 
@@ -33,8 +33,8 @@ class CategoricalDensity(Categorical):
 
 def _parameters(density: Distribution, inner: bool = True) -> list[str]:
     """Return the parameters of a density as text, and those of a density inside it if `inner` is true."""
-    found = ((key, _parameter(key, value, inner)) for key, value in vars(density).items())
-    return [f"{key}={text}" for key, text in found if text]
+    texts = ((key, _parameter(key, value, inner)) for key, value in vars(density).items())
+    return [f"{key}={text}" for key, text in texts if text]
 
 
 def _parameter(key: str, value: object, inner: bool) -> str:

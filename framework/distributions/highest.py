@@ -8,8 +8,9 @@ from framework.distributions.circular import Circular, wrap
 from framework.distributions.protocol import QuadraticBound, quadratic_bound
 
 STARTS = 3
-"""Number of the given places, the highest ones, from which the search starts."""
+"""Number of starting points of the search: those of the given places where the density is highest."""
 STEPS = 16
+"""Largest number of steps."""
 LONGEST = 16.0
 """Longest step, as a multiple of the step to the maximum of the bound."""
 
@@ -17,18 +18,18 @@ LONGEST = 16.0
 def highest(density: Distribution, places: Tensor) -> Tensor:
     """Return a point (*batch, *event) where the density is at least as high as at all `places` (place, *batch, *event).
 
-    Where the density knows its `slope`, the point is a local maximum, up to the rounding of log_prob and within STEPS
+    Where the density knows its `quadratic_bound`, the point is a local maximum, up to the rounding of log_prob and within STEPS
     steps from the highest places. It is not the global maximum if no ascent from these places leads there. Where the
-    `slope` is not known, the point is the best of `places`.
+    `quadratic_bound` is not known, the point is the best of `places`.
     """
     height, which = density.log_prob(places).topk(min(STARTS, len(places)), 0)
     start = places.gather(0, _over_event(density, which))
-    top, height = _climbed(density, start, height)
+    top, height = _climb(density, start, height)
     return top.gather(0, _over_event(density, height.argmax(0, keepdim=True))).squeeze(0)
 
 
 def crossings(components: Distribution, modes: Tensor) -> Tensor:
-    """Return maxima of the products of two of K components, (place, *batch, *event), where their `slope` is known.
+    """Return maxima of the products of two of K components, (place, *batch, *event), where their `quadratic_bound` is known.
 
     Two components that are narrow in different numbers may be highest together far from the mode of each.
 
@@ -41,11 +42,11 @@ def crossings(components: Distribution, modes: Tensor) -> Tensor:
     if both is None:
         return modes[:0]
     own = both.stiffness.diagonal(dim1=0, dim2=-2).movedim(-1, 0).unsqueeze(-2)
-    step = _to_top(both.pull, both.stiffness + own, isinstance(components.support, Circular))
+    step = _step_to_top(both.pull, both.stiffness + own, isinstance(components.support, Circular))
     return (modes.unsqueeze(-2) + step).movedim(-2, 0).flatten(0, 1)
 
 
-def _to_top(pull: Tensor, stiffness: Tensor, angles: bool) -> Tensor:
+def _step_to_top(pull: Tensor, stiffness: Tensor, angles: bool) -> Tensor:
     """Return the step from where a bound touches the density to the bound's maximum; 0 where it is not finite."""
     return (torch.atan2(pull, stiffness) if angles else pull / stiffness).nan_to_num(0.0, 0.0, 0.0)
 
@@ -56,41 +57,41 @@ def _over_event(density: Distribution, index: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def _climbed(density: Distribution, place: Tensor, height: Tensor) -> tuple[Tensor, Tensor]:
-    """Return places (start, *batch, *event) from which no step leads further up, and their log-densities.
+def _climb(density: Distribution, place: Tensor, height: Tensor) -> tuple[Tensor, Tensor]:
+    """Return local maxima (start, *batch, *event), one for each starting point, and their log-densities.
 
     A step leads to the maximum of the bound, where the density is never lower. The step is lengthened by what the last
     step showed (the secant method). For one number this is Newton's method near the maximum, without a second
     derivative.
     """
-    here = quadratic_bound(density, place)
-    if here is None:
+    bound = quadratic_bound(density, place)
+    if bound is None:
         return place, height
     angles = isinstance(density.support, Circular)
     least = 4 * torch.finfo(height.dtype).eps
     reach, rising = torch.ones_like(height), torch.ones_like(height, dtype=torch.bool)
     for _ in range(STEPS):
-        step = _to_top(here.pull, here.stiffness, angles)
-        gain = (here.pull * step).sum(-1)
+        step = _step_to_top(bound.pull, bound.stiffness, angles)
+        gain = (bound.pull * step).sum(-1)
         rising = rising & (gain > least * height.abs().clamp(min=1))
         if not bool(rising.any()):
             break
-        there = place + reach.unsqueeze(-1) * step
-        there = wrap(there) if angles else there
-        found = quadratic_bound(density, there)
-        assert found is not None
-        up = rising & (found.log_prob > height)
+        next_place = place + reach.unsqueeze(-1) * step
+        next_place = wrap(next_place) if angles else next_place
+        next_bound = quadratic_bound(density, next_place)
+        assert next_bound is not None
+        up = rising & (next_bound.log_prob > height)
         # where not even the bound's maximum is higher, only rounding is left
         rising = up | (rising & (reach > 1))
-        left = (found.pull * step).sum(-1) / gain
+        left = (next_bound.pull * step).sum(-1) / gain
         longer = torch.where(left < 1, reach / (1 - left), LONGEST).clamp(1, LONGEST)
         reach = torch.where(up, longer, 1.0)
         wide = up.unsqueeze(-1)
-        place = torch.where(wide, there, place)
-        height = torch.where(up, found.log_prob, height)
-        here = QuadraticBound(
+        place = torch.where(wide, next_place, place)
+        height = torch.where(up, next_bound.log_prob, height)
+        bound = QuadraticBound(
             height,
-            torch.where(wide, found.pull, here.pull),
-            torch.where(wide, found.stiffness, here.stiffness),
+            torch.where(wide, next_bound.pull, bound.pull),
+            torch.where(wide, next_bound.stiffness, bound.stiffness),
         )
     return place, height

@@ -71,7 +71,7 @@ class Interval(NamedTuple):
 def central_interval(density: Distribution, mass: float, draws: int = DRAWS) -> Interval:
     """Return the central interval with the given mass for each number of a density of reals or angles.
 
-    Ends are computed from `normals`, `cdf` or `arc`, or from the Fourier series of an angle's density
+    Ends are computed from `normals`, `cdf` or `arc_probability`, or from the Fourier series of an angle's density
     (`circular_moments`), where these are known; otherwise they are order statistics of `draws` draws.
 
     Args:
@@ -86,26 +86,26 @@ def central_interval(density: Distribution, mass: float, draws: int = DRAWS) -> 
         return Interval(*ends, *(scale * error for error in inner[2:]))
     angles = isinstance(density.support, Circular)
     if density.event_shape.numel() == 1:
-        known = _angle(density, mass) if angles else _real(density, mass)
+        known = _interval_of_angle(density, mass) if angles else _interval_of_real(density, mass)
         if known is None:
-            return _of_draws(density, mass, draws)
+            return _interval_of_draws(density, mass, draws)
         missing = known.low.isnan()
         # draws do not help where the density is NaN
         lost = missing & ~density.log_prob(density.sample()).isnan().unsqueeze(-1)
-        return _where(lost, _of_draws(density, mass, draws), known) if bool(lost.any()) else known
+        return _select(lost, _interval_of_draws(density, mass, draws), known) if bool(lost.any()) else known
     try:
         parts = [marginal(density, index) for index in range(density.event_shape[0])]
     except UserError:
-        return _of_draws(density, mass, draws)
-    found = [central_interval(part, mass, draws) for part in parts]
-    return Interval(*(torch.cat(ends, -1) for ends in zip(*found, strict=True)))
+        return _interval_of_draws(density, mass, draws)
+    intervals = [central_interval(part, mass, draws) for part in parts]
+    return Interval(*(torch.cat(ends, -1) for ends in zip(*intervals, strict=True)))
 
 
-def _where(chosen: Tensor, one: Interval, other: Interval) -> Interval:
-    return Interval(*(torch.where(chosen, *pair) for pair in zip(one, other, strict=True)))
+def _select(chosen: Tensor, first: Interval, second: Interval) -> Interval:
+    return Interval(*(torch.where(chosen, *pair) for pair in zip(first, second, strict=True)))
 
 
-def _exact(low: Tensor, high: Tensor) -> Interval:
+def _exact_interval(low: Tensor, high: Tensor) -> Interval:
     """Return the interval with the computed ends (*batch,), and errors of 0."""
     none = torch.zeros_like(low).unsqueeze(-1)
     return Interval(low.unsqueeze(-1), high.unsqueeze(-1), none, none)
@@ -116,35 +116,35 @@ def _tails(mass: float) -> Tensor:
     return torch.tensor([(1 - mass) / 2, (1 + mass) / 2], dtype=torch.float64)
 
 
-def _real(density: Distribution, mass: float) -> Interval | None:
+def _interval_of_real(density: Distribution, mass: float) -> Interval | None:
     """Return the interval of one real number whose distribution function is known; None if it is not."""
     below = _tails(mass)
     known = normals(density)
     if known is not None:
-        return _exact(*_of_normals(known, below.to(known.mean)))
+        return _exact_interval(*_normal_quantiles(known, below.to(known.mean)))
     like = density.sample(torch.Size((33,))).double()
     below = below.to(like.device)
     if cdf(density, like[0].to(density.sample().dtype)) is None:
         return None
-    return _exact(*_outward(partial(_cdf_of, density), below, like.squeeze(-1)))
+    return _exact_interval(*_widen_bracket(partial(_cdf_of, density), below, like.squeeze(-1)))
 
 
 def _cdf_of(density: Distribution, value: Float[Tensor, "place *batch"]) -> Tensor:
-    found = cdf(density, value.unsqueeze(-1))
-    assert found is not None
-    return found
+    probability = cdf(density, value.unsqueeze(-1))
+    assert probability is not None
+    return probability
 
 
-def _of_normals(known: Normals, below: Float[Tensor, "place"]) -> Float[Tensor, "place *batch"]:
+def _normal_quantiles(known: Normals, below: Float[Tensor, "place"]) -> Float[Tensor, "place *batch"]:
     """Return quantiles of mixtures of normals; they lie between the quantiles of the components."""
     z = normal_quantile(below).reshape(-1, *(1,) * known.mean.dim())
-    each = known.mean + z * known.scale  # (place, *batch, component)
+    quantiles = known.mean + z * known.scale  # (place, *batch, component)
     if known.mean.shape[-1] == 1:
-        return each.squeeze(-1)
+        return quantiles.squeeze(-1)
     weights = known.log_weights.exp()
     counts = weights > 0
-    low = torch.where(counts, each, math.inf).amin(-1)
-    high = torch.where(counts, each, -math.inf).amax(-1)
+    low = torch.where(counts, quantiles, math.inf).amin(-1)
+    high = torch.where(counts, quantiles, -math.inf).amax(-1)
 
     def mass_below(value: Tensor) -> Tensor:
         residual = value.unsqueeze(-1) - known.mean
@@ -156,16 +156,18 @@ def _of_normals(known: Normals, below: Float[Tensor, "place"]) -> Float[Tensor, 
     return find_crossing(mass_below, wanted, low, high, center)
 
 
-def _outward(
-    mass_below: Callable[[Tensor], Tensor], below: Float[Tensor, "place"], drawn: Float[Tensor, "draw *batch"]
+def _widen_bracket(
+    mass_below: Callable[[Tensor], Tensor],
+    below: Float[Tensor, "place"],
+    samples: Float[Tensor, "draw *batch"],
 ) -> Float[Tensor, "place *batch"]:
     """Return quantiles of any density of one real number, from a bracket that grows until it contains them.
 
     The bracket starts from a few draws.
     """
-    center = drawn.median(0).values
-    drawn = drawn.sort(0).values
-    wide = drawn[-1 - len(drawn) // 4] - drawn[len(drawn) // 4]
+    center = samples.median(0).values
+    samples = samples.sort(0).values
+    wide = samples[-1 - len(samples) // 4] - samples[len(samples) // 4]
     # if all draws are equal, the width is the last digit of this number
     step = torch.maximum(wide, 1e-7 * center.abs()).clamp(min=1e-300)
     wanted = below.reshape(-1, *(1,) * center.dim())
@@ -185,14 +187,14 @@ def _outward(
 def find_crossing(
     rising: Callable[[Tensor], Tensor], wanted: Tensor, low: Tensor, high: Tensor, center: Tensor
 ) -> Tensor:
-    """Return the place where a function that never falls reaches `wanted`; NaN where the function is NaN.
+    """Return the argument at which a function that never falls reaches `wanted`; NaN where the function is NaN.
 
     The search uses inverse quadratic interpolation where it is safe and bisection elsewhere (Chandrupatla 1997), item
     by item.
 
     Args:
         rising: the function, which never falls.
-        wanted: the value that the function shall reach.
+        wanted: the value to reach.
         low: lower end of a bracket.
         high: upper end of the bracket.
         center: reference point; the search ends where the bracket is as narrow as EXACT times the distance from it,
@@ -223,21 +225,21 @@ def find_crossing(
             break
         across, rise = (a - b) / (c - b), (over_a - over_b) / (over_c - over_b)
         safe = (1 - (1 - across).sqrt() < rise) & (rise < across.sqrt())
-        found = over_a / (over_b - over_a) * over_c / (over_b - over_c) + (c - a) / (b - a) * over_a / (
-            over_c - over_a
-        ) * over_b / (over_c - over_b)
-        part = torch.where(safe & found.isfinite(), found, 0.5)
+        interpolated = over_a / (over_b - over_a) * over_c / (over_b - over_c) + (c - a) / (
+            b - a
+        ) * over_a / (over_c - over_a) * over_b / (over_c - over_b)
+        part = torch.where(safe & interpolated.isfinite(), interpolated, 0.5)
         edge = (least / (2 * width)).nan_to_num(nan=0.5).clamp(max=0.5)
         part = torch.maximum(edge, torch.minimum(part, 1 - edge))
     return torch.where(broken, math.nan, best)
 
 
-def _angle(density: Distribution, mass: float) -> Interval | None:
-    """Return the interval of one angle; NaN where neither arcs nor the Fourier series are known."""
+def _interval_of_angle(density: Distribution, mass: float) -> Interval | None:
+    """Return the interval of one angle; NaN where neither the probability of arcs nor the Fourier series is known."""
     flat = Reshaped(density, (density.batch_shape.numel(),))
     if not len(flat.batch_shape) or flat.batch_shape.numel() == 0:
         return None
-    law = _arcs(flat)
+    law = _arc_function(flat)
     support = density.support
     assert isinstance(support, Circular)
     low, high = support.ranges[0] if support.ranges is not None else (-math.pi, math.pi)
@@ -250,18 +252,18 @@ def _angle(density: Distribution, mass: float) -> Interval | None:
             return law(places.expand_as(value), value)
 
         ends = find_crossing(mass_below, below, places, torch.full_like(places, high), places)
-        return _exact(*(end.reshape(density.batch_shape) for end in ends))
+        return _exact_interval(*(end.reshape(density.batch_shape) for end in ends))
     center = _circular_center(law, flat)
-    ahead = _reach(lambda width: law(center.expand_as(width), center + width), mass / 2, center)
-    behind = _reach(lambda width: law(center - width, center.expand_as(width)), mass / 2, center)
+    ahead = _width_of_mass(lambda width: law(center.expand_as(width), center + width), mass / 2, center)
+    behind = _width_of_mass(lambda width: law(center - width, center.expand_as(width)), mass / 2, center)
     first = wrap(center - behind)
-    return _exact(*(end.reshape(density.batch_shape) for end in (first, first + behind + ahead)))
+    return _exact_interval(*(end.reshape(density.batch_shape) for end in (first, first + behind + ahead)))
 
 
-def _reach(
+def _width_of_mass(
     mass_within: Callable[[Tensor], Tensor], wanted: float, center: Float[Tensor, "item"]
 ) -> Float[Tensor, "item"]:
-    """Return the width, radians up to π, within which the mass is `wanted`."""
+    """Return the width, radians up to π, of the arc next to `center` that holds the mass `wanted`."""
     power = torch.arange(RUNGS, dtype=torch.float64, device=center.device).unsqueeze(-1)
     rungs = (math.pi * NARROWER**-power).expand(RUNGS, len(center))
     enough = (mass_within(rungs) >= wanted).sum(0).clamp(min=1)  # falling
@@ -271,28 +273,28 @@ def _reach(
     return find_crossing(mass_within, torch.full_like(center, wanted), low, high, none)
 
 
-def _arcs(flat: Distribution) -> Callable[[Tensor, Tensor], Tensor]:
-    """Return a function that gives the mass from one angle counter-clockwise to another, (*sample, item) each.
+def _arc_function(flat: Distribution) -> Callable[[Tensor, Tensor], Tensor]:
+    """Return a function of two angles, (*sample, item) each, that gives the mass of the arc counter-clockwise between them.
 
-    The mass is NaN for items of which it is not known.
+    The mass is NaN for items for which it is not known.
     """
     probe = torch.zeros((*flat.batch_shape, 1), dtype=torch.float64, device=flat.sample().device)
     if arc_probability(flat, probe, probe + 1) is not None:
 
-        def known(start: Tensor, end: Tensor) -> Tensor:
-            found = arc_probability(flat, start.unsqueeze(-1), end.unsqueeze(-1))
-            assert found is not None
-            return found
+        def exact(start: Tensor, end: Tensor) -> Tensor:
+            probability = arc_probability(flat, start.unsqueeze(-1), end.unsqueeze(-1))
+            assert probability is not None
+            return probability
 
-        return known
+        return exact
     series = circular_moments(flat)
 
-    def summed(start: Tensor, end: Tensor) -> Tensor:
+    def from_series(start: Tensor, end: Tensor) -> Tensor:
         return torch.where(
             series.resolved, series.arc_probability(*torch.broadcast_tensors(start, end)), math.nan
         )
 
-    return summed
+    return from_series
 
 
 def _circular_center(law: Callable[[Tensor, Tensor], Tensor], flat: Distribution) -> Float[Tensor, "item"]:
@@ -313,12 +315,12 @@ def _circular_center(law: Callable[[Tensor, Tensor], Tensor], flat: Distribution
     crosses = (behind < 0) & (ends >= 0)
     index = torch.where(crosses, lowest, math.inf).argmin(0, keepdim=True)
     start, stop = nodes.gather(0, index).squeeze(0), last.gather(0, index).squeeze(0)
-    found = find_crossing(
+    middle = find_crossing(
         lambda angle: law(angle - math.pi, angle), torch.full_like(start, 0.5), start, stop, start
     )
     # a density without a middle (the uniform one) has no crossing; its mode is as good as any angle
     mode = flat.mode.squeeze(-1).double()
-    return wrap(torch.where(crosses.any(0) | behind.isnan().any(0), found, mode))
+    return wrap(torch.where(crosses.any(0) | behind.isnan().any(0), middle, mode))
 
 
 def _nodes(flat: Distribution) -> Float[Tensor, "node item"]:
@@ -328,23 +330,23 @@ def _nodes(flat: Distribution) -> Float[Tensor, "node item"]:
     near = torch.tensor([-3, -1, 0, 1, 3], dtype=torch.float64, device=places.device)
     around = (places + near.reshape(-1, 1, 1) * width).flatten(0, 1)
     even = torch.linspace(-math.pi, math.pi, AROUND + 1, dtype=torch.float64, device=places.device)[:-1]
-    found = torch.cat([wrap(around), even.unsqueeze(-1).expand(-1, places.shape[-1])])
-    return found.sort(0).values
+    angles = torch.cat([wrap(around), even.unsqueeze(-1).expand(-1, places.shape[-1])])
+    return angles.sort(0).values
 
 
-def _of_draws(density: Distribution, mass: float, draws: int) -> Interval:
+def _interval_of_draws(density: Distribution, mass: float, draws: int) -> Interval:
     """Return an interval of order statistics: of n draws, the i-th is the quantile i / (n + 1).
 
     Angles are ordered about their circular median.
     """
-    drawn = density.sample(torch.Size((draws,))).double()
+    samples = density.sample(torch.Size((draws,))).double()
     angles = isinstance(density.support, Circular)
-    middle_angle = circular_median(drawn) if angles else torch.zeros_like(drawn[0])
+    middle_angle = circular_median(samples) if angles else torch.zeros_like(samples[0])
     support = density.support
     if isinstance(support, Circular) and support.ranges is not None:
         part = [high - low < 2 * math.pi - 1e-9 for low, high in support.ranges]
-        middle_angle = torch.where(torch.tensor(part, device=drawn.device), 0.0, middle_angle)
-    ordered = (wrap(drawn - middle_angle) if angles else drawn).sort(0).values
+        middle_angle = torch.where(torch.tensor(part, device=samples.device), 0.0, middle_angle)
+    ordered = (wrap(samples - middle_angle) if angles else samples).sort(0).values
     tail = (1 - mass) / 2
     rank = min(draws // 2, max(0, round(tail * (draws + 1)) - 1))
     low, high = ordered[rank], ordered[-1 - rank]

@@ -1,4 +1,4 @@
-"""Random noise that depends on its purpose alone: (seed, step) in training, (seed, batch, question) in evaluation."""
+"""Random noise that depends on its purpose alone: (seed, step) in training, (seed, batch, quantity) in evaluation."""
 
 import hashlib
 import random
@@ -14,7 +14,7 @@ from framework.storage.names import as_bytes
 
 @dataclass(frozen=True)
 class Draw:
-    """The noise of one evaluated batch; what one question draws does not depend on which other questions are asked.
+    """The noise of one evaluated batch; the draws for one quantity do not depend on which other quantities are computed.
 
     Attributes:
         seed: seed of the run.
@@ -25,11 +25,11 @@ class Draw:
     number: int
 
     @contextmanager
-    def __call__(self, question: str) -> Iterator[None]:
-        """Seed the noise for this question within the context; afterwards torch's generators go on where they were."""
+    def __call__(self, quantity: str) -> Iterator[None]:
+        """Seed the noise for this quantity within the context; afterwards torch's generators continue as before."""
         devices = [torch.cuda.current_device()] if torch.cuda.is_initialized() else []
         with torch.random.fork_rng(devices):
-            seed_step(self.seed, self.number, question)
+            seed_step(self.seed, self.number, quantity)
             yield
 
 
@@ -50,6 +50,6 @@ def seed_step(seed: int, step: int, stage: str, rank: int = 0) -> None:
 
 
 def stable_hash(*parts: int | str) -> int:
-    """Return 64 bits that depend on every part and are the same on every machine."""
+    """Return a 64-bit hash of all parts that is the same on every machine."""
     digest = hashlib.blake2b(as_bytes("|".join(map(str, parts))), digest_size=8).digest()
     return int.from_bytes(digest, "little")

@@ -34,8 +34,8 @@ def _(density: IndependentNormals, samples: int) -> Tensor:
 
 @marginal.register
 def _(density: IndependentNormals, index: int) -> IndependentNormals:
-    here = slice(index, index + 1)
-    return IndependentNormals(density.mean[..., here], density.base_dist.scale[..., here])
+    column = slice(index, index + 1)
+    return IndependentNormals(density.mean[..., column], density.base_dist.scale[..., column])
 
 
 @tempered_density.register

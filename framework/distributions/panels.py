@@ -83,10 +83,10 @@ def has_range(density: Distribution) -> bool:
 def entropy_of_one(density: Distribution) -> Float[Tensor, "*batch"]:
     """Return the entropy of a density of one number, nats: to 1e-9 in float64, and to its rounding in float32.
 
-    Panels begin at the density's `peaks`, the first as wide as their `scales`, and are halved until two rules agree.
+    Panels begin at the density's `mode_candidates`, the first as wide as their `peak_widths`, and are halved until two rules agree.
     Their nodes are given relative to the peak, so that the rounding of the number itself does not limit how narrow a
     peak may be. The mass checks the result: where it differs from 1 by more than 1e-7 (float32: 1e-4), some peak is
-    missing from `peaks`, or a tail is too long. Then the mean of -log_prob over DRAWS draws is returned instead, and
+    missing from `mode_candidates`, or a tail is too long. Then the mean of -log_prob over DRAWS draws is returned instead, and
     the log says so. A density with more than LARGEST peaks gets this mean too. NaN stays NaN. The result is
     differentiable like the density.
     """
@@ -107,22 +107,22 @@ def entropy_of_one(density: Distribution) -> Float[Tensor, "*batch"]:
         panels = first_panels(flat, places)
         step = max(1, AT_ONCE // (len(NODES) * len(places)))
         tolerance = TOLERANCE.get(dtype, 1e-6)
-        accepted, sums = resolved_panels(flat, panels, step, tolerance)
+        accepted, sums = refine_panels(flat, panels, step, tolerance)
     if torch.is_grad_enabled():
-        sums = torch.cat([sums_on(flat, part)[0] for part in split(accepted, step)], -1)
+        sums = torch.cat([integrate(flat, part)[0] for part in split(accepted, step)], -1)
     mass, entropy = torch.zeros(2, items, dtype=sums.dtype, device=sums.device).index_add(
         1, accepted.item, sums
     )
     # entropy of the density normalised on these nodes
-    found = entropy / mass + mass.log()
+    result = entropy / mass + mass.log()
     missed = ((mass - 1).abs() > MASS_GAP * tolerance).detach()
     if bool(missed.any()):
         _log.warning(
-            "%d of %d densities (%s) have their mass where quadrature does not find it; their entropies are means over "
+            "Quadrature does not find all the mass of %d of %d densities (%s); their entropies are means over "
             "%d draws.", int(missed.sum()), items, type(density).__name__, DRAWS,
         )  # fmt: skip
-        found = torch.where(missed, drawn_entropy(flat).to(found), found)
-    return found.reshape(density.batch_shape).to(dtype)
+        result = torch.where(missed, drawn_entropy(flat).to(result), result)
+    return result.reshape(density.batch_shape).to(dtype)
 
 
 def drawn_entropy(density: Distribution) -> Float[Tensor, "*batch"]:
@@ -145,7 +145,7 @@ def split(panels: Panels, step: int) -> list[Panels]:
     return [Panels(*part) for part in zip(*(column.split(step) for column in panels), strict=True)]
 
 
-def sums_on(density: Distribution, panels: Panels) -> tuple[Tensor, Tensor]:
+def integrate(density: Distribution, panels: Panels) -> tuple[Tensor, Tensor]:
     """Return ∫ p and -∫ p log p on each panel, (2, panel), and the coarse rule's largest difference there, (panel,)."""
     like = panels.place
     half = (panels.high - panels.low) / 2
@@ -159,23 +159,23 @@ def sums_on(density: Distribution, panels: Panels) -> tuple[Tensor, Tensor]:
     return fine, (fine - coarse).detach().abs().amax(0)
 
 
-def resolved_panels(
+def refine_panels(
     density: Distribution, panels: Panels, step: int, tolerance: float
 ) -> tuple[Panels, Tensor]:
     """Return panels halved until both rules agree, and the sums on them."""
     items = density.batch_shape.numel()
-    done: list[tuple[Panels, Tensor]] = []
+    finished: list[tuple[Panels, Tensor]] = []
     for number in range(ROUNDS + 1):
-        parts = [sums_on(density, part) for part in split(panels, step)]
-        sums, error = (torch.cat(each, -1) for each in zip(*parts, strict=True))
+        parts = [integrate(density, part) for part in split(panels, step)]
+        sums, error = (torch.cat(pair, -1) for pair in zip(*parts, strict=True))
         more = error > tolerance  # false for NaN, which halving would not remove
         crowded = torch.bincount(panels.item[more], minlength=items) > MOST
         more &= ~crowded[panels.item] & (number < ROUNDS)
-        done.append((panels.of(~more), sums[:, ~more]))
+        finished.append((panels.of(~more), sums[:, ~more]))
         if not bool(more.any()):
             break
         panels = panels.of(more).halves()
-    accepted, sums = zip(*done, strict=True)
+    accepted, sums = zip(*finished, strict=True)
     return Panels(*map(torch.cat, zip(*accepted, strict=True))), torch.cat(sums, -1)
 
 
@@ -184,7 +184,7 @@ def first_panels(density: Distribution, place: Float[Tensor, "peak item"]) -> Pa
 
     Args:
         density: the density of one number.
-        place: the density's `peaks`.
+        place: the density's `mode_candidates`.
     """
     scale = known_scales(density)  # (peak, item)
     support = density.support
@@ -197,7 +197,7 @@ def first_panels(density: Distribution, place: Float[Tensor, "peak item"]) -> Pa
     rows = max(1, AT_ONCE // len(place) ** 2)
     nearest = [
         torch.cat(
-            [_scale_there(some, *part, closed) for some in part[0].split(max(1, AT_ONCE // len(place)))]
+            [_smallest_scale_at(some, *part, closed) for some in part[0].split(max(1, AT_ONCE // len(place)))]
         )
         for part in zip(place.split(rows, 1), scale.split(rows, 1), strict=True)
     ]
@@ -217,27 +217,27 @@ def first_panels(density: Distribution, place: Float[Tensor, "peak item"]) -> Pa
     for sign, length in ((-1, before), (1, after)):
         end = (length / scale).asinh()
         count = (end / WIDTH).ceil().to(torch.int64).flatten()
-        each = [column.flatten().repeat_interleave(count) for column in (item, place, scale, end / WIDTH)]
-        number = torch.arange(len(each[0]), device=place.device) - (
+        columns = [column.flatten().repeat_interleave(count) for column in (item, place, scale, end / WIDTH)]
+        number = torch.arange(len(columns[0]), device=place.device) - (
             count.cumsum(0) - count
         ).repeat_interleave(count)
-        stop = torch.minimum(number + 1, each[3]) * WIDTH
+        stop = torch.minimum(number + 1, columns[3]) * WIDTH
         ends = (number * WIDTH, stop) if sign > 0 else (-stop, -number * WIDTH)
-        sides.append((*each[:3], *ends))
+        sides.append((*columns[:3], *ends))
     return Panels(*map(torch.cat, zip(*sides, strict=True)))
 
 
 def known_scales(density: Distribution) -> Float[Tensor, "peak item"]:
-    """Return the density's `scales`, float64; 1 where a scale is not a finite number above 0."""
+    """Return the density's `peak_widths`, float64; 1 where a width is not a finite number above 0."""
     scale = peak_widths(density).double()
     return torch.where((scale > 0) & scale.isfinite(), scale, 1.0)
 
 
-def _scale_there(some: Tensor, place: Tensor, scale: Tensor, closed: bool) -> Tensor:
-    """Return at each of some peaks the least scale among all peaks that cover this place, (some, item)."""
-    apart = some.unsqueeze(1) - place  # (some, other, item)
-    apart = (wrap(apart) if closed else apart).abs()
-    return scale.expand_as(apart).where(apart <= 10 * scale, math.inf).amin(1)
+def _smallest_scale_at(some: Tensor, place: Tensor, scale: Tensor, closed: bool) -> Tensor:
+    """Return at each of the peaks `some` the least scale of all peaks that cover its position, (some, item)."""
+    distance = some.unsqueeze(1) - place  # (some, other, item)
+    distance = (wrap(distance) if closed else distance).abs()
+    return scale.expand_as(distance).where(distance <= 10 * scale, math.inf).amin(1)
 
 
 def first_in_cell(

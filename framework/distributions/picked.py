@@ -35,10 +35,10 @@ class PickedMixture(Distribution):
         *batch, _, _ = self.log_weights.shape
         lead = torch.Size(sample_shape) + self.index.shape[: self.index.dim() - len(batch)]
         index = self.index.expand((*sample_shape, *self.index.shape)).reshape(lead.numel(), *batch)
-        drawn = torch.cat([self._drawn(part) for part in index.split(self.rows)])
-        return drawn.reshape(*lead, *batch, *self.event_shape)
+        samples = torch.cat([self._sample_once(part) for part in index.split(self.rows)])
+        return samples.reshape(*lead, *batch, *self.event_shape)
 
-    def _drawn(self, index: Tensor) -> Tensor:
+    def _sample_once(self, index: Tensor) -> Tensor:
         """Return one sample of each mixture at `index` (sample, *batch)."""
         *_, mixtures, count = self.log_weights.shape
         which = torch.zeros_like(index)

@@ -60,10 +60,10 @@ def median(density: Distribution, samples: int) -> Tensor:
     """
     if density.has_enumerate_support:
         return density.mode
-    drawn = density.sample(torch.Size((samples,)))
+    draws = density.sample(torch.Size((samples,)))
     if isinstance(density.support, Circular):
-        return circular_median(drawn)
-    return drawn.median(0).values
+        return circular_median(draws)
+    return draws.median(0).values
 
 
 @singledispatch
@@ -96,15 +96,15 @@ class _Picked(Distribution):
 
     def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
         lead = self.index.shape[: self.index.dim() - len(self.density.batch_shape) + 1]
-        drawn = self.density.sample(torch.Size(sample_shape) + lead)  # (*sample, *lead, *batch, K, *event)
+        samples = self.density.sample(torch.Size(sample_shape) + lead)  # (*sample, *lead, *batch, K, *event)
         index = self.index.expand((*sample_shape, *self.index.shape))
         axis = index.dim()
         index = index.reshape(*index.shape, 1, *(1,) * len(self.event_shape))
-        return drawn.gather(axis, index.expand((*index.shape[: axis + 1], *self.event_shape))).squeeze(axis)
+        return samples.gather(axis, index.expand((*index.shape[: axis + 1], *self.event_shape))).squeeze(axis)
 
 
 @singledispatch
-def recentre(density: Distribution, index: tuple[Tensor, ...], place: Tensor) -> Distribution:
+def recentre(density: Distribution, index: tuple[Tensor, ...], origin: Tensor) -> Distribution:
     """Return the density of X - place, in float64, so that values near the place keep their digits.
 
     X has the density at `index` of the batch. Only `log_prob` of the returned density is used. Default: values are
@@ -114,9 +114,9 @@ def recentre(density: Distribution, index: tuple[Tensor, ...], place: Tensor) ->
     Args:
         density: density of one number, event_shape (1,).
         index: int64, one for each batch dimension; broadcast together they have the shape (*items).
-        place: (*items, 1).
+        origin: (*items, 1).
     """
-    return _Recentred(density, index, place)
+    return _Recentred(density, index, origin)
 
 
 class _Recentred(Distribution):
@@ -124,32 +124,32 @@ class _Recentred(Distribution):
 
     arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
 
-    def __init__(self, density: Distribution, index: tuple[Tensor, ...], place: Tensor) -> None:
+    def __init__(self, density: Distribution, index: tuple[Tensor, ...], origin: Tensor) -> None:
         self.density = density
-        self.place = place
+        self.origin = origin
         self.like = density.sample(torch.Size((0,)))
-        shape = torch.broadcast_shapes(place.shape[:-1], *(part.shape for part in index))
-        flat = torch.zeros(shape, dtype=torch.int64, device=place.device)
+        shape = torch.broadcast_shapes(origin.shape[:-1], *(part.shape for part in index))
+        flat = torch.zeros(shape, dtype=torch.int64, device=origin.device)
         for part, size in zip(index, density.batch_shape, strict=True):
             flat = flat * size + part
         self.item = flat.flatten()
         order = self.item.argsort(stable=True)
         count = torch.bincount(self.item, minlength=density.batch_shape.numel())
         first = (count.cumsum(0) - count)[self.item[order]]
-        self.turn = torch.empty_like(order)
-        self.turn[order] = torch.arange(len(order), device=order.device) - first
+        self.repetition = torch.empty_like(order)
+        self.repetition[order] = torch.arange(len(order), device=order.device) - first
         super().__init__(shape, density.event_shape, validate_args=False)
 
     def log_prob(self, value: Tensor) -> Tensor:
-        value = (value + self.place).to(self.like.dtype)
+        value = (value + self.origin).to(self.like.dtype)
         lead = value.shape[: value.dim() - len(self.batch_shape) - 1]
         value = value.expand(*lead, *self.batch_shape, 1).reshape(*lead, -1, 1)
-        turns = int(self.turn.amax()) + 1
-        whole = value.new_zeros(*lead, turns, self.density.batch_shape.numel(), 1)
-        whole[..., self.turn, self.item, :] = value
-        found = self.density.log_prob(whole.reshape(*lead, turns, *self.density.batch_shape, 1))
-        found = found.reshape(*lead, turns, -1)[..., self.turn, self.item]
-        return found.reshape(*lead, *self.batch_shape)
+        repetitions = int(self.repetition.amax()) + 1
+        whole = value.new_zeros(*lead, repetitions, self.density.batch_shape.numel(), 1)
+        whole[..., self.repetition, self.item, :] = value
+        log_prob = self.density.log_prob(whole.reshape(*lead, repetitions, *self.density.batch_shape, 1))
+        log_prob = log_prob.reshape(*lead, repetitions, -1)[..., self.repetition, self.item]
+        return log_prob.reshape(*lead, *self.batch_shape)
 
 
 @singledispatch
@@ -184,7 +184,7 @@ class Estimate(NamedTuple):
     samples: Tensor
     unresolved: Tensor
 
-    def each(self, change: Callable[[Tensor], Tensor]) -> "Estimate":
+    def map_fields(self, change: Callable[[Tensor], Tensor]) -> "Estimate":
         """Return an estimate with `change` applied to each of the five fields."""
         return Estimate(*map(change, self))
 
@@ -204,9 +204,9 @@ def estimate(density: Distribution, value: Tensor) -> Estimate:
     Default: log_prob with an error of NaN, "not known", since it is not known whether log_prob draws. A density whose
     log_prob is computed without drawing registers `exactly`; one that draws registers its own function.
     """
-    found = exact_estimate(density, value)
-    unknown = torch.full_like(found.log_mean, math.nan)
-    return estimate_with_error(found.log_mean, unknown, found.samples, found.unresolved)
+    result = exact_estimate(density, value)
+    unknown = torch.full_like(result.log_mean, math.nan)
+    return estimate_with_error(result.log_mean, unknown, result.samples, result.unresolved)
 
 
 def exact_estimate(density: Distribution, value: Tensor) -> Estimate:
@@ -222,13 +222,13 @@ def cdf(density: Distribution, value: Tensor) -> Tensor | None:
 
     Default: exact where `normals` knows the density as a mixture of normals, otherwise None, "not known".
     """
-    found = normals(density)
-    if found is None:
+    components = normals(density)
+    if components is None:
         return None
-    residual = value.double() - found.mean
+    residual = value.double() - components.mean
     # a point mass counts half at its place
-    standard = torch.where(residual == 0, residual, residual / found.scale)
-    weights = found.log_weights.exp()
+    standard = torch.where(residual == 0, residual, residual / components.scale)
+    weights = components.log_weights.exp()
     below = torch.where(weights > 0, weights * torch.special.ndtr(standard), 0.0)
     return below.sum(-1).clamp(max=1)
 
@@ -242,8 +242,8 @@ def marginal_cdfs(density: Distribution, value: Tensor) -> Tensor | None:
     """
     if len(density.event_shape) != 1:
         return None
-    here = range(density.event_shape[0])
-    parts = [cdf(marginal(density, index), value[..., index : index + 1]) for index in here]
+    indices = range(density.event_shape[0])
+    parts = [cdf(marginal(density, index), value[..., index : index + 1]) for index in indices]
     known = [part for part in parts if part is not None]
     return torch.stack(known, -1) if len(known) == len(parts) else None
 

@@ -49,7 +49,7 @@ _log = logging.getLogger(__name__)
 def temper(density: Distribution, temperature: Float[Tensor, ""]) -> Distribution:
     """Return the density proportional to p^(1/T), of the same shapes and number type; differentiable in T.
 
-    T = 1 gives the density itself, unless a gradient in T is wanted. For a mixture see `tempered`.
+    T = 1 gives the density itself, unless a gradient in T is wanted. For a mixture see `tempered_density`.
 
     Args:
         density: p.
@@ -61,7 +61,7 @@ def temper(density: Distribution, temperature: Float[Tensor, ""]) -> Distributio
     """
     value = float(temperature.detach())
     if not 0 < value < math.inf:
-        raise ValueError(f"temperature = {value}; wanted a finite number above 0.")
+        raise ValueError(f"Got temperature = {value}; expected a finite number above 0.")
     if value == 1 and not temperature.requires_grad:
         return density
     return tempered_density(density, temperature)
@@ -100,7 +100,9 @@ def tempered_classes(density: Distribution, temperature: Tensor) -> "RescaledCla
     log_prob = log_probabilities(density)
     # subtract the largest first, so that differences and not sizes are rounded; a probability of 0 stays 0
     heights = log_prob - log_prob.amax(-1, keepdim=True)
-    return RescaledClasses(divided(heights, temperature).log_softmax(-1), density, 1 / temperature)
+    return RescaledClasses(
+        divide_by_temperature(heights, temperature).log_softmax(-1), density, 1 / temperature
+    )
 
 
 def log_probabilities(density: Distribution) -> Float[Tensor, "*batch label"]:
@@ -108,7 +110,7 @@ def log_probabilities(density: Distribution) -> Float[Tensor, "*batch label"]:
     return density.log_prob(density.enumerate_support()).movedim(0, -1)
 
 
-def divided(log_density: Tensor, temperature: Tensor) -> Tensor:
+def divide_by_temperature(log_density: Tensor, temperature: Tensor) -> Tensor:
     """Return log p / T; -∞ stays -∞, without a gradient."""
     ruled_out = log_density == -math.inf
     return torch.where(ruled_out, -math.inf, log_density.masked_fill(ruled_out, 0.0) / temperature)
@@ -138,19 +140,21 @@ def _(density: RescaledClasses, value: Tensor) -> Estimate:
     """
     log_prob = density.log_prob(value)
     with torch.no_grad():
-        found = estimate(density.density, density.density.enumerate_support())
+        inner_estimate = estimate(density.density, density.density.enumerate_support())
         share = density.probs.movedim(-1, 0)
-        part = torch.where(found.standard_error == 0, 0.0, share * found.standard_error)
-        own = torch.where(found.standard_error == 0, 0.0, (1 - share) * found.standard_error)
+        part = torch.where(inner_estimate.standard_error == 0, 0.0, share * inner_estimate.standard_error)
+        own = torch.where(
+            inner_estimate.standard_error == 0, 0.0, (1 - share) * inner_estimate.standard_error
+        )
         error = density.slope.abs().to(log_prob) * (own + part.sum(0) - part)
         label = value.long().expand(log_prob.shape).unsqueeze(-1)
 
-        def of_label(each: Tensor) -> Tensor:
-            each = each.expand(share.shape).movedim(0, -1)
-            return each.expand(*log_prob.shape, each.shape[-1]).gather(-1, label).squeeze(-1)
+        def of_label(field: Tensor) -> Tensor:
+            field = field.expand(share.shape).movedim(0, -1)
+            return field.expand(*log_prob.shape, field.shape[-1]).gather(-1, label).squeeze(-1)
 
-        told = [of_label(each) for each in (error, found.samples, found.unresolved)]
-    return estimate_with_error(log_prob, *told)
+        fields = [of_label(field) for field in (error, inner_estimate.samples, inner_estimate.unresolved)]
+    return estimate_with_error(log_prob, *fields)
 
 
 class CircularPower(Distribution):
@@ -203,7 +207,7 @@ class CircularPower(Distribution):
         self.angles, log_width = self._grid(self.points)
         log_prob = self.density.log_prob(self.angles)  # (points, *batch)
         self.top = log_prob[0]
-        self.powers = divided(log_prob - self.top, self.temperature)
+        self.powers = divide_by_temperature(log_prob - self.top, self.temperature)
         self.log_width = log_width.to(log_prob.dtype)
         terms = self.powers + self.log_width
         self.log_normaliser, coarse = (terms[::every].logsumexp(0) + math.log(every) for every in (1, 2))
@@ -215,8 +219,8 @@ class CircularPower(Distribution):
             return off
         if self.points == MOST_POINTS:
             _log.warning(
-                "%d of %d densities (%s) have a mass between %.3g and %.3g on a grid of %d angles; wanted 1. A peak "
-                "that is narrower is left out of their power, or log_prob is not normalised.",
+                "%d of %d densities (%s) have a mass between %.3g and %.3g on a grid of %d angles, not 1: either "
+                "log_prob is not normalised, or the density has a narrower peak, which its power then lacks.",
                 int(missed.sum()), missed.numel(), type(self.density).__name__,
                 total[missed].amin().exp().item(), total[missed].amax().exp().item(), self.points,
             )  # fmt: skip
@@ -260,7 +264,7 @@ class CircularPower(Distribution):
     def power_of(self, log_prob: Tensor) -> Tensor:
         """Return log_prob of the power where log_prob of p is `log_prob`."""
         # relative to the mode's log-density, so that large log-densities do not cancel
-        return divided(log_prob - self.top, self.temperature) - self.log_normaliser
+        return divide_by_temperature(log_prob - self.top, self.temperature) - self.log_normaliser
 
     @property
     def mass(self) -> Float[Tensor, "points *batch"]:
@@ -272,17 +276,19 @@ class CircularPower(Distribution):
         shape = torch.Size(sample_shape)
         draws = torch.rand(shape.numel(), *self.batch_shape, dtype=torch.float64, device=self.start.device)
         offset, height = self._between
-        until = _cumulated(offset, height)
+        until = _cumulative_integral(offset, height)
         flat = draws.reshape(shape.numel(), len(until)).T.contiguous() * until[:, -1:]
         cell = torch.searchsorted(until, flat, right=True).clamp(1, until.shape[-1] - 1)
-        low, high, start, end = (each.gather(-1, at) for each in (height, offset) for at in (cell - 1, cell))
+        low, high, start, end = (
+            column.gather(-1, at) for column in (height, offset) for at in (cell - 1, cell)
+        )
         rest = (flat - until.gather(-1, cell - 1)).clamp(min=0)
         # the density rises from low to high across the cell: low t + slope t²/2 = rest
         width = (end - start).clamp(min=1e-300)
         root = (low.square() + 2 * (high - low) / width * rest).clamp(min=0).sqrt()
         step = (2 * rest / (low + root).clamp(min=1e-300)).clamp(max=width)
-        found = wrap(self.start.double() + (start + step).T.reshape(*shape, *self.batch_shape, 1))
-        return found.to(self.start.dtype)
+        samples = wrap(self.start.double() + (start + step).T.reshape(*shape, *self.batch_shape, 1))
+        return samples.to(self.start.dtype)
 
     @cached_property
     @torch.no_grad()
@@ -301,7 +307,7 @@ class CircularPower(Distribution):
             .reshape(self.points, batch)
             .T
         )
-        until = _cumulated(u, torch.cat([broad, broad[:, :1]], -1))
+        until = _cumulative_integral(u, torch.cat([broad, broad[:, :1]], -1))
         share = torch.linspace(0, 1, QUANTILES + 1, dtype=torch.float64, device=u.device)[:-1] * until[:, -1:]
         cell = torch.searchsorted(until, share.contiguous(), right=True).clamp(1, self.points)
         below, mass = until.gather(-1, cell - 1), until.gather(-1, cell) - until.gather(-1, cell - 1)
@@ -311,8 +317,12 @@ class CircularPower(Distribution):
         # the rounded angles that the density was evaluated at, not the exact ones
         offset = (angle.double() - self.start.double()).clamp(0, 2 * math.pi)
         offset[0], offset[-1] = 0.0, 2 * math.pi
-        height = divided(self.density.log_prob(angle).double() - self.top.double(), self.temperature).exp()
-        offset, height = (each.reshape(whole.shape[-1], batch).T.contiguous() for each in (offset, height))
+        height = divide_by_temperature(
+            self.density.log_prob(angle).double() - self.top.double(), self.temperature
+        ).exp()
+        offset, height = (
+            column.reshape(whole.shape[-1], batch).T.contiguous() for column in (offset, height)
+        )
         return offset, height
 
     def entropy(self) -> Tensor:
@@ -321,7 +331,7 @@ class CircularPower(Distribution):
         return self.log_normaliser - (self.mass * self.powers.clamp(min=-1e4)).sum(0)
 
 
-def _cumulated(place: Tensor, height: Float[Tensor, "item node"]) -> Float[Tensor, "item node"]:
+def _cumulative_integral(place: Tensor, height: Float[Tensor, "item node"]) -> Float[Tensor, "item node"]:
     """Return the integral from the first place on, by the trapezium rule.
 
     The places ascend; they are the same for all items, or given for each.
@@ -332,11 +342,11 @@ def _cumulated(place: Tensor, height: Float[Tensor, "item node"]) -> Float[Tenso
 
 @quadratic_bound.register
 def _(density: CircularPower, value: Tensor) -> QuadraticBound | None:
-    found = quadratic_bound(density.density, value)
-    if found is None:
+    bound = quadratic_bound(density.density, value)
+    if bound is None:
         return None
-    pull, stiffness = (part / density.temperature.to(part) for part in found[1:])
-    return QuadraticBound(density.power_of(found.log_prob), pull, stiffness)
+    pull, stiffness = (part / density.temperature.to(part) for part in bound[1:])
+    return QuadraticBound(density.power_of(bound.log_prob), pull, stiffness)
 
 
 @estimate.register
@@ -345,13 +355,13 @@ def _(density: CircularPower, value: Tensor) -> Estimate:
 
     The errors of p and of its normaliser may come from the same draws, so they are added.
     """
-    found = estimate(density.density, value)
-    log_prob = density.power_of(found.log_mean)
+    inner_estimate = estimate(density.density, value)
+    log_prob = density.power_of(inner_estimate.log_mean)
     with torch.no_grad():
         around = estimate(density.density, density.angles).standard_error
         of_normaliser = torch.where(around == 0, 0.0, density.mass * around).sum(0)
-        error = (found.standard_error + of_normaliser) / density.temperature.to(log_prob)
-    return estimate_with_error(log_prob, error, found.samples, found.unresolved)
+        error = (inner_estimate.standard_error + of_normaliser) / density.temperature.to(log_prob)
+    return estimate_with_error(log_prob, error, inner_estimate.samples, inner_estimate.unresolved)
 
 
 @images.register

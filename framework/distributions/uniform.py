@@ -42,9 +42,9 @@ def uniform(density: Distribution) -> Distribution:
     if isinstance(support, Circular) and support.ranges is None:
         return UniformAngles(density.sample(torch.Size((0,))), density.batch_shape, density.event_shape)
     raise UserError(
-        f"{type(density).__name__} has no uniform law over its support that the framework knows: wanted classes, whole "
-        "turns, or a density that registers one with `framework.distributions.uniform.uniform.register`; leave out "
-        "what needs it."
+        f"{type(density).__name__} has no uniform distribution over its support that the framework knows. Uniform "
+        "distributions are known for classes, for angles over the whole circle, and for densities that register one "
+        "with `framework.distributions.uniform.uniform.register`. Register one, or leave out the plugin that needs it."
     )
 
 
@@ -88,7 +88,7 @@ def _(density: Mixture) -> Distribution:
 
 @uniform.register
 def _(density: Stacked) -> Distribution:
-    return Stacked([uniform(one) for one in density.densities])
+    return Stacked([uniform(inner) for inner in density.densities])
 
 
 @uniform.register
@@ -110,9 +110,9 @@ def _(density: UniformAngles, index: Tensor) -> UniformAngles:
 
 
 @recentre.register
-def _(density: UniformAngles, index: tuple[Tensor, ...], place: Tensor) -> UniformAngles:
-    shape = torch.broadcast_shapes(place.shape[:-1], *(part.shape for part in index))
-    return UniformAngles(place, shape, density.event_shape)
+def _(density: UniformAngles, index: tuple[Tensor, ...], origin: Tensor) -> UniformAngles:
+    shape = torch.broadcast_shapes(origin.shape[:-1], *(part.shape for part in index))
+    return UniformAngles(origin, shape, density.event_shape)
 
 
 @arc_probability.register

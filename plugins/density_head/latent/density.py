@@ -191,7 +191,7 @@ def _(density: LatentDensity, value: Tensor) -> Estimate:
         found = estimate_log_mean(
             log_weights, len(items), density.effort, at_once=at_once, device=latent.center.device
         )
-    return found.each(lambda field: field.reshape(shape))
+    return found.map_fields(lambda field: field.reshape(shape))
 
 
 @marginal.register

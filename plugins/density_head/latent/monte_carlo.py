@@ -189,7 +189,7 @@ def estimate_log_mean(
         if effort.replicates * done * 2 > MOST:
             more = torch.zeros_like(more)
         found = found._replace(unresolved=wanting)
-        finished.append((rows[~more], found.each(lambda field, chosen=~more: field[chosen])))
+        finished.append((rows[~more], found.map_fields(lambda field, chosen=~more: field[chosen])))
         if not more.any():
             break
         rows = rows[more]
@@ -197,7 +197,7 @@ def estimate_log_mean(
         log_sums = torch.logaddexp(log_sums[..., more], further)
         done *= 2
     order = torch.cat([rows for rows, _ in finished]).argsort()
-    return concatenate_estimates([part for _, part in finished]).each(lambda field: field[order])
+    return concatenate_estimates([part for _, part in finished]).map_fields(lambda field: field[order])
 
 
 def _log_sums(

@@ -110,7 +110,7 @@ def _(density: Floored, value: Tensor) -> Estimate:
     found = estimate(density.density, value)
     log_sum, above = density.floored(value, found.log_mean)
     # the floor is exact
-    return estimate_of_sum(found.each(lambda field: field.unsqueeze(-1)), above.unsqueeze(-1), log_sum)
+    return estimate_of_sum(found.map_fields(lambda field: field.unsqueeze(-1)), above.unsqueeze(-1), log_sum)
 
 
 @arc_probability.register
