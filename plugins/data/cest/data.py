@@ -23,10 +23,10 @@ from framework.errors import DataError
 from framework.spectra.fit import fit
 from framework.spectra.offsets import offsets_of
 from framework.spectra.spectrum import COUNT, Parameters, Preset, spectrum
-from framework.storage.arrays import archive
+from framework.storage.arrays import read_npz
 from framework.storage.cache import folder
 from framework.storage.files import write_whole
-from framework.storage.generated import generated, read_mark
+from framework.storage.generated import ensure_generated, read_mark
 from framework.target import Target
 from plugins.data.cest.resampling import resample
 from plugins.data.cest.spectrum_picture import curve
@@ -159,7 +159,7 @@ class CEST(Data, Mapped):
         settings = {"side": self.side, "noise": 0.01, "shift": 0.08, "data_seed": self.data_seed}
         name = f"{GENERATOR_VERSION}_{self.side}_{self.data_seed}"
         mark = {"plugin": "cest", "version": GENERATOR_VERSION, **settings}
-        return generated(folder("cest") / name, mark, partial(write_slice, **settings)) / FILE, True
+        return ensure_generated(folder("cest") / name, mark, partial(write_slice, **settings)) / FILE, True
 
     def _fit(self, spectra: Tensor) -> Float[Tensor, "voxel p"]:
         """Return the fitted parameters of spectra; read them from the cache if they are stored there."""
@@ -169,7 +169,7 @@ class CEST(Data, Mapped):
         cache_file = folder("cest_fits") / f"{key}.npz"
         if cache_file.is_file():
             try:
-                return torch.from_numpy(archive(cache_file.read_bytes())["parameters"])
+                return torch.from_numpy(read_npz(cache_file.read_bytes())["parameters"])
             except Exception:
                 _log.warning("%s cannot be read; the spectra are fitted again.", cache_file)
         parameters = fit(spectra, torch.tensor(self.offsets), self.wanted).parameters
@@ -263,7 +263,7 @@ def _remarks(volume: Volume, offsets: Sequence[float]) -> tuple[str, ...]:
     if volume.dropped:
         remarks.append(f"left out: {volume.dropped} voxels of which a number is not finite")
     if volume.unread:
-        remarks.append(f"left out: the arrays {', '.join(volume.unread)} of the file")
+        remarks.append(f"left out: arrays that are not read ({', '.join(volume.unread)})")
     if len(volume.offsets) != len(offsets) or not np.allclose(volume.offsets, offsets):
         remarks.append(f"resampled: from the file's {len(volume.offsets)} offsets to {len(offsets)}")
     return tuple(remarks)

@@ -9,10 +9,10 @@ import nibabel
 import numpy as np
 
 from framework.errors import DataError
-from framework.storage.arrays import real
+from framework.storage.arrays import to_real
 from framework.storage.limits import MOST_OF_SPECTRA
-from framework.storage.reading import guarded, inflated, read_bytes, require_numbers, room
-from framework.storage.text import decoded, require_numbers_in, words_of
+from framework.storage.reading import translate_errors, inflate, read_bytes, require_numbers, most_decompressed
+from framework.storage.text import decode, require_numbers_in, words_of
 
 PACKED = b"\x1f\x8b"
 MASKS = (".mask.nii.gz", ".mask.nii")
@@ -36,14 +36,14 @@ def read_nifti(file: Path) -> Mapping[str, np.ndarray]:
     mask_names = [f"{name}{end}".lower() for end in MASKS]
     masks = sorted(path for path in file.parent.iterdir() if path.name.lower() in mask_names)
     images = _read(file)
-    arrays = {"spectra": real(images.dataobj, "spectra"), "affine": np.asarray(images.affine)}
+    arrays = {"spectra": to_real(images.dataobj, "spectra"), "affine": np.asarray(images.affine)}
     if not offsets_file.is_file():
         raise DataError(
             f"The folder of this file holds no {offsets_file.name}. Write the offsets of the images in ppm into such a "
             "file, one offset a line."
         )
-    with guarded(offsets_file, "offsets", "Write one number in ppm a line, one for each image."):
-        text = decoded(read_bytes(offsets_file))
+    with translate_errors(offsets_file, "offsets", "Write one number in ppm a line, one for each image."):
+        text = decode(read_bytes(offsets_file))
         arrays["offsets"] = np.array(require_numbers_in(words_of(text), text))
         if len(arrays["offsets"]) != images.shape[-1]:
             raise DataError(
@@ -56,8 +56,8 @@ def read_nifti(file: Path) -> Mapping[str, np.ndarray]:
         )
     for mask in masks:
         remedy = "Copy the mask again from its source, or remove the file to read every voxel with a number."
-        with guarded(mask, "a mask", remedy):
-            arrays["mask"] = real(_read(mask).dataobj, "mask")
+        with translate_errors(mask, "a mask", remedy):
+            arrays["mask"] = to_real(_read(mask).dataobj, "mask")
             if arrays["mask"].squeeze().shape != arrays["spectra"][..., 0].squeeze().shape:
                 raise DataError(
                     f"The mask has shape {arrays['mask'].shape}, but the images of {file.name} have shape "
@@ -74,7 +74,7 @@ def write_nifti(file: Path, maps: np.ndarray, affine: np.ndarray) -> None:
 def _read(file: Path) -> "nibabel.Nifti1Image | nibabel.Nifti2Image":
     content = read_bytes(file)
     if content.startswith(PACKED):
-        content = inflated(content, room(len(content)))
+        content = inflate(content, most_decompressed(len(content)))
     kind = nibabel.Nifti2Image if content.startswith(SECOND) else nibabel.Nifti1Image
     image = kind.from_bytes(content)
     require_numbers(math.prod(map(int, image.shape)), MOST_OF_SPECTRA, file.stat().st_size)

@@ -10,9 +10,9 @@ from jaxtyping import Bool, Float, Int
 
 from framework.datasets.matlab import read_variables
 from framework.errors import DataError, shorten
-from framework.storage.arrays import archive, real
+from framework.storage.arrays import read_npz, to_real
 from framework.storage.limits import MOST_OF_SPECTRA, MOST_VOXELS
-from framework.storage.reading import guarded, read_bytes, require_numbers
+from framework.storage.reading import read_bytes, require_numbers, translate_errors
 
 SUFFIXES = (".mat", ".npz", ".nii", ".gz")
 SPECTRA = ("spectra", "rawData")
@@ -64,7 +64,7 @@ def read_volume(file: Path) -> Volume:
     Raises:
         DataError: The file is missing, damaged, of another layout, or holds no voxel.
     """
-    with guarded(file, "a volume of Z-spectra", LAYOUT):
+    with translate_errors(file, "a volume of Z-spectra", LAYOUT):
         arrays = _read_arrays(file)
         numbers = sum(np.size(values) for values in arrays.values())
         size = file.stat().st_size
@@ -77,7 +77,7 @@ def _read_arrays(file: Path) -> Mapping[str, Any]:
     if name.endswith(".mat"):
         return read_variables(file, remedy=LAYOUT)
     if name.endswith(".npz"):
-        return archive(read_bytes(file))
+        return read_npz(read_bytes(file))
     if name.endswith((".nii", ".nii.gz")):
         return _nifti(file)
     raise DataError(
@@ -101,7 +101,7 @@ def _volume(arrays: Mapping[str, Any], size: int) -> Volume:
     name = next((name for name in SPECTRA if name in arrays), None)
     if name is None or "offsets" not in arrays:
         raise DataError(f"The file holds {shorten(', '.join(arrays)) or 'nothing'}. {LAYOUT}")
-    spectra, offsets = real(arrays[name], name), real(arrays["offsets"], "offsets").ravel()
+    spectra, offsets = to_real(arrays[name], name), to_real(arrays["offsets"], "offsets").ravel()
     if not 2 <= spectra.ndim <= 4 or spectra.shape[-1] != len(offsets):
         raise DataError(f"{name} has shape {spectra.shape} for {len(offsets)} offsets. {LAYOUT}")
     if not np.isfinite(offsets).all() or len(np.unique(offsets)) < len(offsets):
@@ -137,7 +137,7 @@ def _volume(arrays: Mapping[str, Any], size: int) -> Volume:
     numbers = (
         np.zeros(shape, np.int64)
         if region is None
-        else real(region, "region").astype(np.int64).reshape(shape)
+        else to_real(region, "region").astype(np.int64).reshape(shape)
     )
     if numbers.min() < 0 or numbers.max() >= len(regions):
         raise DataError(
@@ -168,7 +168,7 @@ def _divide_by_m0(spectra: np.ndarray, offsets: np.ndarray, m0: Any) -> tuple[np
     if far.all():
         raise DataError(f"Every offset is {UNSATURATED:g} ppm or more. Write the offsets in ppm, not in Hz.")
     if m0 is not None:
-        unsaturated = real(m0, "M0").reshape(*spectra.shape[:-1], 1)
+        unsaturated = to_real(m0, "M0").reshape(*spectra.shape[:-1], 1)
     elif far.any():
         unsaturated = spectra[..., far].mean(-1, keepdims=True)
     else:
@@ -182,4 +182,4 @@ def _mask(mask: Any, spectra: np.ndarray) -> Bool[np.ndarray, "x y z"]:
     """Return which voxels are read: those where `mask` is above 0, or without a mask those with any number but 0."""
     if mask is None:
         return np.asarray(np.nan_to_num(spectra, nan=1.0).any(-1))
-    return np.asarray(np.nan_to_num(real(mask, "mask").reshape(spectra.shape[:-1])) > 0)
+    return np.asarray(np.nan_to_num(to_real(mask, "mask").reshape(spectra.shape[:-1])) > 0)

@@ -130,7 +130,7 @@ def test_wrong_tables_are_refused(tmp_path: Path, table: str, message: str) -> N
 
 
 def test_messages_about_missing_names_suggest_a_remedy(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"labels\.csv does not exist; expected a table .* data\.csv"):
+    with pytest.raises(DataError, match=r"labels\.csv: no such file; expected a table .* data\.csv"):
         prepared(write_folder(tmp_path), csv="labels.csv")
     with pytest.raises(
         DataError, match=r"names the column 'pam', which .* does not have\. Did you mean 'pan'\?"

@@ -1,4 +1,4 @@
-"""Reading of clouds of many sizes from one NumPy archive: `points`, `offset`, `label`, `object_id`, `classes`."""
+"""Reading of labelled clouds from one NumPy archive: `points`, `offset`, `label`, `object_id`, `classes`."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -7,18 +7,27 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from framework.errors import DataError, shorten
-from framework.storage.arrays import archive
-from framework.storage.reading import guarded, read_bytes
+from framework.storage.arrays import read_npz
+from framework.storage.reading import read_bytes, translate_errors
 
 SOURCE = "github.com/ATRM-Raphael/geo5017_A2"
-WANTED = (
-    "Wanted: a .npz archive with points (points, 3) in metres, offset (objects + 1), label (objects), classes, and "
-    "perhaps object_id (objects); object i is points[offset[i]:offset[i+1]]."
+LAYOUT = (
+    "a .npz archive with points (points, 3) in metres, offset (objects + 1), label (objects), classes, and optionally "
+    "object_id (objects); object i is points[offset[i]:offset[i+1]]."
 )
+REMEDY = f"Set data.root to {LAYOUT}"
 
 
 class Archive(NamedTuple):
-    """Arrays of the archive, which holds its objects one after another."""
+    """Content of an archive, which holds its objects one after another.
+
+    Attributes:
+        points: Points of all objects, metres.
+        offset: Index of the first point of each object, and the number of all points.
+        label: Class of each object, an index into `classes`.
+        identity: Number of each object in the scans.
+        classes: Names of the classes.
+    """
 
     points: Float[np.ndarray, "points 3"]
     offset: Int[np.ndarray, "objects_and_one"]
@@ -31,49 +40,55 @@ def read_archive(root: str | None) -> Archive:
     """Read and check the whole archive.
 
     Raises:
-        DataError: there is no root, no such file, or no archive; an array is missing or of another shape; offsets do
-            not rise; a label has no class; or a coordinate is not finite. The message names the object.
+        DataError: The root is not set or is no archive; an array is missing or of another shape; offsets do not rise;
+            a label has no class; or a coordinate is not finite. The message names the object.
     """
     if root is None:
         raise DataError(
-            f"data.root is not set: the objects were cut from the DALES scans and are not shipped or generated; an "
-            f"extract of 499 of them is at {SOURCE}. {WANTED}"
+            f"data.root is not set. The objects were cut from the DALES scans and are neither shipped nor generated; "
+            f"an extract of 499 objects is at {SOURCE}. {REMEDY}"
         )
     file = Path(root).expanduser()
-    with guarded(file, "a NumPy archive", WANTED, WANTED):
-        return _checked(file, archive(read_bytes(file)))
+    with translate_errors(file, "a NumPy archive", REMEDY, f"expected {LAYOUT}"):
+        return _check_arrays(file, read_npz(read_bytes(file)))
 
 
-def _checked(file: Path, held: dict[str, np.ndarray]) -> Archive:
-    missing = [name for name in ("points", "offset", "label", "classes") if name not in held]
+def _check_arrays(file: Path, arrays: dict[str, np.ndarray]) -> Archive:
+    """Return the archive's content, or raise a DataError if its arrays do not have the layout."""
+    missing = [name for name in ("points", "offset", "label", "classes") if name not in arrays]
     if missing:
         raise DataError(
-            f"{file} holds {shorten(', '.join(held)) or 'nothing'}, but no {missing[0]}. {WANTED}"
+            f"{file} holds {shorten(', '.join(arrays)) or 'nothing'}, but no {missing[0]}. {REMEDY}"
         )
-    points, offset, label = held["points"], held["offset"], held["label"]
-    identity = held.get("object_id", np.arange(len(label)))
+    points, offset, label = arrays["points"], arrays["offset"], arrays["label"]
+    identity = arrays.get("object_id", np.arange(len(label)))
     whole = all(array.ndim == 1 and array.dtype.kind in "iu" for array in (offset, label, identity))
     if points.dtype.kind != "f" or points.ndim != 2 or points.shape[1] != 3 or not whole:
-        shapes = ", ".join(f"{name} {array.dtype} {array.shape}" for name, array in held.items())
-        raise DataError(f"{file}: its arrays came as {shorten(shapes)}. {WANTED}")
-    offset, label = offset.astype(np.int64), label.astype(np.int64)
-    ends = len(offset) == len(label) + 1 == len(identity) + 1 and offset[0] == 0 and offset[-1] == len(points)
-    if not ends or (np.diff(offset) < 1).any():
+        shapes = ", ".join(f"{name} {array.dtype} {array.shape}" for name, array in arrays.items())
         raise DataError(
-            f"{file}: {len(label)} labels, {len(identity)} identities and {len(offset)} offsets that do not cut "
-            f"{len(points)} points into objects of at least one. {WANTED}"
+            f"{file}: The arrays have other types or shapes than expected: {shorten(shapes)}. {REMEDY}"
         )
-    classes = tuple(map(str, held["classes"].tolist()))
+    offset, label = offset.astype(np.int64), label.astype(np.int64)
+    consistent = (
+        len(offset) == len(label) + 1 == len(identity) + 1 and offset[0] == 0 and offset[-1] == len(points)
+    )
+    if not consistent or (np.diff(offset) < 1).any():
+        raise DataError(
+            f"{file}: The {len(offset)} offsets do not divide {len(points)} points into objects of at least one point, "
+            f"each with one of the {len(label)} labels and {len(identity)} numbers in object_id. {REMEDY}"
+        )
+    classes = tuple(map(str, arrays["classes"].tolist()))
     wrong = np.flatnonzero((label < 0) | (label >= len(classes)))
     if len(wrong):
         raise DataError(
-            f"{file}: object {wrong[0]} has label {label[wrong[0]]}, but there are {len(classes)} classes."
+            f"{file}: Object {wrong[0]} has label {label[wrong[0]]}, but there are only {len(classes)} classes. "
+            "Correct the label."
         )
     bad = np.flatnonzero(~np.isfinite(points).all(1))
     if len(bad):
-        place = int(np.searchsorted(offset, bad[0], side="right")) - 1
+        number = int(np.searchsorted(offset, bad[0], side="right")) - 1
         raise DataError(
-            f"{file}: object {place} has a coordinate that is not finite, first its point {bad[0] - offset[place]}. "
+            f"{file}: Point {bad[0] - offset[number]} of object {number} has a coordinate that is not finite. "
             "Leave such points out of the archive."
         )
     return Archive(points, offset, label, identity.astype(np.int64), classes)

@@ -1,4 +1,4 @@
-"""Fixtures that build the data set which a test's module names, in a cache of the test's own."""
+"""Fixtures that build the data set whose name is in the test's module, and give each test its own cache."""
 
 import pytest
 
@@ -13,7 +13,7 @@ def cache(tmp_path_factory, monkeypatch):
 
 @pytest.fixture
 def data(request):
-    """Return a function that builds the data set NAME of the test's module."""
+    """Return a function that builds the data set whose name is NAME in the test's module."""
 
     def make(**config):
         if "root" in config:
@@ -28,8 +28,8 @@ def prepared(data):
     """Return a function that builds and prepares the data set."""
 
     def make(**config):
-        found = data(**config)
-        found.prepare()
-        return found
+        dataset = data(**config)
+        dataset.prepare()
+        return dataset
 
     return make

@@ -16,16 +16,16 @@ from framework.storage.generated import read_mark
 from plugins.data.labelled_clouds import folders
 from plugins.data.labelled_clouds.archive import read_archive
 from plugins.data.labelled_clouds.labelled_clouds import (
-    Found,
+    CloudSet,
     LabelledClouds,
     Unreadable,
+    describe_unread,
     hold_out,
-    loaded,
-    unread,
+    load_listed,
 )
-from plugins.data.labelled_clouds.reading import Packed, Reading, rounded, subsampled
-from plugins.data.labelled_clouds.shapes.generator import VERSION, Models, generated
-from plugins.data.labelled_clouds.shares import folds
+from plugins.data.labelled_clouds.reading import Packed, Reading, round_to_float32, subsample
+from plugins.data.labelled_clouds.shapes.generator import VERSION, Models, generate_models
+from plugins.data.labelled_clouds.shares import assign_folds
 
 FOLDS = 5
 Seed = Annotated[int, Field(ge=0, lt=2**31)]
@@ -37,9 +37,9 @@ class Surfaces:
     """Settings for drawing points from surfaces, uniformly by area.
 
     Attributes:
-        points: number of points of each surface (thesis §6.5.1: 2048).
-        normals: whether to add the faces' normals as columns.
-        data_seed: seed of the points and of the validation split; it does not depend on the seed of the run.
+        points: Number of points drawn from each surface (thesis §6.5.1: 2048).
+        normals: Whether to add the faces' normals as columns.
+        data_seed: Seed of the points and of the validation split, independent of the seed of the run.
     """
 
     points: Annotated[int, Field(ge=1, le=1_000_000)] = 2048
@@ -48,19 +48,20 @@ class Surfaces:
 
 
 class ModelNet40(LabelledClouds):
-    """CAD models of everyday things as points of their surfaces, z up; generated where no root is given.
+    """CAD models of everyday objects, as points drawn from their surfaces, z up; generated if no root is given.
 
-    The points of a mesh depend only on `data_seed` and its file's name. They are drawn once and kept in the cache.
+    The points of a mesh depend only on `data_seed` and the name of the file. They are drawn once and stored in the
+    cache.
 
     Args:
-        root: the unpacked ModelNet40; None for a generated set in its layout, with its 40 classes.
-        surfaces: how meshes become points.
-        classes: names of the classes to use; None for all.
-        validation_share: share of the official training split for validation, equal in every class. With 0 the whole
-            split is used for training, as in the thesis, and validation results are then over training clouds.
-        rotations: number of copies of each training cloud, rotated about the up axis in equal steps (thesis §6.5.1).
-        unreadable: treatment of files that cannot be read: refuse or skip.
-        models: settings of the generated models.
+        root: The unpacked ModelNet40; None for a generated set in the same layout and with the same 40 classes.
+        surfaces: Settings for drawing points from the meshes.
+        classes: Names of the classes to use; None for all.
+        validation_share: Share of the official training split for validation, equal in every class. With 0 the whole
+            split is used for training, as in the thesis, and validation uses training clouds too.
+        rotations: Number of copies of each training cloud, rotated about the up axis in equal steps (thesis §6.5.1).
+        unreadable: Treatment of files that cannot be read. "error" refuses them, "skip" leaves them out.
+        models: Settings of the generated models.
     """
 
     bibtex = """@inproceedings{wu2015modelnet,
@@ -93,31 +94,32 @@ class ModelNet40(LabelledClouds):
         self.validation_share = validation_share
         self.rotations = rotations
 
-    def found(self) -> Found:
+    def load_clouds(self) -> CloudSet:
         if self.root is None:
-            root, name = generated(self.models), f"synthetic, seed {self.models.generator_seed}"
-            remedy = {"remedy": f"Delete {root}: the models are generated anew."}
+            root, name = generate_models(self.models), f"synthetic, seed {self.models.generator_seed}"
+            remedy = {"remedy": f"Delete {root}; the models are then generated again."}
         else:
             root, name, remedy = Path(self.root).expanduser(), self.root, {}
-        listed = folders.official(root, self.classes)
-        how, place = replace(self.reading, surface=True), "modelnet40/clouds"
-        kept, packed = loaded(listed, root, how, place, self.unreadable, **remedy)
-        hold_out(kept.splits, kept.labels, self.validation_share, stream(self.reading.seed, "validation"))
+        listed = folders.list_official(root, self.classes)
+        reading = replace(self.reading, surface=True)
+        readable, packed = load_listed(listed, root, reading, "modelnet40/clouds", self.unreadable, **remedy)
+        random = stream(self.reading.seed, "validation")
+        hold_out(readable.splits, readable.labels, self.validation_share, random)
         synthetic = read_mark(root) is not None
-        return Found(
-            where=str(root),
-            about={
+        return CloudSet(
+            source=str(root),
+            description={
                 "root": name,
                 "version": f"generator {VERSION}" if synthetic else "ModelNet40",
                 "rotations": str(self.rotations),
                 "points": f"{self.reading.points}, seed {self.reading.seed}",
             },
-            classes=kept.classes,
+            classes=readable.classes,
             packed=packed,
-            labels=kept.labels,
-            names=[file.name for file in kept.files],
-            splits=kept.splits,
-            skipped=len(listed.files) - len(kept.files),
+            labels=readable.labels,
+            names=[file.name for file in readable.files],
+            splits=readable.splits,
+            skipped=len(listed.files) - len(readable.files),
             synthetic=synthetic,
             validated_on="validation" if self.validation_share else "train",
             rotations=self.rotations,
@@ -125,20 +127,24 @@ class ModelNet40(LabelledClouds):
 
 
 class PointCloudFolder(LabelledClouds):
-    """Your own meshes and clouds, without writing code, in folders named by class; the class is predicted.
+    """A user's own meshes and clouds in folders that are named by class; the target is the class.
 
-    Surfaces are sampled uniformly by area. Clouds are used as they are, each with its own number of points.
+    Points of meshes are drawn from their surfaces, uniformly by area. Clouds are used unchanged, each with its own
+    number of points.
 
     Args:
-        root: the folder.
-        points: number of points drawn from a mesh (None: 2048), and largest number kept of a cloud (None: all).
-        columns: attributes to read beside x, y, z. "normal_x", "normal_y", "normal_z" of a mesh are its faces' normals.
-        validation: share of the files for validation, equal in every class, where folders do not say it. With 0 the
-            training split serves as validation too: early stopping and calibration then use training data.
-        test: share of the files for the test, likewise.
-        centred: whether to subtract each cloud's mean in float64, before it is rounded to float32 (map coordinates).
-        unreadable: treatment of files that cannot be read: refuse or skip.
-        data_seed: seed of points and splits; it does not depend on the seed of the run.
+        root: The folder.
+        points: Number of points drawn from a mesh (None: 2048), and largest number of points read of a cloud (None:
+            all).
+        columns: Attributes to read in addition to x, y, z. "normal_x", "normal_y", "normal_z" of a mesh are the normals
+            of its faces.
+        validation: Share of the files for validation, equal in every class, if there are no folders of that split. With
+            0 the training split is also used for validation: early stopping and calibration then use training data.
+        test: Share of the files for the test, equal in every class, if there are no folders of that split.
+        centred: Whether to subtract each cloud's mean in float64 before it is rounded to float32; map coordinates need
+            this.
+        unreadable: Treatment of files that cannot be read. "error" refuses them, "skip" leaves them out.
+        data_seed: Seed of points and splits, independent of the seed of the run.
     """
 
     bibtex = """@misc{point_cloud_folder,
@@ -159,75 +165,76 @@ class PointCloudFolder(LabelledClouds):
         unreadable: Unreadable = "error",
         data_seed: Seed = 0,
     ) -> None:
-        wanted = tuple(name for name in dict.fromkeys(columns or ()) if name not in XYZ)
+        further_columns = tuple(name for name in dict.fromkeys(columns or ()) if name not in XYZ)
         self.root = root
-        self.reading = Reading(points, wanted, data_seed, centred)
+        self.reading = Reading(points, further_columns, data_seed, centred)
         self.columns = self.reading.all_columns
         self.unreadable: Unreadable = unreadable
         self.shares = (validation, test)
 
-    def found(self) -> Found:
+    def load_clouds(self) -> CloudSet:
         if self.root is None:
-            raise DataError(f"data.root is not set. {folders.WANTED}")
+            raise DataError(f"data.root is not set. {folders.REMEDY}")
         if sum(self.shares) >= 1:
             raise DataError(
-                f"data.validation + data.test = {sum(self.shares):g}: wanted less than 1, so that files are left for "
-                "training."
+                f"data.validation + data.test = {sum(self.shares):g}, but the sum must be less than 1 to leave files "
+                "for training. Reduce one of them."
             )
         root = Path(self.root).expanduser()
         self.title = root.resolve().name
-        listed = folders.listed(root)
-        kept, packed = loaded(listed, root, self.reading, "point_cloud_folder", self.unreadable)
-        splits = self._drawn(kept)
-        missing = set(range(len(kept.classes))) - set(kept.labels[splits == "train"].tolist())
+        listed = folders.list_user(root)
+        readable, packed = load_listed(listed, root, self.reading, "point_cloud_folder", self.unreadable)
+        splits = self._choose_splits(readable)
+        missing = set(range(len(readable.classes))) - set(readable.labels[splits == "train"].tolist())
         if missing and "train" in splits:
             raise DataError(
-                f"{root}: no training sample of {kept.classes[min(missing)]}; wanted one of every class. Add files."
+                f"{root}: The class {readable.classes[min(missing)]} has no training sample, but every class "
+                "needs one. Add files."
             )
-        return Found(
-            where=str(root),
-            about={
+        return CloudSet(
+            source=str(root),
+            description={
                 "root": self.root,
                 "version": "point_cloud_folder 1",
                 "columns": ", ".join(self.columns),
                 "points": f"{self.reading.points}, seed {self.reading.seed}",
-                "ignored": str(kept.ignored),
+                "ignored": str(readable.ignored),
             },
-            classes=kept.classes,
+            classes=readable.classes,
             packed=packed,
-            labels=kept.labels,
-            names=[file.relative_to(root).as_posix() for file in kept.files],
+            labels=readable.labels,
+            names=[file.relative_to(root).as_posix() for file in readable.files],
             splits=splits,
-            skipped=len(listed.files) - len(kept.files),
+            skipped=len(listed.files) - len(readable.files),
             validated_on="validation" if self.shares[0] or "validation" in splits else "train",
-            remarks=unread(kept, self.reading),
+            remarks=describe_unread(readable, self.reading),
         )
 
-    def _drawn(self, kept: folders.Listed) -> np.ndarray:
-        """Return the split of every sample: as the folders say, and otherwise drawn from the seed."""
-        splits = np.where(kept.splits == "", "train", kept.splits)
+    def _choose_splits(self, listed: folders.FileList) -> np.ndarray:
+        """Return the split of every file: that of its folder or, without such folders, one chosen by the seed."""
+        splits = np.where(listed.splits == "", "train", listed.splits)
         random = stream(self.reading.seed, "splits")
         validation, test = self.shares
-        if "" in kept.splits:
-            hold_out(splits, kept.labels, test, random, "test")
-            validation /= 1 - test  # the share of what is left
-        if "validation" not in kept.splits and validation:
-            hold_out(splits, kept.labels, validation, random)
+        if "" in listed.splits:
+            hold_out(splits, listed.labels, test, random, "test")
+            validation /= 1 - test  # as a share of the files that are not for the test
+        if "validation" not in listed.splits and validation:
+            hold_out(splits, listed.labels, validation, random)
         return splits
 
 
 class Dales(LabelledClouds):
     """Buildings, cars, fences, poles and trees from airborne laser scans, 100 to 28,000 points each, metres.
 
-    Objects are dealt into five folds with equal shares of every class; one fold is the test split. A batch is padded to
-    its largest cloud. Batches also hold "object", int64, the object's number in the archive.
+    The objects are divided into five folds with equal shares of every class; one fold is the test split. A batch is
+    padded to its largest cloud. Batches also hold "object", int64, the number of the object in the scans.
 
     Args:
-        root: the archive.
-        fold: index of the fold that is the test split.
-        points: largest number of points that is kept of an object; None for all.
-        validation_share: share of the other folds for validation, equal in every class.
-        data_seed: seed of folds, validation and points; it does not depend on the seed of the run.
+        root: The archive.
+        fold: Index of the fold that is the test split.
+        points: Largest number of points that is read of an object; None for all.
+        validation_share: Share of the other folds for validation, equal in every class.
+        data_seed: Seed of the folds, of the validation split and of the points, independent of the seed of the run.
     """
 
     bibtex = """@inproceedings{varney2020dales,
@@ -254,19 +261,19 @@ class Dales(LabelledClouds):
         self.columns = self.reading.all_columns
         self.validation_share = validation_share
 
-    def found(self) -> Found:
+    def load_clouds(self) -> CloudSet:
         archive = read_archive(self.root)
         seed, clouds = self.reading.seed, []
         for number, identity in enumerate(archive.identity):
             table = archive.points[archive.offset[number] : archive.offset[number + 1]]
-            table = subsampled(table, self.reading.points, stream(seed, f"object {identity}"))
-            clouds.append(rounded(table, f"{self.root}, object {number}", centred=False))
-        tested = folds(archive.label, FOLDS, stream(seed, "folds")) == self.fold
-        splits = np.where(tested, "test", "train").astype("<U10")
+            table = subsample(table, self.reading.points, stream(seed, f"object {identity}"))
+            clouds.append(round_to_float32(table, f"{self.root}, object {number}", centred=False))
+        in_test = assign_folds(archive.label, FOLDS, stream(seed, "folds")) == self.fold
+        splits = np.where(in_test, "test", "train").astype("<U10")
         hold_out(splits, archive.label, self.validation_share, stream(seed, f"validation {self.fold}"))
-        return Found(
-            where=str(self.root),
-            about={
+        return CloudSet(
+            source=str(self.root),
+            description={
                 "root": str(self.root),
                 "version": "DALES objects",
                 "fold": f"{self.fold} of {FOLDS}, seed {seed}",

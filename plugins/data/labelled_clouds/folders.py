@@ -12,15 +12,23 @@ from framework.errors import DataError, did_you_mean
 from framework.geometry.meshes import READERS
 
 SPLITS = ("train", "validation", "test")
-OFFICIAL = "Wanted: the unpacked ModelNet40, <root>/<class>/{train,test}/<class>_<id>.off."
-WANTED = (
-    "Wanted: <root>/<class>/<file>, <root>/{train,validation,test}/<class>/<file> or "
-    f"<root>/<class>/{{train,test}}/<file>, of {', '.join(READERS)}."
+OFFICIAL_REMEDY = "Set data.root to the unpacked ModelNet40, <root>/<class>/{train,test}/<class>_<id>.off."
+REMEDY = (
+    "Set data.root to a folder with the layout <root>/<class>/<file>, <root>/{train,validation,test}/<class>/<file> or "
+    f"<root>/<class>/{{train,test}}/<file>, where the files are {', '.join(READERS)}."
 )
 
 
-class Listed(NamedTuple):
-    """Classes in alphabetical order; all files with labels and splits ("" if to be drawn); number of ignored files."""
+class FileList(NamedTuple):
+    """Files in a folder, with their classes and splits.
+
+    Attributes:
+        classes: Names of the classes in alphabetical order.
+        files: The files.
+        labels: Class of each file, an index into `classes`.
+        splits: Split of each file; "" if it is to be chosen at random.
+        ignored: Number of files of other kinds.
+    """
 
     classes: tuple[str, ...]
     files: list[Path]
@@ -28,105 +36,135 @@ class Listed(NamedTuple):
     splits: NDArray
     ignored: int
 
-    def only(self, numbers: Iterable[int]) -> "Listed":
-        """Return the listing with only the files of the given numbers."""
-        kept = list(numbers)
-        files = [self.files[number] for number in kept]
-        return self._replace(files=files, labels=self.labels[kept], splits=self.splits[kept])
+    def select(self, indices: Iterable[int]) -> "FileList":
+        """Return a list of only the files with these indices."""
+        chosen = list(indices)
+        files = [self.files[index] for index in chosen]
+        return self._replace(files=files, labels=self.labels[chosen], splits=self.splits[chosen])
 
 
-def official(root: Path, wanted: Sequence[str] | None) -> Listed:
-    """List the files of a root in ModelNet40's layout, its training split first; all classes if `wanted` is None.
+def list_official(root: Path, classes: Sequence[str] | None) -> FileList:
+    """Return the files of a folder in the layout of ModelNet40, the training split first.
+
+    Args:
+        root: The folder.
+        classes: Names of the classes to list; None for all.
 
     Raises:
-        DataError: there is no such folder, another layout, an unknown class, fewer than two classes, or a class without
-            files.
+        DataError: The folder is missing or has another layout, a class is unknown or without files, or there are fewer
+            than two classes.
     """
-    folders = _folders(root, OFFICIAL)
-    strange = [path.name for path in folders if not ((path / "train").is_dir() and (path / "test").is_dir())]
-    if strange or not folders:
-        held = f"{strange[0]} has no folders train and test" if strange else "there are no folders in it"
-        raise DataError(f"data.root = {root}: {held}. {OFFICIAL}")
+    folders = _folders(root, OFFICIAL_REMEDY)
+    unexpected = [
+        path.name for path in folders if not ((path / "train").is_dir() and (path / "test").is_dir())
+    ]
+    if unexpected or not folders:
+        fault = (
+            f"the folder {unexpected[0]} has no folders train and test"
+            if unexpected
+            else "it holds no folders"
+        )
+        raise DataError(f"data.root = {root} is not ModelNet40: {fault}. {OFFICIAL_REMEDY}")
     names = [path.name for path in folders]
-    chosen = names if wanted is None else sorted(set(wanted))
+    chosen = names if classes is None else sorted(set(classes))
     for name in chosen:
         if name not in names:
             raise DataError(
                 f"data.classes names {name!r}, which {root} does not hold.{did_you_mean(name, names)} "
-                f"Its classes: {', '.join(names)}."
+                f"The classes there are {', '.join(names)}."
             )
     if len(chosen) < 2:
-        raise DataError(f"data.classes = {chosen}: wanted at least two of {', '.join(names)}.")
-    places = [(name, split, root / name / split) for split in ("train", "test") for name in chosen]
-    return _collected(chosen, places, (".off",), ".off file", OFFICIAL)
+        raise DataError(
+            f"data.classes = {chosen}, but at least two classes are required. Choose from {', '.join(names)}."
+        )
+    folders_of_class = [(name, split, root / name / split) for split in ("train", "test") for name in chosen]
+    return _collect(chosen, folders_of_class, (".off",), ".off file", OFFICIAL_REMEDY)
 
 
-def listed(root: Path) -> Listed:
-    """List the files of a user's root.
+def list_user(root: Path) -> FileList:
+    """Return the files of a user's folder.
 
     Raises:
-        DataError: there is no such folder, none of the layouts, fewer than two classes, or a class without files.
+        DataError: The folder is missing or has none of the layouts, a class has no files, or there are fewer than two
+            classes.
     """
-    folders = _folders(root, WANTED)
+    folders = _folders(root, REMEDY)
     names = {path.name for path in folders}
     if {"train", "test"} & names:
-        strange = sorted(names - set(SPLITS)) or sorted({"train", "test"} - names)
-        if strange:
-            held = "is missing" if strange[0] in SPLITS else "stands beside"
-            raise DataError(
-                f"data.root = {root}: {strange[0]} {held} among {', '.join(SPLITS)}; of these validation may be left "
-                f"out. {WANTED}"
+        unexpected, missing = sorted(names - set(SPLITS)), sorted({"train", "test"} - names)
+        if unexpected or missing:
+            fault = (
+                f"holds a folder {unexpected[0]} beside folders of splits"
+                if unexpected
+                else f"holds no folder {missing[0]}"
             )
-        places = [(inner.name, split.name, inner) for split in folders for inner in _folders(split, WANTED)]
+            raise DataError(
+                f"data.root = {root} {fault}. The folders of splits are {', '.join(SPLITS)}; only validation may be "
+                f"missing. {REMEDY}"
+            )
+        folders_of_class = [
+            (inner.name, split.name, inner) for split in folders for inner in _folders(split, REMEDY)
+        ]
     else:
-        inside = {path: [inner.name for inner in _folders(path, WANTED)] for path in folders}
-        by_split = [path for path, found in inside.items() if set(found) == {"train", "test"}]
-        for path, found in inside.items():
+        inside = {path: [inner.name for inner in _folders(path, REMEDY)] for path in folders}
+        by_split = [path for path, inner_names in inside.items() if set(inner_names) == {"train", "test"}]
+        for path, inner_names in inside.items():
             if by_split and path not in by_split:
                 raise DataError(
-                    f"data.root = {root}: {path.name} has no folders train and test, others have. {WANTED}"
+                    f"data.root = {root}: The folder {path.name} has no folders train and test, but others have. "
+                    + REMEDY
                 )
-            if found and not by_split:
+            if inner_names and not by_split:
                 raise DataError(
-                    f"data.root = {root}: {path.name} holds folders ({', '.join(found)}). {WANTED}"
+                    f"data.root = {root}: The folder {path.name} holds further folders ({', '.join(inner_names)}). "
+                    + REMEDY
                 )
-        deeper = ("test", "train") if by_split else ("",)
-        places = [(path.name, split, path / split) for path in folders for split in deeper]
-    classes = sorted({name for name, _, _ in places})
+        splits = ("test", "train") if by_split else ("",)
+        folders_of_class = [(path.name, split, path / split) for path in folders for split in splits]
+    classes = sorted({name for name, _, _ in folders_of_class})
     if len(classes) < 2:
         raise DataError(
-            f"data.root = {root}: {len(classes)} classes ({', '.join(classes) or 'no folder'}); wanted at least two. "
-            + WANTED
+            f"data.root = {root} holds {len(classes)} classes ({', '.join(classes) or 'no folder'}), but at least two "
+            f"are required. {REMEDY}"
         )
-    places.sort(key=lambda place: (place[1], place[0]))
-    return _collected(classes, places, READERS, "file that can be read", WANTED)
+    folders_of_class.sort(key=lambda entry: (entry[1], entry[0]))
+    return _collect(classes, folders_of_class, READERS, "file that can be read", REMEDY)
 
 
-def _collected(
+def _collect(
     classes: Sequence[str],
-    places: Iterable[tuple[str, str, Path]],
+    folders_of_class: Iterable[tuple[str, str, Path]],
     suffixes: Iterable[str],
     kind: str,
-    wanted: str,
-) -> Listed:
-    """Return the files of folders with their class and split; hidden files and files of other suffixes are ignored."""
+    remedy: str,
+) -> FileList:
+    """Return the files of folders with their class and split; hidden files and files of other suffixes are ignored.
+
+    Args:
+        classes: Names of the classes.
+        folders_of_class: The folders, each with the name of its class and of its split: (class, split, folder).
+        suffixes: Suffixes of the files to return, in small letters.
+        kind: Name of such a file in messages.
+        remedy: Advice in messages.
+    """
     files, labels, splits, ignored = [], [], [], 0
-    for name, split, folder in places:
-        shown_files = (path for path in folder.iterdir() if not path.name.startswith("."))
-        # keep a folder with such a suffix too: reading it then says that it is not a file
-        held = sorted(path for path in shown_files if path.is_file() or path.suffix.lower() in suffixes)
-        own = [path for path in held if path.suffix.lower() in suffixes]
-        ignored += len(held) - len(own)
-        if not own:
-            shown = ", ".join(path.name for path in held[:3]) or "nothing"
-            raise DataError(f"{folder} holds no {kind} ({shown}). {wanted}")
-        files += own
-        labels += [classes.index(name)] * len(own)
-        splits += [split] * len(own)
-    return Listed(tuple(classes), files, np.array(labels), np.array(splits, "<U10"), ignored)
+    for name, split, folder in folders_of_class:
+        visible = (path for path in folder.iterdir() if not path.name.startswith("."))
+        # a folder with such a suffix is listed too; the message about reading it says that it is no file
+        entries = sorted(path for path in visible if path.is_file() or path.suffix.lower() in suffixes)
+        matching = [path for path in entries if path.suffix.lower() in suffixes]
+        ignored += len(entries) - len(matching)
+        if not matching:
+            content = ", ".join(path.name for path in entries[:3]) or "nothing"
+            raise DataError(f"{folder} holds no {kind}, but {content}. {remedy}")
+        files += matching
+        labels += [classes.index(name)] * len(matching)
+        splits += [split] * len(matching)
+    return FileList(tuple(classes), files, np.array(labels), np.array(splits, "<U10"), ignored)
 
 
-def _folders(root: Path, wanted: str) -> list[Path]:
+def _folders(root: Path, remedy: str) -> list[Path]:
+    """Return the folders in `root`, sorted, without those whose names begin with a point or an underscore."""
     if not root.is_dir():
-        raise DataError(f"data.root = {root}: no such folder. {wanted}")
+        raise DataError(f"data.root = {root} does not exist or is no folder. {remedy}")
     return sorted(path for path in root.iterdir() if path.is_dir() and path.name[0] not in "._")

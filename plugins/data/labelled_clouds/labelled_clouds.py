@@ -1,4 +1,4 @@
-"""Base class of the data sets of labelled clouds: splits, fingerprint and image from the clouds that were found."""
+"""Base class of the data sets of labelled clouds: splits, fingerprint, and image of a cloud."""
 
 import hashlib
 from abc import abstractmethod
@@ -18,37 +18,37 @@ from framework.datasets import cloud_picture, images
 from framework.errors import DataError, shorten
 from framework.geometry import meshes
 from framework.geometry.meshes import READERS
-from framework.storage.names import as_bytes, spelled
+from framework.storage.names import as_bytes, spell_name
 from framework.target import Target
-from plugins.data.labelled_clouds.folders import Listed
-from plugins.data.labelled_clouds.reading import Clouds, Packed, Reading, load, unlabelled
+from plugins.data.labelled_clouds.folders import FileList
+from plugins.data.labelled_clouds.reading import Clouds, Packed, Reading, load_files, load_unlabelled
 from plugins.data.labelled_clouds.rotated import Rotated
-from plugins.data.labelled_clouds.shares import spared
+from plugins.data.labelled_clouds.shares import choose_held_out
 
 Unreadable = Literal["error", "skip"]
 
 
-class Found(NamedTuple):
-    """Clouds of a data set before they are split.
+class CloudSet(NamedTuple):
+    """All clouds of a data set, with their classes and splits.
 
     Attributes:
-        where: source of the clouds, for messages.
-        about: entries of the fingerprint beside sizes, names, labels and splits.
-        classes: names of the classes, in the order of the labels.
-        packed: the clouds.
-        labels: class of each cloud.
-        names: name of each cloud.
-        splits: name of the split of each cloud.
-        fields: further fields of each cloud.
-        skipped: number of files that could not be read.
-        synthetic: whether the clouds were generated.
-        validated_on: the split whose clouds are used for validation.
-        rotations: number of copies of a training cloud, rotated about the up axis.
-        remarks: sentences on what of the user's files is not read.
+        source: Source of the clouds, for messages.
+        description: Entries of the fingerprint besides sizes, names, labels and splits.
+        classes: Names of the classes, in the order of the labels.
+        packed: The clouds.
+        labels: Class of each cloud.
+        names: Name of each cloud.
+        splits: Name of the split of each cloud.
+        fields: Further fields of each cloud.
+        skipped: Number of files that could not be read.
+        synthetic: Whether the clouds were generated.
+        validated_on: Name of the split whose clouds are used for validation.
+        rotations: Number of copies of a training cloud, rotated about the up axis.
+        remarks: Clauses about parts of the user's files that are not read.
     """
 
-    where: str
-    about: Mapping[str, str]
+    source: str
+    description: Mapping[str, str]
     classes: tuple[str, ...]
     packed: Packed
     labels: Int[np.ndarray, "clouds"]
@@ -63,7 +63,7 @@ class Found(NamedTuple):
 
 
 class LabelledClouds(Data):
-    """Base class of data sets of clouds with classes; a data set adds its constructor, its citation, and `found`."""
+    """Base class of data sets of labelled clouds; a data set adds its constructor, its citation, and `load_clouds`."""
 
     suffixes = tuple(READERS)
     varies = False
@@ -71,34 +71,35 @@ class LabelledClouds(Data):
     """Settings for turning files into clouds."""
 
     @abstractmethod
-    def found(self) -> Found:
+    def load_clouds(self) -> CloudSet:
         """Return all clouds, read from files.
 
         Raises:
-            DataError: the clouds cannot be read, for the reasons of `prepare`.
+            DataError: The clouds cannot be read, for one of the reasons that `prepare` lists.
         """
 
     def prepare(self) -> None:
-        found = self.found()
-        self.target = Target("class", tuple(map(spelled, found.classes)))
-        self.input_shape = (found.packed.largest(), len(self.columns))
-        self.synthetic, self.skipped, self.remarks = found.synthetic, found.skipped, found.remarks
-        clouds = apart(found)
+        cloud_set = self.load_clouds()
+        self.target = Target("class", tuple(map(spell_name, cloud_set.classes)))
+        self.input_shape = (cloud_set.packed.largest(), len(self.columns))
+        self.synthetic, self.skipped = cloud_set.synthetic, cloud_set.skipped
+        self.remarks = cloud_set.remarks
+        clouds = split_clouds(cloud_set)
         train = clouds["train"]
-        if found.rotations > 1:
-            train = Rotated(train, found.rotations)
+        if cloud_set.rotations > 1:
+            train = Rotated(train, cloud_set.rotations)
         self._splits = Splits(train, clouds["validation"], clouds["test"])
         self._fingerprint = {
-            **found.about,
-            **{name: str(len(some)) for name, some in clouds.items()},
-            "sha256": digest(found.names, found.labels.tolist(), found.splits.tolist()),
+            **cloud_set.description,
+            **{name: str(len(split)) for name, split in clouds.items()},
+            "sha256": digest(cloud_set.names, cloud_set.labels.tolist(), cloud_set.splits.tolist()),
         }
 
     def splits(self) -> Splits:
         return self._splits
 
     def read(self, files: Sequence[Path]) -> Dataset[Batch]:
-        return unlabelled(files, self.reading)
+        return load_unlabelled(files, self.reading)
 
     def augment(self, batch: Batch) -> Batch:
         return batch
@@ -110,40 +111,49 @@ class LabelledClouds(Data):
         return cloud_picture.draw_cloud(inputs, self.columns)
 
 
-def loaded(
-    listed: Listed,
+def load_listed(
+    listed: FileList,
     root: Path,
-    how: Reading,
-    place: str,
+    reading: Reading,
+    cache_folder: str,
     unreadable: Unreadable,
-    remedy: str = "Restore them, or set data.unreadable=skip to leave them out.",
-) -> tuple[Listed, Packed]:
-    """Return the files that could be read, and their clouds, from the cache folder `place` if they are there.
+    remedy: str = "Copy them again from their source, or set data.unreadable=skip to leave them out.",
+) -> tuple[FileList, Packed]:
+    """Return the list of the files that could be read, and their clouds.
+
+    Args:
+        listed: The files.
+        root: Folder to which the names of the files are relative.
+        reading: Settings for turning files into clouds.
+        cache_folder: Name of the cache folder that stores the clouds.
+        unreadable: Treatment of files that cannot be read.
+        remedy: Advice in the message about such files.
 
     Raises:
-        DataError: some files cannot be read, and are not to be skipped.
+        DataError: Some files cannot be read and are not to be skipped.
     """
-    found = load(listed.files, root, how, place)
-    if found.faults and unreadable == "error":
-        raise DataError(images.fault_message(found.faults, len(listed.files), remedy))
-    return listed.only(found.good), found.packed
+    loaded = load_files(listed.files, root, reading, cache_folder)
+    if loaded.faults and unreadable == "error":
+        raise DataError(images.fault_message(loaded.faults, len(listed.files), remedy))
+    return listed.select(loaded.good), loaded.packed
 
 
-def unread(listed: Listed, how: Reading) -> tuple[str, ...]:
-    """Return remarks on what is not read: files of other kinds, and unread columns of the first file."""
-    said = []
+def describe_unread(listed: FileList, reading: Reading) -> tuple[str, ...]:
+    """Return clauses about what is not read: files of other kinds, and columns of the first file."""
+    remarks = []
     if listed.ignored:
-        said.append(f"left out: {listed.ignored} files of other kinds")
+        remarks.append(f"left out: {listed.ignored} files of other kinds")
     if listed.files:
         mesh = meshes.read(listed.files[0])
-        others = [name for name in mesh.columns if name not in how.columns]
-        if others:
-            said.append(
-                f"left out: the columns {shorten(', '.join(others))} of {listed.files[0].name}; data.columns reads them"
+        unread = [name for name in mesh.columns if name not in reading.columns]
+        if unread:
+            remarks.append(
+                f"left out: the columns {shorten(', '.join(unread))} of {listed.files[0].name}; list them in "
+                "data.columns to read them"
             )
         if len(mesh.faces):
-            said.append(f"the faces of {listed.files[0].name} are read as points drawn from them")
-    return tuple(said)
+            remarks.append(f"points are drawn from the faces of {listed.files[0].name}")
+    return tuple(remarks)
 
 
 def hold_out(
@@ -153,39 +163,45 @@ def hold_out(
     random: np.random.Generator,
     name: str = "validation",
 ) -> None:
-    """Rename the split of a share of the training clouds, equal in every class."""
-    learned = np.flatnonzero(splits == "train")
-    splits[learned[spared(labels[learned], share, random)]] = name
+    """Move a share of the training clouds, equal in every class, to the split `name`; `splits` is changed in place."""
+    training = np.flatnonzero(splits == "train")
+    splits[training[choose_held_out(labels[training], share, random)]] = name
 
 
-def apart(found: Found) -> dict[str, Clouds]:
+def split_clouds(cloud_set: CloudSet) -> dict[str, Clouds]:
     """Return the clouds of each split, with "target", "group" (one for all) and the further fields of each cloud.
 
     Raises:
-        DataError: a split is empty.
+        DataError: A split is empty.
     """
     clouds = {}
     for name in Splits._fields:
-        chosen = np.flatnonzero(found.splits == (found.validated_on if name == "validation" else name))
-        own = {key: values[torch.from_numpy(chosen)] for key, values in found.fields.items()}
-        target, group = torch.from_numpy(found.labels[chosen]), torch.zeros(len(chosen), dtype=torch.int64)
-        clouds[name] = Clouds(found.packed, chosen, target=target, group=group, **own)
-    require_samples({name: len(some) for name, some in clouds.items()}, found.where)
+        source = cloud_set.validated_on if name == "validation" else name
+        chosen = np.flatnonzero(cloud_set.splits == source)
+        fields = {key: values[torch.from_numpy(chosen)] for key, values in cloud_set.fields.items()}
+        target = torch.from_numpy(cloud_set.labels[chosen])
+        group = torch.zeros(len(chosen), dtype=torch.int64)
+        clouds[name] = Clouds(cloud_set.packed, chosen, target=target, group=group, **fields)
+    require_samples({name: len(split) for name, split in clouds.items()}, cloud_set.source)
     return clouds
 
 
-def require_samples(sizes: Mapping[str, int], where: str) -> None:
+def require_samples(sizes: Mapping[str, int], source: str) -> None:
     """Refuse an empty split.
 
+    Args:
+        sizes: Name of a split → number of its samples.
+        source: Source of the clouds, for the message.
+
     Raises:
-        DataError: a split is empty; the message names it and says how many samples the others have.
+        DataError: A split is empty.
     """
     for split, size in sizes.items():
         if size == 0:
-            shown = ", ".join(f"{name} {number}" for name, number in sizes.items())
+            counts = ", ".join(f"{name} {number}" for name, number in sizes.items())
             raise DataError(
-                f"{where}: the {split} split is empty ({shown}). A class keeps at least one sample for training: add "
-                "files, or change the shares."
+                f"{source}: The {split} split is empty ({counts}). At least one sample of each class is used for "
+                "training. Add files, or change the shares."
             )
 
 

@@ -1,7 +1,7 @@
-"""Reading of files as point clouds, many of which are kept in memory.
+"""Reading of files as point clouds, which are kept in memory.
 
-Files are read and their surfaces sampled once. The result is kept in the cache folder, under a hash of everything that
-it depends on, so that a second run starts at once.
+Files are read, and points are drawn from their surfaces, only once. The clouds are stored in the cache under a hash of
+everything that they depend on, so that a second run starts at once.
 """
 
 import hashlib
@@ -25,18 +25,18 @@ from framework.geometry import meshes
 from framework.geometry.clouds import pad
 from framework.geometry.mesh_files import NORMALS, XYZ
 from framework.storage import cache
-from framework.storage.arrays import archive
+from framework.storage.arrays import read_npz
 from framework.storage.files import replacing
 from framework.storage.names import as_bytes
-from framework.storage.progress import tracked
-from framework.storage.reading import guarded, read_bytes
+from framework.storage.progress import track_progress
+from framework.storage.reading import read_bytes, translate_errors
 
 VERSION = 1
-"""Version of the conversion by `cloud`; a changed conversion takes a new number, and thus a new place in the cache."""
+"""Version of `read_cloud`; increase it if the clouds change, so that cached clouds are not used any more."""
 SURFACE_POINTS = 2048
-"""Number of points drawn from a mesh where no number is given (thesis §6.5.1)."""
-COARSE = 1e-3
-"""Rounding to float32, as a share of a cloud's extent, that is refused."""
+"""Number of points drawn from a mesh if no number is given (thesis §6.5.1)."""
+MAX_ROUNDING = 1e-3
+"""Largest rounding error of float32, as a share of a cloud's extent, that is accepted."""
 
 
 @dataclass(frozen=True)
@@ -44,13 +44,13 @@ class Reading:
     """Settings for turning a file into a cloud.
 
     Attributes:
-        points: number of points drawn from the surface of a mesh (None: 2048), and largest number kept of a cloud
-            (None: all).
-        columns: attributes beside x, y, z. A mesh's normals are those of its faces; its other attributes are
-            interpolated.
-        seed: seed of the draws; each draw depends only on it and on the file's name.
-        centred: subtract each cloud's mean before it is rounded to float32.
-        surface: refuse files without faces.
+        points: Number of points drawn from the surface of a mesh (None: 2048), and largest number of points read of a
+            cloud (None: all).
+        columns: Attributes in addition to x, y, z. The normals of a mesh are those of its faces; its other attributes
+            are interpolated.
+        seed: Seed of the random points, which depend only on the seed and on the name of the file.
+        centred: Whether to subtract each cloud's mean before it is rounded to float32.
+        surface: Whether files without faces are refused.
     """
 
     points: int | None
@@ -73,7 +73,7 @@ class Packed(NamedTuple):
 
     @classmethod
     def of(cls, clouds: Sequence[Float32[np.ndarray, "_points columns"]], columns: int) -> "Packed":
-        """Return the clouds packed one after another."""
+        """Return the clouds, each with this number of columns, packed one after another."""
         table = np.concatenate([np.empty((0, columns), np.float32), *clouds])
         return cls(torch.from_numpy(table), torch.from_numpy(np.cumsum([0, *map(len, clouds)])))
 
@@ -83,7 +83,7 @@ class Packed(NamedTuple):
 
 
 class Loaded(NamedTuple):
-    """Clouds of the files that could be read, numbers of these files, and errors of the others."""
+    """Clouds of the files that could be read, indices of these files, and errors of the other files."""
 
     packed: Packed
     good: tuple[int, ...]
@@ -91,9 +91,14 @@ class Loaded(NamedTuple):
 
 
 class Clouds(Dataset[dict[str, Tensor]]):
-    """Data set of some of the packed clouds ("input", (points, columns)) with fields that are in memory.
+    """Data set of some of the packed clouds, as "input" (points, columns), and of further fields.
 
-    A fetched batch is padded to its largest cloud with rows of NaN (`framework.geometry.clouds`).
+    A batch is padded to its largest cloud with rows of NaN (`framework.geometry.clouds`).
+
+    Args:
+        packed: All clouds.
+        chosen: Indices of the clouds that belong to this data set.
+        fields: Further fields, whose first dimension counts the samples of this data set.
     """
 
     def __init__(self, packed: Packed, chosen: Int[np.ndarray, "samples"], **fields: Tensor) -> None:
@@ -114,90 +119,92 @@ class Clouds(Dataset[dict[str, Tensor]]):
         return {"input": pad(clouds), **self.fields.__getitems__(indices)}
 
 
-def cloud(file: Path, how: Reading) -> Float32[np.ndarray, "points columns"]:
-    """Return the cloud of a file: points of a mesh's surface, or the file's own points.
+def read_cloud(file: Path, reading: Reading) -> Float32[np.ndarray, "points columns"]:
+    """Return the cloud of a file: random points of a mesh's surface, or the file's own points.
 
     Raises:
-        DataError: `framework.geometry.meshes` raises it; or a column is missing; or the coordinates are too far from 0
-            for float32.
+        DataError: The file cannot be read, a column is missing, or the coordinates are too far from 0 for float32.
     """
     mesh = meshes.read(file)
-    random = meshes.stream(how.seed, file.name)
-    if len(mesh.faces) or how.surface:
-        drawn = meshes.sample(mesh, how.points or SURFACE_POINTS, random)
-        points = drawn.points
-        of_faces = meshes.normals(mesh)[drawn.face]
-        own = [name for name in how.columns if name not in NORMALS]
-        # interpolate with the weights of the drawn points: attributes that are linear on a face stay linear
-        corners = mesh.attribute(own)[mesh.faces[drawn.face]]
-        of_vertices = np.einsum("pc,pcn->pn", drawn.weights, corners)
+    random = meshes.stream(reading.seed, file.name)
+    if len(mesh.faces) or reading.surface:
+        sample = meshes.sample(mesh, reading.points or SURFACE_POINTS, random)
+        points = sample.points
+        of_faces = meshes.normals(mesh)[sample.face]
+        interpolated = [name for name in reading.columns if name not in NORMALS]
+        # with the barycentric weights of the points, attributes that are linear on a face stay linear
+        corners = mesh.attribute(interpolated)[mesh.faces[sample.face]]
+        of_vertices = np.einsum("pc,pcn->pn", sample.weights, corners)
         attributes = [
-            of_faces[:, NORMALS.index(name)] if name in NORMALS else of_vertices[:, own.index(name)]
-            for name in how.columns
+            of_faces[:, NORMALS.index(name)] if name in NORMALS else of_vertices[:, interpolated.index(name)]
+            for name in reading.columns
         ]
         table = np.column_stack([points, *attributes])
     else:
-        table = np.concatenate([mesh.vertices, mesh.attribute(how.columns)], 1)
-        table = subsampled(table, how.points, random)
-    return rounded(table, str(file), centred=how.centred)
+        table = np.concatenate([mesh.vertices, mesh.attribute(reading.columns)], 1)
+        table = subsample(table, reading.points, random)
+    return round_to_float32(table, str(file), centred=reading.centred)
 
 
-def subsampled(table: NDArray, points: int | None, random: np.random.Generator) -> NDArray:
-    """Return at most `points` rows, drawn without replacement, in their order; all rows if `points` is None."""
+def subsample(table: NDArray, points: int | None, random: np.random.Generator) -> NDArray:
+    """Return at most `points` rows, drawn without replacement and in their order; all rows if `points` is None."""
     if points is None or len(table) <= points:
         return table
     return table[np.sort(random.choice(len(table), points, replace=False))]
 
 
-def rounded(table: NDArray, source: str, *, centred: bool) -> Float32[np.ndarray, "points columns"]:
+def round_to_float32(table: NDArray, source: str, *, centred: bool) -> Float32[np.ndarray, "points columns"]:
     """Return a cloud as float32, after subtracting its mean if `centred` is true.
 
     Raises:
-        DataError: the coordinates exceed float32, or are so far from 0 that rounding would blur the shape.
+        DataError: The coordinates exceed float32, or are so far from 0 that rounding would blur the shape.
     """
     if centred:
         table = np.concatenate([table[:, :3] - table[:, :3].mean(0), table[:, 3:]], 1)
-    reach, extent = np.abs(table[:, :3]).max(), np.ptp(table[:, :3], axis=0).max()
-    step = reach * np.finfo(np.float32).eps
-    if reach > 1e37 or (extent > 0 and step > COARSE * extent):
+    largest, extent = np.abs(table[:, :3]).max(), np.ptp(table[:, :3], axis=0).max()
+    step = largest * np.finfo(np.float32).eps
+    if largest > 1e37 or (extent > 0 and step > MAX_ROUNDING * extent):
         raise DataError(
-            f"{source}: its coordinates reach {reach:.3g} and differ by {extent:.3g}: float32 would round them by "
-            f"{step:.1g}. Subtract their mean (data.centred=true where the data have that key), or choose other units."
+            f"{source}: The coordinates are up to {largest:.3g} in size and differ by {extent:.3g}, so float32 would "
+            f"round them by {step:.1g}. Subtract their mean (data.centred=true, if the data set has that key), or "
+            "choose other units."
         )
     return table.astype(np.float32)
 
 
-def load(files: Sequence[Path], root: Path, how: Reading, place: str) -> Loaded:
-    """Return the clouds of all files, from the cache folder `place` if they were read before, else with a progress bar.
+def load_files(files: Sequence[Path], root: Path, reading: Reading, cache_folder: str) -> Loaded:
+    """Return the clouds of all files, from the cache if it holds them; otherwise read them with a progress bar.
 
     Args:
-        files: the files.
-        root: folder to which the files' names in the cache's key are relative.
-        how: settings for turning files into clouds.
-        place: name of the cache folder.
+        files: The files.
+        root: Folder to which the names of the files in the cache's key are relative.
+        reading: Settings for turning files into clouds.
+        cache_folder: Name of the cache folder.
     """
-    kept = cache.folder(place) / f"{_key(files, root, how)}.npz"
+    cache_file = cache.folder(cache_folder) / f"{_key(files, root, reading)}.npz"
     try:
-        with guarded(kept, "clouds"):
-            found = archive(read_bytes(kept))
-            packed = Packed(torch.from_numpy(found["points"]), torch.from_numpy(found["offset"]))
-            faults = {int(number): text for number, text in json.loads(str(found["faults"])).items()}
+        with translate_errors(cache_file, "clouds"):
+            arrays = read_npz(read_bytes(cache_file))
+            packed = Packed(torch.from_numpy(arrays["points"]), torch.from_numpy(arrays["offset"]))
+            faults = {int(number): text for number, text in json.loads(str(arrays["faults"])).items()}
     except DataError:  # the cached file is missing or damaged: read the files again
-        packed, faults = _read_all(files, how)
+        packed, faults = _read_all(files, reading)
         try:
-            with replacing(kept) as part, part.open("wb") as stream:
+            with replacing(cache_file) as part, part.open("wb") as stream:
                 points, offset = packed.points.numpy(), packed.offset.numpy()
                 np.savez(stream, points=points, offset=offset, faults=np.array(json.dumps(faults)))
         except OSError as error:
             raise DataError(
-                f"{kept} cannot be written ({error}). Free space there, or set FRAMEWORK_CACHE to another folder."
+                f"{cache_file} cannot be written ({error}). Free space on that disk, or set FRAMEWORK_CACHE to another "
+                "folder."
             ) from error
     good = tuple(number for number in range(len(files)) if number not in faults)
     return Loaded(packed, good, tuple(map(DataError, faults.values())))
 
 
-def _key(files: Sequence[Path], root: Path, how: Reading) -> str:
-    digest = hashlib.sha256(f"{VERSION} {how}\n".encode())
+def _key(files: Sequence[Path], root: Path, reading: Reading) -> str:
+    """Return a hash of the settings and of the files' names, sizes and times of modification."""
+    digest = hashlib.sha256(f"{VERSION} {reading}\n".encode())
     for file in files:
         state = file.stat()
         name = as_bytes(file.relative_to(root).as_posix())
@@ -205,27 +212,29 @@ def _key(files: Sequence[Path], root: Path, how: Reading) -> str:
     return digest.hexdigest()[:32]
 
 
-def _read_all(files: Sequence[Path], how: Reading) -> tuple[Packed, dict[int, str]]:
-    """Return the clouds of the files that can be read, and the error messages of the others by number."""
+def _read_all(files: Sequence[Path], reading: Reading) -> tuple[Packed, dict[int, str]]:
+    """Return the clouds of the files that can be read, and the error messages of the other files by their indices."""
     clouds, faults = [], {}
-    for number, file in enumerate(tracked(files, "reading clouds", len(files), "files")):
+    for number, file in enumerate(track_progress(files, "reading clouds", len(files), "files")):
         try:
-            clouds.append(cloud(file, how))
+            clouds.append(read_cloud(file, reading))
         except DataError as error:
             faults[number] = str(error)
-    return Packed.of(clouds, len(how.all_columns)), faults
+    return Packed.of(clouds, len(reading.all_columns)), faults
 
 
-def unlabelled(files: Sequence[Path], how: Reading) -> Clouds:
-    """Return a data set of a user's own files, "input" and "index", in their order.
+def load_unlabelled(files: Sequence[Path], reading: Reading) -> Clouds:
+    """Return a data set of a user's own files with the fields "input" and "index", in the order of the files.
 
     Raises:
-        DataError: there are no files, or some cannot be read; the message names the first ten.
+        DataError: There are no files, or some cannot be read; the message names the first ten.
     """
     if not files:
-        raise DataError(f"No file was given; wanted at least one of {', '.join(meshes.READERS)}.")
-    packed, faults = _read_all([Path(file) for file in files], how)
+        raise DataError(f"No file was given. Give at least one file of {', '.join(meshes.READERS)}.")
+    packed, faults = _read_all([Path(file) for file in files], reading)
     if faults:
         reasons = [DataError(text) for text in faults.values()]
-        raise DataError(images.fault_message(reasons, len(files), "Leave them out, or restore them."))
+        raise DataError(
+            images.fault_message(reasons, len(files), "Leave them out, or copy them again from their source.")
+        )
     return Clouds(packed, np.arange(len(files)))

@@ -1,4 +1,4 @@
-"""Repetition of clouds, rotated about the up axis."""
+"""Data set that repeats clouds, rotated about the up axis."""
 
 import math
 from collections.abc import Sequence
@@ -13,9 +13,9 @@ from plugins.data.labelled_clouds.reading import Clouds
 
 
 class Rotated(Dataset[dict[str, Tensor]]):
-    """Data set with each cloud `rotations` times: first all as they are, then all rotated by 2π / rotations, and so on.
+    """Data set with `rotations` copies of each cloud: first all unrotated, then all rotated by 2π/rotations, and so on.
 
-    Normals, which are the fourth to sixth columns if there are that many, rotate with their points.
+    Normals, which are the fourth to sixth column if a cloud has them, rotate with their points.
     """
 
     def __init__(self, clouds: Clouds, rotations: int) -> None:
@@ -32,13 +32,13 @@ class Rotated(Dataset[dict[str, Tensor]]):
     def __getitems__(self, indices: Sequence[int]) -> dict[str, Tensor]:
         index = torch.as_tensor(indices)
         if ((index < 0) | (index >= len(self))).any():
-            raise IndexError(f"wanted 0 to {len(self) - 1}")
+            raise IndexError(f"An index is out of range; indices are 0 to {len(self) - 1}.")
         batch = self.clouds.__getitems__((index % len(self.clouds)).tolist())
         matrix = self.matrices[index // len(self.clouds)]
-        return {**batch, "input": _turned(batch["input"], matrix), "index": index}
+        return {**batch, "input": _rotate(batch["input"], matrix), "index": index}
 
 
-def _turned(
+def _rotate(
     clouds: Float[Tensor, "batch points columns"], matrix: Float[Tensor, "batch 3 3"]
 ) -> Float[Tensor, "batch points columns"]:
     """Return the clouds with every group of three columns rotated as a vector."""

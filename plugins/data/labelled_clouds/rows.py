@@ -1,4 +1,4 @@
-"""Rows of the contract: generated CAD models, a folder of pieces of land, and an archive of small objects."""
+"""Contract-test cases: generated CAD models, a folder of pieces of land, and an archive of small objects."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -8,27 +8,27 @@ import numpy as np
 from framework.testing.rows import DAMAGES, DataRow
 from framework.testing.sample_files import meshes, surface, write_off
 
-UNMISSED = ("empty", "cut", "garbage", "folder")
-"""Kinds of damage that the data set detects; it cannot detect a missing file, which makes a smaller set."""
+DETECTED = ("empty", "cut", "garbage", "folder")
+"""Kinds of damage that the data set detects; it cannot detect a missing file, without which the set is smaller."""
 MODELS = {"train_models": 3, "test_models": 1, "points": 20, "classes": ["bowl", "cone", "stool"]}
 CLASSES = ("building", "car", "tree")
-MADE = {"data_seed": 1, "generator_seed": 1}
+SEEDS = {"data_seed": 1, "generator_seed": 1}
 
 
 def folder_of_classes(folder: Path) -> Mapping[str, str]:
     """Write meshes and clouds of many sizes, in two classes."""
     for number in range(16):
         vertices, faces = surface(number, side=3 + number % 3)
-        place = folder / ("hills" if number % 2 else "plains")
+        class_folder = folder / ("hills" if number % 2 else "plains")
         if number % 4 < 2:
-            write_off(place / f"{number:02d}.off", vertices, faces)
+            write_off(class_folder / f"{number:02d}.off", vertices, faces)
         else:
-            np.savetxt(place / f"{number:02d}.xyz", vertices, header="x y z", comments="")
+            np.savetxt(class_folder / f"{number:02d}.xyz", vertices, header="x y z", comments="")
     return {"root": str(folder)}
 
 
 def objects(counts: tuple[int, ...] = (11, 10, 12)) -> dict[str, np.ndarray]:
-    """Return an archive's arrays: the given number of objects of each class, of 2 to 20 points each."""
+    """Return the arrays of an archive with `counts[i]` objects of class i, each with 2 to 20 points."""
     random = np.random.default_rng(0)
     label = random.permutation(np.repeat(np.arange(len(counts)), counts))
     sizes = random.integers(2, 21, len(label))
@@ -54,9 +54,9 @@ ROWS = {
             MODELS,
             synthetic=True,
             files=meshes,
-            fragile={"bowl/train/*.off": UNMISSED, "cone/test/*.off": UNMISSED},
+            fragile={"bowl/train/*.off": DETECTED, "cone/test/*.off": DETECTED},
             skip={"unreadable": "skip"},
-            changes={**MADE, "points": 30},
+            changes={**SEEDS, "points": 30},
         ),
         DataRow(
             "normals, turned",
@@ -72,7 +72,7 @@ ROWS = {
             write=folder_of_classes,
             synthetic=False,
             files=meshes,
-            fragile={"hills/*.off": UNMISSED, "plains/*.xyz": UNMISSED},
+            fragile={"hills/*.off": DETECTED, "plains/*.xyz": DETECTED},
             skip={"unreadable": "skip"},
             changes={"data_seed": 1, "points": 8},
         ),

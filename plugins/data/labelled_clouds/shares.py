@@ -4,31 +4,31 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 
-def spared(
+def choose_held_out(
     labels: Int[np.ndarray, "samples"], share: float, random: np.random.Generator
 ) -> Bool[np.ndarray, "samples"]:
-    """Return which samples to hold out: `share` of all, equal in every class, but never the last sample of a class.
+    """Return which samples to hold out: a share of all samples, equal in every class, but never all of a class.
 
-    Each class gives the whole part of its share; classes with the largest remainders give one more each, until the
-    total is reached.
+    From each class, `share` times its size is held out, rounded down. Then one more sample is held out from each of the
+    classes with the largest remainders, until the total is reached.
     """
-    held = np.zeros(len(labels), bool)
+    held_out = np.zeros(len(labels), bool)
     counts = np.bincount(labels) if len(labels) else np.zeros(1, np.int64)
-    wanted = share * counts
-    give = np.minimum(np.floor(wanted).astype(np.int64), np.maximum(counts - 1, 0))
-    rest = np.where(counts - give > 1, wanted - give, -1.0)
-    missing = round(share * len(labels)) - int(give.sum())
-    for label in np.lexsort([random.random(len(counts)), -rest])[: max(missing, 0)]:
-        give[label] += rest[label] > 0
-    for label, number in enumerate(give):
-        held[random.permutation(np.flatnonzero(labels == label))[:number]] = True
-    return held
+    exact = share * counts
+    number = np.minimum(np.floor(exact).astype(np.int64), np.maximum(counts - 1, 0))
+    remainder = np.where(counts - number > 1, exact - number, -1.0)
+    missing = round(share * len(labels)) - int(number.sum())
+    for label in np.lexsort([random.random(len(counts)), -remainder])[: max(missing, 0)]:
+        number[label] += remainder[label] > 0
+    for label, size in enumerate(number):
+        held_out[random.permutation(np.flatnonzero(labels == label))[:size]] = True
+    return held_out
 
 
-def folds(
+def assign_folds(
     labels: Int[np.ndarray, "samples"], count: int, random: np.random.Generator
 ) -> Int[np.ndarray, "samples"]:
-    """Return the fold of each sample; classes are dealt out in turn, so folds differ by at most one sample of each."""
+    """Return the fold of each sample; the number of samples of a class differs by at most one between folds."""
     order = np.concatenate(
         [random.permutation(np.flatnonzero(labels == label)) for label in np.unique(labels)]
     )

@@ -1,4 +1,4 @@
-"""Tests of the reader of the official layout, the generated set, and the data contract."""
+"""Tests of the reader of ModelNet40's layout, of the generated set, and of rotated copies."""
 
 import math
 
@@ -15,24 +15,25 @@ NAME = "modelnet40"
 SIZES = {"train_models": 4, "test_models": 2}
 
 
-def cube(folder, *names, size=1.0, content=None):
-    """Write cubes as `<folder>/<name>`, including the official files' broken header."""
-    text = as_off(solids.box(size, size, size)).replace("OFF\n", "OFF", 1)
+def write_cubes(folder, *names):
+    """Write unit cubes as `<folder>/<name>`, with the broken header of some official files."""
+    text = as_off(solids.box(1.0, 1.0, 1.0)).replace("OFF\n", "OFF", 1)
     for name in names:
         file = folder / name
         file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_text(text if content is None else content)
+        file.write_text(text)
 
 
-def official(folder):
+def write_official(folder):
+    """Write three classes of cubes in the layout of ModelNet40, and return the folder."""
     for category in ("cube", "crate", "box"):
-        cube(folder, *(f"{category}/train/{category}_{number:04d}.off" for number in range(5)))
-        cube(folder, *(f"{category}/test/{category}_{number:04d}.off" for number in range(5, 7)))
+        write_cubes(folder, *(f"{category}/train/{category}_{number:04d}.off" for number in range(5)))
+        write_cubes(folder, *(f"{category}/test/{category}_{number:04d}.off" for number in range(5, 7)))
     return folder
 
 
 def test_splits_labels_and_attributes(prepared, tmp_path):
-    root = official(tmp_path / "ModelNet40")
+    root = write_official(tmp_path / "ModelNet40")
     clouds = prepared(root=root, points=64, validation_share=0.2)
     assert clouds.target.kind == "class"
     assert clouds.target.names == ("box", "crate", "cube")
@@ -47,24 +48,24 @@ def test_splits_labels_and_attributes(prepared, tmp_path):
         surface = (batch["input"] - torch.tensor([0, 0, 0.5])).abs().amax(-1)
         torch.testing.assert_close(surface, torch.full_like(surface, 0.5))
     assert sizes == {"train": [4, 4, 4], "validation": [1, 1, 1], "test": [2, 2, 2]}
-    print_of = clouds.fingerprint()
-    assert (print_of["train"], print_of["version"]) == ("12", "ModelNet40")
+    fingerprint = clouds.fingerprint()
+    assert (fingerprint["train"], fingerprint["version"]) == ("12", "ModelNet40")
 
 
-def test_points_are_those_of_the_file_whatever_else_is_read(data, prepared, tmp_path):
-    root = official(tmp_path / "ModelNet40")
+def test_the_points_of_a_file_do_not_depend_on_other_files(data, prepared, tmp_path):
+    root = write_official(tmp_path / "ModelNet40")
     file = root / "cube" / "test" / "cube_0006.off"
-    wanted = sample(read(file), 64, stream(7, "cube_0006.off")).points.astype(np.float32)
+    expected = sample(read(file), 64, stream(7, "cube_0006.off")).points.astype(np.float32)
     for config in ({}, {"classes": ["cube", "box"]}):
         clouds = prepared(root=root, points=64, data_seed=7, **config)
         last = clouds.splits().test[len(clouds.splits().test) - 1]
-        np.testing.assert_array_equal(last["input"], wanted)
+        np.testing.assert_array_equal(last["input"], expected)
     unlabelled = data(points=64, data_seed=7).read([file])  # without prepare
-    np.testing.assert_array_equal(unlabelled[0]["input"], wanted)
+    np.testing.assert_array_equal(unlabelled[0]["input"], expected)
 
 
 def test_the_second_run_reads_no_mesh(prepared, tmp_path, monkeypatch):
-    root = official(tmp_path / "ModelNet40")
+    root = write_official(tmp_path / "ModelNet40")
     first = prepared(root=root, points=32)
     monkeypatch.setitem(READERS, ".off", None)
     again = prepared(root=root, points=32)
@@ -74,61 +75,64 @@ def test_the_second_run_reads_no_mesh(prepared, tmp_path, monkeypatch):
 
 
 def test_normals_are_those_of_the_faces(prepared, tmp_path):
-    clouds = prepared(root=official(tmp_path / "ModelNet40"), points=50, normals=True)
+    clouds = prepared(root=write_official(tmp_path / "ModelNet40"), points=50, normals=True)
     assert clouds.columns == ("x", "y", "z", "normal_x", "normal_y", "normal_z")
     assert clouds.input_shape == (50, 6)
-    found = clouds.splits().train.__getitems__(range(len(clouds.splits().train)))["input"]
-    # a cube's normal is along the coordinate that is furthest from its middle, outwards
-    local = found[..., :3] - torch.tensor([0, 0, 0.5])
-    at = local.abs().argmax(-1, keepdim=True)
-    outwards = torch.zeros_like(local).scatter(-1, at, local.gather(-1, at).sign())
-    torch.testing.assert_close(found[..., 3:], outwards, atol=1e-6, rtol=0)
+    inputs = clouds.splits().train.__getitems__(range(len(clouds.splits().train)))["input"]
+    # the outward normal of a cube is along the coordinate that is furthest from the middle of the cube
+    local = inputs[..., :3] - torch.tensor([0, 0, 0.5])
+    axis = local.abs().argmax(-1, keepdim=True)
+    outwards = torch.zeros_like(local).scatter(-1, axis, local.gather(-1, axis).sign())
+    torch.testing.assert_close(inputs[..., 3:], outwards, atol=1e-6, rtol=0)
 
 
-def test_all_of_the_training_split_may_train(prepared, tmp_path):
+def test_the_whole_training_split_can_be_used_for_training(prepared, tmp_path):
     """Check that nothing is held out, as in the thesis, and that validation uses unrotated training clouds."""
-    config = {"root": official(tmp_path / "ModelNet40"), "points": 40}
-    whole, held = prepared(**config, validation_share=0, rotations=2), prepared(**config)
+    config = {"root": write_official(tmp_path / "ModelNet40"), "points": 40}
+    whole, held_out = prepared(**config, validation_share=0, rotations=2), prepared(**config)
     train, validation, test = whole.splits()
-    assert len(validation) == len(held.splits().train) + len(held.splits().validation)
+    assert len(validation) == len(held_out.splits().train) + len(held_out.splits().validation)
     assert len(train) == 2 * len(validation)
     first = [split.__getitems__(range(len(validation))) for split in (train, validation)]
     assert torch.equal(first[0]["input"], first[1]["input"])
-    assert len(test) == len(held.splits().test)
+    assert len(test) == len(held_out.splits().test)
 
 
 def test_rotations_repeat_the_training_split_about_the_up_axis(prepared, tmp_path):
-    config = {"root": official(tmp_path / "ModelNet40"), "points": 40, "normals": True}
-    plain, turned = prepared(**config), prepared(**config, rotations=3)
+    config = {"root": write_official(tmp_path / "ModelNet40"), "points": 40, "normals": True}
+    plain, rotated = prepared(**config), prepared(**config, rotations=3)
     count = len(plain.splits().train)
-    assert len(turned.splits().train) == 3 * count
-    assert len(turned.splits().test) == len(plain.splits().test)
-    one = plain.splits().train.__getitems__(range(count))
-    all_three = turned.splits().train.__getitems__(range(3 * count))
-    torch.testing.assert_close(all_three["input"][:count], one["input"], atol=0, rtol=0)
-    assert all_three["index"].tolist() == list(range(3 * count))
-    assert all_three["target"].tolist() == 3 * one["target"].tolist()
-    for turn in (1, 2):
-        found = all_three["input"][turn * count : (turn + 1) * count]
-        for first in (0, 3):  # as complex numbers: a factor of exp(2πi turn / 3)
-            before = torch.complex(one["input"][..., first].double(), one["input"][..., first + 1].double())
-            after = torch.complex(found[..., first].double(), found[..., first + 1].double())
-            factor = complex(math.cos(2 * math.pi * turn / 3), math.sin(2 * math.pi * turn / 3))
+    assert len(rotated.splits().train) == 3 * count
+    assert len(rotated.splits().test) == len(plain.splits().test)
+    unrotated = plain.splits().train.__getitems__(range(count))
+    copies = rotated.splits().train.__getitems__(range(3 * count))
+    torch.testing.assert_close(copies["input"][:count], unrotated["input"], atol=0, rtol=0)
+    assert copies["index"].tolist() == list(range(3 * count))
+    assert copies["target"].tolist() == 3 * unrotated["target"].tolist()
+    for copy in (1, 2):
+        clouds = copies["input"][copy * count : (copy + 1) * count]
+        # x and y as a complex number are multiplied by exp(2πi copy / 3); columns 0 and 1 are points, 3 and 4 normals
+        for first in (0, 3):
+            before = torch.complex(
+                unrotated["input"][..., first].double(), unrotated["input"][..., first + 1].double()
+            )
+            after = torch.complex(clouds[..., first].double(), clouds[..., first + 1].double())
+            factor = complex(math.cos(2 * math.pi * copy / 3), math.sin(2 * math.pi * copy / 3))
             torch.testing.assert_close(after, before * factor, atol=1e-6, rtol=0)
-        torch.testing.assert_close(found[..., [2, 5]], one["input"][..., [2, 5]], atol=0, rtol=0)
-    single = turned.splits().train[count + 2]
-    assert torch.equal(single["input"], all_three["input"][count + 2])
+        torch.testing.assert_close(clouds[..., [2, 5]], unrotated["input"][..., [2, 5]], atol=0, rtol=0)
+    single = rotated.splits().train[count + 2]
+    assert torch.equal(single["input"], copies["input"][count + 2])
     with pytest.raises(IndexError):
-        turned.splits().train[3 * count]
+        rotated.splits().train[3 * count]
 
 
 def test_other_layouts_and_classes_are_refused(prepared, tmp_path):
-    root = official(tmp_path / "ModelNet40")
-    with pytest.raises(DataError, match="ModelNet40 has no folders train and test"):
+    root = write_official(tmp_path / "ModelNet40")
+    with pytest.raises(DataError, match="the folder ModelNet40 has no folders train and test"):
         prepared(root=tmp_path)
     with pytest.raises(DataError, match=r"names 'crat', which .* Did you mean 'crate'"):
         prepared(root=root, classes=["crat", "box"])
-    with pytest.raises(DataError, match="wanted at least two of box, crate, cube"):
+    with pytest.raises(DataError, match=r"at least two classes are required\. Choose from box, crate, cube"):
         prepared(root=root, classes=["box"])
     for file in (root / "crate" / "test").iterdir():
         file.unlink()
@@ -136,7 +140,7 @@ def test_other_layouts_and_classes_are_refused(prepared, tmp_path):
         prepared(root=root)
 
 
-def test_without_a_root_every_class_is_made(prepared):
+def test_without_a_root_every_class_is_generated(prepared):
     clouds = prepared(points=128, **SIZES)
     assert len(clouds.target.names) == len(CLASSES) == 40
     assert clouds.fingerprint()["root"] == "synthetic, seed 0"

@@ -1,4 +1,4 @@
-"""Tests of the generated set, and of the solids that it is made of."""
+"""Tests of the generated set, and of its solids."""
 
 import hashlib
 import json
@@ -9,7 +9,7 @@ import pytest
 
 from framework.geometry.meshes import Mesh, normals, read
 from plugins.data.labelled_clouds.shapes import generator, solids
-from plugins.data.labelled_clouds.shapes.generator import CLASSES, Models, as_off, generated, model
+from plugins.data.labelled_clouds.shapes.generator import CLASSES, Models, as_off, generate_models, model
 
 
 @pytest.fixture(scope="module")
@@ -17,26 +17,28 @@ def root(tmp_path_factory):
     """Return a generated root of 3 + 2 models of each class, in a cache of the module's own."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("FRAMEWORK_CACHE", str(tmp_path_factory.mktemp("cache")))
-        return generated(Models(train_models=3, test_models=2))
+        return generate_models(Models(train_models=3, test_models=2))
 
 
-def test_a_root_is_a_function_of_its_seed_to_the_byte(root):
-    again = generated(Models(train_models=3, test_models=2))
+def test_the_seed_determines_every_byte(root):
+    again = generate_models(Models(train_models=3, test_models=2))
     assert again != root
 
     def content(folder):
         return {file.relative_to(folder): file.read_bytes() for file in sorted(folder.rglob("*.off"))}
 
     assert content(again) == content(root)
-    more = content(generated(Models(train_models=4, test_models=2)))
+    more = content(generate_models(Models(train_models=4, test_models=2)))
     first = {name: text for name, text in content(root).items() if name.parts[1] == "train"}
-    assert {name: more[name] for name in first} == first  # the first of more are those of fewer
-    assert content(generated(Models(train_models=4, test_models=2, generator_seed=1))) != content(root)
+    assert {
+        name: more[name] for name in first
+    } == first  # a larger set begins with the models of a smaller set
+    assert content(generate_models(Models(train_models=4, test_models=2, generator_seed=1))) != content(root)
     assert json.loads((again / "synthetic.json").read_text())["seed"] == 0
 
 
 def test_the_bytes_are_those_of_this_version():
-    """Check the bytes: a change of a family or the writer must raise `generator.VERSION`, or old caches are read."""
+    """Check the bytes: changes of shapes or of the writer must increase `generator.VERSION`, or old caches are read."""
     digest = hashlib.sha256()
     for category in CLASSES:
         digest.update(as_off(model(category, "train", 0, 0)).encode())
@@ -44,7 +46,8 @@ def test_the_bytes_are_those_of_this_version():
 
 
 FACES = (10, 8000)
-EDGE_M = {  # the longest edge of the upright box around a model, metres: what such things measure, and the stretch
+# plausible range of the longest edge of the upright box around a stretched model, metres
+EDGE_M = {
     "airplane": (1.0, 9.0), "bathtub": (0.8, 5.0), "bed": (1.0, 6.0), "bench": (0.4, 6.0),
     "bookshelf": (0.4, 5.0), "bottle": (0.2, 2.0), "bowl": (0.2, 1.6), "car": (1.6, 13.0),
     "chair": (0.4, 3.0), "cone": (0.2, 2.5), "cup": (0.1, 1.2), "curtain": (0.6, 6.0),
@@ -58,8 +61,8 @@ EDGE_M = {  # the longest edge of the upright box around a model, metres: what s
 }  # fmt: skip
 
 
-def test_the_classes_are_those_of_modelnet40_and_equally_many(root):
-    """Check that the root holds exactly Princeton's 40 classes, in their order, with equally many models each."""
+def test_the_classes_are_those_of_modelnet40(root):
+    """Check that the root holds exactly Princeton's 40 classes, in their order, with the same number of models each."""
     assert list(CLASSES) == sorted(CLASSES) == list(EDGE_M)
     assert sorted(path.name for path in root.iterdir() if path.is_dir()) == list(CLASSES)
     for split, count in (("train", 3), ("test", 2)):
@@ -76,19 +79,19 @@ def test_every_model_is_a_closed_surface_of_sensible_size(root, category):
         assert EDGE_M[category][0] < (high - low).max() < EDGE_M[category][1]
         assert (high - low).min() > 0.01 * (high - low).max()
         assert FACES[0] <= len(mesh.faces) < FACES[1]
-        # closed, and outwards on the whole: ∮ n dA = 0, and the volume ∮ x · n dA / 3 is positive
+        # a closed surface with outward normals: ∮ n dA = 0, and the volume ∮ x · n dA / 3 is positive
         corners = mesh.vertices[mesh.faces]
         area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
         np.testing.assert_allclose(area.sum(0), 0, atol=1e-4 * np.abs(area).sum())
         assert (corners.mean(1) * area).sum() / 3 > 0
         wide, deep, tall = high - low
-        around = 2 * (wide * deep + deep * tall + tall * wide)  # the area of the box around it
-        assert 0.05 * around < np.linalg.norm(area, axis=1).sum() < 12 * around
+        box_area = 2 * (wide * deep + deep * tall + tall * wide)  # of the box around the model
+        assert 0.05 * box_area < np.linalg.norm(area, axis=1).sum() < 12 * box_area
         assert_edges_meet(mesh.vertices, mesh.faces)
 
 
 @pytest.mark.parametrize("category", CLASSES)
-def test_no_triangle_is_needless(category):
+def test_no_triangle_has_area_zero(category):
     for number in range(3):
         solid = model(category, "test", number, 3)
         corners = np.round(solid.vertices, 5)[solid.faces]
@@ -97,13 +100,14 @@ def test_no_triangle_is_needless(category):
 
 
 def assert_edges_meet(vertices, faces):
-    """Assert that every edge is passed equally often in both directions: there is no hole and no face turned inside
-    out.
+    """Assert that the faces pass every edge equally often in both directions.
+
+    Then there is no hole, and no face is inside out.
     """
-    names = np.unique(vertices, axis=0, return_inverse=True)[1].reshape(-1)[faces]
-    start, end = names.reshape(-1), np.roll(names, -1, axis=1).reshape(-1)
-    many = len(vertices)
-    np.testing.assert_array_equal(np.sort(start * many + end), np.sort(end * many + start))
+    corners = np.unique(vertices, axis=0, return_inverse=True)[1].reshape(-1)[faces]
+    start, end = corners.reshape(-1), np.roll(corners, -1, axis=1).reshape(-1)
+    count = len(vertices)
+    np.testing.assert_array_equal(np.sort(start * count + end), np.sort(end * count + start))
 
 
 def test_the_models_of_a_class_differ(root):
@@ -112,7 +116,7 @@ def test_the_models_of_a_class_differ(root):
         assert len(texts) == 4
 
 
-# ---- solids against their own formulas -------------------------------------------------------------------
+# ---- volumes and areas of solids, compared with formulas ---------------------------------------------------
 
 
 def volume_and_area(solid):
@@ -126,37 +130,37 @@ CIRCLE = np.stack([np.cos(ANGLE), np.sin(ANGLE)], 1)
 LINE = np.array([(0.0, 0.0), (1.0, 0.0), (3.0, 0.0)])
 SOLIDS = {
     "box": (solids.box(2.0, 3.0, 4.0, (5, 5, 5)), 24, 52),
-    "frustum of a pyramid": (solids.tapered(2.0, 2.0, 1.0, 1.0, 3.0), 7, 5 + 4 * 1.5 * math.hypot(3, 0.5)),
+    "frustum of a pyramid": (solids.frustum(2.0, 2.0, 1.0, 1.0, 3.0), 7, 5 + 4 * 1.5 * math.hypot(3, 0.5)),
     "cylinder": (solids.cylinder(0.5, 2.0, sides=400), math.pi / 2, 2.5 * math.pi),
     "cone": (solids.cylinder(1.0, 2.0, top=0.0, sides=400), 2 * math.pi / 3, math.pi * (1 + math.sqrt(5))),
     "ball": (solids.ball(1.0, (1, 2, 3), 400), 4 * math.pi / 3, 4 * math.pi),
     "rod": (solids.rod((1, 1, 1), (3, 3, 2), 0.1, 400), 3 * math.pi * 0.01, None),
     "plate": (solids.slab([(0, 0), (2, 0), (0, 2)], 0.5), 1, None),
-    "side view": (solids.carried([(0, 0), (4, 0), (4, 1), (0, 3)], 0.5), 4, 16 + 0.5 * (8 + math.sqrt(20))),
+    "side view": (solids.side_prism([(0, 0), (4, 0), (4, 1), (0, 3)], 0.5), 4, 16 + 0.5 * (8 + math.sqrt(20))),
     "tray": (solids.tray(4.0, 3.0, 2.0, 0.5, 0.5), 15, 67),
     "sheet": (solids.ribbon(LINE, LINE, 0.5, 2.0), 3, 17),
-    "disc": (solids.extruded(CIRCLE, 0.5), 0.5 * math.pi, 3 * math.pi),
+    "disc": (solids.prism(CIRCLE, 0.5), 0.5 * math.pi, 3 * math.pi),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("solid, volume, area", SOLIDS.values(), ids=SOLIDS)
 def test_solids_have_their_volume_and_area(solid, volume, area):
-    found = volume_and_area(solid)
-    assert found[0] == pytest.approx(volume, rel=5e-4)
+    measured_volume, measured_area = volume_and_area(solid)
+    assert measured_volume == pytest.approx(volume, rel=5e-4)
     if area is not None:
-        assert found[1] == pytest.approx(area, rel=5e-4)
+        assert measured_area == pytest.approx(area, rel=5e-4)
 
 
 def test_a_ring_is_a_torus_and_its_normals_point_outwards():
-    found, area = volume_and_area(solids.ring(1.0, 0.25, sides=400))
-    # its tube has eight sides: the octagon's share of the disc, and of the circle
-    assert found == pytest.approx(2 * math.pi * 0.25**2 * 4 * math.sin(math.pi / 4), rel=2e-3)
+    volume, area = volume_and_area(solids.ring(1.0, 0.25, sides=400))
+    # the cross-section of the tube is an octagon, with the area and circumference of an octagon in a circle
+    assert volume == pytest.approx(2 * math.pi * 0.25**2 * 4 * math.sin(math.pi / 4), rel=2e-3)
     assert area == pytest.approx(2 * math.pi * 16 * 0.25 * math.sin(math.pi / 8), rel=2e-3)
 
 
-def test_mirror_images_and_turns_keep_the_outside_out():
-    cone = solids.cylinder(0.3, 1.0, top=0.1).moved(1.0)
-    whole = solids.mirrored(cone.turned("x", 30.0).turned("y", 40.0).turned("z", 50.0), 0)
+def test_mirror_images_and_rotations_keep_normals_outwards():
+    cone = solids.cylinder(0.3, 1.0, top=0.1).move(1.0)
+    whole = solids.with_mirror(cone.rotate("x", 30.0).rotate("y", 40.0).rotate("z", 50.0), 0)
     assert volume_and_area(whole)[0] == pytest.approx(2 * volume_and_area(cone)[0])
     mesh = Mesh("both", whole.vertices, whole.faces)
     assert np.isfinite(normals(mesh)).all()

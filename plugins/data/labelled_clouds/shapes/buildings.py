@@ -9,15 +9,15 @@ from plugins.data.labelled_clouds.shapes.solids import (
     Solid,
     ball,
     box,
-    carried,
     cylinder,
-    joined,
-    mirrored,
-    revolved,
+    frustum,
+    join,
+    revolution,
     ribbon,
     rod,
-    tapered,
+    side_prism,
     tray,
+    with_mirror,
 )
 
 Random = np.random.Generator
@@ -45,15 +45,15 @@ def curtain(random: Random) -> Solid:
         knot = 0.4 * height if waist < 1 else 0.0
         if knot:
             parts.append(ribbon(line(0.8 * waist + 0.2), line(waist), 0.02, knot))
-        parts.append(ribbon(line(waist), line(1.0), 0.02, height - knot).moved(0, 0, knot))
+        parts.append(ribbon(line(waist), line(1.0), 0.02, height - knot).move(0, 0, knot))
     if random.random() < 0.7:  # a rail
         parts.append(rod((-0.55 * width, 0, height), (0.55 * width, 0, height), random.uniform(0.012, 0.03)))
         if random.random() < 0.6:
-            parts.append(mirrored(ball(0.05, (0.55 * width, 0, height), 8), 0))
+            parts.append(with_mirror(ball(0.05, (0.55 * width, 0, height), 8), 0))
     if random.random() < 0.3:  # a valance
         drop = random.uniform(0.12, 0.3) * height
         parts.append(box(1.02 * width, 0.06 + 2 * deep, drop, (0, 0, height - drop)))
-    return joined(parts)
+    return join(parts)
 
 
 def door(random: Random) -> Solid:
@@ -79,22 +79,22 @@ def door(random: Random) -> Solid:
     if random.random() < 0.8:
         bar, at = random.uniform(0.02, 0.05), 0.5 * height
         knob = ball(0.04, (0.42 * width, 0.06, at), 8) if random.random() < 0.5 else None
-        parts.append(mirrored(knob or box(0.12, 0.03, bar, (0.4 * width, 0.06, at)), 1))
+        parts.append(with_mirror(knob or box(0.12, 0.03, bar, (0.4 * width, 0.06, at)), 1))
         parts.append(box(0.02, 0.12, 0.02, (0.42 * width, 0, at)))
-    leaf = joined(parts)
+    leaf = join(parts)
     turn = random.uniform(15, 75) if random.random() < 0.2 else 0.0
-    hinged = leaf.moved(width / 2, 0, 0).turned("z", -turn).moved(-width / 2, 0, 0)
+    hinged = leaf.move(width / 2, 0, 0).rotate("z", -turn).move(-width / 2, 0, 0)
     if wings == 2:
-        hinged = mirrored(hinged.moved(-width / 2, 0, 0), 0)
+        hinged = with_mirror(hinged.move(-width / 2, 0, 0), 0)
     parts = [hinged]
     if random.random() < 0.6:  # the frame
         side, deep = random.uniform(0.05, 0.14), random.uniform(0.08, 0.2)
         whole = wings * width
-        parts.append(mirrored(box(side, deep, height, ((whole + side) / 2, 0, 0)), 0))
+        parts.append(with_mirror(box(side, deep, height, ((whole + side) / 2, 0, 0)), 0))
         parts.append(box(whole + 2 * side, deep, side, (0, 0, height)))
         if random.random() < 0.25:
             parts.append(box(whole + 2 * side, 0.5 * deep, 0.3, (0, 0, height + side)))
-    return joined(parts)
+    return join(parts)
 
 
 def mantel(random: Random) -> Solid:
@@ -104,9 +104,9 @@ def mantel(random: Random) -> Solid:
     frieze = random.uniform(0.12, 0.3) * height
     x, z = (width - jamb) / 2, height - frieze
     if random.random() < 0.25:  # columns
-        parts = [mirrored(cylinder(0.45 * jamb, z, (x, 0, 0), sides=14), 0)]
+        parts = [with_mirror(cylinder(0.45 * jamb, z, (x, 0, 0), sides=14), 0)]
     else:
-        parts = [mirrored(box(jamb, deep, z, (x, 0, 0)), 0)]
+        parts = [with_mirror(box(jamb, deep, z, (x, 0, 0)), 0)]
     parts.append(box(width, deep, frieze, (0, 0, z)))
     steps, over = int(random.integers(1, 4)), random.uniform(0.05, 0.15)
     for step in range(steps):
@@ -114,9 +114,9 @@ def mantel(random: Random) -> Solid:
         parts.append(box(width + 2 * share, deep + 2 * share, 0.05, (0, 0, height + 0.05 * step)))
     if random.random() < 0.5:  # feet and capitals
         for level in (0, z - 0.08):
-            parts.append(mirrored(box(1.2 * jamb, deep + 0.06, 0.08, (x, 0, level)), 0))
+            parts.append(with_mirror(box(1.2 * jamb, deep + 0.06, 0.08, (x, 0, level)), 0))
     if random.random() < 0.5:  # panels
-        parts.append(mirrored(box(0.6 * jamb, deep + 0.04, 0.6 * z, (x, 0, 0.2 * z)), 0))
+        parts.append(with_mirror(box(0.6 * jamb, deep + 0.04, 0.6 * z, (x, 0, 0.2 * z)), 0))
         parts.append(box(0.7 * (width - jamb), deep + 0.04, 0.5 * frieze, (0, 0, z + 0.25 * frieze)))
     if random.random() < 0.4:
         parts.append(box(1.05 * width, random.uniform(0.3, 0.7), 0.05, (0, -0.2, -0.05)))
@@ -125,7 +125,7 @@ def mantel(random: Random) -> Solid:
     if random.random() < 0.3:  # above it
         tall, wide = random.uniform(0.4, 1.1), random.uniform(0.6, 1) * width
         parts.append(box(wide, 0.6 * deep, tall, (0, 0.2 * deep, height + 0.05 * steps)))
-    return joined(parts)
+    return join(parts)
 
 
 def stairs(random: Random) -> Solid:
@@ -137,13 +137,13 @@ def stairs(random: Random) -> Solid:
     if kind < 0.2:  # winding about a post
         radius, turn = random.uniform(0.7, 1.1), random.uniform(20, 32)
         for step in range(count):
-            tread = tapered(0.85 * radius, 0.2, 0.85 * radius, 0.2, 0.04)
+            tread = frustum(0.85 * radius, 0.2, 0.85 * radius, 0.2, 0.04)
             vertices = tread.vertices.copy()
             vertices[:, 1] *= 1 + 1.2 * vertices[:, 0] / radius  # wider outside
-            tread = Solid(vertices, tread.faces).moved(0.5 * radius, 0, rise * (step + 1))
-            parts.append(tread.turned("z", turn * step))
+            tread = Solid(vertices, tread.faces).move(0.5 * radius, 0, rise * (step + 1))
+            parts.append(tread.rotate("z", turn * step))
         parts.append(cylinder(0.07, rise * (count + 1) + random.uniform(0, 0.9), sides=12))
-        return joined(parts)
+        return join(parts)
     for step in range(count):
         y, z = run * (step + 0.5), rise * (step + 1)
         if open_:
@@ -153,7 +153,7 @@ def stairs(random: Random) -> Solid:
     far, high = run * count, rise * count
     if open_:
         string = [(0.0, 0.0), (0.15, 0.0), (far, high - 0.15), (far, high), (far - 0.1, high)]
-        parts.append(mirrored(carried(string, 0.04).moved(random.uniform(0.35, 0.5) * width, 0, 0), 0))
+        parts.append(with_mirror(side_prism(string, 0.04).move(random.uniform(0.35, 0.5) * width, 0, 0), 0))
     landing = random.uniform(0.6, 1.2) if random.random() < 0.35 else 0.0
     if landing:
         thick = 0.08 if open_ else high
@@ -163,7 +163,7 @@ def stairs(random: Random) -> Solid:
                 z = high + rise * (step + 1)
                 tread = box(run, landing, 0.04 if open_ else z)
                 parts.append(
-                    tread.moved(width / 2 + run * (step + 0.5), far + landing / 2, z - 0.04 if open_ else 0)
+                    tread.move(width / 2 + run * (step + 0.5), far + landing / 2, z - 0.04 if open_ else 0)
                 )
     if random.random() < 0.45:
         tall, sides = random.uniform(0.7, 1.0), (-1, 1) if random.random() < 0.6 else (1,)
@@ -173,7 +173,7 @@ def stairs(random: Random) -> Solid:
             for step in range(0, count, int(random.integers(1, 4))):
                 y, z = run * (step + 0.5), rise * (step + 1)
                 parts.append(rod((x, y, z), (x, y, z + tall), 0.015, sides=6))
-    return joined(parts)
+    return join(parts)
 
 
 def tent(random: Random) -> Solid:
@@ -187,13 +187,13 @@ def tent(random: Random) -> Solid:
         for side in (-1, 1):
             run, rise = width / 2, height - wall
             slope = math.hypot(run, rise)
-            plate = box(slope, long, thick).turned("y", side * math.degrees(math.atan2(rise, run)))
-            parts.append(plate.moved(side * width / 4, 0, wall + rise / 2))
+            plate = box(slope, long, thick).rotate("y", side * math.degrees(math.atan2(rise, run)))
+            parts.append(plate.move(side * width / 4, 0, wall + rise / 2))
             if wall:
                 parts.append(box(thick, long, wall, (side * width / 2, 0, 0)))
         if random.random() < 0.6:  # the back
-            gable = carried([(-width / 2, wall), (width / 2, wall), (0, height)], thick)
-            parts.append(gable.turned("z", 90).moved(0, long / 2, 0))
+            gable = side_prism([(-width / 2, wall), (width / 2, wall), (0, height)], thick)
+            parts.append(gable.rotate("z", 90).move(0, long / 2, 0))
             if wall:
                 parts.append(box(width, thick, wall, (0, long / 2, 0)))
         if random.random() < 0.5:
@@ -203,11 +203,11 @@ def tent(random: Random) -> Solid:
     elif kind < 0.65:  # a dome, with a porch perhaps
         bend = np.linspace(0, math.pi / 2, 9)
         sides = int(random.choice([6, 8, 24]))
-        dome = revolved([(math.cos(b), math.sin(b)) for b in bend], sides)
-        parts.append(dome.scaled(width / 2, long / 2, random.uniform(0.4, 0.7) * width))
+        dome = revolution([(math.cos(b), math.sin(b)) for b in bend], sides)
+        parts.append(dome.scale(width / 2, long / 2, random.uniform(0.4, 0.7) * width))
         if random.random() < 0.6:
-            porch = revolved([(math.cos(b), math.sin(b)) for b in bend], 12)
-            parts.append(porch.scaled(0.25 * width, 0.3 * long, 0.35 * width).moved(0, -0.45 * long, 0))
+            porch = revolution([(math.cos(b), math.sin(b)) for b in bend], 12)
+            parts.append(porch.scale(0.25 * width, 0.3 * long, 0.35 * width).move(0, -0.45 * long, 0))
     elif kind < 0.8:  # a cone on poles
         sides = int(random.choice([8, 12, 24]))
         parts.append(cylinder(width / 2, 1.3 * height, top=0.06, sides=sides))
@@ -217,15 +217,15 @@ def tent(random: Random) -> Solid:
     else:  # a roof on posts
         post, over = random.uniform(0.6, 1.0) * width, 1.08
         leg = rod((width / 2, long / 2, 0), (width / 2, long / 2, post), 0.03)
-        parts.append(mirrored(mirrored(leg, 0), 1))
+        parts.append(with_mirror(with_mirror(leg, 0), 1))
         roof = random.uniform(0.2, 0.5) * width
         ridge = random.choice([0.02, 0.5])
-        parts.append(tapered(over * width, over * long, 0.02 * width, ridge * long, roof, (0, 0, post)))
+        parts.append(frustum(over * width, over * long, 0.02 * width, ridge * long, roof, (0, 0, post)))
         if random.random() < 0.4:
             parts.append(box(over * width, over * long, 0.2, (0, 0, post - 0.2)))
         if random.random() < 0.35:
-            parts.append(mirrored(box(0.02, long, post, (width / 2, 0, 0)), 0))
-    return joined(parts)
+            parts.append(with_mirror(box(0.02, long, post, (width / 2, 0, 0)), 0))
+    return join(parts)
 
 
 def range_hood(random: Random) -> Solid:
@@ -234,11 +234,11 @@ def range_hood(random: Random) -> Solid:
     rim, tall = random.uniform(0.03, 0.12), random.uniform(0.15, 0.4)
     flue = random.uniform(0.2, 0.38)
     kind = random.random()
-    below = tray(width, depth, rim, 0.02, 0.6 * rim).turned("x", 180).moved(0, 0, rim)
+    below = tray(width, depth, rim, 0.02, 0.6 * rim).rotate("x", 180).move(0, 0, rim)
     parts = [below]
     if kind < 0.45:
         back = random.choice([0.0, 0.5]) * (depth - flue)
-        slope = tapered(width, depth, flue, flue, tall, (0, 0, rim))
+        slope = frustum(width, depth, flue, flue, tall, (0, 0, rim))
         vertices = slope.vertices.copy()
         vertices[4:, 1] += back
         parts.append(Solid(vertices, slope.faces))
@@ -246,7 +246,7 @@ def range_hood(random: Random) -> Solid:
     elif kind < 0.65:  # vaulted
         bend = np.linspace(0, math.pi, 12)
         arch = [(width / 2 * math.cos(b), tall * math.sin(b)) for b in bend]
-        parts.append(carried(arch, depth).turned("z", 90).moved(0, 0, rim))
+        parts.append(side_prism(arch, depth).rotate("z", 90).move(0, 0, rim))
         top, y = rim + 0.8 * tall, 0.0
     elif kind < 0.85:  # a box
         parts.append(box(width, random.uniform(0.5, 1) * depth, 0.6 * tall, (0, 0.0, rim)))
@@ -257,8 +257,8 @@ def range_hood(random: Random) -> Solid:
     if random.random() < 0.85:
         high = random.uniform(0.2, 0.9)
         shape = cylinder(flue / 2, high, sides=20) if random.random() < 0.2 else box(flue, 0.9 * flue, high)
-        parts.append(shape.moved(0, y, top - 0.02))
+        parts.append(shape.move(0, y, top - 0.02))
     if random.random() < 0.5:  # filters and switches
-        parts.append(mirrored(box(0.3 * width, 0.6 * depth, 0.01, (0.22 * width, 0, 0.3 * rim)), 0))
+        parts.append(with_mirror(box(0.3 * width, 0.6 * depth, 0.01, (0.22 * width, 0, 0.3 * rim)), 0))
         parts.append(box(0.3 * width, 0.02, 0.5 * rim, (0, -depth / 2, 0.25 * rim)))
-    return joined(parts)
+    return join(parts)

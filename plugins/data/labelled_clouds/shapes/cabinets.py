@@ -1,4 +1,4 @@
-"""Random solids of cabinets and boxes, metres, front towards -y; the kinds differ in their fronts and insides."""
+"""Random solids of cabinets and boxes, metres, front towards -y; the classes differ in their fronts and insides."""
 
 import math
 from collections.abc import Sequence
@@ -14,12 +14,12 @@ from plugins.data.labelled_clouds.shapes.solids import (
     ball,
     box,
     cylinder,
-    joined,
-    mirrored,
+    frustum,
+    join,
     rod,
-    swept,
-    tapered,
     tray,
+    tube,
+    with_mirror,
 )
 
 Random = np.random.Generator
@@ -28,7 +28,10 @@ Random = np.random.Generator
 def fronts(
     random: Random, width: Number, height: Number, at: Point, rows: int, columns: int, doors: bool = False
 ) -> list[Solid]:
-    """Return drawers or doors with their handles; `at` is the middle of their lower edge on the cabinet's front."""
+    """Return rows and columns of drawers, or of doors, with handles.
+
+    `at` is the middle of their lower edge on the front of the cabinet.
+    """
     x, y, z = at
     wide, tall = width / columns, height / rows
     thick, gap = random.uniform(0.012, 0.03), random.uniform(0.86, 0.97)
@@ -91,7 +94,7 @@ def bookshelf(random: Random) -> Solid:
             parts.append(box(wide, depth * 0.7, tall, (random.uniform(-0.25, 0.25) * width, 0, z + board)))
     if random.random() < 0.25:  # doors below
         parts += fronts(random, width, levels[1] - foot, (0, -depth / 2, foot), 1, 2, doors=True)
-    return joined(parts)
+    return join(parts)
 
 
 def dresser(random: Random) -> Solid:
@@ -111,7 +114,7 @@ def dresser(random: Random) -> Solid:
     if random.random() < 0.2:  # a mirror
         wide, tall = random.uniform(0.5, 0.9) * width, random.uniform(0.4, 0.9)
         parts.append(box(wide, 0.04, tall, (0, 0.4 * depth, height)))
-    return joined(parts)
+    return join(parts)
 
 
 def night_stand(random: Random) -> Solid:
@@ -127,7 +130,7 @@ def night_stand(random: Random) -> Solid:
     parts.append(box(width, depth, height - low, (0, 0, low)))
     rows, doors = int(random.integers(1, 4)), bool(random.random() < 0.15)
     parts += fronts(random, width, height - low, (0, -depth / 2, low), 1 if doors else rows, 1, doors)
-    return joined(parts)
+    return join(parts)
 
 
 def tv_stand(random: Random) -> Solid:
@@ -152,7 +155,7 @@ def tv_stand(random: Random) -> Solid:
             parts += fronts(random, wide, tall, (x, -depth / 2, foot), 1, 1, doors=True)
     if random.random() < 0.15:  # a board behind the set
         parts.append(box(width, board, random.uniform(0.4, 0.9), (0, depth / 2, height)))
-    return joined(parts)
+    return join(parts)
 
 
 def wardrobe(random: Random) -> Solid:
@@ -166,7 +169,7 @@ def wardrobe(random: Random) -> Solid:
         closed = random.uniform(0.5, 0.75) * width
         x = (width - closed) / 2
         shelves = box(width - closed, depth, 0.025)
-        parts += [shelves.moved(-closed / 2, 0, foot + tall * n / 5) for n in range(6)]
+        parts += [shelves.move(-closed / 2, 0, foot + tall * n / 5) for n in range(6)]
         parts.append(box(0.025, depth, tall, (-width / 2, 0, foot)))
         parts.append(box(width - closed, 0.02, tall, (-closed / 2, depth / 2, foot)))
     parts.append(box(closed, depth, tall, (x, 0, foot)))
@@ -180,7 +183,7 @@ def wardrobe(random: Random) -> Solid:
     parts += fronts(
         random, closed, tall + foot - low, (x, -depth / 2, low), 1, int(random.integers(1, 5)), doors=True
     )
-    return joined(parts)
+    return join(parts)
 
 
 def glass_box(random: Random) -> Solid:
@@ -199,32 +202,32 @@ def glass_box(random: Random) -> Solid:
         parts.append(tray(width, depth, height, pane, pane, (0, 0, low)))
     else:
         post = box(bar, bar, height, ((width - bar) / 2, (depth - bar) / 2, low))
-        parts.append(mirrored(mirrored(post, 0), 1))
+        parts.append(with_mirror(with_mirror(post, 0), 1))
         for z in (low, low + height - bar):
-            parts.append(mirrored(box(width, bar, bar, (0, (depth - bar) / 2, z)), 1))
-            parts.append(mirrored(box(bar, depth, bar, ((width - bar) / 2, 0, z)), 0))
-        parts.append(mirrored(box(pane, depth, height, ((width - bar) / 2, 0, low)), 0))
-        parts.append(mirrored(box(width, pane, height, (0, (depth - bar) / 2, low)), 1))
+            parts.append(with_mirror(box(width, bar, bar, (0, (depth - bar) / 2, z)), 1))
+            parts.append(with_mirror(box(bar, depth, bar, ((width - bar) / 2, 0, z)), 0))
+        parts.append(with_mirror(box(pane, depth, height, ((width - bar) / 2, 0, low)), 0))
+        parts.append(with_mirror(box(width, pane, height, (0, (depth - bar) / 2, low)), 1))
         parts += [box(width, depth, pane, (0, 0, z)) for z in (low, low + height - pane)]
     for z in np.linspace(0, 1, int(random.choice([2, 2, 3, 4, 5])))[1:-1] * height:
         parts.append(box(0.97 * width, 0.97 * depth, pane, (0, 0, low + z)))
-    if random.random() < 0.2:  # what it shows
+    if random.random() < 0.2:  # an exhibit
         parts.append(ball(random.uniform(0.1, 0.25) * min(width, depth, height), (0, 0, low + 0.3 * height)))
-    return joined(parts)
+    return join(parts)
 
 
 def radio(random: Random) -> Solid:
     """Return a radio."""
     width, depth, height = random.uniform(0.2, 0.6), random.uniform(0.07, 0.2), random.uniform(0.12, 0.32)
     narrow = random.choice([1.0, 1.0, 0.85])
-    parts = [tapered(width, depth, narrow * width, narrow * depth, height)]
+    parts = [frustum(width, depth, narrow * width, narrow * depth, height)]
 
     def disc(radius: Number, x: Number, z: Number, thick: Number) -> Solid:
-        return cylinder(radius, thick, sides=20).turned("x", 90).moved(x, -0.46 * depth, z)
+        return cylinder(radius, thick, sides=20).rotate("x", 90).move(x, -0.46 * depth, z)
 
     speakers, size = int(random.choice([0, 1, 2, 2])), min(0.42 * height, 0.22 * width)
-    places: Sequence[Number] = {0: (), 1: (-0.25 * width,), 2: (-0.3 * width, 0.3 * width)}[speakers]
-    parts += [disc(size * random.uniform(0.75, 1), x, 0.45 * height, 0.03) for x in places]
+    positions: Sequence[Number] = {0: (), 1: (-0.25 * width,), 2: (-0.3 * width, 0.3 * width)}[speakers]
+    parts += [disc(size * random.uniform(0.75, 1), x, 0.45 * height, 0.03) for x in positions]
     for x in np.linspace(-0.12, 0.12, int(random.integers(0, 5))) * width:
         parts.append(disc(0.06 * height, x + (0.2 * width if speakers == 1 else 0), 0.2 * height, 0.045))
     if random.random() < 0.6:  # the scale
@@ -244,12 +247,12 @@ def radio(random: Random) -> Solid:
         parts.append(rod(start, end, 0.006))
     if random.random() < 0.3:
         parts.append(
-            mirrored(
-                mirrored(cylinder(0.018, 0.025, (0.4 * width, 0.35 * depth, -0.025), sides=8), 0),
+            with_mirror(
+                with_mirror(cylinder(0.018, 0.025, (0.4 * width, 0.35 * depth, -0.025), sides=8), 0),
                 1,
             )
         )
-    return joined(parts)
+    return join(parts)
 
 
 def xbox(random: Random) -> Solid:
@@ -258,13 +261,13 @@ def xbox(random: Random) -> Solid:
     narrow = random.uniform(0.85, 1.0)
     lower = random.uniform(0.3, 0.7) * height
     parts = [
-        tapered(narrow * width, narrow * depth, width, depth, lower),
-        tapered(width, depth, narrow * width, narrow * depth, height - lower, (0, 0, lower)),
+        frustum(narrow * width, narrow * depth, width, depth, lower),
+        frustum(width, depth, narrow * width, narrow * depth, height - lower, (0, 0, lower)),
         box(random.uniform(0.35, 0.6) * width, 0.02, 0.12 * height, (-0.1 * width, -depth / 2, 0.6 * height)),
     ]
     if random.random() < 0.6:
-        knob = cylinder(random.uniform(0.1, 0.22) * height, 0.02, sides=16).turned("x", 90)
-        parts.append(knob.moved(0.36 * width, -0.49 * depth, 0.5 * height))
+        knob = cylinder(random.uniform(0.1, 0.22) * height, 0.02, sides=16).rotate("x", 90)
+        parts.append(knob.move(0.36 * width, -0.49 * depth, 0.5 * height))
     for x in np.linspace(-0.4, 0.4, int(random.choice([0, 0, 5, 8]))) * width:  # ribs
         parts.append(box(0.03 * width, 0.8 * depth, 0.012, (x, 0, height)))
     if random.random() < 0.4:  # the round badge on top
@@ -273,13 +276,13 @@ def xbox(random: Random) -> Solid:
         )
     if random.random() < 0.3:  # a cross over it
         for angle in (35, -35):
-            parts.append(box(1.0 * width, 0.03, 0.015, (0, 0, height)).scaled(0.9, 1, 1).turned("z", angle))
-    solid = joined(parts)
+            parts.append(box(1.0 * width, 0.03, 0.015, (0, 0, height)).scale(0.9, 1, 1).rotate("z", angle))
+    solid = join(parts)
     if random.random() < 0.35:
-        solid = solid.turned("y", 90).moved(0, 0, width / 2)
+        solid = solid.rotate("y", 90).move(0, 0, width / 2)
     if random.random() < 0.2:  # the controller: a bar and two grips
         at = (random.uniform(-0.1, 0.1), -depth / 2 - 0.12)
-        grip = swept([(0.05, 0, 0.03), (0.075, -0.03, 0.025), (0.08, -0.07, 0.015)], [0.022, 0.02, 0.014])
-        pad = joined([box(0.13, 0.06, 0.035, (0, 0, 0.01)), mirrored(grip, 0)])
-        solid = joined([solid, pad.moved(*at, 0)])
+        grip = tube([(0.05, 0, 0.03), (0.075, -0.03, 0.025), (0.08, -0.07, 0.015)], [0.022, 0.02, 0.014])
+        pad = join([box(0.13, 0.06, 0.035, (0, 0, 0.01)), with_mirror(grip, 0)])
+        solid = join([solid, pad.move(*at, 0)])
     return solid

@@ -1,4 +1,4 @@
-"""Random solids of furniture, metres, front towards -y; some kinds share a shape and differ in parts."""
+"""Random solids of furniture, metres, front towards -y; some classes have the same basic shape but other parts."""
 
 import numpy as np
 
@@ -6,11 +6,11 @@ from plugins.data.labelled_clouds.shapes.solids import (
     Solid,
     box,
     cylinder,
-    joined,
-    mirrored,
+    frustum,
+    join,
     ring,
     rod,
-    tapered,
+    with_mirror,
 )
 
 Random = np.random.Generator
@@ -24,17 +24,17 @@ def legs(random: Random, width: float, depth: float, height: float, thick: float
     if random.random() < 0.5:
         leg = rod((x + splay, y + splay, 0), (x, y, height), thick / 2)
     else:
-        leg = tapered(thick * random.uniform(0.6, 1), thick, thick, thick, height, (x, y, 0))
-    return mirrored(mirrored(leg, 0), 1)
+        leg = frustum(thick * random.uniform(0.6, 1), thick, thick, thick, height, (x, y, 0))
+    return with_mirror(with_mirror(leg, 0), 1)
 
 
 def rails(random: Random, width: float, depth: float, height: float, thick: float) -> list[Solid]:
-    """Return bars between the legs; sometimes an empty list."""
+    """Return bars between the legs; in most cases there are none."""
     if random.random() > 0.35:
         return []
     z, half = height * random.uniform(0.2, 0.45), thick * 0.35
     x, y = width / 2 - thick, depth / 2 - thick
-    return [rod((-x, 0, z), (x, 0, z), half), mirrored(rod((x, -y, z), (x, y, z), half), 0)]
+    return [rod((-x, 0, z), (x, 0, z), half), with_mirror(rod((x, -y, z), (x, y, z), half), 0)]
 
 
 def top(random: Random, width: float, depth: float, height: float, thick: float, bar: float) -> list[Solid]:
@@ -63,13 +63,13 @@ def table(random: Random) -> Solid:
         else:
             parts.append(cylinder(bar / 1.5, height))
             parts.append(cylinder(foot, 0.03, top=foot * random.uniform(0.6, 1), sides=24))
-        return joined(parts)
+        return join(parts)
     parts = top(random, width, depth, height, thick, bar)
     if random.random() < 0.15:  # a board below
         parts.append(box(0.85 * width, 0.8 * depth, 0.03, (0, 0, random.uniform(0.15, 0.5) * height)))
     if random.random() < 0.12:  # a drawer
         parts.append(box(0.4 * width, 0.7 * depth, 0.12, (0, -0.16 * depth, height - 0.12)))
-    return joined(parts)
+    return join(parts)
 
 
 def desk(random: Random) -> Solid:
@@ -103,9 +103,9 @@ def desk(random: Random) -> Solid:
     if random.random() < 0.25:  # shelves above
         tall, deep = random.uniform(0.2, 0.7), random.uniform(0.2, 0.35)
         y = (depth - deep) / 2
-        parts.append(mirrored(box(0.025, deep, tall, (0.48 * width, y, height)), 0))
+        parts.append(with_mirror(box(0.025, deep, tall, (0.48 * width, y, height)), 0))
         parts += [box(0.98 * width, deep, 0.025, (0, y, height + share * tall)) for share in (0.5, 1)]
-    return joined(parts)
+    return join(parts)
 
 
 def bench(random: Random) -> Solid:
@@ -131,11 +131,11 @@ def bench(random: Random) -> Solid:
         parts += [box(bar, bar, tall, (side * width * 0.42, depth * 0.52, height)) for side in (-1, 1)]
         if random.random() < 0.4:  # arms
             z = height + 0.5 * tall
-            parts.append(mirrored(box(bar, depth, 0.7 * bar, (0.46 * width, 0, z)), 0))
+            parts.append(with_mirror(box(bar, depth, 0.7 * bar, (0.46 * width, 0, z)), 0))
             parts.append(
-                mirrored(box(0.7 * bar, 0.7 * bar, 0.5 * tall, (0.46 * width, -0.4 * depth, height)), 0)
+                with_mirror(box(0.7 * bar, 0.7 * bar, 0.5 * tall, (0.46 * width, -0.4 * depth, height)), 0)
             )
-    return joined(parts)
+    return join(parts)
 
 
 def stool(random: Random) -> Solid:
@@ -157,13 +157,13 @@ def stool(random: Random) -> Solid:
             )
         if random.random() < 0.2:  # a low back
             parts.append(box(1.2 * size, 0.03, random.uniform(0.1, 0.3), (0, 0.8 * size, height)))
-        return joined(parts)
+        return join(parts)
     parts = [box(2 * size, 2 * size * random.uniform(0.6, 1), thick, (0, 0, height))]
     parts += [
         legs(random, 2 * size, 1.7 * size, height, bar),
         *rails(random, 2 * size, 1.7 * size, height, bar),
     ]
-    return joined(parts)
+    return join(parts)
 
 
 def back(random: Random, width: float, height: float, tall: float, y: float, bar: float) -> list[Solid]:
@@ -182,7 +182,7 @@ def back(random: Random, width: float, height: float, tall: float, y: float, bar
             parts.append(box(width, bar * 0.8, tall * 0.15, (0, 0, tall * 0.85)))
             for x in np.linspace(-0.35, 0.35, count):
                 parts.append(rod((x * width, 0, 0), (x * width, 0, tall * 0.9), bar * 0.25))
-    return [joined(parts).turned("x", -lean).moved(0, y, height)]
+    return [join(parts).rotate("x", -lean).move(0, y, height)]
 
 
 def chair(random: Random) -> Solid:
@@ -207,7 +207,7 @@ def chair(random: Random) -> Solid:
                 box(bar, depth, bar * 0.6, (x, 0, z)),
                 box(bar * 0.7, bar * 0.7, z - height, (x, -depth * 0.4, height)),
             ]
-    return joined(parts)
+    return join(parts)
 
 
 def couch(random: Random, width: float) -> Solid:
@@ -225,8 +225,8 @@ def couch(random: Random, width: float) -> Solid:
         x = side * (width + arm) / 2
         parts.append(box(arm, depth, arm_height, (x, 0, foot)))
         if random.random() < 0.4:
-            tube = cylinder(arm * 0.6, depth, sides=12).turned("x", 90)
-            parts.append(tube.moved(x, depth / 2, foot + arm_height))
+            tube = cylinder(arm * 0.6, depth, sides=12).rotate("x", 90)
+            parts.append(tube.move(x, depth / 2, foot + arm_height))
     if foot:
         parts.append(legs(random, width + 2 * arm, depth, foot, 0.06))
     seats = max(1, round(width / 0.65))
@@ -234,7 +234,7 @@ def couch(random: Random, width: float) -> Solid:
         for number in range(seats):
             x = width * ((number + 0.5) / seats - 0.5)
             parts.append(box(width / seats * 0.94, depth * 0.8, 0.1, (x, -depth * 0.06, height)))
-    return joined(parts)
+    return join(parts)
 
 
 def sofa(random: Random) -> Solid:
@@ -242,7 +242,7 @@ def sofa(random: Random) -> Solid:
     seat = couch(random, random.uniform(0.95, 2.2))
     if random.random() < 0.15:  # a corner sofa
         wing = box(0.7, random.uniform(0.5, 0.9), 0.4, (seat.vertices[:, 0].max() - 0.45, -0.7, 0.02))
-        return joined([seat, wing])
+        return join([seat, wing])
     return seat
 
 
@@ -261,14 +261,14 @@ def bed(random: Random) -> Solid:
         parts.append(box(width, 0.05, height + random.uniform(0.1, 0.4), (0, -length / 2, 0)))
     if random.random() < 0.12 and width < 1.3:  # a bunk
         post = box(0.07, 0.07, 1.6, (0.48 * width, 0.49 * length, 0))
-        parts += [mirrored(mirrored(post, 0), 1), box(width, length, 0.25, (0, 0, 1.1))]
+        parts += [with_mirror(with_mirror(post, 0), 1), box(width, length, 0.25, (0, 0, 1.1))]
     elif random.random() < 0.12:  # a canopy
         post = box(0.06, 0.06, 2.0, (0.48 * width, 0.49 * length, 0))
-        parts.append(mirrored(mirrored(post, 0), 1))
-        parts.append(mirrored(box(width, 0.06, 0.06, (0, 0.49 * length, 1.95)), 1))
-        parts.append(mirrored(box(0.06, length, 0.06, (0.48 * width, 0, 1.95)), 0))
+        parts.append(with_mirror(with_mirror(post, 0), 1))
+        parts.append(with_mirror(box(width, 0.06, 0.06, (0, 0.49 * length, 1.95)), 1))
+        parts.append(with_mirror(box(0.06, length, 0.06, (0.48 * width, 0, 1.95)), 0))
     pillows = 1 if width < 1.3 else 2
     for number in range(pillows if random.random() < 0.8 else 0):
         x = width * ((number + 0.5) / pillows - 0.5)
         parts.append(box(0.7 * width / pillows, 0.35, 0.1, (x, length * 0.36, height + thick)))
-    return joined(parts)
+    return join(parts)

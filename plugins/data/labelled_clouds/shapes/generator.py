@@ -1,7 +1,7 @@
 """Generator of a set of CAD models in ModelNet's layout: `<class>/{train,test}/<class>_<number>.off`, `synthetic.json`.
 
-A root is a function of seed, sizes and classes, to the byte. Each object has its own random stream, so that a larger
-set begins with the objects of a smaller one. A root is written beside its place and renamed when it is complete.
+The same seed, sizes and classes give the same bytes. Each object has its own random stream, so that a larger set begins
+with the objects of a smaller set.
 """
 
 from collections.abc import Callable
@@ -13,13 +13,12 @@ import numpy as np
 from pydantic import Field
 
 from framework.storage import cache
-from framework.storage.generated import draw_all
-from framework.storage.generated import generated as whole
+from framework.storage.generated import draw_all, ensure_generated
 from plugins.data.labelled_clouds.shapes import buildings, cabinets, furniture, things, vessels
-from plugins.data.labelled_clouds.shapes.solids import Solid, without_needless
+from plugins.data.labelled_clouds.shapes.solids import Solid, drop_degenerate
 
 VERSION = 2
-"""Version of the generator; a change in its output takes a new number, and thus a new folder."""
+"""Version of the generator; increase it if the output changes, so that a new folder is written."""
 CLASSES: dict[str, Callable[[np.random.Generator], Solid]] = {
     "airplane": things.airplane,
     "bathtub": vessels.bathtub,
@@ -65,12 +64,12 @@ CLASSES: dict[str, Callable[[np.random.Generator], Solid]] = {
 """Classes of ModelNet40, in its order, and the functions that make their objects."""
 SPLITS = ("train", "test")
 JITTER_DEG, QUARTERS = 12.0, 0.25
-"""Largest rotation of objects about the up axis, degrees, and share that is rotated by quarter turns too.
+"""Largest rotation of objects about the up axis, degrees, and share of objects that are also rotated by quarter turns.
 
 The official models are not aligned either.
 """
 STRETCH = 0.2
-"""Standard deviation of the logarithm of each axis's own stretch."""
+"""Standard deviation of the logarithm of the factor by which each axis is stretched."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,11 +81,11 @@ class Models:
     generator_seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
 
 
-def generated(models: Models) -> Path:
-    """Return the root of a generated set; it is made now if it is not there.
+def generate_models(models: Models) -> Path:
+    """Return the root of a generated set, after generating the set if the cache does not hold it.
 
     Raises:
-        DataError: the cache cannot be written, or holds something else in its place.
+        DataError: The cache cannot be written, or holds other data under the same name.
     """
     train, test, seed = models.train_models, models.test_models, models.generator_seed
     mark = {
@@ -97,23 +96,26 @@ def generated(models: Models) -> Path:
         "classes": list(CLASSES),
     }
     root = cache.folder("modelnet40") / f"v{VERSION}-seed{seed}-train{train}-test{test}"
-    return whole(root, mark, lambda part: _write(part, models))
+    return ensure_generated(root, mark, lambda part: _write(part, models))
 
 
 def model(category: str, split: str, number: int, seed: int) -> Solid:
-    """Return the model of this number, from 0, within its split."""
+    """Return model `number` (0, 1, …) of a class and split."""
     stream = [seed, list(CLASSES).index(category), SPLITS.index(split), number]
     random = np.random.default_rng(stream)
     solid = CLASSES[category](random)
     stretch = np.exp(STRETCH * random.standard_normal(3))
-    turn = JITTER_DEG * random.uniform(-1, 1)
+    angle = JITTER_DEG * random.uniform(-1, 1)
     if random.random() < QUARTERS:
-        turn += 90 * random.integers(1, 4)
-    return without_needless(solid.scaled(*map(float, stretch)).turned("z", float(turn)))
+        angle += 90 * random.integers(1, 4)
+    return drop_degenerate(solid.scale(*map(float, stretch)).rotate("z", float(angle)))
 
 
 def as_off(solid: Solid) -> str:
-    """Return the text of an OFF file, rounded to 10 µm, because the last bits of a cosine differ between machines."""
+    """Return the text of an OFF file.
+
+    Coordinates are rounded to 10 µm, because the last bits of a cosine differ between machines.
+    """
     rounded = np.round(solid.vertices, 5) + 0.0  # no -0
     vertices = [f"{x:g} {y:g} {z:g}" for x, y, z in rounded.tolist()]
     faces = [f"3 {a} {b} {c}" for a, b, c in solid.faces.tolist()]
@@ -129,9 +131,11 @@ def _write(part: Path, models: Models) -> None:
 
     def write(job: int) -> None:
         name, split, number = jobs[job]
-        # numbered through, as the official files are
-        place = number + 1 + (models.train_models if split == "test" else 0)
+        # as in the official set, the numbers of the test files continue those of the training files
+        official_number = number + 1 + (models.train_models if split == "test" else 0)
         text = as_off(model(name, split, number, models.generator_seed))
-        (part / name / split / f"{name}_{place:04d}.off").write_text(text, encoding="ascii", newline="\n")
+        (part / name / split / f"{name}_{official_number:04d}.off").write_text(
+            text, encoding="ascii", newline="\n"
+        )
 
     draw_all(len(jobs), write, "the synthetic CAD models")

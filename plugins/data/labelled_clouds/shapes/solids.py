@@ -12,20 +12,20 @@ Point = Sequence[Number]
 
 
 class Solid(NamedTuple):
-    """One surface or several, as triangles."""
+    """One or several closed surfaces, as triangles."""
 
     vertices: Float[np.ndarray, "vertices 3"]
     faces: Int[np.ndarray, "faces 3"]
 
-    def moved(self, x: Number = 0.0, y: Number = 0.0, z: Number = 0.0) -> "Solid":
+    def move(self, x: Number = 0.0, y: Number = 0.0, z: Number = 0.0) -> "Solid":
         """Return the solid shifted along each axis."""
         return Solid(self.vertices + np.array([x, y, z]), self.faces)
 
-    def scaled(self, x: Number, y: Number, z: Number) -> "Solid":
+    def scale(self, x: Number, y: Number, z: Number) -> "Solid":
         """Return the solid scaled along each axis."""
         return Solid(self.vertices * [x, y, z], self.faces)
 
-    def turned(self, axis: str, angle_deg: Number) -> "Solid":
+    def rotate(self, axis: str, angle_deg: Number) -> "Solid":
         """Return the solid rotated about a coordinate axis, counter-clockwise seen from its positive end."""
         c, s = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
         i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
@@ -35,8 +35,8 @@ class Solid(NamedTuple):
         return Solid(vertices, self.faces)
 
 
-def joined(solids: Sequence[Solid]) -> Solid:
-    """Return all solids as one."""
+def join(solids: Sequence[Solid]) -> Solid:
+    """Return all solids as one solid."""
     first = np.cumsum([0, *(len(solid.vertices) for solid in solids)])
     return Solid(
         np.concatenate([solid.vertices for solid in solids]),
@@ -44,22 +44,22 @@ def joined(solids: Sequence[Solid]) -> Solid:
     )
 
 
-def mirrored(solid: Solid, axis: int) -> Solid:
-    """Return the solid and its mirror image; with `axis` 0, left and right of the plane x = 0."""
+def with_mirror(solid: Solid, axis: int) -> Solid:
+    """Return the solid together with its mirror image; with `axis` 0 the mirror is the plane x = 0."""
     sign = np.ones(3)
     sign[axis] = -1
-    return joined([solid, Solid(solid.vertices * sign, solid.faces[:, ::-1])])
+    return join([solid, Solid(solid.vertices * sign, solid.faces[:, ::-1])])
 
 
 def box(width: Number, depth: Number, height: Number, at: Point = (0, 0, 0)) -> Solid:
     """Return a box with width along x and depth along y; `at` is the middle of its bottom."""
-    return tapered(width, depth, width, depth, height, at)
+    return frustum(width, depth, width, depth, height, at)
 
 
-def tapered(
+def frustum(
     width: Number, depth: Number, top_width: Number, top_depth: Number, height: Number, at: Point = (0, 0, 0)
 ) -> Solid:
-    """Return a box whose top has another size than its bottom."""
+    """Return a box whose top and bottom differ in size (a frustum of a pyramid); `at` is the middle of its bottom."""
     corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) / 2
     bottom = np.column_stack([corners * [width, depth], np.zeros(4)])
     top = np.column_stack([corners * [top_width, top_depth], np.full(4, height)])
@@ -68,14 +68,14 @@ def tapered(
 
 
 def slab(outline: Sequence[Point], thickness: Number) -> Solid:
-    """Return a flat plate centred in the plane z = 0; its outline (x, y) is convex and counter-clockwise."""
+    """Return a flat plate centred in the plane z = 0; its outline (x, y) must be convex and counter-clockwise."""
     flat = np.array([(x, y, 0.0) for x, y in outline])
     half = np.array([0, 0, thickness / 2])
     return Solid(*_rings([flat - half, flat + half], len(flat)))
 
 
-def revolved(profile: Sequence[Point], sides: int = 24) -> Solid:
-    """Return the surface of a profile (radius, height), from bottom to top, rotated about the z axis, ends closed."""
+def revolution(profile: Sequence[Point], sides: int = 24) -> Solid:
+    """Return the closed surface of revolution about z of a profile (radius, height), which runs from bottom to top."""
     angle = 2 * math.pi * np.arange(sides) / sides
     rings = [
         np.column_stack([r * np.cos(angle), r * np.sin(angle), np.full(sides, float(z))]) for r, z in profile
@@ -87,29 +87,29 @@ def cylinder(
     radius: Number, height: Number, at: Point = (0, 0, 0), top: Number | None = None, sides: int = 16
 ) -> Solid:
     """Return an upright cylinder, or a frustum with the upper radius `top`; `at` is the middle of its bottom."""
-    return revolved([(radius, 0), (radius if top is None else top, height)], sides).moved(*at)
+    return revolution([(radius, 0), (radius if top is None else top, height)], sides).move(*at)
 
 
 def rod(start: Point, end: Point, radius: Number, sides: int = 8) -> Solid:
     """Return a round bar between two points."""
-    return swept([start, end], [radius, radius], sides)
+    return tube([start, end], [radius, radius], sides)
 
 
 def ball(radius: Number, at: Point = (0, 0, 0), sides: int = 16) -> Solid:
     """Return a sphere with its centre at `at`."""
     bend = np.linspace(-math.pi / 2, math.pi / 2, sides // 2 + 1)
-    return revolved([(radius * math.cos(b), radius * math.sin(b)) for b in bend], sides).moved(*at)
+    return revolution([(radius * math.cos(b), radius * math.sin(b)) for b in bend], sides).move(*at)
 
 
 def ring(radius: Number, thickness: Number, at: Point = (0, 0, 0), sides: int = 24) -> Solid:
-    """Return a horizontal torus; `thickness` is the radius of its tube."""
+    """Return a horizontal torus about `at`; `thickness` is the radius of its tube."""
     angle = 2 * math.pi * np.arange(sides + 1) / sides
     path = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(sides + 1)])
-    return swept(path, [thickness] * (sides + 1), 8).moved(*at)
+    return tube(path, [thickness] * (sides + 1), 8).move(*at)
 
 
-def swept(path: Sequence[Point] | np.ndarray, radii: Sequence[Number], sides: int = 8) -> Solid:
-    """Return a round tube along a plane path or a straight line, with a radius at each of its points."""
+def tube(path: Sequence[Point] | np.ndarray, radii: Sequence[Number], sides: int = 8) -> Solid:
+    """Return a round tube along a plane path or a straight line, with one radius for each point of the path."""
     points = np.asarray(path, float)
     step = np.gradient(points, axis=0)
     closed = len(points) > 2 and np.allclose(points[0], points[-1])
@@ -128,19 +128,22 @@ def swept(path: Sequence[Point] | np.ndarray, radii: Sequence[Number], sides: in
     return Solid(*_rings(rings, sides, caps=not closed))
 
 
-def extruded(outline: Float[np.ndarray, "corners 2"], height: Number) -> Solid:
-    """Return an outline extruded from z = 0 to `height`; it is counter-clockwise and star-shaped about the origin."""
+def prism(outline: Float[np.ndarray, "corners 2"], height: Number) -> Solid:
+    """Return a prism from z = 0 to `height`; its outline must be counter-clockwise and star-shaped about the origin."""
     middle = np.zeros_like(outline)
     levels = [(middle, 0), (outline, 0), (outline, height), (middle, height)]
     rings = [np.column_stack([flat, np.full(len(flat), float(z))]) for flat, z in levels]
     return Solid(*_rings(rings, len(outline), caps=False))
 
 
-def carried(outline: Sequence[Point], width: Number) -> Solid:
-    """Return a side view (y, z) extruded along x; it is counter-clockwise and star-shaped about its corners' mean."""
+def side_prism(outline: Sequence[Point], width: Number) -> Solid:
+    """Return a prism along x, centred at x = 0.
+
+    Its outline (y, z) must be counter-clockwise and star-shaped about the mean of its corners.
+    """
     flat = np.asarray(outline, float)
     middle = flat.mean(0)
-    solid = extruded(flat - middle, width)
+    solid = prism(flat - middle, width)
     return Solid(solid.vertices[:, [2, 0, 1]] + [-width / 2, *middle], solid.faces)
 
 
@@ -153,7 +156,10 @@ def tray(
     at: Point = (0, 0, 0),
     foot: Number = 1.0,
 ) -> Solid:
-    """Return an open box whose walls and floor have thickness; `foot` is the bottom's size as a share of the rim's."""
+    """Return an open box with walls and a floor of these thicknesses.
+
+    `foot` is the size of the bottom as a share of the size of the rim; `at` is the middle of the bottom.
+    """
     corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) / 2
     outer = np.array([width, depth])
     inner = outer - 2 * wall
@@ -166,7 +172,10 @@ def tray(
 def ribbon(
     low: Float[np.ndarray, "points 2"], high: Float[np.ndarray, "points 2"], thickness: Number, height: Number
 ) -> Solid:
-    """Return a standing sheet between two lines (x, y) of equally many points, at z = 0 and `height`; x is rising."""
+    """Return an upright sheet between two lines (x, y): `low` at z = 0 and `high` at z = `height`.
+
+    Both lines have the same number of points, with rising x.
+    """
     rings = [
         np.array(
             [
@@ -181,21 +190,26 @@ def ribbon(
     return Solid(*_rings(rings, 4))
 
 
-def without_needless(solid: Solid) -> Solid:
-    """Return the solid without triangles that have two corners in one place, which a ring of radius 0 leaves."""
+def drop_degenerate(solid: Solid) -> Solid:
+    """Return the solid without triangles of which two corners coincide, as they do on a ring of radius 0."""
     corners = solid.vertices[solid.faces]
-    apart = np.abs(corners - np.roll(corners, 1, axis=1)).max(-1)  # of each corner from the one before
-    return Solid(solid.vertices, solid.faces[(apart > 1e-9).all(1)])  # the cosine of a right angle is 6e-17
+    edge_lengths = np.abs(corners - np.roll(corners, 1, axis=1)).max(-1)
+    # 1e-9 instead of 0, because the computed cosine of a right angle is 6e-17
+    return Solid(solid.vertices, solid.faces[(edge_lengths > 1e-9).all(1)])
 
 
 def _rings(rings: Sequence[np.ndarray], sides: int, caps: bool = True) -> tuple[np.ndarray, np.ndarray]:
-    """Return rings of equally many points joined by strips; fans close the first and last, which must be convex."""
+    """Return the vertices and faces of a surface through rings of `sides` points each.
+
+    Strips of triangles join neighbouring rings. With `caps`, fans close the first and the last ring, which must then be
+    convex.
+    """
     vertices = np.concatenate(rings)
-    here = np.arange(sides)
-    after = (here + 1) % sides
+    corner = np.arange(sides)
+    after = (corner + 1) % sides
     strips = []
     for start in range(0, (len(rings) - 1) * sides, sides):
-        a, b, c, d = start + here, start + after, start + sides + after, start + sides + here
+        a, b, c, d = start + corner, start + after, start + sides + after, start + sides + corner
         strips += [np.column_stack([a, b, c]), np.column_stack([a, c, d])]
     if caps:
         inner = np.arange(1, sides - 1)

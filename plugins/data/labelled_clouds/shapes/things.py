@@ -9,18 +9,18 @@ from plugins.data.labelled_clouds.shapes.solids import (
     Solid,
     ball,
     box,
-    carried,
     cylinder,
-    extruded,
-    joined,
-    mirrored,
-    revolved,
+    frustum,
+    join,
+    prism,
+    revolution,
     rod,
+    side_prism,
     slab,
-    swept,
-    tapered,
+    tube,
+    with_mirror,
 )
-from plugins.data.labelled_clouds.shapes.vessels import curve, walled
+from plugins.data.labelled_clouds.shapes.vessels import smooth_profile, vessel
 
 Random = np.random.Generator
 
@@ -31,8 +31,8 @@ def airplane(random: Random) -> Solid:
     nose = random.uniform(0.08, 0.25)
     profile = [(0.02, 0.0), (0.75 * radius, nose * 0.5 * length), (radius, nose * length)]
     profile += [(radius, 0.65 * length), (0.2 * radius, length)]
-    body = revolved(curve(random, profile, 20), 16).turned("x", 90).moved(0, length / 2, 0)
-    body = body.turned("z", 180)
+    body = revolution(smooth_profile(random, profile, 20), 16).rotate("x", 90).move(0, length / 2, 0)
+    body = body.rotate("z", 180)
     span, chord = random.uniform(0.8, 1.9), random.uniform(0.25, 0.7)
     sweep, taper = random.uniform(-0.1, 0.9), random.uniform(0.25, 1.0)
     at = random.uniform(-0.2, 0.15) * length
@@ -48,28 +48,28 @@ def airplane(random: Random) -> Solid:
     flat = wing(span * random.uniform(0.3, 0.42), chord * 0.6, 0.15)
     parts = [
         body,
-        mirrored(wing(span, chord, sweep).moved(0, at, z), 0),
-        mirrored(flat.moved(0, tail + (0.1 if high else 0), 0.3 * radius + high), 0),
-        wing(fin, chord * 0.7, 0.2).turned("y", -90).moved(0, tail, 0),
+        with_mirror(wing(span, chord, sweep).move(0, at, z), 0),
+        with_mirror(flat.move(0, tail + (0.1 if high else 0), 0.3 * radius + high), 0),
+        wing(fin, chord * 0.7, 0.2).rotate("y", -90).move(0, tail, 0),
     ]
     if random.random() < 0.12:  # a biplane
-        upper = wing(span, chord, sweep).moved(0, at, z + 0.35)
+        upper = wing(span, chord, sweep).move(0, at, z + 0.35)
         strut = rod((0.6 * span, at + 0.6 * sweep, z), (0.6 * span, at + 0.6 * sweep, z + 0.35), 0.02)
-        parts += [mirrored(upper, 0), mirrored(strut, 0)]
+        parts += [with_mirror(upper, 0), with_mirror(strut, 0)]
     engines = int(random.choice([0, 1, 1, 2]))
     for number in range(engines):
         x = span * (0.3 + 0.28 * number)
-        engine = cylinder(0.07, 0.35, sides=12).turned("x", 90)
-        parts.append(mirrored(engine.moved(x, at + sweep * x / span + 0.05, z - 0.09), 0))
+        engine = cylinder(0.07, 0.35, sides=12).rotate("x", 90)
+        parts.append(with_mirror(engine.move(x, at + sweep * x / span + 0.05, z - 0.09), 0))
     if random.random() < 0.2:  # a propeller
         for angle in (0, 90):
-            blade = box(0.07, 0.03, 0.6, (0, 0, -0.3)).turned("y", angle + 30)
-            parts.append(blade.moved(0, -length / 2, 0))
+            blade = box(0.07, 0.03, 0.6, (0, 0, -0.3)).rotate("y", angle + 30)
+            parts.append(blade.move(0, -length / 2, 0))
     if random.random() < 0.3:  # wheels
         for x, y in ((0.25, 0.1), (-0.25, 0.1), (0, -0.35 * length)):
-            wheel = cylinder(0.08, 0.05, sides=12).turned("y", 90).moved(x - 0.025, y, -radius - 0.2)
+            wheel = cylinder(0.08, 0.05, sides=12).rotate("y", 90).move(x - 0.025, y, -radius - 0.2)
             parts += [wheel, rod((x, y, -radius - 0.2), (x, y, 0), 0.015)]
-    return joined(parts)
+    return join(parts)
 
 
 def car(random: Random) -> Solid:
@@ -80,7 +80,7 @@ def car(random: Random) -> Solid:
     bow, stern = random.uniform(0.6, 0.95) * waist, random.uniform(0.75, 1.0) * waist
     y = length / 2
     hull = [(-y, floor), (y, floor), (0.97 * y, stern), (0.4 * y, waist), (-0.3 * y, waist), (-0.96 * y, bow)]
-    parts = [carried(hull, width)]
+    parts = [side_prism(hull, width)]
     kind, roof = random.random(), random.uniform(0.4, 0.65)
     front, back = -0.38 * y, 0.6 * y
     if kind < 0.25:  # an estate
@@ -92,29 +92,29 @@ def car(random: Random) -> Solid:
     if kind < 0.92:
         rake_front, rake_back = random.uniform(0.1, 0.5), random.uniform(0.02, 0.4)
         shrink = random.uniform(0.75, 0.95)
-        cabin = tapered(0.94 * width, back - front, shrink * width, back - front, roof)
+        cabin = frustum(0.94 * width, back - front, shrink * width, back - front, roof)
         vertices = cabin.vertices.copy()
         vertices[4:6, 1] += rake_front
         vertices[6:, 1] -= rake_back
-        parts.append(Solid(vertices, cabin.faces).moved(0, (front + back) / 2, waist - 0.05))
+        parts.append(Solid(vertices, cabin.faces).move(0, (front + back) / 2, waist - 0.05))
     else:  # an open car
-        pane = box(0.8 * width, 0.03, 0.4).turned("x", -30)
-        parts += [pane.moved(0, front, waist - 0.05)]
-        parts.append(mirrored(box(0.35 * width, 0.15, 0.45, (0.22 * width, 0.2 * y, waist - 0.1)), 0))
+        pane = box(0.8 * width, 0.03, 0.4).rotate("x", -30)
+        parts += [pane.move(0, front, waist - 0.05)]
+        parts.append(with_mirror(box(0.35 * width, 0.15, 0.45, (0.22 * width, 0.2 * y, waist - 0.1)), 0))
     for at in (-0.62 * y, 0.6 * y):
-        tyre = cylinder(wheel, 0.22, sides=18).turned("y", 90).moved(0, at, wheel)
-        parts.append(mirrored(tyre.moved(width / 2 - 0.2, 0, 0), 0))
+        tyre = cylinder(wheel, 0.22, sides=18).rotate("y", 90).move(0, at, wheel)
+        parts.append(with_mirror(tyre.move(width / 2 - 0.2, 0, 0), 0))
     if random.random() < 0.5:  # mirrors, bumpers, a spoiler, a rack
-        parts.append(mirrored(box(0.2, 0.1, 0.12, (0.53 * width, front + 0.1, waist)), 0))
+        parts.append(with_mirror(box(0.2, 0.1, 0.12, (0.53 * width, front + 0.1, waist)), 0))
     if random.random() < 0.4:
         for end in (-y, y):
             parts.append(box(0.95 * width, 0.15, 0.18, (0, end, floor + 0.05)))
     if random.random() < 0.2:
         parts.append(box(0.9 * width, 0.25, 0.05, (0, 0.92 * y, waist + 0.25)))
-        parts.append(mirrored(box(0.05, 0.1, 0.3, (0.3 * width, 0.92 * y, waist - 0.05)), 0))
+        parts.append(with_mirror(box(0.05, 0.1, 0.3, (0.3 * width, 0.92 * y, waist - 0.05)), 0))
     if kind < 0.05 or 0.5 <= kind < 0.62:
         parts.append(box(0.7 * width, 0.5 * (back - front), 0.08, (0, (front + back) / 2, waist + roof)))
-    return joined(parts)
+    return join(parts)
 
 
 def guitar(random: Random) -> Solid:
@@ -134,13 +134,13 @@ def guitar(random: Random) -> Solid:
         reach = reach * (1 - 0.25 * np.exp(-((angle - math.pi / 2) ** 2) / 0.05))
     outline = np.column_stack([wide * reach * x, long * reach * z])
     thick = random.uniform(0.035, 0.06) if electric else random.uniform(0.08, 0.13)
-    body = extruded(outline, thick).turned("x", 90).moved(0, thick / 2, 0)
+    body = prism(outline, thick).rotate("x", 90).move(0, thick / 2, 0)
     neck, bar = random.uniform(0.4, 0.6), random.uniform(0.045, 0.065)
     top = long * upper * 0.8
     parts = [
         body,
         box(bar, 0.025, neck + 0.1, (0, -thick / 2, top - 0.1)),
-        tapered(bar, 0.02, bar * random.uniform(1.2, 1.8), 0.02, 0.16, (0, -thick / 2 + 0.01, top + neck)),
+        frustum(bar, 0.02, bar * random.uniform(1.2, 1.8), 0.02, 0.16, (0, -thick / 2 + 0.01, top + neck)),
         box(random.uniform(0.08, 0.14), 0.025, 0.025, (0, -thick / 2 - 0.005, -0.5 * long)),
     ]
     for row in range(3):
@@ -148,22 +148,22 @@ def guitar(random: Random) -> Solid:
             start = (0, -thick / 2, top + neck + 0.04 + 0.04 * row)
             parts.append(rod(start, (side * 0.06, start[1], start[2]), 0.007, sides=6))
     if not electric and random.random() < 0.8:
-        hole = cylinder(0.05, 0.01, sides=20).turned("x", 90)
-        parts.append(hole.moved(0, -thick / 2 + 0.004, 0.15 * long))
+        hole = cylinder(0.05, 0.01, sides=20).rotate("x", 90)
+        parts.append(hole.move(0, -thick / 2 + 0.004, 0.15 * long))
     elif electric:
         for at in (0.1, -0.2):
             parts.append(box(0.08, 0.025, 0.03, (0, -thick / 2 - 0.005, at * long)))
-    solid = joined(parts)
+    solid = join(parts)
     pose = random.random()
     if pose < 0.2:
-        return solid.turned("x", -90)
+        return solid.rotate("x", -90)
     if pose < 0.35:
-        return solid.turned("x", -random.uniform(10, 25))
-    return solid.turned("y", 90) if pose < 0.42 else solid
+        return solid.rotate("x", -random.uniform(10, 25))
+    return solid.rotate("y", 90) if pose < 0.42 else solid
 
 
 def key_rows(random: Random, width: Number, depth: Number, at: tuple[Number, Number, Number]) -> list[Solid]:
-    """Return a field of keys, its middle at `at`, with a long key in the front row."""
+    """Return a field of keys with its middle at `at`; the front row has a long key."""
     x, y, z = at
     rows, columns = int(random.integers(4, 7)), int(random.integers(9, 16))
     wide, deep = width / columns, depth / rows
@@ -172,8 +172,8 @@ def key_rows(random: Random, width: Number, depth: Number, at: tuple[Number, Num
         for column in range(columns):
             if row == 0 and 0.25 < column / columns < 0.7:
                 continue
-            place = (x + wide * (column + 0.5 - columns / 2), y + deep * (row + 0.5 - rows / 2), z)
-            parts.append(tapered(0.85 * wide, 0.85 * deep, 0.65 * wide, 0.65 * deep, 0.012, place))
+            at = (x + wide * (column + 0.5 - columns / 2), y + deep * (row + 0.5 - rows / 2), z)
+            parts.append(frustum(0.85 * wide, 0.85 * deep, 0.65 * wide, 0.65 * deep, 0.012, at))
     parts.append(box(0.42 * width, 0.8 * deep, 0.012, (x - 0.02 * width, y - deep * (rows - 1) / 2, z)))
     return parts
 
@@ -184,18 +184,18 @@ def keyboard(random: Random) -> Solid:
     thick, rise = random.uniform(0.008, 0.025), random.uniform(0, 0.02)
     y = depth / 2
     wedge = [(-y, -0.012), (y, -0.012), (y, thick + rise), (-y, thick)]
-    keys = random.uniform(0.6, 1.0)  # the share that is no number pad
+    keys = random.uniform(0.6, 1.0)  # share of the width without the number pad
     tilt = math.degrees(math.atan2(rise, depth))
     field = key_rows(random, keys * width * 0.94, 0.8 * depth, (-(1 - keys) / 2 * width, 0, 0))
     if keys < 0.82:
         pad = (1 - keys) * width * 0.88
         field += key_rows(random, pad, 0.8 * depth, (keys / 2 * width, 0, 0))
-    parts = [carried(wedge, width), joined(field).turned("x", tilt).moved(0, 0, thick + rise / 2)]
+    parts = [side_prism(wedge, width), join(field).rotate("x", tilt).move(0, 0, thick + rise / 2)]
     if random.random() < 0.3:  # a rest for the wrists
         parts.append(box(width, 0.35 * depth, 0.6 * thick + 0.012, (0, -0.65 * depth, -0.012)))
     if random.random() < 0.3:
-        parts.append(mirrored(box(0.03, 0.01, 0.03, (0.4 * width, 0.4 * depth, -0.035)), 0))
-    return joined(parts)
+        parts.append(with_mirror(box(0.03, 0.01, 0.03, (0.4 * width, 0.4 * depth, -0.035)), 0))
+    return join(parts)
 
 
 def laptop(random: Random) -> Solid:
@@ -209,11 +209,11 @@ def laptop(random: Random) -> Solid:
     angle = random.uniform(85, 140) if random.random() < 0.85 else random.uniform(15, 70)
     lid = [box(width, depth, 0.5 * thick + 0.004)]
     rim = 0.06 * depth
-    lid.append(mirrored(box(rim, depth, 0.006, ((width - rim) / 2, 0, -0.006)), 0))
+    lid.append(with_mirror(box(rim, depth, 0.006, ((width - rim) / 2, 0, -0.006)), 0))
     lid += [box(width, rim, 0.006, (0, side * (depth - rim) / 2, -0.006)) for side in (-1, 1)]
-    opened = joined(lid).moved(0, -depth / 2, 0).turned("x", -angle)
-    parts.append(opened.moved(0, depth / 2, thick))
-    return joined(parts)
+    opened = join(lid).move(0, -depth / 2, 0).rotate("x", -angle)
+    parts.append(opened.move(0, depth / 2, thick))
+    return join(parts)
 
 
 def monitor(random: Random) -> Solid:
@@ -226,7 +226,7 @@ def monitor(random: Random) -> Solid:
         box(width, thick, height, (0, 0, lift)),
         box(width, 0.03, frame, (0, -thick / 2, lift)),
         box(width, 0.03, frame, (0, -thick / 2, lift + height - frame)),
-        mirrored(box(frame, 0.03, height, ((width - frame) / 2, -thick / 2, lift)), 0),
+        with_mirror(box(frame, 0.03, height, ((width - frame) / 2, -thick / 2, lift)), 0),
     ]
     foot = random.random()
     if foot < 0.4:
@@ -234,16 +234,16 @@ def monitor(random: Random) -> Solid:
     elif foot < 0.75:
         parts.append(cylinder(random.uniform(0.1, 0.18), 0.02, sides=24))
     elif foot < 0.9:  # two feet
-        parts.append(mirrored(box(0.03, 0.25, lift, (0.35 * width, 0, 0)), 0))
+        parts.append(with_mirror(box(0.03, 0.25, lift, (0.35 * width, 0, 0)), 0))
     if foot < 0.75:
         parts.append(box(random.uniform(0.04, 0.12), 0.04, lift + 0.1, (0, thick / 2, 0)))
-    if random.random() < 0.2:  # a tube
+    if random.random() < 0.2:  # a picture tube
         depth = random.uniform(0.2, 0.4)
-        tube = tapered(width * 0.9, height * 0.9, width * 0.5, height * 0.5, depth).turned("x", -90)
-        parts.append(tube.moved(0, thick / 2, lift + height / 2))
+        back_part = frustum(width * 0.9, height * 0.9, width * 0.5, height * 0.5, depth).rotate("x", -90)
+        parts.append(back_part.move(0, thick / 2, lift + height / 2))
     if random.random() < 0.15:  # loudspeakers
-        parts.append(mirrored(box(0.1, 0.1, 0.8 * height, (width / 2 + 0.08, 0, 0)), 0))
-    return joined(parts)
+        parts.append(with_mirror(box(0.1, 0.1, 0.8 * height, (width / 2 + 0.08, 0, 0)), 0))
+    return join(parts)
 
 
 def piano(random: Random) -> Solid:
@@ -259,10 +259,10 @@ def piano(random: Random) -> Solid:
             box(0.96 * width, deep, 0.12, (0, front - deep / 2, ledge - 0.1)),
         ]
         arm = box(0.06, deep, random.uniform(0.15, 0.3), (width / 2 - 0.03, front - deep / 2, ledge - 0.1))
-        parts.append(mirrored(arm, 0))
+        parts.append(with_mirror(arm, 0))
         if random.random() < 0.75:
             leg = cylinder(0.035, ledge, (0.45 * width, front - 0.8 * deep, 0), sides=8)
-            parts.append(mirrored(leg, 0))
+            parts.append(with_mirror(leg, 0))
         if random.random() < 0.5:
             parts.append(box(1.04 * width, depth + 0.06, 0.04, (0, 0, height)))
     else:
@@ -274,27 +274,27 @@ def piano(random: Random) -> Solid:
         outline = [(-width / 2, front), *side, (-width / 2, front + long)]
         flat = np.array(outline)
         middle = np.array([-0.15 * width, front + 0.4 * long])
-        parts.append(extruded(flat - middle, high).moved(middle[0], middle[1], ledge - 0.05))
+        parts.append(prism(flat - middle, high).move(middle[0], middle[1], ledge - 0.05))
         parts.append(box(width, deep, 0.14, (0, front - deep / 2, ledge - 0.05)))
         for x, y in ((-0.42 * width, front), (0.42 * width, front), (-0.2 * width, front + 0.85 * long)):
             parts.append(cylinder(0.06, ledge, (x, y, 0), top=0.08, sides=10))
         if random.random() < 0.6:  # the lid, raised
-            lid = extruded(flat - middle, 0.03).moved(middle[0] + width / 2, middle[1], 0)
-            lid = lid.turned("y", -random.uniform(25, 45))
-            parts.append(lid.moved(-width / 2, 0, ledge + high - 0.05))
+            lid = prism(flat - middle, 0.03).move(middle[0] + width / 2, middle[1], 0)
+            lid = lid.rotate("y", -random.uniform(25, 45))
+            parts.append(lid.move(-width / 2, 0, ledge + high - 0.05))
     for x in np.linspace(-0.45, 0.45, 17) * width:  # black keys
         parts.append(box(0.02, 0.5 * deep, 0.03, (x, front - 0.4 * deep, ledge + 0.02)))
-    if random.random() < 0.5:  # the music
-        rest = box(0.5 * width, 0.03, 0.28).turned("x", -12)
-        parts.append(rest.moved(0, front, ledge + random.uniform(0.05, 0.3)))
+    if random.random() < 0.5:  # music rest
+        rest = box(0.5 * width, 0.03, 0.28).rotate("x", -12)
+        parts.append(rest.move(0, front, ledge + random.uniform(0.05, 0.3)))
     if random.random() < 0.6:
         parts += [box(0.03, 0.15, 0.03, (x, front - 0.1, 0.05)) for x in (-0.08, 0, 0.08)]
     if random.random() < 0.35:
         wide, y = random.uniform(0.4, 0.9), front - deep - random.uniform(0.2, 0.4)
         parts.append(box(wide, 0.32, 0.08, (0, y, 0.42)))
         leg = rod((0.42 * wide, 0.12, 0), (0.42 * wide, 0.12, 0.42), 0.025)
-        parts.append(mirrored(mirrored(leg, 0), 1).moved(0, y, 0))
-    return joined(parts)
+        parts.append(with_mirror(with_mirror(leg, 0), 1).move(0, y, 0))
+    return join(parts)
 
 
 def lamp(random: Random) -> Solid:
@@ -313,47 +313,47 @@ def lamp(random: Random) -> Solid:
             x, y = out * math.cos(angle), out * math.sin(angle)
             if count > 1:
                 parts.append(rod((0, 0, height + 0.6 * tall), (x, y, height + 0.4 * tall), 0.012))
-            hanging = walled([(r * size, (z - height) * size) for r, z in cone], 0.008, 0.8 * tall * size, 16)
-            parts.append(hanging.moved(x, y, height))
-        return joined(parts)
+            hanging = vessel([(r * size, (z - height) * size) for r, z in cone], 0.008, 0.8 * tall * size, 16)
+            parts.append(hanging.move(x, y, height))
+        return join(parts)
     base = cylinder(foot, 0.04, top=foot * random.uniform(0.5, 1))
     if style < 0.35:  # bent
         knee, reach = random.uniform(-0.3, 0.1), random.uniform(0.15, 0.5)
         elbow, end = (knee, 0.0, 0.6 * height), (knee + reach, 0.0, height)
         parts = [base, rod((0, 0, 0), elbow, 0.015), rod(elbow, end, 0.015)]
-        head = revolved([(shade * 0.7, 0), (0.03, 0.2)]).turned("y", random.uniform(-40, 20))
-        return joined([*parts, head.moved(end[0], 0, end[2] - 0.1)])
+        head = revolution([(shade * 0.7, 0), (0.03, 0.2)]).rotate("y", random.uniform(-40, 20))
+        return join([*parts, head.move(end[0], 0, end[2] - 0.1)])
     parts = [base, cylinder(random.uniform(0.01, 0.03), height + 0.5 * tall)]
     if random.random() < 0.2:
         parts.append(ball(shade, (0, 0, height + 0.5 * shade), 14))
     else:
-        parts.append(walled(cone, 0.008, height + 0.8 * tall))
+        parts.append(vessel(cone, 0.008, height + 0.8 * tall))
     if style < 0.6:  # a thick body
         belly = random.uniform(0.8, 1.6) * foot
         body = [(foot * 0.6, 0.0), (belly, random.uniform(0.2, 0.5) * height), (0.03, 0.75 * height)]
-        parts.append(revolved(curve(random, body, 12), 20))
-    return joined(parts)
+        parts.append(revolution(smooth_profile(random, body, 12), 20))
+    return join(parts)
 
 
 def person(random: Random) -> Solid:
-    """Return a standing, walking or seated person, arms down, raised or spread; in trousers, a skirt, or a hat."""
+    """Return a standing, walking or seated person with arms down, raised or spread, sometimes with a skirt or a hat."""
     hip, stout = random.uniform(0.8, 1.0), random.uniform(0.8, 1.4)
     chest, shoulder = hip + random.uniform(0.48, 0.6), random.uniform(0.17, 0.24) * stout**0.5
     seated = random.random() < 0.12
-    stride, apart = random.uniform(0, 0.35), random.uniform(0.07, 0.2)
+    stride, foot_offset = random.uniform(0, 0.35), random.uniform(0.07, 0.2)
     parts = [
-        tapered(1.5 * shoulder, 0.2 * stout, 2 * shoulder, 0.24 * stout, chest - hip, (0, 0, hip)),
-        ball(0.11, (0, -0.02, chest + 0.2), 10).scaled(0.85, 1, 1),
+        frustum(1.5 * shoulder, 0.2 * stout, 2 * shoulder, 0.24 * stout, chest - hip, (0, 0, hip)),
+        ball(0.11, (0, -0.02, chest + 0.2), 10).scale(0.85, 1, 1),
         cylinder(0.055, 0.14, (0, 0, chest - 0.02), sides=8),
     ]
     thigh, shin = 0.085 * stout, 0.05 * stout
     for side in (-1, 1):
-        x, y = side * apart, side * stride
+        x, y = side * foot_offset, side * stride
         top = (side * 0.1, 0.0, hip + 0.03)
         knee = (x, -0.42, hip) if seated else ((x + top[0]) / 2, y / 2 - 0.4 * abs(y) * 0.2, 0.5 * hip)
         ankle = (x, -0.42, 0.45 * hip) if seated else (x, y, 0.06)
-        parts.append(swept([top, knee], [thigh, 0.75 * thigh]))
-        parts.append(swept([knee, ankle], [0.75 * thigh, shin]))
+        parts.append(tube([top, knee], [thigh, 0.75 * thigh]))
+        parts.append(tube([knee, ankle], [0.75 * thigh, shin]))
         parts.append(box(0.1, 0.26, 0.08, (ankle[0], ankle[1] - 0.07, ankle[2] - 0.06)))
     pose, swing = random.random(), random.uniform(-0.3, 0.3)
     for side in (-1, 1):
@@ -369,13 +369,13 @@ def person(random: Random) -> Solid:
             elbow = (joint[0] + side * 0.12, -0.15 * random.random(), chest - 0.27)
             hand = (elbow[0], elbow[1] - 0.2, elbow[2] + random.uniform(-0.05, 0.4))
         arm = 0.05 * stout**0.5
-        parts += [swept([joint, elbow], [arm, 0.85 * arm]), swept([elbow, hand], [0.85 * arm, 0.6 * arm])]
+        parts += [tube([joint, elbow], [arm, 0.85 * arm]), tube([elbow, hand], [0.85 * arm, 0.6 * arm])]
         parts.append(ball(0.05, hand, 8))
-    dressed = random.random()
-    if dressed < 0.2 and not seated:  # a skirt or a coat
+    clothing = random.random()
+    if clothing < 0.2 and not seated:  # a skirt or a coat
         wide = random.uniform(1.3, 2.4) * shoulder
         low = random.uniform(0.15, 0.6) * hip
-        parts.append(cylinder(wide, hip + 0.1 - low, (0, 0, low), top=0.8 * shoulder).scaled(1, 0.8, 1))
+        parts.append(cylinder(wide, hip + 0.1 - low, (0, 0, low), top=0.8 * shoulder).scale(1, 0.8, 1))
     if random.random() < 0.2:  # a hat
         parts.append(cylinder(random.uniform(0.12, 0.25), 0.02, (0, 0, chest + 0.27), sides=16))
         parts.append(cylinder(0.1, random.uniform(0.06, 0.18), (0, 0, chest + 0.27), sides=12))
@@ -385,4 +385,4 @@ def person(random: Random) -> Solid:
         parts.append(box(0.5, 0.45, 0.05, (0, -0.1, hip - 0.12)))
     elif random.random() < 0.15:
         parts.append(cylinder(random.uniform(0.3, 0.45), 0.05, sides=20))
-    return joined(parts)
+    return join(parts)

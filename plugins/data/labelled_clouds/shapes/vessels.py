@@ -1,4 +1,4 @@
-"""Random solids of vessels, plants and things that hold water, metres, z up."""
+"""Random solids of vessels, plants, cones and sanitary ware, metres, z up."""
 
 import math
 from collections.abc import Sequence
@@ -13,28 +13,35 @@ from plugins.data.labelled_clouds.shapes.solids import (
     ball,
     box,
     cylinder,
-    joined,
-    mirrored,
-    revolved,
+    frustum,
+    join,
+    revolution,
     ring,
     rod,
     slab,
-    swept,
-    tapered,
     tray,
+    tube,
+    with_mirror,
 )
 
 Random = np.random.Generator
 
 
-def walled(outer: Sequence[Point], wall: Number, floor: Number, sides: int = 28) -> Solid:
-    """Return a vessel with an outer profile (radius, height) from the foot to the rim, and the same profile inside."""
+def vessel(outer: Sequence[Point], wall: Number, floor: Number, sides: int = 28) -> Solid:
+    """Return a vessel of revolution.
+
+    Args:
+        outer: Outer profile (radius, height) from the foot to the rim; the inner profile is the same, less the wall.
+        wall: Thickness of the wall.
+        floor: Height of the floor.
+        sides: Number of sides of the polygon that approximates a circle.
+    """
     inside = [(max(r - wall, 0.0), z) for r, z in reversed(outer) if z > floor]
-    return revolved([*outer, *inside, (0.0, floor)], sides)
+    return revolution([*outer, *inside, (0.0, floor)], sides)
 
 
-def curve(random: Random, controls: Sequence[Point], steps: int = 14) -> list[tuple[float, float]]:
-    """Return a smooth profile through a few points (radius, height), with cosine steps between them."""
+def smooth_profile(random: Random, controls: Sequence[Point], steps: int = 14) -> list[tuple[float, float]]:
+    """Return a smooth profile through a few points (radius, height); between them the radius follows a cosine."""
     radii, heights = np.array(controls).T
     at = np.linspace(0, len(controls) - 1, steps)
     left = np.minimum(at.astype(int), len(controls) - 2)
@@ -49,27 +56,27 @@ def ear(reach: Number, low: Number, high: Number, out: Number, thick: Number) ->
     bend = np.linspace(math.radians(-80), math.radians(80), 9)
     middle, tall = (low + high) / 2, (high - low) / 2
     path = [(0.95 * reach + out * math.cos(b), 0.0, middle + tall * math.sin(b)) for b in bend]
-    return swept(path, [thick] * len(path))
+    return tube(path, [thick] * len(path))
 
 
 def leaves(
     random: Random, count: int, start: Point, spread: Number, tall: Number, long: Number
 ) -> list[Solid]:
-    """Return stems from one point, up and outwards, each with a leaf."""
+    """Return stems that grow from one point up and outwards, each with a leaf."""
     x, y, z = start
     parts = []
     for _ in range(count):
         angle, out = random.uniform(0, 2 * math.pi), spread * math.sqrt(random.uniform(0.05, 1))
         tip = (x + math.cos(angle) * out, y + math.sin(angle) * out, z + tall * random.uniform(0.4, 1))
         size = long * random.uniform(0.6, 1.4)
-        leaf = slab([(0, -0.3), (0.5, 0), (0, 0.3), (-0.5, 0)], 0.01).scaled(size, size, 1)
-        leaf = leaf.turned("x", random.uniform(-60, 60)).turned("y", random.uniform(-40, 40))
-        parts += [rod((x, y, z), tip, 0.006, sides=5), leaf.turned("z", math.degrees(angle)).moved(*tip)]
+        leaf = slab([(0, -0.3), (0.5, 0), (0, 0.3), (-0.5, 0)], 0.01).scale(size, size, 1)
+        leaf = leaf.rotate("x", random.uniform(-60, 60)).rotate("y", random.uniform(-40, 40))
+        parts += [rod((x, y, z), tip, 0.006, sides=5), leaf.rotate("z", math.degrees(angle)).move(*tip)]
     return parts
 
 
 def fronds(random: Random, count: int, start: Point, reach: Number, tall: Number) -> list[Solid]:
-    """Return long blades that rise and bend over, as of a palm or grass."""
+    """Return long blades that rise and bend over, like those of a palm or of grass."""
     x, y, z = start
     parts = []
     for _ in range(count):
@@ -79,14 +86,14 @@ def fronds(random: Random, count: int, start: Point, reach: Number, tall: Number
         up = rise * (along * 2 - (1 + droop) * along**2)
         path = [(far * s, 0.0, u) for s, u in zip(along, up, strict=True)]
         wide = random.uniform(0.03, 0.07) * (reach + tall) / 2
-        blade = swept(path, [wide * share for share in (0.4, 0.9, 1, 0.9, 0.6, 0.15)], sides=4)
-        blade = blade.scaled(1, 1.6, 1).turned("z", math.degrees(angle))
-        parts.append(blade.moved(x, y, z))
+        blade = tube(path, [wide * share for share in (0.4, 0.9, 1, 0.9, 0.6, 0.15)], sides=4)
+        blade = blade.scale(1, 1.6, 1).rotate("z", math.degrees(angle))
+        parts.append(blade.move(x, y, z))
     return parts
 
 
 def pot(random: Random) -> tuple[list[Solid], float, float]:
-    """Return a pot's parts, the height of its earth, and its radius."""
+    """Return the parts of a pot, the height of the earth in it, and the radius of the pot."""
     radius, height = random.uniform(0.1, 0.25), random.uniform(0.15, 0.4)
     if random.random() < 0.2:  # square
         earth = height * random.uniform(0.75, 0.92)
@@ -98,7 +105,7 @@ def pot(random: Random) -> tuple[list[Solid], float, float]:
     foot = radius * random.uniform(0.55, 0.95)
     outer = [(foot, 0.0), (radius * random.uniform(0.85, 1.1), 0.6 * height), (radius, height)]
     earth = height * random.uniform(0.65, 0.92)
-    parts = [walled(curve(random, outer, 10), 0.015, earth)]
+    parts = [vessel(smooth_profile(random, outer, 10), 0.015, earth)]
     if random.random() < 0.4:
         parts.append(ring(radius, 0.018, (0, 0, height)))
     if random.random() < 0.3:
@@ -116,7 +123,7 @@ def flower_pot(random: Random) -> Solid:
         parts += leaves(random, count, (0, 0, earth), random.uniform(0.5, 1.5) * radius, tall, 0.1)
     elif grown < 0.75:
         parts += fronds(random, int(random.integers(4, 9)), (0, 0, earth), 1.3 * radius, tall)
-    return joined(parts)
+    return join(parts)
 
 
 def plant(random: Random) -> Solid:
@@ -143,9 +150,9 @@ def plant(random: Random) -> Solid:
             angle, out = random.uniform(0, 2 * math.pi), random.uniform(0, 0.5) * radius
             x, y, lean = out * math.cos(angle), out * math.sin(angle), random.uniform(1, 2.5)
             high = top + tall * random.uniform(0.5, 1)
-            blade = tapered(0.06, 0.012, 0.01, 0.006, high - earth).turned("z", random.uniform(0, 180))
-            parts.append(blade.turned("x", -4 * lean).turned("z", math.degrees(angle)).moved(x, y, earth))
-    return joined(parts)
+            blade = frustum(0.06, 0.012, 0.01, 0.006, high - earth).rotate("z", random.uniform(0, 180))
+            parts.append(blade.rotate("x", -4 * lean).rotate("z", math.degrees(angle)).move(x, y, earth))
+    return join(parts)
 
 
 def bottle(random: Random) -> Solid:
@@ -155,13 +162,13 @@ def bottle(random: Random) -> Solid:
     shoulder, start = random.uniform(0.4, 0.72) * height, random.uniform(0.72, 0.88) * height
     outer = [(radius, 0.0), (radius * random.uniform(0.75, 1), shoulder * 0.5), (radius, shoulder)]
     outer += [(neck, start), (neck * random.uniform(0.9, 1.15), height)]
-    body = walled(curve(random, outer, 20), 0.012, 0.02)
-    parts = [body.scaled(1, random.choice([1.0, 1.0, 1.0, 0.55]), 1)]  # some are flat
+    body = vessel(smooth_profile(random, outer, 20), 0.012, 0.02)
+    parts = [body.scale(1, random.choice([1.0, 1.0, 1.0, 0.55]), 1)]  # some are flat
     if random.random() < 0.5:
         parts.append(cylinder(neck * 1.15, height * 0.06, (0, 0, height * 0.96)))
     if random.random() < 0.12:
         parts.append(ear(radius, 0.35 * height, 0.65 * height, 0.07, 0.015))
-    return joined(parts)
+    return join(parts)
 
 
 def vase(random: Random) -> Solid:
@@ -170,16 +177,16 @@ def vase(random: Random) -> Solid:
     belly, neck = random.uniform(0.08, 0.28), random.uniform(0.04, 0.2)
     foot, rim = random.uniform(0.05, 0.17), neck * random.uniform(0.8, 1.9)
     outer = [(foot, 0.0), (belly, random.uniform(0.2, 0.65) * height), (neck, 0.8 * height), (rim, height)]
-    parts = [walled(curve(random, outer, 20), 0.012, 0.02)]
+    parts = [vessel(smooth_profile(random, outer, 20), 0.012, 0.02)]
     if random.random() < 0.2:  # handles
         path = [(neck, 0, 0.85 * height), (belly + 0.08, 0, 0.75 * height), (belly, 0, 0.5 * height)]
-        parts.append(mirrored(swept(path, [0.015] * 3), 0))
+        parts.append(with_mirror(tube(path, [0.015] * 3), 0))
     if random.random() < 0.35:  # flowers
         for _ in range(int(random.integers(2, 8))):
             angle, spread = random.uniform(0, 2 * math.pi), random.uniform(0.05, 0.2)
             tip = (spread * math.cos(angle), spread * math.sin(angle), height * random.uniform(1.2, 1.6))
             parts += [rod((0, 0, 0.3 * height), tip, 0.008), ball(random.uniform(0.02, 0.05), tip, 8)]
-    return joined(parts)
+    return join(parts)
 
 
 def bowl(random: Random) -> Solid:
@@ -187,7 +194,7 @@ def bowl(random: Random) -> Solid:
     radius, height = random.uniform(0.18, 0.36), random.uniform(0.08, 0.3)
     foot = radius * random.uniform(0.25, 0.75)
     outer = [(foot, 0.0), (radius * random.uniform(0.7, 1.02), 0.5 * height), (radius, height)]
-    parts = [walled(curve(random, outer, 14), 0.015, 0.025)]
+    parts = [vessel(smooth_profile(random, outer, 14), 0.015, 0.025)]
     if random.random() < 0.35:
         parts.append(ring(foot, 0.012))
     if random.random() < 0.2:  # fruit
@@ -195,7 +202,7 @@ def bowl(random: Random) -> Solid:
             size = radius * random.uniform(0.18, 0.3)
             x, y = random.uniform(-0.4, 0.4, 2) * radius
             parts.append(ball(size, (x, y, 0.5 * height), 10))
-    return joined(parts)
+    return join(parts)
 
 
 def cup(random: Random) -> Solid:
@@ -209,23 +216,23 @@ def cup(random: Random) -> Solid:
         parts += [cylinder(0.8 * radius, 0.015, top=0.6 * radius, sides=24), cylinder(0.015, low + 0.01)]
         foot = radius * random.uniform(0.2, 0.6)
     outer = [(foot, low), (radius * random.uniform(0.8, 1.1), low + 0.5 * height), (radius, low + height)]
-    parts.append(walled(curve(random, outer, 12), 0.01, low + 0.015))
+    parts.append(vessel(smooth_profile(random, outer, 12), 0.01, low + 0.015))
     if 0.15 <= kind < 0.8:
         span = random.uniform(0.25, 0.4)
         low_end, high_end = (0.5 - span) * height, (0.5 + span) * height
         parts.append(ear(radius, low_end, high_end, random.uniform(0.04, 0.1), random.uniform(0.008, 0.018)))
     if random.random() < 0.15:
         parts.append(cylinder(radius * 1.8, 0.015, (0, 0, -0.015), top=radius * 1.9))
-    return joined(parts)
+    return join(parts)
 
 
 def tap(random: Random, at: Point, size: Number) -> list[Solid]:
-    """Return a water tap behind a basin, its mouth towards -y, optionally with two knobs."""
+    """Return a water tap that opens towards -y, sometimes with two knobs."""
     x, y, z = at
     reach, tall = size * random.uniform(0.6, 1.0), size * random.uniform(0.5, 1.2)
     bend = np.linspace(0, math.pi, 7)
     arch = [(x, y - reach / 2 * (1 - math.cos(b)), z + tall + 0.3 * reach * math.sin(b)) for b in bend]
-    parts = [swept(arch, [0.08 * size] * len(arch)), cylinder(0.08 * size, tall, (x, y, z), sides=8)]
+    parts = [tube(arch, [0.08 * size] * len(arch)), cylinder(0.08 * size, tall, (x, y, z), sides=8)]
     if random.random() < 0.5:
         for side in (-1, 1):
             parts.append(cylinder(0.12 * size, 0.3 * size, (x + side * 0.6 * size, y, z), sides=10))
@@ -240,31 +247,31 @@ def bathtub(random: Random) -> Solid:
         foot = random.uniform(0.75, 1)
         parts = [tray(width, depth, height, wall, random.uniform(0.05, 0.2), foot=foot)]
     elif kind < 0.6:  # an oval basin in a block
-        rim = walled(curve(random, [(0.3, 0), (0.42, 0.5), (0.46, 1)], 9), 0.02, 0.12)
+        rim = vessel(smooth_profile(random, [(0.3, 0), (0.42, 0.5), (0.46, 1)], 9), 0.02, 0.12)
         parts = [
             tray(width, depth, height, 0.04, 0.02),
-            rim.scaled(width, depth, height),
-            mirrored(tray(0.1 * width, depth, height, 0.02, 0.9 * height, (0.45 * width, 0, 0)), 0),
+            rim.scale(width, depth, height),
+            with_mirror(tray(0.1 * width, depth, height, 0.02, 0.9 * height, (0.45 * width, 0, 0)), 0),
         ]
     else:  # standing free
         rim = [(random.uniform(0.3, 0.42), 0), (0.45, 0.5), (0.5, 1)]
-        tub = walled(curve(random, rim, 10), 0.03, 0.1)
-        parts = [tub.scaled(width, depth, height)]
+        tub = vessel(smooth_profile(random, rim, 10), 0.03, 0.1)
+        parts = [tub.scale(width, depth, height)]
         if random.random() < 0.4:
             foot = ball(0.06, (0.28 * width, 0.25 * depth, -0.02), 8)
-            parts.append(mirrored(mirrored(foot, 0), 1))
+            parts.append(with_mirror(with_mirror(foot, 0), 1))
         if random.random() < 0.3:  # one end rises
             vertices = parts[0].vertices.copy()
             vertices[:, 2] *= 1 + 0.5 * np.clip(vertices[:, 0] / width, 0, None)
             parts[0] = Solid(vertices, parts[0].faces)
     if random.random() < 0.5:
-        side = joined(tap(random, (0, 0, 0), 0.2)).turned("z", -90)
-        parts.append(side.moved(-0.46 * width, 0, height))
-    return joined(parts)
+        side = join(tap(random, (0, 0, 0), 0.2)).rotate("z", -90)
+        parts.append(side.move(-0.46 * width, 0, height))
+    return join(parts)
 
 
 def sink(random: Random) -> Solid:
-    """Return a sink, on a column, on a cabinet, or with a draining board."""
+    """Return a sink, sometimes on a column or a cabinet, or with a draining board."""
     width, depth = random.uniform(0.4, 0.9), random.uniform(0.35, 0.6)
     kind, height = random.random(), random.uniform(0.12, 0.25)
     low = 0.0
@@ -272,7 +279,7 @@ def sink(random: Random) -> Solid:
     if kind < 0.3:  # on a column
         low = random.uniform(0.5, 0.75)
         profile = [(0.13, 0), (random.uniform(0.07, 0.1), 0.5 * low), (0.14, low + 0.05)]
-        parts.append(revolved(curve(random, profile, 8), 16))
+        parts.append(revolution(smooth_profile(random, profile, 8), 16))
     elif kind < 0.5:  # on a cabinet
         low = random.uniform(0.5, 0.75)
         parts.append(box(0.95 * width, 0.9 * depth, low))
@@ -287,14 +294,16 @@ def sink(random: Random) -> Solid:
             parts.append(tray(width, depth, height, wall, 0.02, (x, 0, low), random.uniform(0.75, 1)))
     else:
         rim = [(random.uniform(0.2, 0.35), 0), (0.46, 0.5), (0.5, 1)]
-        parts.append(walled(curve(random, rim, 8), 0.04, 0.1).scaled(width, depth, height).moved(0, 0, low))
+        parts.append(
+            vessel(smooth_profile(random, rim, 8), 0.04, 0.1).scale(width, depth, height).move(0, 0, low)
+        )
         if random.random() < 0.5:
             parts.append(box(width, 0.12, 0.6 * height, (0, 0.5 * depth, low + 0.4 * height)))
     if random.random() < 0.3:  # a draining board
         parts.append(box(width, depth, 0.03, (bowls * width / 2 + width / 2, 0, low + height - 0.03)))
     if random.random() < 0.85:
         parts += tap(random, (0, 0.42 * depth, low + height - 0.02), random.uniform(0.15, 0.28))
-    return joined(parts)
+    return join(parts)
 
 
 def toilet(random: Random) -> Solid:
@@ -304,15 +313,15 @@ def toilet(random: Random) -> Solid:
     profile = [(foot, 0), (random.uniform(0.08, 0.12), 0.4 * high), (0.19, high)]
     if random.random() < 0.15:  # on the wall
         profile = [(0.06, 0.4 * high), (0.17, 0.7 * high), (0.19, high)]
-    parts = [walled(curve(random, profile, 10), 0.03, 0.6 * high).scaled(1, long, 1)]
-    parts.append(ring(0.17, 0.025, (0, 0, high + 0.01)).scaled(1, long, 1))
+    parts = [vessel(smooth_profile(random, profile, 10), 0.03, 0.6 * high).scale(1, long, 1)]
+    parts.append(ring(0.17, 0.025, (0, 0, high + 0.01)).scale(1, long, 1))
     behind = 0.19 * long
     lid = random.random()
     if lid < 0.5:  # closed
-        parts.append(cylinder(0.19, 0.025, (0, 0, high + 0.02), sides=24).scaled(1, long, 1))
+        parts.append(cylinder(0.19, 0.025, (0, 0, high + 0.02), sides=24).scale(1, long, 1))
     elif lid < 0.85:  # open, leaning on the tank
-        plate = cylinder(0.18, 0.02, sides=24).scaled(1, long, 1).moved(0, -0.18 * long, 0)
-        parts.append(plate.turned("x", -random.uniform(95, 110)).moved(0, behind - 0.03, high + 0.03))
+        plate = cylinder(0.18, 0.02, sides=24).scale(1, long, 1).move(0, -0.18 * long, 0)
+        parts.append(plate.rotate("x", -random.uniform(95, 110)).move(0, behind - 0.03, high + 0.03))
     deep, wide = random.uniform(0.14, 0.22), random.uniform(0.34, 0.48)
     if random.random() < 0.85:
         start = random.choice([high - 0.03, 0.0])
@@ -320,7 +329,7 @@ def toilet(random: Random) -> Solid:
         parts.append(box(wide, deep, high + tall - start, (0, behind + deep / 2, start)))
         parts.append(box(1.06 * wide, 1.08 * deep, 0.03, (0, behind + deep / 2, high + tall)))
     parts.append(box(0.2, 0.16, high, (0, behind - 0.02, 0)))
-    return joined(parts)
+    return join(parts)
 
 
 def cone(random: Random) -> Solid:
@@ -334,10 +343,10 @@ def cone(random: Random) -> Solid:
         base = box(2 * wide, 2 * wide, 0.04, (0, 0, -0.03)) if random.random() < 0.7 else cylinder(wide, 0.03)
         parts.append(base)
     for z in np.linspace(0.3, 0.75, int(random.choice([0, 0, 1, 2]))):
-        here = radius + (tip - radius) * z + 0.008
-        above = radius + (tip - radius) * (z + 0.1) + 0.008
-        parts.append(cylinder(here, 0.1 * height, (0, 0, z * height), top=above, sides=32))
+        lower = radius + (tip - radius) * z + 0.008
+        upper = radius + (tip - radius) * (z + 0.1) + 0.008
+        parts.append(cylinder(lower, 0.1 * height, (0, 0, z * height), top=upper, sides=32))
     if random.random() < 0.15:
         scoop = ball(0.95 * radius, (0, 0, height), 14)
-        return joined([cylinder(tip, height, top=radius, sides=sides), scoop])
-    return joined(parts)
+        return join([cylinder(tip, height, top=radius, sides=sides), scoop])
+    return join(parts)
