@@ -1,4 +1,4 @@
-"""Folder of a data set's images: the unpacked archive, or one drawn into the cache in the archive's layout."""
+"""Folder of a data set's images: the unpacked archive, or synthetic heads in the cache in the archive's layout."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,14 +19,14 @@ Label = TypeVar("Label")
 
 
 class Archive(NamedTuple):
-    """Published data set, and a function that draws heads in its layout.
+    """Published data set, and a function that writes synthetic heads in its layout.
 
     Attributes:
-        name: name of its folder in the cache.
-        folder: name of the folder that the archive unpacks to.
-        parts: entries of that folder; names of folders end in a slash.
-        version: version of `draw`; a change in what it draws or writes takes a new number, and thus a new folder.
-        draw: function that writes the given number of images, drawn from a seed, into an empty folder.
+        name: Name of its folder in the cache.
+        folder: Name of the folder that the archive unpacks to.
+        parts: Entries of that folder; names of folders end in a slash.
+        version: Version of `draw`. If the output of `draw` changes, increase it, so that a new folder is written.
+        draw: Function of an empty folder, a number of images and a seed, which writes the images into the folder.
     """
 
     name: str
@@ -38,7 +38,14 @@ class Archive(NamedTuple):
 
 @dataclass(frozen=True)
 class Source:
-    """User's folder `root` or, if it is None, a folder with the given number of images drawn from a seed."""
+    """Source of the images: the user's folder or, if there is none, a folder of synthetic images in the cache.
+
+    Attributes:
+        archive: The published data set.
+        root: The user's folder; None for synthetic images.
+        images: Number of synthetic images.
+        seed: Seed of the synthetic images.
+    """
 
     archive: Archive
     root: str | None
@@ -46,11 +53,11 @@ class Source:
     seed: int
 
     def folder(self) -> Path:
-        """Return the folder to read: the user's, which is checked, or one whose images are drawn unless they are there.
+        """Return the folder to read. A user's folder is checked; synthetic images are drawn if they do not exist yet.
 
         Raises:
-            DataError: the user's folder is missing or lacks a part, or the cache cannot be written or holds something
-                else in its place.
+            DataError: The user's folder is missing or lacks a part, or the cache cannot be written or holds other data
+                under the same name.
         """
         if self.root is not None:
             root = Path(self.root).expanduser()
@@ -63,17 +70,20 @@ class Source:
             "images": self.images,
             "seed": self.seed,
         }
-        place = (
+        path = (
             cache.folder(self.archive.name)
             / f"v{version}.{heads_version}-seed{self.seed}-images{self.images}"
         )
-        return generated.generated(place, mark, lambda root: self.archive.draw(root, self.images, self.seed))
+        return generated.ensure_generated(
+            path, mark, lambda root: self.archive.draw(root, self.images, self.seed)
+        )
 
     def generated_in(self) -> Path | None:
-        """Return the cache folder of drawn images; None for a user's folder."""
+        """Return the cache folder of the synthetic images; None for a user's folder."""
         return cache.folder(self.archive.name) if self.root is None else None
 
     def fingerprint(self, synthetic: bool) -> dict[str, str]:
+        """Return root and version of the images, for `Data.fingerprint`."""
         return {
             "root": f"synthetic, seed {self.seed}" if self.root is None else self.root,
             "version": f"generator {self.archive.version}" if synthetic else self.archive.folder,
@@ -82,7 +92,8 @@ class Source:
     def _check(self, root: Path) -> None:
         if not root.is_dir():
             raise DataError(
-                f"data.root = {root}: no such folder; wanted the unpacked {self.archive.folder}, or null."
+                f"data.root = {root} does not exist or is no folder. Set data.root to the unpacked "
+                f"{self.archive.folder}, or to null for synthetic images."
             )
         missing = [
             part
@@ -90,31 +101,37 @@ class Source:
             if not ((root / part).is_dir() if part.endswith("/") else (root / part).is_file())
         ]
         if missing:
-            raise wrong_layout(root, self.archive.folder, ", no ".join(missing))
+            raise wrong_layout(root, self.archive.folder, f"it holds no {', no '.join(missing)}")
 
 
-def wrong_layout(root: Path, folder: str, missing: str) -> DataError:
-    """Return the error for a root that does not hold what the archive unpacks to `folder`."""
+def wrong_layout(root: Path, folder: str, fault: str) -> DataError:
+    """Return the error for a root that has not the layout of the archive.
+
+    Args:
+        root: The user's folder.
+        folder: Name of the folder that the archive unpacks to.
+        fault: Clause that says what is missing.
+    """
     inner = root / folder
-    hint = f"Did you mean {inner}?" if inner.is_dir() else "Unpack the whole archive there."
-    return DataError(f"data.root = {root} is not laid out as {folder}: no {missing}. {hint}")
+    remedy = f"Did you mean {inner}?" if inner.is_dir() else "Unpack the whole archive into this folder."
+    return DataError(f"data.root = {root} has not the layout of {folder}: {fault}. {remedy}")
 
 
 def draw_train_and_test(
     root: Path,
     images: int,
     train_share: float,
-    what: str,
+    name: str,
     draw: Callable[[int], tuple[str, NDArray[np.uint8], Label]],
 ) -> dict[str, list[Label]]:
-    """Write JPEG images into train/ and test/, and return the labels of both in the images' order.
+    """Write JPEG images into train/ and test/, and return the labels of both folders in the order of the images.
 
     Args:
-        root: folder to write into.
-        images: number of images.
-        train_share: share of the images, the first ones, that are for training.
-        what: name of the images in the progress bar.
-        draw: function that returns name, pixels and label of an image by its number.
+        root: Folder to write into.
+        images: Number of images.
+        train_share: Share of the images that are for training; these are the first ones.
+        name: Name of the data set in the progress bar.
+        draw: Function that returns the name, the pixels and the label of the image with a given number.
     """
     train = round(train_share * images)
     labels: dict[int, Label] = {}
@@ -122,10 +139,10 @@ def draw_train_and_test(
         (root / split).mkdir()
 
     def write(number: int) -> None:
-        name, pixels, labels[number] = draw(number)
+        stem, pixels, labels[number] = draw(number)
         folder = root / ("train" if number < train else "test")
-        Image.fromarray(pixels).save(folder / f"{name}.jpg", quality=95)
+        Image.fromarray(pixels).save(folder / f"{stem}.jpg", quality=95)
 
-    generated.draw_all(images, write, f"the synthetic {what} images")
+    generated.draw_all(images, write, f"the synthetic {name} images")
     ordered = [labels[number] for number in range(images)]
     return {"train": ordered[:train], "test": ordered[train:]}

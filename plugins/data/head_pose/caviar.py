@@ -1,4 +1,4 @@
-"""Data set of CAVIAR crops with partly hidden heads, published or drawn: train/ and test/, `or_label.mat`."""
+"""Data set of CAVIAR crops with partly hidden heads, published or synthetic: train/ and test/, `or_label.mat`."""
 
 import math
 from pathlib import Path
@@ -12,7 +12,7 @@ from framework.target import Target
 from plugins.data.head_pose import synthetic_heads
 from plugins.data.head_pose.archive import Archive, Source, draw_train_and_test
 from plugins.data.head_pose.caviar_labels import LABELS, Label, read_labels, write_labels
-from plugins.data.head_pose.labelled_images import Found, Heads, Labelled, Reading
+from plugins.data.head_pose.labelled_images import Heads, Labelled, Labels, Reading
 from plugins.data.head_pose.synthetic_heads import Conditions, Pose
 
 SIDE = 50  # pixels, as published
@@ -25,9 +25,9 @@ AS_PUBLISHED = Reading(image_size=SIDE)
 
 
 class Caviar(Heads):
-    """Partly hidden heads of people in a shopping centre, and their gaze; generated where no root is given.
+    """Partly hidden heads of people in a shopping centre, and their gaze; generated if no root is given.
 
-    Training mirrors no image, because the thesis authors' data hold no mirror images.
+    Training mirrors no images, because the thesis authors' data hold no mirror images.
     """
 
     bibtex = """@misc{fisher2005caviar,
@@ -58,14 +58,15 @@ class Caviar(Heads):
         self.source = Source(ARCHIVE, root, images, generator_seed)
         self.reading = reading
 
-    def found(self, root: Path) -> Found:
+    def read_labels(self, root: Path) -> Labels:
         labels = read_labels(root / LABELS)
-        return Found(
+        return Labels(
             {
                 split: [
-                    Labelled(root / split / f"{each.name}.jpg", (math.radians(each.gaze),)) for each in some
+                    Labelled(root / split / f"{label.name}.jpg", (math.radians(label.gaze),))
+                    for label in labels_of_split
                 ]
-                for split, some in labels.items()
+                for split, labels_of_split in labels.items()
             }
         )
 
@@ -73,12 +74,12 @@ class Caviar(Heads):
 def _draw(root: Path, images: int, seed: int) -> None:
     def draw(number: int) -> tuple[str, np.ndarray, Label]:
         random = np.random.default_rng([seed, 0, number])
-        who = synthetic_heads.person(np.random.default_rng([seed, 1, int(random.integers(PEOPLE))]))
+        person = synthetic_heads.random_person(np.random.default_rng([seed, 1, int(random.integers(PEOPLE))]))
         gaze = float(random.uniform(0, 360))
-        looks = Pose(gaze, float(random.normal(0, 6)), float(random.normal(0, 4)))
-        picture = synthetic_heads.photograph(random, who, looks, SIDE, CONDITIONS)
+        pose = Pose(gaze, float(random.normal(0, 6)), float(random.normal(0, 4)))
+        image = synthetic_heads.photograph(random, person, pose, SIDE, CONDITIONS)
         name = f"synthetic_{number:06d}"
-        return name, picture, Label(name, gaze)
+        return name, image, Label(name, gaze)
 
     write_labels(root / LABELS, draw_train_and_test(root, images, TRAIN_SHARE, "caviar", draw), SIDE)
 

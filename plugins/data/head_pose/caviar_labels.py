@@ -1,7 +1,7 @@
-"""Reading and writing of the label file of the CAVIAR crops, `or_label.mat`: MATLAB 5.
+"""Reading and writing of the label file of the CAVIAR crops, `or_label.mat`, a file of MATLAB 5.
 
-Its struct arrays `or_label_train` and `or_label_test` have one element for each image, whose fields are by their order
-gaze (degrees), x, y, size and name without suffix; the names of the fields do not matter.
+The struct arrays `or_label_train` and `or_label_test` have one element for each image. The fields of an element are, in
+this order, gaze (degrees), x, y, size and name without suffix; the names of the fields do not matter.
 """
 
 import io
@@ -18,7 +18,8 @@ from plugins.data.head_pose.archive import TRAIN_AND_TEST
 
 LABELS = "or_label.mat"
 FIELDS = ("gaze", "x", "y", "size", "name")
-HEADER = b"MATLAB 5.0 MAT-file, synthetic labels".ljust(116)  # SciPy's holds the date
+# SciPy's own header holds the date, which would change the bytes of the file
+HEADER = b"MATLAB 5.0 MAT-file, synthetic labels".ljust(116)
 
 
 class Label(NamedTuple):
@@ -29,16 +30,18 @@ class Label(NamedTuple):
 
 
 def read_labels(file: Path) -> dict[str, list[Label]]:
-    """Return the labels of "train" and "test", in the file's order.
+    """Return the labels of "train" and "test", in the order of the file.
 
     Raises:
-        DataError: the file cannot be read, lacks a struct array, or one of its elements is not a label.
+        DataError: The file cannot be read, lacks a struct array, or an element of the array is no label.
     """
     names = [f"or_label_{split}" for split in TRAIN_AND_TEST]
     content = read_variables(file, names)
     missing = [name for name in names if name not in content]
     if missing:
-        raise DataError(f"{file}: holds no {' and no '.join(missing)}. Restore it from its source.")
+        raise DataError(
+            f"{file}: The file holds no {' and no '.join(missing)}. Copy the file again from its source."
+        )
     return {
         split: [
             _label(file, f"{name}({number})", entry)
@@ -48,24 +51,28 @@ def read_labels(file: Path) -> dict[str, list[Label]]:
     }
 
 
-def _label(file: Path, where: str, entry: Any) -> Label:
+def _label(file: Path, position: str, entry: Any) -> Label:
+    """Return the label in one element of a struct array; `position` names the element in messages."""
     values = list(entry.values()) if isinstance(entry, dict) else [entry]
     if len(values) == len(FIELDS) and isinstance(values[-1], str) and values[-1]:
         gaze = np.asarray(values[0])
         if gaze.size == 1 and gaze.dtype.kind in "iuf":
             return Label(values[-1], float(gaze.item()))
     raise DataError(
-        f"{file}: {where} holds {shorten(values)}; wanted a struct of {', '.join(FIELDS)}, gaze a number of degrees. "
-        "Restore it from its source."
+        f"{file}: {position} holds {shorten(values)}; expected a struct of {', '.join(FIELDS)}, where gaze is a "
+        "number of degrees. Copy the file again from its source."
     )
 
 
 def write_labels(file: Path, labels: Mapping[str, Sequence[Label]], side: int) -> None:
-    """Write a label file as published, with x, y and size of a whole image; the same labels give the same bytes."""
+    """Write a label file in the published layout; the same labels give the same bytes.
+
+    x, y and size are those of a whole image of `side` pixels.
+    """
     content = {}
-    for split, found in labels.items():
-        array = np.empty((1, len(found)), dtype=[(name, object) for name in FIELDS])
-        for index, label in enumerate(found):
+    for split, labels_of_split in labels.items():
+        array = np.empty((1, len(labels_of_split)), dtype=[(name, object) for name in FIELDS])
+        for index, label in enumerate(labels_of_split):
             array[0, index] = (label.gaze, side / 2, side / 2, float(side), label.name)
         content[f"or_label_{split}"] = array
     stream = io.BytesIO()

@@ -1,4 +1,4 @@
-"""Data set of IDIAP head-pose crops, published or drawn: images in train/ and test/, `or_label_full.mat`."""
+"""Data set of IDIAP head-pose crops, published or synthetic: images in train/ and test/, `or_label_full.mat`."""
 
 import math
 from pathlib import Path
@@ -12,7 +12,7 @@ from framework.target import Target
 from plugins.data.head_pose import synthetic_heads
 from plugins.data.head_pose.archive import Archive, Source, draw_train_and_test
 from plugins.data.head_pose.idiap_labels import ANGLES, LABELS, Label, read_labels, write_labels
-from plugins.data.head_pose.labelled_images import Found, Heads, Labelled, Reading
+from plugins.data.head_pose.labelled_images import Heads, Labelled, Labels, Reading
 from plugins.data.head_pose.synthetic_heads import Conditions, Person, Pose
 
 SIDE = 75  # pixels, as published
@@ -25,9 +25,9 @@ AS_PUBLISHED = Reading(image_size=SIDE)
 
 
 class Idiap(Heads):
-    """Heads of a few people in a meeting room, and their pan, tilt and roll; generated where no root is given.
+    """Heads of a few people in a meeting room, and their pan, tilt and roll; generated if no root is given.
 
-    Training mirrors no image, because the published ones hold their mirror images already.
+    Training mirrors no images, because the published set already contains the mirror images.
     """
 
     bibtex = """@inproceedings{ba2005evaluation,
@@ -58,46 +58,48 @@ class Idiap(Heads):
         generator_seed: Annotated[int, Field(ge=0)] = 0,
     ) -> None:
         self.source = Source(ARCHIVE, root, images, generator_seed)
-        # generated labels are in radians whatever a user's own file holds
+        # generated labels are always in radians; angles_in is for a user's own label file
         self.angles_in: Literal["radians", "degrees"] = "radians" if root is None else angles_in
         self.reading = reading
         self.target = Target("angle", tuple(dict.fromkeys(angles or ANGLES)))
 
-    def found(self, root: Path) -> Found:
+    def read_labels(self, root: Path) -> Labels:
         columns = [ANGLES.index(name) for name in self.target.names]
         labels = read_labels(root / LABELS, self.angles_in)
-        return Found(
+        return Labels(
             {
                 split: [
                     Labelled(root / split / label.name, tuple(label.angles[column] for column in columns))
-                    for label in some
+                    for label in labels_of_split
                 ]
-                for split, some in labels.items()
+                for split, labels_of_split in labels.items()
             }
         )
 
 
-def pose(random: np.random.Generator) -> Pose:
-    """Return a random pose of a person at a table, mostly forwards and down."""
+def random_pose(random: np.random.Generator) -> Pose:
+    """Return a random head pose of a person at a table; most people look forwards and slightly down."""
     pan, tilt, roll = random.normal((0, -8, 0), (35, 14, 10)).clip((-90, -60, -45), (90, 45, 45))
     return Pose(float(pan), float(tilt), float(roll))
 
 
-def people(seed: int) -> list[Person]:
-    """Return random people; the same people are in both splits, as in frames of the same recordings."""
-    return [synthetic_heads.person(np.random.default_rng([seed, 1, number])) for number in range(PEOPLE)]
+def random_people(seed: int) -> list[Person]:
+    """Return random people; both splits show the same people, as frames of the same recordings would."""
+    return [
+        synthetic_heads.random_person(np.random.default_rng([seed, 1, number])) for number in range(PEOPLE)
+    ]
 
 
 def _draw(root: Path, images: int, seed: int) -> None:
-    seated = people(seed)
+    people = random_people(seed)
 
     def draw(number: int) -> tuple[str, np.ndarray, Label]:
         random = np.random.default_rng([seed, 0, number])
-        who, looks = int(random.integers(PEOPLE)), pose(random)
-        picture = synthetic_heads.photograph(random, seated[who], looks, SIDE, CONDITIONS)
-        name = f"synthetic_{who:02d}_{number:06d}"
-        pan, tilt, roll = map(math.radians, looks)
-        return name, picture, Label(f"{name}.jpg", (pan, tilt, roll))
+        person, pose = int(random.integers(PEOPLE)), random_pose(random)
+        image = synthetic_heads.photograph(random, people[person], pose, SIDE, CONDITIONS)
+        name = f"synthetic_{person:02d}_{number:06d}"
+        pan, tilt, roll = map(math.radians, pose)
+        return name, image, Label(f"{name}.jpg", (pan, tilt, roll))
 
     write_labels(root / LABELS, draw_train_and_test(root, images, TRAIN_SHARE, "idiap", draw))
 

@@ -1,7 +1,7 @@
-"""Reading and writing of the label file of the IDIAP crops, `or_label_full.mat`: MATLAB 7.3, which is HDF5.
+"""Reading and writing of the label file of the IDIAP crops, `or_label_full.mat`, a file of MATLAB 7.3, which is HDF5.
 
-In it the groups `or_label_train` and `or_label_test` are struct arrays: each of their fields pan, tilt, roll and name
-holds one reference for each image, to a number or to UTF-16 text.
+The groups `or_label_train` and `or_label_test` of the file are struct arrays. Each of the fields pan, tilt, roll and
+name holds one reference for each image, to a number or to UTF-16 text.
 """
 
 import math
@@ -13,15 +13,15 @@ import h5py
 import numpy as np
 
 from framework.errors import DataError
-from framework.storage.reading import guarded, opened
+from framework.storage.reading import open_regular, translate_errors
 from plugins.data.head_pose.archive import TRAIN_AND_TEST
 
 LABELS = "or_label_full.mat"
 ANGLES = ("pan", "tilt", "roll")
-ENOUGH = 20
-"""Number of labels above which angles that all lie within ±2π are taken for radians."""
+UNIT_CHECK_MINIMUM = 20
+"""Number of labels above which angles that all lie within ±2π are assumed to be radians."""
 MOST_LABELS, MOST_VALUES = 2**20, 2**12
-"""Largest number of labels of a split, and of letters of a name."""
+"""Largest number of labels of a split, and largest number of letters of a name."""
 HEADER = b"MATLAB 7.3 MAT-file, synthetic labels".ljust(116) + bytes(8) + b"\x00\x02IM"
 
 
@@ -33,25 +33,28 @@ class Label(NamedTuple):
 
 
 def read_labels(file: Path, angles_in: Literal["radians", "degrees"]) -> dict[str, list[Label]]:
-    """Return the labels of "train" and "test", in the file's order, with angles in radians.
+    """Return the labels of "train" and "test", in the order of the file, with angles in radians.
 
     Raises:
-        DataError: the file is of another kind, a field is missing or of another length, or the angles are not
-            `angles_in`.
+        DataError: The file is of another kind, a field is missing or of another length, or the angles seem to be in
+            another unit than `angles_in`.
     """
-    wanted = (
+    kind = (
         "the MATLAB 7.3 (HDF5) file of structs or_label_train and or_label_test with the fields pan, tilt, roll "
         "and name"
     )
-    with guarded(file, wanted), opened(file), h5py.File(file, "r") as content:
+    with translate_errors(file, kind), open_regular(file), h5py.File(file, "r") as content:
         labels = {split: _read_struct(content, f"or_label_{split}") for split in TRAIN_AND_TEST}
-    _refuse_unit(file, labels, angles_in)
+    _refuse_other_unit(file, labels, angles_in)
     if angles_in == "degrees":
-        labels = {split: [_in_radians(label) for label in found] for split, found in labels.items()}
+        labels = {
+            split: [_to_radians(label) for label in labels_of_split]
+            for split, labels_of_split in labels.items()
+        }
     return labels
 
 
-def _in_radians(label: Label) -> Label:
+def _to_radians(label: Label) -> Label:
     pan, tilt, roll = map(math.radians, label.angles)
     return Label(label.name, (pan, tilt, roll))
 
@@ -61,7 +64,7 @@ def _read_struct(content: h5py.File, name: str) -> list[Label]:
     fields = {field: _read_cells(content, struct[field]) for field in (*ANGLES, "name")}
     lengths = {field: len(cells) for field, cells in fields.items()}
     if len(set(lengths.values())) != 1:
-        raise ValueError(f"{name} holds fields of different lengths: {lengths}")
+        raise ValueError(f"the fields of {name} have different lengths: {lengths}")
     texts = [cell.astype("<u2").tobytes().decode("utf-16-le") for cell in fields["name"]]
     pan, tilt, roll = ([float(cell.item()) for cell in fields[angle]] for angle in ANGLES)
     return [
@@ -70,7 +73,7 @@ def _read_struct(content: h5py.File, name: str) -> list[Label]:
 
 
 def _read_cells(content: Any, field: h5py.Dataset) -> list[np.ndarray]:
-    """Return what a field's references lead to; a struct of one element holds its value itself."""
+    """Return the arrays that a field refers to; the field of a struct of one element holds its value itself."""
     if field.dtype != h5py.ref_dtype:
         return [_values(content, field, MOST_VALUES)]
     return [
@@ -80,34 +83,43 @@ def _read_cells(content: Any, field: h5py.Dataset) -> list[np.ndarray]:
 
 
 def _values(content: h5py.File, dataset: Any, most: int) -> np.ndarray:
-    """Return all values of a small dataset, which must lie in the file itself, as HDF5 would read other files too."""
+    """Return all values of a small HDF5 dataset; a dataset that HDF5 would read from another file is refused."""
     chunk = math.prod(dataset.chunks or ())
     plain = dataset.dtype.kind in "iuf" or dataset.dtype == h5py.ref_dtype
     if not plain or max(dataset.size, chunk) > most:
-        raise ValueError(f"a dataset of {dataset.dtype}, shape {dataset.shape} in chunks of {dataset.chunks}")
+        raise ValueError(
+            f"a dataset of type {dataset.dtype} and shape {dataset.shape}, in chunks of {dataset.chunks}, is no label"
+        )
     if dataset.external or dataset.is_virtual or dataset.file.filename != content.filename:
-        raise ValueError("a dataset that lies in another file")
+        raise ValueError("the values of a dataset lie in another file")
     return dataset[()]
 
 
-def _refuse_unit(
+def _refuse_other_unit(
     file: Path, labels: Mapping[str, Sequence[Label]], angles_in: Literal["radians", "degrees"]
 ) -> None:
-    sizes = [abs(angle) for found in labels.values() for label in found for angle in label.angles]
+    """Raise a DataError if the angles seem to be in another unit than `angles_in`."""
+    sizes = [
+        abs(angle)
+        for labels_of_split in labels.values()
+        for label in labels_of_split
+        for angle in label.angles
+    ]
     largest = max(filter(math.isfinite, sizes), default=0.0)
     if angles_in == "radians" and largest > 2 * math.pi:
         raise DataError(
-            f"{file}: angles up to {largest:.4g} look like degrees; wanted radians. Set data.angles_in=degrees."
+            f"{file}: Angles up to {largest:.4g} look like degrees, but radians are expected. "
+            "Set data.angles_in=degrees."
         )
-    if angles_in == "degrees" and len(sizes) > 3 * ENOUGH and 0 < largest <= 2 * math.pi:
+    if angles_in == "degrees" and len(sizes) > 3 * UNIT_CHECK_MINIMUM and 0 < largest <= 2 * math.pi:
         raise DataError(
-            f"{file}: no angle of {len(sizes)} exceeds {largest:.4g}: this looks like radians; wanted degrees. "
-            "Set data.angles_in=radians."
+            f"{file}: None of the {len(sizes)} angles exceeds {largest:.4g}. This looks like radians, but degrees are "
+            "expected. Set data.angles_in=radians."
         )
 
 
 def write_labels(file: Path, labels: Mapping[str, Sequence[Label]]) -> None:
-    """Write a label file as MATLAB 7.3 lays it out; the same labels give the same bytes."""
+    """Write a label file in the layout of MATLAB 7.3; the same labels give the same bytes."""
     with h5py.File(file, "w", userblock_size=512, libver="earliest") as content:
         cells = content.create_group("#refs#")
 
@@ -116,14 +128,16 @@ def write_labels(file: Path, labels: Mapping[str, Sequence[Label]]) -> None:
             cell.attrs["MATLAB_class"] = np.bytes_(kind)
             return cell.ref
 
-        for split, found in labels.items():
+        for split, labels_of_split in labels.items():
             struct = content.create_group(f"or_label_{split}")
             struct.attrs["MATLAB_class"] = np.bytes_("struct")
             columns = {
-                angle: [refer(np.array([[label.angles[index]]]), "double") for label in found]
+                angle: [refer(np.array([[label.angles[index]]]), "double") for label in labels_of_split]
                 for index, angle in enumerate(ANGLES)
             }
-            texts = [np.frombuffer(label.name.encode("utf-16-le"), np.uint16)[:, None] for label in found]
+            texts = [
+                np.frombuffer(label.name.encode("utf-16-le"), np.uint16)[:, None] for label in labels_of_split
+            ]
             columns["name"] = [refer(text, "char") for text in texts]
             for field, references in columns.items():
                 struct.create_dataset(

@@ -28,7 +28,7 @@ SPLIT_SEED = 13
 
 
 class Labelled(NamedTuple):
-    """One image; its angles are in radians, any number of turns, in the order of the target's names."""
+    """One image and its angles, radians of any size, in the order of the target's names."""
 
     file: Path
     angles: tuple[float, ...]
@@ -36,13 +36,13 @@ class Labelled(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Reading:
-    """Settings for reading images: whole, made square by repeating their border, and scaled.
+    """Settings for reading images: each image is read whole, made square by repeating its border, and scaled.
 
     Attributes:
-        image_size: side of the square, pixels.
-        test_blur: standard deviation of a Gaussian that blurs the test images, pixels of the square.
-        jitter: how far training images are shifted, scaled and made brighter or darker, as a share.
-        skip_unreadable: whether to leave out, and count, images that cannot be read.
+        image_size: Side of the square, pixels.
+        test_blur: Standard deviation of a Gaussian that blurs the test images, pixels of the square.
+        jitter: Largest share by which training images are shifted, scaled and made brighter or darker.
+        skip_unreadable: Whether images that cannot be read are left out and counted; otherwise they are an error.
     """
 
     image_size: Annotated[int, Field(ge=8, le=1024)] = 50
@@ -51,11 +51,11 @@ class Reading:
     skip_unreadable: bool = False
 
     def crop(self, file: Path, split: str) -> Crop:
-        """Return the whole image as a crop; images of the test split are blurred."""
+        """Return the crop that reads a whole image; an image of the test split is blurred."""
         return Crop(file, None, 0.0, self.image_size, blur=self.test_blur if split == "test" else 0.0)
 
-    def own(self, files: Sequence[Path]) -> Fields | Crops:
-        """Return a user's own files without labels, rotated as their EXIF entries say."""
+    def read_unlabelled(self, files: Sequence[Path]) -> Fields | Crops:
+        """Return a user's own images without labels, rotated as their EXIF entries say."""
         return images.load_unlabelled(
             [Crop(Path(file), None, 0.0, self.image_size, upright=True) for file in files]
         )
@@ -65,9 +65,9 @@ class Loaded(NamedTuple):
     """Data of all splits.
 
     Attributes:
-        tables: the fields "input" (uint8, colour), "target" (radians in [-π, π)), "group" (0) and "index" by split.
-        skipped: number of images that were left out because they could not be read.
-        fingerprint: the splits' sizes, the test blur, and a hash over names and labels.
+        tables: Fields "input" (uint8, colour), "target" (radians in [-π, π)), "group" (0) and "index", by split.
+        skipped: Number of images that were left out because they could not be read.
+        fingerprint: Sizes of the splits, the test blur, and a hash of names and labels.
     """
 
     tables: Mapping[str, Fields | Crops]
@@ -75,13 +75,13 @@ class Loaded(NamedTuple):
     fingerprint: dict[str, str]
 
 
-class Found(NamedTuple):
+class Labels(NamedTuple):
     """Labels of a data set.
 
     Attributes:
-        samples: images by split; without "validation" the published test set is halved.
-        faults: errors of labels that could not be read; they count as unreadable images.
-        left_out: text on what else is missing from the splits, for the message about an empty one.
+        samples: Labelled images by split; without "validation" the published test set is halved.
+        faults: Errors of labels that could not be read; they count as unreadable images.
+        left_out: Clause about images that were left out for another reason, for the message about an empty split.
     """
 
     samples: dict[str, list[Labelled]]
@@ -90,33 +90,39 @@ class Found(NamedTuple):
 
 
 class Heads(Data):
-    """Base class of data sets of head images and gaze; a data set adds its constructor, its citation, and `found`.
+    """Base class of data sets of head images; a data set adds its constructor, its citation, and `read_labels`.
 
-    The constructor sets `source`, `reading`, `target`, and, if mirror images are shown in training, `signs`.
+    The constructor sets `source`, `reading`, `target`, and, if training shows mirror images, `signs`.
     """
 
     suffixes = images.SUFFIXES
     source: Source
     reading: Reading
     signs: tuple[float, ...] = ()
-    """Factors of the angles in a mirror image; if empty, no image is mirrored."""
+    """Factors by which mirroring an image multiplies its angles; () if no image is mirrored."""
 
     @abstractmethod
-    def found(self, root: Path) -> Found:
+    def read_labels(self, root: Path) -> Labels:
         """Return the labels in a folder.
 
         Raises:
-            DataError: the labels cannot be read.
+            DataError: The labels cannot be read.
         """
 
     def prepare(self) -> None:
         root = self.source.folder()
         self.synthetic = read_mark(root) is not None
-        samples, faults, left_out = self.found(root)
+        samples, faults, left_out = self.read_labels(root)
         if "validation" not in samples:
             samples["validation"], samples["test"] = halves(samples["test"])
-        names, drawn_in = self.target.names, self.source.generated_in()
-        self._loaded = load(samples, names, self.reading, faults, generated_in=drawn_in, left_out=left_out)
+        self._loaded = load(
+            samples,
+            self.target.names,
+            self.reading,
+            faults,
+            generated_in=self.source.generated_in(),
+            left_out=left_out,
+        )
         self.skipped = self._loaded.skipped
         self.input_shape = (3, self.reading.image_size, self.reading.image_size)
 
@@ -124,7 +130,7 @@ class Heads(Data):
         return Splits(**self._loaded.tables)
 
     def read(self, files: Sequence[Path]) -> Dataset[Batch]:
-        return self.reading.own(files)
+        return self.reading.read_unlabelled(files)
 
     def inputs(self, user_data: Any) -> Tensor:
         return given_images.to_inputs(self, user_data)
@@ -140,7 +146,7 @@ class Heads(Data):
 
 
 def halves(samples: Sequence[Labelled]) -> tuple[list[Labelled], list[Labelled]]:
-    """Return validation and test halves of what was published as one test set, as in the thesis authors' code."""
+    """Return a validation and a test half of the published test set, chosen as in the thesis authors' code."""
     order = np.random.RandomState(SPLIT_SEED).choice(len(samples), len(samples), replace=False)
     shuffled = [samples[index] for index in order]
     return shuffled[: len(samples) // 2], shuffled[len(samples) // 2 :]
@@ -158,15 +164,15 @@ def load(
     """Return the images of all splits.
 
     Args:
-        samples: labelled images by split.
-        names: names of the angles.
-        reading: settings for reading images.
-        faults: errors of labels that could not be read.
-        generated_in: the cache folder of generated images; None for a user's images.
-        left_out: text on what else is missing from the splits.
+        samples: Labelled images by split.
+        names: Names of the angles.
+        reading: Settings for reading images.
+        faults: Errors of labels that could not be read.
+        generated_in: Cache folder of generated images; None for a user's images.
+        left_out: See `Labels`.
 
     Raises:
-        DataError: an angle is not finite, images cannot be read and are not to be skipped, or a split is empty.
+        DataError: An angle is not finite, a split is empty, or images cannot be read and are not to be skipped.
     """
     _refuse_wrong_labels(samples)
     tables, skipped = images.load_splits(
@@ -181,7 +187,7 @@ def load(
         if len(table) == 0:
             raise DataError(
                 f"The {split} split is empty ({total} images in all, {skipped} unreadable{left_out}). "
-                "Restore what is missing, or use other data."
+                "Copy the missing images again from their source, or use other data."
             )
     sizes = {split: str(len(table)) for split, table in tables.items()}
     return Loaded(tables, skipped, {**sizes, "test_blur": str(reading.test_blur), "sha256": _digest(samples)})
@@ -197,11 +203,12 @@ def _refuse_wrong_labels(samples: Mapping[str, Sequence[Labelled]]) -> None:
     if wrong:
         raise DataError(
             f"{len(wrong)} images have an angle that is not finite:{images.list_lines(wrong)}\n"
-            "Mend these labels, or take the images out."
+            "Correct these labels, or remove the images."
         )
 
 
 def _digest(samples: Mapping[str, Sequence[Labelled]]) -> str:
+    """Return the SHA-256 of the names and the angles of all images."""
     digest = hashlib.sha256()
     for split in SPLITS:
         for sample in samples[split]:

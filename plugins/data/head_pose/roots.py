@@ -35,33 +35,33 @@ def table(data: Data, split: str) -> Mapping[str, Tensor]:
     return dataset.fields
 
 
-# ---- train/ and test/: twenty images and eleven, whose red is their number times eight --------------------------
+# ---- 20 images in train/ and 11 in test/; the red value of an image is eight times its number ---------------------
 
 
-def write_idiap(place: Path) -> Path:
+def write_idiap(root: Path) -> Path:
     """Write a folder of IDIAP images with their labels, and return it."""
-    _write_images(place, 75, "head_{}.png")
-    publish_idiap(place)
-    return place
+    _write_images(root, 75, "head_{}.png")
+    publish_idiap(root)
+    return root
 
 
 def publish_idiap(
     root: Path, train: Iterable[int] = range(20), test: Iterable[int] = range(20, 31), **more: Any
 ) -> None:
-    """Write the labels of the images with these numbers."""
+    """Write the IDIAP labels of the images with these numbers, and further struct arrays."""
     rows = {"or_label_train": [*map(idiap_row, train)], "or_label_test": [*map(idiap_row, test)], **more}
     save_idiap(root / "or_label_full.mat", **rows)
 
 
 def idiap_row(number: int) -> Row:
-    """Return the label of the image of a number, with angles in radians."""
+    """Return the label of the image with this number; the angles are in radians."""
     return f"head_{number}.png", 0.1 * number - 1.5, 0.02 * number, -0.05 * number
 
 
 def save_idiap(file: Path, *, column: bool = True, **structs: Sequence[Row]) -> None:
-    """Write a file as MATLAB 7.3 writes struct arrays: cells in #refs#, and fields of references to them.
+    """Write a file as MATLAB 7.3 writes struct arrays: the values in #refs#, and fields of references to the values.
 
-    Text is UTF-16 code units down a column. A row of structs gives columns of references, a column of structs a row.
+    Text is a column of UTF-16 code units. The references of a field form a column if `column` is true, otherwise a row.
     """
     with h5py.File(file, "w", userblock_size=512) as content:
         cells = content.create_group("#refs#")
@@ -74,31 +74,31 @@ def save_idiap(file: Path, *, column: bool = True, **structs: Sequence[Row]) -> 
                     else np.array([[row[index]]], dtype=np.float64)
                     for row in rows
                 ]
-                if len(values) == 1:  # a struct alone holds its values itself
+                if len(values) == 1:  # a single struct holds its values itself
                     struct.create_dataset(field, data=values[0])
                     continue
                 references = np.empty((len(values), 1), dtype=h5py.ref_dtype)
-                for place, value in enumerate(values):
-                    references[place, 0] = cells.create_dataset(f"{name}{field}{place}", data=value).ref
+                for row, value in enumerate(values):
+                    references[row, 0] = cells.create_dataset(f"{name}{field}{row}", data=value).ref
                 struct.create_dataset(field, data=references if column else references.T)
     with file.open("r+b") as stream:
         stream.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\x00\x02IM")
 
 
-def write_caviar(place: Path) -> Path:
+def write_caviar(root: Path) -> Path:
     """Write a folder of CAVIAR images with their labels, and return it."""
-    _write_images(place, 50, "head_{}_x.jpg")
-    publish_caviar(place)
-    return place
+    _write_images(root, 50, "head_{}_x.jpg")
+    publish_caviar(root)
+    return root
 
 
 def publish_caviar(root: Path, train: Iterable[int] = range(20), test: Iterable[int] = range(20, 31)) -> None:
-    """Write the labels of the images with these numbers."""
+    """Write the CAVIAR labels of the images with these numbers."""
     save_caviar(root, struct_array([*map(caviar_row, train)]), struct_array([*map(caviar_row, test)]))
 
 
 def caviar_row(number: int) -> list[Any]:
-    """Return a label whose gaze is 10° × number - 180°, with a uint8 number as MATLAB writes whole ones, and a name."""
+    """Return gaze (10° × number - 180°), x, y, size and name of an image; x is uint8, as MATLAB writes integers."""
     return [10.0 * number - 180, np.uint8(25), 25.5, 50.0, f"head_{number}_x"]
 
 
@@ -115,31 +115,34 @@ def struct_array(rows: Sequence[Sequence[Any]], names: Sequence[str] = CAVIAR_FI
     return array
 
 
-def _write_images(place: Path, side: int, name: str) -> None:
+def _write_images(root: Path, side: int, name: str) -> None:
     for split, numbers in (("train", range(20)), ("test", range(20, 31))):
-        (place / split).mkdir(parents=True)
+        (root / split).mkdir(parents=True)
         for number in numbers:
             color = (8 * number, 100, 200)
-            Image.new("RGB", (side, side), color).save(place / split / name.format(number), quality=100)
+            Image.new("RGB", (side, side), color).save(root / split / name.format(number), quality=100)
 
 
-# ---- a folder a person --------------------------------------------------------------------------------------------
+# ---- one folder for each person -----------------------------------------------------------------------------------
 
 
-def write_towncentre(place: Path) -> Path:
-    """Write forty people with two images each, pan 10° × person and 5° more; published names have more numbers."""
+def write_towncentre(root: Path) -> Path:
+    """Write a folder of TownCentre heads with two images of each person, and return it.
+
+    The pan of person p is 10° p - 720° in the first image and 5° more in the second.
+    """
     for person in range(PEOPLE):
-        folder = place / f"person{person}"
+        folder = root / f"person{person}"
         folder.mkdir(parents=True)
         for second in range(2):
             stem = f"image_{person}_{second}"
             Image.fromarray(pixels(2 * person + second)).save(folder / f"{stem}_17_{second}.png")
             pan = 10 * person + 5 * second - 720
             (folder / f"{stem}.txt").write_text(f"pan = {pan:+.2f}\nvalid = 1\n", encoding="utf-8")
-    (place / "readme.md").write_text("not a folder", encoding="utf-8")
-    return place
+    (root / "readme.md").write_text("not a folder", encoding="utf-8")
+    return root
 
 
 def pixels(number: int, side: int = 50) -> np.ndarray:
-    """Return an image of noise, which depends on the number."""
+    """Return an image of noise (side, side, 3), with the number as its seed."""
     return np.random.default_rng(number).integers(0, 256, (side, side, 3), dtype=np.uint8)

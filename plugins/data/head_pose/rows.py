@@ -1,4 +1,4 @@
-"""Rows of the contract: a few generated heads of each data set, in its official layout."""
+"""Contract-test cases: a few generated heads of each data set, in its official layout."""
 
 from framework.testing.rows import DAMAGES, DataRow
 from framework.testing.sample_files import images
@@ -31,7 +31,7 @@ ROWS = {
             {"images": 200, "image_size": 12},
             synthetic=True,
             files=images,
-            # a missing image is named by its label, but a missing label goes unnoticed
+            # a missing image is noticed because its label exists; a missing label cannot be noticed
             fragile={
                 "0001/*.jpg": ("empty", "cut", "garbage", "folder"),
                 "0001/*.txt": ("empty", "cut", "garbage", "folder"),

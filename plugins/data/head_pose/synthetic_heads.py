@@ -1,10 +1,10 @@
-"""Synthetic photographs of heads: ellipsoids cast by parallel rays, over clutter, through a poor camera.
+"""Synthetic photographs of heads: ray-cast ellipsoids in front of clutter, photographed by a poor camera.
 
-The camera looks along -z; x is right in the image and y is up. A head's own frame has x towards its left, y towards its
-crown, and z out of its face; at pan, tilt and roll 0 both frames agree and the face looks into the camera. Lengths are
-in half heights of a head.
+The rays are parallel. The camera looks along -z; x points right in the image and y up. In the frame of the head, x
+points to its left, y to its crown, and z out of its face. At pan, tilt and roll 0 both frames agree, and the face looks
+into the camera. Lengths are in half heights of a head.
 
-`no_type_check` keeps the type checks that tests switch on from wrapping the kernel before it is compiled.
+`no_type_check` exempts the compiled functions from the type checks that tests switch on.
 """
 
 import math
@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
-from framework.storage.kernels import compiler, kept_in
+from framework.storage.kernels import compiler, kernel_cache
 
-compiled = compiler(kept_in("synthetic_heads", [Path(__file__)]))
+compiled = compiler(kernel_cache("synthetic_heads", [Path(__file__)]))
 
 VERSION = 1
-"""Version of what is drawn; a change takes a new number, which the marks of generated data hold."""
+"""Version of the images, stored with generated data; increase it if the drawn images change."""
 Array = NDArray[np.float64]
 SAMPLES = 2
 """Number of rays along each side of a pixel."""
@@ -36,8 +36,8 @@ HAIRS = ((0.08, 0.07, 0.06), (0.20, 0.13, 0.09), (0.36, 0.24, 0.14), (0.62, 0.47
 class Pose(NamedTuple):
     """Pan, tilt and roll in degrees.
 
-    Pan > 0 turns the nose towards the image's right, tilt > 0 lifts it, roll > 0 leans the crown to the image's left. A
-    mirror image negates pan and roll.
+    Pan > 0 turns the nose towards the right of the image, tilt > 0 lifts the nose, and roll > 0 leans the crown towards
+    the left of the image. A mirror image negates pan and roll.
     """
 
     pan: float
@@ -47,15 +47,16 @@ class Pose(NamedTuple):
 
 @dataclass(frozen=True)
 class Person:
-    """Appearance of a person, which stays the same from image to image; colours (3,) in 0…1.
+    """Appearance of a person, which is the same in every image of the person.
 
     Attributes:
-        axes: half width, height and depth of the skull.
-        face_tilt: how far below the forehead the opening of the hair points, radians.
-        face_reach: cosine of the angular radius of that opening; -1 leaves no hair.
-        long_hair, bun, hat: whether these are on the head.
-        glasses, beard: darkness of either, 0…1.
-        ears: size; 0 where hair hides them.
+        skin, hair, cloth, hat_color: Colours (3,), 0…1.
+        axes: Half width, half height and half depth of the skull.
+        face_tilt: Angle below the horizontal at which the middle of the opening in the hair lies, radians.
+        face_reach: Cosine of the angular radius of that opening; -1: no hair.
+        long_hair, bun, hat: Whether the person has long hair, a bun or a hat.
+        glasses, beard: Darkness of the glasses and of the beard, 0…1; 0: none.
+        ears: Relative size of the ears; 0 if hair hides them.
     """
 
     skin: Array
@@ -74,16 +75,16 @@ class Person:
 
 
 class Conditions(NamedTuple):
-    """Conditions of photographs; values are drawn uniformly from ranges.
+    """Conditions of photographs; values are drawn uniformly from the ranges.
 
     Attributes:
-        pixels: range of the camera's own pixels along a side; the image is scaled to the requested side.
-        height: range of the head's height, as a share of the side.
-        offset: largest shift of the head's middle from the image's, as a share of the side.
-        blur: largest standard deviation of the camera's blur, camera pixels.
-        noise: largest standard deviation of its noise, of values in 0…1.
-        clutter: largest number of shapes in the background.
-        occluded: share of images in which something hides part of the head.
+        pixels: Range of the side of the camera's image, camera pixels; the image is then scaled to the requested side.
+        height: Range of the head's height, as a share of the side.
+        offset: Largest shift of the head's middle from the middle of the image, as a share of the side.
+        blur: Largest standard deviation of the camera's blur, camera pixels.
+        noise: Largest standard deviation of the camera's noise; values of pixels are 0…1.
+        clutter: Largest number of shapes in the background.
+        occluded: Share of images in which a shape hides part of the head.
     """
 
     pixels: tuple[int, int]
@@ -95,8 +96,8 @@ class Conditions(NamedTuple):
     occluded: float
 
 
-def person(random: Generator) -> Person:
-    """Return a random person: head shape, skin, hair and what is worn, drawn from the generator."""
+def random_person(random: Generator) -> Person:
+    """Return a person of random head shape, skin, hair, clothes and accessories."""
     tone = int(random.integers(5))
     long_hair, bald, hat = random.random() < 0.3, random.random() < 0.1, random.random() < 0.15
     covered = long_hair and not bald
@@ -129,29 +130,29 @@ def rotation(pose: Pose) -> Array:
 
 
 def photograph(
-    random: Generator, who: Person, pose: Pose, side: int, conditions: Conditions
+    random: Generator, person: Person, pose: Pose, side: int, conditions: Conditions
 ) -> NDArray[np.uint8]:
-    """Return a photograph of a person's head, (side, side, 3)."""
+    """Return a photograph (side, side, 3) of a person's head in a pose, under random conditions."""
     pixels = int(random.integers(conditions.pixels[0], conditions.pixels[1] + 1))
     scale = 0.5 * pixels * random.uniform(*conditions.height)  # camera pixels per half height
     middle = 0.5 * pixels + pixels * random.uniform(-1, 1, 2) * conditions.offset
     light = np.array([random.normal(0, 0.7), random.uniform(0.1, 1.2), random.uniform(0.1, 1.0)])
     strength = random.uniform(0.2, 0.6)
     body = Pose(pose.pan + random.normal(0, 25))
-    picture = background(random, pixels, conditions.clutter)
-    layer = rendered(who, pose, body, pixels, scale, (middle[0], middle[1]), light, strength)
-    picture = layer[..., :3] + (1 - layer[..., 3:]) * picture
+    image = background(random, pixels, conditions.clutter)
+    layer = render(person, pose, body, pixels, scale, (middle[0], middle[1]), light, strength)
+    image = layer[..., :3] + (1 - layer[..., 3:]) * image
     if random.random() < conditions.occluded:
-        picture = _hidden(random, picture, middle, scale)
-    picture = gaussian_filter(picture, (*2 * (random.uniform(0, conditions.blur),), 0))
-    picture = (picture - 0.5) * random.uniform(0.75, 1.15) + 0.5 + random.uniform(-0.1, 0.1)
-    picture = picture + random.normal(0, random.uniform(0, conditions.noise), picture.shape)
-    seen = Image.fromarray((255 * picture.clip(0, 1)).round().astype(np.uint8))
-    return np.asarray(seen.resize((side, side), Image.Resampling.BICUBIC))
+        image = _occlude(random, image, middle, scale)
+    image = gaussian_filter(image, (*2 * (random.uniform(0, conditions.blur),), 0))
+    image = (image - 0.5) * random.uniform(0.75, 1.15) + 0.5 + random.uniform(-0.1, 0.1)
+    image = image + random.normal(0, random.uniform(0, conditions.noise), image.shape)
+    photo = Image.fromarray((255 * image.clip(0, 1)).round().astype(np.uint8))
+    return np.asarray(photo.resize((side, side), Image.Resampling.BICUBIC))
 
 
-def rendered(
-    who: Person,
+def render(
+    person: Person,
     pose: Pose,
     body: Pose,
     pixels: int,
@@ -160,76 +161,117 @@ def rendered(
     light: Array,
     strength: float,
 ) -> Array:
-    """Return head, neck and shoulders alone, (pixels, pixels, 4): colour times cover, and cover, 0…1.
+    """Return an image (pixels, pixels, 4) of head, neck and shoulders without a background.
+
+    The channels are the colour times the opacity (premultiplied alpha), and the opacity, 0…1.
 
     Args:
-        who: the person.
-        pose: pose of the head.
-        body: pose of the shoulders.
-        pixels: side of the image, pixels.
-        scale: pixels per half height.
-        middle: centre of the head (column, row), pixels from the image's corner.
-        light: direction towards the lamp, any length.
-        strength: the lamp's share of the light, 0…1.
+        person: The person.
+        pose: Pose of the head.
+        body: Pose of the shoulders.
+        pixels: Side of the image, pixels.
+        scale: Pixels per half height of a head.
+        middle: Centre of the head (column, row), pixels from the corner of the image.
+        light: Direction towards the lamp, of any length.
+        strength: Share of the light that comes from the lamp, 0…1; the rest is ambient light.
     """
     head, torso = rotation(pose), rotation(body)
-    parts = _ellipsoids(who, head, torso)
+    parts = _ellipsoids(person, head, torso)
     centers = np.array([center for center, _, _, _ in parts])
     frames = np.array([frame for _, frame, _, _ in parts])
-    # the extent of |F (p - c)| = 1 along an axis of the camera is the length of that row of the inverse of F
-    reaches = np.linalg.norm(np.linalg.inv(frames), axis=2)
+    # along an axis of the camera, the ellipsoid |F (p - c)| = 1 extends as far as the length of that row of F⁻¹
+    half_extents = np.linalg.norm(np.linalg.inv(frames), axis=2)
     colors = np.array([color for _, _, color, _ in parts])
     kinds = np.array([kind for _, _, _, kind in parts])
-    opening = np.array([0.0, -math.sin(who.face_tilt), math.cos(who.face_tilt), who.face_reach])
-    look = np.array([who.glasses, who.beard, *who.hair])
+    opening = np.array([0.0, -math.sin(person.face_tilt), math.cos(person.face_tilt), person.face_reach])
+    look = np.array([person.glasses, person.beard, *person.hair])
     image = np.zeros((pixels, pixels, 4))
     lamp = light / np.linalg.norm(light)
-    _cast(centers, frames, reaches, colors, kinds, head, opening, look, lamp, strength, scale, *middle, image)
+    _cast(
+        centers,
+        frames,
+        half_extents,
+        colors,
+        kinds,
+        head,
+        opening,
+        look,
+        lamp,
+        strength,
+        scale,
+        *middle,
+        image,
+    )
     return image
 
 
-def _ellipsoids(who: Person, head: Array, torso: Array) -> list[tuple[Array, Array, Array, int]]:
-    """Return the centre, the matrix to the unit ball, the colour and the kind of every part."""
+def _ellipsoids(person: Person, head: Array, torso: Array) -> list[tuple[Array, Array, Array, int]]:
+    """Return the parts as ellipsoids: centre (3,), matrix (3, 3) that maps to the unit ball, colour (3,) and kind.
+
+    Args:
+        person: The person.
+        head: Rotation (3, 3) from the head's frame to the camera's.
+        torso: Rotation (3, 3) from the shoulders' frame to the camera's.
+    """
     parts: list[tuple[Array, Array, Array, int]] = []
 
     def add(
-        turn: Array, center: tuple[float, ...], axes: Array | tuple[float, ...], color: Array, kind: int
+        to_camera: Array, center: tuple[float, ...], axes: Array | tuple[float, ...], color: Array, kind: int
     ) -> None:
-        parts.append((turn @ np.array(center), turn.T / np.array(axes)[:, None], color, kind))
+        parts.append((to_camera @ np.array(center), to_camera.T / np.array(axes)[:, None], color, kind))
 
-    width, height, depth = who.axes
-    still = np.eye(3)
-    add(torso, (0.0, -2.35, -0.1), (1.75, 0.95, 0.75), who.cloth, CLOTH)
-    add(still, (0.0, -1.2, -0.1), (0.40, 0.75, 0.42), who.skin * 0.9, CLOTH)
-    add(head, (0.0, 0.0, 0.0), who.axes, who.skin, SKIN)
-    add(head, (0.0, -0.55 * height, 0.28 * depth), (0.50, 0.47, 0.52), who.skin, SKIN)  # jaw
-    add(head, (0.0, -0.12, 0.93 * depth), (0.11, 0.23, 0.21), who.skin * 1.03, SKIN)  # nose
-    for sign in (-1.0, 1.0) if who.ears else ():
-        size = who.ears
+    width, height, depth = person.axes
+    upright = np.eye(3)
+    add(torso, (0.0, -2.35, -0.1), (1.75, 0.95, 0.75), person.cloth, CLOTH)
+    add(upright, (0.0, -1.2, -0.1), (0.40, 0.75, 0.42), person.skin * 0.9, CLOTH)
+    add(head, (0.0, 0.0, 0.0), person.axes, person.skin, SKIN)
+    add(head, (0.0, -0.55 * height, 0.28 * depth), (0.50, 0.47, 0.52), person.skin, SKIN)  # jaw
+    add(head, (0.0, -0.12, 0.93 * depth), (0.11, 0.23, 0.21), person.skin * 1.03, SKIN)  # nose
+    for sign in (-1.0, 1.0) if person.ears else ():
+        size = person.ears
         add(
             head,
             (sign * 1.02 * width, -0.03, -0.08),
             (0.08, 0.22 * size, 0.14 * size),
-            who.skin * 0.92,
+            person.skin * 0.92,
             CLOTH,
         )
-    if who.face_reach > -1:
-        add(head, (0.0, 0.04, -0.03), 1.07 * who.axes, who.hat_color if who.hat else who.hair, HAIR)
-    if who.hat:
-        add(head, (0.0, 0.42 * height, 0.85 * depth), (0.58, 0.07, 0.55), who.hat_color * 0.8, CLOTH)
-    if who.long_hair:
-        add(head, (0.0, -0.4, -0.35), (0.88 * width / 0.76, 1.05, 0.62), who.hair, CLOTH)
-    if who.bun:
-        add(head, (0.0, 0.35, -1.05 * depth), (0.30, 0.30, 0.28), who.hair * 0.9, CLOTH)
+    if person.face_reach > -1:
+        add(
+            head,
+            (0.0, 0.04, -0.03),
+            1.07 * person.axes,
+            person.hat_color if person.hat else person.hair,
+            HAIR,
+        )
+    if person.hat:
+        add(head, (0.0, 0.42 * height, 0.85 * depth), (0.58, 0.07, 0.55), person.hat_color * 0.8, CLOTH)
+    if person.long_hair:
+        add(head, (0.0, -0.4, -0.35), (0.88 * width / 0.76, 1.05, 0.62), person.hair, CLOTH)
+    if person.bun:
+        add(head, (0.0, 0.35, -1.05 * depth), (0.30, 0.30, 0.28), person.hair * 0.9, CLOTH)
     return parts
 
 
 @compiled
 @no_type_check
 def _cast(
-    centers, frames, reaches, colors, kinds, head, opening, look, lamp, strength, scale, column0, row0, image
+    centers,
+    frames,
+    half_extents,
+    colors,
+    kinds,
+    head,
+    opening,
+    look,
+    lamp,
+    strength,
+    scale,
+    column0,
+    row0,
+    image,
 ):
-    """Fill `image` with the nearest surface along each ray, shaded after Lambert."""
+    """Fill `image` with the nearest surface along each ray, with Lambert shading."""
     size = image.shape[0]
     point = np.zeros(3)
     unit = np.zeros(3)
@@ -244,9 +286,9 @@ def _cast(
         nearest, chosen = -np.inf, -1
         for part in range(centers.shape[0]):
             right, up = x - centers[part, 0], y - centers[part, 1]
-            if abs(right) > reaches[part, 0] or abs(up) > reaches[part, 1]:
+            if abs(right) > half_extents[part, 0] or abs(up) > half_extents[part, 1]:
                 continue
-            # |F (p - c)| = 1 with p = (x, y, z): a quadratic equation in z - c_z, its larger root is nearer
+            # |F (p - c)| = 1 with p = (x, y, z) is a quadratic equation in z - c_z; its larger root is nearer
             a = b = c = 0.0
             for axis in range(3):
                 across = frames[part, axis, 0] * right + frames[part, axis, 1] * up
@@ -292,7 +334,10 @@ def _cast(
 @compiled
 @no_type_check
 def _paint_face(point, look, color):
-    """Change the skin's colour at facial features; `point` is in the head's frame, features are seen from the front."""
+    """Change the colour of the skin at facial features.
+
+    `point` is in the head's frame. The features are projected onto the head from the front.
+    """
     x, y = abs(point[0]), point[1]
     if point[2] < 0.15:
         return
@@ -303,7 +348,7 @@ def _paint_face(point, look, color):
     eye = ((x - EYE) / 0.17) ** 2 + ((y - EYE_HEIGHT) / 0.085) ** 2
     if ((x - EYE) / 0.25) ** 2 + ((y - EYE_HEIGHT - 0.03) / 0.17) ** 2 < 1:
         for channel in range(3):
-            color[channel] *= 0.72  # the socket
+            color[channel] *= 0.72  # eye socket
     if eye < 1:
         pupil = ((x - EYE) / 0.085) ** 2 + ((y - EYE_HEIGHT) / 0.085) ** 2 < 1
         for channel in range(3):
@@ -326,40 +371,46 @@ def _paint_face(point, look, color):
 
 
 def _muted(random: Generator) -> Array:
-    """Return a colour (3,) of any brightness and little saturation, as most things have."""
+    """Return a random colour (3,), 0…1, of any brightness and little saturation."""
     return np.clip(random.uniform(0.1, 0.9) + random.normal(0, 0.05, 3), 0, 1)
 
 
 def background(random: Generator, pixels: int, clutter: int) -> Array:
-    """Return smooth noise between two colours with up to `clutter` shapes in front of it, (pixels, pixels, 3)."""
+    """Return an image (pixels, pixels, 3) of smooth noise between two colours, with up to `clutter` random shapes."""
     first = _muted(random)
     second = np.clip(first + random.normal(0, 0.2) + random.normal(0, 0.04, 3), 0, 1)
     cells = int(random.integers(2, 7))
     grid = Image.fromarray(random.random((cells, cells), dtype=np.float32))
     share = np.asarray(grid.resize((pixels, pixels), Image.Resampling.BICUBIC), dtype=np.float64)[..., None]
-    picture = first + share.clip(0, 1) * (second - first)
+    image = first + share.clip(0, 1) * (second - first)
     for _ in range(int(random.integers(0, clutter + 1))):
-        place, size = random.uniform(0, pixels, 2), random.uniform(0.08, 0.45, 2) * pixels
-        mask = _shape(random, pixels, place, size)
-        picture = np.where(mask, _muted(random), picture)
-    return picture
+        centre, size = random.uniform(0, pixels, 2), random.uniform(0.08, 0.45, 2) * pixels
+        mask = _shape(random, pixels, centre, size)
+        image = np.where(mask, _muted(random), image)
+    return image
 
 
-def _hidden(random: Generator, picture: Array, middle: Array, scale: float) -> Array:
-    """Return the image with a shape over part of the head, which is at `middle`, `scale` pixels per half height."""
-    pixels = len(picture)
-    turn, reach = random.uniform(0, 2 * math.pi), random.uniform(0.8, 1.3)
-    place = middle + reach * scale * np.array([0.8 * math.cos(turn), math.sin(turn)])
-    mask = _shape(random, pixels, place, random.uniform(0.6, 1.1, 2) * scale)
-    return np.where(mask, _muted(random), picture)
+def _occlude(random: Generator, image: Array, middle: Array, scale: float) -> Array:
+    """Return the image with a random shape over part of the head.
+
+    The head is at `middle` (column, row); half its height is `scale` pixels.
+    """
+    pixels = len(image)
+    angle, distance = random.uniform(0, 2 * math.pi), random.uniform(0.8, 1.3)
+    centre = middle + distance * scale * np.array([0.8 * math.cos(angle), math.sin(angle)])
+    mask = _shape(random, pixels, centre, random.uniform(0.6, 1.1, 2) * scale)
+    return np.where(mask, _muted(random), image)
 
 
-def _shape(random: Generator, pixels: int, place: Array, size: Array) -> NDArray[np.bool_]:
-    """Return the mask of a rotated ellipse or rectangle of half lengths `size` about `place` (column, row)."""
+def _shape(random: Generator, pixels: int, centre: Array, size: Array) -> NDArray[np.bool_]:
+    """Return the mask (pixels, pixels, 1) of an ellipse or a rectangle, rotated at random.
+
+    Its centre is `centre` (column, row), and `size` holds its half lengths, in pixels.
+    """
     rows, columns = np.mgrid[:pixels, :pixels] + 0.5
-    turn = random.uniform(0, math.pi)
-    right, down = columns - place[0], rows - place[1]
-    along = (right * math.cos(turn) + down * math.sin(turn)) / size[0]
-    across = (down * math.cos(turn) - right * math.sin(turn)) / size[1]
+    angle = random.uniform(0, math.pi)
+    right, down = columns - centre[0], rows - centre[1]
+    along = (right * math.cos(angle) + down * math.sin(angle)) / size[0]
+    across = (down * math.cos(angle) - right * math.sin(angle)) / size[1]
     inside = along**2 + across**2 if random.random() < 0.5 else np.maximum(abs(along), abs(across))
     return inside[..., None] < 1

@@ -26,13 +26,13 @@ def root(tmp_path: Path) -> Path:
 
 
 def test_fields_are_read_by_their_order(root: Path) -> None:
-    """Check fields of other names, because those of the published file are not known."""
+    """Check fields of other names, because the names in the published file are not known."""
     names = ("or", "xc", "yc", "s", "im")
     save_caviar(
         root, struct_array([caviar_row(0)], names), struct_array([caviar_row(n) for n in (20, 21, 22)], names)
     )
     labels = read_labels(root / LABELS)
-    assert labels["train"] == [Label("head_0_x", -180.0)]  # one alone comes without the array
+    assert labels["train"] == [Label("head_0_x", -180.0)]  # a single struct is stored without the array
     assert [label.name for label in labels["test"]] == ["head_20_x", "head_21_x", "head_22_x"]
 
 
@@ -59,7 +59,7 @@ def test_element_that_is_no_label_is_named(root: Path, bad: list[Any]) -> None:
 def test_other_contents_are_refused(root: Path) -> None:
     save_caviar(root, struct_array([caviar_row(0)[:4]], CAVIAR_FIELDS[:4]), struct_array([caviar_row(20)]))
     with pytest.raises(
-        DataError, match=r"or_label_train\(1\) holds .* wanted a struct of gaze, x, y, size, name"
+        DataError, match=r"or_label_train\(1\) holds .* expected a struct of gaze, x, y, size, name"
     ):
         prepared("caviar", root)
     scipy.io.savemat(
@@ -68,7 +68,7 @@ def test_other_contents_are_refused(root: Path) -> None:
     with pytest.raises(DataError, match=r"or_label_train\(1\) holds"):
         prepared("caviar", root)
     scipy.io.savemat(root / LABELS, {"or_label_train": struct_array([caviar_row(0)])})
-    with pytest.raises(DataError, match=r"holds no or_label_test\. Restore"):
+    with pytest.raises(DataError, match=r"The file holds no or_label_test\. Copy"):
         prepared("caviar", root)
 
 

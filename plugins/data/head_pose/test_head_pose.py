@@ -1,4 +1,4 @@
-"""Tests of what IDIAP, TownCentre and CAVIAR have in common: folders, augmentation, and drawn heads."""
+"""Tests of what IDIAP, TownCentre and CAVIAR have in common: folders, augmentation, and synthetic heads."""
 
 import json
 import math
@@ -34,7 +34,17 @@ SPLITS = Splits._fields
 
 
 class Published(NamedTuple):
-    """Data set, with functions that write its published layout and the numbers that a test expects."""
+    """Data set, with functions that write its published layout, and the numbers that a test expects.
+
+    Attributes:
+        archive: The archive.
+        write: Function that fills a folder with images and labels.
+        publish: Function that writes the labels of images with given numbers.
+        angles: Function from the number of an image to its angles, radians.
+        names: Names of the angles.
+        side: Side of the images, pixels.
+        labels: Name of the label file.
+    """
 
     archive: Archive
     write: Callable[[Path], Path]
@@ -86,6 +96,7 @@ def root(published: Published, tmp_path: Path) -> Path:
 
 
 def numbers_in(fields: Any) -> list[int]:
+    """Return the numbers of the images of a split, from their red values."""
     return [round(float(red) / 8) for red in fields["input"][:, 0].float().mean((1, 2))]
 
 
@@ -116,14 +127,17 @@ def test_images_labels_and_splits(published: Published, root: Path) -> None:
 def test_wrong_layouts_say_what_is_missing(published: Published, root: Path, tmp_path: Path) -> None:
     name, folder = published.archive.name, published.archive.folder
     with pytest.raises(
-        DataError, match=rf"data\.root = .*nowhere: no such folder; wanted the unpacked {folder}, or null"
+        DataError,
+        match=rf"data\.root = .*nowhere does not exist .* Set data\.root to the unpacked {folder}, or to null",
     ):
         prepared(name, tmp_path / "nowhere")
     labels = published.labels.replace(".", r"\.")
-    with pytest.raises(DataError, match=rf"no train/, no test/, no {labels}\. Did you mean .*{folder}\?"):
+    with pytest.raises(
+        DataError, match=rf"it holds no train/, no test/, no {labels}\. Did you mean .*{folder}\?"
+    ):
         prepared(name, tmp_path)
     (root / published.labels).unlink()
-    with pytest.raises(DataError, match=rf"no {labels}\. Unpack the whole archive there"):
+    with pytest.raises(DataError, match=rf"it holds no {labels}\. Unpack the whole archive into"):
         prepared(name, root)
 
 
@@ -201,7 +215,7 @@ def test_generation_is_the_same_to_the_byte_whatever_the_threads(
     assert first == second
     other = files_of(Source(archive, None, images, 6).folder())
     assert len(other) == files
-    if archive is not IDIAP:  # whose names tell the person
+    if archive is not IDIAP:  # the names of IDIAP images hold the number of a random person
         assert first.keys() == other.keys()
     assert not any(content == other.get(name) for name, content in first.items())
     mark = json.loads(first["synthetic.json"])
@@ -216,7 +230,7 @@ def test_generated_sets_have_the_published_shares(name: str, sizes: list[int]) -
 
 
 @pytest.mark.parametrize("name", ["idiap", "caviar"])
-def test_generated_data_that_are_damaged_are_to_be_deleted(cache: Path, name: str) -> None:
+def test_the_message_about_damaged_generated_data_says_to_delete_them(cache: Path, name: str) -> None:
     prepared(name, None, images=20)
     next(cache.rglob("*.jpg")).write_bytes(b"")
     with pytest.raises(DataError, match=rf"Delete {cache}/{name}; the next run generates the data again"):
@@ -227,8 +241,11 @@ def test_generated_data_that_are_damaged_are_to_be_deleted(cache: Path, name: st
     ("name", "images", "correlation"),
     [("idiap", 600, 0.4), ("towncentre", 1200, 0.4), ("caviar", 1200, 0.25)],
 )
-def test_pictures_agree_with_their_labels(name: str, images: int, correlation: float) -> None:
-    """Check a kernel regression of the first angle's sine on coarse grey images; its sign changes on mirror images."""
+def test_images_agree_with_their_labels(name: str, images: int, correlation: float) -> None:
+    """Check that a kernel regression predicts the sine of the first angle from coarse grey images.
+
+    On mirror images the sign of the correlation changes.
+    """
     data = prepared(name, None, images=images, image_size=16)
 
     def columns(split: str, *, mirrored: bool) -> tuple[np.ndarray, np.ndarray]:
@@ -240,5 +257,5 @@ def test_pictures_agree_with_their_labels(name: str, images: int, correlation: f
 
     regression = KernelRidge(kernel="rbf", gamma=2e-3, alpha=0.3).fit(*columns("train", mirrored=False))
     for mirrored, sign in ((False, 1), (True, -1)):
-        pictures, sine = columns("test", mirrored=mirrored)
-        assert sign * np.corrcoef(regression.predict(pictures), sine)[0, 1] > correlation
+        pixels, sine = columns("test", mirrored=mirrored)
+        assert sign * np.corrcoef(regression.predict(pixels), sine)[0, 1] > correlation

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from framework.errors import DataError
-from plugins.data.head_pose.idiap import PEOPLE, pose
+from plugins.data.head_pose.idiap import PEOPLE, random_pose
 from plugins.data.head_pose.idiap_labels import LABELS, Label, read_labels, write_labels
 from plugins.data.head_pose.roots import idiap_row, prepared, publish_idiap, save_idiap, table, write_idiap
 
@@ -40,18 +40,18 @@ def test_struct_of_one_element(root: Path) -> None:
     assert label == Label("head_7.png", idiap_row(7)[1:])
 
 
-def test_degrees_and_radians_are_told_apart(root: Path) -> None:
-    turned = {
+def test_labels_in_the_wrong_unit_are_refused(root: Path) -> None:
+    in_degrees = {
         f"or_label_{split}": [
             (name, *(math.degrees(angle) for angle in angles)) for name, *angles in map(idiap_row, numbers)
         ]
         for split, numbers in (("train", range(20)), ("test", range(20, 31)))
     }
     radians = table(prepared("idiap", root), "train")["target"]
-    with pytest.raises(DataError, match=r"looks like radians; wanted degrees\. Set data\.angles_in=radians"):
+    with pytest.raises(DataError, match=r"looks like radians, but degrees .* Set data\.angles_in=radians"):
         prepared("idiap", root, angles_in="degrees")
-    save_idiap(root / LABELS, **turned)
-    with pytest.raises(DataError, match=r"look like degrees; wanted radians\. Set data\.angles_in=degrees"):
+    save_idiap(root / LABELS, **in_degrees)
+    with pytest.raises(DataError, match=r"look like degrees, but radians .* Set data\.angles_in=degrees"):
         prepared("idiap", root)
     torch.testing.assert_close(
         table(prepared("idiap", root, angles_in="degrees"), "train")["target"], radians
@@ -75,7 +75,7 @@ def test_label_file_that_is_cut_short_or_lacks_something_is_named(root: Path) ->
         shorter = content["or_label_train/tilt"][:19]
         del content["or_label_train/tilt"]
         content["or_label_train/tilt"] = shorter
-    with pytest.raises(DataError, match=r"fields of different lengths: .*'tilt': 19"):
+    with pytest.raises(DataError, match=r"fields of or_label_train have different lengths: .*'tilt': 19"):
         prepared("idiap", root)
 
 
@@ -84,12 +84,11 @@ def test_angle_that_is_not_finite_is_never_skipped(root: Path, angle: float) -> 
     publish_idiap(root, or_label_train=[idiap_row(0), ("head_1.png", 0.5, angle, 0.25)])
     with pytest.raises(DataError, match=rf"1 images have an angle .*\n.*head_1\.png: 0\.5, {angle}, 0\.25"):
         prepared("idiap", root, skip_unreadable=True)
-    assert (
-        len(table(prepared("idiap", root, angles=["pan"]), "train")["input"]) == 2
-    )  # nobody asks for that tilt
+    # without tilt among the angles, that label is good
+    assert len(table(prepared("idiap", root, angles=["pan"]), "train")["input"]) == 2
 
 
-def test_labels_are_written_as_matlab_lays_them_out(tmp_path: Path) -> None:
+def test_labels_are_written_in_the_layout_of_matlab(tmp_path: Path) -> None:
     labels = {
         "train": [Label("a_1.jpg", (1.0, -2.0, 3.0)), Label("b.jpg", (0.5, 0.25, 0.125))],
         "test": [Label("c.jpg", (0.0, 0.0, 0.0)), Label("d.jpg", (0.0, 0.0, 1.0))],
@@ -104,14 +103,15 @@ def test_labels_are_written_as_matlab_lays_them_out(tmp_path: Path) -> None:
         assert (cell.dtype, cell.shape) == (np.uint16, (5, 1))
 
 
-def test_generated_set_is_read_as_it_was_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_labels_of_the_generated_set_are_the_random_poses(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("FRAMEWORK_CACHE", str(tmp_path))
-    data = prepared(
-        "idiap", None, images=60, angles_in="degrees"
-    )  # which says how a user's own file is to be read
-    drawn = []
+    # angles_in is for a user's own label file and has no effect on generated labels
+    data = prepared("idiap", None, images=60, angles_in="degrees")
+    poses = []
     for number in range(38):
         random = np.random.default_rng([0, 0, number])
         random.integers(PEOPLE)
-        drawn.append(pose(random))
-    np.testing.assert_allclose(table(data, "train")["target"].rad2deg(), drawn, atol=1e-4)
+        poses.append(random_pose(random))
+    np.testing.assert_allclose(table(data, "train")["target"].rad2deg(), poses, atol=1e-4)

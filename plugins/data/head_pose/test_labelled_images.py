@@ -16,15 +16,18 @@ from framework.errors import DataError
 from plugins.data.head_pose.labelled_images import SPLITS, Labelled, Loaded, Reading, halves, load
 
 
-def samples(place: Path, count: int = 12) -> dict[str, list[Labelled]]:
-    """Write images whose red is their number times ten, and return them with the angles (number, -number) radians."""
-    made = []
+def write_samples(folder: Path, count: int = 12) -> dict[str, list[Labelled]]:
+    """Write images whose red value is ten times their number, and return them by split.
+
+    Their angles are (number, -number) radians.
+    """
+    images = []
     for number in range(count):
         pixels = np.random.default_rng(number).integers(0, 256, (8, 8, 3), dtype=np.uint8)
         pixels[..., 0] = 10 * number
-        Image.fromarray(pixels).save(place / f"{number}.png")
-        made.append(Labelled(place / f"{number}.png", (float(number), float(-number))))
-    return {"train": made[:6], "validation": made[6:9], "test": made[9:]}
+        Image.fromarray(pixels).save(folder / f"{number}.png")
+        images.append(Labelled(folder / f"{number}.png", (float(number), float(-number))))
+    return {"train": images[:6], "validation": images[6:9], "test": images[9:]}
 
 
 def read(
@@ -43,18 +46,18 @@ def sizes(loaded: Loaded) -> list[str]:
 
 
 def test_published_test_set_is_halved_as_the_authors_code_does() -> None:
-    made = [Labelled(Path(str(number)), ()) for number in range(23_991)]
-    validation, test = halves(made)
+    images = [Labelled(Path(str(number)), ()) for number in range(23_991)]
+    validation, test = halves(images)
     np.random.seed(13)  # noqa: NPY002  (their code seeds the global generator)
     order = np.random.choice(23_991, 23_991, replace=False)  # noqa: NPY002
     assert [int(sample.file.name) for sample in (*validation, *test)] == order.tolist()
     assert (len(validation), len(test)) == (11_995, 11_996)  # thesis §3.6.1
-    assert tuple(map(len, halves(made[:10_889]))) == (5_444, 5_445)
+    assert tuple(map(len, halves(images[:10_889]))) == (5_444, 5_445)
     assert halves([]) == ([], [])
 
 
 def test_fields(tmp_path: Path) -> None:
-    chosen = samples(tmp_path)
+    chosen = write_samples(tmp_path)
     splits = read(chosen)
     assert splits.skipped == 0
     assert sizes(splits) == ["6", "3", "3"]
@@ -64,13 +67,13 @@ def test_fields(tmp_path: Path) -> None:
             item = table[index]
             with Image.open(sample.file) as image:
                 pixels = torch.from_numpy(np.array(image)).permute(2, 0, 1)
-            assert torch.equal(item["input"], pixels)  # of the size asked for: unchanged
+            assert torch.equal(item["input"], pixels)  # the image has the requested size already
             expected = [(angle + math.pi) % (2 * math.pi) - math.pi for angle in sample.angles]
             torch.testing.assert_close(item["target"], torch.tensor(expected))
             assert (int(item["index"]), int(item["group"])) == (index, 0)
-    moved = {**chosen, "test": chosen["test"][::-1]}
+    reordered = {**chosen, "test": chosen["test"][::-1]}
     digest = splits.fingerprint["sha256"]
-    assert read(chosen).fingerprint["sha256"] == digest != read(moved).fingerprint["sha256"]
+    assert read(chosen).fingerprint["sha256"] == digest != read(reordered).fingerprint["sha256"]
 
 
 @pytest.mark.parametrize("in_memory", [True, False])
@@ -79,7 +82,7 @@ def test_only_the_test_split_is_blurred(
 ) -> None:
     if not in_memory:
         monkeypatch.setattr(images, "IN_MEMORY", 0)
-    sharp, smooth = read(samples(tmp_path)), read(samples(tmp_path), test_blur=1.2)
+    sharp, smooth = read(write_samples(tmp_path)), read(write_samples(tmp_path), test_blur=1.2)
     assert isinstance(smooth.tables["test"], Crops) != in_memory
     assert smooth.fingerprint["sha256"] == sharp.fingerprint["sha256"]
     for split in SPLITS:
@@ -89,7 +92,7 @@ def test_only_the_test_split_is_blurred(
 
 
 def test_unreadable_images_are_named_or_skipped(tmp_path: Path) -> None:
-    chosen = samples(tmp_path)
+    chosen = write_samples(tmp_path)
     chosen["test"][1].file.unlink()
     chosen["train"][0].file.write_bytes(b"\x89PNG")
     label = DataError("a label that cannot be read")
@@ -111,15 +114,15 @@ def test_unreadable_images_are_named_or_skipped(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("angle", [math.nan, math.inf])
 def test_angle_that_is_not_finite_is_never_skipped(tmp_path: Path, angle: float) -> None:
-    chosen = samples(tmp_path)
+    chosen = write_samples(tmp_path)
     chosen["test"][1] = Labelled(chosen["test"][1].file, (0.5, angle))
-    with pytest.raises(DataError, match=rf"1 images have an angle .*\n.*10\.png: 0\.5, {angle}\nMend"):
+    with pytest.raises(DataError, match=rf"1 images have an angle .*\n.*10\.png: 0\.5, {angle}\nCorrect"):
         read(chosen, skip_unreadable=True)
 
 
 @pytest.mark.parametrize("split", SPLITS)
 def test_empty_split(tmp_path: Path, split: str) -> None:
-    chosen = samples(tmp_path)
+    chosen = write_samples(tmp_path)
     chosen[split] = []
     with pytest.raises(
         DataError, match=rf"The {split} split is empty \(\d+ images in all, 0 unreadable, so\)"
@@ -127,12 +130,12 @@ def test_empty_split(tmp_path: Path, split: str) -> None:
         read(chosen, left_out=", so")
 
 
-def test_own_files_are_turned_as_viewers_do(tmp_path: Path) -> None:
+def test_own_files_are_rotated_as_their_exif_entries_say(tmp_path: Path) -> None:
     image = Image.new("RGB", (10, 10))
     image.paste((255, 255, 255), (0, 0, 5, 10))
     exif = Image.Exif()
-    exif[0x0112] = 6  # to be turned by 90° to be seen upright
-    image.save(tmp_path / "one.png", exif=exif)
-    pixels = Reading(image_size=10).own([tmp_path / "one.png"])[0]["input"]
+    exif[0x0112] = 6  # the image is upright after a rotation by 90°
+    image.save(tmp_path / "rotated.png", exif=exif)
+    pixels = Reading(image_size=10).read_unlabelled([tmp_path / "rotated.png"])[0]["input"]
     assert pixels[0, 0].min() == 255
     assert pixels[0, -1].max() == 0

@@ -1,4 +1,4 @@
-"""Tests of the folders of TownCentre heads: reading, splits by people, refusals, and drawn heads."""
+"""Tests of the folders of TownCentre heads: reading, splits by people, refusals, and synthetic heads."""
 
 import math
 from pathlib import Path
@@ -12,8 +12,8 @@ from framework.data import Splits
 from framework.errors import DataError
 from plugins.data.head_pose import synthetic_heads
 from plugins.data.head_pose.roots import PEOPLE, pixels, prepared, table, write_towncentre
-from plugins.data.head_pose.towncentre import EACH, pose
-from plugins.data.head_pose.towncentre_labels import Head, by_person, find_heads, read_label
+from plugins.data.head_pose.towncentre import IMAGES_PER_PERSON, random_pose
+from plugins.data.head_pose.towncentre_labels import Head, find_heads, read_label, split_by_person
 
 SPLITS = Splits._fields
 
@@ -26,11 +26,11 @@ def root(tmp_path: Path) -> Path:
 def test_people_are_split_as_the_authors_code_does(root: Path) -> None:
     data = prepared("towncentre", root)
     np.random.seed(13)  # noqa: NPY002  (their code seeds the global generator)
-    drawn = np.random.rand(PEOPLE)  # noqa: NPY002
+    uniform = np.random.rand(PEOPLE)  # noqa: NPY002
     people = {
-        "train": np.flatnonzero(drawn < 0.8).tolist(),
-        "validation": np.flatnonzero((drawn >= 0.8) & (drawn < 0.9)).tolist(),
-        "test": np.flatnonzero(drawn > 0.9).tolist(),
+        "train": np.flatnonzero(uniform < 0.8).tolist(),
+        "validation": np.flatnonzero((uniform >= 0.8) & (uniform < 0.9)).tolist(),
+        "test": np.flatnonzero(uniform > 0.9).tolist(),
     }
     for split in SPLITS:
         fields = table(data, split)
@@ -53,12 +53,12 @@ def test_people_are_split_as_the_authors_code_does(root: Path) -> None:
 
 def test_split_does_not_depend_on_the_order_of_folders_and_keeps_the_shares() -> None:
     heads = [Head(Path(f"{person}.jpg"), person, 0.0) for person in range(10_000)]
-    splits = by_person(heads)
+    splits = split_by_person(heads)
     shares = [len(splits[split]) / len(heads) for split in SPLITS]
     assert shares == pytest.approx([0.8, 0.1, 0.1], abs=0.01)
-    turned = by_person(heads[::-1])
+    reversed_order = split_by_person(heads[::-1])
     for split in SPLITS:
-        assert set(turned[split]) == set(splits[split])
+        assert set(reversed_order[split]) == set(splits[split])
 
 
 def test_heads_that_are_not_valid_are_left_out_and_counted(root: Path) -> None:
@@ -69,7 +69,7 @@ def test_heads_that_are_not_valid_are_left_out_and_counted(root: Path) -> None:
     assert sum(len(table(data, split)["input"]) for split in SPLITS) == 2 * PEOPLE - 1
 
 
-def test_a_stem_that_begins_another_takes_its_own_image(root: Path) -> None:
+def test_a_label_whose_stem_begins_another_stem_gets_its_own_image(root: Path) -> None:
     folder = root / "person3"
     Image.fromarray(pixels(99)).save(folder / "image_3_10_17_0.png")
     (folder / "image_3_10.txt").write_text("pan = -90.00\nvalid = 1\n", encoding="utf-8")
@@ -87,8 +87,8 @@ def test_a_stem_that_begins_another_takes_its_own_image(root: Path) -> None:
     ],
 )
 def test_label_files(tmp_path: Path, text: str, expected: tuple[float, bool]) -> None:
-    (tmp_path / "one.txt").write_bytes(text.encode())
-    assert read_label(tmp_path / "one.txt") == expected
+    (tmp_path / "label.txt").write_bytes(text.encode())
+    assert read_label(tmp_path / "label.txt") == expected
 
 
 @pytest.mark.parametrize(
@@ -102,7 +102,7 @@ def test_label_files(tmp_path: Path, text: str, expected: tuple[float, bool]) ->
         b"pan = 1\xff",
     ],
 )
-def test_label_file_that_is_none_is_named(root: Path, content: bytes) -> None:
+def test_the_message_names_a_file_that_holds_no_label(root: Path, content: bytes) -> None:
     file = root / "person3" / "image_3_0.txt"
     file.write_bytes(content)
     with pytest.raises(DataError) as caught:
@@ -123,10 +123,10 @@ def test_missing_damaged_and_doubtful_images_are_named_at_once_or_skipped(root: 
     message = str(caught.value)
     assert message.startswith(f"4 of {2 * PEOPLE} samples cannot be read")
     for part in (
-        "image_3_0.txt: 0 images have names that start with 'image_3_0'; wanted one",
+        "image_3_0.txt: 0 images have names that start with 'image_3_0'; expected exactly one",
         "image_4_0.txt: 2 images have names that start with 'image_4_0': image_4_0_17_0.png, image_4_0_99.png",
         "image_5_1_17_1.png: cannot be read as an image",
-        "other.png: the name does not tell the person",
+        "other.png: The name does not hold the number of the person",
         "data.skip_unreadable=true",
     ):
         assert part in message
@@ -136,19 +136,23 @@ def test_missing_damaged_and_doubtful_images_are_named_at_once_or_skipped(root: 
 
 
 def test_pan_that_is_not_finite_is_refused(root: Path) -> None:
-    """Check that the label is left out, like any unusable label, if the user asks for that."""
+    """Check also that `skip_unreadable` leaves the label out, like any unusable label."""
     (root / "person3" / "image_3_0.txt").write_text("pan = nan\nvalid = 1\n", encoding="utf-8")
-    with pytest.raises(DataError, match=r"image_3_0\.txt: .*wanted two lines, `pan = ` with finite degrees"):
+    with pytest.raises(
+        DataError, match=r"image_3_0\.txt: .*Two lines are expected, `pan = ` with finite degrees"
+    ):
         prepared("towncentre", root)
     prepared("towncentre", root, skip_unreadable=True)
 
 
-def test_wrong_layouts_say_what_is_wanted(root: Path, tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"data\.root = .*nowhere: no such folder; wanted the unpacked Town"):
+def test_the_message_about_a_wrong_layout_names_the_fault_and_the_remedy(root: Path, tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"nowhere does not exist .* Set data\.root to the unpacked Town"):
         prepared("towncentre", tmp_path / "nowhere")
-    with pytest.raises(DataError, match=r"is not laid out as .* Did you mean .*TownCentreHeadImages\?"):
+    with pytest.raises(DataError, match=r"has not the layout of .* Did you mean .*TownCentreHeadImages\?"):
         prepared("towncentre", tmp_path)
-    with pytest.raises(DataError, match=r"no folder in it holds a label file .* Unpack the whole archive"):
+    with pytest.raises(
+        DataError, match=r"none of its folders holds a label file .* Unpack the whole archive"
+    ):
         prepared("towncentre", root / "person3")
 
 
@@ -175,20 +179,22 @@ def test_augment_mirrors_with_the_sign_of_pan(root: Path) -> None:
     assert off.augment(batch) is batch
 
 
-def test_generated_set_is_read_as_it_was_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_labels_of_the_generated_set_are_the_random_poses(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("FRAMEWORK_CACHE", str(tmp_path))
     data = prepared("towncentre", None, images=600)
     counts = [len(table(data, split)["input"]) for split in SPLITS]
     assert sum(counts) == 600 - data.invalid
     assert 3 < data.invalid < 40
     assert counts[0] > 400
-    drawn = []
+    pans = []
     for number in range(600):
-        heading = np.random.default_rng([0, 1, number // EACH])
-        synthetic_heads.person(heading)
+        person_random = np.random.default_rng([0, 1, number // IMAGES_PER_PERSON])
+        synthetic_heads.random_person(person_random)
         random = np.random.default_rng([0, 0, number])
-        pan = pose(heading.uniform(0, 360), random).pan
+        pan = random_pose(person_random.uniform(0, 360), random).pan
         if random.random() >= 0.03:
-            drawn.append((pan + 180) % 360 - 180)
+            pans.append((pan + 180) % 360 - 180)
     read = torch.cat([table(data, split)["target"] for split in SPLITS]).rad2deg().flatten()
-    np.testing.assert_allclose(np.sort(read.numpy()), np.sort(drawn), atol=0.006)
+    np.testing.assert_allclose(np.sort(read.numpy()), np.sort(pans), atol=0.006)

@@ -1,7 +1,7 @@
-"""Reading of the folders of the TownCentre heads: one folder for each person, and a text file for each image.
+"""Reading of the folders of the TownCentre heads: one folder for each person, and a label file for each image.
 
-The text file `<stem>.txt` holds two lines, `pan = +123.45` in degrees and `valid = 1` or 0. Its image is the other file
-whose name starts with `<stem>`; the second of the parts of its name that `_` separates is the person's number.
+The label file `<stem>.txt` holds two lines, `pan = +123.45` in degrees and `valid = 1` or 0. The name of the image
+starts with `<stem>`. If it is split at each `_`, its second part is the number of the person.
 """
 
 import math
@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from framework.errors import DataError, quote, shorten
-from framework.storage.reading import guarded, read_bytes
-from framework.storage.text import decoded, no_number, value
+from framework.storage.reading import read_bytes, translate_errors
+from framework.storage.text import decode, describe_no_number, parse_number
 from plugins.data.head_pose.archive import wrong_layout
 from plugins.data.head_pose.labelled_images import SPLIT_SEED, Labelled
 
@@ -22,78 +22,86 @@ TRAIN_SHARE, VALIDATION_SHARE = 0.8, 0.1
 
 
 class Head(NamedTuple):
-    """Image of person number `person`; pan is in radians, any number of turns."""
+    """Image of person number `person`; pan is in radians, of any size."""
 
     image: Path
     person: int
     pan: float
 
 
-class Found(NamedTuple):
-    """Valid heads in a root, number of heads that are marked as not valid, and errors of labels that cannot be used."""
+class HeadLabels(NamedTuple):
+    """Labels of the heads in a root.
+
+    Attributes:
+        heads: The valid heads.
+        invalid: Number of heads that their labels mark as not valid.
+        faults: Errors of labels that cannot be used.
+    """
 
     heads: list[Head]
     invalid: int
     faults: list[DataError]
 
 
-def find_heads(root: Path) -> Found:
+def find_heads(root: Path) -> HeadLabels:
     """Return all heads in a root, in the order of their names.
 
     Raises:
-        DataError: the root holds no folder with label files.
+        DataError: The root holds no folder with label files.
     """
-    found = Found([], 0, [])
+    heads: list[Head] = []
+    faults: list[DataError] = []
     invalid, labels = 0, 0
     for folder in sorted(path for path in root.iterdir() if path.is_dir()):
         names = sorted(path.name for path in folder.iterdir())
         texts = [name for name in names if name.endswith(".txt")]
-        pictures = [name for name in names if not name.endswith(".txt")]
+        images = [name for name in names if not name.endswith(".txt")]
         labels += len(texts)
         for text in texts:
             try:
                 pan, valid = read_label(folder / text)
                 if valid:
-                    image = _image(folder, text, pictures)
-                    found.heads.append(Head(image, _person(image), math.radians(pan)))
+                    image = _find_image(folder, text, images)
+                    heads.append(Head(image, _person(image), math.radians(pan)))
                 else:
                     invalid += 1
             except DataError as error:
-                found.faults.append(error)
+                faults.append(error)
     if not labels:
-        raise wrong_layout(root, FOLDER, "folder in it holds a label file `<image>.txt`")
-    return found._replace(invalid=invalid)
+        raise wrong_layout(root, FOLDER, "none of its folders holds a label file `<stem>.txt`")
+    return HeadLabels(heads, invalid, faults)
 
 
 def read_label(file: Path) -> tuple[float, bool]:
-    """Return pan in degrees, and whether the image may be used.
+    """Return the pan in degrees, and whether the head is marked as valid.
 
     Raises:
-        DataError: the file cannot be read, or its lines are not those of a label.
+        DataError: The file cannot be read, or its lines are not those of a label.
     """
-    with guarded(file, "a label"):
-        text = decoded(read_bytes(file))
+    with translate_errors(file, "a label"):
+        text = decode(read_bytes(file))
     entries = [line.partition("=") for line in text.splitlines()]
     fields = {name.strip(): value.strip() for name, _, value in entries}
-    pan, valid = value(fields.get("pan", "")), {"0": False, "1": True}.get(fields.get("valid", ""))
+    pan, valid = parse_number(fields.get("pan", "")), {"0": False, "1": True}.get(fields.get("valid", ""))
     if pan is None or not math.isfinite(pan) or valid is None:
         line = next((number for number, (name, _, _) in enumerate(entries, 1) if name.strip() == "pan"), 0)
-        why = f" Line {line}: {no_number(fields['pan'])}." if pan is None and line else ""
+        reason = f" Line {line}: {describe_no_number(fields['pan'])}." if pan is None and line else ""
         raise DataError(
-            f"{file}: {quote(text)}; wanted two lines, `pan = ` with finite degrees and `valid = ` with 0 or 1.{why} "
-            "Restore it from its source."
+            f"{file}: {quote(text)} is no label. Two lines are expected, `pan = ` with finite degrees and "
+            f"`valid = ` with 0 or 1.{reason} Copy the file again from its source."
         )
     return pan, valid
 
 
-def _image(folder: Path, text: str, pictures: Sequence[str]) -> Path:
-    """Return the image of a label: among those that start with its stem, the one that has no digit after it."""
-    stem = text.removesuffix(".txt")
-    names = [name for name in pictures if name.startswith(stem) and not name[len(stem) :][:1].isdigit()]
+def _find_image(folder: Path, label: str, images: Sequence[str]) -> Path:
+    """Return the image whose name begins with the stem of the label file, without a digit directly after the stem."""
+    stem = label.removesuffix(".txt")
+    names = [name for name in images if name.startswith(stem) and not name[len(stem) :][:1].isdigit()]
     if len(names) != 1:
         raise DataError(
-            f"{folder / text}: {len(names)} images have names that start with {quote(stem)}"
-            f"{': ' if names else ''}{shorten(', '.join(names[:3]))}; wanted one. Restore it, or take the label out."
+            f"{folder / label}: {len(names)} images have names that start with {quote(stem)}"
+            f"{': ' if names else ''}{shorten(', '.join(names[:3]))}; expected exactly one. "
+            "Correct the names, or remove the label."
         )
     return folder / names[0]
 
@@ -102,17 +110,17 @@ def _person(image: Path) -> int:
     parts = image.stem.split("_")
     if len(parts) < 2 or not parts[1].isdecimal():
         raise DataError(
-            f"{image}: the name does not tell the person; wanted a number as the second of the parts that `_` "
-            "separates. Restore the published name."
+            f"{image}: The name does not hold the number of the person; expected a number as the second of the parts "
+            "that `_` separates. Give the image its published name."
         )
     return int(parts[1])
 
 
-def by_person(heads: Sequence[Head]) -> dict[str, list[Labelled]]:
-    """Return the samples by split, 80, 10 and 10 % of the people, as in the thesis authors' code."""
+def split_by_person(heads: Sequence[Head]) -> dict[str, list[Labelled]]:
+    """Return the samples by split, with 80, 10 and 10 % of the people, as in the thesis authors' code."""
     people = np.unique([head.person for head in heads])
-    drawn = np.random.RandomState(SPLIT_SEED).rand(len(people))
-    share = dict(zip(people.tolist(), drawn.tolist(), strict=True))
+    uniform = np.random.RandomState(SPLIT_SEED).rand(len(people))
+    share = dict(zip(people.tolist(), uniform.tolist(), strict=True))
     splits: dict[str, list[Labelled]] = {"train": [], "validation": [], "test": []}
     for head in heads:
         splits[_split(share[head.person])].append(Labelled(head.image, (head.pan,)))
@@ -120,6 +128,7 @@ def by_person(heads: Sequence[Head]) -> dict[str, list[Labelled]]:
 
 
 def _split(share: float) -> str:
+    """Return the split of a person whose random number in [0, 1) is `share`."""
     if share < TRAIN_SHARE:
         return "train"
     return "validation" if share < TRAIN_SHARE + VALIDATION_SHARE else "test"
