@@ -78,7 +78,7 @@ def test_a_label_of_no_class_is_refused_wherever_it_is_read(label: float, worker
     if split == "train":
         batches.attach(pl.Trainer(accelerator="cpu", logger=False, enable_checkpointing=False))
     loader = getattr(batches, f"{split}_dataloader")()
-    with pytest.raises(UserError, match=f"is {label}, wanted 0 to 2"):
+    with pytest.raises(UserError, match=f"is {label}, but class indices go from 0 to 2"):
         next(iter(loader))
 
 
@@ -90,8 +90,14 @@ def test_a_label_of_no_class_is_refused_wherever_it_is_read(label: float, worker
         (["density_head=von_mises", "data.kind=angle", "data.fault=flat"], "wanted (2, 1)"),
         (["density_head=von_mises", "data.kind=angles", "data.fault=column"], "wanted (2, 2)"),
         (["density_head=categorical", "data.kind=class", "data.fault=column"], "wanted (2,)"),
-        (["density_head=categorical", "data.kind=class", "data.fault=label"], "is 7, wanted 0 to 1"),
-        (["density_head=categorical", "data.kind=class", "data.fault=below"], "is -1, wanted 0 to 1"),
+        (
+            ["density_head=categorical", "data.kind=class", "data.fault=label"],
+            "is 7, but class indices go from 0 to 1",
+        ),
+        (
+            ["density_head=categorical", "data.kind=class", "data.fault=below"],
+            "is -1, but class indices go from 0 to 1",
+        ),
         (
             ["density_head=wrapped_cauchy", "data.kind=angles", "uncertainty=[temperature]"],
             "No temperature is known",
@@ -130,7 +136,7 @@ def test_a_label_of_the_test_split_costs_the_test_alone(framework: Framework) ->
     chosen = ["density_head=categorical", "data.kind=class", "metric=[accuracy]", "pictures=false"]
     done = framework(*SMALL, *chosen, "data.fault=last label")
     assert done.code == 1, done.out
-    assert "is 7, wanted 0 to 1" in done.out
+    assert "is 7, but class indices go from 0 to 1" in done.out
     assert "Traceback" not in done.out
     data = ("data=trial", "data.kind=class", "data.fault=none", "metric=[accuracy]", "logger=none")
     again = framework("mode=test", f"checkpoint={done.folder}", *data, "pictures=false", folder="again")

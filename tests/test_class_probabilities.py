@@ -143,7 +143,7 @@ def test_few_draws_leave_probabilities_that_sum_to_one(chain, dtype):
 def test_labels_that_are_no_class_are_refused():
     label = torch.tensor([0, 2, 1])
     assert require_labels(label, 3) is label
-    with pytest.raises(DataError, match=r"1 of 3 targets .* row 1 is 2, wanted 0 to 1"):
+    with pytest.raises(DataError, match=r"1 of 3 targets .* row 1 is 2, but class indices go from 0 to 1"):
         require_labels(label, 2)
     with pytest.raises(DataError, match="row 0 is -1"):
         require_labels(torch.tensor([-1]), 2)

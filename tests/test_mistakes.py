@@ -114,7 +114,7 @@ density_head=bernouli | Did you mean 'bernoulli'?
 uncertainty.ensemble.members=3 | No uncertainty is chosen
 metrics=[accuracy] | Did you mean 'metric'?
 metric=[acuracy] | Did you mean 'accuracy'?
-experiment=moons/vanilla_128 metric=[accuracy,psnr] | CategoricalDensity of event_shape () draws no color
+experiment=moons/vanilla_128 metric=[accuracy,psnr] | CategoricalDensity of event_shape () provides no color
 data=moons density_head=extra_trees metric=[psnr] | A metric reads the true 'color' of every image
 objective=[outlier] | Did you mean 'outlier_exposure'?
 renderer=zbufer | Did you mean 'zbuffer'?

@@ -106,7 +106,9 @@ def test_a_missing_truth_and_a_density_that_draws_nothing_get_a_sentence() -> No
         DataError, match=r"The true 'mask' .* only input, target, index, color, depth\. Choose data"
     ):
         prediction.true_image("mask")
-    with pytest.raises(UserError, match=r"MultivariateNormal .* draws no mask.*protocol\.images\.register"):
+    with pytest.raises(
+        UserError, match=r"MultivariateNormal .* provides no mask.*protocol\.images\.register"
+    ):
         prediction.image("mask")
 
 

@@ -110,7 +110,8 @@ class Reshaped(Distribution):
         shape = torch.Size(batch_shape)
         if shape.numel() != density.batch_shape.numel():
             raise ValueError(
-                f"A batch of shape {tuple(density.batch_shape)} cannot be read as {tuple(shape)}; expected as many items."
+                f"A batch of shape {tuple(density.batch_shape)} cannot be read as {tuple(shape)}; expected the same "
+                "number of items."
             )
         self.density = density
         self.has_enumerate_support = density.has_enumerate_support

@@ -58,7 +58,7 @@ def require_labels(target: Real[Tensor, "batch"], classes: int) -> Real[Tensor, 
     if wrong.any():
         raise DataError(
             f"{int(wrong.sum())} of {len(target)} targets of this batch are no class index: the target in row "
-            f"{int(wrong.nonzero()[0])} is {target[wrong][0].item():g}, but indices go from 0 to {classes - 1}. "
+            f"{int(wrong.nonzero()[0])} is {target[wrong][0].item():g}, but class indices go from 0 to {classes - 1}. "
             "Correct the labels of the data."
         )
     return target

@@ -75,7 +75,7 @@ def _(density: Independent, index: int) -> Distribution:
 
 
 def _change_parameters(density: Distribution, change: Callable[[Tensor], Tensor]) -> Distribution | None:
-    """Return a torch density of one number with `change` applied to each of its parameters, or None if this is not known.
+    """Return a torch density of one number with `change` applied to each parameter, or None if this is not known.
 
     It is known if every parameter of the constructor is a tensor with one number for each item of the batch. It is not
     known for a mixture or a transformed density, which have other parts.
@@ -226,5 +226,8 @@ def _(density: MultivariateNormal, value: Tensor) -> Tensor:
 
 
 def normal_quantile(probability: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-    """Return z with Φ(z) = probability; where float64 cannot tell the probability from 0 or 1, z is ±8.2, not infinite."""
+    """Return z with Φ(z) = probability.
+
+    Where float64 cannot tell the probability from 0 or 1, z is ±8.2 and not infinite.
+    """
     return torch.special.ndtri(probability.clamp(2.0**-54, 1 - 2.0**-53))

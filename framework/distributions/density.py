@@ -141,13 +141,13 @@ class Mixture(Distribution):
         if self.has_enumerate_support:
             support = self.enumerate_support()
             return support.gather(0, self.log_prob(support).argmax(0, keepdim=True)).squeeze(0)
-        # take the peaks of every component, also of nested mixtures: a lower peak of one component may become the
-        # highest point together with a peak of another component
-        places = mode_candidates(self)
+        # take the candidates of every component, also of nested mixtures: a lower peak of one component may become
+        # the highest point together with a peak of another component
+        starts = mode_candidates(self)
         if self.event_shape.numel() > 1 and self.log_weights.shape[-1] <= CROSSED:
             modes = self.components.mode.movedim(-1 - event, 0)  # (K, *batch, *event)
-            places = torch.cat([places, crossings(self.components, modes)])
-        return highest(self, places)
+            starts = torch.cat([starts, crossings(self.components, modes)])
+        return highest(self, starts)
 
     @property
     def mean(self) -> Tensor:
@@ -354,7 +354,7 @@ def _(density: Reshaped, index: Tensor) -> Distribution:
     # a picked mixture draws from all its items for each pick; here these would be the items of the whole batch
     if len(inner.batch_shape) != 1 or isinstance(inner, Mixture):
         return pick.dispatch(Distribution)(density, index)
-    # items in the order of (*batch, K): the item of batch place b and component k is b·K + k
+    # items in the order of (*batch, K): the item of batch index b and component k is b·K + k
     lead = index.shape[: index.dim() - len(density.batch_shape) + 1]
     count = density.batch_shape[-1]
     first = torch.arange(density.batch_shape[:-1].numel(), device=index.device) * count

@@ -8,28 +8,32 @@ from framework.distributions.circular import Circular, wrap
 from framework.distributions.protocol import QuadraticBound, quadratic_bound
 
 STARTS = 3
-"""Number of starting points of the search: those of the given places where the density is highest."""
+"""Number of starting points that are used: those where the density is highest."""
 STEPS = 16
 """Largest number of steps."""
 LONGEST = 16.0
 """Longest step, as a multiple of the step to the maximum of the bound."""
 
 
-def highest(density: Distribution, places: Tensor) -> Tensor:
-    """Return a point (*batch, *event) where the density is at least as high as at all `places` (place, *batch, *event).
+def highest(density: Distribution, starts: Tensor) -> Tensor:
+    """Return a point (*batch, *event) where the density is at least as high as at all starting points.
 
-    Where the density knows its `quadratic_bound`, the point is a local maximum, up to the rounding of log_prob and within STEPS
-    steps from the highest places. It is not the global maximum if no ascent from these places leads there. Where the
-    `quadratic_bound` is not known, the point is the best of `places`.
+    If the `quadratic_bound` of the density is known, the point is a local maximum, up to the rounding of log_prob and
+    unless more than STEPS steps are needed. It is not the global maximum if no ascent from the starting points leads
+    there. If the `quadratic_bound` is not known, the point is the best starting point.
+
+    Args:
+        density: the density.
+        starts: starting points, (start, *batch, *event).
     """
-    height, which = density.log_prob(places).topk(min(STARTS, len(places)), 0)
-    start = places.gather(0, _over_event(density, which))
-    top, height = _climb(density, start, height)
+    height, which = density.log_prob(starts).topk(min(STARTS, len(starts)), 0)
+    highest_starts = starts.gather(0, _over_event(density, which))
+    top, height = _climb(density, highest_starts, height)
     return top.gather(0, _over_event(density, height.argmax(0, keepdim=True))).squeeze(0)
 
 
 def crossings(components: Distribution, modes: Tensor) -> Tensor:
-    """Return maxima of the products of two of K components, (place, *batch, *event), where their `quadratic_bound` is known.
+    """Return maxima of products of two of K components, (pair, *batch, *event); none if their bounds are not known.
 
     Two components that are narrow in different numbers may be highest together far from the mode of each.
 
@@ -57,16 +61,16 @@ def _over_event(density: Distribution, index: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def _climb(density: Distribution, place: Tensor, height: Tensor) -> tuple[Tensor, Tensor]:
+def _climb(density: Distribution, point: Tensor, height: Tensor) -> tuple[Tensor, Tensor]:
     """Return local maxima (start, *batch, *event), one for each starting point, and their log-densities.
 
     A step leads to the maximum of the bound, where the density is never lower. The step is lengthened by what the last
     step showed (the secant method). For one number this is Newton's method near the maximum, without a second
     derivative.
     """
-    bound = quadratic_bound(density, place)
+    bound = quadratic_bound(density, point)
     if bound is None:
-        return place, height
+        return point, height
     angles = isinstance(density.support, Circular)
     least = 4 * torch.finfo(height.dtype).eps
     reach, rising = torch.ones_like(height), torch.ones_like(height, dtype=torch.bool)
@@ -76,9 +80,9 @@ def _climb(density: Distribution, place: Tensor, height: Tensor) -> tuple[Tensor
         rising = rising & (gain > least * height.abs().clamp(min=1))
         if not bool(rising.any()):
             break
-        next_place = place + reach.unsqueeze(-1) * step
-        next_place = wrap(next_place) if angles else next_place
-        next_bound = quadratic_bound(density, next_place)
+        next_point = point + reach.unsqueeze(-1) * step
+        next_point = wrap(next_point) if angles else next_point
+        next_bound = quadratic_bound(density, next_point)
         assert next_bound is not None
         up = rising & (next_bound.log_prob > height)
         # where not even the bound's maximum is higher, only rounding is left
@@ -87,11 +91,11 @@ def _climb(density: Distribution, place: Tensor, height: Tensor) -> tuple[Tensor
         longer = torch.where(left < 1, reach / (1 - left), LONGEST).clamp(1, LONGEST)
         reach = torch.where(up, longer, 1.0)
         wide = up.unsqueeze(-1)
-        place = torch.where(wide, next_place, place)
+        point = torch.where(wide, next_point, point)
         height = torch.where(up, next_bound.log_prob, height)
         bound = QuadraticBound(
             height,
             torch.where(wide, next_bound.pull, bound.pull),
             torch.where(wide, next_bound.stiffness, bound.stiffness),
         )
-    return place, height
+    return point, height

@@ -274,7 +274,7 @@ def _width_of_mass(
 
 
 def _arc_function(flat: Distribution) -> Callable[[Tensor, Tensor], Tensor]:
-    """Return a function of two angles, (*sample, item) each, that gives the mass of the arc counter-clockwise between them.
+    """Return a function of two angles, (*sample, item) each: the mass of the arc counter-clockwise between them.
 
     The mass is NaN for items for which it is not known.
     """

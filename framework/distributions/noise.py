@@ -14,7 +14,7 @@ from framework.storage.names import as_bytes
 
 @dataclass(frozen=True)
 class Draw:
-    """The noise of one evaluated batch; the draws for one quantity do not depend on which other quantities are computed.
+    """The noise of one evaluated batch; the draws for a quantity do not depend on which others are computed.
 
     Attributes:
         seed: seed of the run.

@@ -1,18 +1,19 @@
-"""The questions that every density can be asked, with the shapes and units of the answers and what these claim.
+"""The functions that are defined for every density, with the shapes and units of their results.
 
-A density is a `torch.distributions.Distribution`. torch's own questions are `log_prob` (nats), `sample`, `entropy`
-(nats), `mode`, `support` and, for classes, `enumerate_support`. The further questions are defined here. Each is a
-function that dispatches on the type of density, so that the author of a density registers what it knows:
+A density is a `torch.distributions.Distribution`. torch defines its `log_prob` (nats), `sample`, `entropy` (nats),
+`mode`, `support` and, for classes, `enumerate_support`. This module defines further functions. Each of them dispatches
+on the type of the density, so that the author of a density registers what is known for this type:
 
     @marginal.register
     def _(density: Mine, index: int) -> Mine: ...
 
-**No default claims to be exact.** A default that cannot know the answer returns draws, an error of NaN, None ("not
-known in closed form; use draws") or raises a `UserError` that says what to register. A subclass inherits the claims of
-its base. The structures forward every question to their parts: `density.Mixture`, `batch_shapes.Stacked`,
-`batch_shapes.Reshaped`, `tempering.CircularPower`. The answers of torch's densities are in `closed_forms`.
+**No default claims to be exact.** A default that cannot know the result returns draws, an error of NaN or None ("not
+known in closed form; use draws"), or raises a `UserError` that says what to register. A subclass inherits the functions
+that are registered for its base. The structures call the function for each of their parts: `density.Mixture`,
+`batch_shapes.Stacked`, `batch_shapes.Reshaped`, `tempering.CircularPower`. Those of torch's densities are registered in
+`closed_forms`.
 
-Three further quantities are computed from these answers, with nothing to register: `class_probabilities`,
+Three further quantities are computed from these functions, with nothing to register: `class_probabilities`,
 `circular_moments` (which says where its grid resolved the density) and `density.circular_grid`.
 
 In shapes, `*batch` is the batch_shape, `*event` the event_shape, and `*sample` any dimensions before them.
@@ -46,7 +47,7 @@ def marginal(density: Distribution, index: int) -> Distribution:
     raise UserError(
         f"{type(density).__name__} has no marginal for one of its {tuple(density.event_shape)} numbers. "
         "Register one with `framework.distributions.protocol.marginal.register`, or leave out the "
-        "metric or picture that needs it."
+        "metric or figure that needs it."
     )
 
 
@@ -71,7 +72,7 @@ def pick(density: Distribution, index: Tensor) -> Distribution:
     """Return the density at `index` of the last batch dimension of a density with batch_shape (*batch, K).
 
     `index` has the shape (*sample, *batch). Only `sample` of the returned density is used. Default: all K densities are
-    sampled and all but one draw is thrown away, which is right but slow; a density with parameters registers a function
+    sampled and all draws but one are discarded, which is right but slow; a density with parameters registers a function
     that gathers them (`take`).
     """
     return _Picked(density, index)
@@ -85,7 +86,7 @@ def take(parameter: Tensor, index: Tensor) -> Tensor:
 
 
 class _Picked(Distribution):
-    """Samples of one component each, by drawing from all components."""
+    """One chosen component for each item; all components are sampled, and the draws of the others are discarded."""
 
     arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
 
@@ -105,10 +106,10 @@ class _Picked(Distribution):
 
 @singledispatch
 def recentre(density: Distribution, index: tuple[Tensor, ...], origin: Tensor) -> Distribution:
-    """Return the density of X - place, in float64, so that values near the place keep their digits.
+    """Return the density of X - origin, in float64, so that values near the origin keep their digits.
 
     X has the density at `index` of the batch. Only `log_prob` of the returned density is used. Default: values are
-    rounded where the place is added. A density with a location registers a function that subtracts the place from the
+    rounded where the origin is added. A density with a location registers a function that subtracts the origin from the
     location: then no rounding limits how narrow the density may be.
 
     Args:
@@ -120,7 +121,10 @@ def recentre(density: Distribution, index: tuple[Tensor, ...], origin: Tensor) -
 
 
 class _Recentred(Distribution):
-    """Items of a batch, each any number of times; the whole batch is evaluated as often as the most frequent item."""
+    """Recentred items of a batch, each used any number of times.
+
+    The whole batch is evaluated as often as the most frequent item occurs.
+    """
 
     arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
 
@@ -175,7 +179,7 @@ class Estimate(NamedTuple):
         standard_error: standard error of log_mean, from random draws inside the density; 0 where nothing is drawn, NaN
             where it is not known, infinite where no draw had any weight.
         samples: number of draws, int64; 0 where nothing is drawn or the number is not known.
-        unresolved: bool, true where a tolerance was asked for and not reached.
+        unresolved: bool, true where a requested tolerance was not reached.
     """
 
     log_mean: Tensor
@@ -226,7 +230,7 @@ def cdf(density: Distribution, value: Tensor) -> Tensor | None:
     if components is None:
         return None
     residual = value.double() - components.mean
-    # a point mass counts half at its place
+    # a point mass counts half at its position
     standard = torch.where(residual == 0, residual, residual / components.scale)
     weights = components.log_weights.exp()
     below = torch.where(weights > 0, weights * torch.special.ndtr(standard), 0.0)
@@ -250,11 +254,11 @@ def marginal_cdfs(density: Distribution, value: Tensor) -> Tensor | None:
 
 @singledispatch
 def arc_probability(density: Distribution, start: Tensor, end: Tensor) -> Tensor | None:
-    """Return the mass of the arc from `start` counter-clockwise to `end` of a density of one angle; None: not known.
+    """Return the probability of the arc from `start` counter-clockwise to `end`, of a density of one angle; None: unknown.
 
-    Angles are (*sample, *batch, 1), radians; the mass is float64 (*sample, *batch). The arc is less than a whole turn;
-    between equal ends it is empty. Default: None; `circular_moments` then gives the mass where the density is not too
-    narrow.
+    Angles are (*sample, *batch, 1), radians; the result is float64 (*sample, *batch). The arc is shorter than the whole
+    circle, and empty between equal ends. Default: None; `circular_moments` then gives the probability where the density
+    is not too narrow.
     """
     return None
 
@@ -273,7 +277,7 @@ class Normals(NamedTuple):
 
 
 def one_normal(mean: Tensor, scale: Tensor) -> Normals:
-    """Return the answer to `normals` for a single normal density; mean and scale have the shape (*batch, 1)."""
+    """Return the result of `normals` for a single normal density; mean and scale have the shape (*batch, 1)."""
     mean = mean.double()
     return Normals(torch.zeros_like(mean), mean, scale.double())
 
@@ -298,7 +302,7 @@ def mahalanobis(density: Distribution, value: Tensor) -> Tensor | None:
 
 @singledispatch
 def mode_candidates(density: Distribution) -> Tensor:
-    """Return places where the density may be highest, (peak, *batch, *event), as candidates without any guarantee.
+    """Return candidates for the mode, (peak, *batch, *event): values where the density may be highest, without guarantee.
 
     Default: the mode alone. A density with several peaks registers a candidate for each.
     """
@@ -307,16 +311,16 @@ def mode_candidates(density: Distribution) -> Tensor:
 
 @singledispatch
 def peak_widths(density: Distribution) -> Tensor:
-    """Return the width of each of the `peaks` of a density of one number, (peak, *batch), in the number's unit.
+    """Return the width of each of the `mode_candidates` of a density of one number, (peak, *batch), in its unit.
 
     Default: the standard deviation of the normal density with the same height.
     """
-    places = mode_candidates(density)
-    return (-density.log_prob(places).double()).exp() / math.sqrt(2 * math.pi)
+    candidates = mode_candidates(density)
+    return (-density.log_prob(candidates).double()).exp() / math.sqrt(2 * math.pi)
 
 
 class QuadraticBound(NamedTuple):
-    """A lower bound of log p that touches it (see `slope`): log_prob, its gradient `pull`, and a `stiffness`.
+    """A lower bound of log p that touches it (see `quadratic_bound`): log_prob, its gradient `pull`, and `stiffness`.
 
     log_prob is (*sample, *batch); `pull` and `stiffness` are (*sample, *batch, *event).
     """
@@ -340,7 +344,7 @@ def quadratic_bound(density: Distribution, value: Tensor) -> QuadraticBound | No
 
 @singledispatch
 def images(density: Distribution, channels: Collection[str]) -> dict[str, Tensor]:
-    """Return images of the density's point prediction: exactly the channels asked for.
+    """Return images of the density's point prediction, with exactly the requested channels.
 
     Each is (*batch, height, width) or (*batch, height, width, number), as `framework.renderer.Renderer.channels` says:
     "color" is linear RGB. For torch's own densities over images, event_shape (height, width, number), "color" is the
@@ -351,24 +355,24 @@ def images(density: Distribution, channels: Collection[str]) -> dict[str, Tensor
         UserError: no images are registered for the density, or one of the channels is not among them.
     """
     raise UserError(
-        f"{type(density).__name__} of event_shape {tuple(density.event_shape)} draws no {', '.join(sorted(channels))}. "
-        "Register what it draws with `framework.distributions.protocol.images.register`, or leave out the metric or "
-        "picture that needs it."
+        f"{type(density).__name__} of event_shape {tuple(density.event_shape)} provides no {', '.join(sorted(channels))}. "
+        "Register its images with `framework.distributions.protocol.images.register`, or leave out the metric or "
+        "figure that needs them."
     )
 
 
 class ValueSet(ABC):
-    """A set of values for each item of the batch, in which the target is said to lie.
+    """A prediction set for each item of the batch: a set of values that is stated to contain the target.
 
     Attributes:
-        promised: the least share of targets that the sets are said to contain; None where nothing is said.
+        stated_probability: the least share of targets that the sets are stated to contain; None if nothing is stated.
     """
 
     stated_probability: float | None = None
 
     @abstractmethod
     def contains(self, value: Tensor) -> Tensor:
-        """Return whether each value (*sample, *batch, *event) is in its item's set, bool (*sample, *batch)."""
+        """Return true for each value (*sample, *batch, *event) that is in the set of its item, bool (*sample, *batch)."""
 
     @abstractmethod
     def size(self) -> Tensor:
@@ -379,7 +383,7 @@ class ValueSet(ABC):
 
     @abstractmethod
     def empty(self) -> Tensor:
-        """Return whether the set is empty, bool (*batch)."""
+        """Return true for each empty set, bool (*batch)."""
 
     def parts(self) -> "list[list[int]] | list[list[tuple[float, float]]] | None":
         """Return the parts of the set of each item of the flattened batch, ascending.

@@ -233,9 +233,9 @@ class CircularPower(Distribution):
         The first angle is the mode.
         """
         u = grid(points, dtype=torch.float64, device=self.start.device) + math.pi
-        return self._place(u.reshape(points, *(1,) * self.start.dim()), 2 * math.pi / points)
+        return self._angles_at(u.reshape(points, *(1,) * self.start.dim()), 2 * math.pi / points)
 
-    def _place(self, u: Float[Tensor, "number *batch 1"], step: float) -> tuple[Tensor, Tensor]:
+    def _angles_at(self, u: Float[Tensor, "number *batch 1"], step: float) -> tuple[Tensor, Tensor]:
         """Return the angles at u, and log(dθ/du · step)."""
         half_sine, half_cosine = (u / 2).sin(), (u / 2).cos()
         offset = 2 * torch.atan2(self.stretch * half_sine, half_cosine)
@@ -313,7 +313,7 @@ class CircularPower(Distribution):
         below, mass = until.gather(-1, cell - 1), until.gather(-1, cell) - until.gather(-1, cell - 1)
         quantile = u[1] * (cell - 1 + ((share - below) / mass.clamp(min=1e-300)).clamp(0, 1))
         whole = torch.cat([u.expand(batch, -1), quantile], -1).sort(-1).values
-        angle, _ = self._place(whole.T.reshape(whole.shape[-1], *self.batch_shape, 1), 1.0)
+        angle, _ = self._angles_at(whole.T.reshape(whole.shape[-1], *self.batch_shape, 1), 1.0)
         # the rounded angles that the density was evaluated at, not the exact ones
         offset = (angle.double() - self.start.double()).clamp(0, 2 * math.pi)
         offset[0], offset[-1] = 0.0, 2 * math.pi
@@ -331,12 +331,12 @@ class CircularPower(Distribution):
         return self.log_normaliser - (self.mass * self.powers.clamp(min=-1e4)).sum(0)
 
 
-def _cumulative_integral(place: Tensor, height: Float[Tensor, "item node"]) -> Float[Tensor, "item node"]:
-    """Return the integral from the first place on, by the trapezium rule.
+def _cumulative_integral(position: Tensor, height: Float[Tensor, "item node"]) -> Float[Tensor, "item node"]:
+    """Return the integral from the first position to each position, by the trapezium rule.
 
-    The places ascend; they are the same for all items, or given for each.
+    The positions ascend; they are the same for all items, or there are own positions for each item.
     """
-    cells = place.diff(dim=-1) * (height[:, 1:] + height[:, :-1]) / 2
+    cells = position.diff(dim=-1) * (height[:, 1:] + height[:, :-1]) / 2
     return torch.nn.functional.pad(cells.cumsum(-1), (1, 0))
 
 

@@ -59,7 +59,7 @@ def test_the_picture_is_the_light_of_its_numbers_and_that_of_members_their_mean(
     torch.testing.assert_close(srgb_from_linear(drawn), members.location)
     whole = images(Mixture(torch.zeros(2, 3).double(), members), {"color"})["color"]
     torch.testing.assert_close(whole, drawn.mean(1))
-    with pytest.raises(UserError, match="draws no depth"):
+    with pytest.raises(UserError, match="provides no depth"):
         images(members, {"depth"})
 
 

@@ -51,10 +51,10 @@ def test_a_support_without_a_uniform_law_is_refused():
     class Part(torch.distributions.Uniform):
         support = Circular(((0.0, 1.0),))
 
-    with pytest.raises(UserError, match=r"no uniform law.*uniform\.register"):
+    with pytest.raises(UserError, match=r"no uniform distribution.*uniform\.register"):
         uniform(torch.distributions.Independent(Part(torch.zeros(2, 1), torch.ones(2, 1)), 1))
     real = torch.distributions.Independent(torch.distributions.Normal(torch.zeros(2, 1), torch.ones(2, 1)), 1)
-    with pytest.raises(UserError, match="no uniform law"):
+    with pytest.raises(UserError, match="no uniform distribution"):
         uniform(real)
 
 

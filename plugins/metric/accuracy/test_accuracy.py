@@ -70,7 +70,7 @@ def test_nothing_seen_is_nan():
 def test_nan_labels_and_densities_that_cannot_be_judged_are_named():
     with pytest.raises(UserError, match="1 of 2 predicted distributions over classes"):
         measured(torch.tensor([[0.0, 1.0], [0.0, torch.nan]]), [0, 1])
-    with pytest.raises(DataError, match="row 1 is 2, wanted 0 to 1"):
+    with pytest.raises(DataError, match="row 1 is 2, but class indices go from 0 to 1"):
         measured(torch.zeros(2, 2), [0, 2])
     with pytest.raises(UserError, match="does not list classes"):
         real = Independent(Normal(torch.zeros(3, 1), 1.0), 1)

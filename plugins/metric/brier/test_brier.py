@@ -82,7 +82,7 @@ def test_nothing_seen_is_nan():
 def test_nan_labels_and_targets_that_cannot_be_judged_are_named():
     with pytest.raises(UserError, match="2 of 2 predicted distributions over classes"):
         measured(torch.full((2, 2), torch.nan), [0, 1])
-    with pytest.raises(DataError, match="row 0 is 3, wanted 0 to 2"):
+    with pytest.raises(DataError, match="row 0 is 3, but class indices go from 0 to 2"):
         measured(torch.zeros(1, 3), [3])
     with pytest.raises(ConfigError, match="metric brier describes targets of kind 'class'"):
         Brier(Target("real", ("x",)))

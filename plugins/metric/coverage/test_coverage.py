@@ -229,5 +229,5 @@ def test_nan_and_labels_that_do_not_exist_are_named():
     three = Target("angle", ("a", "b", "c"))
     with pytest.raises(UserError, match="masses of regions"):
         measured(three, Cardioid(torch.tensor([[math.nan, 0.0, 0.0]])), torch.zeros(1, 3))
-    with pytest.raises(DataError, match="is 4, wanted 0 to 3"):
+    with pytest.raises(DataError, match="is 4, but class indices go from 0 to 3"):
         measured(CLASSES, Categorical(logits=torch.zeros(1, 4)), torch.tensor([4]))

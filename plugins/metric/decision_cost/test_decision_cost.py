@@ -243,7 +243,7 @@ def test_nan_and_labels_that_do_not_exist_are_named():
     )
     with pytest.raises(UserError, match="1 of 1 expected costs"):
         measured(REAL, lambda part: nothing, torch.zeros(1, 1), edges=[0.0])
-    with pytest.raises(DataError, match="is 3, wanted 0 to 2"):
+    with pytest.raises(DataError, match="is 3, but class indices go from 0 to 2"):
         measured(THREE, lambda part: Categorical(logits=torch.zeros(1, 3)), torch.tensor([3]))
 
 

@@ -269,7 +269,7 @@ def test_what_cannot_be_compared_gets_a_sentence():
         made("ssim").update(colors(near[:, :10], true[:, :10], mask[:, :10]))
     with pytest.raises(DataError, match=r"12 × 12 pixels.*176 a side.*fewer `scales`"):
         made("ms_ssim").update(colors(near, true))
-    with pytest.raises(UserError, match=r"MultivariateNormal of event_shape \(2,\) draws no color"):
+    with pytest.raises(UserError, match=r"MultivariateNormal of event_shape \(2,\) provides no color"):
         psnr.update(
             Prediction(density_about(PLACE, torch.zeros(2, 2)), {"color": true, "index": torch.arange(2)})
         )
