@@ -83,12 +83,12 @@ def has_range(density: Distribution) -> bool:
 def entropy_of_one(density: Distribution) -> Float[Tensor, "*batch"]:
     """Return the entropy of a density of one number, nats: to 1e-9 in float64, and to its rounding in float32.
 
-    Panels begin at the density's `mode_candidates`, and the first panels are as wide as the `peak_widths`. Panels are
-    halved until two rules agree. Their nodes are given relative to the peak, so that the rounding of the number itself does not limit how narrow a
-    peak may be. The mass checks the result: where it differs from 1 by more than 1e-7 (float32: 1e-4), some peak is
-    missing from `mode_candidates`, or a tail is too long. Then the mean of -log_prob over DRAWS draws is returned
-    instead, with a warning in the log. A density with more than LARGEST peaks gets this mean too. NaN stays NaN. The result is
-    differentiable like the density.
+    Panels begin at the `mode_candidates` of the density, and the first panels are as wide as the `peak_widths`. Panels
+    are halved until two rules agree. Their nodes are given relative to the peak, so that the rounding of the number
+    itself does not limit how narrow a peak may be. The mass checks the result: where it differs from 1 by more than
+    1e-7 (float32: 1e-4), some peak is missing from `mode_candidates`, or a tail is too long. Then the result is the
+    mean of -log_prob over DRAWS draws, with a warning in the log. It is this mean too if a density has more than
+    LARGEST peaks. NaN stays NaN. The result is differentiable like the density.
     """
     items = density.batch_shape.numel()
     if items == 0:

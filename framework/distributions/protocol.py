@@ -254,7 +254,7 @@ def marginal_cdfs(density: Distribution, value: Tensor) -> Tensor | None:
 
 @singledispatch
 def arc_probability(density: Distribution, start: Tensor, end: Tensor) -> Tensor | None:
-    """Return the probability of the arc from `start` counter-clockwise to `end`, of a density of one angle; None: unknown.
+    """Return the probability of the arc from `start` counter-clockwise to `end` for one angle; None if unknown.
 
     Angles are (*sample, *batch, 1), radians; the result is float64 (*sample, *batch). The arc is shorter than the whole
     circle, and empty between equal ends. Default: None; `circular_moments` then gives the probability where the density
@@ -302,7 +302,7 @@ def mahalanobis(density: Distribution, value: Tensor) -> Tensor | None:
 
 @singledispatch
 def mode_candidates(density: Distribution) -> Tensor:
-    """Return candidates for the mode, (peak, *batch, *event): values where the density may be highest, without guarantee.
+    """Return candidates for the mode, (peak, *batch, *event): values where the density may be highest, unchecked.
 
     Default: the mode alone. A density with several peaks registers a candidate for each.
     """
@@ -355,8 +355,8 @@ def images(density: Distribution, channels: Collection[str]) -> dict[str, Tensor
         UserError: no images are registered for the density, or one of the channels is not among them.
     """
     raise UserError(
-        f"{type(density).__name__} of event_shape {tuple(density.event_shape)} provides no {', '.join(sorted(channels))}. "
-        "Register its images with `framework.distributions.protocol.images.register`, or leave out the metric or "
+        f"{type(density).__name__} of event_shape {tuple(density.event_shape)} provides no "
+        f"{', '.join(sorted(channels))}. Register its images with `framework.distributions.protocol.images.register`, or leave out the metric or "
         "figure that needs them."
     )
 
@@ -365,7 +365,7 @@ class ValueSet(ABC):
     """A prediction set for each item of the batch: a set of values that is stated to contain the target.
 
     Attributes:
-        stated_probability: the least share of targets that the sets are stated to contain; None if nothing is stated.
+        stated_probability: least share of targets that the sets are stated to contain; None if nothing is stated.
     """
 
     stated_probability: float | None = None
