@@ -16,7 +16,7 @@ from framework.data import Batch, Data, Splits
 from framework.errors import DataError
 from framework.storage import cache as storage
 from framework.target import Target
-from framework.testing.rows import SAID_BY_ROWS, DataRow
+from framework.testing.rows import NEEDS_ROWS, DataRow
 
 LENGTHS = (560, 51, 450)
 
@@ -181,7 +181,7 @@ class Shuffled(Dots):
         return {"root": str(folder)}
 
 
-PLAIN = DataRow("without a rows.py", leave_out=SAID_BY_ROWS)
+PLAIN = DataRow("without a rows.py", leave_out=NEEDS_ROWS)
 
 
 def own_waves(folder: Path) -> list[Path]:

@@ -249,7 +249,7 @@ class Fault:
 
         cases = predicted if self.target.kind == "angle" and not self.config and self.head is None else None
         row = HeadRow(self.name, self.target, cases=cases)
-        subject = HeadSubject(row, lambda: of(self.target), of=of, only=only)
+        subject = HeadSubject(row, lambda: of(self.target), build_for=of, only=only)
         groups = [examine_head(subject), examine_densities(subject)]
         for group in groups[::-1] if self.only in OF_DENSITIES else groups:
             yield from group

@@ -356,6 +356,6 @@ HEADS: Mapping[str, tuple[type[DensityHead], tuple[Target, ...]]] = {
 def right_findings(name: str, target: Target) -> Iterator[Finding]:
     """Every finding of one of them."""
     kind = HEADS[name][0]
-    subject = HeadSubject(HeadRow(name, target), lambda: kind(target), of=kind)
+    subject = HeadSubject(HeadRow(name, target), lambda: kind(target), build_for=kind)
     yield from examine_head(subject)
     yield from examine_densities(subject)

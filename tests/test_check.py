@@ -8,7 +8,7 @@ import torch
 
 from framework.errors import ConfigError
 from framework.testing import contract as contracts
-from framework.testing.finding import Finding, Worst, examined, require
+from framework.testing.finding import Finding, Worst, require, run_check
 from tests.conftest import Framework
 
 
@@ -71,7 +71,7 @@ def test_a_strangers_data_set_passes_without_rows_as_far_as_one_can_say(framewor
     done = framework("mode=check", "data=dial")
     assert done.code == 0, done.out
     assert "no sample in two splits" in done.out
-    assert "a rows.py has to say what is wanted" in done.out
+    assert "only a rows.py can state the expected result" in done.out
     done = framework("mode=check", "data=dial", "+data.bad_label=3")
     assert done.code == 1, done.out
     assert "dial: samples" in done.out
@@ -129,30 +129,30 @@ def test_nothing_chosen_is_refused(framework: Framework) -> None:
 
 def test_the_worst_case_is_kept() -> None:
     worst = Worst()
-    worst.see(torch.tensor([[0.1, 0.5], [0.2, 0.3]]), lambda at: f"at {at}")
-    worst.see(0.4, "later and smaller")
+    worst.record(torch.tensor([[0.1, 0.5], [0.2, 0.3]]), lambda at: f"at {at}")
+    worst.record(0.4, "later and smaller")
     assert worst.finding("property", 1.0) == Finding("property", "at (0, 1)", 0.5, 1.0)
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
 def test_nan_is_the_worst_of_all(bad: float) -> None:
     worst = Worst()
-    worst.see(torch.tensor([0.1, bad, 0.2]), lambda at: f"number {at[0]}")
-    worst.see(3.0, "later and finite")
+    worst.record(torch.tensor([0.1, bad, 0.2]), lambda at: f"number {at[0]}")
+    worst.record(3.0, "later and finite")
     found = worst.finding("property", 1e300)
     assert (str(found.error), found.holds) == (str(bad), False)
     assert found.worst == ("NaN: number 1" if math.isnan(bad) else "number 1")
 
 
 def test_a_check_that_compares_nothing_fails() -> None:
-    assert not examined("property", 1.0, lambda worst: worst.see(torch.empty(0), "nothing")).holds
+    assert not run_check("property", 1.0, lambda worst: worst.record(torch.empty(0), "nothing")).holds
 
 
 def test_what_a_check_raises_is_told() -> None:
     def look(worst: Worst) -> None:
         raise NotImplementedError("no entropy")
 
-    found = examined("entropy", 1.0, look)
+    found = run_check("entropy", 1.0, look)
     assert (found.worst, found.error) == ("NotImplementedError: no entropy", math.inf)
 
 
@@ -161,7 +161,7 @@ def test_a_check_that_hangs_is_ended() -> None:
         while True:
             torch.zeros(1).add_(1)
 
-    found = examined("sampling", 1.0, look, seconds=0.2)
+    found = run_check("sampling", 1.0, look, seconds=0.2)
     assert not found.holds
     assert "did not end within 0.2 s" in found.worst
 
@@ -171,7 +171,7 @@ def test_require_names_every_failure() -> None:
     require(good)
     with pytest.raises(AssertionError, match=r"entropy FAILS: error 2, limit 1 \(row 3\)"):
         require(good, bad)
-    with pytest.raises(AssertionError, match="nothing was examined"):
+    with pytest.raises(AssertionError, match="nothing was checked"):
         require()
 
 

@@ -14,11 +14,11 @@ from framework.data import Data, Splits
 from framework.datasets.fields import Fields
 from framework.errors import DataError
 from framework.storage import cache
-from framework.storage.generated import generated, read_mark
+from framework.storage.generated import ensure_generated, read_mark
 from framework.target import Target
 from framework.testing.contract import _shipped, contract
 from framework.testing.data import examine_data
-from framework.testing.data_folders import configured
+from framework.testing.data_folders import configured_row
 from framework.testing.finding import require
 from framework.testing.rows import DAMAGES, DataRow
 
@@ -61,7 +61,7 @@ class Needles(Data):
         ):
             mark = {"seed": self.data_seed}
             place = cache.folder("needles") / str(self.data_seed)
-            root = generated(place, mark, lambda part: draw(part, self.data_seed))
+            root = ensure_generated(place, mark, lambda part: draw(part, self.data_seed))
         else:
             root = Path(self.root)
             if not root.is_dir():
@@ -317,11 +317,11 @@ def test_the_users_cache_is_left_alone(tmp_path, monkeypatch) -> None:
 
 
 def test_a_users_own_root_is_read_and_never_damaged() -> None:
-    row = configured(ROW, {"root": "/own", "data_seed": 0})
+    row = configured_row(ROW, {"root": "/own", "data_seed": 0})
     assert row.config == {"root": "/own", "data_seed": 0}
     assert (row.fragile, row.skip, row.changes, row.synthetic, row.files) == ({}, {}, {}, None, None)
-    assert configured(ROW, {"data_seed": 1}).changes == {}  # which would change nothing
-    row = configured(REAL, {"data_seed": 3})
+    assert configured_row(ROW, {"data_seed": 1}).changes == {}  # which would change nothing
+    row = configured_row(REAL, {"data_seed": 3})
     assert (row.write, row.fragile) == (written, {"03.txt": DAMAGES})
 
 

@@ -73,7 +73,7 @@ from framework.model import Model
 from framework.target import Target
 from framework.testing.balls import CHANNELS, Ball, ball
 from framework.testing.contract import contract
-from framework.testing.heads import ready, values
+from framework.testing.heads import fit_if_needed, values
 from framework.testing.metrics import Cardioid
 from framework.testing.rows import HeadRow
 from framework.testing.wrappers import LENGTH, Plain
@@ -90,7 +90,7 @@ class Made:
     def __init__(self, name: str, row: HeadRow, seed: int = 0, spread: float = 1.0) -> None:
         torch.manual_seed(0)
         config = resolve("density_head", {"name": name, **row.config})
-        head = ready(build("density_head", config, target=row.target).double(), row.target).eval()
+        head = fit_if_needed(build("density_head", config, target=row.target).double(), row.target).eval()
         torch.manual_seed(1)
         raws = spread * torch.randn(3, BATCH, head.size, dtype=torch.float64)
         torch.manual_seed(100 + seed)
@@ -918,8 +918,8 @@ def test_structures_show_what_is_drawn_inside_or_refuse(name: str) -> None:
                     wanted = wanted.reshape(2, 2, *wanted.shape[1:])
                 assert torch.equal(image, wanted), (kind, channel)
         if kind in seen:  # only what was asked for was drawn
-            assert made.parts[0].asked == [{"color"}, CHANNELS]
-            made.parts[0].asked.clear()
+            assert made.parts[0].requested_channels == [{"color"}, CHANNELS]
+            made.parts[0].requested_channels.clear()
     forwarded = {"itself", "stacked", "reshaped", "mixture of one", "with a set"}
     extra = {"gaussian": {"moved there and back"}, "von_mises": {"floored", "power"}}
     assert seen == forwarded | extra.get(name, {"floored"})

@@ -12,9 +12,9 @@ from framework.distributions.density import Mixture
 from framework.distributions.intervals import central_interval
 from framework.prediction import Prediction, table_columns
 from framework.target import Target
-from framework.testing.devices import OneDevice, Questions, on_one_device
+from framework.testing.devices import Calls, OneDevice, check_devices
 from framework.testing.finding import Worst
-from framework.testing.questions import every_question
+from framework.testing.protocol_checks import protocol_calls
 from plugins.density_head.von_mises.density import VonMises
 from tests.planted_heads import CLASSES, HEIGHT, ONE, PLACE
 
@@ -56,7 +56,7 @@ WRONG: dict[str, Callable[[Tensor], object]] = {
 
 def mixes(ask: Callable[[Tensor], object]) -> bool:
     mode = OneDevice()
-    x = mode.receive(torch.tensor([0.3, 0.1, 0.7]))
+    x = mode.label_device(torch.tensor([0.3, 0.1, 0.7]))
     with mode:
         ask(x)
     return bool(mode.faults)
@@ -93,17 +93,17 @@ def of_classes(raw: Tensor) -> Distribution:
 def test_the_answers_of_a_density_are_on_its_device(
     target: Target, make: Callable[[Tensor], Distribution], mixed: bool
 ) -> None:
-    def questions(mode: OneDevice) -> Questions:
-        raw = mode.receive(torch.randn(2, 3, len(target.names)))
+    def calls(mode: OneDevice) -> Calls:
+        raw = mode.label_device(torch.randn(2, 3, len(target.names)))
         density = Mixture(raw[..., 0].log_softmax(-1), make(raw)) if mixed else make(raw[:, 0])
-        yield from every_question(
-            density, mode.receive(torch.tensor([[0], [1], [0]])), mode.receive(torch.tensor(1.7))
+        yield from protocol_calls(
+            density, mode.label_device(torch.tensor([[0], [1], [0]])), mode.label_device(torch.tensor(1.7))
         )
         if target.kind != "class":
             yield "middle", lambda: central_interval(density, 0.9, 99)
-        batch = {"index": mode.receive(torch.arange(2)), "target": density.sample()}
+        batch = {"index": mode.label_device(torch.arange(2)), "target": density.sample()}
         yield "answers", lambda: table_columns(target, Prediction(density, batch))
 
     worst = Worst()
-    on_one_device(questions, worst)
+    check_devices(calls, worst)
     assert worst.error == 0, worst.case

@@ -7,11 +7,11 @@ from scipy.optimize import least_squares
 from framework.flights.estimation import cauchy, estimate_states, observed_frames
 from framework.flights.physics import Constants
 from framework.flights.trajectories import simulate
-from framework.testing.flights import SIGMA, windows_of
+from framework.testing.flights import SIGMA, simulate_windows
 
 
 def test_states_are_those_of_scipys_robust_least_squares() -> None:
-    frames, _, _ = windows_of(4)
+    frames, _, _ = simulate_windows(4)
     seen = observed_frames(frames, 0.016)
     found = estimate_states(seen, Constants(), SIGMA, most=200)
     for row in range(4):
@@ -29,8 +29,8 @@ def test_states_are_those_of_scipys_robust_least_squares() -> None:
 
 
 def test_outliers_do_not_move_the_state() -> None:
-    clean, future, _ = windows_of(40)
-    dirty, _, _ = windows_of(40, outliers=True)
+    clean, future, _ = simulate_windows(40)
+    dirty, _, _ = simulate_windows(40, outliers=True)
     errors = []
     for frames in (clean, dirty):
         seen = observed_frames(frames, 0.016)

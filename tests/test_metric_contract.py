@@ -9,7 +9,7 @@ from framework.configuration.schema import build, resolve
 from framework.errors import ConfigError
 from framework.metric import Metric
 from framework.target import Target
-from framework.testing.metrics import Cardioid, density_about, examine_metric
+from framework.testing.metrics import Cardioid, examine_metric, simplest_density
 from framework.testing.rows import MetricRow
 
 CLASSES = Target("class", ("a", "b", "c"))
@@ -95,7 +95,7 @@ def test_a_cardioid_of_any_strength_is_a_density(strength):
 def test_broader_densities_have_more_entropy_about_the_same_place(target):
     place = torch.randn(5, len(target.names), generator=torch.Generator().manual_seed(0))
     narrow, same, broad = (
-        density_about(target, place, None if breadth is None else torch.full((5,), breadth))
+        simplest_density(target, place, None if breadth is None else torch.full((5,), breadth))
         for breadth in (None, 1.0, 2.0)
     )
     torch.testing.assert_close(narrow.entropy(), same.entropy(), rtol=0, atol=0)

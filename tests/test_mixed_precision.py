@@ -12,7 +12,7 @@ from framework.configuration.schema import build, resolve
 from framework.distributions.normals import JointNormal
 from framework.testing.contract import contract
 from framework.testing.finding import SEED, seed
-from framework.testing.heads import HeadSubject, ready
+from framework.testing.heads import HeadSubject, fit_if_needed
 from framework.testing.rows import HeadRow
 
 HEADS = [
@@ -48,7 +48,9 @@ def require_same(make: Callable[[], Distribution], value: Tensor, kind: torch.dt
 @pytest.mark.parametrize("name, row", HEADS)
 def test_densities_of_heads_are_those_of_full_precision(name: str, row: HeadRow) -> None:
     config = resolve("density_head", {"name": name, **row.config})
-    subject = HeadSubject(row, lambda: ready(build("density_head", config, target=row.target), row.target))
+    subject = HeadSubject(
+        row, lambda: fit_if_needed(build("density_head", config, target=row.target), row.target)
+    )
     head, raw, value = subject.make(), row.scale * subject.raws(4), subject.values(4)
 
     def make() -> Distribution:

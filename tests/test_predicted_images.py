@@ -13,7 +13,7 @@ from framework.metric import Metric
 from framework.prediction import Prediction
 from framework.target import Target
 from framework.testing.balls import CHANNELS, Ball, ball
-from framework.testing.metrics import density_about, examine_metric
+from framework.testing.metrics import examine_metric, simplest_density
 from framework.testing.rows import MetricRow
 from framework.testing.wrappers import LENGTH, Plain
 
@@ -75,7 +75,7 @@ def asked(*metrics: Metric) -> list[list[frozenset[str]]]:
         device=torch.device("cpu"),
         outliers=[other],
     )
-    return [density.asked for density in predicted]
+    return [density.requested_channels for density in predicted]
 
 
 def test_what_metrics_read_is_drawn_at_once_and_nothing_else() -> None:
@@ -90,18 +90,18 @@ def test_what_metrics_read_is_drawn_at_once_and_nothing_else() -> None:
 def test_another_frame_keeps_what_is_read_and_seen() -> None:
     (batch,) = batches(1)
     place = batch["target"]
-    density = Ball(density_about(PLACE, place), place, SIZE)
+    density = Ball(simplest_density(PLACE, place), place, SIZE)
     prediction = Prediction(density, batch, reads=("color", "depth"))
     moved = prediction.in_frame(Frame(torch.ones(3, 2), torch.full((3, 2), 2.0)))
     assert isinstance(moved.density, AffineDensity)
     torch.testing.assert_close(moved.image("color"), ball(place, SIZE)["color"], rtol=0, atol=0)
-    assert density.asked == [{"color", "depth"}]
+    assert density.requested_channels == [{"color", "depth"}]
 
 
 def test_a_missing_truth_and_a_density_that_draws_nothing_get_a_sentence() -> None:
     (batch,) = batches(1)
     del batch["mask"]
-    prediction = Prediction(density_about(PLACE, batch["target"]), batch)
+    prediction = Prediction(simplest_density(PLACE, batch["target"]), batch)
     with pytest.raises(
         DataError, match=r"The true 'mask' .* only input, target, index, color, depth\. Choose data"
     ):

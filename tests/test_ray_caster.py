@@ -15,7 +15,7 @@ from framework.configuration.schema import build, resolve
 from framework.geometry.camera import Camera, look_from
 from framework.renderer import Renderer, Scene, Texture, join_scenes
 from framework.testing.extremes import extremes
-from framework.testing.finding import examined
+from framework.testing.finding import run_check
 from framework.testing.scenes import sphere
 from tests.conftest import STRANGER
 
@@ -234,6 +234,6 @@ class Faulty(Renderer):
 def test_the_contract_finds_what_extreme_scenes_break(
     before: Callable[[Tensor], Tensor], after: Callable[[Tensor], Tensor], told: str | None
 ) -> None:
-    finding = examined("extreme scenes", 0.0, lambda worst: extremes(Faulty(before, after), worst))
+    finding = run_check("extreme scenes", 0.0, lambda worst: extremes(Faulty(before, after), worst))
     assert finding.holds == (told is None), finding
     assert told is None or told in finding.worst

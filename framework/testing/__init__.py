@@ -1,6 +1,6 @@
-"""Contract tests of the registries: the rows of a plugin decide which checks run, in pytest and in `mode=check`.
+"""Contract tests of the registries: checks of every installed plugin, run by pytest and by `mode=check`.
 
-`contract` runs the checks of a plugin that is given by name. `rows` defines what a plugin states about itself, and
-`finding` defines the result of a check. Each group of plugins has its own module of checks; `densities` holds what
-every density must satisfy.
+A plugin lists in its `rows.py` with which parameters it is checked, as the classes in `rows` describe. `contract` runs
+the checks of a plugin by name, and `finding` defines the result of a check. Each registry has its own module of checks;
+`densities` checks the densities of density heads and uncertainty wrappers.
 """

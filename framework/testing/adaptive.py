@@ -1,4 +1,4 @@
-"""Adaptive quadrature of a density of one or two numbers, however narrow: boxes are split where two rules disagree."""
+"""Adaptive quadrature of densities of one or two numbers: a box is split where two rules disagree on its integral."""
 
 import math
 from collections.abc import Callable
@@ -17,31 +17,34 @@ from framework.distributions.protocol import mode_candidates
 RULES = {1: (10, 6), 2: (8, 5)}
 """Gauss-Legendre points per side of the two rules; a box on which their sums differ is split."""
 TOLERANCE = {1: 1e-10, 2: 1e-8}
+"""Largest difference between the two rules on a box that is not split, in probability."""
 ROUNDS = {1: 60, 2: 40}
+"""Largest number of rounds of splitting."""
 MOST = {1: 128, 2: 48}
 """Largest number of boxes of a batch row that are split in one round."""
 MOST_PEAKS = 64
+"""Largest number of mode candidates that are used."""
 HIDDEN = 2.0
-"""Ratio of a known value of the integrand to that at the highest node above which a box is split."""
-REACH = 36.0
-"""Bound on the coordinate s of values mode + a sinh(s), where a is the density's own width.
+"""Ratio above which a box is split: a known value of the integrand in the box, divided by that at its highest node."""
+LARGEST_COORDINATE = 36.0
+"""Largest coordinate s, where values are mode + a sinh(s) and a is the width of the density.
 
-For reals the quadrature reaches sinh 36 = 2e15 widths, for angles half a turn.
+Reals are integrated up to sinh 36 = 2e15 widths from the mode, angles up to half a turn from it.
 """
 
 
 @dataclass(frozen=True)
 class Boxes:
-    """Result of the quadrature of a density with batch_shape (rows,).
+    """Boxes into which the domain of a density with batch_shape (rows,) was split, with their masses.
 
     Attributes:
-        value: Values at which the density was evaluated last, (node, rows, number).
+        value: Nodes of all boxes, as values of the density, (node, rows, number).
         log_prob: Log-density at `value`, (node, rows), nats.
-        weight: Volume of each node, (node, rows); Σ weight · exp(log_prob) is the integral.
-        border: Borders of the boxes of one number, ascending, (box + 1, rows).
+        weight: Quadrature weight of each node, (node, rows); Σ weight · exp(log_prob) is the integral.
+        border: Borders of the boxes, ascending, (box + 1, rows); empty for densities of two numbers.
         mass: Mass of each box, (box, rows).
-        way: Coordinates in which the boxes are cut.
-        low, high: Corners of the boxes in these coordinates, (box, rows, number).
+        mapping: Map from the coordinates in which boxes are cut to values.
+        low, high: Lower and upper corners of the boxes in these coordinates, (box, rows, number).
     """
 
     value: Tensor
@@ -49,58 +52,59 @@ class Boxes:
     weight: Tensor
     border: Tensor
     mass: Tensor
-    way: "_Map"
+    mapping: "_Map"
     low: Tensor
     high: Tensor
 
-    def mean(self, of: Tensor) -> Tensor:
-        """Return ∫ p f, (rows,), for a function f with values (node, rows)."""
+    def mean(self, integrand: Tensor) -> Tensor:
+        """Return ∫ p f, (rows,), for a function f whose values at the nodes are `integrand`, (node, rows)."""
         share = self.weight * self.log_prob.exp()
-        return torch.where(share > 0, share * of, 0.0).sum(0)
+        return torch.where(share > 0, share * integrand, 0.0).sum(0)
 
     def entropy(self) -> Tensor:
         """Return the entropy, (rows,), nats."""
         return -self.mean(self.log_prob)
 
-    def doubt(self, of: Callable[[Tensor], Tensor]) -> Tensor:
-        """Return a bound on the error of ∫ p f for a function f of values, (rows,).
+    def error_bound(self, function: Callable[[Tensor], Tensor]) -> Tensor:
+        """Return a bound on the error of ∫ p f, (rows,), for a function f of values.
 
         The boxes are cut for p rather than for f, and they end at a finite distance. The bound is the difference of the
-        two rules, plus a bound on the part beyond the ends for tails that fall like a power.
+        two rules, plus a bound on the integral beyond the outermost boxes for tails that fall like a power.
         """
         shares = []
         for points in RULES[self.low.shape[-1]]:
-            value, log_prob, weight = _nodes(self.way, self.low, self.high, points)
+            value, log_prob, weight = _nodes(self.mapping, self.low, self.high, points)
             share = weight * log_prob.exp()
-            part = torch.where(share > 0, share * of(value).reshape(share.shape), 0.0).sum(1)
+            part = torch.where(share > 0, share * function(value).reshape(share.shape), 0.0).sum(1)
             shares.append(part)
         rules = (shares[0] - shares[1]).abs().sum(0)
-        if self.way.angles:
+        if self.mapping.angles:
             return rules
-        outermost = (self.low == self.way.ends[0]).any(-1) | (self.high == self.way.ends[1]).any(-1)
+        outermost = (self.low == self.mapping.ends[0]).any(-1) | (self.high == self.mapping.ends[1]).any(-1)
         return rules + 100 * torch.where(outermost, shares[0].abs(), 0.0).sum(0)
 
-    def below(self, value: Tensor) -> Tensor:
-        """Return the mass from the first border to `value` (several, rows) of one number.
+    def mass_below(self, value: Tensor) -> Tensor:
+        """Return the mass between the first border and each value, both (value, rows), for densities of one number.
 
         For angles the first border is half a turn before the mode.
         """
-        place = self.way.back(value.unsqueeze(-1))
-        border = self.way.back(self.border.unsqueeze(-1))[..., 0]
-        border[0], border[-1] = (end[:, 0] for end in self.way.ends)
-        box = torch.searchsorted(border.T.contiguous(), place[..., 0].T.contiguous()).T.clamp(
+        coordinates = self.mapping.coordinates(value.unsqueeze(-1))
+        border = self.mapping.coordinates(self.border.unsqueeze(-1))[..., 0]
+        border[0], border[-1] = (end[:, 0] for end in self.mapping.ends)
+        box = torch.searchsorted(border.T.contiguous(), coordinates[..., 0].T.contiguous()).T.clamp(
             1, len(border) - 1
         )
         low = border.gather(0, box - 1).unsqueeze(-1)
-        _, log_prob, weight = _nodes(self.way, low, place, RULES[1][0])
+        _, log_prob, weight = _nodes(self.mapping, low, coordinates, RULES[1][0])
         before = torch.cat([torch.zeros_like(self.mass[:1]), self.mass.cumsum(0)]).gather(0, box - 1)
         return before + (weight * log_prob.exp()).sum(1)
 
 
 class _Map:
-    """Map from the coordinates in which boxes are cut to values: sinh along the density's own axes, in its own widths.
+    """Map from the coordinates in which boxes are cut to values: origin + width · sinh(coordinate) on each axis.
 
-    The origin is the highest of some candidates, since the density's mode may be wrong.
+    The axes and widths are estimated from the density. The origin is the candidate with the highest density, since the
+    mode that the density states may be wrong.
     """
 
     def __init__(self, density: Distribution, candidates: Tensor) -> None:
@@ -109,18 +113,18 @@ class _Map:
         best = height.where(~height.isnan(), -math.inf).argmax(0)
         self.mode = candidates[best, torch.arange(len(best))]
         self.angles = isinstance(density.support, Circular)
-        self.chart = isinstance(density.support, Circular) and density.support.ranges is not None
-        if self.chart:
+        self.has_ranges = isinstance(density.support, Circular) and density.support.ranges is not None
+        if self.has_ranges:
             self.mode = wrap(self.mode)
         self.scale = self._widths()
         self.slope = torch.zeros_like(self.mode[:, 0])
         if not self.angles and self.mode.shape[1] == 2:
             self._whiten()
-        end = torch.full_like(self.mode, REACH)
+        end = torch.full_like(self.mode, LARGEST_COORDINATE)
         self.ends = -end, end
         if isinstance(density.support, Circular):
-            turn = [(-math.pi, math.pi)] * self.mode.shape[1]
-            first, last = torch.tensor(density.support.ranges or turn, dtype=torch.float64).T
+            whole_turn = [(-math.pi, math.pi)] * self.mode.shape[1]
+            first, last = torch.tensor(density.support.ranges or whole_turn, dtype=torch.float64).T
             if density.support.ranges is None:
                 first, last = first + self.mode, last + self.mode
             self.ends = ((first - self.mode) / self.scale).asinh(), ((last - self.mode) / self.scale).asinh()
@@ -130,31 +134,31 @@ class _Map:
         return self.density.log_prob(value.to(like.dtype)).double()
 
     def _widths(self) -> Tensor:
-        """Return the distance along each axis at which log p is half a nat below the mode, (rows, number)."""
+        """Return the distance from the mode along each axis at which log p has fallen by half a nat, (rows, number)."""
         steps = 2.0 ** torch.arange(-40, 2 if self.angles else 60, dtype=torch.float64)
         top = self.log_prob(self.mode)
-        found = []
+        widths = []
         for number in range(self.mode.shape[1]):
             axis = torch.zeros(self.mode.shape[1], dtype=torch.float64)
             axis[number] = 1
-            there = self.mode + steps[:, None, None] * axis
-            fallen = (top - self.log_prob(there) > 0.5).int()
+            values = self.mode + steps[:, None, None] * axis
+            fallen = (top - self.log_prob(values) > 0.5).int()
             first = torch.where(
                 fallen.amax(0) > 0, fallen.argmax(0), 40
             )  # width 2^0 = 1 where p does not fall
-            found.append(steps[first])
-        return torch.stack(found, -1)
+            widths.append(steps[first])
+        return torch.stack(widths, -1)
 
     def _whiten(self) -> None:
-        """Set the slope of the second number's conditional mode in the first.
+        """Set the slope at which the conditional mode of the second number moves with the first number.
 
-        The slope comes from mixed differences over the widths.
+        The slope is estimated by mixed second differences of log p, one width apart.
         """
         first, second = self.scale[:, 0], self.scale[:, 1]
         corner = {}
-        for one, two in product((-1, 0, 1), repeat=2):
-            offset = torch.stack([one * first, two * second], -1)
-            corner[one, two] = self.log_prob(self.mode + offset)
+        for first_sign, second_sign in product((-1, 0, 1), repeat=2):
+            offset = torch.stack([first_sign * first, second_sign * second], -1)
+            corner[first_sign, second_sign] = self.log_prob(self.mode + offset)
         mixed = (corner[1, 1] - corner[1, -1] - corner[-1, 1] + corner[-1, -1]) / 4
         bend = corner[0, 1] + corner[0, -1] - 2 * corner[0, 0]
         slope = -mixed / bend * second / first
@@ -166,18 +170,18 @@ class _Map:
         wider = torch.where(fallen.amax(0) > 0, steps[fallen.argmax(0)], 1.0)
         self.scale = torch.stack([first * wider, second], -1)
 
-    def to(self, place: Tensor) -> tuple[Tensor, Tensor]:
-        """Return values and the volume of the map at coordinates (node, rows, number)."""
-        offset = self.scale * place.sinh()
-        volume = (self.scale * place.cosh()).prod(-1)
-        if place.shape[-1] == 2:
+    def values_and_volumes(self, coordinates: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the values at coordinates (node, rows, number), and the volume element of the map, (node, rows)."""
+        offset = self.scale * coordinates.sinh()
+        volume = (self.scale * coordinates.cosh()).prod(-1)
+        if coordinates.shape[-1] == 2:
             offset = torch.stack([offset[..., 0], offset[..., 1] + self.slope * offset[..., 0]], -1)
         return self.mode + offset, volume
 
-    def back(self, value: Tensor) -> Tensor:
-        """Return the coordinates of values."""
-        offset = (wrap(value.double()) if self.chart else value.double()) - self.mode
-        if self.angles and not self.chart:
+    def coordinates(self, value: Tensor) -> Tensor:
+        """Return the coordinates of values, both (..., rows, number)."""
+        offset = (wrap(value.double()) if self.has_ranges else value.double()) - self.mode
+        if self.angles and not self.has_ranges:
             offset = wrap(offset)
         if offset.shape[-1] == 2:
             offset = torch.stack([offset[..., 0], offset[..., 1] - self.slope * offset[..., 0]], -1)
@@ -185,7 +189,7 @@ class _Map:
 
 
 def _rule(points: int, numbers: int) -> tuple[Tensor, Tensor]:
-    """Return nodes (points^numbers, numbers) of the unit box and their weights."""
+    """Return the Gauss-Legendre nodes of the unit box, (points^numbers, numbers), and their weights."""
     node, weight = (torch.from_numpy(part) for part in np.polynomial.legendre.leggauss(points))
     nodes = torch.cartesian_prod(*[(node + 1) / 2] * numbers).reshape(-1, numbers)
     weights = torch.cartesian_prod(*[weight / 2] * numbers).reshape(-1, numbers).prod(-1)
@@ -194,29 +198,31 @@ def _rule(points: int, numbers: int) -> tuple[Tensor, Tensor]:
 
 @lru_cache(maxsize=4)
 def boxes(density: Distribution) -> Boxes:
-    """Return a density of one or two numbers, batch_shape (rows,), in boxes on which two rules agree.
+    """Integrate a density of one or two numbers, batch_shape (rows,), over boxes on which two rules agree.
 
-    Candidates for peaks are the mode, `peaks` and draws. A box is also split while it may hide a peak or a ridge.
+    A box is also split while it may hide a peak or a ridge of the density. Peaks are searched for at the mode, at the
+    values that `mode_candidates` returns, and at draws.
     """
-    humps = mode_candidates(density)[:MOST_PEAKS].double()
-    drawn = density.sample(torch.Size((24,))).double()
-    seen = torch.cat([density.mode.unsqueeze(0).double(), humps, drawn])
-    way = _Map(density, seen)
-    humps = way.back(humps)
-    numbers = way.mode.shape[1]
-    height = way.log_prob(seen)
-    place = way.back(seen)
+    peak_values = mode_candidates(density)[:MOST_PEAKS].double()
+    draws = density.sample(torch.Size((24,))).double()
+    candidates = torch.cat([density.mode.unsqueeze(0).double(), peak_values, draws])
+    mapping = _Map(density, candidates)
+    peak_coordinates = mapping.coordinates(peak_values)
+    numbers = mapping.mode.shape[1]
+    candidate_log_prob = mapping.log_prob(candidates)
+    candidate_coordinates = mapping.coordinates(candidates)
     side = 8 if numbers == 1 else 4
     cut = torch.linspace(0, 1, side + 1, dtype=torch.float64)
-    length = way.ends[1] - way.ends[0]
-    low = way.ends[0] + torch.cartesian_prod(*[cut[:-1]] * numbers).reshape(-1, 1, numbers) * length
-    high = way.ends[0] + torch.cartesian_prod(*[cut[1:]] * numbers).reshape(-1, 1, numbers) * length
+    length = mapping.ends[1] - mapping.ends[0]
+    low = mapping.ends[0] + torch.cartesian_prod(*[cut[:-1]] * numbers).reshape(-1, 1, numbers) * length
+    high = mapping.ends[0] + torch.cartesian_prod(*[cut[1:]] * numbers).reshape(-1, 1, numbers) * length
     if numbers == 1:
         # A kink at a peak near a border may lie beyond the outermost nodes of both rules, so a border is put there.
-        edges = torch.cat([low.expand(-1, *humps.shape[1:]), high[-1:].expand(-1, *humps.shape[1:]), humps])
+        shape = peak_coordinates.shape[1:]
+        edges = torch.cat([low.expand(-1, *shape), high[-1:].expand(-1, *shape), peak_coordinates])
         edges = edges.sort(0).values
         low, high = edges[:-1], edges[1:]
-    parts = _summed(way, low, high, place, height, humps)
+    parts = _evaluate_boxes(mapping, low, high, candidate_coordinates, candidate_log_prob, peak_coordinates)
     # float32 does not reproduce more digits
     tolerance = TOLERANCE[numbers] if density.log_prob(density.mode).dtype == torch.float64 else 1e-4
     for _ in range(ROUNDS[numbers]):
@@ -225,73 +231,82 @@ def boxes(density: Distribution) -> Boxes:
             break
         split = min(split, MOST[numbers])
         order = parts[3].argsort(0, descending=True)
-        low, high, across = (_taken(parts[index], order[:split]) for index in (0, 1, 4))
-        middle = torch.where(across, (low + high) / 2, math.nan)
+        low, high, split_axis = (_gather_boxes(parts[index], order[:split]) for index in (0, 1, 4))
+        middle = torch.where(split_axis, (low + high) / 2, math.nan)
         halves = torch.cat([low, middle.fmax(low)]), torch.cat([middle.fmin(high), high])
-        fresh = _summed(way, *halves, place, height, humps)
+        fresh = _evaluate_boxes(mapping, *halves, candidate_coordinates, candidate_log_prob, peak_coordinates)
         parts = tuple(
-            torch.cat([_taken(old, order[split:]), new]) for old, new in zip(parts, fresh, strict=True)
+            torch.cat([_gather_boxes(old, order[split:]), new]) for old, new in zip(parts, fresh, strict=True)
         )
-    return _gathered(way, *parts[:3])
+    return _make_boxes(mapping, *parts[:3])
 
 
-def _taken(part: Tensor, index: Tensor) -> Tensor:
-    """Return the entries of `part` (box, rows, ...) at index (some, rows)."""
+def _gather_boxes(part: Tensor, index: Tensor) -> Tensor:
+    """Return the boxes of each row that `index` (chosen box, row) names, from a tensor (box, row, ...)."""
     if part.dim() == 3:
         index = index.unsqueeze(-1).expand(*index.shape, part.shape[-1])
     return part.gather(0, index)
 
 
-def _nodes(way: _Map, low: Tensor, high: Tensor, points: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Return values (box · node, rows, number), and log-densities and weights (box, node, rows)."""
+def _nodes(mapping: _Map, low: Tensor, high: Tensor, points: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the nodes of boxes (box · node, rows, number), and their log-densities and weights, (box, node, rows)."""
     nodes, weights = _rule(points, low.shape[-1])
-    place = low.unsqueeze(1) + (high - low).unsqueeze(1) * nodes[:, None]
-    value, volume = way.to(place.flatten(0, 1))
+    coordinates = low.unsqueeze(1) + (high - low).unsqueeze(1) * nodes[:, None]
+    value, volume = mapping.values_and_volumes(coordinates.flatten(0, 1))
     shape = (low.shape[0], len(nodes), low.shape[1])
     weight = volume.reshape(shape) * weights[:, None] * (high - low).prod(-1).unsqueeze(1)
-    return value, way.log_prob(value).reshape(shape), weight
+    return value, mapping.log_prob(value).reshape(shape), weight
 
 
-def _summed(
-    way: _Map, low: Tensor, high: Tensor, place: Tensor, height: Tensor, humps: Tensor
+def _evaluate_boxes(
+    mapping: _Map,
+    low: Tensor,
+    high: Tensor,
+    candidate_coordinates: Tensor,
+    candidate_log_prob: Tensor,
+    peak_coordinates: Tensor,
 ) -> tuple[Tensor, ...]:
-    """Return boxes, their masses, the urgency to split each, and the number in which to split it.
+    """Return the corners of boxes, their masses, the urgency to split each, and the axis along which to split it.
 
-    Boxes are their corners, low and high. Masses and urgency have shape (box, rows). The number is a mask (box, rows,
-    number). A split is urgent where the two sums differ, or where a candidate or the estimate from a known peak is far
-    above every node.
+    The corners are `low` and `high`. Masses and urgency have shape (box, rows). The axis is a mask (box, rows, number).
+    The urgency is the difference of the two rules, or more where the integrand at a candidate or near a known peak is
+    far above that at every node.
     """
     numbers = low.shape[-1]
     sums, highest, rough = [], torch.zeros_like(low[..., 0]), torch.zeros_like(low)
     for points in RULES[numbers]:
-        _, log_prob, weight = _nodes(way, low, high, points)
+        _, log_prob, weight = _nodes(mapping, low, high, points)
         share = weight * log_prob.exp()
         sums.append(share.sum(1))
-        even = share / _rule(points, numbers)[1][:, None]  # mass of the box if this node stood for all of it
+        # mass of the box if the integrand were everywhere as high as at this node
+        even = share / _rule(points, numbers)[1][:, None]
         highest = torch.maximum(highest, even.nan_to_num().amax(1))
         if points == RULES[numbers][0]:
             rough = _roughness(even.nan_to_num(), points, numbers)
     size = (high - low).prod(-1)
-    inside = ((place.unsqueeze(1) >= low) & (place.unsqueeze(1) <= high)).all(-1)  # (candidate, box, rows)
-    _, volume = way.to(place)
-    peak = torch.where(inside, (height.exp() * volume).unsqueeze(1), 0.0).amax(0) * size
-    # a box with a peak in or near it is split in its longest number, a box with a ridge across the ridge
-    known = torch.cat([peak.unsqueeze(0), _known(way, low, high, humps) * size])
-    hidden, which = torch.where(known > HIDDEN * highest, known.clamp(max=1.0), 0.0).max(0)
+    point = candidate_coordinates.unsqueeze(1)
+    inside = ((point >= low) & (point <= high)).all(-1)  # (candidate, box, rows)
+    _, volume = mapping.values_and_volumes(candidate_coordinates)
+    peak = torch.where(inside, (candidate_log_prob.exp() * volume).unsqueeze(1), 0.0).amax(0) * size
+    # a box with a peak in it or near it is split along its longest axis, a box with a ridge across the ridge
+    largest = torch.cat(
+        [peak.unsqueeze(0), _integrands_near_peaks(mapping, low, high, peak_coordinates) * size]
+    )
+    hidden, which = torch.where(largest > HIDDEN * highest, largest.clamp(max=1.0), 0.0).max(0)
     longest = (high - low).argmax(-1)
     number = torch.where(which < 2, longest, which - 2)
     number = torch.where(hidden > 0, number, rough.argmax(-1))
-    across = torch.nn.functional.one_hot(number, numbers).bool()
-    # a narrower box holds a peak that float64 does not resolve
-    wide = (high - low).where(across, 0.0).amax(-1) > 1e-13
+    split_axis = torch.nn.functional.one_hot(number, numbers).bool()
+    # float64 does not resolve a peak in a narrower box
+    wide = (high - low).where(split_axis, 0.0).amax(-1) > 1e-13
     urgency = torch.maximum((sums[0] - sums[1]).abs(), hidden)
-    return low, high, sums[0], torch.where(wide & urgency.isfinite(), urgency, 0.0), across
+    return low, high, sums[0], torch.where(wide & urgency.isfinite(), urgency, 0.0), split_axis
 
 
 def _roughness(integrand: Tensor, points: int, numbers: int) -> Tensor:
-    """Return the share of the integrand (box, node, rows) in the two highest polynomials of each number.
+    """Return the part of the integrand (box, node, rows) in the two highest Legendre polynomials of each number.
 
-    The result has shape (box, rows, number). The nodes are too few in the number in which it is largest.
+    The result has shape (box, rows, number). A box needs more nodes along the number for which the result is largest.
     """
     if numbers == 1:
         return torch.zeros_like(integrand[:, :1]).movedim(1, -1)
@@ -310,37 +325,39 @@ def _highest_polynomials(points: int) -> Tensor:
     """Return the matrix (2, points) from node values to coefficients of the two highest Legendre polynomials."""
     node, weight = np.polynomial.legendre.leggauss(points)
     values = np.polynomial.legendre.legvander(node, points - 1)[:, -2:]
-    found = weight[:, None] * values * np.arange(2 * points - 3, 2 * points, 2)
-    return torch.from_numpy(np.ascontiguousarray(found.T))
+    matrix = weight[:, None] * values * np.arange(2 * points - 3, 2 * points, 2)
+    return torch.from_numpy(np.ascontiguousarray(matrix.T))
 
 
-def _known(way: _Map, low: Tensor, high: Tensor, humps: Tensor) -> Tensor:
-    """Return the highest integrand that the density's peaks indicate in each box, (probe, box, rows).
+def _integrands_near_peaks(mapping: _Map, low: Tensor, high: Tensor, peak_coordinates: Tensor) -> Tensor:
+    """Return the highest integrand at points of each box that are close to known peaks, (probe, box, rows).
 
-    The first probe is the box's nearest point to each peak. For two numbers there are two more, which have one number
-    of that point and the middle of the box in the other: a peak that is narrow in one number and broad in the other is
-    a ridge, which also crosses boxes that hold no peak.
+    The first probe is the point of the box that is nearest to a peak. For densities of two numbers there are two more
+    probes: one coordinate is that of the nearest point, the other is the middle of the box. They detect a ridge, a peak
+    that is narrow in one number and broad in the other, which also crosses boxes that hold no peak.
     """
     numbers = low.shape[-1]
-    near = humps.unsqueeze(1).clamp(low, high)  # (peak, box, rows, number)
+    near = peak_coordinates.unsqueeze(1).clamp(low, high)  # (peak, box, rows, number)
     middle = ((low + high) / 2).expand_as(near)
     probes = [near]
     for number in range(numbers if numbers > 1 else 0):
-        here = torch.arange(numbers) == number
-        probes.append(torch.where(here, near, middle))
-    found = []
+        is_number = torch.arange(numbers) == number
+        probes.append(torch.where(is_number, near, middle))
+    highest = []
     for probe in probes:
-        value, volume = way.to(probe.flatten(0, 1))
-        found.append((way.log_prob(value).exp() * volume).reshape(near.shape[:-1]).nan_to_num().amax(0))
-    return torch.stack(found)
+        value, volume = mapping.values_and_volumes(probe.flatten(0, 1))
+        highest.append((mapping.log_prob(value).exp() * volume).reshape(near.shape[:-1]).nan_to_num().amax(0))
+    return torch.stack(highest)
 
 
-def _gathered(way: _Map, low: Tensor, high: Tensor, mass: Tensor) -> Boxes:
-    value, log_prob, weight = _nodes(way, low, high, RULES[low.shape[-1]][0])
+def _make_boxes(mapping: _Map, low: Tensor, high: Tensor, mass: Tensor) -> Boxes:
+    value, log_prob, weight = _nodes(mapping, low, high, RULES[low.shape[-1]][0])
     border = mass[:0]
     if low.shape[-1] == 1:
-        order = (low + high)[..., 0].argsort(0)  # empty boxes come before those that begin at the same place
+        order = (low + high)[..., 0].argsort(
+            0
+        )  # empty boxes come before those that begin at the same coordinate
         mass = mass.gather(0, order)
         ends = torch.cat([low[..., 0].gather(0, order), high[..., 0].amax(0, keepdim=True)])
-        border = way.to(ends.unsqueeze(-1))[0][..., 0]
-    return Boxes(value, log_prob.flatten(0, 1), weight.flatten(0, 1), border, mass, way, low, high)
+        border = mapping.values_and_volumes(ends.unsqueeze(-1))[0][..., 0]
+    return Boxes(value, log_prob.flatten(0, 1), weight.flatten(0, 1), border, mass, mapping, low, high)

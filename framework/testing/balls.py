@@ -1,4 +1,4 @@
-"""Density for checks of metrics that read images: its images show a ball."""
+"""Density whose images show a ball, for checks of metrics that read predicted images."""
 
 from collections.abc import Collection
 from typing import ClassVar
@@ -15,12 +15,16 @@ CHANNELS = frozenset({"color", "mask", "depth"})
 
 
 def ball(place: Tensor, size: tuple[int, int], channels: Collection[str] = CHANNELS) -> dict[str, Tensor]:
-    """Return images of a ball whose position shows the place: an eighth of a side for each unit.
+    """Return images of a ball that moves with `place`: by an eighth of the image's shorter side for each unit.
 
     Args:
-        place: Place, (batch, number); the first number moves the ball to the right, the last one downwards.
+        place: Location of a density, (batch, number). The first number moves the ball to the right, the last one
+            downwards.
         size: Height and width of the images, pixels.
-        channels: Channels to draw.
+        channels: Names of the channels to draw.
+
+    Returns:
+        Channel → images, (batch, height, width) or, for colour, (batch, height, width, 3).
     """
     height, width = size
     row, column = ((torch.arange(side, device=place.device) + 0.5) / side for side in size)
@@ -33,23 +37,23 @@ def ball(place: Tensor, size: tuple[int, int], channels: Collection[str] = CHANN
     shade = torch.stack(
         [0.2 + 8 * bulge, 0.5 + across[:, None, :].expand_as(bulge), torch.full_like(bulge, 0.3)], -1
     )
-    drawn = {
+    channel_images = {
         "color": torch.where(mask[..., None], shade, 0.0).clamp(0, 1),
         "mask": mask,
         "depth": torch.where(mask, 3 - bulge.clamp(min=0).sqrt(), torch.inf),
     }
-    return {channel: drawn[channel] for channel in sorted(channels)}
+    return {channel: channel_images[channel] for channel in sorted(channels)}
 
 
 class Ball(Mixture):
-    """Density that equals another to the last bit and draws a ball.
+    """Density that equals a given one to the last bit, and whose images show a ball.
 
     Args:
         density: Density of batch_shape (batch,).
-        place, size: Place and size of the ball's images, see `ball`.
+        place, size: Location of the ball and size of the images, as in `ball`.
 
     Attributes:
-        asked: Channels of each drawing, in order.
+        requested_channels: Channels of each call of `images`, in order.
     """
 
     arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
@@ -57,12 +61,12 @@ class Ball(Mixture):
     def __init__(self, density: Distribution, place: Tensor, size: tuple[int, int]) -> None:
         self.place = place
         self.size = size
-        self.asked: list[frozenset[str]] = []
+        self.requested_channels: list[frozenset[str]] = []
         shape = (*density.batch_shape, 1)
         super().__init__(place.new_zeros(shape), Reshaped(density, shape))
 
 
 @images.register
 def _(density: Ball, channels: Collection[str]) -> dict[str, Tensor]:
-    density.asked.append(frozenset(channels))
+    density.requested_channels.append(frozenset(channels))
     return ball(density.place, density.size, channels)

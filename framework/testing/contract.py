@@ -1,4 +1,4 @@
-"""Contract tests of any installed plugin, given by name: every check of every row yields one finding."""
+"""Contract tests of any installed plugin by its name: every check of every row yields one finding."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -12,7 +12,7 @@ from framework.errors import ConfigError, UserError
 from framework.target import Target
 from framework.testing.finding import Finding
 from framework.testing.rows import (
-    SAID_BY_ROWS,
+    NEEDS_ROWS,
     DataRow,
     EncoderRow,
     HeadRow,
@@ -30,6 +30,7 @@ TARGETS = (
     Target("real", ("x", "y")),
     Target("class", ("first", "second", "third")),
 )
+"""Targets that a plugin without rows is tried with."""
 ROW_OF = {
     "data": DataRow,
     "density_head": HeadRow,
@@ -39,17 +40,18 @@ ROW_OF = {
     "objective": ObjectiveRow,
     "renderer": RendererRow,
 }
+"""Registry → class of the rows of its plugins."""
 SHAPES = ((3, 64, 64), (1, 96, 80), (16,))
-"""Input shapes that an encoder without rows is tried with; it may refuse some of them with a ConfigError."""
+"""Input shapes that an encoder without rows is tried with; an encoder may refuse some of them with a ConfigError."""
 
 
 @dataclass(frozen=True)
 class Contract:
-    """Rows of one plugin and the checks of its group.
+    """Contract rows of one plugin, with the checks of its registry.
 
     Attributes:
-        group, name: Group and name of the plugin.
-        rows: Parametrisations of the plugin to check.
+        group, name: Registry and name of the plugin.
+        rows: Rows with which the plugin is checked.
     """
 
     group: str
@@ -57,22 +59,23 @@ class Contract:
     rows: tuple[Row, ...]
 
     def findings(self, row: Row) -> Iterator[Finding]:
-        """Yield one finding for each property of a row."""
-        yield from _examiner(self.group)(self.name, row)
+        """Yield the finding of each check of the plugin with the parameters of `row`."""
+        yield from _examine_function(self.group)(self.name, row)
 
 
 def contract(group: str, name: str, config: Mapping[str, Any] | None = None) -> Contract:
-    """Return the contract of the plugin `name`, with one more row for `config` where that is not checked already.
+    """Return the contract of the plugin `name`, with an additional row for `config` if no row has that configuration.
 
-    The row is added unless `config` equals the configuration of a shipped row or the defaults. Where the plugin ships
-    rows, the new row is a copy of a shipped one with the parameters of `config`: of the row whose parts have the same
-    names, else of the first row whose target the configured plugin accepts. The copy keeps the target and the
-    properties left out, but not the reference cases.
+    No row is added if `config` equals the configuration of a shipped row or the defaults. If the plugin ships rows, the
+    additional row is a copy of a shipped row with the parameters of `config`. The shipped row is one whose parts have
+    the same names, else the first whose target the configured plugin accepts. The copy keeps the target and the
+    properties that are left out, but not the reference cases.
 
     Raises:
-        ConfigError: The plugin does not exist, its group has no contract, the config is out of range, or no row fits.
+        ConfigError: The plugin does not exist, its registry has no contract, a parameter is invalid, or the configured
+            plugin accepts the target of no row.
     """
-    _examiner(group)
+    _examine_function(group)
     shipped = _shipped(group, name)
     if config is None:
         return Contract(group, name, shipped or _defaults(group, name, {}, "defaults"))
@@ -84,10 +87,12 @@ def contract(group: str, name: str, config: Mapping[str, Any] | None = None) -> 
     if chosen in [resolve(group, {"name": name, **row}) for row in known]:
         return Contract(group, name, shipped)
     if isinstance(shipped[0], DataRow):
-        from framework.testing.data_folders import configured
+        from framework.testing.data_folders import configured_row
 
-        usual = resolve(group, {"name": name})
-        further = configured(shipped[0], {key: plain[key] for key in plain if plain[key] != usual[key]})
+        defaults = resolve(group, {"name": name})
+        further = configured_row(
+            shipped[0], {key: plain[key] for key in plain if plain[key] != defaults[key]}
+        )
         return Contract(group, name, (further, *shipped))
     further = replace(_nearest(group, chosen, shipped), name="as configured", config=plain)
     if isinstance(further, HeadRow):
@@ -96,11 +101,11 @@ def contract(group: str, name: str, config: Mapping[str, Any] | None = None) -> 
 
 
 def _nearest(group: str, chosen: Mapping[str, Any], shipped: tuple[Row, ...]) -> Row:
-    """Return the row whose parts have the same names as those of `chosen`, else the first whose target is accepted."""
+    """Return a row whose parts have the names of those in `chosen`, else the first whose target `chosen` accepts."""
 
     def same_parts(row: Row) -> bool:
-        theirs = resolve(group, {"name": chosen["name"], **row.config})
-        return [part_name(theirs[key]) for key in chosen] == [part_name(value) for value in chosen.values()]
+        resolved = resolve(group, {"name": chosen["name"], **row.config})
+        return [part_name(resolved[key]) for key in chosen] == [part_name(value) for value in chosen.values()]
 
     def part_name(value: Any) -> Any:
         return value.get("name") if isinstance(value, Mapping) else None
@@ -109,7 +114,7 @@ def _nearest(group: str, chosen: Mapping[str, Any], shipped: tuple[Row, ...]) ->
     for row in sorted(shipped, key=same_parts, reverse=True):
         try:
             if target := getattr(row, "target", None):
-                _tried(group, chosen, target)
+                _try_target(group, chosen, target)
             return row
         except ConfigError as error:
             refused.append(error)
@@ -117,19 +122,18 @@ def _nearest(group: str, chosen: Mapping[str, Any], shipped: tuple[Row, ...]) ->
 
 
 def _shipped(group: str, name: str) -> tuple[Row, ...]:
-    """Return the rows of the `rows.py` beside the plugin's class, else those of a `rows.py` in a folder above it.
+    """Return the rows from the `rows.py` beside the module of the plugin's class, or from a folder above it.
 
-    A family of plugins keeps its rows in its folder, `plugins/<group>/<family>`. The search goes up to the folder of
-    the registry and stops there. In a third-party package, which may have no folder of that name, the search goes up to
-    the top.
+    A family of plugins keeps its rows in its folder, `plugins/<group>/<family>`. The search ends at the folder that is
+    named like the registry, or at the top of a third-party package without such a folder.
     """
     package = load(group, name).__module__.rpartition(".")[0]
     while package:
         if find_spec(f"{package}.rows") is not None:
             rows = import_module(f"{package}.rows").ROWS.get(name, ())
-            found = tuple(row for row in rows if isinstance(row, ROW_OF[group]))
-            if found:
-                return found
+            matching = tuple(row for row in rows if isinstance(row, ROW_OF[group]))
+            if matching:
+                return matching
         package = package.rpartition(".")[0]
         if package.rpartition(".")[2] == group:
             break
@@ -137,35 +141,40 @@ def _shipped(group: str, name: str) -> tuple[Row, ...]:
 
 
 def _defaults(group: str, name: str, config: Mapping[str, Any], label: str) -> tuple[Row, ...]:
-    """Return a row with `config` for every target or input shape that the plugin accepts."""
+    """Return a row with `config` for each of TARGETS or SHAPES that the plugin accepts."""
     resolved = resolve(group, {"name": name, **config})
     if group == "data":
-        return (DataRow(label, config, leave_out=SAID_BY_ROWS),)
+        return (DataRow(label, config, leave_out=NEEDS_ROWS),)
     if group == "renderer":
         return (RendererRow(label, config),)
-    found: list[Row] = []
+    accepted: list[Row] = []
     refused: list[str] = []
     for option in SHAPES if group == "encoder" else TARGETS:
         try:
             if isinstance(option, Target):
-                _tried(group, resolved, option)
+                _try_target(group, resolved, option)
                 row = ROW_OF[group]
-                found.append(row(f"{label}, {len(option.names)} of kind {option.kind}", option, config))
+                accepted.append(row(f"{label}, {len(option.names)} of kind {option.kind}", option, config))
             else:
                 build(group, resolved, input_shape=option)
-                found.append(EncoderRow(f"{label}, {' × '.join(map(str, option))}", option, config))
+                accepted.append(EncoderRow(f"{label}, {' × '.join(map(str, option))}", option, config))
         except ConfigError as error:
             refused.append(str(error))
-    if not found:
+    if not accepted:
         raise ConfigError(
-            f"{group} {name!r} accepts none of the {'shapes' if group == 'encoder' else 'targets'} tried: "
-            f"{' '.join(refused)} Give it a rows.py (framework.testing.rows)."
+            f"The {group} {name!r} cannot be checked without a rows.py, because it accepts none of the "
+            f"{'input shapes' if group == 'encoder' else 'targets'} that plugins without rows are tried with: "
+            f"{' '.join(refused)} Write a rows.py for the plugin, as framework.testing.rows describes."
         )
-    return tuple(found)
+    return tuple(accepted)
 
 
-def _tried(group: str, resolved: Mapping[str, Any], target: Target) -> None:
-    """Build the plugin for a target, which may raise a ConfigError; a wrapper is also calibrated on such densities."""
+def _try_target(group: str, resolved: Mapping[str, Any], target: Target) -> None:
+    """Build the plugin for a target; a wrapper is also calibrated on a model of that target.
+
+    Raises:
+        ConfigError: The plugin does not accept the target.
+    """
     if group == "uncertainty":
         import torch
 
@@ -174,7 +183,7 @@ def _tried(group: str, resolved: Mapping[str, Any], target: Target) -> None:
 
         wrapper = build(group, resolved, model=lambda: Plain(target), target=target)
         batch = {"input": inputs(8), "target": values(target, (8,)), "index": torch.arange(8)}
-        try:  # some wrappers learn only from the densities that they cannot work, such as a power without a normaliser
+        try:  # some wrappers refuse a density only when they get it, such as a power without a known normaliser
             wrapper.eval().calibrate([batch])
             wrapper(batch["input"])
         except UserError as error:
@@ -185,9 +194,11 @@ def _tried(group: str, resolved: Mapping[str, Any], target: Target) -> None:
         build(group, resolved, target=target)
 
 
-def _examiner(group: str) -> Callable[[str, Any], Iterator[Finding]]:
+def _examine_function(group: str) -> Callable[[str, Any], Iterator[Finding]]:
     if group not in CONTRACTS:
-        raise ConfigError(f"No contract is written for the group {group}, only for {', '.join(CONTRACTS)}.")
+        raise ConfigError(
+            f"The registry {group!r} has no contract; those with one are {', '.join(CONTRACTS)}."
+        )
     return CONTRACTS[group]
 
 
@@ -199,14 +210,14 @@ def _examine_data(name: str, row: DataRow) -> Iterator[Finding]:
 
 def _examine_head(name: str, row: HeadRow) -> Iterator[Finding]:
     from framework.testing.densities import examine_densities
-    from framework.testing.heads import HeadSubject, examine_head, ready
+    from framework.testing.heads import HeadSubject, examine_head, fit_if_needed
 
     config = resolve("density_head", {"name": name, **row.config})
 
-    def of(target: Target) -> Any:
-        return ready(build("density_head", config, target=target), target)
+    def build_for(target: Target) -> Any:
+        return fit_if_needed(build("density_head", config, target=target), target)
 
-    subject = HeadSubject(row, lambda: of(row.target), of=of)
+    subject = HeadSubject(row, lambda: build_for(row.target), build_for=build_for)
     yield from examine_head(subject)
     yield from examine_densities(subject)
 
@@ -231,25 +242,27 @@ def _examine_wrapper(name: str, row: WrapperRow) -> Iterator[Finding]:
     from framework.model import Predictor
     from framework.testing.wrappers import Plain, examine_wrapper
 
-    def around(config: Mapping[str, Any], model: Callable[[], Predictor], target: Target) -> Any:
+    def wrap(config: Mapping[str, Any], model: Callable[[], Predictor], target: Target) -> Any:
         resolved = resolve("uncertainty", {"name": name, **config})
         return build("uncertainty", resolved, model=model, target=target)
 
-    same = row.identity
-    identity = None if same is None else lambda model: around({**row.config, **same}, model, row.target)
-    yield from examine_wrapper(
-        row, lambda target: around(row.config, lambda: Plain(target), target), identity
+    same_as_model = row.identity
+    identity = (
+        None
+        if same_as_model is None
+        else lambda model: wrap({**row.config, **same_as_model}, model, row.target)
     )
+    yield from examine_wrapper(row, lambda target: wrap(row.config, lambda: Plain(target), target), identity)
 
 
 def _examine_objective(name: str, row: ObjectiveRow) -> Iterator[Finding]:
     from framework.testing.objectives import examine_objective
 
-    def weighted(factor: float) -> Any:
+    def build_weighted(factor: float) -> Any:
         chosen = resolve("objective", {"name": name, **row.config})
         return build("objective", resolve("objective", {**chosen, "weight": factor * chosen["weight"]}))
 
-    yield from examine_objective(row, weighted)
+    yield from examine_objective(row, build_weighted)
 
 
 def _examine_renderer(name: str, row: RendererRow) -> Iterator[Finding]:
@@ -268,4 +281,4 @@ CONTRACTS: dict[str, Callable[[str, Any], Iterator[Finding]]] = {
     "objective": _examine_objective,
     "renderer": _examine_renderer,
 }
-"""Check functions by group: each takes the plugin's name and a row, and yields findings."""
+"""Registry → function that checks a plugin, given its name and a row, and yields the findings."""

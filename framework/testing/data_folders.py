@@ -1,4 +1,4 @@
-"""Folders in which a data set is prepared for a check, with a cache of their own, and damage to its files."""
+"""Folders in which checks prepare a data set, each with its own cache, and damage to the files of a data set."""
 
 import inspect
 import os
@@ -15,16 +15,16 @@ import numpy as np
 
 from framework.data import Data
 from framework.storage.generated import MARK
-from framework.testing.data_samples import Contents, contents, parts
+from framework.testing.data_samples import Contents, hash_split, parts
 from framework.testing.finding import SEED
-from framework.testing.rows import SAID_BY_ROWS, Damage, DataRow
+from framework.testing.rows import NEEDS_ROWS, Damage, DataRow
 
 Build = Callable[[Mapping[str, Any]], Data]
 
 
 @contextmanager
 def cache_in(folder: Path) -> Iterator[None]:
-    """Use a folder instead of the user's cache for data that are generated within the block."""
+    """Generate data in `folder`, instead of in the user's cache, within the block."""
     before = os.environ.get("FRAMEWORK_CACHE")
     os.environ["FRAMEWORK_CACHE"] = str(folder)
     try:
@@ -36,7 +36,7 @@ def cache_in(folder: Path) -> Iterator[None]:
 
 
 class _Entries:
-    """Result of `os.scandir` in reverse order of names."""
+    """Result of `os.scandir`, sorted by name in reverse order."""
 
     def __init__(self, entries: Any) -> None:
         with entries:
@@ -59,8 +59,8 @@ class _Entries:
 
 
 @contextmanager
-def listed_backwards() -> Iterator[None]:
-    """List the files of folders in reverse order within the block, as another machine may do."""
+def list_folders_backwards() -> Iterator[None]:
+    """List the files of folders in reverse order within the block, since the order depends on the file system."""
     listdir, scandir = os.listdir, os.scandir
     os.listdir = lambda *path: sorted(listdir(*path), reverse=True)  # type: ignore[assignment]
     os.scandir = lambda *path: _Entries(scandir(*path))  # type: ignore[assignment]
@@ -74,7 +74,7 @@ class Place:
     """Folder for one preparation of a data set.
 
     Attributes:
-        files: Folder of the files that the row's `write` made for the data set to read; empty for generated data.
+        files: Folder of the files that the row's `write` wrote; empty for generated data.
         cache: Folder for generated data.
         source: Parameters that locate the written files.
     """
@@ -86,12 +86,12 @@ class Place:
 
 
 class Workbench:
-    """Builder of the data set of a row, which prepares it as often as checks need it.
+    """Builder of a row's data set, which prepares it as often as the checks need.
 
     Args:
-        row: Row of the data set.
-        build: Function from parameters to the data set, not prepared.
-        scratch: Empty folder.
+        row: Contract row of the data set.
+        build: Function from parameters to the data set, which it does not prepare.
+        scratch: Empty folder for the files of all preparations.
     """
 
     def __init__(self, row: DataRow, build: Build, scratch: Path) -> None:
@@ -99,23 +99,23 @@ class Workbench:
         self.build = build
         self.scratch = scratch
 
-    def folder(self) -> Path:
+    def make_folder(self) -> Path:
         """Return a new empty folder."""
         path = self.scratch / str(len(list(self.scratch.iterdir())))
         path.mkdir()
         return path
 
-    def place(self) -> Place:
+    def make_place(self) -> Place:
         """Return a new place with the row's files."""
-        return Place(self.row, self.folder())
+        return Place(self.row, self.make_folder())
 
-    def built(self, place: Place, **config: Any) -> Data:
-        """Return the data set of a place, not prepared; `config` overrides the row's."""
+    def build_at(self, place: Place, **config: Any) -> Data:
+        """Build the data set at a place without preparing it; `config` overrides the row's parameters."""
         return self.build({**place.source, **self.row.config, **config})
 
-    def prepared(self, place: Place, **config: Any) -> Data:
-        """Return a prepared data set of a place; `config` overrides the row's."""
-        data = self.built(place, **config)
+    def prepare_at(self, place: Place, **config: Any) -> Data:
+        """Build and prepare the data set at a place; `config` overrides the row's parameters."""
+        data = self.build_at(place, **config)
         with cache_in(place.cache):
             data.prepare()
         return data
@@ -123,50 +123,50 @@ class Workbench:
     @cached_property
     def first(self) -> Place:
         """Place of the first preparation."""
-        return self.place()
+        return self.make_place()
 
     @cached_property
     def data(self) -> Data:
-        """Data set that is prepared once, for checks that change nothing."""
-        return self.prepared(self.first)
+        """Data set of the first preparation, for checks that do not change it."""
+        return self.prepare_at(self.first)
 
     @cached_property
     def again(self) -> Data:
-        """Data set that is prepared a second time in the same place, so that generated data are read back."""
-        return self.prepared(self.first)
+        """Data set of a second preparation at the same place, where generated data are read back from the cache."""
+        return self.prepare_at(self.first)
 
     @cached_property
     def contents(self) -> dict[str, Contents]:
-        """Contents of each split, by name."""
-        return {name: contents(split) for name, split in parts(self.data).items()}
+        """Name of each split → hashes of its samples."""
+        return {name: hash_split(split) for name, split in parts(self.data).items()}
 
     @cached_property
-    def says_where(self) -> list[str]:
-        """Parameters that locate the data: those that `write` returned, else `root` where there is one."""
+    def location_keys(self) -> list[str]:
+        """Names of the parameters that locate the data: those that `write` returned, else `root` if there is one."""
         if self.row.write is None:
             return ["root"] if "root" in inspect.signature(type(self.data)).parameters else []
-        below = self.first.files
-        return [key for key, value in self.first.source.items() if Path(str(value)).is_relative_to(below)]
+        folder = self.first.files
+        return [key for key, value in self.first.source.items() if Path(str(value)).is_relative_to(folder)]
 
     def default(self, key: str) -> Any:
-        """Return the constructor's default value of a parameter."""
+        """Return the default value of a constructor parameter."""
         return inspect.signature(type(self.data)).parameters[key].default
 
     @cached_property
     def generated(self) -> Path | None:
-        """Folder that the first preparation generated in the official layout; None where there is none."""
-        if self.row.write or self.row.config.get("root") or not self.says_where:
+        """Folder of generated files in the official layout, from the first preparation; None if there is none."""
+        if self.row.write or self.row.config.get("root") or not self.location_keys:
             return None
         return next((mark.parent for mark in sorted(self.first.cache.rglob(MARK))), None)
 
-    def spoilt(self, spoil: Callable[[Path], None]) -> tuple[Place, dict[str, Any]]:
-        """Return a copy of the data set's files, changed by `spoil`, and the parameters with which it is read."""
-        place = self.place()
+    def copy_files(self, change: Callable[[Path], None]) -> tuple[Place, dict[str, Any]]:
+        """Copy the data set's files and apply `change` to the copy; return its place and the parameters to read it."""
+        place = self.make_place()
         if self.generated is None:
-            spoil(place.files)
+            change(place.files)
             return place, {}
         shutil.copytree(self.generated, place.files, dirs_exist_ok=True)
-        spoil(place.files)
+        change(place.files)
         return place, {"root": str(place.files)}
 
 
@@ -185,26 +185,28 @@ def damage(file: Path, kind: Damage) -> None:
 
 
 def first_match(folder: Path, pattern: str) -> Path:
-    """Return the first file that matches a pattern.
+    """Return the first file, in order of names, that matches a glob pattern.
 
     Raises:
-        ValueError: No file matches the row's pattern.
+        ValueError: No file matches the pattern.
     """
-    found = sorted(path for path in folder.glob(pattern) if path.is_file())
-    if not found:
-        raise ValueError(f"the row's pattern {pattern!r} fits no file of its data set.")
-    return found[0]
+    matches = sorted(path for path in folder.glob(pattern) if path.is_file())
+    if not matches:
+        raise ValueError(
+            f"The pattern {pattern!r} of `fragile` fits no file in {folder}. Correct the pattern in rows.py."
+        )
+    return matches[0]
 
 
-def configured(row: DataRow, own: Mapping[str, Any]) -> DataRow:
-    """Return the row with a user's parameters added to its own.
+def configured_row(row: DataRow, own: Mapping[str, Any]) -> DataRow:
+    """Return a row with a user's parameters added to the parameters of `row`.
 
-    Where these parameters locate the data, nothing else of the row is kept. A user's data are read and never damaged,
-    and the row cannot know their columns or which files are equivalent.
+    If the user's parameters locate the data, only the limits and the properties left out are kept. The files are then
+    the user's own: they are read but not damaged, and the row does not know their columns.
     """
     with TemporaryDirectory() as folder:
-        says_where = {"root", *(row.write(Path(folder)) if row.write else ())}
-    if says_where & set(own):
-        return DataRow("as configured", own, leave_out={**SAID_BY_ROWS, **row.leave_out}, limits=row.limits)
+        location_keys = {"root", *(row.write(Path(folder)) if row.write else ())}
+    if location_keys & set(own):
+        return DataRow("as configured", own, leave_out={**NEEDS_ROWS, **row.leave_out}, limits=row.limits)
     changes = {key: value for key, value in row.changes.items() if key not in own}
     return replace(row, name="as configured", config={**row.config, **own}, changes=changes)

@@ -1,4 +1,4 @@
-"""Samples of a split that checks look at, and comparisons of samples to the last bit."""
+"""Choice of the samples of a split to check, and comparisons of samples to the last bit."""
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,41 +13,41 @@ from framework.data import Batch, Data
 from framework.testing.finding import SEED, Worst
 
 FEW = 400
-"""Number of samples of a split that are always checked, or all where there are fewer."""
+"""Smallest number of samples of a split that are checked; a shorter split is checked entirely."""
 MOST = 5000
-"""Largest number of samples of a split that are checked, drawn at random where there are more."""
+"""Largest number of samples of a split that are checked; a longer split is sampled at random."""
 BYTES = 2**27
-"""Limit on the memory of the checked samples of a split beyond FEW, bytes."""
+"""Limit on the memory of the checked samples of a split, bytes, where more than FEW are checked."""
 SECONDS = 1.5
-"""Limit on the processor time to fetch the checked samples of a split beyond FEW, seconds."""
+"""Limit on the processor time to fetch the checked samples of a split, seconds, where more than FEW are checked."""
 
 
-def few(length: int, most: int) -> list[int]:
-    """Return all numbers below `length`, or `most` of them, evenly spaced, with the first and the last."""
+def spaced_indices(length: int, most: int) -> list[int]:
+    """Return all indices below `length`, or `most` of them, evenly spaced, with the first and the last."""
     if length <= most:
         return list(range(length))
     return np.linspace(0, length - 1, most).round().astype(int).tolist()
 
 
-def numbers(split: Any) -> list[int]:
-    """Return the numbers of all samples, or of as many as MOST, BYTES and SECONDS allow.
+def indices_to_check(split: Any) -> list[int]:
+    """Return the indices of all samples, or of as many as MOST, BYTES and SECONDS allow.
 
-    The split is divided into equally long blocks, and one sample is drawn at random from each, so that periodic faults
-    show. The first and the last sample are included.
+    A long split is divided into equally long blocks, and one sample of each block is drawn at random, so that periodic
+    faults are found. The first and the last sample are included.
     """
     length = len(split)
     if length <= FEW:
         return list(range(length))
     start = time.process_time()
-    tried = [split[number] for number in few(length, 8)]
+    tried = [split[number] for number in spaced_indices(length, 8)]
     seconds = (time.process_time() - start) / len(tried)
     size = max(sum(value.numel() * value.element_size() for value in sample.values()) for sample in tried)
     most = max(FEW, min(MOST, BYTES // max(size, 1), int(SECONDS / max(seconds, 1e-6))))
     if length <= most:
         return list(range(length))
     edges = np.linspace(0, length, most + 1).astype(int)
-    drawn = np.random.default_rng(SEED).integers(edges[:-1], edges[1:]).tolist()
-    return [0, *drawn[1:-1], length - 1]
+    random_picks = np.random.default_rng(SEED).integers(edges[:-1], edges[1:]).tolist()
+    return [0, *random_picks[1:-1], length - 1]
 
 
 def parts(data: Data) -> dict[str, Any]:
@@ -61,51 +61,51 @@ def total(data: Data) -> int:
 
 
 def samples(split: Any) -> Iterator[tuple[int, Batch]]:
-    """Yield number and sample, as `split[number]` returns it, of at most FEW samples."""
-    for number in few(len(split), FEW):
+    """Yield the index and the sample, as `split[index]` returns it, of at most FEW samples."""
+    for number in spaced_indices(len(split), FEW):
         yield number, split[number]
 
 
-def batches(asked: Sequence[int], sizes: Sequence[int]) -> Iterator[list[int]]:
-    """Yield the numbers in batches of these sizes, which repeat in turn."""
-    start = turn = 0
-    while start < len(asked):
-        size = sizes[turn % len(sizes)]
-        yield list(asked[start : start + size])
-        start, turn = start + size, turn + 1
+def batches(indices: Sequence[int], sizes: Sequence[int]) -> Iterator[list[int]]:
+    """Yield the indices in consecutive batches; after the last of `sizes` the first follows again."""
+    start = count = 0
+    while start < len(indices):
+        size = sizes[count % len(sizes)]
+        yield list(indices[start : start + size])
+        start, count = start + size, count + 1
 
 
-def fits(shape: tuple[int, ...], wanted: tuple[int, ...]) -> bool:
-    """Return whether an input has the data set's shape; a cloud, (points, columns), may have fewer points."""
-    if len(wanted) == 2 and len(shape) == 2:
-        return 0 < shape[0] <= wanted[0] and shape[1] == wanted[1]
-    return shape == wanted
+def fits(shape: tuple[int, ...], expected: tuple[int, ...]) -> bool:
+    """Return whether an input has the expected shape; a cloud, (points, columns), may have fewer points."""
+    if len(expected) == 2 and len(shape) == 2:
+        return 0 < shape[0] <= expected[0] and shape[1] == expected[1]
+    return shape == expected
 
 
 def trimmed(inputs: Tensor) -> Tensor:
-    """Return a cloud without its padding, the rows of NaN at its end; return any other input as it is."""
+    """Return a cloud without its padding, the rows of NaN at its end; return any other input unchanged."""
     if inputs.dim() != 2 or not inputs.is_floating_point():
         return inputs
-    there = (~inputs.isnan().all(-1)).nonzero()
-    return inputs[: int(there[-1]) + 1] if len(there) else inputs[:0]
+    valid_rows = (~inputs.isnan().all(-1)).nonzero()
+    return inputs[: int(valid_rows[-1]) + 1] if len(valid_rows) else inputs[:0]
 
 
-Marks = Mapping[str, int]
-"""Field of a sample → hash of its dtype, shape and content, to the last bit."""
+Hashes = Mapping[str, int]
+"""Field of a sample → hash of its dtype, shape and content."""
 
 
-def marks(batch: Batch) -> list[Marks]:
-    """Return the marks of every sample of a batch; clouds are taken without their padding."""
+def hash_samples(batch: Batch) -> list[Hashes]:
+    """Return the hashes of every sample of a batch; the padding of clouds is ignored."""
     rows: dict[str, list[int]] = {}
     for key, values in batch.items():
         if key == "input" and values.dim() == 3 and values.is_floating_point() and values.isnan().any():
-            rows[key] = [_mark(trimmed(cloud)[None])[0] for cloud in values]
+            rows[key] = [_hash_rows(trimmed(cloud)[None])[0] for cloud in values]
         else:
-            rows[key] = _mark(values)
+            rows[key] = _hash_rows(values)
     return [dict(zip(rows, row, strict=True)) for row in zip(*rows.values(), strict=True)]
 
 
-def _mark(values: Tensor) -> list[int]:
+def _hash_rows(values: Tensor) -> list[int]:
     kind = (str(values.dtype), tuple(values.shape[1:]))
     values = values.detach()
     if values.is_floating_point():
@@ -116,52 +116,57 @@ def _mark(values: Tensor) -> list[int]:
 
 @dataclass(frozen=True)
 class Contents:
-    """Contents of a split at the first look.
+    """Hashes of the checked samples of a split.
 
     Attributes:
-        length: Number of samples.
-        marks: Number of a checked sample → its marks.
+        length: Number of samples of the split.
+        hashes: Index of a checked sample → its hashes.
     """
 
     length: int
-    marks: Mapping[int, Marks]
+    hashes: Mapping[int, Hashes]
 
 
-def contents(split: Any, asked: Sequence[int] | None = None) -> Contents:
-    """Return the marks of the samples `asked`, or of those to check if None, as `split[number]` returns them."""
-    asked = numbers(split) if asked is None else asked
-    one_by_one = ((number, split[number]) for number in asked)
-    found = {
-        number: marks({key: value[None] for key, value in sample.items()})[0] for number, sample in one_by_one
+def hash_split(split: Any, indices: Sequence[int] | None = None) -> Contents:
+    """Return the hashes of samples as `split[index]` returns them, for `indices` or, if None, for those to check."""
+    indices = indices_to_check(split) if indices is None else indices
+    one_by_one = ((number, split[number]) for number in indices)
+    hashes = {
+        number: hash_samples({key: value[None] for key, value in sample.items()})[0]
+        for number, sample in one_by_one
     }
-    return Contents(len(split), found)
+    return Contents(len(split), hashes)
 
 
-def equal_marks(found: Marks, wanted: Marks, what: str, worst: Worst, *, only: Sequence[str] = ()) -> None:
-    """Check that two samples have the same content in all fields, or in those of `only`; quick where they are equal."""
-    if not only and found == wanted:
+def check_equal_hashes(
+    actual: Hashes, expected: Hashes, label: str, worst: Worst, *, only: Sequence[str] = ()
+) -> None:
+    """Check that two samples have the same content in all fields, or in those of `only`."""
+    if not only and actual == expected:
         return
     if not only:
-        worst.same(f"{what}: fields", sorted(found), sorted(wanted))
-    for key in only or sorted(set(found) & set(wanted)):
-        worst.count(found[key] != wanted[key], f"{what}: {key} is another")
+        worst.same(f"{label}: fields", sorted(actual), sorted(expected))
+    for key in only or sorted(set(actual) & set(expected)):
+        worst.count(actual[key] != expected[key], f"{label}: {key} differs")
 
 
-def equal_splits(
-    found: Data, wanted: Mapping[str, Contents], what: str, worst: Worst, *, only: tuple[str, ...] = ()
+def check_equal_splits(
+    actual: Data, expected: Mapping[str, Contents], label: str, worst: Worst, *, only: tuple[str, ...] = ()
 ) -> None:
-    """Check that the samples of every split have the same content in all fields, or in those of `only`."""
-    for name, split in parts(found).items():
-        before = wanted[name]
-        worst.same(f"{what}: length of {name}", len(split), before.length)
-        asked = [number for number in before.marks if number < len(split)]
-        for number, one in contents(split, asked).marks.items():
-            equal_marks(one, before.marks[number], f"{what}: {name} {number}", worst, only=only)
+    """Check that every split has the same samples as `expected`, in all fields or in those of `only`."""
+    for name, split in parts(actual).items():
+        before = expected[name]
+        worst.same(f"{label}: length of {name}", len(split), before.length)
+        indices = [number for number in before.hashes if number < len(split)]
+        for number, hashes in hash_split(split, indices).hashes.items():
+            check_equal_hashes(hashes, before.hashes[number], f"{label}: {name} {number}", worst, only=only)
 
 
-def equal_fields(found: Batch, wanted: Batch, what: str, worst: Worst, *, only: tuple[str, ...] = ()) -> None:
-    """Check that two samples or batches agree to the last bit in all fields, or in those of `only`."""
+def check_equal_fields(
+    actual: Batch, expected: Batch, label: str, worst: Worst, *, only: tuple[str, ...] = ()
+) -> None:
+    """Check that two samples or batches are equal to the last bit, in all fields or in those of `only`."""
     if not only:
-        worst.same(f"{what}: fields", sorted(found), sorted(wanted))
-    for key in only or set(found) & set(wanted):
-        worst.same_bits(f"{what}: {key}", found[key], wanted[key])
+        worst.same(f"{label}: fields", sorted(actual), sorted(expected))
+    for key in only or set(actual) & set(expected):
+        worst.same_bits(f"{label}: {key}", actual[key], expected[key])

@@ -1,42 +1,44 @@
-"""Check that targets belong to their inputs, by nearest neighbours, where inputs predict targets at all."""
+"""Check by nearest neighbours that targets belong to their inputs, where inputs predict targets at all."""
 
 import torch
 from torch import Tensor
 
 from framework.data import Data
 from framework.datasets.fields import fetch
-from framework.testing.data_samples import batches, numbers, parts, trimmed
+from framework.testing.data_samples import batches, indices_to_check, parts, trimmed
 from framework.testing.finding import SEED, Worst
 
 LEAST, MOST = 192, 960
-"""Smallest number of samples of a split that is checked, and number of its first samples that are used."""
+"""Number of samples that a split needs to be checked, and largest number of its samples that are used."""
 BLOCK = 48
+"""Number of consecutive samples whose errors are averaged."""
 NEIGHBOURS = 7
+"""Number of neighbours whose targets predict the target of a sample."""
 SIZE = 64
-"""Largest number of values of an input; larger inputs are projected at random to this number."""
+"""Dimension of the space in which neighbours are searched for; larger inputs are projected to it at random."""
 SURE, CHANCE = 0.2, 0.8
-"""Bounds on the error relative to that of random targets.
+"""Bounds on the prediction error, relative to that for random targets.
 
-Inputs predict targets if the error is below the first bound, and do not if it is above the second.
+Inputs predict targets if the error is below the first bound. They do not if it is above the second.
 """
 
 
-def belong(data: Data, worst: Worst) -> None:
-    """Check that no block of a split has inputs that do not predict its targets, where those of most blocks do.
+def check_targets_belong(data: Data, worst: Worst) -> None:
+    """Check that inputs predict their own targets in every block of a split, if they do in most blocks.
 
-    A target is predicted by the median over the nearest other samples. Where inputs do not predict their own targets,
-    they must not predict those of the sample before or after either.
+    A target is predicted by the median target of the samples with the nearest inputs. If inputs do not predict their
+    own targets, they must not predict those of the previous or the next sample either.
     """
     for name, split in parts(data).items():
-        asked = numbers(split)[:MOST]
-        worst.count(False, f"{name} has {len(asked)} samples")
-        if len(asked) < LEAST:
+        indices = indices_to_check(split)[:MOST]
+        worst.count(False, f"{name} has {len(indices)} samples to check")
+        if len(indices) < LEAST:
             continue
         inputs, targets = [], []
-        for part in batches(asked, [64]):
+        for part in batches(indices, [64]):
             batch = fetch(split, part)
-            inputs.append(torch.stack([_numbers(one) for one in batch["input"]]))
-            targets.append(_targets(data, batch["target"]))
+            inputs.append(torch.stack([_input_features(sample_input) for sample_input in batch["input"]]))
+            targets.append(_target_features(data, batch["target"]))
         x, y = torch.cat(inputs), torch.cat(targets)
         if x.shape[1] > SIZE:
             generator = torch.Generator().manual_seed(SEED)
@@ -50,28 +52,28 @@ def belong(data: Data, worst: Worst) -> None:
         blocks = torch.stack([part.mean() for part in share.split(BLOCK)[: len(share) // BLOCK]])
         if blocks.median() < SURE:
             wrong = blocks > CHANCE
-            first = asked[BLOCK * int(wrong.double().argmax())]
+            first = indices[BLOCK * int(wrong.double().argmax())]
             worst.count(
                 wrong,
-                f"{name}: the inputs of {int(wrong.sum())} stretches of {BLOCK} samples, the first from {first} on, "
-                "tell nothing of their targets, where those of most others do",
+                f"{name}: the inputs of {int(wrong.sum())} blocks of {BLOCK} samples, the first from {first} on, do "
+                "not predict their targets, while those of most other blocks do",
             )
         elif share.mean() > CHANCE:
             for step in (1, -1):
                 beside = (_error(y.roll(step, 0), near) / chance).mean().item()
                 worst.count(
                     beside < SURE,
-                    f"{name}: inputs tell the targets of the samples {step:+d} away, not their own",
+                    f"{name}: inputs do not predict their own targets, but those of the samples at index {-step:+d}",
                 )
 
 
 def _error(targets: Tensor, near: Tensor) -> Tensor:
-    """Return the squared error of the median of the neighbours' targets."""
+    """Return the squared error of the median target of each sample's neighbours, (samples,)."""
     return 2 * (targets - targets[near].median(1).values).square().sum(-1)
 
 
-def _numbers(inputs: Tensor) -> Tensor:
-    """Return the values of one input; those of a cloud are its moments, since its points have no order."""
+def _input_features(inputs: Tensor) -> Tensor:
+    """Return the features of one input, (number,): its values, or moments for a cloud, whose points have no order."""
     inputs = inputs.double()
     if inputs.dim() != 2:
         return inputs.reshape(-1)
@@ -80,13 +82,13 @@ def _numbers(inputs: Tensor) -> Tensor:
     return torch.cat([points.mean(0), (centred.T @ centred).reshape(-1) / len(points), centred.abs().amax(0)])
 
 
-def _targets(data: Data, targets: Tensor) -> Tensor:
-    """Return targets as numbers whose differences are meaningful, (samples, number)."""
+def _target_features(data: Data, targets: Tensor) -> Tensor:
+    """Return targets as numbers whose distances are meaningful, (samples, number)."""
     if data.target.kind == "class":
         return torch.nn.functional.one_hot(targets.long(), len(data.target.names)).double()
     flat = targets.double().flatten(1)
     if data.target.kind == "angle":
         return torch.cat([flat.sin(), flat.cos()], 1)
-    # at most three deviations, so that a few far targets do not dominate
+    # at most three standard deviations, so that a few far targets do not dominate
     spread = flat.std(0).clamp(min=1e-12)
     return ((flat - flat.median(0).values) / spread).clamp(-3, 3)

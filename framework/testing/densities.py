@@ -1,4 +1,4 @@
-"""Checks of any density, whatever plugin made it; each check reports its worst case."""
+"""Checks of the densities of density heads and uncertainty wrappers; each check records its largest error."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -14,43 +14,46 @@ from framework.distributions.protocol import arc_probability, cdf, marginal, med
 from framework.errors import UserError
 from framework.testing.adaptive import boxes
 from framework.testing.finding import SEED, Finding, Worst, seed
-from framework.testing.flattened import flattened
-from framework.testing.heads import PATIENCE, HeadSubject
-from framework.testing.quadrature import cells, counted, density_at, side
-from framework.testing.questions import (
-    candidates,
-    estimated,
-    marginals_of_draws,
-    medians_of_draws,
-    mixed,
-    moments_of_draws,
-    moved_places,
-    normal_forms,
-    picks,
-    powers,
-    powers_of,
-    shares_below,
-    slopes,
+from framework.testing.flattened import flatten
+from framework.testing.heads import TIME_LIMIT, HeadSubject
+from framework.testing.protocol_checks import (
+    apply_to_powers,
+    check_estimate,
+    check_marginal_cdfs,
+    check_marginals,
+    check_medians,
+    check_mode_candidates,
+    check_moments,
+    check_normals,
+    check_pick,
+    check_powers,
+    check_quadratic_bound,
+    check_recentre,
+    mix_pairs,
 )
+from framework.testing.quadrature import cells, count_samples, density_at, side
 
 DRAWS = 20_000
+"""Number of draws that are compared with a density."""
 SCALES = (1e-2, 0.1, 1.0, 10.0, 1e2, 1e3)
-"""Standard deviations of the distribution parameters at which densities are checked, beside the row's own scale."""
+"""Standard deviations of the random raw parameters at which densities are checked, in addition to the row's scale."""
 CELLS = 24
 """Number of cells of about equal mass in which draws of one number are counted."""
 MEDIAN_DRAWS = 2000
+"""Number of draws from which a median is check_estimate, where it has no closed form."""
 Check = Callable[[Distribution, Worst], None]
 
 
 class Property(NamedTuple):
-    """Check of densities, its limit, and the distribution parameters at which it runs.
+    """Check of densities, its limit, and the raw parameters at which it runs.
 
     Attributes:
         name: Name of the property.
         limit: Largest error that passes.
         check: Function that runs the check.
-        batch: "scales": every scale of SCALES and the row's own; "own": the row's own scale, at which a fixed grid
-            resolves the densities; "many": 64 rows each of small, ordinary and large distribution parameters.
+        batch: Choice of the raw parameters. "scales": each scale of SCALES and the row's own. "own": the row's own
+            scale, at which a fixed grid resolves the densities. "many": 64 batch rows each of the scales 0.01, 1 and
+            100.
     """
 
     name: str
@@ -62,45 +65,45 @@ class Property(NamedTuple):
 def examine_densities(subject: HeadSubject) -> Iterator[Finding]:
     """Yield one finding for each property of the row's densities, in float64.
 
-    A density that draws random numbers is checked at the row's own scale only: its log_prob at the same distribution
-    parameters varies between calls by more than the error of any quadrature.
+    A density whose log_prob draws random numbers is checked at the row's own scale only, since its log_prob varies
+    between calls by more than the error of any quadrature.
     """
     draws = subject.draws()
 
     @cache
-    def made(batch: str) -> tuple[Distribution, list[str]]:
-        own, several = subject.row.scale, 1 if _numbers(subject) > 1 else 3
+    def densities(batch: str) -> tuple[Distribution, list[str]]:
+        own, repeats = subject.row.scale, 1 if _numbers(subject) > 1 else 3
         scales = {"own": [own] * 3, "many": [s for s in (1e-2, 1.0, 1e2) for _ in range(64)]}.get(
-            batch, [s for s in (*SCALES, own) for _ in range(several)]
+            batch, [s for s in (*SCALES, own) for _ in range(repeats)]
         )
         raw = subject.raws(len(scales)).double() * torch.tensor(scales, dtype=torch.float64).unsqueeze(-1)
         head = subject.make().double()
         head.requires_grad_(False)
-        names = [f"raw numbers of size {scale:g}, batch row {row}" for row, scale in enumerate(scales)]
-        return flattened(head(raw)), names
+        names = [f"raw parameters of size {scale:g}, batch row {row}" for row, scale in enumerate(scales)]
+        return flatten(head(raw)), names
 
     for name, limit, check, batch in CHECKS:
-        if not subject.wants(name) or not applies(name, subject, draws):
+        if not subject.includes(name) or not applies(name, subject, draws):
             continue
-        # densities of more than two numbers are integrated on a fixed grid, and draws of more than one number
-        # counted on one
+        # densities of more than two numbers are integrated on a fixed grid, which also counts draws of more than
+        # one number
         grid = {"integral": 2, "samples follow log_prob": 1}.get(name, math.inf)
-        hangs = subject.seconds < PATIENCE  # a check took too long, most likely at extreme parameters
-        chosen = "own" if draws or hangs or _numbers(subject) > grid else batch
+        too_slow = subject.seconds < TIME_LIMIT  # an earlier check was, most likely at extreme parameters
+        chosen = "own" if draws or too_slow or _numbers(subject) > grid else batch
         if chosen == "own" and batch == "many":
             continue
 
-        def look(worst: Worst, check: Check = check, chosen: str = chosen) -> None:
+        def run(worst: Worst, check: Check = check, chosen: str = chosen) -> None:
             with torch.no_grad():
-                density, worst.rows = made(chosen)
+                density, worst.rows = densities(chosen)
                 check(density, worst)
 
-        yield subject.examined(name, limit, look)
-    yield from _examine_questions(subject, draws)
+        yield subject.run_check(name, limit, run)
+    yield from _examine_protocol(subject, draws)
 
 
-def _examine_questions(subject: HeadSubject, draws: bool) -> Iterator[Finding]:
-    """Yield findings for the optional functions of the protocol, and for mixtures and tempered densities."""
+def _examine_protocol(subject: HeadSubject, draws: bool) -> Iterator[Finding]:
+    """Yield findings for the optional functions of framework.distributions.protocol, and for mixtures and powers."""
 
     @cache
     def pairs() -> Distribution:
@@ -111,69 +114,72 @@ def _examine_questions(subject: HeadSubject, draws: bool) -> Iterator[Finding]:
 
     @cache
     def rows() -> Distribution:
+        """Return densities of batch_shape (3,)."""
         head = subject.make().double()
         head.requires_grad_(False)
         return head(subject.row.scale * subject.raws(3).double())
 
     @cache
     def mixture() -> Distribution:
-        return mixed(pairs())
+        """Return mixtures of two densities, batch_shape (3,)."""
+        return mix_pairs(pairs())
 
     numbers, kind = _numbers(subject), subject.row.target.kind
-    one, classes = numbers == 1 and kind in ("real", "angle"), kind == "class"
+    is_scalar, classes = numbers == 1 and kind in ("real", "angle"), kind == "class"
     few = kind in ("real", "angle") and 2 <= numbers <= 6
     several = kind == "image" or few
-    asked: list[tuple[str, float, Callable[[], Distribution], Check, bool]] = [
-        ("estimate", 1.0, rows, estimated, True),
-        ("pick", 1.0, pairs, picks, True),
-        ("quadratic_bound", 1.0, rows, slopes, not classes and not draws and kind != "image"),
-        ("recentre", 1.0, rows, moved_places, one and not draws),
-        ("normals", 1.0, rows, normal_forms, kind == "real" and not draws),
-        ("mode candidates and peak widths", 0.0, rows, candidates, not classes and not draws),
-        ("marginal_cdfs", 1.0, rows, shares_below, kind in ("real", "image") and not draws),
+    checks: list[tuple[str, float, Callable[[], Distribution], Check, bool]] = [
+        ("estimate", 1.0, rows, check_estimate, True),
+        ("pick", 1.0, pairs, check_pick, True),
+        ("quadratic_bound", 1.0, rows, check_quadratic_bound, not classes and not draws and kind != "image"),
+        ("recentre", 1.0, rows, check_recentre, is_scalar and not draws),
+        ("normals", 1.0, rows, check_normals, kind == "real" and not draws),
+        ("mode candidates and peak widths", 0.0, rows, check_mode_candidates, not classes and not draws),
+        ("marginal_cdfs", 1.0, rows, check_marginal_cdfs, kind in ("real", "image") and not draws),
         (
             "mean and variance",
             1.0,
             rows,
-            moments_of_draws,
+            check_moments,
             kind in ("real", "image") and numbers > 2 and not draws,
         ),
-        ("median", 1.0, rows, medians_of_draws, several and not draws),
-        ("marginals", 1.0, rows, marginals_of_draws, few and not draws),
-        ("tempered: power", 1.0, rows, powers, not draws),
-        ("mixture: estimate", 1.0, mixture, estimated, not draws),
-        ("mixture: slope", 1.0, mixture, slopes, one and not draws),
+        ("median", 1.0, rows, check_medians, several and not draws),
+        ("marginals", 1.0, rows, check_marginals, few and not draws),
+        ("tempered: power", 1.0, rows, check_powers, not draws),
+        ("mixture: estimate", 1.0, mixture, check_estimate, not draws),
+        ("mixture: slope", 1.0, mixture, check_quadratic_bound, is_scalar and not draws),
     ]
-    for name in OF_ONE:
+    for name in MIXTURE_PROPERTIES:
         limit, check = next((limit, check) for known, limit, check, _ in CHECKS if known == name)
-        suits = applies(name, subject, draws) and (one or classes) and not draws
+        suits = applies(name, subject, draws) and (is_scalar or classes) and not draws
         if name == "mode":
             limit, check = 1.0, mode_of_mixture
-        asked.append((f"mixture: {name}", limit, mixture, check, suits))
+        checks.append((f"mixture: {name}", limit, mixture, check, suits))
         if name in ("integral", "samples follow log_prob", "entropy"):
-            power = partial(powers_of, check=check)
-            asked.append((f"tempered: {name}", limit, rows, power, suits))
-    for name, limit, density, check, suits in asked:
+            power = partial(apply_to_powers, check=check)
+            checks.append((f"tempered: {name}", limit, rows, power, suits))
+    for name, limit, density, check, suits in checks:
         # a property that a row leaves out is left out for its mixtures and powers too
-        if not suits or not subject.wants(name) or name.rpartition(": ")[2] in subject.row.leave_out:
+        if not suits or not subject.includes(name) or name.rpartition(": ")[2] in subject.row.leave_out:
             continue
 
-        def look(worst: Worst, density: Callable[[], Distribution] = density, check: Check = check) -> None:
+        def run(worst: Worst, density: Callable[[], Distribution] = density, check: Check = check) -> None:
             with torch.no_grad():
                 check(density(), worst)
 
-        yield subject.examined(name, limit, look)
+        yield subject.run_check(name, limit, run)
 
 
 def _numbers(subject: HeadSubject) -> int:
+    """Return the number of numbers of a target."""
     return math.prod(subject.row.target.event_shape)
 
 
 def applies(name: str, subject: HeadSubject, draws: bool = False) -> bool:
-    """Return whether a property can be checked for the row's target."""
+    """Return whether a property applies to the row's target; `draws` tells whether log_prob draws random numbers."""
     kind, numbers = subject.row.target.kind, _numbers(subject)
     kind = "real" if kind == "image" else kind
-    wanted = {
+    expected = {
         "integral": numbers <= 3,
         "integral by draws": kind in ("angle", "real") and numbers >= 3 and not draws,
         "samples follow log_prob": numbers <= 3,
@@ -184,36 +190,36 @@ def applies(name: str, subject: HeadSubject, draws: bool = False) -> bool:
         "mean and variance": kind == "real" and numbers <= 2,
         "cdf": kind in ("angle", "real") and numbers == 1 and not draws,
     }
-    return wanted.get(name, True)
+    return expected.get(name, True)
 
 
 def integral(density: Distribution, worst: Worst) -> None:
     """Check that the density integrates to 1.
 
-    A density of one or two numbers is integrated in boxes that adapt to it, a density of three numbers on a grid.
+    A density of one or two numbers is integrated by adaptive quadrature, a density of three numbers on a grid.
     """
     if density.event_shape in ((1,), (2,)):
-        found = boxes(density)
-        total = found.mean(torch.ones_like(found.log_prob))
+        quadrature = boxes(density)
+        total = quadrature.mean(torch.ones_like(quadrature.log_prob))
     else:
         _, mass = cells(density)
         total = mass.sum(tuple(range(max(1, len(density.event_shape) and density.event_shape[0]))))
-    worst.see((total - 1).abs(), lambda at: f"{worst.row(at[0])}: {total[at].item():.9g}")
+    worst.record((total - 1).abs(), lambda at: f"{worst.row(at[0])}: {total[at].item():.9g}")
 
 
 def integral_by_draws(density: Distribution, worst: Worst) -> None:
-    """Check by draws that the density integrates to 1, in standard errors.
+    """Check by draws that the density integrates to 1; the error is in standard errors.
 
-    The check compares E_p[q/(p + q)] with E_q[p/(p + q)], where p is the density and q a normal fitted to other draws
-    of it. Both are ∫ pq/(p + q) if p is normalised and draws follow it. The averaged quantities lie in [0, 1], however
-    heavy the tails are. If q were fitted to the draws that are averaged, it would be too high there, which for ten
-    numbers amounts to some standard errors.
+    Let p be the density and q a normal density. The check compares E_p[q/(p + q)] with E_q[p/(p + q)]. Both are equal
+    to ∫ pq/(p + q) if p integrates to 1 and its draws follow it. Both averages are of values in [0, 1], also for heavy
+    tails. q is fitted to other draws than those in the average, where a fitted q would be too high: for ten numbers by
+    several standard errors.
     """
-    others, drawn = density.sample(torch.Size((2 * DRAWS,))).double().chunk(2)
+    fit_draws, test_draws = density.sample(torch.Size((2 * DRAWS,))).double().chunk(2)
     support = density.support
     circular = isinstance(support, Circular)
-    center = density.mode.double() if circular else others.mean(0)
-    offset, other = (wrap(part - center) if circular else part - center for part in (drawn, others))
+    center = density.mode.double() if circular else fit_draws.mean(0)
+    offset, other = (wrap(part - center) if circular else part - center for part in (test_draws, fit_draws))
     shift = other.mean(0)
     _, root = torch.linalg.qr((other - shift).movedim(0, 1) / DRAWS**0.5)  # (rows, numbers, numbers)
     normal = torch.randn(DRAWS, *offset.shape[1:], dtype=torch.float64)
@@ -221,71 +227,80 @@ def integral_by_draws(density: Distribution, worst: Worst) -> None:
 
     def log_ratio(offset: Tensor, standard: Tensor) -> Tensor:
         value = center + offset
-        found = torch.cat([density.log_prob(part) for part in value.split(4000)])
-        inside = torch.ones_like(found, dtype=torch.bool)
+        log_prob = torch.cat([density.log_prob(part) for part in value.split(4000)])
+        inside = torch.ones_like(log_prob, dtype=torch.bool)
         if circular:
             inside = (offset.abs() <= math.pi).all(-1)
             for number, (low, high) in enumerate((isinstance(support, Circular) and support.ranges) or ()):
                 place = wrap(value[..., number])
                 inside &= (place >= low) & (place <= high)
         log_normal = -(standard.square() + math.log(2 * math.pi)).sum(-1) / 2 - volume
-        return torch.where(inside, found, -math.inf) - log_normal
+        return torch.where(inside, log_prob, -math.inf) - log_normal
 
     standard = torch.linalg.solve_triangular(root.mT, (offset - shift).movedim(0, -1), upper=False)
     of_p = torch.sigmoid(-log_ratio(offset, standard.movedim(-1, 0)))
     of_q = torch.sigmoid(log_ratio(shift + torch.einsum("dbi,bij->dbj", normal, root), normal))
     noise = ((of_p.var(0) + of_q.var(0)) / DRAWS).sqrt()
-    # no verdict is possible where rounding of the draws is coarser than the density is narrow
+    # nothing can be said where draws are rounded by more than the width of the density
     least = root.diagonal(dim1=-2, dim2=-1).abs().amin(-1)
-    told = least > 1e4 * torch.finfo(torch.float64).eps * drawn.abs().amax(0).amax(-1)
+    resolved = least > 1e4 * torch.finfo(torch.float64).eps * test_draws.abs().amax(0).amax(-1)
     gap = (of_p.mean(0) - of_q.mean(0)).abs() / (noise + 1e-9)
-    worst.see(
-        gap.where(told, 0), lambda at: f"{worst.row(at[0])}: off by {(of_p.mean(0) - of_q.mean(0))[at]:.3g}"
+    worst.record(
+        gap.where(resolved, 0),
+        lambda at: f"{worst.row(at[0])}: averages differ by {(of_p.mean(0) - of_q.mean(0))[at]:.3g}",
     )
 
 
 def samples_follow_log_prob(density: Distribution, worst: Worst) -> None:
     """Check by a χ² test over cells that draws follow log_prob; the error is a standard normal deviate.
 
-    χ² is converted after Wilson & Hilferty (1931). Draws of one number are counted in cells of equal mass by
-    quadrature, draws of several numbers on a grid. Cells that expect fewer than five draws are merged into one.
+    χ² is converted to a normal deviate by the formula of Wilson & Hilferty (1931). Draws of one number are counted in
+    cells of equal mass from the quadrature, draws of several numbers on a grid. Cells with an expectation of fewer than
+    five draws are merged into one.
     """
     seed(SEED)
-    drawn = density.sample(torch.Size((DRAWS,)))
+    draws = density.sample(torch.Size((DRAWS,)))
     if density.event_shape == (1,):
-        _one_number(density, drawn, worst, "")
+        _compare_draws(density, draws, worst, "")
         return
     borders, mass = cells(density)
-    count = counted(density, borders, drawn)
+    count = count_samples(density, borders, draws)
     batch = density.batch_shape
     _chi_square(DRAWS * mass.reshape(-1, *batch), count.reshape(-1, *batch), worst, "")
 
 
 def samples_follow_marginals(density: Distribution, worst: Worst) -> None:
-    """Check that each number of the draws follows marginal(density, number)."""
-    drawn = density.sample(torch.Size((DRAWS,)))
+    """Check that draws of each number follow `marginal(density, number)`."""
+    draws = density.sample(torch.Size((DRAWS,)))
     for number in range(density.event_shape[0]):
         try:
-            one = marginal(density, number)
+            marginal_density = marginal(density, number)
         except UserError:
-            worst.count(isinstance(density.support, Circular), "no marginal is given")
+            worst.count(isinstance(density.support, Circular), "the density has no marginals")
             return
-        _one_number(one, drawn[..., number : number + 1], worst, f"number {number}, ")
+        _compare_draws(marginal_density, draws[..., number : number + 1], worst, f"number {number}, ")
 
 
-def _one_number(density: Distribution, drawn: Tensor, worst: Worst, what: str) -> None:
-    found = boxes(density)
-    place, border = found.way.back(drawn)[..., 0], found.way.back(found.border[1:-1].unsqueeze(-1))[..., 0]
+def _compare_draws(density: Distribution, draws: Tensor, worst: Worst, prefix: str) -> None:
+    """Check by a χ² test that draws follow a density of one number."""
+    quadrature = boxes(density)
+    place, border = (
+        quadrature.mapping.coordinates(draws)[..., 0],
+        quadrature.mapping.coordinates(quadrature.border[1:-1].unsqueeze(-1))[..., 0],
+    )
     box = torch.searchsorted(border.T.contiguous(), place.T.contiguous()).T
-    middle = found.mass.cumsum(0) - found.mass / 2
-    cell = (CELLS * middle / found.mass.sum(0)).long().clamp(0, CELLS - 1)
-    expected = torch.zeros(CELLS, len(found.way.mode), dtype=torch.float64).scatter_add_(0, cell, found.mass)
+    middle = quadrature.mass.cumsum(0) - quadrature.mass / 2
+    cell = (CELLS * middle / quadrature.mass.sum(0)).long().clamp(0, CELLS - 1)
+    expected = torch.zeros(CELLS, len(quadrature.mapping.mode), dtype=torch.float64).scatter_add_(
+        0, cell, quadrature.mass
+    )
     count = torch.zeros_like(expected).scatter_add_(0, cell.gather(0, box), torch.ones_like(place))
-    worst.finite(f"{what}draws", drawn)
-    _chi_square(DRAWS * expected, count, worst, what)
+    worst.finite(f"{prefix}draws", draws)
+    _chi_square(DRAWS * expected, count, worst, prefix)
 
 
-def _chi_square(expected: Tensor, count: Tensor, worst: Worst, what: str) -> None:
+def _chi_square(expected: Tensor, count: Tensor, worst: Worst, prefix: str) -> None:
+    """Record the normal deviate of χ² for expected and actual counts, (cell, *batch)."""
     rare = expected < 5
     score = ((count - expected).square() / expected).where(~rare, 0).sum(0)
     rest, rest_count = expected.where(rare, 0).sum(0), count.where(rare, 0).sum(0)
@@ -293,133 +308,143 @@ def _chi_square(expected: Tensor, count: Tensor, worst: Worst, what: str) -> Non
     freedom = ((~rare).sum(0) - 1 + (rest >= 5)).clamp(min=1)
     spread = 2 / (9 * freedom)
     normal = ((score / freedom).pow(1 / 3) - 1 + spread) / spread.sqrt()
-    worst.see(normal, lambda at: f"{what}{worst.row(at[0])}, {freedom[at].item()} degrees of freedom")
+    worst.record(normal, lambda at: f"{prefix}{worst.row(at[0])}, {freedom[at].item()} degrees of freedom")
 
 
 def independent(density: Distribution, worst: Worst) -> None:
-    """Check that draws are independent of the draw before and of the next batch row.
+    """Check that a draw is independent of the previous draw and of the draw of the next batch row.
 
-    The error is the correlation of their signs in standard errors.
+    The error is the correlation of their signs about the median, in standard errors.
     """
-    drawn = density.sample(torch.Size((4000,))).double()
+    draws = density.sample(torch.Size((4000,))).double()
     if density.event_shape:
-        offset = drawn - density.mode.double()
+        offset = draws - density.mode.double()
         offset = wrap(offset) if isinstance(density.support, Circular) else offset
         sign = torch.where(offset > offset.median(0).values, 1.0, -1.0).double().flatten(1)
     else:
-        sign = torch.where(drawn == density.mode, 1.0, -1.0).double()
+        sign = torch.where(draws == density.mode, 1.0, -1.0).double()
     sign = sign - sign.mean(0)
     numbers = max(1, sign.shape[1] // density.batch_shape.numel())
     spread = sign.square().mean(0).sqrt()
-    for what, first, second, scale in (
-        ("the draw before", sign[1:], sign[:-1], spread * spread),
+    for neighbour, first, second, scale in (
+        ("the previous draw", sign[1:], sign[:-1], spread * spread),
         ("the next row", sign[:, numbers:], sign[:, :-numbers], spread[numbers:] * spread[:-numbers]),
     ):
         together = (first * second).mean(0) / scale.clamp(min=1e-3) * len(first) ** 0.5
-        worst.see(together.abs(), lambda at, what=what: f"{worst.row(at[0] // numbers)} with {what}")
+        worst.record(
+            together.abs(),
+            lambda at, neighbour=neighbour: f"{worst.row(at[0] // numbers)}: correlation with {neighbour}",
+        )
 
 
 def periodic(density: Distribution, worst: Worst) -> None:
-    """Check that log_prob is the same up to a thousand turns on; relative to its slope, since 2π has no exact float."""
+    """Check that log_prob is the same after up to a thousand turns.
+
+    The error is relative to the gradient of log_prob, since 2π is not exact in floating point.
+    """
     generator = torch.Generator().manual_seed(SEED)
     shape = torch.Size((8, *density.batch_shape, *density.event_shape))
     value = 6 * torch.randn(shape, dtype=torch.float64, generator=generator)
     value[0], value[1], value[2] = math.pi, -math.pi, 0.0
     with torch.enable_grad():
-        here = density.log_prob(value.requires_grad_())
-        (slope,) = torch.autograd.grad(here.sum(), value)
+        log_prob = density.log_prob(value.requires_grad_())
+        (slope,) = torch.autograd.grad(log_prob.sum(), value)
     for turns in (1, -1, 7, -1000):
         moved = value.detach() + turns * 2 * math.pi
-        scale = here.detach().abs().clamp(min=1) + slope.abs().sum(-1)
-        # the number of turns times 2π is rounded relative to its size, as any float
+        scale = log_prob.detach().abs().clamp(min=1) + slope.abs().sum(-1)
+        # the rounding error of the number of turns times 2π is relative to its size
         scale = scale * (1 + moved.abs().amax(-1))
-        error = (density.log_prob(moved) - here.detach()).abs() / scale
-        worst.see(error, lambda at, turns=turns: f"{turns} turns on, value {at[0]}, {worst.row(at[1])}")
+        error = (density.log_prob(moved) - log_prob.detach()).abs() / scale
+        worst.record(error, lambda at, turns=turns: f"{turns} turns, value {at[0]}, {worst.row(at[1])}")
 
 
 def entropy(density: Distribution, worst: Worst) -> None:
-    """Check that the entropy is -∫ p log p: by quadrature for one or two numbers and classes, else by draws.
+    """Check that the entropy is -∫ p log p.
 
-    The error is in units of 1e-6 nats (relative above 1 nat) or, where draws are involved, of a statistical error that
-    chance hardly exceeds.
+    The integral is a sum for classes, a quadrature for one or two numbers, and else a mean over draws. The error is in
+    units of 1e-6 nats (relative above 1 nat), plus the standard errors where the entropy or the integral is estimated
+    from draws.
     """
-    found = torch.stack([_after(number, density.entropy) for number in range(2)]).double()
-    noise = torch.zeros_like(found[0])
-    if not torch.equal(*found):
-        further = [_after(number, density.entropy) for number in range(2, 16)]
-        found = torch.cat([found, torch.stack(further).double()])
-        noise = 2 * found.std(0) / 4
+    entropies = torch.stack([_call_seeded(number, density.entropy) for number in range(2)]).double()
+    noise = torch.zeros_like(entropies[0])
+    if not torch.equal(*entropies):
+        further = [_call_seeded(number, density.entropy) for number in range(2, 16)]
+        entropies = torch.cat([entropies, torch.stack(further).double()])
+        noise = 2 * entropies.std(0) / 4
     if density.event_shape == ():
         log_prob = density.log_prob(density.enumerate_support()).double()
-        wanted = -(log_prob.exp() * log_prob.clamp(min=-1e4)).sum(0)
+        expected = -(log_prob.exp() * log_prob.clamp(min=-1e4)).sum(0)
     elif density.event_shape in ((1,), (2,)):
-        wanted = boxes(density).entropy()
+        expected = boxes(density).entropy()
     else:
-        drawn = density.sample(torch.Size((DRAWS,)))
-        surprise = _surprise(density, drawn)
-        wanted, noise = surprise.mean(0), noise + 1.2 * surprise.std(0) / DRAWS**0.5
-        # A draw is rounded, possibly by more than the width of a density of several numbers. A second rounding
-        # shows the effect.
-        size = drawn.abs().clamp(min=math.pi if isinstance(density.support, Circular) else 0.0)
-        once_more = drawn + torch.finfo(drawn.dtype).eps * size * (torch.rand_like(drawn) - 0.5).sign()
+        draws = density.sample(torch.Size((DRAWS,)))
+        surprise = _surprise(density, draws)
+        expected, noise = surprise.mean(0), noise + 1.2 * surprise.std(0) / DRAWS**0.5
+        # A draw of several numbers may be rounded by more than the width of the density. Rounding it once more shows
+        # the effect.
+        size = draws.abs().clamp(min=math.pi if isinstance(density.support, Circular) else 0.0)
+        once_more = draws + torch.finfo(draws.dtype).eps * size * (torch.rand_like(draws) - 0.5).sign()
         noise = noise + (_surprise(density, once_more) - surprise).abs().mean(0)
-    error = (found.mean(0) - wanted).abs() / (noise + 1e-6 * wanted.abs().clamp(min=1))
-    worst.see(
+    error = (entropies.mean(0) - expected).abs() / (noise + 1e-6 * expected.abs().clamp(min=1))
+    worst.record(
         error,
-        lambda at: f"{worst.row(at[0])}: {found.mean(0)[at].item():.9g}, wanted {wanted[at].item():.9g}",
+        lambda at: (
+            f"{worst.row(at[0])}: {entropies.mean(0)[at].item():.9g}, expected {expected[at].item():.9g}"
+        ),
     )
 
 
 def _surprise(density: Distribution, value: Tensor) -> Tensor:
+    """Return -log_prob in float64."""
     return torch.cat([-density.log_prob(part) for part in value.split(2000)]).double()
 
 
-def _after(number: int, ask: Callable[[], Tensor]) -> Tensor:
+def _call_seeded(number: int, function: Callable[[], Tensor]) -> Tensor:
     seed(number)
-    return ask()
+    return function()
 
 
 def mode_is_highest(density: Distribution, worst: Worst) -> None:
-    """Check that neither a draw nor a node of the quadrature is more than `limit` nats above the mode."""
+    """Check that no draw and no node of the quadrature has a higher density than the mode; the error is in nats."""
     seed(SEED)
     count = max(64, 36_000 // max(18, density.batch_shape.numel()))
-    drawn = density.sample(torch.Size((count,)))
-    highest = density.log_prob(drawn).amax(0)
+    draws = density.sample(torch.Size((count,)))
+    highest = density.log_prob(draws).amax(0)
     if density.event_shape in ((1,), (2,)) and density.batch_shape.numel() < 64:
         highest = torch.maximum(highest, boxes(density).log_prob.amax(0))
     above = highest - density.log_prob(density.mode)
-    worst.see(above, lambda at: f"{worst.row(at[0])}: {above[at].item():.3g} nats above the mode")
+    worst.record(above, lambda at: f"{worst.row(at[0])}: {above[at].item():.3g} nats above the mode")
 
 
 def mode_of_mixture(density: Distribution, worst: Worst) -> None:
-    """Check the mode of a mixture; the error is in units of the height that the search may miss.
+    """Check the mode of a mixture; the error is in units of the height by which the search for the mode may be wrong.
 
-    That height is 0.05 nats where `quadratic_bound` leads up from the modes of the components, else log 2 nats.
+    This height is 0.05 nats where `quadratic_bound` leads up from the modes of the components, else log 2 nats.
     """
     known = density.has_enumerate_support or quadratic_bound(density, density.mode) is not None
     inner = Worst()
     mode_is_highest(density, inner)
-    worst.see(inner.error / (0.05 if known else math.log(2)), inner.case)
+    worst.record(inner.error / (0.05 if known else math.log(2)), inner.case)
 
 
 def marginals(density: Distribution, worst: Worst) -> None:
-    """Check that marginal(density, i) is the joint density integrated over the other angles."""
+    """Check that `marginal(density, i)` is the joint density integrated over the other angles."""
     numbers = density.event_shape[0]
     points = 256 if numbers == 2 else 64
     sides = [side(density, number, points, points // 8) for number in range(numbers)]
     for index in range(numbers):
-        some, one = side(density, index, 12, 12)[0], torch.ones(12, dtype=torch.float64)
-        nodes = [some if number == index else sides[number][0] for number in range(numbers)]
-        weights = [one if number == index else sides[number][1] for number in range(numbers)]
+        points_of_index, unit_weights = side(density, index, 12, 12)[0], torch.ones(12, dtype=torch.float64)
+        nodes = [points_of_index if number == index else sides[number][0] for number in range(numbers)]
+        weights = [unit_weights if number == index else sides[number][1] for number in range(numbers)]
         axes = torch.meshgrid(*nodes, indexing="ij")
         weight = torch.stack(torch.meshgrid(*weights, indexing="ij")).prod(0)
         joint = density_at(density, torch.stack(axes, -1).flatten(0, -2))
         joint = joint.reshape(*axes[0].shape, *density.batch_shape)
         joint = joint * weight.reshape(*weight.shape, *(1,) * len(density.batch_shape))
-        wanted = joint.sum([number for number in range(numbers) if number != index])
-        found = density_at(marginal(density, index), some[:, None])
-        worst.see(
-            (found - wanted).abs() / wanted.clamp(min=1),
+        expected = joint.sum([number for number in range(numbers) if number != index])
+        actual = density_at(marginal(density, index), points_of_index[:, None])
+        worst.record(
+            (actual - expected).abs() / expected.clamp(min=1),
             lambda at, index=index: f"angle {index}, point {at[0]}, {worst.row(at[1])}",
         )
 
@@ -427,100 +452,112 @@ def marginals(density: Distribution, worst: Worst) -> None:
 def median_is_best(density: Distribution, worst: Worst) -> None:
     """Check that half of the mass lies on each side of the median.
 
-    The expected deviation from the median of an angle must also be the least. The error is in standard errors of a
-    median of MEDIAN_DRAWS draws; where nothing is drawn, in 1e-6 of the mass.
+    The median of an angle must also have the smallest expected distance. The error is in standard errors of a median of
+    MEDIAN_DRAWS draws or, if the median is computed without draws, in units of 1e-6 of the mass.
     """
-    chosen = _after(SEED, lambda: median(density, MEDIAN_DRAWS)).double()
-    still = torch.equal(chosen, _after(SEED + 1, lambda: median(density, MEDIAN_DRAWS)).double())
-    found = boxes(density)
-    below = found.below(chosen[..., 0].unsqueeze(0))[0]
+    chosen = _call_seeded(SEED, lambda: median(density, MEDIAN_DRAWS)).double()
+    deterministic = torch.equal(
+        chosen, _call_seeded(SEED + 1, lambda: median(density, MEDIAN_DRAWS)).double()
+    )
+    quadrature = boxes(density)
+    below = quadrature.mass_below(chosen[..., 0].unsqueeze(0))[0]
     if isinstance(density.support, Circular):
-        # mass ahead of the median up to its antipode; both are counted from half a turn before the mode
-        other = found.below(
-            wrap(chosen[..., 0] + math.pi - found.way.mode[:, 0]).unsqueeze(0) + found.way.mode[:, 0]
+        # mass from the antipode of the median to the median; both are counted from half a turn before the mode
+        below_antipode = quadrature.mass_below(
+            wrap(chosen[..., 0] + math.pi - quadrature.mapping.mode[:, 0]).unsqueeze(0)
+            + quadrature.mapping.mode[:, 0]
         )
-        below = (below - other[0]).remainder(1.0)
-        deviation = angular_distance(chosen[..., 0], found.value[..., 0])
-        mean = found.mean(deviation)
-        spread = (found.mean(deviation.square()) - mean.square()).clamp(min=1e-30).sqrt()
-        # every seventh node suffices, since the others lie between them
+        below = (below - below_antipode[0]).remainder(1.0)
+        deviation = angular_distance(chosen[..., 0], quadrature.value[..., 0])
+        mean = quadrature.mean(deviation)
+        spread = (quadrature.mean(deviation.square()) - mean.square()).clamp(min=1e-30).sqrt()
+        # every seventh node suffices, since the nodes are dense
         best = torch.stack(
-            [found.mean(angular_distance(node, found.value[..., 0])) for node in found.value[::7, :, 0]]
+            [
+                quadrature.mean(angular_distance(node, quadrature.value[..., 0]))
+                for node in quadrature.value[::7, :, 0]
+            ]
         )
-        worst.see(
+        worst.record(
             (mean - best.amin(0)) / (2 * spread / MEDIAN_DRAWS**0.5),
-            lambda at: f"{worst.row(at[0])}: {mean[at].item():.4g}, best {best.amin(0)[at].item():.4g} rad",
+            lambda at: (
+                f"{worst.row(at[0])}: mean distance {mean[at].item():.4g} rad, smallest {best.amin(0)[at].item():.4g}"
+            ),
         )
-    unit = 1e-6 if still else 0.5 / MEDIAN_DRAWS**0.5
-    worst.see(
+    unit = 1e-6 if deterministic else 0.5 / MEDIAN_DRAWS**0.5
+    worst.record(
         (below - 0.5).abs() / unit,
-        lambda at: f"{worst.row(at[0])}: {below[at].item():.6g} of the mass before it",
+        lambda at: f"{worst.row(at[0])}: {below[at].item():.6g} of the mass before the median",
     )
 
 
 def moments(density: Distribution, worst: Worst) -> None:
-    """Check mean and variance, where the density has them, against the quadrature, in standard deviations.
+    """Compare mean and variance, where the density has them, with the quadrature; errors are in standard deviations.
 
-    The quadrature adapts to the density alone, so that heavy tails leave an error in moments; only differences beyond
-    that error count. Where the density states that no variance exists, that of the quadrature must be huge, and the
-    mean need not exist either.
+    The quadrature adapts to the density rather than to its moments, which have an error for heavy tails. Only
+    differences beyond this error count. If the density states that its variance does not exist, the variance of the
+    quadrature must be huge, and the mean need not exist either.
     """
-    found = boxes(density)
-    offset = found.value - found.way.mode  # keeps the digits of a narrow density far from 0
-    mean = torch.stack([found.mean(part) for part in offset.unbind(-1)], -1)
-    variance = torch.stack([found.mean(part) for part in (offset - mean).square().unbind(-1)], -1)
+    quadrature = boxes(density)
+    offset = quadrature.value - quadrature.mapping.mode  # keeps the digits of a narrow density far from 0
+    mean = torch.stack([quadrature.mean(part) for part in offset.unbind(-1)], -1)
+    variance = torch.stack([quadrature.mean(part) for part in (offset - mean).square().unbind(-1)], -1)
     numbers = range(offset.shape[-1])
-    # uncertainty of the mean distance from the mode, and of its mean square
+    # error bounds of the mean distance from the mode and of the mean square distance
     first, second = (
         torch.stack(
             [
-                found.doubt(lambda value, i=i, power=power: (value - found.way.mode)[..., i].abs() ** power)
+                quadrature.error_bound(
+                    lambda value, i=i, power=power: (value - quadrature.mapping.mode)[..., i].abs() ** power
+                )
                 for i in numbers
             ],
             -1,
         )
         for power in (1, 2)
     )
-    given = {}
+    stated = {}
     for name in ("mean", "variance"):
         try:
-            given[name] = getattr(density, name).double()
+            stated[name] = getattr(density, name).double()
         except (NotImplementedError, AttributeError):
-            worst.count(False, f"no {name} is given")
+            worst.count(False, f"the density has no {name}")
     none = torch.zeros_like(variance, dtype=torch.bool)
-    if "variance" in given:
-        huge = variance + second > 1e6 * found.way.scale.square()
-        # where the variance only just does not exist, it grows too slowly to be huge within the quadrature's reach
-        none = ~given["variance"].isfinite() & (huge | (100 * second > variance))
-        gap = ((given["variance"] - variance).abs() - 10 * second).clamp(min=0) / variance
-        worst.see(gap.where(~none, 0.0), lambda at: f"variance, {worst.row(at[0])}")
-    if "mean" in given:
-        gap = ((given["mean"] - found.way.mode - mean).abs() - 10 * first).clamp(min=0) / variance.sqrt()
-        worst.see(gap.where(~none, 0.0), lambda at: f"mean, {worst.row(at[0])}")
+    if "variance" in stated:
+        huge = variance + second > 1e6 * quadrature.mapping.scale.square()
+        # for tails just too heavy for a variance, the integral is not huge within the range of the quadrature
+        none = ~stated["variance"].isfinite() & (huge | (100 * second > variance))
+        gap = ((stated["variance"] - variance).abs() - 10 * second).clamp(min=0) / variance
+        worst.record(gap.where(~none, 0.0), lambda at: f"variance, {worst.row(at[0])}")
+    if "mean" in stated:
+        gap = ((stated["mean"] - quadrature.mapping.mode - mean).abs() - 10 * first).clamp(
+            min=0
+        ) / variance.sqrt()
+        worst.record(gap.where(~none, 0.0), lambda at: f"mean, {worst.row(at[0])}")
 
 
 def masses(density: Distribution, worst: Worst) -> None:
-    """Check cdf and arc, where they are known, against the quadrature at mode ± {0, 0.3, 1, 3, 30} widths."""
-    found = boxes(density)
+    """Compare cdf and arc_probability, where known, with the quadrature at mode ± {0, 0.3, 1, 3, 30} widths."""
+    quadrature = boxes(density)
     offset = torch.tensor([-30, -3, -1, -0.3, 0, 0.3, 1, 3, 30], dtype=torch.float64)[:, None]
-    value = found.way.mode[:, 0] + offset * found.way.scale[:, 0]
+    value = quadrature.mapping.mode[:, 0] + offset * quadrature.mapping.scale[:, 0]
     if isinstance(density.support, Circular):
-        value = value.clamp(found.way.mode[:, 0] - 3.1, found.way.mode[:, 0] + 3.1)
-        given = arc_probability(
-            density, found.border[:1].unsqueeze(-1).expand(len(offset), -1, 1), value.unsqueeze(-1)
+        value = value.clamp(quadrature.mapping.mode[:, 0] - 3.1, quadrature.mapping.mode[:, 0] + 3.1)
+        actual = arc_probability(
+            density, quadrature.border[:1].unsqueeze(-1).expand(len(offset), -1, 1), value.unsqueeze(-1)
         )
     else:
-        given = cdf(density, value.unsqueeze(-1))
-    if given is None:
+        actual = cdf(density, value.unsqueeze(-1))
+    if actual is None:
         worst.count(False, "not known in closed form")
         return
-    wanted = found.below(value)
-    worst.see(
-        (given - wanted).abs(), lambda at: f"mode + {offset[at[0]].item():g} widths, {worst.row(at[1])}"
+    expected = quadrature.mass_below(value)
+    worst.record(
+        (actual - expected).abs(), lambda at: f"mode + {offset[at[0]].item():g} widths, {worst.row(at[1])}"
     )
 
 
-OF_ONE = (
+MIXTURE_PROPERTIES = (
     "integral",
     "samples follow log_prob",
     "entropy",
@@ -529,7 +566,7 @@ OF_ONE = (
     "mean and variance",
     "cdf",
 )
-"""Properties that are also checked for a mixture of two densities of one number or of classes."""
+"""Properties that are also checked for mixtures of two densities of one number or of classes."""
 CHECKS = (
     Property("integral", 1e-6, integral, "scales"),
     Property("integral by draws", 6.0, integral_by_draws, "scales"),
@@ -545,3 +582,4 @@ CHECKS = (
     Property("mean and variance", 1e-5, moments, "scales"),
     Property("cdf", 1e-6, masses, "scales"),
 )
+"""All checks of densities."""

@@ -1,9 +1,8 @@
-"""A check on the CPU for calls that would mix tensors of the CPU with tensors of a GPU.
+"""Check on the CPU that code would not mix tensors on the CPU with tensors on a GPU.
 
-`OneDevice` runs code with its input tensors marked as tensors of the device, as if a GPU held them. Tensors made
-without `device=` are marked as tensors of the CPU. A result inherits the marks of the tensors that it is computed from,
-and a call that mixes both kinds where CUDA would raise an error is recorded. No tensor is moved: all numbers stay as
-they are.
+`OneDevice` runs code whose input tensors are labelled as on the device, as if they were on a GPU. Tensors created
+without `device=` are labelled as on the CPU. A result inherits the label of the tensors from which it is computed. A
+call that mixes both labels where CUDA would raise an error is recorded. No tensor is moved, and no value changes.
 """
 
 import dis
@@ -21,9 +20,9 @@ from torch.utils.weak import WeakTensorKeyDictionary
 from framework.testing.finding import SEED, TooSlow, Worst, seed
 
 DEVICE = torch.device("cpu", 0)
-"""Device that `tensor.device` reports for a tensor marked as of the device; torch treats it as the CPU.
+"""Device that `tensor.device` returns for a tensor labelled as on the device.
 
-It differs from `torch.device("cpu")`, which `tensor.device` reports for a tensor marked as of the CPU.
+Torch computes on the CPU with it, but it differs from `torch.device("cpu")`, which other tensors return.
 """
 FACTORIES = frozenset(
     ("zeros", "ones", "empty", "full", "arange", "range", "linspace", "logspace", "eye", "rand", "randn", "randint",
@@ -33,15 +32,15 @@ FACTORIES = frozenset(
 )  # fmt: skip
 """Functions whose result is on the CPU unless `device=` is given."""
 CONVERSIONS = frozenset(("tensor", "as_tensor", "asarray"))
-"""Functions whose result is on the device of their argument if that is a tensor; else they act as FACTORIES."""
-OF_THE_FIRST = frozenset(
+"""Functions whose result is on the device of their argument if that is a tensor, else as for FACTORIES."""
+LIKE_THE_FIRST = frozenset(
     ("expand_as", "view_as", "reshape_as", "copy_", "set_", "resize_as_", "__deepcopy__", "is_same_size", "align_as",
      "_make_subclass", "backward", "register_hook", "new_tensor", "new_zeros", "new_ones",
      "new_full", "new_empty", "new_empty_strided", "zeros_like", "ones_like", "empty_like", "full_like", "rand_like",
      "randn_like", "randint_like")
 )  # fmt: skip
-"""Functions whose result is on the device of their first argument, whatever the devices of the others are."""
-ONE_BY_ONE = frozenset(("broadcast_tensors", "atleast_1d", "atleast_2d", "atleast_3d"))
+"""Functions whose result is on the device of their first argument, for any device of the other arguments."""
+ELEMENTWISE_RESULTS = frozenset(("broadcast_tensors", "atleast_1d", "atleast_2d", "atleast_3d"))
 """Functions that return one result for each argument, on the device of that argument."""
 STRICT = frozenset(
     ("cat", "concat", "concatenate", "stack", "hstack", "vstack", "dstack", "column_stack", "row_stack", "block_diag",
@@ -49,46 +48,46 @@ STRICT = frozenset(
      "scatter_reduce_", "index_select", "index_add", "index_add_", "index_copy", "index_copy_", "take",
      "take_along_dim", "equal", "allclose", "isclose", "outer", "kron", "tensordot", "einsum", "isin")
 )  # fmt: skip
-"""Functions that refuse tensors of two devices even where the CPU tensors have no dimensions."""
+"""Functions that refuse tensors on two devices even if the CPU tensors have no dimensions."""
 _LIBRARIES = frozenset(("torch", "torchmetrics", "jaxtyping", "beartype", "numpy", "scipy"))
-Questions = Iterator[tuple[str, Callable[[], Any]]]
-"""Names of calls, and functions that perform them."""
+Calls = Iterator[tuple[str, Callable[[], Any]]]
+"""Names of calls to check, each with a function that performs the call."""
 _on_device: Any = WeakTensorKeyDictionary()
-"""Mark of a tensor: True on the device, False on the CPU; a tensor without an entry has no known place."""
+"""Tensor → True if labelled as on the device, False if on the CPU; tensors that are absent have no label."""
 
 
 class OneDevice(TorchFunctionMode):
-    """Recorder of calls that mix tensors of the device with tensors of the CPU, used as a context manager.
+    """Context manager that records calls that mix tensors on the device with tensors on the CPU.
 
     Attributes:
-        faults: Descriptions of the mixed tensors and the place of the call; each place occurs once.
+        faults: Descriptions of the calls, with file and line and the tensors; no description occurs twice.
     """
 
     def __init__(self) -> None:
         super().__init__()
         self.faults: list[str] = []
 
-    def receive(self, value: Any) -> Any:
-        """Mark every tensor in a value or its nested containers as of the device, and return the value."""
+    def label_device(self, value: Any) -> Any:
+        """Label every tensor in a value and its nested containers as on the device, and return the value."""
         for tensor in tensors_in(value):
             _on_device[tensor] = True
         return value
 
-    def move(self, module: nn.Module) -> None:
-        """Mark the tensors that `module.to(device)` would move: parameters, buffers and the states of metrics.
+    def label_module(self, module: nn.Module) -> None:
+        """Label the tensors that `module.to(device)` would move: parameters, buffers and the states of metrics.
 
-        Plain attributes stay on the CPU. Tensors that modules of the same package hold as constants do too.
+        Tensors in other attributes stay on the CPU, as do global constants of the package that defines the module.
         """
-        _mark_constants({"framework", type(module).__module__.partition(".")[0]})
+        _label_constants({"framework", type(module).__module__.partition(".")[0]})
         for part in module.modules():
-            self.receive([*part._parameters.values(), *part._buffers.values()])
+            self.label_device([*part._parameters.values(), *part._buffers.values()])
             states = getattr(part, "_defaults", None)
             if isinstance(states, dict):  # state of a torchmetrics.Metric
-                self.receive([states, [getattr(part, name) for name in states]])
+                self.label_device([states, [getattr(part, name) for name in states]])
                 part._device = DEVICE  # type: ignore[assignment]
 
-    def keep(self, value: Any) -> None:
-        """Mark every tensor in a value as of the CPU, like attributes of an object that no call moves."""
+    def label_cpu(self, value: Any) -> None:
+        """Label every tensor in a value as on the CPU, for example attributes of an object that no call moves."""
         for tensor in tensors_in(value):
             _on_device[tensor] = False
 
@@ -98,37 +97,37 @@ class OneDevice(TorchFunctionMode):
         kwargs = kwargs or {}
         name = getattr(func, "__name__", "")
         if name == "__get__":
-            return self._attribute(func, args)
+            return self._read_attribute(func, args)
         result = func(*args, **kwargs)
         if name == "__set__":
             return result
         if name == "__iter__":
             result = list(result)
         if name in FACTORIES:
-            return self._placed(result, kwargs.get("device"))
+            return self._label_new(result, kwargs.get("device"))
         if name in CONVERSIONS and not (args and isinstance(args[0], Tensor)):
-            return self._placed(result, kwargs.get("device"))
+            return self._label_new(result, kwargs.get("device"))
         if name in ("to", "type_as", "cpu", *CONVERSIONS):
-            return self._moved(name, result, args, kwargs)
+            return self._label_moved(name, result, args, kwargs)
         received = list(tensors_in((args, kwargs)))
         if name.startswith(("new_",)) or name.endswith("_like") or name == "full_like":
-            return self._made_like(result, received[0], kwargs.get("device"))
+            return self._label_like(result, received[0], kwargs.get("device"))
         if name in ("numpy", "__array__"):
             if received and _on_device.get(received[0]):
-                self._fault(name, "it reads a tensor of the device")
+                self._record_fault(name, "it converts a tensor on the device to NumPy")
             return result
-        if name in OF_THE_FIRST:
+        if name in LIKE_THE_FIRST:
             return self._inherit(result, received[:1])
-        if name in ONE_BY_ONE:
+        if name in ELEMENTWISE_RESULTS:
             results = result if isinstance(result, (tuple, list)) else (result,)
-            for one, source in zip(results, received, strict=False):
-                self._inherit(one, [source])
+            for single_result, source in zip(results, received, strict=False):
+                self._inherit(single_result, [source])
             return result
         if name == "__getitem__":
-            self._indexed(name, args[0], args[1])
+            self._check_index(name, args[0], args[1])
             return self._inherit(result, [args[0]])
         if name == "__setitem__":
-            self._assigned(*args)
+            self._check_assignment(*args)
             return result
         if name == "grad":  # torch.autograd.grad: each gradient is on the device of its input
             sources = args[1] if len(args) > 1 else kwargs["inputs"]
@@ -141,14 +140,14 @@ class OneDevice(TorchFunctionMode):
             inside = [tensor for tensor in received if _on_device.get(tensor)]
             if inside and any(name in STRICT or tensor.dim() > 0 for tensor in mixed):
                 shapes = ", ".join(
-                    f"{tuple(tensor.shape)} of the {'device' if _on_device.get(tensor) else 'CPU'}"
+                    f"{tuple(tensor.shape)} on the {'device' if _on_device.get(tensor) else 'CPU'}"
                     for tensor in received
                     if _on_device.get(tensor) is not None
                 )
-                self._fault(name, f"its tensors are {shapes}")
+                self._record_fault(name, f"its tensors have shapes {shapes}")
         return self._inherit(result, received)
 
-    def _attribute(self, func: Any, args: tuple[Any, ...]) -> Any:
+    def _read_attribute(self, func: Any, args: tuple[Any, ...]) -> Any:
         result = func(*args)
         owner = args[0]
         attribute = getattr(func.__self__, "__name__", "")
@@ -158,21 +157,21 @@ class OneDevice(TorchFunctionMode):
             self._inherit(result, [owner])
         return result
 
-    def _placed(self, result: Any, device: Any) -> Any:
-        """Mark a new tensor according to the `device=` argument that it was made with."""
+    def _label_new(self, result: Any, device: Any) -> Any:
+        """Label a new tensor according to the `device=` argument with which it was created."""
         if device is None or not _is_device(device):
-            self._leave(result)
+            self._label_on_cpu(result)
         else:
-            self.receive(result)
+            self.label_device(result)
         return result
 
-    def _made_like(self, result: Any, source: Tensor, device: Any) -> Any:
-        return self._inherit(result, [source]) if device is None else self._placed(result, device)
+    def _label_like(self, result: Any, source: Tensor, device: Any) -> Any:
+        return self._inherit(result, [source]) if device is None else self._label_new(result, device)
 
-    def _moved(self, name: str, result: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> Any:
-        """Mark the result of `.to`, `.cpu` and similar calls.
+    def _label_moved(self, name: str, result: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> Any:
+        """Label the result of `.to`, `.cpu` and similar calls.
 
-        The result is a new tensor where its mark differs from that of its source.
+        The result is a new tensor if its label differs from that of its source.
         """
         source = args[0]
         inside = _on_device.get(source)
@@ -186,37 +185,37 @@ class OneDevice(TorchFunctionMode):
         if result is source and inside != _on_device.get(source):
             result = source.view_as(source)
         if inside:
-            self.receive(result)
+            self.label_device(result)
         elif inside is False:
-            self._leave(result)
+            self._label_on_cpu(result)
         return result
 
     def _inherit(self, result: Any, sources: list[Tensor]) -> Any:
-        """Mark results by the marks of the tensors that they are computed from."""
+        """Label results like the tensors from which they are computed."""
         known = [_on_device.get(tensor) for tensor in sources]
         if any(known):
-            self.receive(result)
-        elif known and all(mark is False for mark in known):
-            self._leave(result)
+            self.label_device(result)
+        elif known and all(on_device is False for on_device in known):
+            self._label_on_cpu(result)
         return result
 
-    def _leave(self, result: Any) -> None:
-        """Mark tensors as of the CPU, unless a calling function chooses by itself where it computes."""
+    def _label_on_cpu(self, result: Any) -> None:
+        """Label tensors as on the CPU, unless a calling function has separate code for each kind of device."""
         tensors = [tensor for tensor in tensors_in(result) if _on_device.get(tensor) is not False]
-        if tensors and not _decided():
+        if tensors and not _has_device_code():
             for tensor in tensors:
                 _on_device[tensor] = False
 
-    def _indexed(self, name: str, tensor: Any, index: Any) -> None:
-        """Record a fault where a CPU tensor is indexed by a tensor of the device; CUDA allows the reverse."""
+    def _check_index(self, name: str, tensor: Any, index: Any) -> None:
+        """Record a fault if a tensor on the device indexes a tensor on the CPU; CUDA allows the reverse."""
         if isinstance(tensor, Tensor) and _on_device.get(tensor) is False:
             for part in tensors_in(index):
                 if _on_device.get(part) and (part.dim() > 0 or part.dtype == torch.bool):
-                    self._fault(name, "a tensor of the device indexes one of the CPU")
+                    self._record_fault(name, "a tensor on the device indexes a tensor on the CPU")
 
-    def _assigned(self, tensor: Tensor, index: Any, value: Any) -> None:
-        """Record a fault where an assignment to indexed elements mixes devices; CUDA allows it for slices."""
-        self._indexed("__setitem__", tensor, index)
+    def _check_assignment(self, tensor: Tensor, index: Any, value: Any) -> None:
+        """Record a fault if an assignment to elements selected by indices mixes devices; CUDA allows it for slices."""
+        self._check_index("__setitem__", tensor, index)
         listed = index if isinstance(index, tuple) else (index,)
         advanced = any(
             isinstance(part, list)
@@ -224,67 +223,69 @@ class OneDevice(TorchFunctionMode):
             for part in listed
         )
         if advanced and isinstance(value, Tensor) and value.dim() > 0:
-            places = _on_device.get(tensor), _on_device.get(value)
-            if places in ((True, False), (False, True)):
-                inside, outside = ("device", "CPU") if places[0] else ("CPU", "device")
-                self._fault(
-                    "__setitem__", f"{tuple(value.shape)} of the {outside} into a tensor of the {inside}"
+            labels = _on_device.get(tensor), _on_device.get(value)
+            if labels in ((True, False), (False, True)):
+                inside, outside = ("device", "CPU") if labels[0] else ("CPU", "device")
+                self._record_fault(
+                    "__setitem__",
+                    f"a tensor {tuple(value.shape)} on the {outside} is assigned into a tensor on the {inside}",
                 )
 
-    def _fault(self, name: str, what: str) -> None:
-        if _decided():
+    def _record_fault(self, name: str, problem: str) -> None:
+        if _has_device_code():
             return
-        text = f"{name} at {_place()}: {what}"
+        text = f"{name} at {_call_site()}: {problem}"
         if text not in self.faults:
             self.faults.append(text)
 
 
-def on_one_device(make: Callable[[OneDevice], Questions], worst: Worst) -> None:
-    """Report every call that would mix devices while an object is built and used.
+def check_devices(make_calls: Callable[[OneDevice], Calls], worst: Worst) -> None:
+    """Record every call that would mix devices while an object is built and used.
 
-    A call that raises an error is repeated without marks. An error that occurs only with marks is reported; any other
-    error is left to the checks that test for it.
+    A call that raises an error is repeated without labels. An error that occurs only with labels is recorded; any other
+    error is left to other checks.
 
     Args:
-        make: Function that builds the object under the given mode, marks the tensors that are moved and received, and
-            yields the calls to make.
+        make_calls: Function that builds the object, labels its tensors and its inputs by the mode that it receives, and
+            yields the calls to perform.
         worst: Recorder of the faults.
     """
     mode = OneDevice()
-    worst.count(False, "no tensor met one of another device")
+    worst.count(False, "no call mixes devices")
     seed(SEED)
-    questions = make(mode)
+    calls = make_calls(mode)
     while True:
         with mode, torch.no_grad():
-            name, question = next(questions, ("", None))
-        if question is None:
+            name, call = next(calls, ("", None))
+        if call is None:
             break
-        _ask(mode, question)
+        _perform(mode, call)
         for fault in mode.faults:
             worst.count(True, f"{name}: {fault}")
         mode.faults.clear()
 
 
-def _ask(mode: OneDevice, question: Callable[[], Any]) -> None:
-    said = ""
-    for marked in (True, False):
+def _perform(mode: OneDevice, call: Callable[[], Any]) -> None:
+    """Perform a call under the mode, and add a fault if it raises an error only there."""
+    error_message = ""
+    for labelled in (True, False):
         seed(SEED)
         try:
-            with mode if marked else nullcontext(), torch.no_grad():
-                question()
+            with mode if labelled else nullcontext(), torch.no_grad():
+                call()
         except TooSlow:
             raise
         except Exception as error:
-            if not marked:  # the input is refused, or another check covers the error
+            if not labelled:  # the input is refused, or another check finds the error
                 return
-            said = " ".join(f"{type(error).__name__}: {error}".split())
-        if not said:
+            error_message = " ".join(f"{type(error).__name__}: {error}".split())
+        if not error_message:
             return
-    mode.faults.append(f"raises only on a device: {said}")
+    mode.faults.append(f"raises an error only on a device: {error_message}")
 
 
 def tensors_in(value: Any, depth: int = 0) -> Iterator[Tensor]:
-    """Yield every tensor in a value and in the lists, tuples, sets and dictionaries nested in it, 4 levels deep."""
+    """Yield every tensor in a value, and in lists, tuples, sets and dictionaries nested up to 4 levels deep."""
     if isinstance(value, Tensor):
         yield value
     elif depth < 4 and isinstance(value, (list, tuple, set)):
@@ -299,8 +300,8 @@ def _is_device(chosen: Any) -> bool:
     return chosen == DEVICE if isinstance(chosen, torch.device) else str(chosen) == str(DEVICE)
 
 
-def _mark_constants(packages: set[str]) -> None:
-    """Mark tensors that modules of the packages hold as constants as of the CPU; no call moves them."""
+def _label_constants(packages: set[str]) -> None:
+    """Label global tensors in the modules of the packages as on the CPU, since no call moves them."""
     for name, module in list(sys.modules.items()):
         if name.partition(".")[0] in packages:
             for value in list(vars(module).values()):
@@ -309,7 +310,7 @@ def _mark_constants(packages: set[str]) -> None:
 
 
 def _frames() -> Iterator[FrameType]:
-    """Yield the frames of the calls between here and the check, innermost first, without those of libraries."""
+    """Yield the stack frames between the recorded call and this module, innermost first, without those of libraries."""
     frame = sys._getframe(1)
     while frame is not None and (frame.f_code.co_filename, frame.f_code.co_name) != _ENTRY:
         frame = frame.f_back
@@ -322,20 +323,20 @@ def _frames() -> Iterator[FrameType]:
 
 
 _ENTRY = (__file__, "__torch_function__")
-"""File and function through which torch enters `OneDevice`; type checkers may put frames between it and a helper."""
+"""File and function by which torch enters `OneDevice`; beartype may add frames between it and a function here."""
 
 
-def _decided() -> bool:
-    """Return whether a calling function asks where a tensor is, and so has separate code for each kind of device.
+def _has_device_code() -> bool:
+    """Return whether a calling function tests on which device a tensor is, and so has separate code for each device.
 
-    Its code for the CPU, which runs here, is not the code that runs on a GPU, so its calls are not judged.
+    Only its code for the CPU runs here, so its calls say nothing about its code for a GPU.
     """
-    return any(_asks(frame.f_code) for frame in _frames())
+    return any(_tests_device(frame.f_code) for frame in _frames())
 
 
-def _asks(code: CodeType) -> bool:
+def _tests_device(code: CodeType) -> bool:
     """Return whether a function reads `is_cuda`, `is_cpu` or `device.type`."""
-    known = _ASKS.get(code)
+    known = _TESTS_DEVICE.get(code)
     if known is None:
         known = bool({"is_cuda", "is_cpu"} & {*code.co_names})
         if not known and "type" in code.co_names:
@@ -343,16 +344,17 @@ def _asks(code: CodeType) -> bool:
             for instruction in dis.get_instructions(code):
                 known |= instruction.argval == "type" and before == "device"
                 before = instruction.argval
-        _ASKS[code] = known
+        _TESTS_DEVICE[code] = known
     return known
 
 
-_ASKS: dict[CodeType, bool] = {}
+_TESTS_DEVICE: dict[CodeType, bool] = {}
+"""Code of a function → result of `_tests_device`."""
 
 
-def _place() -> str:
-    """Return file and line of the innermost call outside libraries; the path is cut to its last three parts."""
+def _call_site() -> str:
+    """Return file and line of the innermost call outside libraries, with the last three parts of the path."""
     for frame in _frames():
         path = frame.f_code.co_filename
         return f"{'/'.join(path.split('/')[-3:])}:{frame.f_lineno}"
-    return "an unknown place"
+    return "an unknown line"

@@ -1,4 +1,4 @@
-"""Contract tests of an encoder: one function for each property; each reports its worst case."""
+"""Contract tests of an encoder: one function for each property; each records its largest error."""
 
 import copy
 import math
@@ -21,26 +21,27 @@ from framework.testing.cloud_encoders import (
     other_shapes,
     padding,
 )
-from framework.testing.devices import OneDevice, Questions, on_one_device
-from framework.testing.encoder_gradients import STEPS, moved_a_little, of_weights
-from framework.testing.finding import SEED, Finding, Worst, examined
+from framework.testing.devices import Calls, OneDevice, check_devices
+from framework.testing.encoder_gradients import STEPS, check_parameter_gradients, perturb_parameters
+from framework.testing.finding import SEED, Finding, Worst, run_check
 from framework.testing.rows import CloudRow, EncoderRow
 
 Make = Callable[[], Encoder]
 MANY, SOME = 131, 9
-"""Number of samples of a large batch; SOME where four samples take more processor time than SLOW seconds."""
+"""Number of samples of a large batch, for a fast and for a slow encoder."""
 SLOW = 0.03
+"""Processor time for four samples above which an encoder is slow, seconds."""
 
 
 def examine_encoder(row: EncoderRow, build: Callable[[tuple[int, ...]], Encoder]) -> Iterator[Finding]:
-    """Yield one finding for each property of an encoder; `build` makes a new one for an input shape."""
+    """Yield one finding for each property of an encoder; `build` returns a new encoder for an input shape."""
 
     def make(seed: int = SEED) -> Encoder:
         torch.manual_seed(seed)
         return build(row.input_shape).eval()
 
     def inputs(count: int) -> Tensor:
-        """Return the row's own inputs, or images in [0, 1], or normal vectors."""
+        """Return the row's own inputs if it has some, else images in [0, 1] or normal random vectors."""
         if row.inputs is not None:
             return row.inputs(count)
         generator = torch.Generator().manual_seed(SEED)
@@ -50,7 +51,7 @@ def examine_encoder(row: EncoderRow, build: Callable[[tuple[int, ...]], Encoder]
 
     @cache
     def slow() -> bool:
-        return _slow(make, inputs)
+        return _is_slow(make, inputs)
 
     checks: dict[str, tuple[float, Callable[[Worst], None]]] = {
         "on the device of its inputs": (0.0, lambda worst: _on_one_device(make, inputs, worst)),
@@ -65,7 +66,7 @@ def examine_encoder(row: EncoderRow, build: Callable[[tuple[int, ...]], Encoder]
         "gradient": (1e-4, lambda worst: _against_differences(make, inputs, worst)),
         "gradient in weights": (
             5e-3,
-            lambda worst: of_weights(make, inputs, worst, slow=slow()),
+            lambda worst: check_parameter_gradients(make, inputs, worst, slow=slow()),
         ),
         "finite on extreme inputs": (0.0, lambda worst: _extremes(make, inputs, worst)),
     }
@@ -86,67 +87,69 @@ def examine_encoder(row: EncoderRow, build: Callable[[tuple[int, ...]], Encoder]
         }
     for name, (limit, check) in checks.items():
         if name not in row.leave_out:
-            yield examined(name, row.limits.get(name, limit), check)
+            yield run_check(name, row.limits.get(name, limit), check)
 
 
 def _on_one_device(make: Make, inputs: Callable[[int], Tensor], worst: Worst) -> None:
-    """Check evaluation, training with a gradient in the input, and images as bytes for mixed devices."""
+    """Check that evaluation, training with a gradient in the input, and images as bytes mix no devices."""
 
-    def questions(mode: OneDevice) -> Questions:
+    def calls(mode: OneDevice) -> Calls:
         encoder = make()
-        mode.move(encoder)
-        batch = mode.receive(inputs(2))
+        mode.label_module(encoder)
+        batch = mode.label_device(inputs(2))
 
         @torch.enable_grad()
-        def trained() -> None:
+        def train() -> None:
             encoder.train()(batch.clone().requires_grad_())
 
         if batch.is_floating_point():
-            yield "training", trained
+            yield "training", train
         encoder.eval()
         yield "evaluation", lambda: encoder(batch)
         if batch.dim() == 4:
             yield "bytes", lambda: encoder((255 * batch).to(torch.uint8))
 
-    on_one_device(questions, worst)
+    check_devices(calls, worst)
 
 
 def _shapes(make: Make, inputs: Callable[[int], Tensor], worst: Worst) -> None:
     encoder = make()
     worst.count(
         not all(isinstance(side, int) and side > 0 for side in encoder.output_shape),
-        f"output_shape {encoder.output_shape}",
+        f"output_shape is {encoder.output_shape}, expected integers above 0",
     )
     with torch.no_grad():
         for count in (0, 1, 3):
-            found = tuple(encoder(inputs(count)).shape)
-            worst.same(f"features of {count} samples", found, (count, *encoder.output_shape))
-        found = tuple(encoder.train()(inputs(4)).shape)
-        worst.same("features of 4 samples in training", found, (4, *encoder.output_shape))
+            shape = tuple(encoder(inputs(count)).shape)
+            worst.same(f"shape of the features of {count} samples", shape, (count, *encoder.output_shape))
+        shape = tuple(encoder.train()(inputs(4)).shape)
+        worst.same("shape of the features of 4 samples in training", shape, (4, *encoder.output_shape))
 
 
 def _number_types(make: Make, inputs: Callable[[int], Tensor], worst: Worst) -> None:
-    """Check that features have the dtype of the parameters, whatever the float dtype of the inputs."""
+    """Check that features have the dtype of parameters and inputs, float32 or float64."""
     for kind in (torch.float32, torch.float64):
         with torch.no_grad():
-            worst.same(f"features of {kind}", make().to(kind)(inputs(2).to(kind)).dtype, kind)
+            worst.same(f"dtype of the features for {kind}", make().to(kind)(inputs(2).to(kind)).dtype, kind)
 
 
 def _bytes(make: Make, row: EncoderRow, worst: Worst) -> None:
-    """Check that bytes are read as 0 to 1, also in a nearly black image, whose bytes could be mistaken for floats."""
+    """Check that images as bytes are scaled to [0, 1], also a nearly black image, whose bytes are only 0 and 1."""
     encoder = make()
-    for what, brightest in {"bytes": 256, "dark bytes": 2}.items():
+    for pixel_kind, brightest in {"bytes": 256, "dark bytes": 2}.items():
         pixels = torch.randint(0, brightest, (3, *row.input_shape), dtype=torch.uint8)
         with torch.no_grad():
-            found, wanted = encoder(pixels), encoder(pixels.float() / 255)
-        scale = wanted.abs().amax().clamp(min=1e-6)
-        worst.see((found - wanted).abs() / scale, f"{what} against the same in [0, 1]")
+            actual, expected = encoder(pixels), encoder(pixels.float() / 255)
+        scale = expected.abs().amax().clamp(min=1e-6)
+        worst.record(
+            (actual - expected).abs() / scale, f"features of {pixel_kind} and of the same image in [0, 1]"
+        )
 
 
 def _every_part(make: Make, batch: Tensor, worst: Worst) -> None:
-    """Check that each channel and each quarter of an image affects the features, with weights as after training."""
+    """Check that each channel and each quarter of an image affects the features."""
     encoder = make()
-    moved_a_little(encoder)
+    perturb_parameters(encoder)
     channels, height, width = batch.shape[1:]
     whole = slice(None)
     parts: dict[str, tuple[Any, ...]] = {
@@ -159,15 +162,15 @@ def _every_part(make: Make, batch: Tensor, worst: Worst) -> None:
     generator = torch.Generator().manual_seed(SEED + 1)
     other = torch.rand(batch.shape, generator=generator)
     with torch.no_grad():
-        found = encoder(batch)
-        for what, place in parts.items():
+        original = encoder(batch)
+        for part_name, place in parts.items():
             changed = batch.clone()
             changed[(whole, *place)] = other[(whole, *place)]
-            worst.count(torch.equal(encoder(changed), found), f"{what} changes nothing")
+            worst.count(torch.equal(encoder(changed), original), f"{part_name} does not affect the features")
 
 
 def _repeatable(make: Make, inputs: Callable[[int], Tensor], worst: Worst) -> None:
-    """Check that features repeat, whatever was encoded before, and that evaluation changes no state."""
+    """Check that features of the same inputs are equal after other inputs, and that evaluation changes no state."""
     with torch.no_grad():
         encoder, batch = make(), inputs(3)
         before = {name: value.clone() for name, value in _state(encoder).items()}
@@ -181,7 +184,9 @@ def _repeatable(make: Make, inputs: Callable[[int], Tensor], worst: Worst) -> No
         other = make()
         other(inputs(7)[-4:])
         worst.same_bits(
-            "features of another of one seed, which other inputs came to first", other(batch), first
+            "features of a second encoder with the same seed that encoded other inputs first",
+            other(batch),
+            first,
         )
 
 
@@ -190,18 +195,22 @@ def _state(encoder: Encoder) -> dict[str, Tensor]:
 
 
 def _rows_apart(make: Make, inputs: Callable[[int], Tensor], worst: Worst, *, slow: bool) -> None:
-    """Check that in evaluation a sample's features do not depend on its batch, up to rounding of matrix products."""
+    """Check in evaluation mode that features of a sample do not depend on its batch, except for rounding errors."""
     encoder = make()
 
     def compare(batch: Tensor, sizes: list[int]) -> None:
         whole = encoder(batch)
-        worst.same(f"features of {len(batch)}", tuple(whole.shape), (len(batch), *encoder.output_shape))
+        worst.same(
+            f"shape of the features of {len(batch)}", tuple(whole.shape), (len(batch), *encoder.output_shape)
+        )
         scale = whole.abs().amax().clamp(min=1e-6)
         start = 0
         for part in batch.split(sizes):
             gap = (whole[start : start + len(part)] - encoder(part)).abs().flatten(1).amax(-1) / scale
-            said = f"of {len(batch)}, among {len(part)}"
-            worst.see(gap, lambda at, start=start, said=said: f"sample {start + at[0]} {said}")
+            batch_sizes = f"in a batch of {len(batch)} and of {len(part)}"
+            worst.record(
+                gap, lambda at, start=start, batch_sizes=batch_sizes: f"sample {start + at[0]} {batch_sizes}"
+            )
             start += len(part)
 
     with torch.no_grad():
@@ -212,7 +221,7 @@ def _rows_apart(make: Make, inputs: Callable[[int], Tensor], worst: Worst, *, sl
         compare(inputs(MANY), [7] * (MANY // 7) + [MANY % 7])
 
 
-def _slow(make: Make, inputs: Callable[[int], Tensor]) -> bool:
+def _is_slow(make: Make, inputs: Callable[[int], Tensor]) -> bool:
     encoder, batch = make(), inputs(4)
     start = time.process_time()
     with torch.no_grad():
@@ -221,71 +230,75 @@ def _slow(make: Make, inputs: Callable[[int], Tensor]) -> bool:
 
 
 def _untouched(make: Make, inputs: Callable[[int], Tensor], worst: Worst) -> None:
-    """Check that encoding leaves the batch as it is, since other members of an ensemble read it."""
+    """Check that encoding does not change the batch, since other members of an ensemble read it."""
     encoder, batches = make(), {"floats": inputs(4)}
     if batches["floats"].dim() == 4:
         batches["bytes"] = (batches["floats"] * 255).round().clamp(0, 255).to(torch.uint8)
-    for what, batch in batches.items():
+    for kind, batch in batches.items():
         for training in (False, True):
-            given = batch.clone()
+            passed = batch.clone()
             with torch.no_grad():
-                encoder.train(training)(given)
-            worst.same_bits(f"{what} after {'training' if training else 'evaluation'}", given, batch)
+                encoder.train(training)(passed)
+            worst.same_bits(
+                f"inputs as {kind} after {'training' if training else 'evaluation'}", passed, batch
+            )
 
 
 def _round_trip(make: Callable[..., Encoder], inputs: Callable[[int], Tensor], worst: Worst) -> None:
-    """Check that a stored encoder gives the same bits, also after training changed buffers such as running means."""
+    """Check that an encoder with a stored state returns equal features, also after training changed its buffers."""
     encoder = make()
     other = make(SEED + 7)  # so that a parameter that is not stored has another value
-    for what, batches in {"the first state": 0, "the state after training": 2}.items():
+    for state_name, batches in {"the initial state": 0, "the state after training": 2}.items():
         with torch.no_grad():
             for _ in range(batches):
                 encoder.train()(inputs(5))
-            wanted = encoder.eval()(inputs(3))
+            expected = encoder.eval()(inputs(3))
             other.load_state_dict(encoder.state_dict())
-            worst.same_bits(f"features of {what}", other(inputs(3)), wanted)
+            worst.same_bits(f"features of {state_name}", other(inputs(3)), expected)
     with torch.no_grad():
         worst.same_bits("features of a copy", copy.deepcopy(encoder)(inputs(3)), encoder(inputs(3)))
 
 
 def _claims(make: Callable[..., Encoder], inputs: Callable[[int], Tensor], worst: Worst) -> None:
-    """Check the claims of an encoder.
+    """Check that the attributes `fixed` and `vectorises` are true.
 
-    With `fixed`, features depend on the input alone. With `vectorises`, several encoders evaluated at once give the
-    features of each.
+    If `fixed`, features depend on the inputs alone. If `vectorises`, torch.vmap over the parameters of several encoders
+    gives the features of each.
     """
     encoder = make()
-    worst.count(False, "it says nothing of itself")
+    worst.count(False, "neither fixed nor vectorises")
     if not (encoder.fixed or encoder.vectorises):
         return
     other, batch = make(SEED + 7), inputs(3)
     with torch.no_grad():
         if encoder.fixed:
             learned = [name for name, value in encoder.named_parameters() if value.requires_grad]
-            worst.same("parameters learned though fixed", learned, [])
-            wanted = encoder(batch)
-            worst.same_bits("fixed features with another seed", other(batch), wanted)
-            worst.same_bits("fixed features in training", encoder.train()(batch), wanted)
+            worst.same("learned parameters although fixed", learned, [])
+            expected = encoder(batch)
+            worst.same_bits("fixed features with another seed", other(batch), expected)
+            worst.same_bits("fixed features in training", encoder.train()(batch), expected)
             encoder.eval()
         if encoder.vectorises and any(True for _ in encoder.parameters()):
             both = [encoder, other]
             state = stack_module_state(both)  # type: ignore[arg-type]  # modules
-            found = torch.vmap(lambda parts: functional_call(encoder, parts, (batch,)), randomness="same")(
-                state
-            )
-            for number, (one, each) in enumerate(zip(found, both, strict=True)):
-                wanted = each(batch)
-                scale = wanted.abs().amax().clamp(min=1e-6)
-                worst.see((one - wanted).abs() / scale, f"features of {number} of two at once")
+            stacked_features = torch.vmap(
+                lambda parts: functional_call(encoder, parts, (batch,)), randomness="same"
+            )(state)
+            for number, (features, member) in enumerate(zip(stacked_features, both, strict=True)):
+                expected = member(batch)
+                scale = expected.abs().amax().clamp(min=1e-6)
+                worst.record(
+                    (features - expected).abs() / scale, f"features of encoder {number} of two by torch.vmap"
+                )
 
 
 def _gradients(make: Make, inputs: Callable[[int], Tensor], worst: Worst) -> None:
     """Check that in training every parameter gets a gradient.
 
-    Several batches are used, so that dropout and dead units leave out no parameter by chance.
+    Several batches are used, since dropout and inactive units may leave out a parameter by chance.
     """
     encoder = make().train()
-    worst.count(False, "no parameters")
+    worst.count(False, "the encoder has no parameters")
     if not any(True for _ in encoder.parameters()):
         return
     missing = {name for name, parameter in encoder.named_parameters() if parameter.requires_grad}
@@ -297,49 +310,49 @@ def _gradients(make: Make, inputs: Callable[[int], Tensor], worst: Worst) -> Non
         if not missing:
             return
     for name in sorted(missing):
-        worst.count(True, f"parameter {name}")
+        worst.count(True, f"parameter {name} has no gradient")
 
 
 def _against_differences(make: Make, inputs: Callable[[int], Tensor], worst: Worst) -> None:
-    """Check the directional derivative of the features' mean square in the input, in evaluation mode and float64.
+    """Compare a directional derivative in the input with central differences, in evaluation mode and float64.
 
-    The error is relative to the gradient's size. The step that agrees best counts, since long steps cross kinks and
-    short steps lose digits.
+    The derivative is that of the mean square of the features. The error is relative to the norm of the gradient. The
+    step with the best agreement counts, since long steps cross kinks and short steps lose digits.
     """
     encoder, batch = make().double(), inputs(2).double()
     encoder.requires_grad_(False)
     batch.requires_grad_()
-    found = encoder(batch)
-    if not found.requires_grad:  # an encoder that is not learned may have no gradient
-        worst.count(False, "no gradient flows")
+    features = encoder(batch)
+    if not features.requires_grad:  # an encoder without learned parameters may have no gradient
+        worst.count(False, "the features have no gradient in the input")
         return
     generator = torch.Generator().manual_seed(SEED)
     direction = torch.randn(batch.shape, dtype=torch.float64, generator=generator)
-    (gradient,) = torch.autograd.grad(found.square().mean(), batch)
+    (gradient,) = torch.autograd.grad(features.square().mean(), batch)
     analytic = (gradient * direction).sum().item()
-    told, error = "", math.inf
+    description, error = "", math.inf
     for step in STEPS:
         with torch.no_grad():
             ends = [encoder(batch + sign * step * direction).square().mean().item() for sign in (1, -1)]
         numeric = (ends[0] - ends[1]) / (2 * step)
         gap = abs(analytic - numeric) / max(abs(numeric), gradient.norm().item(), 1e-8)
         if not gap >= error:
-            told, error = f"{analytic:.9g}, by differences {numeric:.9g}", gap
-    worst.see(error, told)
+            description, error = f"{analytic:.9g}, by differences {numeric:.9g}", gap
+    worst.record(error, description)
 
 
 def _extremes(make: Make, inputs: Callable[[int], Tensor], worst: Worst) -> None:
-    """Check that features are finite at constant inputs, which for vectors are also large.
+    """Check that features are finite for constant inputs, which for vectors are also tiny and large.
 
-    NaN must not affect other rows, or it must be refused.
+    A sample of NaN must not affect other samples, or must be refused.
     """
     encoder, like = make(), inputs(3)
     sizes = (0.0, 1.0) if like.dim() == 4 else (0.0, 1e-30, 1.0, 1e6)
     with torch.no_grad():
         for size in sizes:
-            worst.finite(f"features of a constant {size:g}", encoder(torch.full_like(like, size)))
+            worst.finite(f"features of inputs that are all {size:g}", encoder(torch.full_like(like, size)))
         like[1].fill_(math.nan)
         try:
-            worst.finite("features of the rows beside one of NaN", encoder(like)[[0, 2]])
-        except UserError as error:  # a cloud of NaN holds no point
-            worst.count("1" not in str(error), f"an error that does not name row 1: {error}")
+            worst.finite("features of the samples beside one of NaN", encoder(like)[[0, 2]])
+        except UserError as error:  # a cloud of NaN has no points
+            worst.count("1" not in str(error), f"the error message does not name sample 1: {error}")

@@ -1,4 +1,4 @@
-"""Result of one check: its worst case, and how far that is from the limit."""
+"""Result of one check: its worst case, the error there and the largest error that passes."""
 
 import math
 import signal
@@ -16,20 +16,20 @@ SEED = 20260
 
 
 def seed(number: int) -> None:
-    """Seed the default CPU generator, which all random numbers of a check come from."""
-    # torch.manual_seed also formats the stack for every device that is not in use, 0.5 ms in all
+    """Seed the default CPU generator, from which all random numbers of a check are drawn."""
+    # torch.manual_seed takes 0.5 ms, since it also formats the stack for every device that is not in use
     torch.default_generator.manual_seed(number)
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of the contract's table.
+    """Result of one check of one row: a line in the table of `mode=check`.
 
     Attributes:
-        name: Property that must hold.
-        worst: Worst case in words; the reason, where the property does not hold.
-        error: Size of the error in the property's own measure; NaN where a result was NaN, infinite where the plugin
-            raised an error or did not end in time.
+        name: Name of the property that was checked.
+        worst: Description of the case with the largest error, or of the exception that the plugin raised.
+        error: Largest error, in the unit of the property; NaN where a result was NaN, infinite where the plugin raised
+            an exception or exceeded the time limit.
         limit: Largest error that passes.
     """
 
@@ -40,8 +40,8 @@ class Finding:
 
     @property
     def holds(self) -> bool:
-        """Return whether the error is within the limit, which NaN is not."""
-        return self.error <= self.limit  # false for NaN
+        """Return whether the error is within the limit; False for NaN."""
+        return self.error <= self.limit
 
     def __str__(self) -> str:
         verdict = "holds" if self.holds else "FAILS"
@@ -49,27 +49,29 @@ class Finding:
 
 
 class Worst:
-    """Recorder of the worst case among errors.
+    """Recorder of the largest error of a check, with a description of the case in which it occurred.
 
     Attributes:
-        rows: Descriptions of the batch rows of the densities, used where a row number says too little.
+        error: Largest error so far; -∞ before the first, NaN once an error was NaN.
+        case: Description of the case with that error.
+        rows: Description of each batch row of the densities under test; empty to describe rows by their number.
     """
 
     def __init__(self) -> None:
         self.error = -torch.inf
-        self.case = "nothing to compare"
+        self.case = "nothing was compared"
         self.rows: Sequence[str] = ()
 
     def row(self, index: int) -> str:
         """Return the description of a batch row."""
         return self.rows[index] if self.rows else f"batch row {index}"
 
-    def see(self, error: float | Tensor, case: str | Callable[[tuple[int, ...]], str]) -> None:
-        """Record an error, or a tensor of errors, if it is the worst so far; NaN is worse than every number.
+    def record(self, error: float | Tensor, case: str | Callable[[tuple[int, ...]], str]) -> None:
+        """Record the largest of some errors if it exceeds all recorded before; NaN exceeds every number.
 
         Args:
-            error: Number, or tensor of any shape.
-            case: Description of the case, or a function from the index of the worst error to it.
+            error: Error, or errors in a tensor of any shape.
+            case: Description of the case, or function from the index of the largest error in the tensor to it.
         """
         if not isinstance(error, Tensor):
             error = torch.tensor(float(error), dtype=torch.float64)
@@ -79,54 +81,57 @@ class Worst:
         index = int(flat.argmax())  # the index of the first NaN, if there is one
         if not flat[index].item() <= self.error and not math.isnan(self.error):
             self.error = flat[index].item()
-            # torch's own unravel_index imports a symbolic algebra package, 0.4 s
+            # torch.unravel_index takes 0.4 s, since it imports a symbolic algebra package
             at = tuple(int(number) for number in np.unravel_index(index, error.shape))
             self.case = case if isinstance(case, str) else case(at)
 
     def count(self, wrong: Tensor | bool, case: str) -> None:
-        """Record the number of wrong values of a yes-or-no property."""
-        self.see(float(wrong.sum()) if isinstance(wrong, Tensor) else float(wrong), case)
+        """Record the number of wrong values as the error; `wrong` is one truth value or a mask."""
+        self.record(float(wrong.sum()) if isinstance(wrong, Tensor) else float(wrong), case)
 
-    def same(self, what: str, found: object, wanted: object) -> None:
-        """Record an error of 1 unless two objects, such as shapes or types, are equal."""
-        self.count(found != wanted, f"{what}: {found}" + (f", wanted {wanted}" if found != wanted else ""))
+    def same(self, label: str, actual: object, expected: object) -> None:
+        """Record an error of 1 if two objects, such as shapes or types, differ, else 0."""
+        different = actual != expected
+        self.count(different, f"{label}: {actual}" + (f", expected {expected}" if different else ""))
 
-    def same_bits(self, what: str, found: Tensor, wanted: Tensor) -> None:
-        """Record the largest difference of two tensors that must agree to the last bit; NaN equals NaN."""
-        if found.shape != wanted.shape or found.dtype != wanted.dtype:
-            self.see(
+    def same_bits(self, label: str, actual: Tensor, expected: Tensor) -> None:
+        """Record the largest difference of two tensors that must be equal to the last bit; NaN equals NaN.
+
+        The error is infinite if their shapes or types differ.
+        """
+        if actual.shape != expected.shape or actual.dtype != expected.dtype:
+            self.record(
                 torch.inf,
-                f"{what}: {found.dtype} {tuple(found.shape)}, wanted {wanted.dtype} {tuple(wanted.shape)}",
+                f"{label}: {actual.dtype} {tuple(actual.shape)}, expected {expected.dtype} {tuple(expected.shape)}",
             )
             return
-        equal = (found == wanted) | (found.isnan() & wanted.isnan())
-        gap = (found.double() - wanted.double()).abs()
-        self.see(gap.where(~equal, 0), what)
+        equal = (actual == expected) | (actual.isnan() & expected.isnan())
+        gap = (actual.double() - expected.double()).abs()
+        self.record(gap.where(~equal, 0), label)
 
-    def finite(self, what: str, found: Tensor) -> None:
+    def finite(self, label: str, values: Tensor) -> None:
         """Record the number of values that are NaN or infinite."""
         self.count(
-            ~found.isfinite(), f"{what}: {int((~found.isfinite()).sum())} of {found.numel()} not finite"
+            ~values.isfinite(), f"{label}: {int((~values.isfinite()).sum())} of {values.numel()} not finite"
         )
 
     def finding(self, name: str, limit: float) -> Finding:
-        """Return the finding; it fails if no error was recorded, since nothing was compared."""
-        # a check that compared nothing has shown nothing
+        """Return the finding of this property; it fails if no error was recorded, since nothing was compared."""
         error = torch.inf if self.error == -torch.inf else self.error
         case = f"NaN: {self.case}" if math.isnan(error) else self.case
         return Finding(name, case, error if math.isnan(error) else max(error, 0.0), limit)
 
 
 class TooSlow(Exception):
-    """Error of a check that did not end in time."""
+    """Error of a check that exceeded its limit of processor time."""
 
 
 @contextmanager
 def at_most(seconds: float) -> Iterator[None]:
     """Raise TooSlow in a block that uses more than `seconds` of processor time.
 
-    The limit applies only in the main thread and on systems that have such an alarm. It counts processor time rather
-    than elapsed time, so that a busy machine does not make a sound plugin fail.
+    Processor time is used rather than elapsed time, so that no correct plugin fails on a busy machine. Outside the main
+    thread, and on systems without SIGPROF, there is no limit.
 
     Raises:
         TooSlow: The block used more processor time.
@@ -135,10 +140,10 @@ def at_most(seconds: float) -> Iterator[None]:
         yield
         return
 
-    def ring(number: int, frame: Any) -> None:
+    def raise_too_slow(number: int, frame: Any) -> None:
         raise TooSlow(f"did not end within {seconds:g} s of processor time")
 
-    before = signal.signal(signal.SIGPROF, ring)
+    before = signal.signal(signal.SIGPROF, raise_too_slow)
     signal.setitimer(signal.ITIMER_PROF, seconds)
     try:
         yield
@@ -147,25 +152,32 @@ def at_most(seconds: float) -> Iterator[None]:
         signal.signal(signal.SIGPROF, before)
 
 
-def examined(name: str, limit: float, look: Callable[[Worst], None], *, seconds: float = 20.0) -> Finding:
-    """Run one check and return its finding; an exception, or no end in time, counts as an infinite error."""
+def run_check(name: str, limit: float, check: Callable[[Worst], None], *, seconds: float = 20.0) -> Finding:
+    """Run one check and return its finding; the error is infinite if it raises an exception or takes too long.
+
+    Args:
+        name: Name of the property.
+        limit: Largest error that passes.
+        check: Function that runs the check and records its errors.
+        seconds: Limit of processor time, seconds.
+    """
     worst = Worst()
     seed(SEED)
     try:
         with at_most(seconds):
-            look(worst)
+            check(worst)
     except Exception as error:
-        told = " ".join(f"{type(error).__name__}: {error}".split())
-        return Finding(name, told if len(told) <= 300 else told[:297] + "...", torch.inf, limit)
+        message = " ".join(f"{type(error).__name__}: {error}".split())
+        return Finding(name, message if len(message) <= 300 else message[:297] + "...", torch.inf, limit)
     return worst.finding(name, limit)
 
 
 def require(*findings: Finding) -> None:
-    """Assert that all findings hold; for tests.
+    """Assert in a test that all findings hold.
 
     Raises:
         AssertionError: A finding does not hold, or there is none; the message lists all that fail.
     """
-    assert findings, "nothing was examined"
+    assert findings, "nothing was checked"
     failed = [str(finding) for finding in findings if not finding.holds]
     assert not failed, "\n".join(failed)

@@ -1,4 +1,4 @@
-"""Densities over images as densities over vectors, so that checks of vectors apply to images too."""
+"""Densities over images as densities over vectors, so that checks of vectors also apply to images."""
 
 from typing import ClassVar
 
@@ -9,13 +9,13 @@ from torch.distributions import Distribution, constraints
 from framework.distributions.protocol import cdf, marginal_cdfs, median
 
 
-def flattened(density: Distribution) -> Distribution:
-    """Return the density, as one over vectors if it is over images."""
+def flatten(density: Distribution) -> Distribution:
+    """Return a density over images as one over vectors; return any other density unchanged."""
     return Flattened(density) if len(density.event_shape) == 3 else density
 
 
 class Flattened(Distribution):
-    """Density over images (height, width, number) as one over vectors, event_shape (height · width · number,)."""
+    """Density over vectors of length height · width · number, from a density over images (height, width, number)."""
 
     arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
 
@@ -29,7 +29,7 @@ class Flattened(Distribution):
         return constraints.real_vector
 
     def image(self, value: Tensor) -> Tensor:
-        """Return vectors as images."""
+        """Return vectors (..., height · width · number) as images (..., height, width, number)."""
         return value.unflatten(-1, self.density.event_shape)
 
     def log_prob(self, value: Tensor) -> Tensor:
@@ -61,6 +61,6 @@ def _(density: Flattened, samples: int) -> Tensor:
 
 @cdf.register
 def _(density: Flattened, value: Tensor) -> Tensor | None:
-    """Return the distribution function of an image of one number."""
-    found = marginal_cdfs(density.density, density.image(value))
-    return None if found is None else found[..., 0, 0, 0]
+    """Return the distribution function of an image of a single number."""
+    probability = marginal_cdfs(density.density, density.image(value))
+    return None if probability is None else probability[..., 0, 0, 0]

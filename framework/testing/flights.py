@@ -1,4 +1,4 @@
-"""Flights for checks of components that read or predict them: observed and future places of thrown balls."""
+"""Flights of thrown balls, observed and future positions, for checks of plugins that read or predict them."""
 
 import numpy as np
 import torch
@@ -13,25 +13,25 @@ from framework.target import Target
 STEP = 0.016
 """Time between frames, seconds."""
 SIGMA = 0.003
-"""Standard deviation of the noise of `windows_of`, metres."""
+"""Standard deviation of the noise of observed positions from `simulate_windows`, metres."""
 START = np.array([0.8, -4.1, -0.62, -0.6, 6.2, 1.6, 20.0, -30.0, 10.0])
-"""Position, velocity and spin, at the first frame, of a ball that lands on the table."""
+"""Position, velocity and spin, in the first frame, of a ball that lands on the table; metres and seconds."""
 TWO_FRAMES = Target("real", future_names(2, STEP))
-"""Target of a ball's places at the next two frames."""
+"""Target of a ball's positions in the next two frames."""
 
 
-def thrown(count: int) -> Float[Tensor, "flight number"]:
-    """Return the observed numbers of six frames of falling balls."""
+def falling_balls(count: int) -> Float[Tensor, "flight number"]:
+    """Return observations of falling balls in six frames, each with the time, position and visibility of the ball."""
     since = STEP * torch.arange(-5.0, 1.0).expand(count, -1)
     height = torch.linspace(-0.2, 0.2, count).unsqueeze(-1) - 4.9 * since.square()
     frames = [since, 0.5 * since, 5 * since - 3, height, torch.ones_like(since)]
     return torch.stack(frames, -1).flatten(1)
 
 
-def windows_of(
+def simulate_windows(
     count: int, outliers: bool = False
 ) -> tuple[Float[Tensor, "flight 20 5"], Float[Tensor, "flight 35 3"], Float[Tensor, "flight 9"]]:
-    """Return observed frames of flights that begin near `START`, their future without noise, and their first states.
+    """Return flights that begin near `START`: observed frames, future positions without noise, and initial states.
 
     Args:
         count: Number of flights.
@@ -43,9 +43,9 @@ def windows_of(
     )
     times = STEP * torch.arange(55, dtype=torch.float64).expand(count, -1)
     places = simulate(states, times, Constants())[..., :3]
-    seen = places[:, :20] + SIGMA * torch.from_numpy(random.normal(size=(count, 20, 3)))
-    there = torch.from_numpy(random.random((count, 20, 1)) > 0.1)
+    observed = places[:, :20] + SIGMA * torch.from_numpy(random.normal(size=(count, 20, 3)))
+    present = torch.from_numpy(random.random((count, 20, 1)) > 0.1)
     if outliers:
-        seen = seen + (torch.from_numpy(random.random((count, 20, 1))) < 0.1) * 0.4
-    frames = torch.cat([times[:, :20, None] - times[:, 19:20, None], seen, torch.ones(count, 20, 1)], -1)
-    return frames * there, places[:, 20:], states
+        observed = observed + (torch.from_numpy(random.random((count, 20, 1))) < 0.1) * 0.4
+    frames = torch.cat([times[:, :20, None] - times[:, 19:20, None], observed, torch.ones(count, 20, 1)], -1)
+    return frames * present, places[:, 20:], states

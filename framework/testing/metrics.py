@@ -1,4 +1,4 @@
-"""Contract tests of a metric: one function for each property; each reports its worst case."""
+"""Contract tests of a metric: one function for each property; each records its largest error."""
 
 import copy
 import math
@@ -26,35 +26,37 @@ from framework.metric import Metric
 from framework.prediction import Prediction, Split
 from framework.target import Target
 from framework.testing.balls import Ball, ball
-from framework.testing.devices import OneDevice, Questions, on_one_device
-from framework.testing.finding import SEED, Finding, Worst, examined
+from framework.testing.devices import Calls, OneDevice, check_devices
+from framework.testing.finding import SEED, Finding, Worst, run_check
 from framework.testing.heads import values
 from framework.testing.metric_numbers import (
     SCALE,
-    degrees,
-    nats,
-    not_hidden,
-    same,
-    scaled,
-    standard_errors,
+    check_degrees,
+    check_nan_visible,
+    check_nats,
+    check_same,
+    check_scaling,
+    check_standard_errors,
 )
 from framework.testing.rows import MetricRow
 
 Make = Callable[[], Metric]
 SAMPLES = 24
+"""Number of samples in most checks."""
 MANY = 261
-"""Number of samples in one update, more than a test split is commonly fetched in; MANY_IMAGES for images."""
+"""Number of samples in a large update, larger than common batch sizes."""
 MANY_IMAGES = 72
+"""Number of images in a large update."""
 CASES = 48
-"""Number of test cases from which standard errors are resampled."""
+"""Number of test cases with which standard errors are checked."""
 
 
 class Cardioid(Distribution):
-    """Density (1 + 2ρ cos(φ - μ)) / 2π of each angle (Mardia & Jupp 2000, §3.5.5), the simplest on the circle.
+    """Density (1 + 2ρ cos(φ - μ)) / 2π of independent angles φ (Mardia & Jupp 2000, §3.5.5).
 
     Args:
         location: μ, (*batch, angle), radians.
-        strength: 2ρ in (0, 1], (*batch); 1 everywhere by default, which is narrowest.
+        strength: 2ρ in (0, 1], (*batch); 1 everywhere by default, which gives the narrowest densities.
     """
 
     arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
@@ -73,7 +75,7 @@ class Cardioid(Distribution):
         return self.location
 
     def log_prob(self, value: Tensor) -> Tensor:
-        # 1 + cos d = 2 cos²(d/2); kept above 0, where log_prob would be -∞ and no metric could be compared
+        # 1 + cos d = 2 cos²(d/2); a lower bound keeps log_prob finite, so that metrics can be compared
         near = 2 * torch.cos((value - self.location) / 2).square()
         weight = self.strength.unsqueeze(-1)
         near = 1 - weight + weight * near
@@ -85,13 +87,13 @@ class Cardioid(Distribution):
         # of freedom
         like = {"dtype": self.location.dtype, "device": self.location.device}
         normal = torch.randn(4, *shape, **like)
-        found = self.location + 2 * torch.atan(normal[0] / normal[1:].norm(dim=0))
+        narrow = self.location + 2 * torch.atan(normal[0] / normal[1:].norm(dim=0))
         if (self.strength == 1).all():
-            return found
+            return narrow
         # 1 + s cos d = s (1 + cos d) + (1 - s): a mixture of the density of strength 1 and the uniform density
         anywhere = 2 * math.pi * torch.rand(shape, **like)
         chosen = torch.rand(shape, device=self.location.device)
-        return torch.where(chosen < self.strength.unsqueeze(-1), found, anywhere)
+        return torch.where(chosen < self.strength.unsqueeze(-1), narrow, anywhere)
 
     def entropy(self) -> Tensor:
         # log 2π - (1/2π) ∫ (1 + s cos d) log(1 + s cos d) = log 4π - 1 + r - log(1 + r) with r = √(1 - s²)
@@ -118,18 +120,18 @@ def _(density: Cardioid, index: Tensor) -> Cardioid:
     return Cardioid(take(density.location, index), strength)
 
 
-def numbers_about(target: Target) -> int:
-    """Return the size of the last dimension of the place that `density_about` reads."""
+def place_size(target: Target) -> int:
+    """Return the size of the last dimension of the `place` that `simplest_density` reads."""
     return len(target.names) if target.kind == "class" else math.prod(target.event_shape)
 
 
-def density_about(target: Target, place: Tensor, breadth: Tensor | None = None) -> Distribution:
-    """Return the simplest density of the target's kind about a place (*batch, number); for classes the place is logits.
+def simplest_density(target: Target, place: Tensor, breadth: Tensor | None = None) -> Distribution:
+    """Return a simple density for a target: cardioid, normal or categorical.
 
     Args:
         target: Target of the density.
         place: Location of the density, or logits of classes, (*batch, number).
-        breadth: Factor on the width, 1 or more, (*batch); logits of classes are divided by it.
+        breadth: Factor on the width of the density, 1 or more, (*batch); logits of classes are divided by it.
     """
     if target.kind == "angle":
         return Cardioid(place, None if breadth is None else 1 / breadth)
@@ -149,7 +151,7 @@ def density_about(target: Target, place: Tensor, breadth: Tensor | None = None) 
 
 
 def examine_metric(row: MetricRow, build: Make) -> Iterator[Finding]:
-    """Yield one finding for each property of a metric on predictions of `row.target`."""
+    """Yield one finding for each property of a metric, for predictions of the row's target."""
     reads = bool(build().reads)
     whole = predictions(row, SAMPLES, images=reads)
     many, kind = Many(build, row, images=reads), row.target.kind
@@ -175,22 +177,22 @@ def examine_metric(row: MetricRow, build: Make) -> Iterator[Finding]:
         checks["only the images it names"] = (0.0, lambda worst: _images(build, whole, worst))
     for name, (limit, check) in checks.items():
         if name not in row.leave_out:
-            yield examined(name, row.limits.get(name, limit), check)
+            yield run_check(name, row.limits.get(name, limit), check)
 
 
 @dataclass(frozen=True)
 class Predictions:
-    """Predictions for a fixed set of samples, as a function of sample indices and a split.
+    """Predictions for a fixed set of samples, callable with sample indices and the name of a split.
 
     Attributes:
-        row: Row of the contract, which states the target and the image size.
+        row: Contract row, which states the target and the image size.
         target: Target of each sample.
-        place: Place of the density of each sample, as `density_about` reads it.
-        breadth: Factor on the widths of the densities of the test split; None for the narrowest.
-        outliers: Factor on the widths of the densities of outliers. An outlier has the place of the next sample, so
-            that no two predictions of one index have the same place.
+        place: Location of the density of each sample, as `simplest_density` reads it.
+        breadth: Factor on the widths of the densities of the test split; None for 1.
+        outliers: Factor on the widths of the densities of outliers. An outlier has the location of the next sample, so
+            that the test sample and the outlier of an index differ in location.
         fields: Further fields of the batch.
-        images: Whether the predictions have images; they show balls.
+        images: Whether the predictions have images, which show balls.
     """
 
     row: MetricRow
@@ -203,44 +205,46 @@ class Predictions:
 
     def __call__(self, index: Tensor, split: Split) -> Prediction:
         """Return the prediction of these samples of a split."""
-        about, breadth = self.place[index], None if self.breadth is None else self.breadth[index]
+        location, breadth = self.place[index], None if self.breadth is None else self.breadth[index]
         if split == "outliers":
-            about = self.place[(index + 1) % len(self.target)]
+            location = self.place[(index + 1) % len(self.target)]
             breadth = self.outliers[index] * (1 if breadth is None else breadth)
-        density = density_about(self.row.target, about, breadth)
+        density = simplest_density(self.row.target, location, breadth)
         if self.images:
-            density = Ball(density, about.float(), self.row.size)
+            density = Ball(density, location.float(), self.row.size)
         batch = {"target": self.target[index], "index": index, "group": torch.zeros_like(index)}
         batch |= {name: field[index] for name, field in self.fields.items()}
         return Prediction(density, batch, split=split)
 
 
 def predictions(row: MetricRow, count: int, *, images: bool, near: bool = False) -> Predictions:
-    """Return predictions at random places or, if `near`, close to the targets.
+    """Return predictions at random locations or, if `near`, close to the targets.
 
-    Predictions near the targets have a random difficulty for each sample, so that the errors of its numbers are
-    correlated.
+    If `near`, each sample has a random difficulty, so that the errors of the numbers of its target are correlated.
     """
     target = values(row.target, (count,))
     fields = {name: make(count) for name, make in row.fields.items()}
     if images:
         fields = {**ball(_place(row, target), row.size), **fields}
     generator = torch.Generator().manual_seed(SEED)
-    shape = (count, numbers_about(row.target))
+    shape = (count, place_size(row.target))
     place = torch.randn(shape, generator=generator)
     outliers = 1 + 2 * torch.rand(count, generator=generator)
     if near:
-        hard = torch.randn(count, 1, generator=generator).abs()
-        away = _place(row, target)
-        place = away / 2 + place if row.target.kind == "class" else away + hard * (0.7 + 0.1 * place)
+        difficulty = torch.randn(count, 1, generator=generator).abs()
+        center = _place(row, target)
+        place = (
+            center / 2 + place if row.target.kind == "class" else center + difficulty * (0.7 + 0.1 * place)
+        )
     return Predictions(row, target, place, None, outliers, fields, images)
 
 
-Slices = Callable[[Tensor, Split], Prediction]
+Predict = Callable[[Tensor, Split], Prediction]
+"""Function from sample indices and a split to the prediction."""
 
 
 def _place(row: MetricRow, target: Tensor) -> Tensor:
-    """Return the place of a density about the target, as `density_about` reads it; logits for classes."""
+    """Return the `place` of a density at the target, as `simplest_density` reads it."""
     return (
         3.0 * torch.nn.functional.one_hot(target, len(row.target.names))
         if row.target.kind == "class"
@@ -248,267 +252,298 @@ def _place(row: MetricRow, target: Tensor) -> Tensor:
     )
 
 
-def _feed(metric: Metric, some: Slices, part: Tensor) -> None:
-    """Update a metric with samples `part` of every split that it reads."""
+def _update(metric: Metric, predict: Predict, indices: Tensor) -> None:
+    """Update a metric with the samples of these indices, for every split that it reads."""
     for split in metric.splits:
-        metric.update(some(part, split))
+        metric.update(predict(indices, split))
 
 
-def _after(build: Make, some: Slices, parts: Sequence[Tensor]) -> dict[str, Tensor]:
+def _compute(build: Make, predict: Predict, parts: Sequence[Tensor]) -> dict[str, Tensor]:
+    """Return the numbers of a new metric after one update for each part, a tensor of sample indices."""
     metric = build()
     torch.manual_seed(SEED)
     for part in parts:
-        _feed(metric, some, part)
+        _update(metric, predict, part)
     return metric.compute()
 
 
-def _on_one_device(build: Make, some: "Predictions", worst: Worst) -> None:
-    """Check two updates of every split, the numbers, and both again after a reset, for mixed devices."""
+def _on_one_device(build: Make, predict: "Predictions", worst: Worst) -> None:
+    """Check that updates, numbers, and both after a reset mix no devices."""
 
-    def questions(mode: OneDevice) -> Questions:
+    def calls(mode: OneDevice) -> Calls:
         metric = build()
-        mode.move(metric)
+        mode.label_module(metric)
         fields = ("target", "place", "breadth", "outliers", "fields")
-        received = replace(some, **mode.receive({name: getattr(some, name) for name in fields}))
-        parts = mode.receive(list(torch.arange(SAMPLES // 2).split(SAMPLES // 4)))
+        received = replace(predict, **mode.label_device({name: getattr(predict, name) for name in fields}))
+        parts = mode.label_device(list(torch.arange(SAMPLES // 2).split(SAMPLES // 4)))
         for part in parts:
-            yield "update", lambda part=part: _feed(metric, received, part)
+            yield "update", lambda part=part: _update(metric, received, part)
         yield "compute", metric.compute
         yield "reset", metric.reset
-        yield "update after a reset", lambda: _feed(metric, received, parts[0])
+        yield "update after a reset", lambda: _update(metric, received, parts[0])
         yield "compute after a reset", metric.compute
 
-    on_one_device(questions, worst)
+    check_devices(calls, worst)
 
 
-def _named(build: Make, some: Slices, worst: Worst) -> None:
+def _named(build: Make, predict: Predict, worst: Worst) -> None:
     metric = build()
-    found = _after(build, some, [torch.arange(SAMPLES)])
+    numbers = _compute(build, predict, [torch.arange(SAMPLES)])
     worst.count(
-        not set(metric.columns) <= set(found), f"columns {sorted(set(metric.columns) - set(found))} missing"
+        not set(metric.columns) <= set(numbers),
+        f"columns {sorted(set(metric.columns) - set(numbers))} are not computed",
     )
-    worst.count(not set(metric.better) <= set(metric.columns), f"better {sorted(metric.better)} of columns")
-    for key, value in found.items():
+    worst.count(
+        not set(metric.better) <= set(metric.columns),
+        f"better names {sorted(metric.better)}, which must be columns",
+    )
+    for key, value in numbers.items():
         worst.same(f"shape of {key}", tuple(value.shape), ())
-        worst.same(f"{key} is one number", value.numel(), 1)
+        worst.same(f"number of values of {key}", value.numel(), 1)
     worst.count(
-        all(value.isnan().item() for value in found.values()), "every number is NaN on ordinary predictions"
+        all(value.isnan().item() for value in numbers.values()),
+        "every number is NaN for ordinary predictions",
     )
 
 
-def _nothing(build: Make, some: Slices, worst: Worst) -> None:
-    for what, parts in {"no update": [], "an empty batch": [torch.arange(0)]}.items():
-        for key, value in _quiet(build, some, parts).items():
-            worst.count(not value.isnan().item(), f"{what}: {key} is {value.item():g}")
+def _nothing(build: Make, predict: Predict, worst: Worst) -> None:
+    for situation, parts in {"no update": [], "an empty batch": [torch.arange(0)]}.items():
+        for key, value in _compute_quietly(build, predict, parts).items():
+            worst.count(not value.isnan().item(), f"{situation}: {key} is {value.item():g}")
 
 
-def _quiet(build: Make, some: Slices, parts: Sequence[Tensor]) -> dict[str, Tensor]:
+def _compute_quietly(build: Make, predict: Predict, parts: Sequence[Tensor]) -> dict[str, Tensor]:
     with warnings.catch_warnings():
-        # torchmetrics warns of compute before update, which is tested here
+        # torchmetrics warns of compute before update, which this check does on purpose
         warnings.filterwarnings("ignore", message=".*compute.*before the.*update.*", category=UserWarning)
-        return _after(build, some, parts)
+        return _compute(build, predict, parts)
 
 
 class Many:
-    """More predictions than a metric may be used to, and the numbers of all of them at once.
+    """Large set of predictions, with the numbers of a metric for all of them.
 
     Attributes:
-        some: Predictions.
+        predictions: Predictions.
         index: Indices of all predictions.
     """
 
     def __init__(self, build: Make, row: MetricRow, *, images: bool) -> None:
         self.build = build
-        dear = images or row.target.kind == "image"
-        self.some = predictions(row, MANY_IMAGES if dear else MANY, images=images)
-        self.index = torch.arange(len(self.some.target))
+        slow = images or row.target.kind == "image"
+        self.predictions = predictions(row, MANY_IMAGES if slow else MANY, images=images)
+        self.index = torch.arange(len(self.predictions.target))
 
     @cached_property
     def at_once(self) -> dict[str, Tensor]:
-        """Return the numbers after one update with all predictions."""
-        return _after(self.build, self.some, [self.index])
+        """Numbers of the metric after one update with all predictions."""
+        return _compute(self.build, self.predictions, [self.index])
 
 
-def _batches(build: Make, some: Slices, many: Many, worst: Worst) -> None:
+def _batches(build: Make, predict: Predict, many: Many, worst: Worst) -> None:
     index = torch.arange(SAMPLES)
-    wanted = _after(build, some, [index])
-    same("in batches of 7", _after(build, some, index.split(7)), wanted, worst)
-    same("one by one", _after(build, some, index.split(1)), wanted, worst)
+    expected = _compute(build, predict, [index])
+    check_same("in batches of 7", _compute(build, predict, index.split(7)), expected, worst)
+    check_same("one by one", _compute(build, predict, index.split(1)), expected, worst)
     count, half = len(many.index), len(many.index) // 2
     parts = many.index.split([1, half + 3, count - half - 4])
-    same(f"{count} in uneven parts", _after(build, many.some, parts), many.at_once, worst)
+    check_same(
+        f"{count} samples in uneven batches", _compute(build, many.predictions, parts), many.at_once, worst
+    )
 
 
-def _order(build: Make, some: Slices, many: Many, worst: Worst) -> None:
+def _order(build: Make, predict: Predict, many: Many, worst: Worst) -> None:
     index = torch.arange(SAMPLES)
-    same("backwards", _after(build, some, [index.flip(0)]), _after(build, some, [index]), worst)
+    check_same(
+        "in reverse order",
+        _compute(build, predict, [index.flip(0)]),
+        _compute(build, predict, [index]),
+        worst,
+    )
     order = torch.randperm(len(many.index), generator=torch.Generator().manual_seed(SEED))
-    same(f"{len(order)} shuffled", _after(build, many.some, [order]), many.at_once, worst)
+    check_same(
+        f"{len(order)} samples in random order",
+        _compute(build, many.predictions, [order]),
+        many.at_once,
+        worst,
+    )
 
 
-def _merge(build: Make, some: Slices, worst: Worst) -> None:
-    """Check that the states of two processes, merged by torchmetrics, give the numbers of all samples."""
+def _merge(build: Make, predict: Predict, worst: Worst) -> None:
+    """Check that the states of two metrics, merged by torchmetrics, give the numbers of all samples."""
     first, second = build(), build()
-    _feed(first, some, torch.arange(10))
-    _feed(second, some, torch.arange(10, SAMPLES))
+    _update(first, predict, torch.arange(10))
+    _update(second, predict, torch.arange(10, SAMPLES))
     first.merge_state(second)
-    same("two halves merged", first.compute(), _after(build, some, [torch.arange(SAMPLES)]), worst)
+    check_same(
+        "merged states of two parts",
+        first.compute(),
+        _compute(build, predict, [torch.arange(SAMPLES)]),
+        worst,
+    )
 
 
-def _reset(build: Make, some: Slices, worst: Worst) -> None:
+def _reset(build: Make, predict: Predict, worst: Worst) -> None:
     index = torch.arange(SAMPLES)
     metric = build()
-    _feed(metric, some, index[:5])
+    _update(metric, predict, index[:5])
     metric.reset()
-    _feed(metric, some, index)
-    wanted = _after(build, some, [index])
-    same("after a reset", metric.compute(), wanted, worst)
-    same("of a copy", copy.deepcopy(metric).compute(), wanted, worst)
+    _update(metric, predict, index)
+    expected = _compute(build, predict, [index])
+    check_same("after a reset", metric.compute(), expected, worst)
+    check_same("of a copy", copy.deepcopy(metric).compute(), expected, worst)
 
 
 def _perfect(build: Make, row: MetricRow, worst: Worst) -> None:
-    """Check that a density about the target is judged better than a density about another place.
+    """Check that densities at the targets give better numbers than densities at other locations.
 
-    All columns of `better` are compared. For a metric that reads outliers, densities of outliers are broader in the
-    first case, and as narrow as those of test samples in the second.
+    All columns of `better` are compared. For a metric that reads outliers, densities of outliers are broader than those
+    of test samples in the first case, and equally broad in the second.
     """
     metric = build()
-    some = predictions(row, SAMPLES, images=bool(metric.reads))
+    predicted = predictions(row, SAMPLES, images=bool(metric.reads))
     index = torch.arange(SAMPLES)
     breadth = torch.full((SAMPLES,), 2.0)
 
-    def about(location: Tensor, outliers: Tensor | None) -> dict[str, Tensor]:
-        batch = some(index, "test").batch
+    def compute_at(location: Tensor, outliers: Tensor | None) -> dict[str, Tensor]:
+        batch = predicted(index, "test").batch
         location = _place(row, location)
-        judged = build()
-        for split in judged.splits:
-            density = density_about(row.target, location.float(), outliers if split == "outliers" else None)
-            if judged.reads:
+        new_metric = build()
+        for split in new_metric.splits:
+            density = simplest_density(
+                row.target, location.float(), outliers if split == "outliers" else None
+            )
+            if new_metric.reads:
                 density = Ball(density, location.float(), row.size)
-            judged.update(Prediction(density, batch, split=split))
-        return judged.compute()
+            new_metric.update(Prediction(density, batch, split=split))
+        return new_metric.compute()
 
-    target = some(index, "test").target
+    target = predicted(index, "test").target
     elsewhere = (target + 1) % len(row.target.names) if row.target.kind == "class" else target + 2.0
-    good, bad = about(target, breadth), about(elsewhere, None)
-    worst.count(False, "no column has a better way")
-    for key, way in metric.better.items():
-        ahead = good[key] - bad[key] if way == "higher" else bad[key] - good[key]
-        told = f"{key}: {good[key].item():.4g} about the target, {bad[key].item():.4g} elsewhere"
-        worst.count(not (ahead > 0 or good[key].isnan().item()), told)
+    good, bad = compute_at(target, breadth), compute_at(elsewhere, None)
+    worst.count(False, "no column has a better direction")
+    for key, direction in metric.better.items():
+        gain = good[key] - bad[key] if direction == "higher" else bad[key] - good[key]
+        description = (
+            f"{key}: {good[key].item():.4g} for densities at the targets, {bad[key].item():.4g} elsewhere"
+        )
+        worst.count(not (gain > 0 or good[key].isnan().item()), description)
 
 
-def _computed_twice(build: Make, some: Slices, worst: Worst) -> None:
-    """Check that `compute` after every batch, and twice in a row, does not change the numbers."""
+def _computed_twice(build: Make, predict: Predict, worst: Worst) -> None:
+    """Check that calling `compute` after every batch, and twice in a row, does not change the numbers."""
     index = torch.arange(SAMPLES)
-    wanted = _after(build, some, index.split(10))
+    expected = _compute(build, predict, index.split(10))
     metric = build()
     torch.manual_seed(SEED)
     for part in index.split(10):
-        _feed(metric, some, part)
+        _update(metric, predict, part)
         metric.compute()
-    same("computed after every batch", metric.compute(), wanted, worst)
-    metric.update(some(index[:0], metric.splits[0]))  # so that torchmetrics does not return the cached result
-    same("computed again", metric.compute(), wanted, worst)
+    check_same("computed after every batch", metric.compute(), expected, worst)
+    metric.update(
+        predict(index[:0], metric.splits[0])
+    )  # so that torchmetrics does not return its cached result
+    check_same("computed again", metric.compute(), expected, worst)
 
 
-def _untouched(build: Make, some: Slices, worst: Worst) -> None:
-    """Check that a metric leaves the prediction as it is, since other metrics read the same one."""
+def _untouched(build: Make, predict: Predict, worst: Worst) -> None:
+    """Check that an update does not change the prediction, since other metrics read the same prediction."""
     metric, index = build(), torch.arange(SAMPLES)
     for split in metric.splits:
-        seen = some(index, split)
+        prediction = predict(index, split)
         torch.manual_seed(SEED)
         for derived in ("log_prob", "estimate", "class_probabilities", "entropy", "point"):
             try:
-                getattr(seen, derived)
+                getattr(prediction, derived)
             except (UserError, NotImplementedError):
                 continue
-        before = {name: value.clone() for name, value in _tensors(seen).items()}
-        metric.update(seen)
-        after = _tensors(seen)
+        before = {name: value.clone() for name, value in _tensors(prediction).items()}
+        metric.update(prediction)
+        after = _tensors(prediction)
         worst.same("fields of the batch", sorted(after.keys() & before.keys()), sorted(before))
         for name in before.keys() & after.keys():
             worst.same_bits(f"{name} after an update", after[name], before[name])
 
 
 def _tensors(prediction: Prediction) -> dict[str, Tensor]:
-    """Return the tensors of the batch and the density of a prediction, and those derived from both, by name."""
-    found = {f"batch[{name!r}]": value for name, value in prediction.batch.items()}
+    """Return name → tensor, for the batch, the density and the derived quantities of a prediction."""
+    tensors = {f"batch[{name!r}]": value for name, value in prediction.batch.items()}
     for owner in (prediction, prediction.density):
         for name, value in vars(owner).items():
             if isinstance(value, Tensor):
-                found[name.lstrip("_")] = value
-    return found
+                tensors[name.lstrip("_")] = value
+    return tensors
 
 
 def _standard_errors(build: Make, row: MetricRow, worst: Worst) -> None:
     images = bool(build().reads)
     count = CASES // 2 if images or row.target.kind == "image" else CASES
-    some = predictions(row, count, images=images, near=True)
-    standard_errors(lambda index: _after(build, some, [index]), count, worst)
+    predicted = predictions(row, count, images=images, near=True)
+    check_standard_errors(lambda index: _compute(build, predicted, [index]), count, worst)
 
 
 def _turns(build: Make, row: MetricRow, worst: Worst) -> None:
-    """Check that whole turns of predicted or true angles change nothing; in float64, where they round little."""
-    some = predictions(row, SAMPLES, images=bool(build().reads))
-    some = replace(some, target=some.target.double(), place=some.place.double())
+    """Check in float64 that whole turns added to predicted or true angles do not change the numbers."""
+    predicted = predictions(row, SAMPLES, images=bool(build().reads))
+    predicted = replace(predicted, target=predicted.target.double(), place=predicted.place.double())
     index = torch.arange(SAMPLES)
-    wanted = _after(build, some, [index])
+    expected = _compute(build, predicted, [index])
     generator = torch.Generator().manual_seed(SEED)
-    turns = 2 * math.pi * torch.randint(-3, 4, (2, *some.target.shape), generator=generator).double()
-    for what, other in {
-        "targets": replace(some, target=some.target + turns[0]),
-        "predicted angles": replace(some, place=some.place + turns[1]),
+    turns = 2 * math.pi * torch.randint(-3, 4, (2, *predicted.target.shape), generator=generator).double()
+    for changed, other in {
+        "targets": replace(predicted, target=predicted.target + turns[0]),
+        "predicted angles": replace(predicted, place=predicted.place + turns[1]),
     }.items():
-        same(f"whole turns of {what}", _after(build, other, [index]), wanted, worst)
+        check_same(f"whole turns added to {changed}", _compute(build, other, [index]), expected, worst)
 
 
 def _unit(build: Make, row: MetricRow, worst: Worst) -> None:
-    """Check degrees against radians, nats against bits, and that numbers of reals follow their target's unit."""
+    """Check that numbers are in degrees only if their names say so, are in nats, and scale with the unit of reals."""
     index, kind = torch.arange(SAMPLES), row.target.kind
-    some = predictions(row, SAMPLES, images=False, near=True)
+    predicted = predictions(row, SAMPLES, images=False, near=True)
     metric = build()
     columns = metric.columns
     if kind in ("class", "angle"):
-        place = torch.zeros_like(some.place)
-        flat = replace(some, place=place, breadth=torch.full((SAMPLES,), 1e15))
-        nats(columns, row.target, _after(build, flat, [index]), worst)
+        place = torch.zeros_like(predicted.place)
+        flat = replace(predicted, place=place, breadth=torch.full((SAMPLES,), 1e15))
+        check_nats(columns, row.target, _compute(build, flat, [index]), worst)
     if kind == "angle":
         anywhere = predictions(row, SAMPLES, images=False)
-        off, far = (replace(some, place=some.target.double() + far) for far in (1.0, 2.0))
-        wide = [_after(build, other, [index]) for other in (anywhere, some, far)]
-        degrees(columns, wide, _after(build, off, [index]), worst)
+        off, far = (replace(predicted, place=predicted.target.double() + far) for far in (1.0, 2.0))
+        wide = [_compute(build, second, [index]) for second in (anywhere, predicted, far)]
+        check_degrees(columns, wide, _compute(build, off, [index]), worst)
     if kind == "real":
-        first, other, again = (
+        first, second, third = (
             replace(
-                some,
-                target=some.target.double() * scale,
-                place=some.place.double() * scale,
+                predicted,
+                target=predicted.target.double() * scale,
+                place=predicted.place.double() * scale,
                 breadth=torch.full((SAMPLES,), scale, dtype=torch.float64),
             )
             for scale in (1.0, SCALE, SCALE**2)
         )
-        wanted, found, more = (_after(build, one, [index]) for one in (first, other, again))
-        scaled(columns, found, more, wanted, len(row.target.names), worst)
-    worst.count(False, "nothing has a unit")
+        first_numbers, second_numbers, third_numbers = (
+            _compute(build, scaled_predictions, [index]) for scaled_predictions in (first, second, third)
+        )
+        check_scaling(columns, second_numbers, third_numbers, first_numbers, len(row.target.names), worst)
+    worst.count(False, "no number has a unit")
 
 
 def _nan(build: Make, row: MetricRow, worst: Worst) -> None:
-    some = predictions(row, SAMPLES, images=False, near=True)
-    bad = slice(5, 13)  # so many that a median changes
+    predicted = predictions(row, SAMPLES, images=False, near=True)
+    bad = slice(5, 13)  # enough samples to change a median
 
-    def judge(place: float | Tensor, breadth: float) -> dict[str, Tensor]:
-        places, breadths = some.place.clone(), torch.ones(SAMPLES)
+    def evaluate(place: float | Tensor, breadth: float) -> dict[str, Tensor]:
+        places, breadths = predicted.place.clone(), torch.ones(SAMPLES)
         places[bad] += place
         breadths[bad] = breadth
-        return _after(build, replace(some, place=places, breadth=breadths), [index])
+        return _compute(build, replace(predicted, place=places, breadth=breadths), [index])
 
     index, metric = torch.arange(SAMPLES), build()
-    without = _after(build, some, [torch.cat([index[: bad.start], index[bad.stop :]])])
-    not_hidden(
-        lambda: judge(math.nan, math.nan),
-        judge(0.0, 1.0),
-        judge(torch.arange(1.0, 1.0 + some.place.shape[1]), 2.0),
+    without = _compute(build, predicted, [torch.cat([index[: bad.start], index[bad.stop :]])])
+    check_nan_visible(
+        lambda: evaluate(math.nan, math.nan),
+        evaluate(0.0, 1.0),
+        evaluate(torch.arange(1.0, 1.0 + predicted.place.shape[1]), 2.0),
         without,
         metric.columns,
         metric.better,
@@ -516,9 +551,9 @@ def _nan(build: Make, row: MetricRow, worst: Worst) -> None:
     )
 
 
-def _images(build: Make, some: Slices, worst: Worst) -> None:
-    """Check that exactly the images of `reads` are drawn, each once and alone, as the prediction announces none."""
-    metric, prediction = build(), some(torch.arange(SAMPLES), build().splits[0])
+def _images(build: Make, predict: Predict, worst: Worst) -> None:
+    """Check that the metric draws exactly the images in `reads`, each once and by itself."""
+    metric, prediction = build(), predict(torch.arange(SAMPLES), build().splits[0])
     metric.update(prediction)
-    asked = prediction.density.asked  # type: ignore[attr-defined]  # a Ball
-    worst.same("images drawn", sorted(map(sorted, asked)), sorted([name] for name in metric.reads))
+    requested = prediction.density.requested_channels  # type: ignore[attr-defined]  # a Ball
+    worst.same("images drawn", sorted(map(sorted, requested)), sorted([name] for name in metric.reads))

@@ -1,4 +1,4 @@
-"""Contract tests of an objective: one function for each property; each reports its worst case."""
+"""Contract tests of an objective: one function for each property; each records its largest error."""
 
 import copy
 from collections.abc import Callable, Iterable, Iterator
@@ -13,23 +13,31 @@ from framework.errors import ConfigError, UserError
 from framework.model import Predictor, independent_penalty
 from framework.objective import Objective
 from framework.target import Target
-from framework.testing.devices import OneDevice, Questions, on_one_device
-from framework.testing.finding import SEED, Finding, Worst, examined
+from framework.testing.devices import Calls, OneDevice, check_devices
+from framework.testing.finding import SEED, Finding, Worst, run_check
 from framework.testing.heads import values
-from framework.testing.metrics import density_about, numbers_about
+from framework.testing.metrics import place_size, simplest_density
 from framework.testing.rows import ObjectiveRow
 from framework.testing.wrappers import LENGTH
 
 Make = Callable[[float], Objective]
 """Function that builds the row's objective with its weight multiplied by a factor."""
 SAMPLES = 12
+"""Number of samples of a batch."""
 STEPS = (1e-5, 1e-6, 1e-7, 1e-8)
+"""Step lengths of central differences."""
 MANY = 130
+"""Number of samples of a large batch."""
 DRAWS = 8
+"""Number of seeds over which the penalty of an objective that draws random numbers is averaged."""
 
 
 class Network(nn.Module):
-    """Small network with a layer that keeps state and a layer that draws noise: batch norm and dropout."""
+    """Small network with batch norm, which has state, and dropout, which draws random numbers.
+
+    Attributes:
+        gain: Factor on the raw parameters, which can make them extreme.
+    """
 
     def __init__(self, target: Target) -> None:
         super().__init__()
@@ -37,18 +45,17 @@ class Network(nn.Module):
         self.first = nn.Linear(LENGTH, 8)
         self.norm = nn.BatchNorm1d(8)
         self.dropout = nn.Dropout(0.2)
-        self.last = nn.Linear(8, numbers_about(target))
+        self.last = nn.Linear(8, place_size(target))
         self.gain = 1.0
-        """Factor on the distribution parameters, which makes them extreme."""
 
     def forward(self, inputs: Tensor) -> Distribution:
         numbers = inputs / 255 if inputs.dtype == torch.uint8 else inputs
         hidden = self.norm(self.first(numbers.to(self.first.weight.dtype)).tanh())
-        return density_about(self.target, self.gain * self.last(self.dropout(hidden)))
+        return simplest_density(self.target, self.gain * self.last(self.dropout(hidden)))
 
 
 class Members(Predictor):
-    """Predictor that an objective is checked on: `count` networks that train together, or a single one if None."""
+    """Predictor to check an objective on: an ensemble of `count` networks, or a single network if None."""
 
     def __init__(self, target: Target, count: int | None = None) -> None:
         super().__init__()
@@ -64,21 +71,21 @@ class Members(Predictor):
         )
 
     def training_densities(self, inputs: Tensor) -> Distribution:
-        found = [network(inputs) for network in self.networks]
-        return Stacked(found) if self.several else found[0]
+        densities = [network(inputs) for network in self.networks]
+        return Stacked(densities) if self.several else densities[0]
 
     def calibrate(self, batches: Iterable[Batch]) -> None:
         pass
 
     def amplify(self, gain: float) -> None:
-        """Set the factor on the distribution parameters of every network."""
+        """Set the factor on the raw parameters of every network."""
         for network in self.networks:
             assert isinstance(network, Network)
             network.gain = gain
 
 
 def examine_objective(row: ObjectiveRow, build: Make) -> Iterator[Finding]:
-    """Yield one finding for each property of an objective on small predictors of `row.target`, new for each check."""
+    """Yield one finding for each property of an objective, checked on small predictors of the row's target."""
     checks: dict[str, tuple[float, Callable[[Worst], None]]] = {
         "on the device of its inputs": (0.0, lambda worst: _on_one_device(build, row, worst)),
         "a finite scalar": (0.0, lambda worst: _scalar(build, row, worst)),
@@ -91,7 +98,7 @@ def examine_objective(row: ObjectiveRow, build: Make) -> Iterator[Finding]:
         "a mean over samples": (1e-5, lambda worst: _mean(build, row, worst)),
         "members train as if alone": (1e-5, lambda worst: _members(build, row, worst)),
         "members that differ": (1e-5, lambda worst: _different_members(build, row, worst)),
-        "terms to be logged": (0.0, lambda worst: _told(build, row, worst)),
+        "terms to be logged": (0.0, lambda worst: _logged_terms(build, row, worst)),
         "random numbers of others": (0.0, lambda worst: _generator(build, row, worst)),
         "NaN is not hidden": (0.0, lambda worst: _nan(build, row, worst)),
         "number types": (0.0, lambda worst: _number_types(build, row, worst)),
@@ -100,11 +107,11 @@ def examine_objective(row: ObjectiveRow, build: Make) -> Iterator[Finding]:
     }
     for name, (limit, check) in checks.items():
         if name not in row.leave_out:
-            yield examined(name, row.limits.get(name, limit), check)
+            yield run_check(name, row.limits.get(name, limit), check)
 
 
 def predictor_of(row: ObjectiveRow, count: int | None = None) -> Members:
-    """Return a predictor in training mode; its initial parameters are the same each time."""
+    """Return a predictor in training mode, with the same parameters at each call."""
     torch.manual_seed(SEED)
     predictor = Members(row.target, count)
     predictor(batch_of(row, 32)["input"])  # sets the running moments of batch norm
@@ -112,7 +119,7 @@ def predictor_of(row: ObjectiveRow, count: int | None = None) -> Members:
 
 
 def batch_of(row: ObjectiveRow, count: int) -> Batch:
-    """Return a seeded batch: inputs, targets, and the other fields that the row's objective reads."""
+    """Return a seeded batch of `count` samples, with the further fields that the objective reads."""
     generator = torch.Generator().manual_seed(SEED + 2)
     return {
         "input": torch.randn(count, LENGTH, generator=generator),
@@ -124,18 +131,18 @@ def batch_of(row: ObjectiveRow, count: int) -> Batch:
 
 
 def in_float64(batch: Batch) -> Batch:
-    """Convert the floating-point fields of a batch to float64."""
+    """Return the batch with floating-point fields converted to float64."""
     return {name: field.double() if field.is_floating_point() else field for name, field in batch.items()}
 
 
 def penalty(objective: Objective, predictor: Predictor, batch: Batch) -> Tensor:
-    """Return the penalty after seeding, as the framework seeds every step."""
+    """Return the penalty with a fixed random seed."""
     torch.manual_seed(SEED)
     return objective(predictor, batch)
 
 
 def gradients(objective: Objective, predictor: Predictor, batch: Batch) -> dict[str, Tensor]:
-    """Return the gradient of every parameter that has one, by name."""
+    """Return name → gradient of the penalty, for every parameter with a gradient."""
     predictor.zero_grad()
     penalty(objective, predictor, batch).backward()
     return {
@@ -146,69 +153,70 @@ def gradients(objective: Objective, predictor: Predictor, batch: Batch) -> dict[
 
 
 def _on_one_device(build: Make, row: ObjectiveRow, worst: Worst) -> None:
-    """Check the penalty of one model and of three members for mixed devices."""
+    """Check that the penalties of one model and of three members mix no devices."""
 
-    def questions(mode: OneDevice) -> Questions:
+    def calls(mode: OneDevice) -> Calls:
         for count in (None, 3):
             objective, predictor = build(1.0), predictor_of(row, count)
-            mode.move(predictor)
-            mode.move(objective)
-            batch = mode.receive(batch_of(row, SAMPLES))
+            mode.label_module(predictor)
+            mode.label_module(objective)
+            batch = mode.label_device(batch_of(row, SAMPLES))
 
             @torch.enable_grad()
-            def trained(
+            def train(
                 objective: Objective = objective, predictor: Members = predictor, batch: Batch = batch
             ) -> None:
                 penalty(objective, predictor, batch)
 
-            yield "one model" if count is None else f"{count} members", trained
+            yield "one model" if count is None else f"{count} members", train
 
-    on_one_device(questions, worst)
+    check_devices(calls, worst)
 
 
 def _scalar(build: Make, row: ObjectiveRow, worst: Worst) -> None:
     for count in (None, 3):
         predictor = predictor_of(row, count)
-        found = penalty(build(1.0), predictor, batch_of(row, SAMPLES))
-        what = "one model" if count is None else f"{count} members"
-        worst.same(f"shape of the penalty of {what}", tuple(found.shape), ())
-        worst.finite(f"penalty of {what}", found)
-        worst.count(not found.requires_grad, f"the penalty of {what} has no gradient")
-        seen = gradients(build(1.0), predictor, batch_of(row, SAMPLES))
-        for name, gradient in seen.items():
+        value = penalty(build(1.0), predictor, batch_of(row, SAMPLES))
+        predictor_name = "one model" if count is None else f"{count} members"
+        worst.same(f"shape of the penalty of {predictor_name}", tuple(value.shape), ())
+        worst.finite(f"penalty of {predictor_name}", value)
+        worst.count(not value.requires_grad, f"the penalty of {predictor_name} has no gradient")
+        gradients_by_name = gradients(build(1.0), predictor, batch_of(row, SAMPLES))
+        for name, gradient in gradients_by_name.items():
             worst.finite(f"gradient of {name}", gradient)
         worst.count(
-            not any(gradient.abs().sum() > 0 for gradient in seen.values()), f"every gradient of {what} is 0"
+            not any(gradient.abs().sum() > 0 for gradient in gradients_by_name.values()),
+            f"every gradient of {predictor_name} is 0",
         )
 
 
 def _gradient(build: Make, row: ObjectiveRow, worst: Worst) -> None:
-    """Check the directional derivative in all parameters against central differences, in evaluation mode and float64.
+    """Compare a directional derivative in all parameters with central differences, in evaluation mode and float64.
 
-    Of several steps the one that agrees best counts, as for density heads: a larger step may be too coarse for a narrow
-    density or cross a kink, and a smaller one is lost in rounding.
+    The step with the best agreement counts: a longer step may cross a kink or be too coarse for a narrow density, and a
+    shorter one loses digits to rounding.
     """
     objective, predictor = build(1.0), predictor_of(row).eval().double()
     batch = in_float64(batch_of(row, SAMPLES))
-    found = gradients(objective, predictor, batch)
+    analytic_gradients = gradients(objective, predictor, batch)
     generator = torch.Generator().manual_seed(SEED)
     parameters = dict(predictor.named_parameters())
     direction = {
         name: torch.randn(parameter.shape, dtype=torch.float64, generator=generator)
         for name, parameter in parameters.items()
     }
-    analytic = sum((found[name] * direction[name]).sum().item() for name in found)
+    analytic = sum((analytic_gradients[name] * direction[name]).sum().item() for name in analytic_gradients)
 
-    def moved(amount: float) -> float:
+    def penalty_at(amount: float) -> float:
         other = copy.deepcopy(predictor)
         with torch.no_grad():
             for name, parameter in other.named_parameters():
                 parameter.add_(amount * direction[name])
         return penalty(objective, other, batch).item()
 
-    found_by = [(moved(step) - moved(-step)) / (2 * step) for step in STEPS]
-    numeric = min(found_by, key=lambda one: abs(analytic - one))
-    worst.see(
+    numeric_by_step = [(penalty_at(step) - penalty_at(-step)) / (2 * step) for step in STEPS]
+    numeric = min(numeric_by_step, key=lambda derivative: abs(analytic - derivative))
+    worst.record(
         abs(analytic - numeric) / max(abs(numeric), 1e-3),
         f"directional derivative {analytic:.9g}, by differences {numeric:.9g}",
     )
@@ -216,183 +224,205 @@ def _gradient(build: Make, row: ObjectiveRow, worst: Worst) -> None:
 
 def _weight(build: Make, row: ObjectiveRow, worst: Worst) -> None:
     batch = batch_of(row, SAMPLES)
-    one = penalty(build(1.0), predictor_of(row), batch).item()
+    unit_penalty = penalty(build(1.0), predictor_of(row), batch).item()
     for factor in (0.25, 3.0, 1e6):
-        found = penalty(build(factor), predictor_of(row), batch).item()
-        worst.see(
-            abs(found - factor * one) / max(abs(factor * one), 1e-12),
-            f"{factor:g} times the weight: {found:.9g}, wanted {factor * one:.9g}",
+        value = penalty(build(factor), predictor_of(row), batch).item()
+        worst.record(
+            abs(value - factor * unit_penalty) / max(abs(factor * unit_penalty), 1e-12),
+            f"penalty with {factor:g} times the weight: {value:.9g}, expected {factor * unit_penalty:.9g}",
         )
     try:
-        none = build(0.0)
+        weightless = build(0.0)
     except ConfigError:
-        worst.count(False, "weight 0 is refused")
+        worst.count(False, "a weight of 0 is refused")
         return
-    found = penalty(none, predictor_of(row), batch).item()
-    worst.count(found != 0, f"weight 0: penalty {found:g}")
+    value = penalty(weightless, predictor_of(row), batch).item()
+    worst.count(value != 0, f"penalty with weight 0: {value:g}")
 
 
 def _repeatable(build: Make, row: ObjectiveRow, worst: Worst) -> None:
     batch, objective = batch_of(row, SAMPLES), build(1.0)
-    found = [penalty(one, predictor_of(row), batch) for one in (objective, objective, build(1.0))]
-    worst.same_bits("penalty of two calls", found[1], found[0])
-    worst.same_bits("penalty of two objectives", found[2], found[0])
+    penalties = [
+        penalty(used_objective, predictor_of(row), batch)
+        for used_objective in (objective, objective, build(1.0))
+    ]
+    worst.same_bits("penalty of two calls", penalties[1], penalties[0])
+    worst.same_bits("penalty of two equal objectives", penalties[2], penalties[0])
 
 
 def _traces(build: Make, row: ObjectiveRow, worst: Worst) -> None:
-    """Check that a penalty leaves training modes, buffers, parameters, their gradients and the batch as they are."""
+    """Check that a penalty changes no training modes, buffers, parameters, gradients or fields of the batch."""
     for training in (True, False):
         predictor, batch = predictor_of(row), batch_of(row, SAMPLES)
         predictor.train(training)
         first = predictor.networks[0]
         assert isinstance(first, Network)
-        first.norm.train(not training)  # a mode that differs from the predictor's, as a user may set it
+        first.norm.train(not training)  # a module in another mode than the predictor, as a user may set it
         modes = {name: module.training for name, module in predictor.named_modules()}
         state = copy.deepcopy(predictor.state_dict())
         before = {name: field.clone() for name, field in batch.items()}
         penalty(build(1.0), predictor, batch)
         after = {name: module.training for name, module in predictor.named_modules()}
         changed = [name for name in modes if after[name] != modes[name]]
-        worst.count(bool(changed), f"modes changed of {', '.join(changed) or 'none'}")
+        worst.count(bool(changed), f"training modes changed: {', '.join(changed) or 'none'}")
         for name, value in predictor.state_dict().items():
-            worst.same_bits(f"{name} after a penalty, training {training}", value, state[name])
+            worst.same_bits(
+                f"{name} after a penalty, {'training' if training else 'evaluation'} mode", value, state[name]
+            )
         for name, parameter in predictor.named_parameters():
-            worst.count(parameter.grad is not None, f"a gradient is left in {name}")
-            worst.count(not parameter.requires_grad, f"{name} needs no gradient any more")
+            worst.count(parameter.grad is not None, f"{name} has a gradient after a penalty")
+            worst.count(not parameter.requires_grad, f"{name} no longer requires a gradient")
         worst.same("fields of the batch", sorted(batch), sorted(before))
         for name, field in before.items():
             worst.same_bits(f"{name} of the batch", batch[name], field)
-            worst.count(batch[name].requires_grad, f"{name} of the batch needs a gradient now")
+            worst.count(batch[name].requires_grad, f"{name} of the batch requires a gradient after a penalty")
 
 
 def _order(build: Make, row: ObjectiveRow, worst: Worst) -> None:
-    """Check that the order of samples does not matter; without dropout, whose masks follow batch positions."""
+    """Check in evaluation mode that the order of samples does not matter; dropout masks depend on batch positions."""
     predictor, batch = predictor_of(row).eval(), batch_of(row, SAMPLES)
     backwards = {name: field.flip(0) for name, field in batch.items()}
-    wanted = penalty(build(1.0), predictor, batch).item()
-    found = penalty(build(1.0), predictor, backwards).item()
-    worst.see(abs(found - wanted) / max(abs(wanted), 1e-6), f"backwards {found:.9g}, forwards {wanted:.9g}")
+    expected = penalty(build(1.0), predictor, batch).item()
+    backwards_penalty = penalty(build(1.0), predictor, backwards).item()
+    worst.record(
+        abs(backwards_penalty - expected) / max(abs(expected), 1e-6),
+        f"penalty in reverse order {backwards_penalty:.9g}, in order {expected:.9g}",
+    )
 
 
 def _each_sample(build: Make, row: ObjectiveRow, worst: Worst) -> None:
-    """Check that the first, middle and last of MANY samples each change the penalty, in evaluation mode."""
+    """Check in evaluation mode that the first, middle and last of MANY samples each affect the penalty."""
     objective, predictor, batch = build(1.0), predictor_of(row).eval(), batch_of(row, MANY)
-    wanted = penalty(objective, predictor, batch).item()
+    expected = penalty(objective, predictor, batch).item()
 
     def changed(at: slice) -> bool:
         other = {**batch, "input": batch["input"].clone(), "target": batch["target"].clone()}
         other["input"][at] = 1.5 - 2 * batch["input"].flip(0)[at]
         other["target"][at] = (1 + batch["target"][at]) % max(2, len(row.target.names))
-        return penalty(objective, predictor, other).item() != wanted
+        return penalty(objective, predictor, other).item() != expected
 
     if not changed(slice(None)):
-        worst.count(False, "reads no sample of the batch")
+        worst.count(False, "the objective does not read the batch")
         return
     for at in (0, MANY // 2, MANY - 1):
-        worst.count(not changed(slice(at, at + 1)), f"sample {at} of {MANY} changes nothing")
+        worst.count(not changed(slice(at, at + 1)), f"sample {at} of {MANY} does not affect the penalty")
 
 
 def _mean(build: Make, row: ObjectiveRow, worst: Worst) -> None:
-    """Check that a batch that holds every sample twice has the same penalty, so that the batch size does not scale it.
+    """Check that a batch with every sample twice has the same penalty, which hence does not grow with the batch size.
 
-    The penalty of an objective that draws random numbers is a mean over DRAWS seeds, and a tolerance is added.
+    For an objective that draws random numbers, penalties are averaged over DRAWS seeds, and an error of 0.4 is
+    tolerated.
     """
     objective, predictor, batch = build(1.0), predictor_of(row).eval(), batch_of(row, SAMPLES)
     twice = {name: torch.cat([field, field]) for name, field in batch.items()}
-    found = []
-    for some in (batch, twice):
+    penalties = []
+    for repeated in (batch, twice):
         values = []
         for number in range(DRAWS):
             torch.manual_seed(number)
-            values.append(objective(predictor, some).item())
-        found.append(values)
-    wanted, doubled = (sum(values) / DRAWS for values in found)
-    error = abs(doubled - wanted) / max(abs(wanted), 1e-6)
-    if len(set(found[0])) > 1:
+            values.append(objective(predictor, repeated).item())
+        penalties.append(values)
+    expected, doubled = (sum(values) / DRAWS for values in penalties)
+    error = abs(doubled - expected) / max(abs(expected), 1e-6)
+    if len(set(penalties[0])) > 1:
         error = max(0.0, error - 0.4)
-    worst.see(error, f"every sample twice {doubled:.9g}, once {wanted:.9g}")
+    worst.record(error, f"penalty with every sample twice {doubled:.9g}, once {expected:.9g}")
 
 
 def _different_members(build: Make, row: ObjectiveRow, worst: Worst) -> None:
-    """Check that the penalty of different members is the mean of their penalties; without dropout.
+    """Check without dropout that the penalty of an ensemble is the mean of its members' penalties.
 
-    The gradient of each member must be that of its own penalty.
+    The gradient in the parameters of each member must be that of the member's own penalty.
     """
     objective, together, batch = build(1.0), predictor_of(row, 3).eval(), batch_of(row, SAMPLES)
     whole = gradients(objective, together, batch)
-    found, each = penalty(objective, together, batch).item(), []
+    joint_penalty, member_penalties = penalty(objective, together, batch).item(), []
     for index, network in enumerate(together.networks):
         alone = predictor_of(row).eval()
         alone.networks[0].load_state_dict(network.state_dict())
-        each.append(penalty(objective, alone, batch).item())
+        member_penalties.append(penalty(objective, alone, batch).item())
         for name, gradient in gradients(objective, alone, batch).items():
             other = whole.get(name.replace("networks.0", f"networks.{index}"), torch.zeros_like(gradient))
             scale = gradient.abs().max().clamp(min=1e-6)
-            worst.see((other - gradient).abs().max() / scale, f"gradient of member {index}, {name}")
-    wanted = sum(each) / len(each)
-    worst.see(
-        abs(found - wanted) / max(abs(wanted), 1e-6), f"penalty of three {found:.9g}, their mean {wanted:.9g}"
+            worst.record((other - gradient).abs().max() / scale, f"gradient of member {index}, {name}")
+    expected = sum(member_penalties) / len(member_penalties)
+    worst.record(
+        abs(joint_penalty - expected) / max(abs(expected), 1e-6),
+        f"penalty of three members {joint_penalty:.9g}, mean of their penalties {expected:.9g}",
     )
 
 
-def _told(build: Make, row: ObjectiveRow, worst: Worst) -> None:
-    """Check that the terms to be logged are finite scalars of the last batch without a graph."""
+def _logged_terms(build: Make, row: ObjectiveRow, worst: Worst) -> None:
+    """Check that logged terms are finite scalars without a graph."""
     objective = build(1.0)
     penalty(objective, predictor_of(row), batch_of(row, SAMPLES))
-    worst.count(False, "none")
+    worst.count(False, "the objective logs no terms")
     for name, term in objective.logged_terms.items():
         worst.same(f"shape of {name}", tuple(term.shape), ())
-        worst.count(term.requires_grad, f"{name} holds the graph of the batch")
+        worst.count(term.requires_grad, f"{name} is not detached from the graph")
         worst.finite(name, term)
 
 
 def _generator(build: Make, row: ObjectiveRow, worst: Worst) -> None:
-    """Check that random numbers drawn after a penalty still depend on the seed set before it."""
+    """Check that random numbers drawn after a penalty depend on the seed that was set before the penalty."""
     objective, predictor, batch = build(1.0), predictor_of(row).eval(), batch_of(row, SAMPLES)
-    drawn = []
+    random_numbers = []
     for number in (0, 1):
         torch.manual_seed(number)
         objective(predictor, batch)
-        drawn.append(torch.rand(4))
-    worst.count(torch.equal(*drawn), "two seeds, and the same random numbers after the penalty")
+        random_numbers.append(torch.rand(4))
+    worst.count(torch.equal(*random_numbers), "random numbers after a penalty are equal for two seeds")
 
 
 def _nan(build: Make, row: ObjectiveRow, worst: Worst) -> None:
-    """Check that a network that returns NaN has a penalty of NaN or is refused."""
+    """Check that a network that returns NaN gets a non-finite penalty or is refused."""
     predictor = predictor_of(row).eval()
     with torch.no_grad():
         for network in predictor.networks:
             assert isinstance(network, Network)
             network.last.weight.fill_(float("nan"))
     try:
-        found = penalty(build(1.0), predictor, batch_of(row, SAMPLES))
+        value = penalty(build(1.0), predictor, batch_of(row, SAMPLES))
     except (ValueError, UserError):
-        worst.count(False, "refused")
+        worst.count(False, "NaN is refused")
         return
-    worst.count(bool(found.isfinite()), f"penalty {found.item():g} of a network that gives NaN")
+    worst.count(
+        bool(value.isfinite()),
+        f"penalty {value.item():g} for a network that returns NaN, expected NaN or an error",
+    )
 
 
 def _members(build: Make, row: ObjectiveRow, worst: Worst) -> None:
-    """Check that equal members have the penalty, and each the gradient, of one alone; without dropout."""
+    """Check without dropout that equal members have the penalty of a single one, and each its gradient."""
     alone = predictor_of(row).eval()
     together = predictor_of(row, 3).eval()
     for network in together.networks:
         network.load_state_dict(alone.networks[0].state_dict())
     batch, objective = batch_of(row, SAMPLES), build(1.0)
-    wanted, found = penalty(objective, alone, batch).item(), penalty(objective, together, batch).item()
-    worst.see(
-        abs(found - wanted) / max(abs(wanted), 1e-6), f"penalty of three {found:.9g}, of one {wanted:.9g}"
+    expected, joint_penalty = (
+        penalty(objective, alone, batch).item(),
+        penalty(objective, together, batch).item(),
     )
-    own, each = gradients(objective, alone, batch), gradients(objective, together, batch)
-    for name, gradient in own.items():
+    worst.record(
+        abs(joint_penalty - expected) / max(abs(expected), 1e-6),
+        f"penalty of three equal members {joint_penalty:.9g}, of one {expected:.9g}",
+    )
+    alone_gradients, joint_gradients = (
+        gradients(objective, alone, batch),
+        gradients(objective, together, batch),
+    )
+    for name, gradient in alone_gradients.items():
         for index in range(3):
-            other = each.get(name.replace("networks.0", f"networks.{index}"), torch.zeros_like(gradient))
+            other = joint_gradients.get(
+                name.replace("networks.0", f"networks.{index}"), torch.zeros_like(gradient)
+            )
             scale = gradient.abs().max().clamp(min=1e-6)
-            worst.see((other - gradient).abs().max() / scale, f"gradient of member {index}, {name}")
+            worst.record((other - gradient).abs().max() / scale, f"gradient of member {index}, {name}")
 
 
 def _number_types(build: Make, row: ObjectiveRow, worst: Worst) -> None:
-    """Check that the penalty has the predictor's dtype, and that inputs may be images as bytes."""
+    """Check that the penalty has the predictor's dtype, and that it is finite for inputs as bytes."""
     objective = build(1.0)
     for kind in (torch.float32, torch.float64):
         predictor = predictor_of(row).to(kind)
@@ -400,15 +430,17 @@ def _number_types(build: Make, row: ObjectiveRow, worst: Worst) -> None:
         typed = {
             name: field.to(kind) if field.is_floating_point() else field for name, field in batch.items()
         }
-        found = penalty(objective, predictor, typed)
-        worst.same(f"penalty of a predictor of {kind}", found.dtype, kind)
-        worst.finite(f"penalty of a predictor of {kind}", found)
+        value = penalty(objective, predictor, typed)
+        worst.same(f"dtype of the penalty for a predictor of {kind}", value.dtype, kind)
+        worst.finite(f"penalty for a predictor of {kind}", value)
         bytes_ = torch.randint(0, 256, typed["input"].shape, dtype=torch.uint8)
-        worst.finite(f"penalty of bytes, {kind}", penalty(objective, predictor, {**typed, "input": bytes_}))
+        worst.finite(
+            f"penalty for inputs as bytes, {kind}", penalty(objective, predictor, {**typed, "input": bytes_})
+        )
 
 
 def _extreme(build: Make, row: ObjectiveRow, worst: Worst) -> None:
-    """Check that penalty and gradients are finite at parameters up to ±1e4, as of an overconfident network."""
+    """Check that penalty and gradients are finite at raw parameters up to ±1e4, as of an overconfident network."""
     for kind in (torch.float32, torch.float64):
         for size in (1e2, 1e4):
             predictor = predictor_of(row).to(kind)
@@ -421,12 +453,12 @@ def _extreme(build: Make, row: ObjectiveRow, worst: Worst) -> None:
 
 
 def _small(build: Make, row: ObjectiveRow, worst: Worst) -> None:
-    """Check batches of no sample and of one, in evaluation mode, as batch norm cannot train on one sample.
+    """Check that penalties of an empty batch and of a single sample are finite scalars.
 
-    A batch without samples must not make the loss NaN.
+    The check runs in evaluation mode, since batch norm cannot train on one sample.
     """
     for count in (0, 1):
         predictor = predictor_of(row).eval()
-        found = penalty(build(1.0), predictor, batch_of(row, count))
-        worst.same(f"shape of the penalty of {count}", tuple(found.shape), ())
-        worst.finite(f"penalty of {count}", found)
+        value = penalty(build(1.0), predictor, batch_of(row, count))
+        worst.same(f"shape of the penalty of {count} samples", tuple(value.shape), ())
+        worst.finite(f"penalty of {count} samples", value)

@@ -1,4 +1,4 @@
-"""Checks of the digits of a head's log-densities: against the row's reference, and float32 against float64."""
+"""Checks of the accuracy of a head's log-densities: the row's reference cases, and float32 compared with float64."""
 
 import copy
 import math
@@ -12,36 +12,36 @@ from framework.testing.heads import HeadSubject, as_type, seeded
 
 
 def reference(subject: HeadSubject, worst: Worst, dtype: torch.dtype) -> None:
-    """Check log_prob of the row's cases; the error is relative to max(1, |reference|).
+    """Compare log_prob with the row's reference cases; the error is relative to max(1, |reference|).
 
-    A head with parameters of its own rounds each of them once when it is converted. What this changes, to first order,
-    is not counted as an error. A head without parameters receives its inputs exactly and must not lose their digits.
+    Conversion to `dtype` rounds each parameter of the head once. The change of log_prob from this rounding, to first
+    order, is not counted as an error. The inputs of the cases are exact in every dtype.
     """
     assert subject.row.cases is not None
     head = subject.make().double()
     cases = list(subject.row.cases(head))
     change = [torch.zeros_like(case.log_prob) for case in cases]
     if dtype != torch.float64 and any(part.requires_grad for part in head.parameters()):
-        change = [rounded(subject, head, case.raw, case.value, parameters=True)[1] for case in cases]
+        change = [rounding_change(subject, head, case.raw, case.value, parameters=True)[1] for case in cases]
     head = head.to(dtype)
     for case, allowed in zip(cases, change, strict=True):
         with torch.no_grad():
-            found = seeded(head, case.raw.to(dtype)).log_prob(as_type(case.value, dtype)).double()
-        gap = (found - case.log_prob).abs() - torch.finfo(dtype).eps * allowed
+            log_prob = seeded(head, case.raw.to(dtype)).log_prob(as_type(case.value, dtype)).double()
+        gap = (log_prob - case.log_prob).abs() - torch.finfo(dtype).eps * allowed
         error = gap.clamp(min=0) / case.log_prob.abs().clamp(min=1)
-        worst.see(
+        worst.record(
             error,
-            lambda at, case=case, found=found: (
-                f"{case.name}: {found[at].item():.9g}, reference {case.log_prob[at].item():.9g}"
+            lambda at, case=case, log_prob=log_prob: (
+                f"{case.name}: {log_prob[at].item():.9g}, reference {case.log_prob[at].item():.9g}"
             ),
         )
 
 
 def precision(subject: HeadSubject, worst: Worst) -> None:
-    """Check log_prob in float32 against the same head in float64 at the same inputs; the error is in float32 epsilons.
+    """Compare log_prob in float32 with float64 for the same head and inputs; the error is in float32 epsilons.
 
-    The error is relative to max(1, |log p|) plus the change from rounding the distribution parameters or an angle, so
-    that what remains is cancellation inside the head.
+    The error is relative to max(1, |log p|) plus the change of log p from rounding the raw parameters and angles. Hence
+    a large error is one from cancellation inside the head.
     """
     single = subject.make()
     double = copy.deepcopy(single).double()
@@ -51,26 +51,26 @@ def precision(subject: HeadSubject, worst: Worst) -> None:
             at_mode = seeded(single, raw).mode
         for where, value in (("the mode", at_mode), ("a random value", subject.values(64))):
             with torch.no_grad():
-                found = seeded(single, raw).log_prob(value).double()
-            exact, change = rounded(subject, double, raw.double(), value)
+                log_prob = seeded(single, raw).log_prob(value).double()
+            exact, change = rounding_change(subject, double, raw.double(), value)
             scale = exact.abs().clamp(min=1) + change
-            error = (found - exact).abs() / scale / torch.finfo(torch.float32).eps
-            worst.see(
+            error = (log_prob - exact).abs() / scale / torch.finfo(torch.float32).eps
+            worst.record(
                 error,
-                lambda at, size=size, where=where, found=found, exact=exact: (
-                    f"at {where}, raw numbers of size {size:g}: {found[at].item():.9g}, "
+                lambda at, size=size, where=where, log_prob=log_prob, exact=exact: (
+                    f"at {where}, raw parameters of size {size:g}: {log_prob[at].item():.9g}, "
                     f"in float64 {exact[at].item():.9g}"
                 ),
             )
 
 
-def rounded(
+def rounding_change(
     subject: HeadSubject, head: DensityHead, raw: Tensor, value: Tensor, parameters: bool = False
 ) -> tuple[Tensor, Tensor]:
-    """Return log_prob of a float64 head, and its first-order change from rounding the inputs, in units of the rounding.
+    """Return log_prob of a float64 head, and its first-order change per relative rounding error of the inputs.
 
-    The change is Σ|r ∂log p/∂r| + Σ max(|φ|, π)|∂log p/∂φ| over distribution parameters r and angles φ. With
-    `parameters`, the sum over the head's own parameters is added.
+    The change is Σ|r ∂log p/∂r| + Σ max(|φ|, π)|∂log p/∂φ| over raw parameters r and angles φ. With `parameters`, the
+    sum over the head's own parameters is added.
     """
     arguments = {"raw": raw.clone().requires_grad_()}
     if value.is_floating_point():
@@ -83,12 +83,12 @@ def rounded(
     for (name, argument), slope in zip(arguments.items(), slopes, strict=True):
         size = argument.detach().abs().clamp(min=least.get(name, 0.0))
         change = change + (slope.abs() * size).flatten(log_prob.dim()).sum(-1)
-    if own:  # the parameters are shared by all rows of the batch, so that each row needs its own gradient
-        for row, one in enumerate(log_prob):
-            of_one = torch.autograd.grad(one, own, retain_graph=True, allow_unused=True)
+    if own:  # all batch rows share the head's parameters, so that each row needs its own backward pass
+        for row, row_log_prob in enumerate(log_prob):
+            row_gradients = torch.autograd.grad(row_log_prob, own, retain_graph=True, allow_unused=True)
             parts = [
                 (slope * part).abs().sum()
-                for part, slope in zip(own, of_one, strict=True)
+                for part, slope in zip(own, row_gradients, strict=True)
                 if slope is not None
             ]
             change[row] = change[row] + sum(parts)

@@ -1,4 +1,4 @@
-"""Integrals of any density by brute force: cells of its domain with their masses."""
+"""Integrals of any density on a fixed grid: the masses of the cells of its domain."""
 
 import math
 
@@ -10,18 +10,19 @@ from torch.distributions import Distribution
 from framework.distributions.circular import Circular
 
 POINTS = {1: 1020, 2: 252, 3: 60}
-"""Number of angles → grid points per side; exact to spectral accuracy for densities that the grid resolves."""
+"""Number of angles → grid points per side; the error is negligible for densities that the grid resolves."""
 REAL_POINTS = {1: 1020, 2: 252, 3: 72}
+"""Number of reals → grid points per side."""
 CELLS = {1: 12, 2: 12, 3: 6}
-"""Number of cells per side in which samples are counted; it divides the number of points."""
+"""Number of numbers → cells per side in which samples are counted; it divides the number of points."""
 REAL_SCALE = 3.0
-"""Scale c of the map x = c tan(t/2) from a uniform t on the circle to the reals; half of the points lie within ±c."""
+"""Scale c of the map x = c tan(t/2) from the circle to the reals; half of the grid points lie within ±c."""
 
 
 def cells(density: Distribution) -> tuple[list[Tensor], Tensor]:
-    """Return the borders (cells per side + 1,) of each number, and the mass (*cells, *batch) of each cell, float64.
+    """Return the borders of cells along each number, (cells per side + 1,), and their masses (*cells, *batch), float64.
 
-    Densities may be over one to three numbers or over classes; the borders of classes lie between the labels.
+    The density may be over one to three numbers or over classes; the borders of classes lie between their indices.
 
     Raises:
         ValueError: The density has more than three numbers.
@@ -32,7 +33,9 @@ def cells(density: Distribution) -> tuple[list[Tensor], Tensor]:
         return [torch.arange(len(classes) + 1) - 0.5], density.log_prob(classes).double().exp()
     numbers = density.event_shape[0]
     if numbers not in POINTS:
-        raise ValueError(f"quadrature covers one to three numbers, got {numbers}; pass a marginal.")
+        raise ValueError(
+            f"Got a density of {numbers} numbers, but the grid covers one to three. Pass a marginal density."
+        )
     points = (POINTS if isinstance(density.support, Circular) else REAL_POINTS)[numbers]
     count = CELLS[numbers]
     sides = [side(density, index, points, count) for index in range(numbers)]
@@ -45,15 +48,15 @@ def cells(density: Distribution) -> tuple[list[Tensor], Tensor]:
 
 
 def density_at(density: Distribution, points: Tensor) -> Tensor:
-    """Return the density at points (points, numbers), shape (points, *batch), float64."""
+    """Return the density, (points, *batch) float64, at points (points, numbers)."""
     batch = density.batch_shape
     like = density.sample(torch.Size((0,)))  # an empty sample has the dtype of the density
     value = points.to(like.dtype).reshape(-1, *(1,) * len(batch), points.shape[-1])
     return density.log_prob(value.expand(-1, *batch, -1)).double().exp()
 
 
-def counted(density: Distribution, borders: list[Tensor], samples: Tensor) -> Tensor:
-    """Return the number of samples (draws, *batch, *event) in each cell, (*cells, *batch), float64."""
+def count_samples(density: Distribution, borders: list[Tensor], samples: Tensor) -> Tensor:
+    """Return the number of samples (draws, *batch, *event) in each cell, (*cells, *batch) float64."""
     batch = density.batch_shape
     if density.event_shape == ():
         labels = torch.arange(len(borders[0]) - 1).reshape(-1, *(1,) * samples.dim())
@@ -65,16 +68,16 @@ def counted(density: Distribution, borders: list[Tensor], samples: Tensor) -> Te
         if isinstance(density.support, Circular):
             place = torch.remainder(place + math.pi, 2 * math.pi) - math.pi
         cell = cell * side + torch.bucketize(place.contiguous(), border[1:-1])
-    found = torch.zeros(math.prod(sides), *batch, dtype=torch.float64)
-    found.scatter_add_(0, cell, torch.ones_like(cell, dtype=torch.float64))
-    return found.reshape(*sides, *batch)
+    counts = torch.zeros(math.prod(sides), *batch, dtype=torch.float64)
+    counts.scatter_add_(0, cell, torch.ones_like(cell, dtype=torch.float64))
+    return counts.reshape(*sides, *batch)
 
 
 def side(density: Distribution, index: int, points: int, count: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Return nodes (points,), their weights, and the borders (count + 1,) of cells for one number of the density.
+    """Return nodes (points,), weights (points,) and borders of cells (count + 1,) along one number of the density.
 
-    Nodes over a whole turn are equally spaced. A part of a turn, at whose ends a density need not agree, has
-    Gauss-Legendre nodes in each cell.
+    Nodes over a whole turn are equally spaced. A range that is shorter than a turn has Gauss-Legendre nodes in each
+    cell, since the density may differ at its two ends.
     """
     middle = (torch.arange(points, dtype=torch.float64) + 0.5) / points
     border = torch.arange(count + 1, dtype=torch.float64) / count

@@ -1,4 +1,4 @@
-"""Contract tests of a renderer: one function for each property; each reports its worst case."""
+"""Contract tests of a renderer: one function for each property; each records its largest error."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -9,7 +9,9 @@ from torch import Tensor
 
 from framework.geometry.camera import look_from
 from framework.renderer import Renderer, Scene
-from framework.testing.compared import (
+from framework.testing.extremes import extremes
+from framework.testing.finding import Finding, Worst, run_check
+from framework.testing.image_checks import (
     color_gradient,
     colors,
     depth,
@@ -18,15 +20,13 @@ from framework.testing.compared import (
     several,
     visibility,
 )
-from framework.testing.extremes import extremes
-from framework.testing.finding import Finding, Worst, examined
-from framework.testing.painted import barycentric, gradient, normal, texture, uv
 from framework.testing.rows import RendererRow
 from framework.testing.scenes import SIZE, camera, empty, sphere, square
+from framework.testing.surface_checks import barycentric, gradient, normal, texture, uv
 
 Make = Callable[[], Renderer]
 OF_TRIANGLES = {"no holes", "sphere: depth, metres", "what the near plane cuts", "extreme scenes"}
-"""Properties that are left out for a renderer that draws sets of points, where its row says so."""
+"""Properties that are left out for a renderer of point sets, if its row leaves out "no faces, nothing seen"."""
 
 
 def examine_renderer(row: RendererRow, build: Make) -> Iterator[Finding]:
@@ -66,7 +66,7 @@ def examine_renderer(row: RendererRow, build: Make) -> Iterator[Finding]:
         left_out |= OF_TRIANGLES
     for name, (limit, check) in checks.items():
         if name not in left_out:
-            yield examined(
+            yield run_check(
                 name,
                 row.limits.get(name, limit),
                 lambda worst, check=check: check(build(), worst),
@@ -78,8 +78,8 @@ def _channels(renderer: Renderer, worst: Worst) -> None:
     scene, every = sphere(), sorted(renderer.channels)
     together = renderer(scene, every)
     worst.same("channels drawn", sorted(together), every)
-    worst.same("channels of none asked", dict(renderer(scene, ())), {})
-    wanted = {
+    worst.same("channels drawn when none is requested", dict(renderer(scene, ())), {})
+    expected = {
         "color": (torch.float32, (*SIZE, 3)),
         "depth": (torch.float32, SIZE),
         "face": (torch.int32, SIZE),
@@ -90,32 +90,34 @@ def _channels(renderer: Renderer, worst: Worst) -> None:
     }
     for name in every:
         alone = renderer(replace(scene, colors=scene.colors if name == "color" else None), (name,))
-        worst.same(f"channels when {name} is asked for", sorted(alone), [name])
-        worst.same_bits(f"{name} alone and with the others", alone[name], together[name])
-        if name in wanted:
-            worst.same(f"{name}", (alone[name].dtype, tuple(alone[name].shape)), wanted[name])
+        worst.same(f"channels drawn when only {name} is requested", sorted(alone), [name])
+        worst.same_bits(f"{name} alone and with other channels", alone[name], together[name])
+        if name in expected:
+            worst.same(
+                f"type and shape of {name}", (alone[name].dtype, tuple(alone[name].shape)), expected[name]
+            )
 
 
 def _refusals(renderer: Renderer, worst: Worst) -> None:
-    scene, some = sphere(), sorted(renderer.channels)[:1]
+    scene, first_channel = sphere(), sorted(renderer.channels)[:1]
     wrong: dict[str, tuple[Scene, tuple[str, ...]]] = {
         "a channel that does not exist": (scene, ("colour of the wind",)),
-        "faces beyond the vertices": (replace(scene, faces=scene.faces + len(scene.vertices)), tuple(some)),
-        "negative faces": (replace(scene, faces=-scene.faces - 1), tuple(some)),
+        "faces beyond the vertices": (replace(scene, faces=scene.faces + len(scene.vertices)), tuple(first_channel)),
+        "negative faces": (replace(scene, faces=-scene.faces - 1), tuple(first_channel)),
     }
     if "color" in renderer.channels:
-        wrong["colour of a scene without"] = (replace(scene, colors=None), ("color",))
-    for what, (bad, channels) in wrong.items():
+        wrong["colour of a scene without colours"] = (replace(scene, colors=None), ("color",))
+    for fault, (bad, channels) in wrong.items():
         try:
             renderer(bad, channels)
         except ValueError as error:
-            worst.count(len(str(error)) < 10, f"{what}: {error}")
+            worst.count(len(str(error)) < 10, f"{fault}: the error message is {error}")
         else:
-            worst.count(True, f"{what}: drawn, wanted a ValueError")
+            worst.count(True, f"{fault}: accepted, expected a ValueError")
 
 
 def _repeatable(renderer: Renderer, worst: Worst) -> None:
-    """Check that a scene gives the same bits, also after another scene was drawn: the renderer keeps no state."""
+    """Check that images of a scene are equal to the last bit after another scene was drawn."""
     first = renderer(sphere(), sorted(renderer.channels))
     renderer(square(2.0), sorted(renderer.channels))
     for name, again in renderer(sphere(), sorted(renderer.channels)).items():
@@ -123,8 +125,8 @@ def _repeatable(renderer: Renderer, worst: Worst) -> None:
 
 
 def _no_faces(renderer: Renderer, worst: Worst) -> None:
-    """Check that a scene without faces shows the background; rows of renderers of point sets leave this out."""
-    _is_background(renderer, empty(sphere()), "no faces", worst)
+    """Check that a scene without faces shows the background; rows of renderers of point sets leave this check out."""
+    _check_background(renderer, empty(sphere()), "no faces", worst)
 
 
 def _background(renderer: Renderer, worst: Worst) -> None:
@@ -136,22 +138,22 @@ def _background(renderer: Renderer, worst: Worst) -> None:
         "out of view": replace(scene, vertices=scene.vertices + away),
         "nearer than the near plane": square(camera().near / 2, side=1e-4),
     }
-    for what, unseen in scenes.items():
-        _is_background(renderer, unseen, what, worst)
+    for situation, unseen in scenes.items():
+        _check_background(renderer, unseen, situation, worst)
 
 
 def _bad_triangles(renderer: Renderer, worst: Worst) -> None:
     scene = square(3.0)
     point = scene.vertices[:1].expand(4, 3)
-    for what, vertices in {
+    for shape, vertices in {
         "NaN": torch.full_like(scene.vertices, math.nan),
         "infinite": torch.full_like(scene.vertices, math.inf),
         "one point": point,
         "a line": scene.vertices[:1]
         + torch.arange(4.0)[:, None] * (scene.vertices[1:2] - scene.vertices[:1]) / 3,
     }.items():
-        _is_background(renderer, replace(scene, vertices=vertices), what, worst)
-    # a bad triangle beside good ones leaves the good ones unchanged
+        _check_background(renderer, replace(scene, vertices=vertices), shape, worst)
+    # a bad triangle must not change the image of good ones
     mixed = replace(
         scene,
         vertices=torch.cat([scene.vertices, torch.tensor([[math.nan, 0, 0]])]),
@@ -160,35 +162,37 @@ def _bad_triangles(renderer: Renderer, worst: Worst) -> None:
     )
     channels = sorted(renderer.channels - {"color"})
     good = renderer(replace(scene, colors=None), channels)
-    for name, found in renderer(mixed, channels).items():
-        worst.same_bits(f"{name} beside a bad triangle", found, good[name])
+    for name, rendered in renderer(mixed, channels).items():
+        worst.same_bits(f"{name} with an additional bad triangle", rendered, good[name])
 
 
-def _is_background(renderer: Renderer, scene: Scene, what: str, worst: Worst) -> None:
-    drawn = renderer(scene, sorted(renderer.channels))
+def _check_background(renderer: Renderer, scene: Scene, situation: str, worst: Worst) -> None:
+    rendered = renderer(scene, sorted(renderer.channels))
     background: dict[str, float] = {"depth": math.inf, "face": -1, "mask": 0}
     background |= {"normal": 0.0, "barycentric": 0.0, "uv": 0.0}
-    for name, value in drawn.items():
+    for name, value in rendered.items():
         if name == "color":
             off = (value - renderer.background).abs()
-            worst.see(off, f"color of a scene {what}: {value.flatten()[int(off.argmax())].item():.6g}")
+            worst.record(
+                off, f"color of a scene, {situation}: {value.flatten()[int(off.argmax())].item():.6g}"
+            )
         elif name in background:
-            worst.count(value != background[name], f"{name} of a scene {what}")
+            worst.count(value != background[name], f"{name} of a scene, {situation}")
 
 
 def _ties(renderer: Renderer, worst: Worst) -> None:
-    """Check that of equal surfaces the one with the lowest face index is seen."""
+    """Check that of faces in the same position the one with the lowest index is visible."""
     if "face" not in renderer.channels:
-        worst.count(False, "draws no faces")
+        worst.count(False, "the renderer does not draw face")
         return
     scene = square(3.0)
     doubled = replace(scene, faces=scene.faces.repeat(3, 1))
     face = renderer(doubled, ("face",))["face"]
-    worst.count(~((face == 0) | (face == 1)), "faces seen of three equal squares")
+    worst.count(~((face == 0) | (face == 1)), "pixels that do not show the first of three equal squares")
 
 
 def _no_holes(renderer: Renderer, worst: Worst) -> None:
-    """Check that a square of thousands of triangles across the view covers every pixel."""
+    """Check that a square of thousands of triangles that fills the view covers every pixel."""
     scene = square(3.0)
     side = 57
     part = torch.linspace(0, 1, side, dtype=torch.float64)
@@ -203,16 +207,18 @@ def _no_holes(renderer: Renderer, worst: Worst) -> None:
     faces = torch.cat([faces, faces.flip(-1)])  # visible from both sides
     mesh = Scene(vertices.reshape(-1, 3).float(), faces, None, scene.camera)
     if "mask" in renderer.channels:
-        worst.count(~renderer(mesh, ("mask",))["mask"], "pixels of a closed surface not covered")
+        worst.count(~renderer(mesh, ("mask",))["mask"], "pixels of a closed surface that are not covered")
     elif "depth" in renderer.channels:
-        worst.count(~renderer(mesh, ("depth",))["depth"].isfinite(), "pixels of a closed surface not covered")
+        worst.count(
+            ~renderer(mesh, ("depth",))["depth"].isfinite(), "pixels of a closed surface that are not covered"
+        )
     else:
-        worst.count(False, "draws neither mask nor depth")
+        worst.count(False, "the renderer draws neither mask nor depth")
 
 
 def _hiding(renderer: Renderer, worst: Worst) -> None:
     if "face" not in renderer.channels:
-        worst.count(False, "draws no faces")
+        worst.count(False, "the renderer does not draw face")
         return
     far, near = square(5.0), square(2.0)
     for order, (first, second) in {"far first": (far, near), "near first": (near, far)}.items():
@@ -228,28 +234,28 @@ def _hiding(renderer: Renderer, worst: Worst) -> None:
 
 
 def _sphere(renderer: Renderer, worst: Worst) -> None:
-    """Check the depth of a finely cut sphere against the intersection of each ray, away from the outline; metres."""
+    """Compare the depth of a fine sphere with ray intersections, except near the outline; the error is in metres."""
     if "depth" not in renderer.channels:
-        worst.count(False, "draws no depth")
+        worst.count(False, "the renderer does not draw depth")
         return
     scene = sphere(rings=120)
     depth = renderer(replace(scene, colors=None), ("depth",))["depth"].double()
-    seen = scene.camera
+    view = scene.camera
     y, x = torch.meshgrid(*[torch.arange(side, dtype=torch.float64) for side in SIZE], indexing="ij")
     ray = torch.stack(
         [
-            (x - seen.principal[0]) / seen.focal[0],
-            (y - seen.principal[1]) / seen.focal[1],
+            (x - view.principal[0]) / view.focal[0],
+            (y - view.principal[1]) / view.focal[1],
             torch.ones_like(x),
         ],
         -1,
     )
-    centre = seen.translation.double()  # centre of the sphere in the camera's frame
+    centre = view.translation.double()  # centre of the sphere in camera coordinates
     along, square_of_ray = ray @ centre, ray.square().sum(-1)
     inside = along.square() - square_of_ray * (centre.square().sum() - 1)
     true = (along - inside.clamp(min=0).sqrt()) / square_of_ray
     clear = inside > 0.3 * inside.max()
-    worst.see((depth - true).abs().where(clear, 0), lambda at: f"pixel {at}: {depth[at].item():.6g} m")
+    worst.record((depth - true).abs().where(clear, 0), lambda at: f"pixel {at}: {depth[at].item():.6g} m")
 
 
 def _small(renderer: Renderer, worst: Worst) -> None:
@@ -268,12 +274,12 @@ def _small(renderer: Renderer, worst: Worst) -> None:
 
 
 def _places(renderer: Renderer, worst: Worst) -> None:
-    """Check that a triangle inside one pixel is drawn at the pixel and depth that `Camera.project` returns."""
+    """Check that a triangle inside a pixel is drawn at the pixel and depth that `Camera.project` returns."""
     if "mask" not in renderer.channels:
-        worst.count(False, "draws no mask")
+        worst.count(False, "the renderer does not draw mask")
         return
-    seen = camera()
-    focal, principal = (torch.tensor(part, dtype=torch.float64) for part in (seen.focal, seen.principal))
+    view = camera()
+    focal, principal = (torch.tensor(part, dtype=torch.float64) for part in (view.focal, view.principal))
     around = torch.tensor([[-0.4, -0.3], [0.4, -0.3], [0.0, 0.45]], dtype=torch.float64)
     for row in range(3, SIZE[0], 7):
         for column in range(2, SIZE[1], 9):
@@ -282,34 +288,42 @@ def _places(renderer: Renderer, worst: Worst) -> None:
             inside = (
                 torch.cat([(pixels - principal) / focal, torch.ones(3, 1, dtype=torch.float64)], -1) * depth
             )
-            world = (inside - seen.translation.double()) @ seen.rotation.double()
-            place, far = seen.project(world)
+            world = (inside - view.translation.double()) @ view.rotation.double()
+            place, far = view.project(world)
             worst.count(
-                bool((place - pixels).abs().max() > 1e-4), f"pixel {row, column}: projected to {place}"
+                bool((place - pixels).abs().max() > 1e-4),
+                f"pixel {row, column}: Camera projects it to {place}",
             )
-            worst.count(bool((far - depth).abs().max() > 1e-4), f"pixel {row, column}: depth {far}")
+            worst.count(
+                bool((far - depth).abs().max() > 1e-4),
+                f"pixel {row, column}: Camera gives depth {far}, expected {depth}",
+            )
             faces = torch.tensor([[0, 1, 2], [0, 2, 1]])  # visible from both sides
-            mask = renderer(Scene(world.float(), faces, None, seen), ("mask",))["mask"]
-            found = mask.nonzero().tolist()
-            worst.count(found != [[row, column]], f"pixel {row, column}: drawn at {found}")
+            mask = renderer(Scene(world.float(), faces, None, view), ("mask",))["mask"]
+            drawn_pixels = mask.nonzero().tolist()
+            worst.count(
+                drawn_pixels != [[row, column]],
+                f"pixel {row, column}: the triangle is drawn at {drawn_pixels}",
+            )
 
 
 def _cut(renderer: Renderer, worst: Worst) -> None:
-    """Check the relative depth of a floor that extends behind the camera; it may also be left out."""
+    """Check the relative depth of a floor that extends behind the camera; the renderer may also leave the floor out."""
     if "depth" not in renderer.channels:
-        worst.count(False, "draws no depth")
+        worst.count(False, "the renderer does not draw depth")
         return
-    seen = replace(camera(), rotation=torch.eye(3), translation=torch.zeros(3), near=0.5)
+    view = replace(camera(), rotation=torch.eye(3), translation=torch.zeros(3), near=0.5)
     vertices = torch.tensor([[-90.0, 1, -50], [90, 1, -50], [90, 1, 50], [-90, 1, 50]])
     faces = torch.tensor([[0, 1, 2], [0, 2, 3], [2, 1, 0], [3, 2, 0]])
-    depth = renderer(Scene(vertices, faces, None, seen), ("depth",))["depth"].double()
+    depth = renderer(Scene(vertices, faces, None, view), ("depth",))["depth"].double()
     if not depth.isfinite().any():
         return
-    down = (torch.arange(SIZE[0], dtype=torch.float64) - seen.principal[1]) / seen.focal[1]
+    down = (torch.arange(SIZE[0], dtype=torch.float64) - view.principal[1]) / view.focal[1]
     true = (1 / down).where(down > 0, math.inf)[:, None].expand(SIZE)
     clear = (true > 0.6) & (true < 40)
     off = (depth / true - 1).abs().nan_to_num(math.inf)
-    worst.see(
-        off.where(clear, 0), lambda at: f"pixel {at}: {depth[at].item():.6g} m, wanted {true[at].item():.6g}"
+    worst.record(
+        off.where(clear, 0),
+        lambda at: f"pixel {at}: {depth[at].item():.6g} m, expected {true[at].item():.6g}",
     )
-    worst.count(depth.isfinite() & (true > 60), "pixels above the floor's end are drawn")
+    worst.count(depth.isfinite() & (true > 60), "pixels that are drawn above the far end of the floor")

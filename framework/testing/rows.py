@@ -1,8 +1,8 @@
-"""Rows of the contract: the parameters and references that a plugin states in its `rows.py` for the contract tests.
+"""Contract rows: the parameters with which a plugin is checked, and references for its results.
 
-`rows.py` stands beside the module of the plugin's class, or for a family in a folder above it. Its `ROWS` is a
-dictionary from the plugin's name to its rows, for example `HeadRow` for a density head. A plugin without rows is
-checked with its default parameters and without a reference.
+A plugin lists its rows in a file `rows.py` beside the module of its class, or in a folder above for a family of
+plugins. There, `ROWS` is a dictionary from the name of a plugin to its rows, for example `HeadRow` for a density head.
+A plugin without rows is checked with its default parameters and without a reference.
 """
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
@@ -18,12 +18,12 @@ from framework.target import Target
 
 @dataclass(frozen=True)
 class Case:
-    """Stiff or extreme distribution parameters of a density head, with log-densities from an independent source.
+    """Extreme distribution parameters of a density head, with log-densities from an independent source.
 
     Attributes:
-        name: What is extreme here: "κ = 1e12".
-        raw: Distribution parameters, (batch, size) float64, each exactly representable in float32.
-        value: Targets, (batch, *event), each exactly representable in float32; int64 for classes.
+        name: Description of what is extreme, for example "κ = 1e12".
+        raw: Raw parameters, (batch, size) float64, each exactly representable in float32.
+        value: Target values, (batch, *event), each exactly representable in float32; int64 for classes.
         log_prob: Log-density at `value`, (batch,) float64, nats, to full float64 accuracy.
     """
 
@@ -35,19 +35,19 @@ class Case:
 
 @dataclass(frozen=True)
 class HeadRow:
-    """Parametrisation of a density head.
+    """Parameters with which a density head is checked.
 
     Attributes:
-        name: What distinguishes the row from the plugin's other rows.
+        name: Description that distinguishes the row from the plugin's other rows.
         target: Target that the head predicts.
-        config: Parameters of the head.
-        cases: Function from a built head (evaluation mode, float64) to reference cases; None where no reference is
+        config: Parameters of the plugin.
+        cases: Function from the head, in evaluation mode and float64, to reference cases; None where no reference is
             known.
-        scale: Standard deviation of the normal distribution parameters at which densities of three numbers, and
-            densities that draw, are integrated. It must make them broad enough for a grid. Other densities are also
-            integrated at scales from 1e-2 to 1e3.
-        limits: Property → limit, where it differs from the contract's own.
-        leave_out: Property → reason why this density cannot have it.
+        scale: Standard deviation of the random raw parameters at which densities are integrated on a grid: those of
+            three numbers, and those that draw random numbers in log_prob. The densities must be broad enough for the
+            grid. All other densities are also integrated at scales from 1e-2 to 1e3.
+        limits: Property → largest error that passes, where it differs from the default.
+        leave_out: Property that is not checked → reason.
     """
 
     name: str
@@ -61,14 +61,14 @@ class HeadRow:
 
 @dataclass(frozen=True)
 class EncoderRow:
-    """Parametrisation of an encoder of vectors or of images with at most 3 channels; CloudRow is for point clouds.
+    """Parameters with which an encoder of vectors, or of images of up to 3 channels, is checked; see also CloudRow.
 
     Attributes:
-        name: What distinguishes the row from the plugin's other rows.
+        name: Description that distinguishes the row from the plugin's other rows.
         input_shape: Shape of the input of one sample.
         config, limits, leave_out: See HeadRow.
-        columns: Names of the last dimension of the input, as `Data.columns`.
-        inputs: Function from a number of samples to inputs, for an encoder that does not accept arbitrary numbers.
+        columns: Names of the entries of the input's last dimension, as in `Data.columns`.
+        inputs: Function from a number of samples to inputs, for an encoder that does not accept random numbers.
     """
 
     name: str
@@ -82,24 +82,23 @@ class EncoderRow:
 
 @dataclass(frozen=True)
 class CloudRow(EncoderRow):
-    """Parametrisation of an encoder of point clouds.
+    """Parameters with which an encoder of point clouds is checked.
 
-    A cloud has shape (points, columns), with x, y, z in the first three columns. Such an encoder reads a set: its
-    features depend neither on padding nor on the order of the points, and it must refuse malformed clouds with an error
-    that names them.
+    A cloud has shape (points, columns), with x, y, z in the first three columns. The features must depend neither on
+    padding nor on the order of the points. The encoder must refuse a malformed cloud with an error that names it.
     """
 
 
 @dataclass(frozen=True)
 class MetricRow:
-    """Parametrisation of a metric.
+    """Parameters with which a metric is checked.
 
     Attributes:
-        name: What distinguishes the row from the plugin's other rows.
-        target: Target that is predicted; a metric that reads images gets images of a ball (`framework.testing.balls`).
+        name: Description that distinguishes the row from the plugin's other rows.
+        target: Target of the predictions. A metric that reads images gets those of `framework.testing.balls`.
         fields: Further batch fields that the metric reads: name → function from a number of samples to a tensor with
             that first dimension.
-        size: Height and width in pixels of the predicted images, where the metric reads some.
+        size: Height and width, pixels, of the predicted images, for a metric that reads images.
         config, limits, leave_out: See HeadRow.
     """
 
@@ -114,13 +113,13 @@ class MetricRow:
 
 @dataclass(frozen=True)
 class WrapperRow:
-    """Parametrisation of an uncertainty wrapper.
+    """Parameters with which an uncertainty wrapper is checked.
 
     Attributes:
-        name: What distinguishes the row from the plugin's other rows.
-        target: Target that is predicted.
-        identity: Parameters with which the wrapper must equal the model that it wraps, to the last bit ({"members":
-            1}); None where there are none.
+        name: Description that distinguishes the row from the plugin's other rows.
+        target: Target of the wrapped model.
+        identity: Parameters with which the wrapper must equal the wrapped model to the last bit, for example
+            {"members": 1}; None where there are none.
         config, limits, leave_out: See HeadRow.
     """
 
@@ -134,11 +133,11 @@ class WrapperRow:
 
 @dataclass(frozen=True)
 class ObjectiveRow:
-    """Parametrisation of an objective; the inputs are vectors of `framework.testing.wrappers.LENGTH` numbers.
+    """Parameters with which an objective is checked; inputs are vectors of `framework.testing.wrappers.LENGTH` numbers.
 
     Attributes:
-        name: What distinguishes the row from the plugin's other rows.
-        target: Target that is predicted.
+        name: Description that distinguishes the row from the plugin's other rows.
+        target: Target of the predictor.
         fields: Further batch fields that the objective reads: name → function from a number of samples to a tensor with
             that first dimension.
         config, limits, leave_out: See HeadRow.
@@ -154,10 +153,10 @@ class ObjectiveRow:
 
 @dataclass(frozen=True)
 class RendererRow:
-    """Parametrisation of a renderer.
+    """Parameters with which a renderer is checked.
 
     Attributes:
-        name: What distinguishes the row from the plugin's other rows.
+        name: Description that distinguishes the row from the plugin's other rows.
         config, limits, leave_out: See HeadRow.
     """
 
@@ -168,11 +167,12 @@ class RendererRow:
 
 
 Damage = Literal["missing", "empty", "cut", "garbage", "folder"]
-"""Damage to a file: it is removed, emptied, cut in half, filled with other bytes, or replaced by a folder."""
+"""Damage to a file: it is removed, emptied, cut in half, filled with random bytes, or replaced by a folder."""
 DAMAGES: tuple[Damage, ...] = ("missing", "empty", "cut", "garbage", "folder")
+"""Every kind of damage."""
 
 
-SAID_BY_ROWS: Mapping[str, str] = dict.fromkeys(
+NEEDS_ROWS: Mapping[str, str] = dict.fromkeys(
     (
         "synthetic is said",
         "damaged files are named",
@@ -180,26 +180,28 @@ SAID_BY_ROWS: Mapping[str, str] = dict.fromkeys(
         "own files",
         "damaged own files are named",
     ),
-    "a rows.py has to say what is wanted",
+    "only a rows.py can state the expected result",
 )
-"""Properties that cannot be checked of a data set without rows, and the reason."""
+"""Property of a data set that cannot be checked without a `rows.py` → reason."""
 
 
 @dataclass(frozen=True)
 class DataRow:
-    """Parametrisation of a data set, as small as possible, because it is prepared a dozen times.
+    """Parameters with which a data set is checked. It should be small, because it is prepared a dozen times.
 
     Attributes:
-        name: What distinguishes the row from the plugin's other rows.
+        name: Description that distinguishes the row from the plugin's other rows.
         config, limits, leave_out: See HeadRow.
-        write: Function that fills an empty folder with the files that the data set reads, in the official layout where
-            there is one, and returns the parameters that locate them ({"root": ...}). None where data are generated.
+        write: Function that writes the files of the data set to an empty folder, in the official layout where there is
+            one, and returns the parameters that locate them, for example {"root": ...}. None for generated data.
         synthetic: Value that `Data.synthetic` must have; None accepts any.
-        files: Function that fills an empty folder with two or more user files for `Data.read`, no two of them equal.
-        fragile: Pattern of written or generated files → kinds of damage to the first match that `prepare` must report
-            by name. Leave out damage that cannot be detected: half of a list of names is still a list of names.
-        skip: Parameters with which unreadable files of the first pattern are left out and counted.
-        changes: Parameters that each change the samples, and therefore the fingerprint.
+        files: Function that writes two or more different user files for `Data.read` to an empty folder, and returns
+            their paths.
+        fragile: Glob pattern → kinds of damage. After each damage to the first file that matches the pattern, `prepare`
+            must raise an error that names the file. Leave out damage that cannot be detected: half of a list of names
+            is still a list of names.
+        skip: Parameters with which the data set skips and counts unreadable files of the first pattern in `fragile`.
+        changes: Parameters, each with a value that changes the samples and therefore the fingerprint.
     """
 
     name: str

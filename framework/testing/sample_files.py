@@ -1,4 +1,4 @@
-"""Small files as a user may have them, for rows of data sets: images and meshes."""
+"""Small image and mesh files such as a user may have, for contract rows of data sets."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,8 +12,10 @@ from framework.testing.finding import SEED
 def noise_image(file: Path, number: int, size: tuple[int, int] = (20, 20)) -> Path:
     """Write a colour image of random pixels and return its path.
 
-    The image has `size` (height, width), and its pixels differ for each `number`. The suffix of `file` decides the
-    format.
+    Args:
+        file: Path of the image; its suffix determines the format.
+        number: Number that selects the seed of the pixels.
+        size: Height and width, pixels.
     """
     pixels = np.random.default_rng([SEED, number]).integers(0, 256, (*size, 3), np.uint8)
     file.parent.mkdir(parents=True, exist_ok=True)
@@ -28,7 +30,10 @@ def images(folder: Path) -> Sequence[Path]:
 
 
 def surface(number: int, side: int = 6) -> tuple[np.ndarray, np.ndarray]:
-    """Return vertices (side², 3) and triangles of a rough surface off the origin, which differs for each `number`."""
+    """Return vertices (side², 3) and triangles (face, 3) of a rough surface away from the origin.
+
+    `number` selects the seed of the surface.
+    """
     random = np.random.default_rng([SEED, number])
     row, column = np.divmod(np.arange(side**2), side)
     vertices = np.stack([row, column, random.normal(size=side**2)], -1) + random.normal(3, 1, 3)

@@ -1,4 +1,4 @@
-"""Scenes on which renderers are checked."""
+"""Scenes with which renderers are checked."""
 
 import math
 from dataclasses import replace
@@ -10,10 +10,11 @@ from framework.renderer import Scene
 from framework.testing.finding import SEED
 
 SIZE = (48, 64)
+"""Height and width of the images, pixels."""
 
 
 def sphere(rings: int = 24, radius: float = 1.0) -> Scene:
-    """Return a sphere about the origin, coloured by position, seen from four metres."""
+    """Return a sphere about the origin, coloured by position, with a camera at a distance of four metres."""
     theta = torch.linspace(0, math.pi, rings + 1, dtype=torch.float64)
     phi = torch.arange(2 * rings, dtype=torch.float64) * (math.pi / rings)
     grid = torch.stack(
@@ -39,15 +40,15 @@ def camera() -> Camera:
 
 
 def square(distance: float, side: float = 10.0) -> Scene:
-    """Return a square of two triangles across the view, `distance` metres in front of the camera and facing it."""
-    seen = camera()
+    """Return a square of two triangles that faces the camera at a distance of `distance` metres."""
+    view = camera()
     corners = torch.tensor([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]).double() * side / 2
     corners[:, 2] = distance
-    world = (corners - seen.translation.double()) @ seen.rotation.double()
+    world = (corners - view.translation.double()) @ view.rotation.double()
     faces = torch.tensor([[0, 2, 1], [0, 3, 2]])
-    return Scene(world.float(), faces, torch.rand(4, 3, generator=torch.Generator().manual_seed(SEED)), seen)
+    return Scene(world.float(), faces, torch.rand(4, 3, generator=torch.Generator().manual_seed(SEED)), view)
 
 
 def empty(scene: Scene) -> Scene:
-    """Return the scene without faces."""
+    """Return a copy of the scene without faces."""
     return replace(scene, faces=scene.faces[:0])

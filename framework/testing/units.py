@@ -1,4 +1,4 @@
-"""Check of heads of reals whose target has a location and a scale: the density is in the target's own unit."""
+"""Check that a head for a real-valued target with location and scale returns densities in the target's unit."""
 
 import math
 from collections.abc import Callable
@@ -15,24 +15,26 @@ from framework.errors import ConfigError, UserError
 from framework.target import Target
 from framework.testing.finding import SEED, Worst, seed
 from framework.testing.heads import HeadSubject
-from framework.testing.questions import MANY, two_samples
+from framework.testing.protocol_checks import MANY, compare_draws
 
-Answer = TypeVar("Answer")
+Result = TypeVar("Result")
 UNITS = ((200.0, 50.0), (0.3, 1e-5))
-"""Location and scale, in turn, of the numbers of a target, as of a height in centimetres and a wavelength in metres."""
+"""Locations and scales of alternating numbers of a target, as of heights in centimetres and wavelengths in metres."""
 TOLERANCE = 1e-5
+"""Largest relative error that passes."""
 
 
 def units(subject: HeadSubject, worst: Worst) -> None:
-    """Check that a target of location l and scale s has the density p((y - l)/s)/s.
+    """Check that a target with location l and scale s has the density p((y - l)/s)/s.
 
-    Here p is the density of the standardised target. A head may ignore location and scale and return the same density
-    as without them; that passes.
+    Here p is the density of the standardised target. A head also passes if it ignores location and scale and returns
+    the same density as without them.
     """
     head = subject.make()
     if head.direct or isinstance(head, Fitted):
         worst.count(
-            False, "it reads features, which may be in the target's unit, or is fitted to targets at once"
+            False,
+            "the head reads features in the target's unit or is fitted to targets, so its density need not scale",
         )
         return
     plain = replace(subject.row.target, location=(), scale=())
@@ -40,105 +42,124 @@ def units(subject: HeadSubject, worst: Worst) -> None:
         chosen = [UNITS[(first + number) % 2] for number in range(len(plain.names))]
         location, scale = (torch.tensor(part, dtype=torch.float64) for part in zip(*chosen, strict=True))
         target = replace(plain, location=tuple(location.tolist()), scale=tuple(scale.tolist()))
-        _compare(subject, target, location, scale, worst)
+        _compare_units(subject, target, location, scale, worst)
 
 
-def _compare(subject: HeadSubject, target: Target, location: Tensor, scale: Tensor, worst: Worst) -> None:
-    assert subject.of is not None
+def _compare_units(
+    subject: HeadSubject, target: Target, location: Tensor, scale: Tensor, worst: Worst
+) -> None:
+    assert subject.build_for is not None
     seed(SEED)
     try:
-        head = subject.of(target).eval().double()
+        head = subject.build_for(target).eval().double()
     except ConfigError:
-        worst.count(False, "a target with location and scale is refused")
+        worst.count(False, "the head refuses a target with location and scale")
         return
     seed(SEED)
-    alone = subject.of(replace(target, location=(), scale=())).eval().double()
-    what = f"location {location[0].item():g}, scale {scale[0].item():g}"
+    alone = subject.build_for(replace(target, location=(), scale=())).eval().double()
+    unit = f"location {location[0].item():g}, scale {scale[0].item():g}"
     raw = subject.raws(12).double() * torch.tensor([0.3, 1.0, 3.0], dtype=torch.float64).repeat(4).unsqueeze(
         -1
     )
     standard = subject.values(12).double()
     with torch.no_grad():
         # some values near the mode, where a narrow density is not negligible
-        standard[6:] = _after(lambda: alone(raw[6:]).sample()).double()
+        standard[6:] = _call_seeded(lambda: alone(raw[6:]).sample()).double()
     value = location + scale * standard
     volume = scale.log().sum()
     with torch.no_grad():
-        plain = _after(lambda: alone(raw))
-        own = _after(lambda: head(raw))
-        ignored = _after(lambda: plain.log_prob(value.to(plain.mode))).double()
-        log_prob = _after(lambda: own.log_prob(value)).double()
+        plain = _call_seeded(lambda: alone(raw))
+        own = _call_seeded(lambda: head(raw))
+        ignored = _call_seeded(lambda: plain.log_prob(value.to(plain.mode))).double()
+        log_prob = _call_seeded(lambda: own.log_prob(value)).double()
         if torch.equal(ignored.nan_to_num(), log_prob.nan_to_num()):
-            worst.count(False, "the head does not read the target's location and scale")
+            worst.count(False, "the head ignores the target's location and scale")
             return
-        wanted = _after(lambda: plain.log_prob(standard)).double() - volume
-        _see(worst, f"log_prob, {what}", log_prob, wanted, 1.0)
-        entropy, without = _after(own.entropy).double(), _after(plain.entropy).double()
-        _see(worst, f"entropy, {what}", entropy, without + volume, 1.0)
-        _places(own, plain, location, scale, worst, what)
-        drawn = own.sample(torch.Size((MANY,))).double()
-        others = location + scale * plain.sample(torch.Size((MANY,))).double()
+        expected = _call_seeded(lambda: plain.log_prob(standard)).double() - volume
+        _record_gap(worst, f"log_prob, {unit}", log_prob, expected, 1.0)
+        entropy, without = _call_seeded(own.entropy).double(), _call_seeded(plain.entropy).double()
+        _record_gap(worst, f"entropy, {unit}", entropy, without + volume, 1.0)
+        _compare_locations(own, plain, location, scale, worst, unit)
+        draws = own.sample(torch.Size((MANY,))).double()
+        expected_draws = location + scale * plain.sample(torch.Size((MANY,))).double()
         inner = Worst()
         for row in range(0, 12, 5):
-            two_samples(own, drawn[:, row], others[:, row], inner, f"row {row}")
-        worst.see(TOLERANCE * inner.error, f"{inner.case}, {what}")
+            compare_draws(own, draws[:, row], expected_draws[:, row], inner, f"row {row}")
+        worst.record(TOLERANCE * inner.error, f"{inner.case}, {unit}")
     losses, gradients = [], []
-    for model, given in ((head, value), (alone, standard)):
+    for model, targets in ((head, value), (alone, standard)):
         leaf = raw.clone().requires_grad_()
-        loss = _after(lambda model=model, leaf=leaf, given=given: model.train().loss(leaf, given))
+        loss = _call_seeded(lambda model=model, leaf=leaf, targets=targets: model.train().loss(leaf, targets))
         losses.append((loss - loss[0]).detach())
         gradients.append(torch.autograd.grad(loss.sum(), leaf, allow_unused=True)[0])
         model.eval()
-    found, wanted = losses
-    _see(worst, f"loss of a row less that of the first, {what}", found, wanted, wanted.abs().amax().item())
-    if all(one is not None for one in gradients):
-        found, wanted = gradients
-        _see(worst, f"gradient of the loss, {what}", found, wanted, wanted.abs().amax().item())
+    actual, expected = losses
+    _record_gap(
+        worst,
+        f"difference of each loss from the first, {unit}",
+        actual,
+        expected,
+        expected.abs().amax().item(),
+    )
+    if all(row_gradient is not None for row_gradient in gradients):
+        actual, expected = gradients
+        _record_gap(worst, f"gradient of the loss, {unit}", actual, expected, expected.abs().amax().item())
     with torch.no_grad():
         head.calibrate(raw, value)
         alone.calibrate(raw, standard)
-        found, wanted = (
-            _after(lambda model=model, given=given: model(raw).log_prob(given)).double()
-            for model, given in ((head, value), (alone, standard))
+        actual, expected = (
+            _call_seeded(lambda model=model, targets=targets: model(raw).log_prob(targets)).double()
+            for model, targets in ((head, value), (alone, standard))
         )
-        _see(worst, f"log_prob after calibrate, {what}", found, wanted - volume, 1.0)
+        _record_gap(worst, f"log_prob after calibrate, {unit}", actual, expected - volume, 1.0)
 
 
-def _places(
-    own: Distribution, plain: Distribution, location: Tensor, scale: Tensor, worst: Worst, what: str
+def _compare_locations(
+    own: Distribution, plain: Distribution, location: Tensor, scale: Tensor, worst: Worst, unit: str
 ) -> None:
-    """Check mode, moments, median, marginals and cdf of both densities in the standardised unit."""
+    """Compare mode, moments, median, marginals and cdf of both densities in the standardised unit."""
     for name in ("mode", "mean", "variance"):
         try:
-            found, wanted = getattr(own, name).double(), getattr(plain, name).double()
+            actual, expected = getattr(own, name).double(), getattr(plain, name).double()
         except (NotImplementedError, AttributeError):
             continue
-        found = found / scale.square() if name == "variance" else (found - location) / scale
-        _see(worst, f"{name}, {what}", found, wanted, 1.0)
-    middle = [(_after(lambda density=density: median(density, 500))).double() for density in (own, plain)]
-    _see(worst, f"median, {what}", (middle[0] - location) / scale, middle[1], 1.0)
+        actual = actual / scale.square() if name == "variance" else (actual - location) / scale
+        _record_gap(worst, f"{name}, {unit}", actual, expected, 1.0)
+    middle = [
+        (_call_seeded(lambda density=density: median(density, 500))).double() for density in (own, plain)
+    ]
+    _record_gap(worst, f"median, {unit}", (middle[0] - location) / scale, middle[1], 1.0)
     place = plain.mode.double() + 0.3
     for number in range(len(location)):
-        here = slice(number, number + 1)
+        this_number = slice(number, number + 1)
         try:
-            one, other = marginal(own, number), marginal(plain, number)
+            own_marginal, plain_marginal = marginal(own, number), marginal(plain, number)
         except UserError:
             return
-        given = location[here] + scale[here] * place[..., here]
-        wanted = _after(lambda other=other, here=here: other.log_prob(place[..., here])).double()
-        found = _after(lambda one=one, given=given: one.log_prob(given)).double() + scale[here].log()
-        _see(worst, f"marginal of number {number}, {what}", found, wanted, 1.0)
-        masses = cdf(one, given), cdf(other, place[..., here])
+        value = location[this_number] + scale[this_number] * place[..., this_number]
+        expected = _call_seeded(
+            lambda plain_marginal=plain_marginal, this_number=this_number: plain_marginal.log_prob(
+                place[..., this_number]
+            )
+        ).double()
+        actual = (
+            _call_seeded(lambda own_marginal=own_marginal, value=value: own_marginal.log_prob(value)).double()
+            + scale[this_number].log()
+        )
+        _record_gap(worst, f"marginal of number {number}, {unit}", actual, expected, 1.0)
+        masses = cdf(own_marginal, value), cdf(plain_marginal, place[..., this_number])
         if masses[0] is not None and masses[1] is not None:
-            _see(worst, f"cdf of number {number}, {what}", masses[0], masses[1], 1.0)
+            _record_gap(worst, f"cdf of number {number}, {unit}", masses[0], masses[1], 1.0)
 
 
-def _see(worst: Worst, what: str, found: Tensor, wanted: Tensor, least: float) -> None:
-    """Record the difference, relative to the wanted value where that is above `least`, else to `least`."""
-    apart = torch.where((found == wanted) | (found.isnan() & wanted.isnan()), 0.0, (found - wanted).abs())
-    worst.see(apart / wanted.nan_to_num(nan=0.0).abs().clamp(min=max(least, math.ulp(1.0))), what)
+def _record_gap(worst: Worst, label: str, actual: Tensor, expected: Tensor, least: float) -> None:
+    """Record the difference, relative to the expected value or to `least`, whichever is larger."""
+    gap = torch.where(
+        (actual == expected) | (actual.isnan() & expected.isnan()), 0.0, (actual - expected).abs()
+    )
+    worst.record(gap / expected.nan_to_num(nan=0.0).abs().clamp(min=max(least, math.ulp(1.0))), label)
 
 
-def _after(ask: Callable[[], Answer]) -> Answer:
+def _call_seeded(function: Callable[[], Result]) -> Result:
     seed(SEED)
-    return ask()
+    return function()

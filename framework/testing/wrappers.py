@@ -1,6 +1,6 @@
-"""Contract tests of an uncertainty wrapper: one function for each property; each reports its worst case.
+"""Contract tests of an uncertainty wrapper: one function for each property; each records its largest error.
 
-The properties of its calibration are checked in framework.testing.calibration.
+Calibration is checked in framework.testing.calibration.
 """
 
 import copy
@@ -15,11 +15,11 @@ from framework.data import Batch
 from framework.distributions.circular import Circular
 from framework.model import Predictor
 from framework.target import Target
-from framework.testing import densities as asked
-from framework.testing.devices import OneDevice, Questions, on_one_device
-from framework.testing.finding import SEED, Finding, Worst, examined, seed
+from framework.testing import densities
+from framework.testing.devices import Calls, OneDevice, check_devices
+from framework.testing.finding import SEED, Finding, Worst, run_check, seed
 from framework.testing.heads import values
-from framework.testing.metrics import density_about, numbers_about
+from framework.testing.metrics import place_size, simplest_density
 from framework.testing.rows import WrapperRow
 from framework.uncertainty import Uncertainty
 
@@ -27,15 +27,16 @@ Make = Callable[[], Uncertainty]
 Build = Callable[[Target], Uncertainty]
 """Function that builds the row's wrapper around `Plain`, for the row's target in any unit."""
 LENGTH = 6
+"""Number of values of an input."""
 UNITS = ((200.0, 50.0), (-3.0, 1e-3))
-"""Locations and scales of real targets, beside 0 and 1."""
+"""Locations and scales of real-valued targets, in addition to 0 and 1."""
 
 
 class Plain(Predictor):
-    """Model to wrap: one linear layer to place and breadth of the simplest density of the target's kind.
+    """Model to wrap: a linear layer to location and breadth of the density that `simplest_density` returns.
 
-    The effect of `calibrate` does not depend on the samples. A wrapper around this model can therefore be compared with
-    a wrapper around a model that was calibrated before.
+    The effect of `calibrate` is the same for all samples. A wrapper that calibrates this model can therefore be
+    compared with a wrapper around a model that was calibrated before.
 
     Attributes:
         calibrated: Buffer that is 1 after `calibrate`, else 0.
@@ -47,7 +48,7 @@ class Plain(Predictor):
         super().__init__()
         self.target = target
         self.dropout = nn.Dropout(0.1)  # for wrappers that need a dropout layer
-        self.layer = nn.Linear(LENGTH, numbers_about(target) + 1)
+        self.layer = nn.Linear(LENGTH, place_size(target) + 1)
         self.register_buffer("calibrated", torch.zeros(()))
 
     def forward(self, inputs: Tensor) -> Distribution:
@@ -58,7 +59,7 @@ class Plain(Predictor):
                 torch.tensor(part).to(place) for part in (self.target.location, self.target.scale)
             )
             place, breadth = location + scale * place, scale[0] * breadth
-        return density_about(self.target, place, breadth)
+        return simplest_density(self.target, place, breadth)
 
     def loss(self, inputs: Tensor, target: Tensor) -> Tensor:
         return -self(inputs).log_prob(target)
@@ -67,27 +68,26 @@ class Plain(Predictor):
         return self(inputs)
 
     def calibrate(self, batches: Iterable[Batch]) -> None:
-        rows = sum(
-            len(batch["target"]) for batch in batches
-        )  # an iterator that was read before yields no rows
+        # an iterator that was read before yields no rows
+        rows = sum(len(batch["target"]) for batch in batches)
         self.calibrated.fill_(float(rows > 0))
 
 
-def wrapped(wrapper: Uncertainty) -> list[Plain]:
-    """Return the models inside the wrapper; none where it keeps their parameters in another form."""
+def wrapped_models(wrapper: Uncertainty) -> list[Plain]:
+    """Return the models inside the wrapper, or no models if it stores their parameters in another form."""
     return [module for module in wrapper.modules() if isinstance(module, Plain)]
 
 
 def examine_wrapper(
     row: WrapperRow, build: Build, build_identity: Callable[[Callable[[], Predictor]], Uncertainty] | None
 ) -> Iterator[Finding]:
-    """Yield one finding for each property of a wrapper around `Plain`, new for each check.
+    """Yield one finding for each property of an uncertainty wrapper, built around `Plain` anew for each check.
 
     Args:
-        row: Row of the contract.
-        build: Function that builds the row's wrapper for a target.
-        build_identity: Function that builds the wrapper around a given model such that it must equal that model; None
-            where it cannot.
+        row: Contract row of the wrapper.
+        build: Function that builds the wrapper for a target.
+        build_identity: Function that builds the wrapper around a given model, with parameters for which it must equal
+            the model; None if there are no such parameters.
     """
     from framework.testing.calibration import Calibration
 
@@ -114,90 +114,100 @@ def examine_wrapper(
     }
     calibration = Calibration(row, build)
     checks |= {name: (limit, check) for name, limit, check in calibration.checks()}
-    # the mode of a mixture of densities is the best of some candidates
+    # the mode of a mixture is the highest of some candidates, not exact
     limit = 1e-6 if row.target.kind == "class" else 0.2
-    checks["mode"] = (limit, lambda worst: _of_densities(calibration.many, asked.mode_is_highest, worst))
-    for name, limit, check in questions(row.target):
-        checks[name] = (limit, lambda worst, check=check: _of_densities(calibration.densities, check, worst))
+    checks["mode"] = (
+        limit,
+        lambda worst: _check_densities(calibration.many, densities.mode_is_highest, worst),
+    )
+    for name, limit, check in density_checks(row.target):
+        checks[name] = (
+            limit,
+            lambda worst, check=check: _check_densities(calibration.densities, check, worst),
+        )
     if build_identity is not None:
         checks["one member is the member"] = (0.0, lambda worst: _identity(build_identity, row, worst))
     for name, (limit, check) in checks.items():
         if name not in row.leave_out:
-            yield examined(name, row.limits.get(name, limit), check)
+            yield run_check(name, row.limits.get(name, limit), check)
 
 
-def questions(target: Target) -> Iterator[tuple[str, float, asked.Check]]:
-    """Yield name, limit and check of each property in framework.testing.densities that suits the target."""
+def density_checks(target: Target) -> Iterator[tuple[str, float, densities.Check]]:
+    """Yield name, limit and check of each property in framework.testing.densities that applies to the target."""
     numbers = 0 if target.kind == "class" else len(target.names)
-    yield "integral", 1e-5, asked.integral
-    yield "samples follow log_prob", 5.0, asked.samples_follow_log_prob if numbers != 2 else _drawn_on_a_grid
+    yield "integral", 1e-5, densities.integral
+    yield (
+        "samples follow log_prob",
+        5.0,
+        densities.samples_follow_log_prob if numbers != 2 else _compare_on_grid,
+    )
     if numbers == 2:
-        yield "samples follow marginals", 5.0, asked.samples_follow_marginals
-    yield "entropy", 5.0, asked.entropy
+        yield "samples follow marginals", 5.0, densities.samples_follow_marginals
+    yield "entropy", 5.0, densities.entropy
     if target.kind == "angle":
-        yield "2π-periodic", 1e-12, asked.periodic
+        yield "2π-periodic", 1e-12, densities.periodic
     if numbers == 1:
-        yield "median", 5.0, asked.median_is_best
-        yield "cdf", 1e-6, asked.masses
+        yield "median", 5.0, densities.median_is_best
+        yield "cdf", 1e-6, densities.masses
     if target.kind == "real" and numbers <= 2:
-        yield "mean and variance", 1e-5, asked.moments
+        yield "mean and variance", 1e-5, densities.moments
 
 
-def _drawn_on_a_grid(density: Distribution, worst: Worst) -> None:
-    """Check that draws follow log_prob; for reals only where the grid resolves the density."""
+def _compare_on_grid(density: Distribution, worst: Worst) -> None:
+    """Check that draws follow log_prob; reals are checked only if the grid resolves the density."""
     broad = bool((density.mode.abs() < 10).all() and (density.entropy() > 0).all())
     if isinstance(density.support, Circular) or broad:
-        asked.samples_follow_log_prob(density, worst)
+        densities.samples_follow_log_prob(density, worst)
     else:
-        worst.count(False, "the grid is too coarse; draws of each number are compared with its marginal")
+        worst.count(False, "left to the check of the marginals, since the grid is too coarse")
 
 
 def in_units(target: Target) -> list[Target]:
-    """Return the target; for reals also the same target in other units."""
+    """Return the target; if it is real-valued, also the same target in other units."""
     if target.kind != "real":
         return [target]
     many = len(target.names)
-    others = [replace(target, location=(at,) * many, scale=(scale,) * many) for at, scale in UNITS]
-    return [target, *others]
+    other_units = [replace(target, location=(at,) * many, scale=(scale,) * many) for at, scale in UNITS]
+    return [target, *other_units]
 
 
 def inputs(count: int, number: int = 0) -> Tensor:
-    """Return seeded inputs (count, LENGTH), which differ for each `number`."""
+    """Return seeded inputs (count, LENGTH); `number` selects the seed."""
     return torch.randn(count, LENGTH, generator=torch.Generator().manual_seed(SEED + 100 * number))
 
 
 def batches(row: WrapperRow) -> list[Batch]:
-    """Return a small labelled validation set as batches."""
+    """Return a validation set of 40 samples as batches."""
     target = values(row.target, (40,))
     parts = zip(inputs(40).split(16), target.split(16), strict=True)
-    return [{"input": some, "target": labels} for some, labels in parts]
+    return [{"input": batch_inputs, "target": target_values} for batch_inputs, target_values in parts]
 
 
 def _on_one_device(make: Make, row: WrapperRow, worst: Worst) -> None:
-    """Check losses, calibration and every function of the densities after it for mixed devices."""
-    from framework.testing.questions import every_question
+    """Check that losses, calibration and all functions of the calibrated densities mix no devices."""
+    from framework.testing.protocol_checks import protocol_calls
 
-    def questions(mode: OneDevice) -> Questions:
+    def calls(mode: OneDevice) -> Calls:
         wrapper = make()
-        mode.move(wrapper)
-        given, labels = mode.receive((inputs(4), values(row.target, (4,))))
-        labelled = mode.receive(batches(row))
-        index = mode.receive(torch.zeros(3, 1, dtype=torch.int64))
-        temperature = mode.receive(torch.tensor(1.7, dtype=torch.float64))
+        mode.label_module(wrapper)
+        features, labels = mode.label_device((inputs(4), values(row.target, (4,))))
+        labelled = mode.label_device(batches(row))
+        index = mode.label_device(torch.zeros(3, 1, dtype=torch.int64))
+        temperature = mode.label_device(torch.tensor(1.7, dtype=torch.float64))
 
         @torch.enable_grad()
-        def trained() -> None:
-            wrapper.train().loss(given, labels)
-            density = wrapper.training_densities(given)
+        def train() -> None:
+            wrapper.train().loss(features, labels)
+            density = wrapper.training_densities(features)
             density.log_prob(density.sample())
 
-        yield "loss", trained
+        yield "loss", train
         wrapper.eval()
-        yield "log_prob of targets", lambda: wrapper(given).log_prob(labels)
+        yield "log_prob of targets", lambda: wrapper(features).log_prob(labels)
         yield "calibrate", lambda: wrapper.calibrate(labelled)
-        yield from every_question(wrapper(given), index, temperature)
+        yield from protocol_calls(wrapper(features), index, temperature)
 
-    on_one_device(questions, worst)
+    check_devices(calls, worst)
 
 
 def _densities(make: Make, row: WrapperRow, worst: Worst) -> None:
@@ -214,7 +224,7 @@ def _densities(make: Make, row: WrapperRow, worst: Worst) -> None:
             worst.finite(f"log_prob of {count}", log_prob)
             if row.target.kind == "angle":
                 worst.count(
-                    not isinstance(density.support, Circular), f"support: {density.support}, wanted angles"
+                    not isinstance(density.support, Circular), f"support: {density.support}, expected angles"
                 )
             if count:
                 worst.same(f"sample of {count}", tuple(density.sample().shape), (count, *event))
@@ -223,81 +233,81 @@ def _densities(make: Make, row: WrapperRow, worst: Worst) -> None:
 
 
 def _number_types(make: Make, row: WrapperRow, worst: Worst) -> None:
-    """Check that float64 stays float64, before and after `calibrate`."""
+    """Check that log_prob has the dtype of model and inputs, before and after `calibrate`."""
     for kind in (torch.float32, torch.float64):
         wrapper = make().to(kind)
         typed = [
             {name: field.to(kind) if field.is_floating_point() else field for name, field in batch.items()}
             for batch in batches(row)
         ]
-        for what in ("as built", "calibrated"):
-            if what == "calibrated":
+        for state in ("as built", "calibrated"):
+            if state == "calibrated":
                 wrapper.calibrate(typed)
             with torch.no_grad():
-                found = wrapper(typed[0]["input"]).log_prob(typed[0]["target"])
-            worst.same(f"log_prob of {kind}, {what}", found.dtype, kind)
+                log_prob = wrapper(typed[0]["input"]).log_prob(typed[0]["target"])
+            worst.same(f"log_prob of {kind}, {state}", log_prob.dtype, kind)
 
 
 def _repeatable(make: Make, row: WrapperRow, worst: Worst) -> None:
-    """Check that results repeat, also after other inputs and between two wrappers after the same calibration."""
+    """Check that results are equal for equal seeds, also after other inputs and for two wrappers calibrated alike."""
     target = values(row.target, (5,))
 
-    def everything(wrapper: Uncertainty) -> dict[str, Tensor]:
+    def compute_results(wrapper: Uncertainty) -> dict[str, Tensor]:
         seed(SEED)
         density = wrapper(inputs(5))
-        found = {"log_prob": density.log_prob(target), "mode": density.mode}
+        results = {"log_prob": density.log_prob(target), "mode": density.mode}
         seed(SEED)
-        return {**found, "sample": density.sample(), "loss": wrapper.loss(inputs(5), target)}
+        return {**results, "sample": density.sample(), "loss": wrapper.loss(inputs(5), target)}
 
     with torch.no_grad():
         first, second = make(), make()
-        wanted = everything(first)
+        expected = compute_results(first)
         first(3 * inputs(7, 1)).sample()
         first.loss(3 * inputs(5, 1), target)
-        for what, other in {"after other inputs": first, "of two wrappers": second}.items():
-            for name, found in everything(other).items():
-                worst.same_bits(f"{name} {what}", found, wanted[name])
+        for comparison, other in {"after other inputs": first, "of two wrappers": second}.items():
+            for name, results in compute_results(other).items():
+                worst.same_bits(f"{name} {comparison}", results, expected[name])
     for wrapper in (first, second):
         seed(SEED)
         wrapper.calibrate(batches(row))
     with torch.no_grad():
-        wanted = everything(first)
-        for name, found in everything(second).items():
-            worst.same_bits(f"{name} of two calibrated", found, wanted[name])
+        expected = compute_results(first)
+        for name, results in compute_results(second).items():
+            worst.same_bits(f"{name} of two calibrated wrappers", results, expected[name])
 
 
 def _rows_apart(make: Make, row: WrapperRow, worst: Worst) -> None:
-    """Check that results of row 2 do not change with other rows, and that its loss has no gradient in their inputs."""
-    wrapper, target, given = make(), values(row.target, (5,)), inputs(5)
-    other = torch.where(torch.arange(5).unsqueeze(-1) == 2, given, 1 - 3 * given)
-    for what in ("as built", "calibrated"):
-        if what == "calibrated":
+    """Check that results of a batch row do not depend on other rows, and its loss has no gradient in their inputs."""
+    wrapper, target, features = make(), values(row.target, (5,)), inputs(5)
+    other = torch.where(torch.arange(5).unsqueeze(-1) == 2, features, 1 - 3 * features)
+    for state in ("as built", "calibrated"):
+        if state == "calibrated":
             wrapper.calibrate(batches(row))
-        found: list[dict[str, Tensor]] = []
+        results: list[dict[str, Tensor]] = []
         with torch.no_grad():
-            for some in (given, other):
+            for rows in (features, other):
                 seed(SEED)
-                density = wrapper(some)
-                answers = {"log_prob": density.log_prob(target), "mode": density.mode}
+                density = wrapper(rows)
+                quantities = {"log_prob": density.log_prob(target), "mode": density.mode}
                 seed(SEED)
-                answers["entropy"] = density.entropy()
+                quantities["entropy"] = density.entropy()
                 seed(SEED)
-                answers["loss"] = wrapper.loss(some, target)
-                found.append({name: answer[2].double() for name, answer in answers.items()})
-        for name, alone in found[0].items():
-            # quadratures of a batch share their nodes, and an entropy may be estimated by draws
+                quantities["loss"] = wrapper.loss(rows, target)
+                results.append({name: quantity[2].double() for name, quantity in quantities.items()})
+        for name, alone in results[0].items():
+            # an entropy may be estimated from draws, or by a quadrature whose nodes all rows share
             least = 10.0 if name == "entropy" else 1.0
-            error = (found[1][name] - alone).abs() / alone.abs().clamp(min=least)
-            worst.see(error, f"{name} of row 2 where the others change, {what}")
-    reached = inputs(5).requires_grad_()
+            error = (results[1][name] - alone).abs() / alone.abs().clamp(min=least)
+            worst.record(error, f"{name} of row 2 when other rows change, {state}")
+    leaf = inputs(5).requires_grad_()
     seed(SEED)
-    wrapper.loss(reached, target)[2].backward()
-    if reached.grad is not None:
-        worst.see(reached.grad[[0, 1, 3, 4]].abs().max(), "gradient of row 2's loss in the others' inputs")
+    wrapper.loss(leaf, target)[2].backward()
+    if leaf.grad is not None:
+        worst.record(leaf.grad[[0, 1, 3, 4]].abs().max(), "gradient of the loss of row 2 in other inputs")
 
 
 def _traces(make: Make, row: WrapperRow, worst: Worst) -> None:
-    """Check that predictions change no training modes, buffers or parameters, and calibrate no modes."""
+    """Check that predictions change no training modes, buffers or parameters, and that calibrate changes no modes."""
     target = values(row.target, (5,))
     for training in (True, False):
         wrapper = make().train(training)
@@ -309,26 +319,30 @@ def _traces(make: Make, row: WrapperRow, worst: Worst) -> None:
             wrapper.loss(inputs(5), target)
             wrapper.training_densities(inputs(5)).sample()
         for name, value in wrapper.state_dict().items():
-            worst.same_bits(f"{name} after an answer, training {training}", value, state[name])
-        for what in ("an answer", "calibrate"):
-            if what == "calibrate":
+            worst.same_bits(
+                f"{name} after a prediction, {'training' if training else 'evaluation'} mode",
+                value,
+                state[name],
+            )
+        for call in ("a prediction", "calibrate"):
+            if call == "calibrate":
                 wrapper.calibrate(batches(row))
             after = {name: module.training for name, module in wrapper.named_modules()}
             changed = [name or "the wrapper" for name in modes if after.get(name) != modes[name]]
-            worst.count(bool(changed), f"modes changed by {what}: {', '.join(changed) or 'none'}")
+            worst.count(bool(changed), f"training modes changed by {call}: {', '.join(changed) or 'none'}")
 
 
 def _knobs(make: Make, row: WrapperRow, worst: Worst) -> None:
-    """Check that values of the knobs are in ascending order and that the smallest two can be set and work."""
+    """Check that the values of each knob are in ascending order, and that log_prob is finite with the smallest two."""
     wrapper = make()
-    worst.count(False, "none declared")
-    for name, dial in wrapper.knobs.items():
-        worst.same(f"order of {name}", list(dial), sorted(dial))
-        for setting in dial[:2]:
+    worst.count(False, "the wrapper has no knobs")
+    for name, settings in wrapper.knobs.items():
+        worst.same(f"order of {name}", list(settings), sorted(settings))
+        for setting in settings[:2]:
             setattr(wrapper, name, setting)
             with torch.no_grad():
-                found = wrapper(inputs(3)).log_prob(values(row.target, (3,)))
-            worst.finite(f"log_prob with {name} = {setting}", found)
+                log_prob = wrapper(inputs(3)).log_prob(values(row.target, (3,)))
+            worst.finite(f"log_prob with {name} = {setting}", log_prob)
 
 
 def _loss(make: Make, row: WrapperRow, worst: Worst) -> None:
@@ -337,25 +351,25 @@ def _loss(make: Make, row: WrapperRow, worst: Worst) -> None:
     worst.same("shape of the loss of 8", tuple(loss.shape), (8,))
     worst.finite("loss", loss)
     loss.sum().backward()
-    found = [parameter.grad for parameter in wrapper.parameters() if parameter.grad is not None]
-    worst.count(not found, "no parameter has a gradient")
-    for gradient in found:
+    gradients = [parameter.grad for parameter in wrapper.parameters() if parameter.grad is not None]
+    worst.count(not gradients, "no parameter has a gradient")
+    for gradient in gradients:
         worst.finite("gradient", gradient)
 
 
 def _trains(make: Make, row: WrapperRow, worst: Worst) -> None:
-    """Check that a small step down the loss improves every model inside, in evaluation mode without dropout."""
+    """Check in evaluation mode that a small step against the gradient of the loss improves every wrapped model."""
     wrapper = make().double()
-    given, target = inputs(64).double(), values(row.target, (64,))
+    features, target = inputs(64).double(), values(row.target, (64,))
     target = target.double() if target.is_floating_point() else target
-    models = wrapped(wrapper)
+    models = wrapped_models(wrapper)
 
-    def lost() -> list[float]:
+    def model_losses() -> list[float]:
         with torch.no_grad():
-            return [model.loss(given, target).mean().item() for model in models]
+            return [model.loss(features, target).mean().item() for model in models]
 
-    before = lost()
-    wrapper.loss(given, target).mean().backward()
+    before = model_losses()
+    wrapper.loss(features, target).mean().backward()
     with torch.no_grad():
         for model in models:
             slopes = [part.grad for part in model.parameters() if part.grad is not None]
@@ -363,39 +377,41 @@ def _trains(make: Make, row: WrapperRow, worst: Worst) -> None:
             for part in model.parameters():
                 if part.grad is not None:
                     part -= 1e-4 * part.grad / length.clamp(min=1e-12)
-    worst.count(False, "keeps no model as it is")
-    for number, (first, then) in enumerate(zip(before, lost(), strict=True)):
-        worst.count(not then < first, f"loss of model {number}: {first:.9g}, after a step {then:.9g}")
+    worst.count(False, "the wrapper stores no models as modules")
+    for number, (first, then) in enumerate(zip(before, model_losses(), strict=True)):
+        worst.count(not then < first, f"loss of wrapped model {number}: {first:.9g}, after a step {then:.9g}")
 
 
 def _training_densities(make: Make, row: WrapperRow, worst: Worst) -> None:
-    """Check that training densities are of one model or of every member, and pass gradients to all models inside.
+    """Check that training densities are those of one model or of every member, with gradients in all wrapped models.
 
-    The log-density of a mixture must lie between those of its members at every value.
+    The log-density of the wrapper must lie between the smallest and the largest of its members at every value.
     """
     wrapper, target = make(), values(row.target, (5,))
     density = wrapper.training_densities(inputs(5))
     worst.count(
         density.batch_shape[:1] != (5,) or len(density.batch_shape) > 2,
-        f"batch_shape {tuple(density.batch_shape)} of 5, wanted (5,) or (5, members)",
+        f"batch_shape is {tuple(density.batch_shape)} for 5 samples, expected (5,) or (5, members)",
     )
     several = len(density.batch_shape) == 2
     value = torch.stack([values(row.target, (5,)), wrapper(inputs(5)).mode, 0 * target])
     parts = density.log_prob(value.unsqueeze(2) if several else value)
-    worst.count(not parts.requires_grad, "an objective gets no gradient")
+    worst.count(not parts.requires_grad, "the training densities have no gradient")
     parts.sum().backward()
-    for number, model in enumerate(wrapped(wrapper)):
-        reached = any(part.grad is not None and bool(part.grad.any()) for part in model.parameters())
-        worst.count(not reached, f"an objective does not reach model {number}")
+    for number, model in enumerate(wrapped_models(wrapper)):
+        has_gradient = any(part.grad is not None and bool(part.grad.any()) for part in model.parameters())
+        worst.count(not has_gradient, f"the training densities have no gradient in wrapped model {number}")
     if several:
         with torch.no_grad():
             whole, parts = wrapper(inputs(5)).log_prob(value), parts.detach()
         outside = (whole - parts.amax(-1)).maximum(parts.amin(-1) - whole)
-        worst.see(outside, lambda at: f"a mixture of what is trained, value {at[0]}, row {at[1]}")
+        worst.record(
+            outside, lambda at: f"log-density outside the range of the members, value {at[0]}, row {at[1]}"
+        )
 
 
 def _round_trip(make: Make, build: Make, row: WrapperRow, worst: Worst) -> None:
-    """Check that a stored wrapper gives the same bits, with all that `calibrate` fitted."""
+    """Check that a wrapper with the stored state has the same log_prob, including what `calibrate` fitted."""
     wrapper = make()
     wrapper.calibrate(batches(row))
     seed(SEED + 7)  # so that a parameter that is not stored has another value
@@ -406,31 +422,35 @@ def _round_trip(make: Make, build: Make, row: WrapperRow, worst: Worst) -> None:
         seed(SEED)
         first = wrapper(inputs(5)).log_prob(target)
         seed(SEED)
-        worst.same_bits("log_prob of the stored state", other(inputs(5)).log_prob(target), first)
+        worst.same_bits(
+            "log_prob of a wrapper with the stored state", other(inputs(5)).log_prob(target), first
+        )
 
 
 def _calibration(make: Make, row: WrapperRow, worst: Worst) -> None:
-    """Check that `calibrate` keeps parameters and yields finite densities, for ordinary and identical labels."""
-    for what, labelled in {"ordinary": batches(row), "all alike": _alike(row)}.items():
+    """Check that `calibrate` changes no parameters, and that log_prob is finite after it, also for equal targets."""
+    for label_kind, labelled in {"ordinary": batches(row), "all equal": _equal_targets(row)}.items():
         wrapper = make()
         before = {name: parameter.clone() for name, parameter in wrapper.named_parameters()}
         wrapper.calibrate(labelled)
         for name, parameter in wrapper.named_parameters():
-            worst.same_bits(f"parameter {name} after calibrate, labels {what}", parameter, before[name])
+            worst.same_bits(
+                f"parameter {name} after calibrate, targets {label_kind}", parameter, before[name]
+            )
         with torch.no_grad():
-            found = wrapper(inputs(5)).log_prob(values(row.target, (5,)))
-        worst.finite(f"log_prob after calibrate, labels {what}", found)
+            log_prob = wrapper(inputs(5)).log_prob(values(row.target, (5,)))
+        worst.finite(f"log_prob after calibrate, targets {label_kind}", log_prob)
 
 
-def _alike(row: WrapperRow) -> list[Batch]:
+def _equal_targets(row: WrapperRow) -> list[Batch]:
     return [{**batch, "target": torch.zeros_like(batch["target"])} for batch in batches(row)]
 
 
-def _of_densities(
-    found: dict[str, Distribution], check: Callable[[Distribution, Worst], None], worst: Worst
+def _check_densities(
+    densities_by_name: dict[str, Distribution], check: Callable[[Distribution, Worst], None], worst: Worst
 ) -> None:
-    for what, density in found.items():
-        worst.rows = [f"{what}, row {number}" for number in range(*density.batch_shape)]
+    for description, density in densities_by_name.items():
+        worst.rows = [f"{description}, row {number}" for number in range(*density.batch_shape)]
         with torch.no_grad():
             check(density, worst)
 
@@ -438,13 +458,13 @@ def _of_densities(
 def _identity(
     build_identity: Callable[[Callable[[], Predictor]], Uncertainty], row: WrapperRow, worst: Worst
 ) -> None:
-    """Check that a wrapper with the row's `identity` parameters equals the model that it wraps, to the last bit."""
+    """Check that a wrapper with the row's `identity` parameters equals the wrapped model to the last bit."""
     seed(SEED)
     member = Plain(row.target).eval()
     wrapper = build_identity(lambda: member).eval()
-    target, given = values(row.target, (64,)), 4 * inputs(64)  # places several turns apart
+    target, features = values(row.target, (64,)), 4 * inputs(64)  # locations several turns from each other
     with torch.no_grad():
-        whole, alone = wrapper(given), member(given)
+        whole, alone = wrapper(features), member(features)
         worst.same_bits("log_prob", whole.log_prob(target), alone.log_prob(target))
         worst.same_bits("mode", whole.mode, alone.mode)
-        worst.same_bits("loss", wrapper.loss(given, target), member.loss(given, target))
+        worst.same_bits("loss", wrapper.loss(features, target), member.loss(features, target))

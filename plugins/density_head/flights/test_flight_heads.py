@@ -12,21 +12,21 @@ from framework.flights.frames import future_names
 from framework.flights.physics import Constants
 from framework.model import Model
 from framework.target import Target
-from framework.testing.flights import SIGMA, STEP, TWO_FRAMES, thrown, windows_of
+from framework.testing.flights import SIGMA, STEP, TWO_FRAMES, falling_balls, simulate_windows
 from plugins.density_head.flights.ballistic import BallisticHead
 from plugins.density_head.flights.identification import FITTED, HIGH, LOW
 
 
 @pytest.mark.parametrize("density", ["linearised", "sampled"])
 def test_the_physics_covers_what_it_simulated(density: str) -> None:
-    frames, future, _ = windows_of(60)
+    frames, future, _ = simulate_windows(60)
     target = Target("real", future_names(35, STEP))
     config = {"name": "ballistic", "density": density, "identify": False, "samples": 60}
     head = build("density_head", resolve("density_head", config), target=target).eval()
     torch.manual_seed(0)
-    found = head(frames.flatten(1)).sample((199,))
+    samples = head(frames.flatten(1)).sample((199,))
     noisy = future.flatten(1) + SIGMA * torch.randn(future.flatten(1).shape)
-    rank = (found < noisy).sum(0)
+    rank = (samples < noisy).sum(0)
     assert ((rank >= 10) & (rank < 190)).double().mean().item() == pytest.approx(0.9, abs=0.05)
 
 
@@ -39,7 +39,7 @@ def test_heads_refuse_what_is_no_flight() -> None:
 
 @pytest.mark.parametrize("nonsense", [False, True])
 def test_constants_are_found_and_of_nonsense_stay_within_their_bounds(nonsense: bool) -> None:
-    frames, future, _ = windows_of(12)
+    frames, future, _ = simulate_windows(12)
     target = Target("real", future_names(35, STEP))
     wrong = {"drag": 0.1, "lift": 0.001, "restitution": 0.8, "friction": 0.2, "surface": -0.93}
     head = build("density_head", resolve("density_head", {"name": "ballistic", **wrong}), target=target)
@@ -47,13 +47,13 @@ def test_constants_are_found_and_of_nonsense_stay_within_their_bounds(nonsense: 
     if nonsense:
         frames, future = torch.randn_like(frames)[:2], torch.randn_like(future)[:2]
     head.fit(frames.flatten(1), future.flatten(1) + SIGMA * torch.randn(future.flatten(1).shape), 0)
-    found = head.constants
+    constants = head.constants
     for name, low, high in zip(FITTED, LOW, HIGH, strict=True):
         middle = wrong["surface"] if name == "surface" else 0.0
-        assert middle + low <= getattr(found, name) <= middle + high
+        assert middle + low <= getattr(constants, name) <= middle + high
         if not nonsense:
             near = {"lift": 1e-3, "restitution": 0.02, "surface": 0.003}.get(name, 0.01)
-            assert getattr(found, name) == pytest.approx(getattr(Constants(), name), abs=near), name
+            assert getattr(constants, name) == pytest.approx(getattr(Constants(), name), abs=near), name
     if not nonsense:
         assert head.noise.item() == pytest.approx(SIGMA, rel=0.1)
 
@@ -76,7 +76,7 @@ def test_physics_far_from_any_ball_give_a_density_or_a_sentence(
         constants=constants,
     )
     try:
-        log_prob = head(thrown(2)).log_prob(torch.zeros(2, 6))
+        log_prob = head(falling_balls(2)).log_prob(torch.zeros(2, 6))
     except NonFiniteParameters as error:
         assert "in batch row 0" in str(error)
     else:

@@ -1,9 +1,9 @@
 """Rows of the contract: observed frames of thrown balls."""
 
-from framework.testing.flights import thrown
+from framework.testing.flights import falling_balls
 from framework.testing.rows import EncoderRow
 
 ROWS = {
-    name: (EncoderRow("a thrown ball", (30,), {"future": 3}, inputs=thrown),)
+    name: (EncoderRow("a thrown ball", (30,), {"future": 3}, inputs=falling_balls),)
     for name in ("ballistic", "extrapolation")
 }
