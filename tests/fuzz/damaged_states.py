@@ -27,7 +27,7 @@ from framework.storage.checkpoints import TRAILER
 from framework.storage.weights import fill_from_file
 from framework.target import Target
 from framework.testing.contract import contract
-from framework.testing.heads import HeadSubject, ready, values
+from framework.testing.heads import HeadSubject, fit_if_needed, values
 from framework.testing.rows import EncoderRow, HeadRow, WrapperRow
 from framework.training.checkpoint import WholeCheckpoints
 from tests.fuzz.damage import Reader, Silent, spoilt
@@ -73,7 +73,7 @@ class Subject:
         ).eval()
         for part in predictor.modules():
             if isinstance(part, DensityHead):
-                ready(part, self.target)
+                fit_if_needed(part, self.target)
         inputs = self.inputs.repeat(5, *[1] * (self.inputs.dim() - 1))
         with torch.no_grad():
             predictor.calibrate([{"input": inputs, "target": values(self.target, (20,))}])
@@ -102,7 +102,9 @@ def answer(predictor: Predictor, target: Target, inputs: Tensor) -> Tensor:
 
 def of_head(name: str, row: HeadRow) -> Subject:
     config = resolve("density_head", {"name": name, **row.config})
-    made = HeadSubject(row, lambda: ready(build("density_head", config, target=row.target), row.target))
+    made = HeadSubject(
+        row, lambda: fit_if_needed(build("density_head", config, target=row.target), row.target)
+    )
     encoder = [resolve("encoder", SMALL)] if made.make().backbones else []
     return Subject(parts(encoder, config), row.target, made.raws(4))
 
@@ -468,7 +470,7 @@ def in_data(content: bytes, random: np.random.Generator) -> bytes:
 def asked(file: Path) -> object:
     """What a stored model answers to what its user has."""
     predictor = loading.load(file)
-    data = loading.reader(loading.stored(file)[0])
+    data = loading.reader(loading.read_stored(file)[0])
     try:
         if "height" in data.state_dict():
             data.preview(torch.zeros(3, 6))

@@ -16,7 +16,7 @@ from framework.distributions.protocol import estimate, marginal
 from framework.errors import ConfigError
 from framework.target import Target
 from framework.testing.densities import integral, marginals, median_is_best, samples_follow_log_prob
-from framework.testing.finding import examined, require
+from framework.testing.finding import require, run_check
 from framework.testing.heads import values
 from plugins.density_head.latent import density as module
 from plugins.density_head.latent.cvae import (
@@ -38,8 +38,11 @@ def test_each_network_may_have_a_backbone_of_its_own():
     }
     model = build_predictor({**resolve_all_parts(config)}, ONE, (4,), 0).double()
     shared = {**config, "density_head": {"name": "cvae", **SMALL}}
-    one = build_predictor(resolve_all_parts(shared), ONE, (4,), 0).double()
-    counts = [sum(parameter.numel() for parameter in made.encoders.parameters()) for made in (model, one)]
+    shared_model = build_predictor(resolve_all_parts(shared), ONE, (4,), 0).double()
+    counts = [
+        sum(parameter.numel() for parameter in predictor.encoders.parameters())
+        for predictor in (model, shared_model)
+    ]
     assert counts[0] == 3 * counts[1] + sum(5 * part + part for part in model.head.backbones)
     networks = model.encoders[0].networks
     assert not torch.equal(networks[0][0].layers[0].weight, networks[1][0].layers[0].weight)
@@ -47,16 +50,19 @@ def test_each_network_may_have_a_backbone_of_its_own():
     raw = model.raw(inputs)
     for index, part in enumerate(raw.split(model.head.backbones, -1)):
         gradients = torch.autograd.grad(part.sum(), list(networks.parameters()), retain_graph=True)
-        each = len(gradients) // 3
-        moved = [any(bool(one.any()) for one in gradients[at * each : (at + 1) * each]) for at in range(3)]
+        per_network = len(gradients) // 3
+        moved = [
+            any(bool(gradient.any()) for gradient in gradients[at * per_network : (at + 1) * per_network])
+            for at in range(3)
+        ]
         assert moved == [at == index for at in range(3)]
     target = torch.randn(3, 1, dtype=torch.float64)
     torch.manual_seed(0)
-    found = model.loss(inputs, target)
-    same = head()
+    loss = model.loss(inputs, target)
+    same = build_head()
     same.load_state_dict(model.head.state_dict())
     torch.manual_seed(0)
-    torch.testing.assert_close(same.double().loss(raw, target), found, rtol=0, atol=0)
+    torch.testing.assert_close(same.double().loss(raw, target), loss, rtol=0, atol=0)
     with pytest.raises(ConfigError, match="which only the head of a model has"):
         component = {"name": "cvae", **SMALL, "backbones": "each"}
         build(
@@ -66,7 +72,7 @@ def test_each_network_may_have_a_backbone_of_its_own():
 
 def resolve_all_parts(config):
     """Resolve the parts that `build_predictor` reads."""
-    encoders = [resolve("encoder", one) for one in config["encoder"].values()]
+    encoders = [resolve("encoder", settings) for settings in config["encoder"].values()]
     return {
         "encoder": encoders,
         "density_head": resolve("density_head", config["density_head"]),
@@ -74,7 +80,7 @@ def resolve_all_parts(config):
     }
 
 
-def head(config=SMALL, target=ONE):
+def build_head(config=SMALL, target=ONE):
     torch.manual_seed(12)
     return build("density_head", resolve("density_head", {"name": "cvae", **config}), target=target)
 
@@ -111,8 +117,8 @@ class CategoricalHead(NormalHead):
         return Categorical(logits=raw, validate_args=False)
 
 
-def raws(made, *batch):
-    return torch.randn(*batch, made.size, generator=torch.Generator().manual_seed(1))
+def raws(head, *batch):
+    return torch.randn(*batch, head.size, generator=torch.Generator().manual_seed(1))
 
 
 @pytest.mark.parametrize(
@@ -120,25 +126,27 @@ def raws(made, *batch):
     [(Target("real", ("x", "y")), NormalHead), (Target("class", ("a", "b", "c")), CategoricalHead)],
 )
 def test_targets_that_are_not_angles(target, component):
-    made = CVAEHead(target, **SMALL, component=component(target)).eval()
-    raw, value = raws(made, 4), values(target, (4,))
+    head = CVAEHead(target, **SMALL, component=component(target)).eval()
+    raw, value = raws(head, 4), values(target, (4,))
     with torch.no_grad():
-        density = made(raw)
+        density = head(raw)
         assert density.log_prob(value).shape == (4,)
         assert density.sample((6,)).shape == (6, *value.shape)
-    made.train().loss(raw, value).sum().backward()
-    assert all(parameter.grad.abs().sum() > 0 for parameter in made.parameters())
+    head.train().loss(raw, value).sum().backward()
+    assert all(parameter.grad.abs().sum() > 0 for parameter in head.parameters())
 
 
 @pytest.mark.parametrize("target", [ONE, TWO])
 def test_the_mixture_is_a_density_that_samples_follow(target):
-    made = head(target=target).double().eval()
+    head = build_head(target=target).double().eval()
     with torch.no_grad():
-        density = made(raws(made, 3).double())  # κ small enough for the grids
+        density = head(raws(head, 3).double())  # κ small enough for the grids
         checks = [(integral, 1e-6), (samples_follow_log_prob, 5.0)]
         checks += [(marginals, 1e-6)] if target is TWO else [(median_is_best, 5.0)]
         for check, limit in checks:
-            require(examined(check.__name__, limit, lambda worst, check=check: check(density.mixture, worst)))
+            require(
+                run_check(check.__name__, limit, lambda worst, check=check: check(density.mixture, worst))
+            )
         assert isinstance(marginal(density, 0), Mixture)
 
 
@@ -147,13 +155,13 @@ def test_the_mixture_is_a_density_that_samples_follow(target):
 
 @pytest.fixture
 def toy():
-    made = head({**SMALL, "latent": 1}).double().eval()
-    made.requires_grad_(False)
-    raw = raws(made, 3).double()
-    networks = made.networks(raw)
+    head = build_head({**SMALL, "latent": 1}).double().eval()
+    head.requires_grad_(False)
+    raw = raws(head, 3).double()
+    networks = head.networks(raw)
     # not so far out that a few rare z dominate the integral
     value = networks.component(networks.decode(networks.prior.mean)).mode + 0.3
-    return made, networks, raw, value
+    return head, networks, raw, value
 
 
 def truth(networks, value):
@@ -185,32 +193,32 @@ def test_bounds_rise_to_the_integral(toy):
 
 
 def test_log_prob_with_many_samples_is_the_integral(toy):
-    made, networks, raw, value = toy
-    made.samples = 20_000
+    head, networks, raw, value = toy
+    head.samples = 20_000
     torch.manual_seed(0)
-    assert (made(raw).log_prob(value) - truth(networks, value)).abs().max() < 0.02
-    assert (made(raw).mixture.log_prob(value) - truth(networks, value)).abs().max() < 0.02
+    assert (head(raw).log_prob(value) - truth(networks, value)).abs().max() < 0.02
+    assert (head(raw).mixture.log_prob(value) - truth(networks, value)).abs().max() < 0.02
 
 
 @pytest.mark.parametrize("tolerance", [0.1, 0.01, 0.001])
 def test_the_tolerance_is_reached(toy, tolerance):
-    made, networks, raw, value = toy
-    made.samples, made.tolerance = 64, tolerance
-    found = []
+    head, networks, raw, value = toy
+    head.samples, head.tolerance = 64, tolerance
+    estimates = []
     for seed in range(60):
         torch.manual_seed(seed)
-        found.append(estimate(made(raw), value))
-    error = (torch.stack([one.log_mean for one in found]) - truth(networks, value)).abs()
+        estimates.append(estimate(head(raw), value))
+    error = (torch.stack([result.log_mean for result in estimates]) - truth(networks, value)).abs()
     assert (error < tolerance).double().mean() > 0.75
     assert (error < 3 * tolerance).double().mean() > 0.95
-    assert not any(one.unresolved.any() for one in found)
+    assert not any(result.unresolved.any() for result in estimates)
 
 
 def test_one_density_is_a_function_of_the_value(toy):
-    made, _, raw, value = toy
+    head, _, raw, value = toy
     for tolerance in (None, 0.05):
-        made.tolerance = tolerance
-        density = made(raw)
+        head.tolerance = tolerance
+        density = head(raw)
         first = density.log_prob(value)
         density.sample((2,))
         assert torch.equal(density.log_prob(value), first)
@@ -221,10 +229,10 @@ def test_one_density_is_a_function_of_the_value(toy):
 
 
 def test_samples_follow_the_integral(toy):
-    made, networks, raw, _ = toy
+    head, networks, raw, _ = toy
     torch.manual_seed(0)
-    drawn = made(raw).sample((20_000,))
-    cosine = drawn.cos().mean(0)[:, 0]
+    samples = head(raw).sample((20_000,))
+    cosine = samples.cos().mean(0)[:, 0]
     angles = torch.linspace(-math.pi, math.pi, 361, dtype=torch.float64)[:-1]
     mass = torch.stack([truth(networks, angle.expand(3, 1)) for angle in angles]).exp() * (2 * math.pi / 360)
     torch.testing.assert_close(mass.sum(0), torch.ones(3).double(), rtol=1e-6, atol=0)
@@ -242,41 +250,41 @@ def test_gaussians_agree_with_torch():
 
 
 def test_the_samples_may_be_set_at_any_time_and_training_has_its_own():
-    made = head()
-    raw = raws(made, 2)
-    assert made.train()(raw).mixture.log_weights.shape == (2, 5)
-    made.eval().samples = 3
-    assert made(raw).mixture.log_weights.shape == (2, 3)
-    assert made(raw).mixture.components.batch_shape == (2, 3)
+    head = build_head()
+    raw = raws(head, 2)
+    assert head.train()(raw).mixture.log_weights.shape == (2, 5)
+    head.eval().samples = 3
+    assert head(raw).mixture.log_weights.shape == (2, 3)
+    assert head(raw).mixture.components.batch_shape == (2, 3)
 
 
 def test_memory_is_bounded(monkeypatch):
-    made = head(target=TWO).eval()
-    raw, grid = raws(made, 6), values(TWO, (40, 6))
-    held = []
-    made.decoder.body[1].register_forward_hook(lambda layer, arguments, output: held.append(output.numel()))
-    found = []
+    head = build_head(target=TWO).eval()
+    raw, grid = raws(head, 6), values(TWO, (40, 6))
+    sizes = []
+    head.decoder.body[1].register_forward_hook(lambda layer, arguments, output: sizes.append(output.numel()))
+    results = []
     with torch.no_grad():
         for chunk in (module.CHUNK, 500):
             monkeypatch.setattr(module, "CHUNK", chunk)
             torch.manual_seed(0)
-            density = made(raw)
-            held.clear()
-            found.append([density.mixture.log_prob(grid), density.log_prob(grid), density.sample((40,))])
-    assert max(held) <= 500
-    for first, second in zip(*found, strict=True):
+            density = head(raw)
+            sizes.clear()
+            results.append([density.mixture.log_prob(grid), density.log_prob(grid), density.sample((40,))])
+    assert max(sizes) <= 500
+    for first, second in zip(*results, strict=True):
         assert first.shape == second.shape
-    torch.testing.assert_close(found[0][:2], found[1][:2])
+    torch.testing.assert_close(results[0][:2], results[1][:2])
 
 
 def test_a_component_that_is_fitted_afterwards_is_refused():
     with pytest.raises(ConfigError, match="fits concentration after training"):
-        head({"component": {"name": "von_mises", "concentration": "fixed"}})
+        build_head({"component": {"name": "von_mises", "concentration": "fixed"}})
 
 
 def test_what_the_encoder_sees():
-    made = head(target=TWO)
+    head = build_head(target=TWO)
     value = torch.tensor([[0.5, -2.0]])
     expected = np.r_[np.cos([0.5, -2.0]), np.sin([0.5, -2.0])]
-    np.testing.assert_allclose(made.encode(value)[0], expected, rtol=1e-6)
-    torch.testing.assert_close(made.encode(value + 2 * math.pi), made.encode(value), rtol=0, atol=1e-6)
+    np.testing.assert_allclose(head.encode(value)[0], expected, rtol=1e-6)
+    torch.testing.assert_close(head.encode(value + 2 * math.pi), head.encode(value), rtol=0, atol=1e-6)
