@@ -25,7 +25,7 @@ from framework.storage.closed_pipes import DroppingWriter
 from framework.storage.files import alone, unwritable
 from framework.sweeps import jobs
 from framework.training.batches import outlive_signals
-from framework.training.schedules import WARMUP_SHARE, schedule, smooth, warmup
+from framework.training.schedules import WARMUP_SHARE, count_warmup_steps, make_schedule, smooth_factor
 
 
 @pytest.mark.parametrize("place", range(4))
@@ -125,10 +125,10 @@ def test_a_folder_that_cannot_be_made_gets_a_sentence(number: int) -> None:
 def test_warm_up_is_a_share_of_the_run(kind: str, steps: int, asked: int) -> None:
     more = {"milestones": [2]} if kind == "step" else {}
     chosen = OptimizerSettings(schedule=kind, warmup_steps=asked, **more)
-    factor = schedule(chosen, steps, 5)
-    assert warmup(chosen, steps) <= WARMUP_SHARE * steps
+    factor = make_schedule(chosen, steps, 5)
+    assert count_warmup_steps(chosen, steps) <= WARMUP_SHARE * steps
     if steps >= asked / WARMUP_SHARE:
-        assert warmup(chosen, steps) == asked
+        assert count_warmup_steps(chosen, steps) == asked
     if kind == "cosine" and steps >= 4 * asked:  # not a bit of a long training changes
         expected = [
             min(1.0, (step + 1) / (asked + 1)) * 0.5 * (1 + math.cos(math.pi * min(1.0, step / steps)))
@@ -137,7 +137,7 @@ def test_warm_up_is_a_share_of_the_run(kind: str, steps: int, asked: int) -> Non
         assert [factor(step) for step in range(0, steps, 97)] == expected
     if kind == "cosine" and steps >= 10:
         assert max(factor(step) for step in range(steps)) > 0.8
-    assert smooth(0, total=None) == 1
+    assert smooth_factor(0, total=None) == 1
 
 
 def test_the_newest_run_is_that_whose_checkpoint_is_newest(tmp_path: Path) -> None:

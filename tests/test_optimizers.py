@@ -24,7 +24,7 @@ from framework.target import Target
 from framework.testing.wrappers import LENGTH, Plain
 from framework.training.batches import Batches
 from framework.training.module import FUSED, OPTIMIZERS, Training
-from framework.training.schedules import schedule, see
+from framework.training.schedules import make_schedule, update_plateaus
 
 
 @pytest.mark.parametrize("momentum", [None, 0.0, 0.9])
@@ -55,7 +55,7 @@ def test_plateau_reduces_when_torchs_does(patience: int) -> None:
     """Whose patience is one less: it reduces at the first epoch beyond it."""
     settings = OptimizerSettings(schedule="plateau", factor=0.5, patience=patience, learning_rate=0.25)
     ours, theirs = (torch.optim.SGD([nn.Parameter(torch.zeros(2))], lr=0.25) for _ in range(2))
-    rates = torch.optim.lr_scheduler.LambdaLR(ours, [schedule(settings, 100, 4)])
+    rates = torch.optim.lr_scheduler.LambdaLR(ours, [make_schedule(settings, 100, 4)])
     reference = torch.optim.lr_scheduler.ReduceLROnPlateau(
         theirs, factor=0.5, patience=patience - 1, threshold=0, eps=0
     )
@@ -64,7 +64,7 @@ def test_plateau_reduces_when_torchs_does(patience: int) -> None:
         for _ in range(4):
             ours.step()
             rates.step()
-        see(rates, loss, epoch + 1)
+        update_plateaus(rates, loss, epoch + 1)
         reference.step(loss)
         assert ours.param_groups[0]["lr"] == theirs.param_groups[0]["lr"]
     assert 0 < ours.param_groups[0]["lr"] < 0.25
@@ -74,7 +74,7 @@ def test_step_reduces_after_the_epochs_that_it_names() -> None:
     """The learning rate equals that of torch's MultiStepLR by epochs."""
     settings = OptimizerSettings(schedule="step", factor=0.1, milestones=[2, 3], learning_rate=0.25)
     ours, theirs = (torch.optim.SGD([nn.Parameter(torch.zeros(2))], lr=0.25) for _ in range(2))
-    rates = torch.optim.lr_scheduler.LambdaLR(ours, [schedule(settings, 20, 5)])
+    rates = torch.optim.lr_scheduler.LambdaLR(ours, [make_schedule(settings, 20, 5)])
     reference = torch.optim.lr_scheduler.MultiStepLR(theirs, [2, 3], gamma=0.1)
     for step in range(20):
         assert ours.param_groups[0]["lr"] == pytest.approx(theirs.param_groups[0]["lr"], rel=1e-12)

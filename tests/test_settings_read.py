@@ -37,7 +37,7 @@ from framework.configuration.settings import (
 )
 from framework.errors import ConfigError
 from framework.runs import session
-from framework.training.schedules import Plateau, schedule
+from framework.training.schedules import Plateau, make_schedule
 
 GROUPED = {"optimizer": OptimizerSettings, "logger": LoggerSettings, "trainer": TrainerSettings}
 OPTIONS = composition.folder() / "mode"
@@ -200,7 +200,7 @@ def test_an_option_that_a_mode_has_not_is_refused(mode: str, composed: Callable[
 def rates(**changes: Any) -> tuple[float, ...]:
     """The learning rate's factor in each step of a training that comes to a standstill."""
     chosen = OptimizerSettings(**changes)
-    factor = schedule(chosen, 120, 10)
+    factor = make_schedule(chosen, 120, 10)
     found = []
     for step in range(120):
         if step and step % 10 == 0 and isinstance(factor, Plateau):

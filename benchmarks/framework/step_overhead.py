@@ -32,7 +32,7 @@ from framework.target import Target
 from framework.tracking.signals import Stopper
 from framework.tracking.tracker import NoTracker
 from framework.training.batches import Batches
-from framework.training.module import OPTIMIZERS, KeepCheckpoints, Report, StopAtBatch, Training
+from framework.training.module import OPTIMIZERS, KeepCheckpoints, LogMetrics, StopAtBatch, Training
 
 ROUNDS = 7
 
@@ -178,7 +178,7 @@ def ours(case: Case) -> float:
             limit_val_batches=0,
             gradient_clip_val=1.0,
             use_distributed_sampler=False,
-            callbacks=[Report(tracker, 10), StopAtBatch(Stopper(), keep), clock],
+            callbacks=[LogMetrics(tracker, 10), StopAtBatch(Stopper(), keep), clock],
         )
         batches.attach(trainer)
         trainer.fit(training, datamodule=batches)

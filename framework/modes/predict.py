@@ -29,7 +29,7 @@ from framework.runs.session import for_trained
 from framework.runs.user_files import UNREADABLE, files_in, say_left_out, to_read
 from framework.storage.names import spelled
 from framework.target import Target
-from framework.training.batches import Batches, told
+from framework.training.batches import Batches, track_batches
 
 ERRORS = ("_low_error", "_high_error", "_low_error_deg", "_high_error_deg")
 ENDS = ("_low", "_high", "_low_deg", "_high_deg")
@@ -110,7 +110,7 @@ def predictions(
     names = _names(data, files, len(dataset))  # type: ignore[arg-type]
     rows: list[dict[str, str]] = []
     mapped: list[tuple[Tensor, Tensor]] = []
-    for number, batch in enumerate(told(loader, "predicting")):
+    for number, batch in enumerate(track_batches(loader, "predicting")):
         prediction = predicted(predictor, batch, settings.samples, Draw(settings.seed, number))
         prediction = prediction.in_frame(data.frame(batch))
         columns = table_columns(target, prediction)

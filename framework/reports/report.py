@@ -16,7 +16,7 @@ from framework.reports.table import COST_BETTER, COST_COLUMNS, Better, machine, 
 from framework.runs.run import Run
 from framework.runs.session import Session
 from framework.storage.files import write_whole
-from framework.training.batches import told
+from framework.training.batches import track_batches
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -34,13 +34,15 @@ def report_test(run: Run, session: Session) -> None:
     loader = blocks.test_dataloader()
     found = evaluate(
         session.predictor,
-        told(loader, "testing"),
+        track_batches(loader, "testing"),
         metrics,
         groups=data.groups,
         samples=settings.samples,
         seed=settings.seed,
         device=session.device,
-        outliers=() if outliers is None else told(blocks.of(outliers.splits().test), "testing on outliers"),
+        outliers=()
+        if outliers is None
+        else track_batches(blocks.of(outliers.splits().test), "testing on outliers"),
     )
     batch = next(iter(session.batches().test_dataloader()))
     spent = cost(session.predictor, batch, samples=settings.samples, device=session.device)

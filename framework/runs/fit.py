@@ -19,11 +19,11 @@ from framework.storage.checkpoints import read
 from framework.storage.first_rank import first_rank
 from framework.tracking.signals import Stopped
 from framework.training.cached_features import CachedFeatures, fits
-from framework.training.checkpoint import BEST, TRAINED, WholeCheckpoints, trained
+from framework.training.checkpoint import BEST, TRAINED, WholeCheckpoints, find_resumable
 from framework.training.fitting import fit_at_once, mean_loss
-from framework.training.module import KeepCheckpoints, Report, StopAtBatch, StopEarly, Training
+from framework.training.module import KeepCheckpoints, LogMetrics, StopAtBatch, StopEarly, Training
 from framework.training.progress import Progress
-from framework.training.rank_processes import sharing_one_fate
+from framework.training.rank_processes import end_together
 from framework.uncertainty import outermost
 
 
@@ -77,7 +77,7 @@ def _by_gradient(session: Session, run: Run) -> tuple[float, int]:
     batches.orders = several.model_count if several else 1
     batches.attach(trainer)
     resume = _resumed_from(session, run)
-    with sharing_one_fate(trainer, run.stopper, partial(_give_up, run)):
+    with end_together(trainer, run.stopper, partial(_give_up, run)):
         trainer.fit(training, datamodule=batches, ckpt_path=resume, weights_only=True)
         _part()
     early = any(isinstance(one, StopEarly) and one.stopped for one in trainer.callbacks)  # type: ignore[attr-defined]
@@ -85,14 +85,14 @@ def _by_gradient(session: Session, run: Run) -> tuple[float, int]:
         f"{'stopped early at' if early else 'ended at'} epoch {trainer.current_epoch}, kept {keep.kept_epoch + 1}"
     )
     if first_rank():
-        fill(session.predictor, weights(read(keep.kept)), str(keep.kept))
+        fill(session.predictor, weights(read(keep.kept_path)), str(keep.kept_path))
     session.device = trainer.strategy.root_device
     return keep.kept_loss, keep.kept_epoch
 
 
 def _resumed_from(session: Session, run: Run) -> Path | None:
     """Return the checkpoint from which training continues, or None; every rank looks before rank 0 writes another."""
-    resume = trained(run.checkpoints) if run.resumed else None
+    resume = find_resumable(run.checkpoints) if run.resumed else None
     if run.resumed and first_rank():
         step = 0 if resume is None else int(read(resume)["global_step"])
         run.tracker.drop_after(step)
@@ -145,7 +145,7 @@ def _trainer(run: Run, keep: KeepCheckpoints, console: Console) -> pl.Trainer:
     chosen = dict(run.settings.trainer)
     patience = chosen.get("patience")
     callbacks: list[pl.Callback] = [
-        Report(run.tracker, chosen.get("log_every_steps") or 10),
+        LogMetrics(run.tracker, chosen.get("log_every_steps") or 10),
         keep,
         StopAtBatch(run.stopper, keep),
     ]

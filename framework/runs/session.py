@@ -62,8 +62,8 @@ from framework.storage.first_rank import first_rank
 from framework.storage.progress import output
 from framework.target import Target
 from framework.tracking.run_info import MODEL
-from framework.training.batches import Batches, require_targets, told
-from framework.training.checkpoint import WholeCheckpoints, trained
+from framework.training.batches import Batches, require_targets, track_batches
+from framework.training.checkpoint import WholeCheckpoints, find_resumable
 from framework.uncertainty import remarks
 
 FEW = 8
@@ -188,7 +188,7 @@ def for_training(config: Config) -> Session:
             )
     data = build_data(parts)
     started = config.settings.checkpoint is not None and not (
-        resumed and trained(config.folder / "checkpoints")
+        resumed and find_resumable(config.folder / "checkpoints")
     )
     start = Start.of(parts, data, config.settings) if started else None
     introduce_threads(config.settings.threads, console)
@@ -567,7 +567,7 @@ def calibrate(session: Session) -> None:
     """Calibrate the session's predictor on the validation split, and print its remarks."""
     session.predictor.eval().to(session.device)
     seed_step(session.settings.seed, 0, "calibrate")
-    batches = told(session.blocks().val_dataloader(), "calibrating")
+    batches = track_batches(session.blocks().val_dataloader(), "calibrating")
     session.predictor.calibrate(on_device(batches, session.device))
     for remark in remarks(session.predictor):
         session.console.print(remark, soft_wrap=True, highlight=False, markup=False)

@@ -1,4 +1,4 @@
-"""The order of batches, a function of (seed, epoch)."""
+"""Batches of a data set, whose order is a function of (seed, epoch)."""
 
 import os
 import signal
@@ -28,7 +28,7 @@ Position = tuple[int, int]
 
 @final
 class SeededBatches(Sampler[list[int]]):
-    """Sample indices of the batches of one epoch; with several ranks, this rank's share of each batch.
+    """Sampler that yields the sample indices of each batch of an epoch; with several ranks, this rank's share of them.
 
     The order depends on (seed, epoch) only, not on the ranks. Rank r of R takes the r-th of R equal slices of each
     batch, so that all ranks have equally many batches and no sample occurs twice.
@@ -37,9 +37,8 @@ class SeededBatches(Sampler[list[int]]):
         length: number of samples.
         batch_size: samples of a batch over all ranks.
         orders: number of independent orders; a batch concatenates one batch of each order.
-        position: function from the number of batches of an epoch to the starting position. It is called once per
-            iteration, when the first batch is requested (a DataLoader calls `iter` earlier, and with workers once too
-            often).
+        position: function from the number of batches of an epoch to the starting position. It is called when the first
+            batch is requested, and not by `iter`, which a DataLoader calls earlier and, with workers, once too often.
         seed: seed of the order; None keeps the samples' own order.
         drop_last: leave out the samples that do not fill a batch (different ones in each epoch). If there are fewer
             samples than one batch, they still make one smaller batch.
@@ -63,12 +62,13 @@ class SeededBatches(Sampler[list[int]]):
     ) -> None:
         if batch_size < ranks:
             raise ConfigError(
-                f"batch_size = {batch_size} over {ranks} devices leaves some without a sample: "
-                f"wanted at least {ranks}."
+                f"batch_size = {batch_size} gives some of the {ranks} devices no sample. Set batch_size to at least "
+                f"{ranks}."
             )
         if length < ranks:
             raise DataError(
-                f"A split has {length} samples for {ranks} devices: wanted at least one for each."
+                f"A split has {length} samples for {ranks} devices, but needs at least one per device. Use fewer "
+                "devices or more samples."
             )
         self.length = length
         self.batch_size = batch_size
@@ -80,13 +80,13 @@ class SeededBatches(Sampler[list[int]]):
         self.orders = orders
 
     def __len__(self) -> int:
-        whole, rest = divmod(self.length, self.batch_size)
+        full, rest = divmod(self.length, self.batch_size)
         # A remainder too small to give each rank a sample joins the batch before it.
-        return max(1, whole + (not self.drop_last and rest >= self.ranks))
+        return max(1, full + (not self.drop_last and rest >= self.ranks))
 
     def __iter__(self) -> Iterator[list[int]]:
         epoch, first = self.position(len(self))
-        orders = [epoch_order(self.length, self.seed, epoch, one) for one in range(self.orders)]
+        orders = [epoch_order(self.length, self.seed, epoch, member) for member in range(self.orders)]
         for number in range(first, len(self)):
             yield [sample for order in orders for sample in self._part(order, number)]
 
@@ -99,7 +99,7 @@ class SeededBatches(Sampler[list[int]]):
 
 
 def epoch_order(length: int, seed: int | None, epoch: int, member: int = 0) -> list[int]:
-    """Return the permutation of `length` samples for (seed, epoch); without a seed they keep their order.
+    """Return the order of `length` samples in an epoch: a permutation that depends on (seed, epoch) only.
 
     Args:
         length: number of samples.
@@ -116,7 +116,7 @@ def epoch_order(length: int, seed: int | None, epoch: int, member: int = 0) -> l
 
 @final
 class Batches(pl.LightningDataModule):
-    """Batches of a data set for every stage; a training resumes within an epoch with the same next batch.
+    """Loaders of a data set's batches for every stage; a resumed training continues with the same next batch.
 
     Call `attach` before `fit`, and give the Trainer `use_distributed_sampler=False`, because this class handles ranks.
     Training drops the samples that do not fill a batch. The other stages see every sample once, in the data set's
@@ -150,11 +150,11 @@ class Batches(pl.LightningDataModule):
         self.orders = orders
 
     def attach(self, trainer: pl.Trainer) -> None:
-        """Set the trainer whose progress gives the starting position, and whose rank and device the batches are for."""
+        """Set the trainer, which provides the starting position, the rank and the device of the batches."""
         self.trainer = trainer
 
     def train_dataloader(self) -> DataLoader[Batch]:
-        """Return the training batches, starting at the position of the trainer."""
+        """Return the training batches, starting at the trainer's position in the epoch."""
         orders = self.orders if self.trainer is None or self.trainer.world_size == 1 else 1
         split = self.data.splits().train
         return self._loader(split, position=self._position, seed=self.seed, drop_last=True, orders=orders)
@@ -168,12 +168,12 @@ class Batches(pl.LightningDataModule):
         return self._loader(self.data.splits().test, seed=None, drop_last=False)
 
     def of(self, dataset: Dataset[Batch]) -> DataLoader[Batch]:
-        """Return batches of any other dataset in its own order, without a check of its targets."""
+        """Return batches of any other dataset in the dataset's order; the targets are not checked."""
         return self._loader(dataset, as_batch, seed=None, drop_last=False)
 
     def predict_dataloader(self) -> DataLoader[Batch]:
         """Return the batches of the user's own files."""
-        # A plain loader, because Lightning rebuilds the loader of predict to track indices, and cannot rebuild ours.
+        # A plain loader: Lightning rebuilds the loader for prediction, and cannot rebuild one with `SeededBatches`.
         return DataLoader(
             self.data.read(self.files),
             batch_size=self.batch_size,
@@ -200,7 +200,7 @@ class Batches(pl.LightningDataModule):
             num_workers=self.workers,
             persistent_workers=self.workers > 0,
             worker_init_fn=outlive_signals if self.workers else None,
-            collate_fn=collate or partial(with_targets, self.data.target),
+            collate_fn=collate or partial(collate_with_targets, self.data.target),
             pin_memory=trainer is not None and trainer.strategy.root_device.type == "cuda",
             generator=self._generator(),
         )
@@ -208,20 +208,22 @@ class Batches(pl.LightningDataModule):
     def _generator(self) -> torch.Generator:
         """Return the generator of the workers' seeds.
 
-        Without it a DataLoader would draw these seeds from the global generator at each start.
+        Without one, a DataLoader would draw these seeds from the global generator at each start.
         """
         return torch.Generator().manual_seed(self.seed)
 
     def _position(self, batches: int) -> Position:
-        """Return the position of the training, from the counters that Lightning keeps in a checkpoint.
+        """Return the position of the training, from the counters that Lightning stores in a checkpoint.
 
-        `processed` counts the batches whose step was taken, in the last epoch that was *started*. The other counters do
-        not: `completed` is one behind in a checkpoint written at the end of a batch, and `ready` is one ahead in a
+        `processed` counts the batches of the last *started* epoch whose step was taken. The other counters are not
+        used: `completed` is one too low in a checkpoint written at the end of a batch, and `ready` is one too high in a
         checkpoint written after an exception.
         """
         trainer: Any = self.trainer  # Any: Lightning types its counters by a base class that lacks them
         if trainer is None:
-            raise ConfigError("The training batches were asked for before `attach(trainer)`: call it first.")
+            raise ConfigError(
+                "The training batches were requested before `attach(trainer)` was called. Call it first."
+            )
         limit = trainer.limit_train_batches
         batches = min(batches, limit) if isinstance(limit, int) else int(batches * limit)
         epoch = trainer.fit_loop.epoch_progress.current
@@ -235,9 +237,9 @@ class Batches(pl.LightningDataModule):
 
 
 def outlive_signals(worker: int) -> None:
-    """Let a data-loading process go on after a signal that all processes of a run receive.
+    """Let a loading process continue after a signal that all processes of a run receive.
 
-    The run then saves its checkpoint and ends its workers itself. A second SIGTERM ends a worker at once.
+    The main process saves its checkpoint and then ends the workers. A second SIGTERM ends a worker at once.
     """
     for number in SIGNALS:
         signal.signal(number, _end_at_second if number == signal.SIGTERM else signal.SIG_IGN)
@@ -247,36 +249,37 @@ def _end_at_second(number: int, frame: FrameType | None) -> None:
     signal.signal(number, lambda *_: os._exit(0))
 
 
-def with_targets(target: Target, items: Mapping[str, Tensor] | list[Batch]) -> Batch:
-    """Return samples as a batch, as `as_batch` does, and check their targets with `require_targets`."""
+def collate_with_targets(target: Target, items: Mapping[str, Tensor] | list[Batch]) -> Batch:
+    """Return samples as a batch (see `as_batch`) whose targets were checked by `require_targets`."""
     return require_targets(as_batch(items), target)
 
 
 def require_targets(batch: Batch, target: Target) -> Batch:
-    """Return the batch itself if its targets have the layout of `target`.
+    """Return the batch unchanged if its targets have the shape and labels that `target` describes.
 
-    Targets of another shape would broadcast, and the model would be trained on them.
+    Targets of another shape would be broadcast in the loss without an error.
 
     Raises:
         DataError: the targets have another shape, or a label belongs to no class.
     """
-    found, wanted = batch["target"], (len(batch["input"]), *target.event_shape)
-    if tuple(found.shape) != wanted:
+    values, expected = batch["target"], (len(batch["input"]), *target.event_shape)
+    if tuple(values.shape) != expected:
         raise DataError(
-            f'The data set gives {wanted[0]} samples a "target" of shape {tuple(found.shape)}: wanted {wanted}, for '
-            f"targets of kind {target.kind!r} ({target.listed_names}). Mend the data set, or its `target`."
+            f'The data set gives {expected[0]} samples a "target" of shape {tuple(values.shape)}, but shape {expected} '
+            f"is required for targets of kind {target.kind!r} ({target.listed_names}). Correct the data set or its "
+            "`target`."
         )
     if target.kind == "class":
-        require_labels(found, len(target.names))
+        require_labels(values, len(target.names))
     return batch
 
 
-def told(loader: DataLoader[Batch], what: str) -> Iterator[Batch]:
-    """Yield the batches of a loader and show the user how many samples are done.
+def track_batches(loader: DataLoader[Batch], activity: str) -> Iterator[Batch]:
+    """Return the batches of a loader, and show the user how many samples are processed.
 
     Args:
         loader: the batches.
-        what: name of the activity.
+        activity: name of the activity.
     """
     samples: int = len(loader.dataset)  # type: ignore[arg-type]
-    return tracked(loader, what, samples, "samples", lambda batch: len(batch["input"]))
+    return tracked(loader, activity, samples, "samples", lambda batch: len(batch["input"]))

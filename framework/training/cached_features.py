@@ -1,4 +1,4 @@
-"""A data set whose inputs are features that fixed encoders computed once per sample."""
+"""A data set whose inputs are features that fixed encoders compute once per sample."""
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
@@ -13,10 +13,10 @@ from torch.utils.data import Dataset
 from framework.data import Batch, Data, Splits
 from framework.datasets.fields import Fields
 from framework.errors import ConfigError
-from framework.training.batches import Batches, told
+from framework.training.batches import Batches, track_batches
 
 LARGEST = 8 * 2**30
-"""Size of the features of one split, in bytes, up to which they are held in memory.
+"""Largest size of a split's features, in bytes, that is kept in memory.
 
 Larger features are computed in every epoch.
 """
@@ -24,7 +24,7 @@ Larger features are computed in every epoch.
 
 @final
 class CachedFeatures(Data):
-    """Another data set's samples with features as inputs; each split is computed when it is first requested.
+    """Another data set with features as inputs; the features of a split are computed when they are first read.
 
     Args:
         data: a prepared data set whose `augment` leaves batches as they are.
@@ -46,55 +46,57 @@ class CachedFeatures(Data):
         self.synthetic = data.synthetic
         self.skipped = data.skipped
         self.varies = False
-        train, validation, test = (_Computed(split, self._computed) for split in data.splits())
+        train, validation, test = (_LazyFeatures(split, self._compute) for split in data.splits())
         self.computed = train, validation
         self._splits = Splits(train, validation, test)
 
     def prepare(self) -> None:
-        """Do nothing, because the data set is prepared."""
+        """Do nothing, because the original data set is already prepared."""
 
     def splits(self) -> Splits:
         """Return the splits, with features as inputs."""
         return self._splits
 
     def compute(self) -> int:
-        """Compute now the features that training reads, and return the number of their samples."""
+        """Compute the features of the training and validation splits now, and return the number of samples."""
         return sum(len(split.fields) for split in self.computed)
 
     def read(self, files: Sequence[Path]) -> Dataset[Batch]:
-        """Return the features of a user's own files."""
-        return _Computed(self.data.read(files), self._computed)
+        """Return the samples of a user's files with features as inputs."""
+        return _LazyFeatures(self.data.read(files), self._compute)
 
     def augment(self, batch: Batch) -> Batch:
         """Return the batch itself."""
         return batch
 
     def fingerprint(self) -> Mapping[str, str]:
-        """Return what identifies the data set."""
+        """Return the fingerprint of the original data set."""
         return self.data.fingerprint()
 
     def preview(self, inputs: Tensor) -> np.ndarray:
-        """Refuse to draw features."""
-        raise ConfigError("Features have no picture; ask the data they were computed from.")
+        """Raise a ConfigError, because features cannot be drawn."""
+        raise ConfigError(
+            "Features cannot be drawn. Call `preview` of the data set from which they were computed."
+        )
 
     @torch.no_grad()
-    def _computed(self, dataset: Dataset[Batch]) -> Fields:
-        """Return all fields in memory, in the order of the data set."""
+    def _compute(self, dataset: Dataset[Batch]) -> Fields:
+        """Return all fields of a data set in memory, in its order, with features as inputs."""
         count: int = len(dataset)  # pyright: ignore[reportArgumentType]
         fields: dict[str, Tensor] = {}
         row = 0
-        for batch in told(self.batches.of(dataset), "computing features"):
-            found = {**batch, "input": self.features(batch["input"])}
-            for name, some in found.items():
+        for batch in track_batches(self.batches.of(dataset), "computing features"):
+            batch_fields = {**batch, "input": self.features(batch["input"])}
+            for name, rows in batch_fields.items():
                 if name not in fields:
-                    fields[name] = some.new_empty(count, *some.shape[1:])
-                fields[name][row : row + len(some)] = some
+                    fields[name] = rows.new_empty(count, *rows.shape[1:])
+                fields[name][row : row + len(rows)] = rows
             row += len(batch["input"])
         return Fields(**fields)
 
 
 @final
-class _Computed(Dataset[Batch]):
+class _LazyFeatures(Dataset[Batch]):
     """A split whose features are computed when it is first read."""
 
     def __init__(self, dataset: Dataset[Batch], compute: Callable[[Dataset[Batch]], Fields]) -> None:
@@ -117,11 +119,13 @@ class _Computed(Dataset[Batch]):
 
 
 def fits(data: Data, features: Callable[[Tensor], Tensor]) -> bool:
-    """Return whether the features of the training split, which is the largest, can be held in memory."""
+    """Return whether the features of the training split, the largest split, take at most LARGEST bytes."""
     dataset = data.splits().train
     count: int = len(dataset)  # pyright: ignore[reportArgumentType]
     if count == 0:
         return True
     with torch.no_grad():
-        one = features(next(iter(Batches(data, batch_size=1, workers=0, seed=0).of(dataset)))["input"])
-    return count * one.numel() * one.element_size() <= LARGEST
+        sample_features = features(
+            next(iter(Batches(data, batch_size=1, workers=0, seed=0).of(dataset)))["input"]
+        )
+    return count * sample_features.numel() * sample_features.element_size() <= LARGEST

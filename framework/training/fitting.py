@@ -1,4 +1,4 @@
-"""Fits density heads that learn from the whole training split at once."""
+"""Fitting of density heads that learn from the whole training split at once."""
 
 from collections.abc import Iterable
 
@@ -27,16 +27,16 @@ def fit_at_once(predictor: Predictor, batches: Batches, seed: int) -> None:
     """
     if not fitted_models(predictor):
         return
-    seen = list(batches.of(batches.data.splits().train))
-    target = torch.cat([batch["target"] for batch in seen])
+    loaded = list(batches.of(batches.data.splits().train))
+    target = torch.cat([batch["target"] for batch in loaded])
     for number, model in enumerate(fitted_models(predictor)):
-        features = torch.cat([model.raw(batch["input"]) for batch in seen])
+        features = torch.cat([model.raw(batch["input"]) for batch in loaded])
         bad = (~features.isfinite()).any(1).nonzero().flatten()
         if len(bad):
-            index = torch.cat([batch["index"] for batch in seen])[bad[0]]
+            index = torch.cat([batch["index"] for batch in loaded])[bad[0]]
             raise DataError(
-                f"{len(bad)} of {len(features)} training samples have features that are not finite, the first is "
-                f"sample {int(index)}. Mend or leave out those samples, or look at the encoder."
+                f"{len(bad)} of {len(features)} training samples have features that are not finite; the first is "
+                f"sample {int(index)}. Correct or leave out these samples, or check the encoder."
             )
         assert isinstance(model.head, Fitted)
         model.head.fit(features, target, seed + number)

@@ -20,8 +20,8 @@ from framework.model import FrozenFrontEnd, Predictor, one_pass
 from framework.objective import AdversaryOptimizer, Objective
 from framework.tracking.signals import Stopper
 from framework.tracking.tracker import Tracker
-from framework.training.ranks import Share, WholeBatch, gathered, share, summed
-from framework.training.schedules import schedule, see, smooth
+from framework.training.ranks import Share, WholeBatch, gather_rows, rank_share, sum_over_ranks
+from framework.training.schedules import make_schedule, smooth_factor, update_plateaus
 from framework.uncertainty import outermost, own_batches
 
 OPTIMIZERS: dict[str, Callable[..., torch.optim.Optimizer]] = {
@@ -33,9 +33,9 @@ OPTIMIZERS: dict[str, Callable[..., torch.optim.Optimizer]] = {
 }
 """Optimisers by their names in the config."""
 FUSED = ("adam", "adamw", "sgd")
-"""Optimisers that are used in their fused form, which takes half the time for the step of a small network.
+"""Optimisers whose fused form is used, which halves the time of a small network's step.
 
-It makes one pass over the memory of each parameter instead of several.
+The fused form makes one pass over the memory of each parameter instead of several.
 """
 
 ONE_VALUE = "Expected more than 1 value per channel"
@@ -43,10 +43,10 @@ ONE_VALUE = "Expected more than 1 value per channel"
 
 
 class Training(pl.LightningModule):
-    """Minimises the predictor's mean loss plus the objectives.
+    """LightningModule that minimises the predictor's mean loss plus the objectives.
 
-    Noise (dropout, latent samples, augmentation) is a function of (seed, step). A loss that is not finite stops the run
-    before the optimiser uses it.
+    Noise (dropout, latent samples, augmentation) is a function of (seed, step). A loss that is not finite raises an
+    error before the optimiser step.
 
     Args:
         cached: True if batches hold cached features (training.cached_features) instead of inputs; the predictor is then
@@ -75,14 +75,14 @@ class Training(pl.LightningModule):
 
     @property
     def learner(self) -> Predictor:
-        """The predictor that reads the batches: of a `FrozenFrontEnd` with cached features, the predictor inside."""
+        """Predictor that reads the batches: with cached features, the one inside the `FrozenFrontEnd`."""
         if self.cached:
             assert isinstance(self.predictor, FrozenFrontEnd)
             return self.predictor.predictor
         return self.predictor
 
     def training_step(self, batch: Batch, batch_index: int) -> Tensor:
-        """Return the loss of a batch, averaged so that the mean gradient over ranks is that of the whole batch.
+        """Return the loss of this rank's batch, weighted so that the mean over ranks is the loss of the whole batch.
 
         Raises:
             NonFiniteLoss: the loss is NaN or infinite.
@@ -97,43 +97,43 @@ class Training(pl.LightningModule):
             loss = losses.mean()
             for objective in self.objectives:
                 loss = loss + objective(self.learner, batch)
-        if rows:  # Gradients are averaged over ranks, whose shares may differ by a row.
+        if rows:  # Lightning averages gradients over ranks, whose shares may differ by a row.
             loss = loss * (rows.count * self.trainer.world_size / rows.whole)
-            value = summed(loss).item() / self.trainer.world_size
+            value = sum_over_ranks(loss).item() / self.trainer.world_size
         else:
             value = loss.item()
         if not math.isfinite(value):
-            raise NonFiniteLoss(self._blame(losses, batch, value))
+            raise NonFiniteLoss(self._non_finite_message(losses, batch, value))
         self.last_loss = value
         return loss
 
     def _losses(self, batch: Batch) -> Tensor:
-        """Return the predictor's loss per sample; errors of the network become sentences."""
+        """Return the predictor's loss per sample; errors of the network become messages for the user."""
         try:
             return self.learner.loss(batch["input"], batch["target"])
-        except NonFiniteParameters as answer:
+        except NonFiniteParameters:
             raise NonFiniteLoss(
-                f"After step {self.global_step} (epoch {self.current_epoch}) the network's {answer} Earlier "
+                f"After step {self.global_step} (epoch {self.current_epoch}) the network's {error} Earlier "
                 "checkpoints are kept. Lower optimizer.learning_rate, set trainer.gradient_clip_val, or train in "
                 "trainer.precision=32-true."
-            ) from answer
+            ) from error
         except ValueError as error:
             if ONE_VALUE not in str(error):
                 raise
             raise ConfigError(
-                f"A training batch of {len(batch['input'])} leaves batch norm one value of each channel, and its "
-                "variance needs two. Give a batch_size (and a training split) of at least 2, or choose layers without "
-                "batch norm."
+                f"A training batch of {len(batch['input'])} gives batch norm one value per channel, but the variance "
+                "needs two. Set batch_size to at least 2, use a training split of at least 2 samples, or choose "
+                "layers without batch norm."
             ) from error
 
     def _orders(self) -> int:
-        """Return how many batches, one per model that trains, are concatenated in a batch (training.batches)."""
+        """Return the number of batches, one per model that is trained, that a batch concatenates (training.batches)."""
         trainer: Any = self.trainer
         return trainer.datamodule.orders
 
     def _share(self, batch: Batch) -> Share | None:
-        """Return this rank's part of the batch; None if a single process trains."""
-        return share(len(batch["index"]), self.device) if self.trainer.world_size > 1 else None
+        """Return which rows of the whole batch this rank has; None if a single process trains."""
+        return rank_share(len(batch["index"]), self.device) if self.trainer.world_size > 1 else None
 
     def on_validation_batch_start(self, batch: Batch, batch_index: int, dataloader_idx: int = 0) -> None:
         """Seed the noise of a validation batch by (seed, batch)."""
@@ -145,59 +145,64 @@ class Training(pl.LightningModule):
         with WholeBatch(rows) if rows else nullcontext():
             loss = self._losses(batch).mean()
         count = len(batch["target"])
-        if rows:  # weighted by rows here, because Lightning averages the ranks' numbers of rows as integers
-            loss, count = summed(loss * rows.count) / rows.whole, rows.whole
+        if rows:  # weighted here, because Lightning would average the ranks' batch sizes as integers
+            loss, count = sum_over_ranks(loss * rows.count) / rows.whole, rows.whole
         self.log("validation/loss", loss, on_epoch=True, batch_size=count, sync_dist=True)
 
     def configure_optimizers(self) -> dict[str, Any]:
         """Return the optimiser and the schedule of its learning rates.
 
-        Each adversary has its own group of parameters and its own schedule.
+        Each adversary has its own parameter group and its own schedule.
         """
-        chosen = self.optimizer_settings
-        more: dict[str, Any] = {} if chosen.momentum is None else {"momentum": chosen.momentum}
+        settings = self.optimizer_settings
+        options: dict[str, Any] = {} if settings.momentum is None else {"momentum": settings.momentum}
         scaler = getattr(getattr(self.trainer, "precision_plugin", None), "scaler", None)
-        if (
-            chosen.name in FUSED and scaler is None
-        ):  # with a scaler a fused optimiser would unscale gradients after they are clipped
-            more["fused"] = True
-        groups: list[dict[str, Any]] = [{"params": self._own()}]
+        # With a scaler, a fused optimiser would unscale gradients after they are clipped.
+        if settings.name in FUSED and scaler is None:
+            options["fused"] = True
+        groups: list[dict[str, Any]] = [{"params": self._predictor_parameters()}]
         groups += [
             {
-                "params": list(one.parameters()),
-                "lr": rival.learning_rate,
-                "betas": rival.betas,
+                "params": list(objective.parameters()),
+                "lr": adversary.learning_rate,
+                "betas": adversary.betas,
                 "weight_decay": 0.0,
             }
-            for one, rival in self._rivals()
+            for objective, adversary in self._adversaries()
         ]
-        optimizer = OPTIMIZERS[chosen.name](
-            groups, lr=chosen.learning_rate, weight_decay=chosen.weight_decay, **more
+        optimizer = OPTIMIZERS[settings.name](
+            groups, lr=settings.learning_rate, weight_decay=settings.weight_decay, **options
         )
         total, epoch = self._planned_steps()
-        factors = [schedule(chosen, total, epoch)]
+        factors = [make_schedule(settings, total, epoch)]
         factors += [
-            partial(smooth, total=total if rival.schedule == "cosine" else None)
-            for _, rival in self._rivals()
+            partial(smooth_factor, total=total if adversary.schedule == "cosine" else None)
+            for _, adversary in self._adversaries()
         ]
         rates = torch.optim.lr_scheduler.LambdaLR(optimizer, factors)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": rates, "interval": "step"}}
 
     def on_validation_end(self) -> None:
-        """Give the validation loss to a schedule that depends on it."""
+        """Pass the validation loss to schedules that depend on it."""
         if self.trainer.state.fn == "fit" and not self.trainer.sanity_checking:
             loss = float(self.trainer.callback_metrics["validation/loss"])
-            see(self.lr_schedulers(), loss, self.current_epoch + 1)
+            update_plateaus(self.lr_schedulers(), loss, self.current_epoch + 1)
 
-    def _rivals(self) -> list[tuple[Objective, AdversaryOptimizer]]:
+    def _adversaries(self) -> list[tuple[Objective, AdversaryOptimizer]]:
         """Return the objectives whose parameters are trained against the predictor, with their optimiser settings."""
-        objectives = [one for one in self.objectives if isinstance(one, Objective)]
-        return [(one, one.adversary_optimizer) for one in objectives if one.adversary_optimizer is not None]
+        objectives = [module for module in self.objectives if isinstance(module, Objective)]
+        return [
+            (objective, objective.adversary_optimizer)
+            for objective in objectives
+            if objective.adversary_optimizer is not None
+        ]
 
-    def _own(self) -> list[nn.Parameter]:
-        """Return the parameters that the predictor's own optimiser settings train."""
-        apart = {id(parameter) for one, _ in self._rivals() for parameter in one.parameters()}
-        return [parameter for parameter in self.parameters() if id(parameter) not in apart]
+    def _predictor_parameters(self) -> list[nn.Parameter]:
+        """Return the parameters that are trained with the predictor's optimiser settings."""
+        excluded = {
+            id(parameter) for objective, _ in self._adversaries() for parameter in objective.parameters()
+        }
+        return [parameter for parameter in self.parameters() if id(parameter) not in excluded]
 
     def configure_gradient_clipping(
         self,
@@ -205,9 +210,9 @@ class Training(pl.LightningModule):
         gradient_clip_val: float | None = None,
         gradient_clip_algorithm: str | None = None,
     ) -> None:
-        """Clip gradients as Lightning does, but separately for each adversary and for each of several models.
+        """Clip gradients as Lightning does, but separately for each adversary and each jointly trained model.
 
-        It also clips for fused optimisers in mixed precision, which Lightning refuses.
+        Unlike Lightning, it also clips with fused optimisers in mixed precision.
         """
         if not gradient_clip_val:
             return
@@ -220,14 +225,14 @@ class Training(pl.LightningModule):
             if gradient_clip_algorithm == "value":
                 nn.utils.clip_grad_value_(group["params"], gradient_clip_val)
             else:
-                left = [one for one in group["params"] if one not in clipped]
-                nn.utils.clip_grad_norm_(left, gradient_clip_val)
+                remaining = [parameter for parameter in group["params"] if parameter not in clipped]
+                nn.utils.clip_grad_norm_(remaining, gradient_clip_val)
 
     def _planned_steps(self) -> tuple[int, int]:
-        """Return the number of optimiser steps of the whole training, and of one epoch, for the schedule.
+        """Return the planned number of optimiser steps of the whole training and of one epoch.
 
-        `trainer.estimated_stepping_batches` is not used: it starts the loader, whose workers then fetch from the first
-        batch before a resumed run knows its position.
+        `trainer.estimated_stepping_batches` is not used, because it starts the loader: the workers of a resumed run
+        would fetch from the first batch on, before the run's position is known.
         """
         trainer: Any = self.trainer
         batches = len(trainer.datamodule.train_dataloader())
@@ -241,26 +246,26 @@ class Training(pl.LightningModule):
         """Add the description of the run to the checkpoint."""
         checkpoint["framework"] = self.description
 
-    def _blame(self, losses: Tensor, batch: Batch, value: float) -> str:
-        """Return the message about a loss that is not finite, with the samples that caused it."""
+    def _non_finite_message(self, losses: Tensor, batch: Batch, value: float) -> str:
+        """Return the error message for a loss that is not finite; it names the samples that caused it."""
         bad = (~losses.detach().isfinite()).nonzero().flatten().tolist()
         rows = [int(batch["index"][row]) for row in bad]
         if self.trainer.world_size > 1:
-            rows = [row for some in gathered(rows) for row in some]
-        who = f"samples {rows[:10]} of the training split" if rows else "an objective, not a sample"
+            rows = [row for rank_rows in gather_rows(rows) for row in rank_rows]
+        cause = f"samples {rows[:10]} of the training split" if rows else "an objective, not a sample"
         return (
-            f"The training loss became {value} at step {self.global_step} (epoch {self.current_epoch}), through {who}. "
-            "The weights were not changed by this step and the last checkpoint is kept. Look at these samples, lower "
-            "optimizer.learning_rate, or set trainer.gradient_clip_val."
+            f"The training loss became {value} at step {self.global_step} (epoch {self.current_epoch}), caused by "
+            f"{cause}. This step did not change the weights, and the last checkpoint is kept. Check these samples, "
+            "lower optimizer.learning_rate, or set trainer.gradient_clip_val."
         )
 
 
 class KeepCheckpoints(pl.Callback):
-    """Writes last.ckpt (and keeps the one before it as previous.ckpt) and, with `keep="best"`, best.ckpt.
+    """Callback that writes last.ckpt, previous.ckpt (the last.ckpt before it) and, with `keep="best"`, best.ckpt.
 
-    Training resumes from the first two. `best` holds weights only; with Adam it takes a third of the size. `last` is
-    saved at the end of every epoch with a validation, at the end of the last epoch, and every `every_steps` steps.
-    `best` is saved whenever the validation loss reaches a new minimum. Each write is whole or absent
+    Training can resume from the first two. best.ckpt holds weights only; with Adam it has a third of their size.
+    last.ckpt is saved after every epoch with a validation, after the last epoch, and every `every_steps` steps.
+    best.ckpt is saved whenever the validation loss reaches a new minimum. Every write is atomic
     (framework.storage.checkpoints).
 
     Attributes:
@@ -276,7 +281,7 @@ class KeepCheckpoints(pl.Callback):
         self.kept_epoch = -1
 
     @property
-    def kept(self) -> Path:
+    def kept_path(self) -> Path:
         """Path of the checkpoint whose weights will be tested."""
         return self.folder / f"{self.keep}.ckpt"
 
@@ -285,7 +290,7 @@ class KeepCheckpoints(pl.Callback):
         return {"kept_loss": self.kept_loss, "kept_epoch": self.kept_epoch}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Take over the loss and epoch of the kept weights."""
+        """Restore the loss and epoch of the kept weights."""
         self.kept_loss = state_dict["kept_loss"]
         self.kept_epoch = state_dict["kept_epoch"]
 
@@ -305,12 +310,12 @@ class KeepCheckpoints(pl.Callback):
         if self.keep == "last" or loss < self.kept_loss:
             self.kept_loss, self.kept_epoch = loss, trainer.current_epoch
             if self.keep == "best":
-                trainer.save_checkpoint(self.kept, weights_only=True)
+                trainer.save_checkpoint(self.kept_path, weights_only=True)
 
     def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Save last.ckpt after an epoch with a validation, and after the last epoch."""
-        done, every = trainer.current_epoch + 1, trainer.check_val_every_n_epoch or 1
-        if done % every == 0 or done == trainer.max_epochs or trainer.should_stop:
+        epochs, every = trainer.current_epoch + 1, trainer.check_val_every_n_epoch or 1
+        if epochs % every == 0 or epochs == trainer.max_epochs or trainer.should_stop:
             self.save_last(trainer)
 
     def save_last(self, trainer: pl.Trainer) -> None:
@@ -322,11 +327,11 @@ class KeepCheckpoints(pl.Callback):
 
 
 class StopEarly(EarlyStopping):
-    """Stops when the validation loss had no new minimum for `patience` validations, or is not finite.
+    """Callback that stops a training after `patience` validations without a new minimum, or a loss that is not finite.
 
-    It checks at the end of a validation, because last.ckpt is written after that and must hold the result. Lightning
-    restores this result, but not that the trainer was told to stop. Without `on_train_start`, a run that was killed in
-    its test would therefore train on when it is resumed.
+    The check runs at the end of a validation, because last.ckpt is written after it and must include the result.
+    When a run is resumed, Lightning restores this result, but not the trainer's flag to stop. Without `on_train_start`,
+    a run that was killed during its test would therefore continue to train.
     """
 
     def __init__(self, patience: int) -> None:
@@ -336,16 +341,16 @@ class StopEarly(EarlyStopping):
 
     @property
     def stopped(self) -> bool:
-        """True if the trainer was told to stop; it still trains until its `min_epochs` and `min_steps`."""
+        """True if early stopping was triggered; the trainer still trains until its `min_epochs` and `min_steps`."""
         return self.stopping_reason is not EarlyStoppingReason.NOT_STOPPED
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Tell the trainer of a resumed run to stop if that was decided before."""
+        """Stop a resumed run whose early stopping was triggered before."""
         trainer.should_stop = trainer.should_stop or self.stopped
 
 
-class Report(pl.Callback):
-    """Sends losses and the learning rate to the tracker, every `every_steps` steps and at the end of an epoch."""
+class LogMetrics(pl.Callback):
+    """Callback that logs losses and the learning rate every `every_steps` steps and at the end of an epoch."""
 
     def __init__(self, tracker: Tracker, every_steps: int) -> None:
         self.tracker = tracker
@@ -354,33 +359,33 @@ class Report(pl.Callback):
     def on_train_batch_end(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        """Send the training loss, the learning rate and the scalars of the objectives."""
+        """Log the training loss, the learning rate and the scalars of the objectives."""
         if (trainer.global_step % self.every_steps == 0 or trainer.is_last_batch) and trainer.is_global_zero:
             assert isinstance(pl_module, Training)
             rate = trainer.optimizers[0].param_groups[0]["lr"]
-            told = {
+            objective_terms = {
                 f"train/{name}": float(value)
-                for one in pl_module.objectives
-                if isinstance(one, Objective)
-                for name, value in one.logged_terms.items()
+                for objective in pl_module.objectives
+                if isinstance(objective, Objective)
+                for name, value in objective.logged_terms.items()
             }
             self.tracker.log_metrics(
-                {"train/loss": pl_module.last_loss, "train/learning_rate": rate, **told},
+                {"train/loss": pl_module.last_loss, "train/learning_rate": rate, **objective_terms},
                 trainer.global_step,
                 trainer.current_epoch,
             )
 
     def on_validation_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Send the validation loss."""
+        """Log the validation loss."""
         if not trainer.sanity_checking and trainer.is_global_zero and trainer.state.fn == "fit":
             loss = float(trainer.callback_metrics["validation/loss"])
             self.tracker.log_metrics({"validation/loss": loss}, trainer.global_step, trainer.current_epoch)
 
 
 class StopAtBatch(pl.Callback):
-    """Delays a signal during the fit until the batch ends; then last.ckpt is saved and the run stops.
+    """Callback that handles a signal at the end of the current training batch: it saves last.ckpt and stops the run.
 
-    In the last batch of an epoch the signal waits for the end of the epoch.
+    A signal during the last batch of an epoch is handled at the end of the epoch.
     """
 
     def __init__(self, stopper: Stopper, keep: KeepCheckpoints) -> None:
@@ -388,31 +393,31 @@ class StopAtBatch(pl.Callback):
         self.keep = keep
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Delay signals from now on."""
+        """Delay signals until the end of a batch from now on."""
         self.stopper.wait = True
-        # Lightning has installed its own handler, whose broadcast inside a signal makes several ranks hang.
+        # Replace Lightning's handler, whose broadcast inside a signal handler makes several ranks hang.
         self.stopper.install()
 
     def on_train_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Let signals act at once again."""
+        """Let signals take effect immediately again."""
         self.stopper.wait = False
 
     def on_train_batch_end(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        """Save last.ckpt and stop if a signal has come, except at the last batch of an epoch."""
-        if self._told(trainer) and not trainer.is_last_batch:
+        """Save last.ckpt and stop if a signal was received, except at the last batch of an epoch."""
+        if self._signal_received(trainer) and not trainer.is_last_batch:
             self.keep.save_last(trainer)
             self.stopper.stop()
 
     def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Save last.ckpt and stop if a signal has come."""
-        if self._told(trainer):
+        """Save last.ckpt and stop if a signal was received."""
+        if self._signal_received(trainer):
             self.keep.save_last(trainer)
             self.stopper.stop()
 
-    def _told(self, trainer: pl.Trainer) -> bool:
-        """Return whether any rank has received a signal, so that all ranks save and stop together."""
+    def _signal_received(self, trainer: pl.Trainer) -> bool:
+        """Return whether any rank received a signal; the result is the same on all ranks, so that all save and stop."""
         return trainer.strategy.reduce_boolean_decision(self.stopper.received is not None, all=False)
 
     def on_validation_batch_end(
@@ -424,7 +429,7 @@ class StopAtBatch(pl.Callback):
         batch_idx: int,
         dataloader_idx: int = 0,
     ) -> None:
-        """Stop without saving if a signal has come."""
+        """Stop without saving if a signal was received."""
         # No checkpoint is saved here: a run resumed from it would skip the rest of the validation.
-        if self._told(trainer):
+        if self._signal_received(trainer):
             self.stopper.stop()

@@ -1,4 +1,4 @@
-"""Progress of a training: a bar on a terminal; in a log one line per epoch, or every half minute."""
+"""Progress of a training: a bar on a terminal, or lines in a log, one per epoch and one every half minute."""
 
 import time
 from typing import Any, final
@@ -12,31 +12,31 @@ from framework.training.module import Training
 
 @final
 class Progress(pl.Callback):
-    """Shows the epoch, counted from 1, its mean training loss so far, and the last validation loss.
+    """Callback that shows the epoch (from 1), the epoch's mean training loss so far, and the last validation loss.
 
     Args:
-        console: the console to write to; a quiet one in ranks other than the first.
-        seconds: time after which a log gets a line within a long epoch.
+        console: the console to write to; it is quiet in all ranks but the first.
+        seconds: interval of lines within a long epoch, in a log.
     """
 
     def __init__(self, console: Console, seconds: float = 30.0) -> None:
         self.console = console
         self.seconds = seconds
-        self._total, self._steps, self._told = 0.0, 0, 0.0
+        self._total, self._steps, self._last_line_time = 0.0, 0, 0.0
         self._bar: progress.Progress | None = None
         self._task = progress.TaskID(0)
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Start the bar, if the console is a terminal."""
-        self._told = time.monotonic()
+        self._last_line_time = time.monotonic()
         if self.console.is_terminal and not self.console.quiet:
-            shown = (
+            columns = (
                 progress.TextColumn("{task.description}"),
                 progress.BarColumn(),
                 progress.MofNCompleteColumn(),
             )
             times = (progress.TimeElapsedColumn(), progress.TimeRemainingColumn())
-            self._bar = progress.Progress(*shown, *times, console=self.console)
+            self._bar = progress.Progress(*columns, *times, console=self.console)
             self._task = self._bar.add_task("")
             self._bar.start()
 
@@ -44,7 +44,7 @@ class Progress(pl.Callback):
         """Reset the bar and the mean loss."""
         self._total, self._steps = 0.0, 0
         if self._bar is not None:
-            self._bar.reset(self._task, total=trainer.num_training_batches, description=self._said(trainer))
+            self._bar.reset(self._task, total=trainer.num_training_batches, description=self._text(trainer))
 
     def on_train_batch_end(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, batch: Any, batch_idx: int
@@ -54,8 +54,8 @@ class Progress(pl.Callback):
         self._total += pl_module.last_loss
         self._steps += 1
         if self._bar is not None:
-            self._bar.update(self._task, completed=batch_idx + 1, description=self._said(trainer))
-        elif time.monotonic() - self._told > self.seconds:
+            self._bar.update(self._task, completed=batch_idx + 1, description=self._text(trainer))
+        elif time.monotonic() - self._last_line_time > self.seconds:
             self._line(trainer, f", step {batch_idx + 1} of {trainer.num_training_batches}")
 
     def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
@@ -75,13 +75,13 @@ class Progress(pl.Callback):
         self.on_train_end(trainer, pl_module)
 
     def _line(self, trainer: pl.Trainer, step: str = "") -> None:
-        self._told = time.monotonic()
-        self.console.print(self._said(trainer, step), soft_wrap=True, highlight=False)
+        self._last_line_time = time.monotonic()
+        self.console.print(self._text(trainer, step), soft_wrap=True, highlight=False)
 
-    def _said(self, trainer: pl.Trainer, step: str = "") -> str:
+    def _text(self, trainer: pl.Trainer, step: str = "") -> str:
         epochs = trainer.max_epochs or 0
-        said = f"epoch {trainer.current_epoch + 1}" + (f" of {epochs}" if epochs > 0 else "") + step
+        text = f"epoch {trainer.current_epoch + 1}" + (f" of {epochs}" if epochs > 0 else "") + step
         if self._steps:
-            said += f": loss {self._total / self._steps:.4g}"
+            text += f": loss {self._total / self._steps:.4g}"
         validation = trainer.callback_metrics.get("validation/loss")
-        return said if validation is None else f"{said}, validation loss {float(validation):.4g}"
+        return text if validation is None else f"{text}, validation loss {float(validation):.4g}"

@@ -1,4 +1,4 @@
-"""The processes of several ranks: none outlives another. If one dies, all end, and the run is closed."""
+"""Processes of several ranks that end together: if one dies, the others end, and the run is closed."""
 
 import os
 import select
@@ -25,20 +25,20 @@ from framework.errors import UserError
 from framework.tracking.signals import ENDING, SIGNALS, Stopped, Stopper, ending_with_parent
 
 _GRACE = 4.0
-"""Seconds in which this rank may leave the training by itself after another rank has died."""
+"""Seconds that this rank has to leave the training by itself after another rank has died."""
 _CLOSING = 3.0
 """Seconds for closing the run if this rank has not left the training by itself."""
 _MOMENT = 5.0
 """Seconds within which a rank ends after it has closed its connections."""
-_TOLD = ("gloo", "NCCL", "c10d", "ProcessGroup", "Connection")
-"""Words by which an error that a collective operation raises from compiled code is recognised."""
+_COLLECTIVE_WORDS = ("gloo", "NCCL", "c10d", "ProcessGroup", "Connection")
+"""Words that identify the message of an error of a collective operation in compiled code."""
 _PAUSE = 0.1
 """Seconds between two checks."""
 
 
 @final
 class RankStopped(Stopped):
-    """Another rank was killed, or received a signal to stop that this rank did not receive."""
+    """Exception for another rank that was killed, or that received a signal to stop which this rank did not receive."""
 
     def __init__(self, rank: int, number: int) -> None:
         super().__init__(number)
@@ -47,21 +47,21 @@ class RankStopped(Stopped):
 
 @final
 class RankFailed(UserError):
-    """Another rank ended with an error of its own."""
+    """Error for another rank that ended with an error of its own."""
 
 
 @final
 class RankLauncher(_SubprocessScriptLauncher):
-    """Lightning's launcher of ranks, changed so that the ranks die with this process.
+    """Lightning's launcher of ranks, changed so that the other ranks die with this process.
 
-    It also never kills this process because of another rank. Lightning does so with a signal that leaves no time to
-    close the run (`_ChildProcessObserver`).
+    Lightning's own launcher kills this process if another rank dies (`_ChildProcessObserver`), with a signal that
+    leaves no time to close the run; this launcher does not.
     """
 
     def launch(
         self, function: Callable[..., Any], *args: Any, trainer: pl.Trainer | None = None, **kwargs: Any
     ) -> Any:
-        """Start the other ranks and call `function` in this one."""
+        """Start the other ranks, and return the result of `function` in this one."""
         self.cluster_environment.validate_settings(num_devices=self.num_processes, num_nodes=self.num_nodes)
         if not self.cluster_environment.creates_processes_externally:
             self._call_children_scripts()
@@ -87,9 +87,9 @@ class RankLauncher(_SubprocessScriptLauncher):
 
 
 def _command(rank: int) -> tuple[Sequence[str], str | None]:
-    """Return the command and the folder in which a rank starts.
+    """Return the command that starts a rank, and its working folder.
 
-    It is Lightning's command with the options of this Python (above all -P).
+    The command is Lightning's, with the options of the running Python interpreter (above all -P).
     """
     if HydraConfig.initialized():
         command, folder = _hydra_subprocess_cmd(rank)
@@ -99,29 +99,30 @@ def _command(rank: int) -> tuple[Sequence[str], str | None]:
 
 
 @contextmanager
-def sharing_one_fate(
+def end_together(
     trainer: pl.Trainer, stopper: Stopper, close: Callable[[BaseException], None]
 ) -> Iterator[None]:
-    """Train inside the block with any number of ranks, and check after an error whether another rank caused it.
+    """Make all ranks that train inside the `with` block end together.
 
-    This rank has a few seconds to leave the block after another rank has died, or after a signal that it does not
-    notice because it waits in a collective operation. After that its run is closed from another thread, and the process
-    ends.
+    If this rank fails, the error says whether another rank caused it. After another rank has died, or after a signal
+    that this rank cannot handle because it waits in a collective operation, this rank has a few seconds to leave the
+    block. After that, another thread closes the run and ends the process.
 
     Args:
         trainer: the trainer of the block.
         stopper: the receiver of signals.
-        close: closes the run as the given error requires; it is abandoned after a few seconds.
+        close: function that closes the run after the given error; it has a few seconds.
 
     Raises:
-        RankStopped: another rank was killed or told to stop.
+        RankStopped: another rank was killed or stopped by a signal.
         RankFailed: another rank failed.
     """
     connector = trainer._signal_connector
     register = connector.register_signal_handlers
 
     def register_ours_last() -> None:
-        register()  # Lightning's handler broadcasts inside a signal, which makes several ranks hang
+        # Replace Lightning's handler, whose broadcast inside a signal handler makes several ranks hang.
+        register()
         stopper.install()
 
     connector.register_signal_handlers = register_ours_last
@@ -136,7 +137,7 @@ def sharing_one_fate(
     try:
         yield
     except RuntimeError as error:
-        cause = guard.cause(_MOMENT) if _of_a_collective(error) else None
+        cause = guard.cause(_MOMENT) if _is_collective_error(error) else None
         guard.leave(cause)
         if cause is None:
             raise
@@ -147,18 +148,18 @@ def sharing_one_fate(
     guard.end()
 
 
-def _of_a_collective(error: BaseException) -> bool:
-    """Return whether an error says that another rank is gone."""
+def _is_collective_error(error: BaseException) -> bool:
+    """Return whether an error comes from a collective operation, which fails if another rank is gone."""
     frames = traceback.walk_tb(error.__traceback__)
     names = (str(frame.f_globals.get("__name__")) for frame, _ in frames)
-    return any(word in str(error) for word in _TOLD) or any(
+    return any(word in str(error) for word in _COLLECTIVE_WORDS) or any(
         name.startswith("torch.distributed") for name in names
     )
 
 
 @final
 class _Guard(threading.Thread):
-    """Thread that watches the ranks that this process has started, during the training.
+    """Thread that watches, during the training, the ranks that this process has started.
 
     It reads signals from a pipe, because Python's own handlers wait for the main thread.
     """
@@ -178,7 +179,7 @@ class _Guard(threading.Thread):
         self._before = signal.set_wakeup_fd(self._writes, warn_on_full_buffer=False)
         self._over = threading.Event()
         self._left: float | None = None
-        """Time at which the main thread left the training with an error; None before."""
+        """Time at which the main thread left the training with an error; None before that."""
         self._caused = False
         """True if another rank has caused that error."""
 
@@ -197,14 +198,19 @@ class _Guard(threading.Thread):
                 if now - self._left > _GRACE:
                     self._kill()
                 if self._caused and died is not None and now - died > 2 * _GRACE:
-                    os._exit(1)  # the run is closed; a later sync sends what the store lacks
+                    os._exit(1)  # the run is closed; a later mode=sync sends the numbers that the store lacks
             elif died is not None and now - died > _GRACE:
-                self._end(self.cause(0.0) or RankFailed("Another rank ended before the training did."))
+                self._end(
+                    self.cause(0.0)
+                    or RankFailed(
+                        "Another rank ended before the training was finished. Look for its error message above."
+                    )
+                )
             elif signalled and self._stopper.received is None and now - signalled[0] > ENDING:
                 self._end(Stopped(signalled[1]))
 
     def cause(self, patience: float) -> RankStopped | RankFailed | Stopped | None:
-        """Return why this rank cannot go on; None if no reason is found within `patience` seconds."""
+        """Return why this rank must stop: another rank or a signal; None if no cause appears in `patience` seconds."""
         deadline = time.monotonic() + patience
         while True:
             for rank, process in enumerate(self._ranks, 1):
@@ -215,10 +221,12 @@ class _Guard(threading.Thread):
                     return RankStopped(rank, code - 128)
                 if code:
                     return RankFailed(
-                        f"Rank {rank} of the training failed (exit code {code}), so the others cannot go on. Its own "
-                        "error stands above."
+                        f"Rank {rank} of the training failed (exit code {code}), so the other ranks cannot continue. "
+                        "The error message of that rank is printed above."
                     )
-            if self._stopper.received is not None:  # from a launcher that ends all ranks because of one
+            if (
+                self._stopper.received is not None
+            ):  # sent by a launcher that ends all ranks because one failed
                 return Stopped(self._stopper.received)
             if time.monotonic() >= deadline:
                 return None
@@ -243,7 +251,7 @@ class _Guard(threading.Thread):
             os.close(descriptor)
 
     def _signal(self) -> int | None:
-        """Wait a moment for a signal and return its number; None if none has come."""
+        """Wait up to _PAUSE seconds for a signal and return its number; None if there is none."""
         if select.select([self._reads], [], [], _PAUSE)[0]:
             numbers = [number for number in os.read(self._reads, 64) if number in SIGNALS]
             return numbers[0] if numbers else None
@@ -258,7 +266,7 @@ class _Guard(threading.Thread):
                 process.kill()
 
     def _end(self, error: BaseException) -> None:
-        """Close the run in place of the main thread, which waits in a collective operation, and end this process."""
+        """Close the run for the main thread, which waits in a collective operation, and end the process."""
         self._kill()
         closing = threading.Thread(target=self._close, args=(error,), daemon=True)
         closing.start()

@@ -1,4 +1,4 @@
-"""Several ranks that train as one process would: noise and batch statistics are those of the whole batch."""
+"""Training on several ranks with the result of one process: noise and batch statistics are those of the whole batch."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -45,47 +45,47 @@ class Share:
     whole: int
 
 
-def share(count: int, device: torch.device) -> Share:
-    """Return the part of this rank, which has `count` rows; every rank must call it."""
+def rank_share(count: int, device: torch.device) -> Share:
+    """Return which rows of the whole batch this rank's `count` rows are; every rank must call this function."""
     counts = [torch.zeros((), dtype=torch.int64, device=device) for _ in range(dist.get_world_size())]
     dist.all_gather(counts, torch.tensor(count, device=device))
-    sizes = [int(one) for one in counts]
+    sizes = [int(count) for count in counts]
     return Share(sum(sizes[: dist.get_rank()]), count, sum(sizes))
 
 
-def summed(value: Tensor) -> Tensor:
-    """Return the sum over all ranks, without a gradient; every rank must call it."""
+def sum_over_ranks(value: Tensor) -> Tensor:
+    """Return the sum of a tensor over all ranks, without a gradient; every rank must call this function."""
     total = value.detach().clone()
     dist.all_reduce(total)
     return total
 
 
-def gathered(rows: list[int]) -> list[list[int]]:
-    """Return the rows of each rank, in the order of ranks; every rank must call it."""
-    found: list[Any] = [None] * dist.get_world_size()
-    dist.all_gather_object(found, rows)
-    return found
+def gather_rows(rows: list[int]) -> list[list[int]]:
+    """Return the row numbers of each rank, in the order of ranks; every rank must call this function."""
+    lists: list[Any] = [None] * dist.get_world_size()
+    dist.all_gather_object(lists, rows)
+    return lists
 
 
 class _Sum(torch.autograd.Function):
-    """Sum over ranks whose gradient on a rank is the sum of the gradients on all ranks."""
+    """Sum over ranks; its gradient on every rank is the sum of the gradients on all ranks."""
 
     @staticmethod
     def forward(context: Any, value: Tensor) -> Tensor:
-        return summed(value)
+        return sum_over_ranks(value)
 
     @staticmethod
     def backward(context: Any, *gradients: Tensor) -> Tensor:
-        return summed(gradients[0])
+        return sum_over_ranks(gradients[0])
 
 
 @final
 class WholeBatch(TorchFunctionMode):
-    """Mode in which noise for a rank's rows is drawn for the whole batch, and the rank keeps its rows.
+    """Torch mode in which each rank draws noise for the whole batch and uses the part for its own rows.
 
-    All ranks seed their generators alike, so each row gets the noise that one process would give it. The first
-    dimension whose length is the number of the rank's rows is taken for the batch. Noise in a shape without such a
-    dimension is the same on all ranks. Batch norm in training takes its statistics from the rows of all ranks.
+    All ranks seed their generators alike, so each row gets the noise that it would get in one process. The first
+    dimension whose length equals the number of the rank's rows is assumed to be the batch. Noise of a shape without
+    such a dimension is the same on all ranks. Batch norm computes its training statistics over the rows of all ranks.
     """
 
     def __init__(self, rows: Share) -> None:
@@ -102,36 +102,38 @@ class WholeBatch(TorchFunctionMode):
             return self._batch_norm(*args, **kwargs)
         if func in FACTORIES:
             size = kwargs.pop("size", None) or (args[0] if args and not isinstance(args[0], int) else args)
-            return self._kept(size, lambda shape: func(shape, **kwargs))
+            return self._draw_whole(size, lambda shape: func(shape, **kwargs))
         if func is torch.randint:
             bounds = [part for part in args if isinstance(part, int)]
             bounds += [kwargs.pop(key) for key in ("low", "high") if key in kwargs]
             size = kwargs.pop("size") if "size" in kwargs else args[-1]
-            return self._kept(size, lambda shape: func(*bounds, shape, **kwargs))
+            return self._draw_whole(size, lambda shape: func(*bounds, shape, **kwargs))
         if func in LIKE:
             like = {"dtype": args[0].dtype, "device": args[0].device, **kwargs}
-            return self._kept(args[0].shape, lambda shape: LIKE[func](shape, **like))
+            return self._draw_whole(args[0].shape, lambda shape: LIKE[func](shape, **like))
         if func in IN_PLACE:
             tensor, rest = args[0], args[1:]
             with torch.no_grad():
                 return tensor.copy_(
-                    self._kept(tensor.shape, lambda shape: func(tensor.new_empty(shape), *rest, **kwargs))
+                    self._draw_whole(
+                        tensor.shape, lambda shape: func(tensor.new_empty(shape), *rest, **kwargs)
+                    )
                 )
         if func is torch.normal and any(isinstance(part, Tensor) for part in args):
             mean, std = (torch.as_tensor(part) for part in (*args, *kwargs.values()))
             mean, std = torch.broadcast_tensors(mean, std)
-            return mean + std * self._kept(mean.shape, lambda shape: mean.new_empty(shape).normal_())
+            return mean + std * self._draw_whole(mean.shape, lambda shape: mean.new_empty(shape).normal_())
         if func in (torch.bernoulli, Tensor.bernoulli) and not args[1:]:
-            return self._padded_bernoulli(args[0], **kwargs)
+            return self._bernoulli(args[0], **kwargs)
         return func(*args, **kwargs)
 
     def _axis(self, shape: Iterable[int]) -> int | None:
-        """Return the dimension of the batch; None if there is none, or if this rank has all rows."""
-        found = [axis for axis, size in enumerate(shape) if size == self.rows.count]
-        return found[0] if found and self.rows.count < self.rows.whole else None
+        """Return the dimension of the batch; None if the shape has none, or if this rank has all rows."""
+        axes = [axis for axis, size in enumerate(shape) if size == self.rows.count]
+        return axes[0] if axes and self.rows.count < self.rows.whole else None
 
-    def _kept(self, size: Iterable[int], draw: Callable[[list[int]], Tensor]) -> Tensor:
-        """Return the rank's rows of what `draw` gives in the shape of the whole batch."""
+    def _draw_whole(self, size: Iterable[int], draw: Callable[[list[int]], Tensor]) -> Tensor:
+        """Call `draw` with the shape of the whole batch, and return this rank's rows of the result."""
         shape = list(size)
         axis = self._axis(shape)
         if axis is None:
@@ -139,8 +141,8 @@ class WholeBatch(TorchFunctionMode):
         shape[axis] = self.rows.whole
         return draw(shape).narrow(axis, self.rows.start, self.rows.count).contiguous()
 
-    def _padded_bernoulli(self, probability: Tensor, **keywords: Any) -> Tensor:
-        """Draw from probabilities that exist only for the rank's rows; the other rows use 0.5."""
+    def _bernoulli(self, probability: Tensor, **keywords: Any) -> Tensor:
+        """Draw Bernoulli values for this rank's rows; the unknown probabilities of the other rows count as 0.5."""
 
         def draw(shape: list[int]) -> Tensor:
             axis = self._axis(probability.shape)
@@ -150,7 +152,7 @@ class WholeBatch(TorchFunctionMode):
             whole.narrow(axis, self.rows.start, self.rows.count).copy_(probability)
             return torch.bernoulli(whole, **keywords)
 
-        return self._kept(probability.shape, draw)
+        return self._draw_whole(probability.shape, draw)
 
     def _dropout(
         self,
@@ -160,13 +162,13 @@ class WholeBatch(TorchFunctionMode):
         training: bool = True,
         inplace: bool = False,
     ) -> Tensor:
-        """Apply a dropout to the whole batch, with zeros for the other ranks' rows, and keep the rank's rows."""
+        """Apply dropout to the whole batch, with zeros for the other ranks' rows, and return this rank's rows."""
         axis = self._axis(input.shape)
         if not training or p == 0 or axis is None:
             return func(input, p, training, inplace)
         shape = list(input.shape)
         shape[axis] = self.rows.whole
-        # The noise of the other ranks' rows does not depend on their values, so zeros stand for them.
+        # The noise does not depend on the values, so the other ranks' rows may be zeros.
         whole = input.new_zeros(shape)
         whole = torch.cat(
             [

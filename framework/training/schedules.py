@@ -1,4 +1,4 @@
-"""Changes of the learning rate during training: factors on it, one for each optimiser step."""
+"""Schedules of the learning rate: the factor that multiplies it at each optimiser step."""
 
 import math
 from collections.abc import Callable
@@ -10,62 +10,59 @@ from torch.optim.lr_scheduler import LambdaLR
 from framework.configuration.settings import OptimizerSettings
 
 WARMUP_SHARE = 0.25
-"""Largest share of a training that its warm-up takes.
+"""Largest share of a training's steps that the warm-up takes.
 
-A training shorter than four times `warmup_steps` warms up for a quarter of its steps. Longer trainings are not
-affected; `cest` has 400 steps and warms up for 100 of them.
+A training shorter than four times `warmup_steps` warms up for a quarter of its steps; `cest`, for example, has 400
+steps and warms up for 100 of them. Longer trainings are not affected.
 """
 
 
-def warmup(chosen: OptimizerSettings, steps: int) -> int:
-    """Return the number of warm-up steps in a training of this many `steps`."""
-    return min(chosen.warmup_steps, int(WARMUP_SHARE * steps))
+def count_warmup_steps(settings: OptimizerSettings, steps: int) -> int:
+    """Return the number of warm-up steps in a training of `steps` steps."""
+    return min(settings.warmup_steps, int(WARMUP_SHARE * steps))
 
 
-def schedule(chosen: OptimizerSettings, steps: int, epoch: int) -> Callable[[int], float]:
-    """Return the function from the number of an optimiser step, from 0, to the factor on the learning rate.
+def make_schedule(settings: OptimizerSettings, steps: int, epoch: int) -> Callable[[int], float]:
+    """Return the schedule: a function from the optimiser step, counted from 0, to the factor of the learning rate.
 
     Args:
-        chosen: settings of the optimiser.
+        settings: settings of the optimiser.
         steps: number of steps of the whole training.
         epoch: number of steps of one epoch.
     """
-    warming = warmup(chosen, steps)
-    if chosen.schedule == "plateau":
-        return Plateau(chosen.factor, chosen.patience, warming)
-    if chosen.schedule == "step":
-        starts = [milestone * epoch for milestone in chosen.milestones]
-        return partial(stepped, starts=starts, factor=chosen.factor, warmup_steps=warming)
-    total = steps if chosen.schedule == "cosine" else None
-    return partial(smooth, total=total, warmup_steps=warming)
+    warmup_steps = count_warmup_steps(settings, steps)
+    if settings.schedule == "plateau":
+        return Plateau(settings.factor, settings.patience, warmup_steps)
+    if settings.schedule == "step":
+        starts = [milestone * epoch for milestone in settings.milestones]
+        return partial(step_factor, starts=starts, factor=settings.factor, warmup_steps=warmup_steps)
+    total = steps if settings.schedule == "cosine" else None
+    return partial(smooth_factor, total=total, warmup_steps=warmup_steps)
 
 
-def warm(step: int, warmup_steps: int) -> float:
-    """Return the factor of the warm-up: it rises linearly to 1."""
+def warmup_factor(step: int, warmup_steps: int) -> float:
+    """Return the factor of the warm-up at a step; it rises linearly to 1."""
     return min(1.0, (step + 1) / (warmup_steps + 1))
 
 
-def smooth(step: int, *, total: int | None, warmup_steps: int = 0) -> float:
-    """Return the factor at a step: 1 throughout if `total` is None, or half a cosine from 1 to 0 over `total` steps.
-
-    It is multiplied by the factor of the warm-up.
-    """
+def smooth_factor(step: int, *, total: int | None, warmup_steps: int = 0) -> float:
+    """Return the warm-up's factor at a step, times half a cosine from 1 to 0 over `total` steps if `total` is given."""
     if total is None:
-        return warm(step, warmup_steps)
-    return warm(step, warmup_steps) * 0.5 * (1 + math.cos(math.pi * min(1.0, step / total)))
+        return warmup_factor(step, warmup_steps)
+    return warmup_factor(step, warmup_steps) * 0.5 * (1 + math.cos(math.pi * min(1.0, step / total)))
 
 
-def stepped(step: int, *, starts: list[int], factor: float, warmup_steps: int = 0) -> float:
-    """Return the factor at a step, which is multiplied by `factor` at each of the steps in `starts`."""
-    return warm(step, warmup_steps) * factor ** sum(step >= start for start in starts)
+def step_factor(step: int, *, starts: list[int], factor: float, warmup_steps: int = 0) -> float:
+    """Return the warm-up's factor at a step times `factor` for each of the steps in `starts` that is reached."""
+    return warmup_factor(step, warmup_steps) * factor ** sum(step >= start for start in starts)
 
 
 class Plateau:
-    """Schedule that multiplies by `factor` after `patience` epochs without a new minimum of the validation loss.
+    """Schedule that multiplies the rate by `factor` after `patience` epochs without a lower validation loss.
 
-    Torch's ReduceLROnPlateau is not used: Lightning steps it after an epoch's checkpoint is written, so a resumed run
-    would miss that step. The state of this class is in the checkpoint, because LambdaLR keeps the attributes of the
-    functions that it calls.
+    Torch's ReduceLROnPlateau is not used: Lightning steps it after it has written an epoch's checkpoint, so a resumed
+    run would miss that step. The state of this class is stored in checkpoints, because LambdaLR stores the attributes
+    of the functions that it calls.
     """
 
     def __init__(self, factor: float, patience: int, warmup_steps: int = 0) -> None:
@@ -78,10 +75,10 @@ class Plateau:
 
     def __call__(self, step: int) -> float:
         """Return the factor at a step."""
-        return warm(step, self.warmup_steps) * self.factor**self.reductions
+        return warmup_factor(step, self.warmup_steps) * self.factor**self.reductions
 
-    def see(self, loss: float, epochs: int) -> None:
-        """Add the validation loss after `epochs` epochs."""
+    def record_loss(self, loss: float, epochs: int) -> None:
+        """Record the validation loss after `epochs` epochs, and reduce the factor if it is due."""
         if loss < self.best:
             self.best, self.since = loss, epochs
         elif epochs - self.since >= self.patience:
@@ -89,13 +86,13 @@ class Plateau:
             self.since = epochs
 
 
-def see(schedules: Any, loss: float, epochs: int) -> None:
-    """Give the validation loss to the plateaus of a `LambdaLR`; the next step already has the new rate."""
+def update_plateaus(schedules: Any, loss: float, epochs: int) -> None:
+    """Record the validation loss in the `Plateau` schedules of a `LambdaLR`, and set the rates of the next step."""
     if not isinstance(schedules, LambdaLR):
         return
-    plateaus = [one for one in schedules.lr_lambdas if isinstance(one, Plateau)]
-    for one in plateaus:
-        one.see(loss, epochs)
+    plateaus = [factor for factor in schedules.lr_lambdas if isinstance(factor, Plateau)]
+    for plateau in plateaus:
+        plateau.record_loss(loss, epochs)
     if plateaus:
         groups = schedules.optimizer.param_groups
         for group, base, factor in zip(groups, schedules.base_lrs, schedules.lr_lambdas, strict=True):
