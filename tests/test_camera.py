@@ -121,7 +121,7 @@ def test_what_no_camera_is_made_of_gets_a_sentence(name: str, value: object) -> 
     seen = look_from(0.7, 0.4, -0.2, distance=6.0, field_of_view=0.8, size=(48, 64))
     object.__setattr__(seen, name, value)  # past the type checks that only tests have
     for method in (seen.project, seen.to_canonical):
-        with pytest.raises(ValueError, match=rf"camera\.{name} came with .*; wanted the shape \("):
+        with pytest.raises(ValueError, match=rf"camera\.{name} has .*; expected the shape \("):
             method(torch.ones(5, 3))
 
 
@@ -141,7 +141,7 @@ def test_a_field_of_view_in_degrees_is_refused(angle: float) -> None:
         lambda: look_from(0.3, 0.2, 0.1, distance=4.0, field_of_view=angle, size=(48, 64)),
         lambda: focal_length(48, angle),
     ):
-        with pytest.raises(ValueError, match=r"field_of_view came as .*; wanted radians.*math\.radians"):
+        with pytest.raises(ValueError, match=r"field_of_view = .*; expected radians.*math\.radians"):
             ask()
 
 

@@ -203,7 +203,7 @@ def test_an_attribute_that_is_missing_not_finite_or_out_of_range_is_refused_when
     np.testing.assert_array_equal(mesh.attribute(["green"]), [[1], [0], [0]])
     with pytest.raises(DataError, match=r"point 1 \(from 0\) has red = nan"):
         mesh.attribute(["green", "red"])
-    with pytest.raises(DataError, match="colours go from 0 to 255; wanted 0 to 1"):
+    with pytest.raises(DataError, match="colours go from 0 to 255; expected 0 to 1"):
         mesh.attribute(["blue"])
     with pytest.raises(DataError, match=r"no column 'gren'\. Did you mean 'green'"):
         mesh.attribute(["gren"])
@@ -291,24 +291,24 @@ OTHER = b"ply\nformat ascii 1.0\nelement point 0\n" + END
 
 BROKEN = {
     "off: empty": (".off", b"", "the file is empty"),
-    "off: another word": (".off", b"COFF\n1 0 0\n0 0 0 1 1 1 1\n", "wanted OFF in its first line, got 'COFF'"),
-    "off: binary": (".off", b"OFF BINARY\n\0\0\0", "wanted a whole number, got 'BINARY'"),
+    "off: another word": (".off", b"COFF\n1 0 0\n0 0 0 1 1 1 1\n", "expected OFF in the first line, got 'COFF'"),
+    "off: binary": (".off", b"OFF BINARY\n\0\0\0", "expected a whole number, got 'BINARY'"),
     "off: no counts": (".off", b"OFF\n", "got nothing"),
-    "off: negative": (".off", b"OFF\n-1 2 0\n", "wanted the numbers of vertices"),
-    "off: cut short": (".off", text_off()[:-10], "only 7 lines follow; it is cut short"),
-    "off: cut within a line": (".off", text_off()[:-3], "wanted 3 corners, got the line '3 1 2'"),
+    "off: negative": (".off", b"OFF\n-1 2 0\n", "expected the numbers of vertices"),
+    "off: cut short": (".off", text_off()[:-10], "only 7 lines follow; the file is cut short"),
+    "off: cut within a line": (".off", text_off()[:-3], "expected 3 corners, got the line '3 1 2'"),
     "off: a word": (".off", b"OFF\n1 0 0\n0 zero 0\n", "wanted a number, got 'zero'"),
-    "off: two numbers": (".off", b"OFF\n2 0 0\n0 0\n0 0 0 0\n", "wanted 3 numbers for each vertex, got the line '0 0'"),
+    "off: two numbers": (".off", b"OFF\n2 0 0\n0 0\n0 0 0 0\n", "expected 3 numbers for each vertex, got the line '0 0'"),
     "off: no such vertex": (".off", text_off().replace(b"3 1 2 3", b"3 1 2 4"), r"triangle 3 .* \[1, 2, 4\]"),
-    "off: half a vertex": (".off", text_off().replace(b"3 1 2 3", b"3 1 2 .5"), "wanted a whole number, got '.5'"),
+    "off: half a vertex": (".off", text_off().replace(b"3 1 2 3", b"3 1 2 .5"), "expected a whole number, got '.5'"),
     "off: two corners": (".off", text_off().replace(b"3 1 2 3", b"2 1 2"), "face 3 .* has 2 corners"),
-    "off: not one point": (".off", b"OFF\n0 0 0\n", "it has no vertices"),
-    "obj: empty": (".obj", b"# nothing\n", "it has no vertices"),
+    "off: not one point": (".off", b"OFF\n0 0 0\n", "the file has no vertices"),
+    "obj: empty": (".obj", b"# nothing\n", "the file has no vertices"),
     "obj: two corners": (".obj", b"v 0 0 0\nv 1 0 0\nf 1// 2//\n", "at least 3 corners, got the line f '1// 2//'"),
     "obj: vertex 0": (".obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 0 1 2\n", "names vertex 0"),
     "obj: before the first": (".obj", b"v 0 0 0\nv 1 0 0\nf -1 -2 -3\n", r"corners \[1, 0, -1\]"),
-    "obj: some coloured": (".obj", b"v 0 0 0 1 1 1\nv 1 0 0\n", "wanted 6 numbers for each vertex"),
-    "obj: a plane": (".obj", b"v 0 0\nv 1 0\n", "wanted 3 coordinates"),
+    "obj: some coloured": (".obj", b"v 0 0 0 1 1 1\nv 1 0 0\n", "expected 6 numbers for each vertex"),
+    "obj: a plane": (".obj", b"v 0 0\nv 1 0\n", "expected 3 coordinates"),
     "stl: cut short": (".stl", STL[:-1], "has 283 bytes and announces 4 faces, which take 284"),
     "stl: too long": (".stl", STL + b"\0", "has 285 bytes"),
     "stl: empty": (".stl", b"", "announces 0 faces"),
@@ -317,23 +317,23 @@ BROKEN = {
     "stl: a word": (".stl", b"solid a\n" + FACET.replace(b"1 0 0", b"1 o 0") + b"endsolid", "got 'o'"),
     "ply: no header": (".ply", b"ply\nformat ascii 1.0\n", "a line end_header"),
     "ply: no format": (".ply", b"ply\nelement vertex 0\n" + END, "no line format"),
-    "ply: another format": (".ply", b"ply\nformat binary 1.0\n" + END, "'format binary 1.0', which is not PLY's"),
-    "ply: no vertices": (".ply", OTHER, "wanted an element vertex, got point"),
+    "ply: another format": (".ply", b"ply\nformat binary 1.0\n" + END, "'format binary 1.0', which is no line of a PLY header"),
+    "ply: no vertices": (".ply", OTHER, "expected an element vertex, got point"),
     "ply: no z": (".ply", PLANE, "no z, only x, y"),
     "ply: cut short": (".ply", HEAD + END + POINTS[:-6], "announces 3 lines of data, but 2 follow"),
     "ply: too long": (".ply", HEAD + END + POINTS + POINTS, "but 6 follow"),
     "ply: a negative vertex": (".ply", HEAD + FACE + END + POINTS + b"3 0 1 -1\n", r"corners \[0, 1, -1\]"),
     "ply: two corners": (".ply", HEAD + FACE + END + POINTS + b"2 0 1\n", "face 0 .* has 2 corners"),
     "ply: strips": (".ply", HEAD + STRIPS + END + POINTS + b"0\n", "strips of triangles"),
-    "ply: nothing in it": (".ply", HEAD.replace(b"3", b"0", 1) + END, "it has no vertices"),
-    "ply: binary cut short": (".ply", binary_ply("<")[:-1], "it is cut short"),
-    "ply: binary too long": (".ply", binary_ply(">", extra=b"\0\0"), "2 bytes follow what its header announces"),
+    "ply: nothing in it": (".ply", HEAD.replace(b"3", b"0", 1) + END, "the file has no vertices"),
+    "ply: binary cut short": (".ply", binary_ply("<")[:-1], "the file is cut short"),
+    "ply: binary too long": (".ply", binary_ply(">", extra=b"\0\0"), "2 bytes follow after the data that the header announces"),
     "xyz: two numbers": (".xyz", b"0 0\n1 1\n", "at least 3 numbers for each point, got the line '0 0'"),
-    "xyz: uneven": (".xyz", b"0 0 0\n1 1 1 1\n1 1\n", "wanted 3 numbers for each point, got the line '1 1 1 1'"),
+    "xyz: uneven": (".xyz", b"0 0 0\n1 1 1 1\n1 1\n", "expected 3 numbers for each point, got the line '1 1 1 1'"),
     "xyz: a name too few": (".xyz", b"x y z\n0 0 0 1\n", "names 3 columns, but each point has 4 numbers"),
-    "xyz: empty": (".xyz", b"\n\n", "it has no vertices"),
+    "xyz: empty": (".xyz", b"\n\n", "the file has no vertices"),
     "npy: a plane": (".npy", array(np.zeros((4, 2))), r"got float64 \(4, 2\)"),
-    "npy: words": (".npy", array(np.array([["a", "b", "c"]])), "wanted numbers of shape"),
+    "npy: words": (".npy", array(np.array([["a", "b", "c"]])), "expected numbers of shape"),
     "npy: objects": (".npy", array(np.array([[{}, 1, 2]], dtype=object)), "cannot be read as NPY"),
     "npy: cut short": (".npy", array(np.zeros((4, 3)))[:-1], "cannot be read as NPY"),
     "npz: no points": (".npz", archive(a=np.zeros((4, 3)), b=np.zeros(3)), "an array named points, got a, b"),
@@ -531,7 +531,7 @@ def test_the_same_seed_and_name_give_the_same_points():
 @pytest.mark.parametrize(
     "mesh, message",
     [
-        (Mesh("cloud", TETRAHEDRON, np.empty((0, 3), int)), "cloud: it has no faces"),
+        (Mesh("cloud", TETRAHEDRON, np.empty((0, 3), int)), "cloud: the mesh has no faces"),
         (Mesh("point", np.zeros((3, 3)), np.array([[0, 1, 2]])), "point: its 1 faces have no area"),
         (
             Mesh("line", np.eye(3)[:1] * np.arange(4)[:, None], np.array([[0, 1, 2], [1, 2, 3]])),

@@ -12,7 +12,7 @@ from framework.geometry.rotation import viewpoint_rotation
 
 SHAPES = {"rotation": (3, 3), "translation": (3,), "focal": (2,), "principal": (2,)}
 """Shapes of the tensors that a camera consists of."""
-SAID = {"focal": ", (fx, fy), pixels", "principal": ", (cx, cy), pixels"}
+MEANINGS = {"focal": ", (fx, fy), pixels", "principal": ", (cx, cy), pixels"}
 """Meaning and unit of the numbers of a lens, for messages."""
 
 
@@ -46,15 +46,14 @@ class Camera:
         Nothing else checks them: a single focal length would count as two, and kernels would read beyond an array.
 
         Raises:
-            ValueError: rotation, translation, focal or principal has another shape; the message says what came and what
-                was wanted.
+            ValueError: rotation, translation, focal or principal has another shape; the message names both shapes.
         """
-        for name, wanted in SHAPES.items():
-            came = _shape(getattr(self, name))
-            if came != wanted:
-                numbers = " a single number" if came == () else f" the shape {came}"
+        for name, expected_shape in SHAPES.items():
+            shape = _shape(getattr(self, name))
+            if shape != expected_shape:
+                got = "a single number" if shape == () else f"the shape {shape}"
                 raise ValueError(
-                    f"camera.{name} came with{numbers}; wanted the shape {wanted}{SAID.get(name, '')}."
+                    f"camera.{name} has {got}; expected the shape {expected_shape}{MEANINGS.get(name, '')}."
                 )
 
     def project(
@@ -67,8 +66,8 @@ class Camera:
         Raises:
             ValueError: as `check_shapes`.
         """
-        seen, focal, principal = self._seen(points)
-        return focal * seen[..., :2] / seen[..., 2:] + principal, seen[..., 2]
+        camera_points, focal, principal = self._in_camera_frame(points)
+        return focal * camera_points[..., :2] / camera_points[..., 2:] + principal, camera_points[..., 2]
 
     def to_canonical(self, points: Real[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
         """Return world points in coordinates of the `canonical_camera` of the same image size, metres.
@@ -83,23 +82,23 @@ class Camera:
         Raises:
             ValueError: as `check_shapes`.
         """
-        seen, focal, principal = self._seen(points)
+        camera_points, focal, principal = self._in_camera_frame(points)
         plain = canonical_camera(self.height, self.width)
-        depth, middle = seen[..., 2:], principal.new_tensor(plain.principal)
-        across = focal * seen[..., :2] + (principal - middle) * depth
+        depth, middle = camera_points[..., 2:], principal.new_tensor(plain.principal)
+        across = focal * camera_points[..., :2] + (principal - middle) * depth
         return torch.cat([across / focal.new_tensor(plain.focal), depth], -1)
 
-    def _seen(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return camera coordinates of world points, and focal lengths and principal point as tensors like them."""
+    def _in_camera_frame(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return camera coordinates of world points, and focal lengths and principal point as tensors of the same type."""
         self.check_shapes()
         if not points.is_floating_point():  # as integers a rotation would have only the entries -1, 0 and 1
             points = points.to(torch.get_default_dtype())
-        seen = points @ self.rotation.to(points).T + self.translation.to(points)
+        camera_points = points @ self.rotation.to(points).T + self.translation.to(points)
         focal, principal = (
             torch.as_tensor(part, dtype=points.dtype, device=points.device)
             for part in (self.focal, self.principal)
         )
-        return seen, focal, principal
+        return camera_points, focal, principal
 
 
 def _shape(numbers: object) -> tuple[int, ...]:
@@ -119,16 +118,15 @@ def focal_length(height: int, field_of_view: float) -> float:
     """
     if not 0 < field_of_view < math.pi:
         raise ValueError(
-            f"field_of_view came as {field_of_view:g}; wanted radians, above 0 and below π. Give math.radians(degrees)."
+            f"Got field_of_view = {field_of_view:g}; expected radians, above 0 and below π. Give math.radians(degrees)."
         )
     return 0.5 * height / math.tan(0.5 * field_of_view)
 
 
 def canonical_camera(height: int, width: int) -> Camera:
-    """Return the camera for images of this size that needs no further number.
+    """Return the canonical camera for images of this size, which is at the origin and along the axes.
 
-    It is at the origin, along the axes. Its focal length is as many pixels as the image has rows, and its principal
-    point is the centre of the image.
+    The focal length is as many pixels as the image has rows. The principal point is the centre of the image.
     """
     return Camera(
         rotation=torch.eye(3),

@@ -24,7 +24,7 @@ LOOSE, TIGHT = 2.0, 0.01
 
 
 class NormalisedClouds(NamedTuple):
-    """Clouds around the origin; centre and scale lead back (`denormalised`).
+    """Clouds around the origin, with the centre and scale that map them back (`denormalise_clouds`).
 
     Attributes:
         clouds: of the input's dtype; attributes and padding are unchanged.
@@ -45,8 +45,8 @@ def require_clouds(input_shape: tuple[int, ...], by: str) -> None:
     """
     if len(input_shape) != 2 or input_shape[1] < 3:
         raise ConfigError(
-            f"{by} got inputs of shape {input_shape}; wanted clouds, (points, columns) with x, y, z in the first three "
-            "columns. Choose data of point clouds, or another encoder."
+            f"{by} got inputs of shape {input_shape}, but it reads clouds, (points, columns), with x, y, z in the first "
+            "three columns. Choose data of point clouds, or another encoder."
         )
 
 
@@ -59,8 +59,8 @@ def sizes(clouds: Tensor) -> Int[Tensor, "batch"]:
     """
     if clouds.dim() != 3 or clouds.shape[2] < 3 or clouds.dtype not in (torch.float32, torch.float64):
         raise DataError(
-            f"A batch of clouds of shape {tuple(clouds.shape)} and type {clouds.dtype}; wanted (batch, points, columns)"
-            " of float32 or float64 with x, y, z in the first three columns. Check what `data` yields."
+            f"Got a batch of clouds of shape {tuple(clouds.shape)} and type {clouds.dtype}; expected (batch, points, "
+            "columns) of float32 or float64 with x, y, z in the first three columns. Check the batches of `data`."
         )
     count, points, _ = clouds.shape
     # a finite sum has only finite summands, so that one pass suffices for clouds without padding
@@ -72,23 +72,23 @@ def sizes(clouds: Tensor) -> Int[Tensor, "batch"]:
     empty = (counts == 0).nonzero()
     if len(empty):
         raise DataError(
-            f"Cloud {int(empty[0])} of the batch has no point (rows of NaN are padding); wanted one at least. "
-            "Leave out what was read from an empty file."
+            f"Cloud {int(empty[0])} of the batch has no point (rows of NaN are padding); expected at least "
+            "one. Leave out empty files."
         )
     bad = ~clouds.isfinite().all(-1) & (number <= counts[:, None])
     if bad.any():
         cloud, point = bad.nonzero()[0].tolist()
         column = int((~clouds[cloud, point].isfinite()).nonzero()[0])
         raise DataError(
-            f"Cloud {cloud} of the batch holds {clouds[cloud, point, column].item()} in column {column} of its point "
-            f"{point}; wanted finite numbers, and rows of NaN as padding at the end alone. Mend the file, or drop such "
-            "points."
+            f"Cloud {cloud} of the batch holds {clouds[cloud, point, column].item()} in column {column} of point "
+            f"{point}; expected finite numbers, and rows of NaN only as padding at the end. Correct the file, or remove "
+            "such points."
         )
     return counts
 
 
 def point_mask(clouds: Tensor, sizes: Tensor | None) -> Bool[Tensor, "batch points"]:
-    """Return which rows of clouds with these sizes hold points; all rows if None."""
+    """Return a mask of the rows of clouds that hold points, (batch, points): the first `sizes` rows; all rows if None."""
     if sizes is None:
         return clouds.new_ones(clouds.shape[:2], dtype=torch.bool)
     return torch.arange(clouds.shape[1], device=clouds.device) < sizes.to(clouds.device)[:, None]
@@ -102,10 +102,10 @@ def pad(clouds: Sequence[Tensor]) -> Float[Tensor, "batch points columns"]:
     """
     shapes = {tuple(cloud.shape[1:]) for cloud in clouds}
     if len(shapes) != 1 or len(next(iter(shapes))) != 1:
-        found = ", ".join(str(tuple(cloud.shape)) for cloud in clouds[:4]) or "none"
+        shape_names = ", ".join(str(tuple(cloud.shape)) for cloud in clouds[:4]) or "none"
         raise DataError(
-            f"Clouds of shapes {found} do not make a batch; wanted one cloud at least, each (points, columns) with as "
-            "many columns as the others. Give every cloud the same attributes."
+            f"Clouds of shapes {shape_names} do not form a batch; expected at least one cloud, and each (points, columns) "
+            "with the same number of columns. Give every cloud the same attributes."
         )
     return pad_sequence(list(clouds), batch_first=True, padding_value=math.nan)
 
@@ -136,20 +136,20 @@ def normalise_clouds(
         origin = torch.zeros(count, 3, dtype=torch.float64, device=clouds.device)
         return NormalisedClouds(clouds, origin, torch.ones_like(origin[:, 0]))
     if how == "unit_ball" and clouds.device.type == "cpu":
-        found = _compiled(clouds.detach(), counts)
+        normalised = _compiled(clouds.detach(), counts)
         if clouds.requires_grad and torch.is_grad_enabled():  # adds a gradient and changes no bit
             traced = _composed(clouds, how, counts)
-            pairs = zip(found, traced, strict=True)
-            found = NormalisedClouds(*(value + (other - other.detach()) for value, other in pairs))
+            pairs = zip(normalised, traced, strict=True)
+            normalised = NormalisedClouds(*(value + (other - other.detach()) for value, other in pairs))
     else:
-        found = _composed(clouds, how, counts)
-    if clouds.dtype == torch.float64 and not bool(found.scale.isfinite().all()):
-        cloud = int((~found.scale.isfinite()).nonzero()[0])
+        normalised = _composed(clouds, how, counts)
+    if clouds.dtype == torch.float64 and not bool(normalised.scale.isfinite().all()):
+        cloud = int((~normalised.scale.isfinite()).nonzero()[0])
         raise DataError(
-            f"Cloud {cloud} of the batch is so large that squared distances exceed float64; wanted coordinates below "
-            "1e150. Choose other units."
+            f"Cloud {cloud} of the batch is so large that squared distances exceed float64; expected coordinates "
+            "below 1e150. Choose other units."
         )
-    return found
+    return normalised
 
 
 def _compiled(clouds: Tensor, counts: Tensor) -> NormalisedClouds:
@@ -157,11 +157,11 @@ def _compiled(clouds: Tensor, counts: Tensor) -> NormalisedClouds:
     from framework.geometry.clouds_compiled import unit_ball
 
     clouds = clouds.contiguous()  # the function is compiled for contiguous arrays only
-    made = torch.empty_like(clouds)
+    normalised = torch.empty_like(clouds)
     centre = torch.empty(len(clouds), 3, dtype=torch.float64)
     scale = torch.empty(len(clouds), dtype=torch.float64)
-    unit_ball(clouds.numpy(), counts.numpy(), made.numpy(), centre.numpy(), scale.numpy())
-    return NormalisedClouds(made, centre, scale)
+    unit_ball(clouds.numpy(), counts.numpy(), normalised.numpy(), centre.numpy(), scale.numpy())
+    return NormalisedClouds(normalised, centre, scale)
 
 
 def _composed(clouds: Tensor, how: Normalisation, counts: Tensor) -> NormalisedClouds:
@@ -176,14 +176,16 @@ def _composed(clouds: Tensor, how: Normalisation, counts: Tensor) -> NormalisedC
     offset = coordinates - first
     if real is not None:
         offset = offset.where(real, 0)  # before anything is multiplied: NaN × 0 is no gradient
-    kept = real if how == "unit_ball" else near_middle(offset, real)
-    if kept is None:
+    counted_points = real if how == "unit_ball" else near_middle(offset, real)
+    if counted_points is None:
         mean = offset.mean(1, keepdim=True)
     else:
-        mean = offset.where(kept, 0).sum(1, keepdim=True) / kept.sum(1, keepdim=True)
+        mean = offset.where(counted_points, 0).sum(1, keepdim=True) / counted_points.sum(1, keepdim=True)
     local = offset - mean  # the numerator of eq. 6.2
     norm = torch.linalg.vector_norm(local, dim=-1)
-    largest = (norm if kept is None else norm.where(kept[..., 0], 0)).amax(1)  # its denominator
+    largest = (norm if counted_points is None else norm.where(counted_points[..., 0], 0)).amax(
+        1
+    )  # its denominator
     scale = largest.where(largest > 0, 1)
     local = (local / scale[:, None, None]).to(clouds.dtype)
     if real is not None:
@@ -197,7 +199,7 @@ def _composed(clouds: Tensor, how: Normalisation, counts: Tensor) -> NormalisedC
 def near_middle(
     offset: Float[Tensor, "batch points 3"], real: Bool[Tensor, "batch points 1"] | None
 ) -> Bool[Tensor, "batch points 1"]:
-    """Return which points are within `REACH` median distances of the medians of the coordinates: no far outliers."""
+    """Return a mask of the points within `REACH` median distances of the medians of the coordinates: no far outliers."""
     known = offset if real is None else offset.where(real, math.nan)
     distance = torch.linalg.vector_norm(known - known.nanmedian(1, keepdim=True).values, dim=-1, keepdim=True)
     typical = distance.nanmedian(1, keepdim=True).values
@@ -218,7 +220,7 @@ def denormalise_clouds(
 def require_normalised(
     coordinates: Float[Tensor, "batch points 3"], reach: float, counts: Tensor, by: str
 ) -> None:
-    """Require normalised clouds; a basis or a grid around the origin cannot describe others.
+    """Require normalised clouds, because a basis or a grid around the origin cannot describe other clouds.
 
     Args:
         coordinates: of clouds that were not normalised by "unit_ball" or "robust".
@@ -227,8 +229,8 @@ def require_normalised(
         by: name of the caller, for the message.
 
     Raises:
-        DataError: half of a cloud's points are farther than 2 reaches from the origin (fewer may be outliers that a
-            robust normalisation left there), or all are within 0.01 (but not all on it).
+        DataError: half of a cloud's points are farther than 2 · `reach` from the origin (fewer may be outliers that a
+            robust normalisation left there), or all are nearer than 0.01 · `reach`, but not all at the origin.
     """
     real = point_mask(coordinates, counts)
     norm = torch.linalg.vector_norm(coordinates.detach().double(), dim=-1)
@@ -240,9 +242,9 @@ def require_normalised(
     if bad.any():
         cloud = int(bad.nonzero()[0])
         raise DataError(
-            f"Cloud {cloud} of the batch reaches {largest[cloud]:.3g} from the origin; {by} with normalise=none wants "
-            f"clouds about the origin that reach between {TIGHT * reach:g} and {LOOSE * reach:g}, some outliers apart, "
-            "since it says nothing of others. Choose normalise=unit_ball."
+            f"Cloud {cloud} of the batch extends to {largest[cloud]:.3g} from the origin, but {by} with "
+            f"normalise=none describes only clouds about the origin that extend to between {TIGHT * reach:g} and "
+            f"{LOOSE * reach:g}, apart from some outliers. Choose normalise=unit_ball."
         )
 
 

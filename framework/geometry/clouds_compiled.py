@@ -12,18 +12,18 @@ compiled = compiler(kept_in("unit_ball", [Path(__file__)]))
 
 @compiled
 @no_type_check
-def unit_ball(clouds, counts, made, centre, scale):
-    """Fill `made` with eq. 6.2 of each cloud; see `framework.geometry.clouds.normalise_clouds`.
+def unit_ball(clouds, counts, normalised, centre, scale):
+    """Fill `normalised` with eq. 6.2 of each cloud; see `framework.geometry.clouds.normalise_clouds`.
 
     Args:
         clouds: (cloud, point, column) float32 or float64.
         counts: number of points of each cloud, int64.
-        made: filled with the normalised clouds, like `clouds`.
+        normalised: filled with the normalised clouds, like `clouds`.
         centre: filled with the centre of each cloud, (cloud, 3) float64.
         scale: filled with the scale of each cloud, (cloud,) float64.
     """
     for number in range(clouds.shape[0]):
-        cloud, out, count = clouds[number], made[number], counts[number]
+        cloud, out, count = clouds[number], normalised[number], counts[number]
         # relative to the first point: clouds far from the origin keep their digits, equal points are exactly equal
         x, y, z = np.float64(cloud[0, 0]), np.float64(cloud[0, 1]), np.float64(cloud[0, 2])
         mean_x = mean_y = mean_z = 0.0

@@ -8,21 +8,21 @@ from torch import Tensor
 
 @torch.no_grad()
 def farthest(
-    places: Float[Tensor, "batch points 3"], counts: Int[Tensor, "batch"], count: int
+    positions: Float[Tensor, "batch points 3"], counts: Int[Tensor, "batch"], count: int
 ) -> Int[Tensor, "batch count"]:
     """Return indices of points of each cloud: each as far as possible from all before it, the first from the mean.
 
-    Of equally far points the first is chosen. None is chosen twice before all were chosen; then they repeat in turn. So
-    every order of a cloud's points gives the same positions, unless distances are equal, and a smaller `count` gives
+    Of equally far points the first is chosen. No point is chosen twice before all were chosen; then the sequence repeats.
+    So every order of a cloud's points gives the same positions, unless distances are equal, and a smaller `count` gives
     the beginning of the result of a larger one. It is computed in float64 on the CPU, whatever device the clouds are
     on.
 
     Args:
-        places: positions of the points, (batch, points, 3).
+        positions: positions of the points, (batch, points, 3).
         counts: sizes of the clouds, 1 or more; rows behind them are not read.
-        count: number of points wanted.
+        count: number of points to choose.
     """
     from framework.geometry.farthest_compiled import farthest as compiled
 
-    coordinates = np.ascontiguousarray(places.detach().cpu().double().numpy())
-    return torch.from_numpy(compiled(coordinates, counts.cpu().numpy(), count)).to(places.device)
+    coordinates = np.ascontiguousarray(positions.detach().cpu().double().numpy())
+    return torch.from_numpy(compiled(coordinates, counts.cpu().numpy(), count)).to(positions.device)

@@ -19,36 +19,36 @@ def farthest(clouds, counts, count):
     Args:
         clouds: (cloud, point, 3) float64, C-contiguous.
         counts: number of points of each cloud, int64; rows behind them are not read.
-        count: number of points wanted.
+        count: number of points to choose.
     """
-    found = np.empty((len(clouds), count), dtype=np.int64)
+    indices = np.empty((len(clouds), count), dtype=np.int64)
     for number in range(len(clouds)):
         cloud, size = clouds[number], counts[number]
         at = np.zeros(3)
         for axis in range(3):
             at[axis] = cloud[:size, axis].mean()
         distance = np.empty(size)
-        best, place = -1.0, 0
+        best, farthest_point = -1.0, 0
         for point in range(size):
             square = _square(cloud, point, at)
             if square > best:
-                best, place = square, point
+                best, farthest_point = square, point
         distance[:] = np.inf
         for step in range(count):
             if step >= size:
-                found[number, step] = found[number, step - size]  # all were chosen: repeat them
+                indices[number, step] = indices[number, step - size]  # all were chosen: repeat them
                 continue
-            found[number, step] = place
-            at[:] = cloud[place]
-            distance[place] = -1.0  # marks this point as chosen, not others at the same position
-            best, place = -1.0, 0
+            indices[number, step] = farthest_point
+            at[:] = cloud[farthest_point]
+            distance[farthest_point] = -1.0  # marks this point as chosen, not others at the same position
+            best, farthest_point = -1.0, 0
             for point in range(size):
                 if distance[point] >= 0:
                     square = min(distance[point], _square(cloud, point, at))
                     distance[point] = square
                     if square > best:
-                        best, place = square, point
-    return found
+                        best, farthest_point = square, point
+    return indices
 
 
 @njit(inline="always")

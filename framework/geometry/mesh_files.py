@@ -1,6 +1,6 @@
 """Parsers of mesh and cloud files, one function for each format; they never make up what a file does not hold.
 
-Every parser takes the bytes of a file and raises a ValueError that says what came, in which line, and what was wanted;
+Every parser takes the bytes of a file. It raises a ValueError that says what it got, in which line, and what it expected;
 the caller, `geometry.meshes`, names the file. PLY has a module of its own. Comments are skipped, and line ends may be
 those of any system. Polygons are cut into fans of triangles (correct for convex ones).
 """
@@ -63,7 +63,7 @@ def text_lines(content: bytes, comment: bytes | None = b"#", names: Sequence[byt
     return [line for line in _lines(content, comment, names) if line and not line.isspace()]
 
 
-def placed(
+def line_numbers(
     content: bytes,
     comment: bytes | None = b"#",
     names: Sequence[bytes] = (),
@@ -81,12 +81,12 @@ def placed(
     """
 
     def place(line: int) -> int:
-        kept = [
+        line_numbers = [
             number
             for number, words in enumerate(map(bytes.split, _lines(content, comment, names)), 1)
             if words and (not key or words[0] == key)
         ]
-        return kept[first + line]
+        return line_numbers[first + line]
 
     return place
 
@@ -111,7 +111,7 @@ def numbers(lines: Sequence[bytes], dtype: type = np.float64, place: Place | Non
     try:
         return np.fromstring(joined, dtype=dtype, sep=" ") if joined else np.empty(0, dtype)
     except ValueError:
-        found: list[float] = []
+        values: list[float] = []
         for number, line in enumerate(lines):
             for word in line.split():
                 value = None if dtype is np.int64 else text.value(word.decode("utf-8", "replace"))
@@ -119,8 +119,8 @@ def numbers(lines: Sequence[bytes], dtype: type = np.float64, place: Place | Non
                     value = _whole(word) if dtype is np.int64 else None
                 if value is None:
                     raise ValueError(_at(number, place) + _no_number(word, dtype, line)) from None
-                found.append(value)
-        return np.array(found, dtype)
+                values.append(value)
+        return np.array(values, dtype)
 
 
 def _whole(word: bytes) -> int | None:
@@ -131,9 +131,9 @@ def _whole(word: bytes) -> int | None:
 
 
 def _no_number(word: bytes, dtype: type, line: bytes) -> str:
-    where = f" in the line {_shown(line)}"
+    where = f" in the line {_excerpt(line)}"
     if dtype is np.int64:
-        return f"wanted a whole number, got {_shown(word)}{where}"
+        return f"expected a whole number, got {_excerpt(word)}{where}"
     return text.no_number(word[:60].decode("utf-8", "replace"), where)
 
 
@@ -143,21 +143,21 @@ def _at(number: int, place: Place | None) -> str:
 
 
 def rows(
-    lines: Sequence[bytes], what: str, width: int | None = None, place: Place | None = None
+    lines: Sequence[bytes], row_name: str, width: int | None = None, place: Place | None = None
 ) -> Float[np.ndarray, "rows width"]:
     """Return lines of equally many numbers, (rows, width); `width` None: as many as the first line has.
 
     Raises:
         ValueError: a line has another number of them, or a word that is no number; the message names it.
     """
-    wanted = len(lines[0].split()) if width is None and lines else width or 0
+    columns = len(lines[0].split()) if width is None and lines else width or 0
     values = numbers(lines, place=place)
-    if len(values) != wanted * len(lines) or any(len(line.split()) != wanted for line in lines):
-        number, line = next((n, line) for n, line in enumerate(lines) if len(line.split()) != wanted)
+    if len(values) != columns * len(lines) or any(len(line.split()) != columns for line in lines):
+        number, line = next((n, line) for n, line in enumerate(lines) if len(line.split()) != columns)
         raise ValueError(
-            f"{_at(number, place)}wanted {wanted} numbers for each {what}, got the line {_shown(line)}"
+            f"{_at(number, place)}wanted {columns} numbers for each {row_name}, got the line {_excerpt(line)}"
         )
-    return values.reshape(len(lines), wanted)
+    return values.reshape(len(lines), columns)
 
 
 def polygons(lines: Sequence[bytes], place: Place | None = None) -> Int[np.ndarray, "faces 3"]:
@@ -173,16 +173,16 @@ def polygons(lines: Sequence[bytes], place: Place | None = None) -> Int[np.ndarr
     if alike and (flat[:: corners + 1] == corners).all():
         counts = np.full(len(lines), corners)
         return fans(counts, flat.reshape(-1, corners + 1)[:, 1:].ravel())
-    counts, found = [], []
+    counts, corner_texts = [], []
     for number, line in enumerate(lines):
         words = line.split()
         where = None if place is None else lambda _, number=number: place(number)
         count = int(numbers(words[:1], np.int64, where)[0])
         if len(words) <= count:
-            raise ValueError(f"{_at(number, place)}wanted {count} corners, got the line {_shown(line)}")
+            raise ValueError(f"{_at(number, place)}expected {count} corners, got the line {_excerpt(line)}")
         counts.append(count)
-        found.append(b" ".join(words[1 : count + 1]))
-    return fans(np.array(counts), numbers(found, np.int64, place))
+        corner_texts.append(b" ".join(words[1 : count + 1]))
+    return fans(np.array(counts), numbers(corner_texts, np.int64, place))
 
 
 def fans(
@@ -191,7 +191,7 @@ def fans(
     """Return polygons of `counts` corners each, cut into triangles that share the polygon's first corner."""
     if len(counts) and counts.min() < 3:
         number = int(np.flatnonzero(counts < 3)[0])
-        raise ValueError(f"face {number} (from 0) has {counts[number]} corners; wanted at least 3")
+        raise ValueError(f"face {number} (from 0) has {counts[number]} corners; expected at least 3")
     if len(counts) and (counts == 3).all():
         return corners.reshape(-1, 3).astype(np.int64)
     parts = counts - 2
@@ -209,33 +209,35 @@ def off(content: bytes) -> Parsed:
     """
     lines = text_lines(content)
     if not lines:
-        raise ValueError("the file is empty; wanted OFF in its first line")
+        raise ValueError("the file is empty; expected OFF in the first line")
     keyword, first = lines[0].strip()[:3], lines[0].strip()[3:]  # such as OFF490 518 0
     if keyword != b"OFF":
         raise ValueError(
-            f"wanted OFF in its first line, got {_shown(lines[0])}; save variants with colours or normals as PLY"
+            f"expected OFF in the first line, got {_excerpt(lines[0])}; save variants with colours or normals as PLY"
         )
     lines = [first, *lines[1:]] if first.strip() else lines[1:]
     skipped = 0 if first.strip() else 1
-    counts = numbers(lines[:1], np.int64, placed(content, first=skipped)) if lines else np.empty(0, np.int64)
+    counts = (
+        numbers(lines[:1], np.int64, line_numbers(content, first=skipped)) if lines else np.empty(0, np.int64)
+    )
     if len(counts) not in (2, 3) or (counts < 0).any() or (counts > MOST).any():
-        shown = _shown(lines[0]) if lines else "nothing"
-        raise ValueError(f"wanted the numbers of vertices, faces and edges, got {shown}")
+        shown = _excerpt(lines[0]) if lines else "nothing"
+        raise ValueError(f"expected the numbers of vertices, faces and edges, got {shown}")
     vertices, faces = int(counts[0]), int(counts[1])
     body = lines[1:]
     if len(body) < vertices + faces:
         raise ValueError(
-            f"its header announces {vertices} vertices and {faces} faces, but only {len(body)} lines follow; it is cut "
+            f"the header announces {vertices} vertices and {faces} faces, but only {len(body)} lines follow; it is cut "
             "short"
         )
     start = 1 + skipped
     return Parsed(
-        rows(body[:vertices], "vertex", 3, placed(content, first=start)),
-        polygons(body[vertices : vertices + faces], placed(content, first=start + vertices)),
+        rows(body[:vertices], "vertex", 3, line_numbers(content, first=start)),
+        polygons(body[vertices : vertices + faces], line_numbers(content, first=start + vertices)),
     )
 
 
-def continued(content: bytes) -> bytes:
+def join_continued_lines(content: bytes) -> bytes:
     """Return an OBJ file with continued lines joined, with as many lines as before."""
     if b"\\" not in content:
         return content
@@ -253,7 +255,7 @@ def continued(content: bytes) -> bytes:
 
 def obj(content: bytes) -> Parsed:
     """Parse Wavefront OBJ: vertices (with colours after the coordinates, if all have them) and faces of all objects."""
-    joined = continued(content)
+    joined = join_continued_lines(content)
     points, faces, before = [], [], []
     for line in text_lines(joined):
         key, *rest = line.split(None, 1)
@@ -262,18 +264,20 @@ def obj(content: bytes) -> Parsed:
         elif key == b"f":
             faces += rest or [b""]
             before.append(len(points))
-    values = rows(points, "vertex", place=placed(joined, key=b"v"))
+    values = rows(points, "vertex", place=line_numbers(joined, key=b"v"))
     if values.size and values.shape[1] not in (3, 4, 6, 7):
-        raise ValueError(f"wanted 3 coordinates, and perhaps 3 colours, got the line v {_shown(points[0])}")
+        raise ValueError(
+            f"expected 3 coordinates, and perhaps 3 colours, got the line v {_excerpt(points[0])}"
+        )
     words = [[word.partition(b"/")[0] for word in line.split()] for line in faces]
     counts = np.array([len(line) for line in words], np.int64)
     if len(counts) and counts.min() < 3:
         raise ValueError(
-            f"wanted a face of at least 3 corners, got the line f {_shown(faces[int(counts.argmin())])}"
+            f"expected a face of at least 3 corners, got the line f {_excerpt(faces[int(counts.argmin())])}"
         )
-    corners = numbers([b" ".join(line) for line in words], np.int64, placed(joined, key=b"f"))
+    corners = numbers([b" ".join(line) for line in words], np.int64, line_numbers(joined, key=b"f"))
     if (corners == 0).any():
-        raise ValueError("a face names vertex 0; wanted numbers from 1, or from -1 backwards")
+        raise ValueError("a face names vertex 0; expected numbers from 1, or from -1 backwards")
     corners = np.where(corners > 0, corners - 1, corners + np.repeat(np.array(before, np.int64), counts))
     vertices, colours = values[:, :3].reshape(-1, 3), values[:, -3:]
     shape = fans(counts, corners)
@@ -282,19 +286,23 @@ def obj(content: bytes) -> Parsed:
 
 def stl(content: bytes) -> Parsed:
     """Parse STL, binary or text, its keywords in capitals or not; every face has corners of its own."""
-    promised = int.from_bytes(content[80:84], "little") if len(content) >= 84 else -1
-    wanted = 84 + 50 * promised
-    if 84 <= wanted <= len(content) and ends_well(content, wanted):
+    announced_faces = int.from_bytes(content[80:84], "little") if len(content) >= 84 else -1
+    announced_bytes = 84 + 50 * announced_faces
+    if 84 <= announced_bytes <= len(content) and has_only_padding(content, announced_bytes):
         record = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("more", "<u2")])
-        table = np.frombuffer(content, record, promised, offset=84)
+        table = np.frombuffer(content, record, announced_faces, offset=84)
         corners = table["corners"].astype(np.float64).reshape(-1, 3)
     elif text.plain(content).lstrip()[:5].lower() == b"solid" and b"\0" not in content:
         corners = _stl_text(content)
     else:
-        rest = len(content) - wanted
-        fault = "it is cut short, or no STL" if promised < 0 or rest < 0 else f"{rest} bytes follow"
+        rest = len(content) - announced_bytes
+        fault = (
+            "the file is cut short, or is no STL file"
+            if announced_faces < 0 or rest < 0
+            else f"{rest} bytes follow"
+        )
         raise ValueError(
-            f"it has {len(content)} bytes and announces {max(promised, 0)} faces, which take {max(wanted, 84)}; {fault}"
+            f"the file has {len(content)} bytes and announces {max(announced_faces, 0)} faces, which take {max(announced_bytes, 84)}; {fault}"
         )
     return Parsed(corners, np.arange(len(corners)).reshape(-1, 3))
 
@@ -308,7 +316,7 @@ def _stl_text(content: bytes) -> Float[np.ndarray, "corners 3"]:
         for key, line in zip(keys, lines, strict=True)
     ]
     chosen = [number for number, key in enumerate(keys) if key == b"vertex"]
-    every = placed(content, b"//")
+    every = line_numbers(content, b"//")
     corners = rows(
         [b" ".join(lines[number][1:]) for number in chosen], "vertex", 3, lambda line: every(chosen[line])
     )
@@ -317,13 +325,13 @@ def _stl_text(content: bytes) -> Float[np.ndarray, "corners 3"]:
     if opened != ended or len(corners) != 3 * opened or solids != closed:
         raise ValueError(
             f"{opened} facets are opened, {ended} ended, with {len(corners)} corners; {solids} solids are opened, "
-            f"{closed} ended; wanted 3 corners a facet, and an end of each; it is cut short"
+            f"{closed} ended; expected 3 corners a facet, and an end of each; the file is cut short"
         )
     return corners
 
 
-def ends_well(content: bytes, end: int) -> bool:
-    """Return whether a binary file has nothing after `end`, except the line end that editors and transfers add."""
+def has_only_padding(content: bytes, end: int) -> bool:
+    """Return whether a binary file has nothing after `end` except blank bytes, which editors and transfers may add."""
     return len(content) - end <= PADDING and not content[end:].strip(b" \t\r\n\x1a")
 
 
@@ -333,7 +341,7 @@ def xyz(content: bytes) -> Parsed:
     The first three numbers are coordinates. A first line of as many names (`x y z red …`, also as a comment) names the
     columns, which may then be in any order; otherwise they are column_4 and so on.
     """
-    plain = _separated(text.plain(content))
+    plain = _blank_separated(text.plain(content))
     if b"//" in plain:
         plain = re.sub(rb"(?:(?<![\d.])//|//(?!\w))[^\r\n]*", _as_comment, plain)
     head = re.split(rb"[\r\n]", plain.lstrip(), maxsplit=1)[0]
@@ -344,16 +352,16 @@ def xyz(content: bytes) -> Parsed:
     named = set(XYZ) <= set(names)
     if named and not head.startswith(b"#"):
         lines, first = lines[1:], 1
-    values = rows(lines, "point", place=placed(plain, first=first))
+    values = rows(lines, "point", place=line_numbers(plain, first=first))
     if len(values) and values.shape[1] < 3:
-        raise ValueError(f"wanted at least 3 numbers for each point, got the line {_shown(lines[0])}")
+        raise ValueError(f"expected at least 3 numbers for each point, got the line {_excerpt(lines[0])}")
     if named and head.startswith(b"#") and names[:3] != XYZ and len(names) != values.shape[1]:
         named = False  # an ordinary comment that contains these words
     if not named:
         return _table(values, None)
     if len(values) and len(names) != values.shape[1]:
         raise ValueError(
-            f"its first line names {len(names)} columns, but each point has {values.shape[1]} numbers"
+            f"the first line names {len(names)} columns, but each point has {values.shape[1]} numbers"
         )
     text.require_distinct(names)
     more = [name for name in names if name not in XYZ]
@@ -363,8 +371,8 @@ def xyz(content: bytes) -> Parsed:
     )
 
 
-def _as_comment(found: re.Match[bytes]) -> bytes:
-    return b"#" + found[0]
+def _as_comment(match: re.Match[bytes]) -> bytes:
+    return b"#" + match[0]
 
 
 DECIMAL_COMMA = re.compile(rb"\d,\d")
@@ -375,7 +383,7 @@ QUOTED_COMMA = re.compile(rb"\"[-+]?\d*,\d")
 NO_NUMBER = re.compile(rb"[,;][ \t]*[,;]")
 
 
-def _separated(content: bytes) -> bytes:
+def _blank_separated(content: bytes) -> bytes:
     """Return a cloud's lines with blanks between the numbers.
 
     Raises:
@@ -409,7 +417,7 @@ def _refuse(content: bytes, wrong: Callable[[bytes], bool], why: str) -> None:
     """Raise for the first line that is wrong, apart from comments."""
     for number, line in enumerate(_lines(content, b"#", ()), 1):
         if not re.match(rb"\s*//", line) and wrong(line):
-            raise ValueError(f"line {number}: {why}, got {_shown(line)}")
+            raise ValueError(f"line {number}: {why}, got {_excerpt(line)}")
 
 
 def npy(content: bytes) -> Parsed:
@@ -419,19 +427,21 @@ def npy(content: bytes) -> Parsed:
 
 def npz(content: bytes) -> Parsed:
     """Parse a NumPy archive: `points`, or the only array; `normals`, `colors` and other named columns; `faces`."""
-    held = arrays.archive(content)
-    require_numbers(sum(array.size for array in held.values()), MOST_NUMBERS, len(content))
-    key = "points" if "points" in held or len(held) != 1 else next(iter(held))
-    if key not in held:
-        raise ValueError(f"wanted an array named points, got {shorten(', '.join(held)) or 'nothing'}")
-    points = _points(held.pop(key))
-    faces = held.pop("faces", np.empty((0, 3), np.int64))
+    stored_arrays = arrays.archive(content)
+    require_numbers(sum(array.size for array in stored_arrays.values()), MOST_NUMBERS, len(content))
+    key = "points" if "points" in stored_arrays or len(stored_arrays) != 1 else next(iter(stored_arrays))
+    if key not in stored_arrays:
+        raise ValueError(
+            f"expected an array named points, got {shorten(', '.join(stored_arrays)) or 'nothing'}"
+        )
+    points = _points(stored_arrays.pop(key))
+    faces = stored_arrays.pop("faces", np.empty((0, 3), np.int64))
     if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu":
-        raise ValueError(f"wanted faces of shape (faces, 3), got {faces.dtype} {faces.shape}")
+        raise ValueError(f"expected faces of shape (faces, 3), got {faces.dtype} {faces.shape}")
     table = _table(points, None)
     columns, parts = list(table.columns), [] if table.attributes is None else [table.attributes]
     groups = {"normals": NORMALS, "colors": COLOURS, "colours": COLOURS}
-    for name, values in held.items():
+    for name, values in stored_arrays.items():
         names = groups.get(name, (name,))
         if values.dtype.kind not in "biuf" or values.shape not in {(len(points), len(names)), (len(points),)}:
             continue  # an array that has no row for each point
@@ -444,7 +454,7 @@ def npz(content: bytes) -> Parsed:
 
 def _points(array: NDArray) -> Float[np.ndarray, "points columns"]:
     if array.dtype.kind not in "iuf" or array.ndim != 2 or array.shape[1] < 3:
-        raise ValueError(f"wanted numbers of shape (points, 3 or more), got {array.dtype} {array.shape}")
+        raise ValueError(f"expected numbers of shape (points, 3 or more), got {array.dtype} {array.shape}")
     return array.astype(np.float64)
 
 
@@ -457,7 +467,7 @@ def _table(values: NDArray, names: tuple[str, ...] | None) -> Parsed:
     return Parsed(vertices, np.empty((0, 3), np.int64), columns, values[:, 3:] if more else None)
 
 
-def _shown(text: bytes) -> str:
+def _excerpt(text: bytes) -> str:
     """Return the beginning of a word or line, for a message."""
     plain = text[:60].decode("utf-8", "replace").strip()
     return repr(plain + ("…" if len(text) > 60 else ""))

@@ -57,27 +57,28 @@ class Mesh:
         missing = [name for name in names if name not in self.columns]
         if missing:
             raise DataError(
-                f"{self.source} has no column {missing[0]!r}.{did_you_mean(missing[0], self.columns)} Its columns "
-                f"beside x, y, z: {shorten(', '.join(self.columns)) or 'none'}. Leave it out, or add it to the file."
+                f"{self.source} has no column {missing[0]!r}.{did_you_mean(missing[0], self.columns)} The "
+                f"columns beside x, y, z are: {shorten(', '.join(self.columns)) or 'none'}. Leave the column out, or add "
+                "it to the file."
             )
         if not names or self.attributes is None:
             return np.empty((len(self.vertices), 0))
-        found = self.attributes[:, [self.columns.index(name) for name in names]]
-        wrong = ~np.isfinite(found)
+        values = self.attributes[:, [self.columns.index(name) for name in names]]
+        wrong = ~np.isfinite(values)
         if wrong.any():
             row, column = (int(numbers[0]) for numbers in np.nonzero(wrong))
             raise DataError(
-                f"{self.source}: point {row} (from 0) has {names[column]} = {found[row, column]}; wanted finite "
-                "numbers. Mend the file, or leave that column out."
+                f"{self.source}: point {row} (from 0) has {names[column]} = {values[row, column]}; expected "
+                "finite numbers. Correct the file, or leave that column out."
             )
         bounded = [number for number, name in enumerate(names) if name in COLOURS]
-        colours = found[:, bounded]
+        colours = values[:, bounded]
         if colours.size and not (colours.min() >= 0 and colours.max() <= 1):
             raise DataError(
-                f"{self.source}: its colours go from {colours.min():g} to {colours.max():g}; wanted 0 to 1. Divide "
-                "them by 255, say."
+                f"{self.source}: the colours go from {colours.min():g} to {colours.max():g}; expected 0 to 1. Divide "
+                "them, for example, by 255."
             )
-        return found
+        return values
 
 
 def read(file: Path, *, drop_non_finite: bool = False) -> Mesh:
@@ -94,43 +95,46 @@ def read(file: Path, *, drop_non_finite: bool = False) -> Mesh:
     """
     parse = READERS.get(file.suffix.lower())
     if parse is None:
-        raise DataError(f"{file}: cannot be read; wanted a file whose name ends in {', '.join(READERS)}.")
-    missing = "wanted a mesh or point cloud. Mend the path."
+        raise DataError(f"{file}: cannot be read; expected a file whose name ends in {', '.join(READERS)}.")
+    missing = "expected a mesh or point cloud. Correct the path."
     with guarded(file, file.suffix[1:].upper(), missing=missing):
-        found = parse(read_bytes(file))
-    if not len(found.vertices):
-        raise DataError(f"{file}: it has no vertices; wanted at least one. Leave it out, or restore it.")
-    _check_faces(file, found)
-    mesh = Mesh(str(file), found.vertices, found.faces, found.columns, found.attributes)
-    return _finite(mesh, drop_non_finite)
+        parsed = parse(read_bytes(file))
+    if not len(parsed.vertices):
+        raise DataError(
+            f"{file}: the file has no vertices; expected at least one. Leave the file out, or copy it again from its "
+            "source."
+        )
+    _check_faces(file, parsed)
+    mesh = Mesh(str(file), parsed.vertices, parsed.faces, parsed.columns, parsed.attributes)
+    return _handle_non_finite(mesh, drop_non_finite)
 
 
-def _check_faces(file: Path, found: Parsed) -> None:
-    wrong = (found.faces < 0) | (found.faces >= len(found.vertices))
+def _check_faces(file: Path, parsed: Parsed) -> None:
+    wrong = (parsed.faces < 0) | (parsed.faces >= len(parsed.vertices))
     if wrong.any():
         row = int(np.flatnonzero(wrong.any(1))[0])
         raise DataError(
-            f"{file}: triangle {row} (from 0) has the corners {found.faces[row].tolist()}, but there are only vertices "
-            f"0 to {len(found.vertices) - 1}. Restore it from its source."
+            f"{file}: triangle {row} (from 0) has the corners {parsed.faces[row].tolist()}, but there are only vertices "
+            f"0 to {len(parsed.vertices) - 1}. Copy the file again from its source."
         )
 
 
-def _finite(mesh: Mesh, drop: bool) -> Mesh:
+def _handle_non_finite(mesh: Mesh, drop: bool) -> Mesh:
     good = np.asarray(np.isfinite(mesh.vertices).all(1))
     if good.all():
         return mesh
     first = int(np.flatnonzero(~good)[0])
     if not drop or not good.any():
         raise DataError(
-            f"{mesh.source}: {int((~good).sum())} of {len(good)} points have a coordinate that is not finite, first "
-            f"point {first} (from 0): {mesh.vertices[first].tolist()}. Mend the file, or leave it out."
+            f"{mesh.source}: {int((~good).sum())} of {len(good)} points have a coordinate that is not finite; the "
+            f"first is point {first} (from 0): {mesh.vertices[first].tolist()}. Correct the file, or leave it out."
         )
-    place = np.cumsum(good) - 1
+    new_index = np.cumsum(good) - 1
     faces = mesh.faces[good[mesh.faces].all(1)]
     return replace(
         mesh,
         vertices=mesh.vertices[good],
-        faces=place[faces],
+        faces=new_index[faces],
         attributes=None if mesh.attributes is None else mesh.attributes[good],
         dropped=int((~good).sum()),
     )
@@ -161,16 +165,16 @@ def sample(mesh: Mesh, count: int, random: np.random.Generator) -> Sampled:
     _, areas = _cross(mesh)  # twice the area, in units² of the longest side
     if not areas.sum() > 0:
         raise DataError(
-            f"{mesh.source}: its {len(areas)} faces have no area; wanted a surface to draw points from. Leave it out, "
-            "or give points instead of a mesh."
+            f"{mesh.source}: the {len(areas)} faces have no area, but points can only be sampled from a surface with an "
+            "area. Leave the mesh out, or give points instead of a mesh."
         )
     cumulative = np.cumsum(areas)
-    drawn = random.random((3, count))
+    uniform_draws = random.random((3, count))
     # `right`: a face without area has no interval; the last face with area also gets the remainder from rounding
-    face = np.searchsorted(cumulative, drawn[0] * cumulative[-1], side="right")
+    face = np.searchsorted(cumulative, uniform_draws[0] * cumulative[-1], side="right")
     face = np.minimum(face, np.flatnonzero(areas)[-1])
-    root = np.sqrt(drawn[1])  # P = (1 - √r₁) A + √r₁ (1 - r₂) B + √r₁ r₂ C (Osada et al. 2002, eq. 1)
-    weights = np.stack([1 - root, root * (1 - drawn[2]), root * drawn[2]], 1)
+    root = np.sqrt(uniform_draws[1])  # P = (1 - √r₁) A + √r₁ (1 - r₂) B + √r₁ r₂ C (Osada et al. 2002, eq. 1)
+    weights = np.stack([1 - root, root * (1 - uniform_draws[2]), root * uniform_draws[2]], 1)
     a, b, c = mesh.vertices[mesh.faces[face].T]
     return Sampled(a + weights[:, 1:2] * (b - a) + weights[:, 2:] * (c - a), face, weights)
 
@@ -188,8 +192,8 @@ def _cross(mesh: Mesh) -> tuple[Float[np.ndarray, "3 faces"], Float[np.ndarray, 
     """
     if not len(mesh.faces):
         raise DataError(
-            f"{mesh.source}: it has no faces; wanted a surface to draw points from. Use it as the point cloud it is, "
-            "or restore its faces."
+            f"{mesh.source}: the mesh has no faces, but points can only be sampled from a surface. Use the mesh as a "
+            "point cloud, or restore the faces."
         )
     a, b, c = (mesh.vertices.T.take(mesh.faces[:, corner], 1) for corner in range(3))
     with np.errstate(over="ignore"):
@@ -197,7 +201,7 @@ def _cross(mesh: Mesh) -> tuple[Float[np.ndarray, "3 faces"], Float[np.ndarray, 
     unit = float(max(abs(first.min()), first.max(), abs(second.min()), second.max()))
     if not np.isfinite(unit):
         raise DataError(
-            f"{mesh.source}: its sides are longer than any number; wanted below 1e300. Choose other units."
+            f"{mesh.source}: the sides of the faces are too long for float64; expected below 1e300. Choose other units."
         )
     if unit > 0:
         first, second = first / unit, second / unit
@@ -207,6 +211,6 @@ def _cross(mesh: Mesh) -> tuple[Float[np.ndarray, "3 faces"], Float[np.ndarray, 
 
 
 def stream(seed: int, name: str) -> np.random.Generator:
-    """Return the random numbers of a file, independent of files read before; `name` is its name without folders."""
+    """Return a generator of random numbers for a file, independent of other files; `name` is its name without folders."""
     digest = hashlib.blake2b(as_bytes(name), digest_size=8).digest()
     return np.random.default_rng([seed, int.from_bytes(digest, "little")])

@@ -17,9 +17,9 @@ from framework.geometry.mesh_files import (
     Parsed,
     Place,
     column_names,
-    ends_well,
     fans,
-    placed,
+    has_only_padding,
+    line_numbers,
     polygons,
     rows,
     text_lines,
@@ -73,22 +73,22 @@ def ply(content: bytes) -> Parsed:
     last = rb"\r" if re.match(rb"ply[ \t]*\r(?!\n)", content) else rb"\r?\n"
     end = re.search(rb"(?:^|[\r\n])end_header[ \t]*" + last, content)
     if not content.startswith(b"ply") or end is None:
-        raise ValueError("wanted ply in its first line and a line end_header")
+        raise ValueError("expected ply in the first line and a line end_header")
     order, elements = _header(content[: end.start()])
     names = {element.name for element in elements}
     if "tristrips" in names:
-        raise ValueError("its faces are strips of triangles; save it with single faces")
+        raise ValueError("the faces are strips of triangles; save the mesh with single faces")
     if "vertex" not in names:
-        raise ValueError(f"wanted an element vertex, got {shorten(', '.join(sorted(names))) or 'none'}")
+        raise ValueError(f"expected an element vertex, got {shorten(', '.join(sorted(names))) or 'none'}")
     body = content[end.end() :]
     for element in elements:
         text.require_distinct(column_names([entry.name for entry in element.properties]), "property")
     if order == "":
         before = len(re.findall(rb"\r\n|\r|\n", content[: end.end()]))
-        vertices, faces = _text(body, elements, placed(body, None), before)
+        vertices, faces = _text(body, elements, line_numbers(body, None), before)
     else:
         vertices, faces = _binary(body, elements, order)
-    return _parsed(next(element for element in elements if element.name == "vertex"), vertices, faces)
+    return _to_parsed(next(element for element in elements if element.name == "vertex"), vertices, faces)
 
 
 def _header(content: bytes) -> tuple[str, list[Element]]:
@@ -97,7 +97,7 @@ def _header(content: bytes) -> tuple[str, list[Element]]:
     # lines of bytes, since lines of text also end at other characters, such as the last byte of Å
     for line in content.splitlines()[1:]:
         if max(len(elements), len(elements[-1].properties) if elements else 0) > MOST_COLUMNS:
-            raise ValueError(f"its header has more than {MOST_COLUMNS} elements, or properties of one")
+            raise ValueError(f"the header has more than {MOST_COLUMNS} elements, or properties of one")
         words = [word.decode("utf-8", "replace") for word in line.split()]
         if not words or words[0] in ("comment", "obj_info"):
             continue
@@ -111,19 +111,21 @@ def _header(content: bytes) -> tuple[str, list[Element]]:
             elif words[0] == "property":
                 last = elements[-1]
                 if words[1] == "list":
-                    found = Property(words[4], TYPES[words[3]], TYPES[words[2]])
-                    if found.length is None or found.length.startswith("f"):
+                    parsed_property = Property(words[4], TYPES[words[3]], TYPES[words[2]])
+                    if parsed_property.length is None or parsed_property.length.startswith("f"):
                         raise ValueError
                 else:
-                    found = Property(words[2], TYPES[words[1]], None)
-                elements[-1] = Element(last.name, last.count, (*last.properties, found))
+                    parsed_property = Property(words[2], TYPES[words[1]], None)
+                elements[-1] = Element(last.name, last.count, (*last.properties, parsed_property))
             else:
                 raise ValueError
         except (KeyError, IndexError, ValueError):
-            told = quote(line.decode("utf-8", "replace").strip())
-            raise ValueError(f"its header has the line {told}, which is not PLY's") from None
+            header_line = quote(line.decode("utf-8", "replace").strip())
+            raise ValueError(
+                f"the header has the line {header_line}, which is no line of a PLY header"
+            ) from None
     if order is None:
-        raise ValueError("its header has no line format")
+        raise ValueError("the header has no line format")
     return order, elements
 
 
@@ -137,23 +139,25 @@ def _text(body: bytes, elements: list[Element], place: Place, before: int) -> tu
         before: number of lines of the header.
     """
     lines = text_lines(body, None)
-    promised = sum(element.count for element in elements if element.properties)
-    if len(lines) != promised:
-        raise ValueError(f"its header announces {promised} lines of data, but {len(lines)} follow")
+    announced_lines = sum(element.count for element in elements if element.properties)
+    if len(lines) != announced_lines:
+        raise ValueError(f"the header announces {announced_lines} lines of data, but {len(lines)} follow")
     vertices, faces = np.empty((0, 3)), np.empty((0, 3), np.int64)
     for element in elements:
-        first = promised - len(lines)
+        first = announced_lines - len(lines)
         own, lines = lines[: element.count], lines[element.count :]
 
         def where(line: int, first: int = first) -> int:
             return before + place(first + line)
 
         if element.name == "vertex":
-            _no_list(element)
+            _refuse_lists(element)
             vertices = rows(own, "vertex", len(element.properties), where) if own else vertices
         elif element.name == "face" and own:
             if not _corners(element) == element.properties[0]:
-                raise ValueError("a text file's faces must begin with their corners; save it as binary")
+                raise ValueError(
+                    "in a text file the faces must begin with their corners; save the file as binary"
+                )
             faces = polygons(own, where)
     return vertices, faces
 
@@ -163,7 +167,7 @@ def _binary(body: bytes, elements: list[Element], order: str) -> tuple[NDArray, 
     start = 0
     for element in elements:
         if element.name == "vertex":
-            _no_list(element)
+            _refuse_lists(element)
             kind = np.dtype([(f"{i}", order + entry.kind) for i, entry in enumerate(element.properties)])
             _require(body, start + element.count * kind.itemsize)
             table = np.frombuffer(body, kind, element.count, start)
@@ -171,10 +175,10 @@ def _binary(body: bytes, elements: list[Element], order: str) -> tuple[NDArray, 
             vertices = np.stack(columns, 1) if columns else vertices
             start += element.count * kind.itemsize
         else:
-            found, start = _lists(body, start, element, order)
-            faces = found if element.name == "face" else faces
-    if start > len(body) or not ends_well(body, start):
-        raise ValueError(f"{len(body) - start} bytes follow what its header announces")
+            triangles, start = _lists(body, start, element, order)
+            faces = triangles if element.name == "face" else faces
+    if start > len(body) or not has_only_padding(body, start):
+        raise ValueError(f"{len(body) - start} bytes follow after the data that the header announces")
     return vertices, faces
 
 
@@ -184,7 +188,7 @@ def _lists(body: bytes, start: int, element: Element, order: str) -> tuple[Int[n
     if element.count == 0 or not element.properties:
         return empty, start
     wanted = _corners(element) if element.name == "face" else None
-    kind = _uniform(
+    kind = _first_record(
         body, start, element, order
     )  # assumes that all items are like the first, as they nearly always are
     if start + element.count * kind.itemsize <= len(body):
@@ -198,7 +202,7 @@ def _lists(body: bytes, start: int, element: Element, order: str) -> tuple[Int[n
             return fans(np.full(len(corners), corners.shape[1]), corners.astype(np.int64).ravel()), end
     least = sum(int((entry.length or entry.kind)[1]) for entry in element.properties)
     _require(body, start + element.count * least)
-    counts, places = _walked(body, start, element, wanted, order)
+    counts, places = _locate_lists(body, start, element, wanted, order)
     end = int(places[-1])
     if wanted is None:
         return empty, end
@@ -209,7 +213,7 @@ def _lists(body: bytes, start: int, element: Element, order: str) -> tuple[Int[n
     return fans(counts, corners.astype(np.int64)), end
 
 
-def _walked(
+def _locate_lists(
     body: bytes, start: int, element: Element, wanted: Property | None, order: str
 ) -> tuple[Int[np.ndarray, "items"], Int[np.ndarray, "places"]]:
     """Return for each item the length of its list `wanted`, and the list's position; the last position is the end."""
@@ -240,7 +244,7 @@ def _walked(
     return counts, places
 
 
-def _uniform(body: bytes, start: int, element: Element, order: str) -> np.dtype:
+def _first_record(body: bytes, start: int, element: Element, order: str) -> np.dtype:
     """Return the record type of the element's first item."""
     fields = []
     for number, entry in enumerate(element.properties):
@@ -262,7 +266,7 @@ def _values(body: bytes, start: int, count: int, kind: str) -> NDArray:
 def _require(body: bytes, end: int) -> None:
     if len(body) < end:
         raise ValueError(
-            f"its header announces at least {end} bytes of data, but {len(body)} follow; it is cut short"
+            f"the header announces at least {end} bytes of data, but {len(body)} follow; the file is cut short"
         )
 
 
@@ -270,21 +274,21 @@ def _corners(element: Element) -> Property:
     for entry in element.properties:
         if entry.name in CORNERS and entry.length is not None:
             return entry
-    raise ValueError(f"its faces have no list {' or '.join(CORNERS)}")
+    raise ValueError(f"the faces have no list {' or '.join(CORNERS)}")
 
 
-def _no_list(element: Element) -> None:
+def _refuse_lists(element: Element) -> None:
     lists = [entry.name for entry in element.properties if entry.length is not None]
     if lists:
-        raise ValueError(f"its vertices have lists ({shorten(', '.join(lists))}); wanted single numbers")
+        raise ValueError(f"the vertices have lists ({shorten(', '.join(lists))}); expected single numbers")
 
 
-def _parsed(vertex: Element, values: NDArray, faces: NDArray) -> Parsed:
+def _to_parsed(vertex: Element, values: NDArray, faces: NDArray) -> Parsed:
     names = column_names([entry.name for entry in vertex.properties])
     missing = [name for name in XYZ if name not in names]
     if missing:
         raise ValueError(
-            f"its vertices have no {', '.join(missing)}, only {shorten(', '.join(names)) or 'nothing'}"
+            f"the vertices have no {', '.join(missing)}, only {shorten(', '.join(names)) or 'nothing'}"
         )
     if not len(values):
         values = np.empty((0, len(names)))

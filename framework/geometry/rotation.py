@@ -35,14 +35,14 @@ def geodesic_distance(
 
 def about_z(angle: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 3 3"]:
     """Return the rotation about the third axis, radians, counter-clockwise seen from its positive end."""
-    cos, sin, zero, one = angle.cos(), angle.sin(), torch.zeros_like(angle), torch.ones_like(angle)
-    rows = torch.stack([cos, -sin, zero, sin, cos, zero, zero, zero, one], -1)
+    cos, sin, zeros, ones = angle.cos(), angle.sin(), torch.zeros_like(angle), torch.ones_like(angle)
+    rows = torch.stack([cos, -sin, zeros, sin, cos, zeros, zeros, zeros, ones], -1)
     return rows.unflatten(-1, (3, 3))
 
 
 def _about_x_elevation(elevation: Tensor) -> Tensor:
     # Rx(e - π/2) with cos(e - π/2) = sin e and sin(e - π/2) = -cos e, exact in any precision.
     cos, sin = elevation.sin(), -elevation.cos()
-    zero, one = torch.zeros_like(cos), torch.ones_like(cos)
-    rows = torch.stack([one, zero, zero, zero, cos, -sin, zero, sin, cos], -1)
+    zeros, ones = torch.zeros_like(cos), torch.ones_like(cos)
+    rows = torch.stack([ones, zeros, zeros, zeros, cos, -sin, zeros, sin, cos], -1)
     return rows.unflatten(-1, (3, 3))

@@ -11,19 +11,19 @@ def linear_from_bytes(stored: UInt8[Tensor, "*any"]) -> Float[Tensor, "*any"]:
 
 
 def linear_from_srgb(numbers: Float[Tensor, "*any"]) -> Float[Tensor, "*any"]:
-    """Return linear RGB in [0, 1] of sRGB numbers in [0, 1]; others are clamped. It is the inverse of `encoded`."""
+    """Return linear RGB in [0, 1] of sRGB numbers in [0, 1]; others are clamped. It is the inverse of `srgb_from_linear`."""
     share = numbers.clamp(0, 1)
     return torch.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
 
 
-def bytes_from_linear(light: Float[Tensor, "*any"]) -> UInt8[Tensor, "*any"]:
+def bytes_from_linear(linear: Float[Tensor, "*any"]) -> UInt8[Tensor, "*any"]:
     """Return 8-bit numbers of linear RGB; values outside of [0, 1] are clamped."""
-    return (srgb_from_linear(light) * 255).round().to(torch.uint8)
+    return (srgb_from_linear(linear) * 255).round().to(torch.uint8)
 
 
-def srgb_from_linear(light: Float[Tensor, "*any"]) -> Float[Tensor, "*any"]:
+def srgb_from_linear(linear: Float[Tensor, "*any"]) -> Float[Tensor, "*any"]:
     """Return sRGB numbers in [0, 1], not rounded; they have a gradient where linear RGB is inside of [0, 1]."""
-    light = light.clamp(0, 1)
+    linear = linear.clamp(0, 1)
     # 1.055 x - 0.055, written so that white is 1 to the bit, since white pixels are recognised by this value
-    curve = 1 + 1.055 * (light.clamp(min=1e-8) ** (1 / 2.4) - 1)
-    return torch.where(light <= 0.0031308, light * 12.92, curve)
+    curve = 1 + 1.055 * (linear.clamp(min=1e-8) ** (1 / 2.4) - 1)
+    return torch.where(linear <= 0.0031308, linear * 12.92, curve)

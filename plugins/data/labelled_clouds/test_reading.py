@@ -47,7 +47,7 @@ def test_a_surface_is_sampled_and_a_cloud_stays_unchanged(folder):
     rows = [np.flatnonzero((own == point).all(1)).item() for point in fewer]
     assert len(rows) == 20
     assert rows == sorted(set(rows))
-    with pytest.raises(DataError, match="it has no faces"):
+    with pytest.raises(DataError, match="the mesh has no faces"):
         read_cloud(folder / "own.npy", Reading(20, surface=True))
     with pytest.raises(DataError, match="no column 'normal_x'"):
         read_cloud(folder / "own.npy", Reading(20, NORMALS))

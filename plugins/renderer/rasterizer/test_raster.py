@@ -653,7 +653,7 @@ def test_a_lens_that_is_not_two_numbers_is_refused(lens, name, learned, road):
     if learned:
         scene = replace(scene, vertices=scene.vertices.clone().requires_grad_())
     object.__setattr__(scene.camera, name, LENSES[lens])  # past the type checks that only tests have
-    with pytest.raises(ValueError, match=rf"camera\.{name} came with .*; wanted the shape \(2,\)"):
+    with pytest.raises(ValueError, match=rf"camera\.{name} has .*; expected the shape \(2,\)"):
         road(Rasterizer(gradient="interior", supersampling=2), scene, ("color", "mask"))
 
 
@@ -668,10 +668,10 @@ def test_a_lens_that_is_not_two_numbers_is_refused(lens, name, learned, road):
         ({"translation": torch.tensor([0.0, math.inf, 0.0])}, "not finite"),
         ({"rotation": torch.eye(3, device="meta")}, "camera.rotation came on meta"),
         ({"focal": torch.ones(2, device="meta")}, "camera.focal came on meta"),
-        ({"rotation": torch.eye(4)}, "camera.rotation came with the shape (4, 4); wanted the shape (3, 3)"),
+        ({"rotation": torch.eye(4)}, "camera.rotation has the shape (4, 4); expected the shape (3, 3)"),
         (
             {"translation": torch.ones(1)},
-            "camera.translation came with the shape (1,); wanted the shape (3,)",
+            "camera.translation has the shape (1,); expected the shape (3,)",
         ),
     ],
 )

@@ -158,7 +158,7 @@ def test_what_it_cannot_draw_is_refused(encoders, tmp_path):
         for lens in (8.0, (8.0,), (8.0, 8.0, 8.0), torch.tensor([8.0]), torch.tensor(8.0), torch.ones(2, 1)):
             camera = seen_from(SIZE)
             object.__setattr__(camera, name, lens)  # past the type checks that only tests have
-            with pytest.raises(ValueError, match=rf"camera\.{name} came with .*; wanted the shape \(2,\)"):
+            with pytest.raises(ValueError, match=rf"camera\.{name} has .*; expected the shape \(2,\)"):
                 drawn(replace(scene, camera=camera))
     if encoders[0]["name"] == "rasterised":
         with pytest.raises(ValueError, match="topology"):
