@@ -89,7 +89,7 @@ class Camera:
         return torch.cat([across / focal.new_tensor(plain.focal), depth], -1)
 
     def _in_camera_frame(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return camera coordinates of world points, and focal lengths and principal point as tensors of the same type."""
+        """Return camera coordinates of world points, and focal lengths and principal point as tensors of that type."""
         self.check_shapes()
         if not points.is_floating_point():  # as integers a rotation would have only the entries -1, 0 and 1
             points = points.to(torch.get_default_dtype())

@@ -45,8 +45,8 @@ def require_clouds(input_shape: tuple[int, ...], by: str) -> None:
     """
     if len(input_shape) != 2 or input_shape[1] < 3:
         raise ConfigError(
-            f"{by} got inputs of shape {input_shape}, but it reads clouds, (points, columns), with x, y, z in the first "
-            "three columns. Choose data of point clouds, or another encoder."
+            f"{by} got inputs of shape {input_shape}, but it reads clouds, (points, columns), with x, y, z in the "
+            "first three columns. Choose data of point clouds, or another encoder."
         )
 
 
@@ -59,8 +59,9 @@ def sizes(clouds: Tensor) -> Int[Tensor, "batch"]:
     """
     if clouds.dim() != 3 or clouds.shape[2] < 3 or clouds.dtype not in (torch.float32, torch.float64):
         raise DataError(
-            f"Got a batch of clouds of shape {tuple(clouds.shape)} and type {clouds.dtype}; expected (batch, points, "
-            "columns) of float32 or float64 with x, y, z in the first three columns. Check the batches of `data`."
+            f"Got a batch of clouds of shape {tuple(clouds.shape)} and type {clouds.dtype}; expected (batch, "
+            "points, columns) of float32 or float64 with x, y, z in the first three columns. Check the batches of "
+            "`data`."
         )
     count, points, _ = clouds.shape
     # a finite sum has only finite summands, so that one pass suffices for clouds without padding
@@ -81,14 +82,14 @@ def sizes(clouds: Tensor) -> Int[Tensor, "batch"]:
         column = int((~clouds[cloud, point].isfinite()).nonzero()[0])
         raise DataError(
             f"Cloud {cloud} of the batch holds {clouds[cloud, point, column].item()} in column {column} of point "
-            f"{point}; expected finite numbers, and rows of NaN only as padding at the end. Correct the file, or remove "
-            "such points."
+            f"{point}; expected finite numbers, and rows of NaN only as padding at the end. Correct the file, or "
+            "remove such points."
         )
     return counts
 
 
 def point_mask(clouds: Tensor, sizes: Tensor | None) -> Bool[Tensor, "batch points"]:
-    """Return a mask of the rows of clouds that hold points, (batch, points): the first `sizes` rows; all rows if None."""
+    """Return a mask of the rows that hold points, (batch, points): the first `sizes` rows of each cloud; None: all."""
     if sizes is None:
         return clouds.new_ones(clouds.shape[:2], dtype=torch.bool)
     return torch.arange(clouds.shape[1], device=clouds.device) < sizes.to(clouds.device)[:, None]
@@ -199,7 +200,7 @@ def _composed(clouds: Tensor, how: Normalisation, counts: Tensor) -> NormalisedC
 def near_middle(
     offset: Float[Tensor, "batch points 3"], real: Bool[Tensor, "batch points 1"] | None
 ) -> Bool[Tensor, "batch points 1"]:
-    """Return a mask of the points within `REACH` median distances of the medians of the coordinates: no far outliers."""
+    """Return a mask of the points within `REACH` median distances of the medians of the coordinates."""
     known = offset if real is None else offset.where(real, math.nan)
     distance = torch.linalg.vector_norm(known - known.nanmedian(1, keepdim=True).values, dim=-1, keepdim=True)
     typical = distance.nanmedian(1, keepdim=True).values

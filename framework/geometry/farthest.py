@@ -10,7 +10,7 @@ from torch import Tensor
 def farthest(
     positions: Float[Tensor, "batch points 3"], counts: Int[Tensor, "batch"], count: int
 ) -> Int[Tensor, "batch count"]:
-    """Return indices of points of each cloud: each as far as possible from all before it, the first from the mean.
+    """Return indices of points of each cloud: each as far as possible from those before, the first from the mean.
 
     Of equally far points the first is chosen. No point is chosen twice before all were chosen; then the sequence repeats.
     So every order of a cloud's points gives the same positions, unless distances are equal, and a smaller `count` gives

@@ -1,7 +1,7 @@
 """Parsers of mesh and cloud files, one function for each format; they never make up what a file does not hold.
 
-Every parser takes the bytes of a file. It raises a ValueError that says what it got, in which line, and what it expected;
-the caller, `geometry.meshes`, names the file. PLY has a module of its own. Comments are skipped, and line ends may be
+Every parser takes the bytes of a file. It raises a ValueError that says what it got, in which line, and what it
+expected; the caller, `geometry.meshes`, names the file. PLY has a module of its own. Comments are skipped, and line ends may be
 those of any system. Polygons are cut into fans of triangles (correct for convex ones).
 """
 
@@ -155,7 +155,7 @@ def rows(
     if len(values) != columns * len(lines) or any(len(line.split()) != columns for line in lines):
         number, line = next((n, line) for n, line in enumerate(lines) if len(line.split()) != columns)
         raise ValueError(
-            f"{_at(number, place)}wanted {columns} numbers for each {row_name}, got the line {_excerpt(line)}"
+            f"{_at(number, place)}expected {columns} numbers for each {row_name}, got the line {_excerpt(line)}"
         )
     return values.reshape(len(lines), columns)
 
@@ -302,7 +302,8 @@ def stl(content: bytes) -> Parsed:
             else f"{rest} bytes follow"
         )
         raise ValueError(
-            f"the file has {len(content)} bytes and announces {max(announced_faces, 0)} faces, which take {max(announced_bytes, 84)}; {fault}"
+            f"the file has {len(content)} bytes and announces {max(announced_faces, 0)} faces, which take "
+            f"{max(announced_bytes, 84)}; {fault}"
         )
     return Parsed(corners, np.arange(len(corners)).reshape(-1, 3))
 
@@ -460,7 +461,7 @@ def _points(array: NDArray) -> Float[np.ndarray, "points columns"]:
 
 def _table(values: NDArray, names: tuple[str, ...] | None) -> Parsed:
     if values.shape[1] > MOST_COLUMNS:
-        raise ValueError(f"each point has {values.shape[1]} numbers; wanted at most {MOST_COLUMNS}")
+        raise ValueError(f"each point has {values.shape[1]} numbers; expected at most {MOST_COLUMNS}")
     more = max(values.shape[1] - 3, 0)
     columns = names or tuple(f"column_{number}" for number in range(4, 4 + more))
     vertices = values[:, :3].reshape(-1, 3)

@@ -58,8 +58,8 @@ class Mesh:
         if missing:
             raise DataError(
                 f"{self.source} has no column {missing[0]!r}.{did_you_mean(missing[0], self.columns)} The "
-                f"columns beside x, y, z are: {shorten(', '.join(self.columns)) or 'none'}. Leave the column out, or add "
-                "it to the file."
+                f"columns beside x, y, z are: {shorten(', '.join(self.columns)) or 'none'}. Leave the column out, or "
+                "add it to the file."
             )
         if not names or self.attributes is None:
             return np.empty((len(self.vertices), 0))
@@ -101,8 +101,8 @@ def read(file: Path, *, drop_non_finite: bool = False) -> Mesh:
         parsed = parse(read_bytes(file))
     if not len(parsed.vertices):
         raise DataError(
-            f"{file}: the file has no vertices; expected at least one. Leave the file out, or copy it again from its "
-            "source."
+            f"{file}: the file has no vertices; expected at least one. Leave the file out, or copy it again from "
+            "its source."
         )
     _check_faces(file, parsed)
     mesh = Mesh(str(file), parsed.vertices, parsed.faces, parsed.columns, parsed.attributes)
@@ -165,8 +165,8 @@ def sample(mesh: Mesh, count: int, random: np.random.Generator) -> Sampled:
     _, areas = _cross(mesh)  # twice the area, in units² of the longest side
     if not areas.sum() > 0:
         raise DataError(
-            f"{mesh.source}: the {len(areas)} faces have no area, but points can only be sampled from a surface with an "
-            "area. Leave the mesh out, or give points instead of a mesh."
+            f"{mesh.source}: the {len(areas)} faces have no area, but points can only be sampled from a surface with "
+            "an area. Leave the mesh out, or give points instead of a mesh."
         )
     cumulative = np.cumsum(areas)
     uniform_draws = random.random((3, count))
@@ -211,6 +211,9 @@ def _cross(mesh: Mesh) -> tuple[Float[np.ndarray, "3 faces"], Float[np.ndarray, 
 
 
 def stream(seed: int, name: str) -> np.random.Generator:
-    """Return a generator of random numbers for a file, independent of other files; `name` is its name without folders."""
+    """Return a generator of random numbers for a file; `name` is the name of the file without folders.
+
+    The numbers do not depend on the files that were read before.
+    """
     digest = hashlib.blake2b(as_bytes(name), digest_size=8).digest()
     return np.random.default_rng([seed, int.from_bytes(digest, "little")])

@@ -11,7 +11,10 @@ def linear_from_bytes(stored: UInt8[Tensor, "*any"]) -> Float[Tensor, "*any"]:
 
 
 def linear_from_srgb(numbers: Float[Tensor, "*any"]) -> Float[Tensor, "*any"]:
-    """Return linear RGB in [0, 1] of sRGB numbers in [0, 1]; others are clamped. It is the inverse of `srgb_from_linear`."""
+    """Return linear RGB in [0, 1] of sRGB numbers; numbers outside of [0, 1] are clamped.
+
+    The function is the inverse of `srgb_from_linear`.
+    """
     share = numbers.clamp(0, 1)
     return torch.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
 

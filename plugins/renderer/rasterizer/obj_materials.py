@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 
 from framework.errors import DataError, quote
 from framework.geometry import mesh_files
-from framework.geometry.mesh_files import continued, placed, text_lines
+from framework.geometry.mesh_files import join_continued_lines, line_numbers, text_lines
 from framework.renderer import Wrap
 from framework.storage.limits import MOST_MATERIALS
 from framework.storage.reading import guarded, read_bytes
@@ -129,7 +129,7 @@ def _texture_of(material: Material, notes: list[str]) -> Path | None:
 def _corners(content: bytes) -> Corners:
     points, words, counts, before, materials, libraries = [], [], [], [], [], []
     material = ""
-    content = continued(content)
+    content = join_continued_lines(content)
     for line in text_lines(content, names=NAMES):
         key, said = _statement(line)
         rest = said.split()
@@ -144,7 +144,7 @@ def _corners(content: bytes) -> Corners:
             material = fsdecode(said)
         elif key == b"mtllib":
             libraries.append(fsdecode(said))
-    uv = mesh_files.rows(points, "place in a texture", 2, placed(content, names=NAMES, key=b"vt"))
+    uv = mesh_files.rows(points, "place in a texture", 2, line_numbers(content, names=NAMES, key=b"vt"))
     places = mesh_files.numbers(words, np.int64)
     sizes = np.array(counts, np.int64)
     places = np.where(places < 0, places + np.repeat(np.array(before, np.int64), sizes), places - 1)
@@ -176,7 +176,9 @@ def _materials(library: Path) -> dict[str, Material]:
             if key == b"newmtl":
                 current = found.setdefault(fsdecode(said), Material())
             elif key == b"Kd":
-                color = mesh_files.rows([said], "colour Kd", 3, placed(content, names=NAMES, first=number))[0]
+                color = mesh_files.rows(
+                    [said], "colour Kd", 3, line_numbers(content, names=NAMES, first=number)
+                )[0]
                 if not np.isfinite(color).all():
                     raise ValueError(
                         f"its colour Kd is {color.tolist()}; wanted three finite numbers from 0 to 1"
