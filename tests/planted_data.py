@@ -428,8 +428,8 @@ def by_numpy(data: Waves, batch: Batch) -> Batch:
 
 BITS, FETCH, OWNED, DIFFER = (
     "same data, same bits",
-    "one by one or at once",
-    "a batch is nobody else's",
+    "batches equal single samples",
+    "batches share no memory",
     "samples differ",
 )
 ALL_FAULTS = (

@@ -279,12 +279,12 @@ def branching(encoder: Any, inputs: Tensor) -> Tensor:
 
 
 APART, WEIGHTS, BITS, ROUND = (
-    "rows of a batch apart",
+    "batch rows are independent",
     "gradient in weights",
     "same seed, same bits",
     "state-dict round trip",
 )
-COUNTS, CLAIMS = "all of an image counts", "what it says of itself"
+COUNTS, CLAIMS = "every part of an image is read", "fixed and vectorises are true"
 ALL_FAULTS = (
     Fault("chunks of long batches backwards", APART, changes={"forward": chunks_backwards}),
     Fault("a hundred rows at most", APART, changes={"forward": a_hundred_at_most}),

@@ -129,7 +129,7 @@ ALL_FAULTS = (
                 lambda r: bool((r.abs() > 1e15).any()) and bool(r.isfinite().all()), "too large"
             )
         },
-        "finite for any raw numbers",
+        "finite for any raw parameters",
     ),
     Fault("depends on its neighbours in the batch", ONE, {"forward": wrong.batch_wide}),
     Fault("float64 becomes float32", ONE, {"log_prob": lambda d, v: d.log_prob(v).float()}),
@@ -181,9 +181,9 @@ ALL_FAULTS = (
         "another density as a component",
         ONE,
         {"forward": wrong.doubled_when_stacked},
-        "mixture of one is the component",
+        "mixture of one equals the component",
     ),
-    Fault("knobs descend", ONE, {"knobs": lambda: {"samples": (3, 1)}}, "knobs turn"),
+    Fault("knobs descend", ONE, {"knobs": lambda: {"samples": (3, 1)}}, "knobs can be set"),
     Fault(
         "arc of the density at half κ",
         ONE,
@@ -203,7 +203,12 @@ ALL_FAULTS = (
         "float32 against float64",
         NO_CASES,
     ),
-    Fault("four rows know each other", ONE, {"forward": wrong.four_know_each_other}, "rows of a batch apart"),
+    Fault(
+        "four rows know each other",
+        ONE,
+        {"forward": wrong.four_know_each_other},
+        "batch rows are independent",
+    ),
     Fault(
         "loss counts predictions",
         ONE,

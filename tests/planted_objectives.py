@@ -139,18 +139,18 @@ class Fault:
 
 ALL_FAULTS = (
     Fault("a sum over samples", Summed, CLASSES, "a mean over samples"),
-    Fault("a mean over members too", MeanOfMembers, CLASSES, "members train as if alone"),
-    Fault("the worst member stands for all", OfTheSurest, CLASSES, "members that differ"),
+    Fault("a mean over members too", MeanOfMembers, CLASSES, "equal members train like one model"),
+    Fault("the worst member stands for all", OfTheSurest, CLASSES, "different members train separately"),
     Fault("the first 64 of a batch", FirstSixtyFour, CLASSES, "every sample counts"),
     Fault("the last ones of a batch are left out", DropsTheLast, PLACE, "every sample counts"),
     Fault("logs with the graph", TellsTheGraph, CLASSES, "terms to be logged"),
     Fault("logs every sample", TellsEach, PLACE, "terms to be logged"),
-    Fault("seeds the generator", Seeds, CLASSES, "random numbers of others"),
+    Fault("seeds the generator", Seeds, CLASSES, "later random numbers follow the seed"),
     Fault("NaN is 0", HidesNaN, PLACE, "NaN is not hidden"),
     Fault("half of the gradient is detached", Detached, PLACE, "gradient"),
     Fault("never above 10", Clamped, PLACE, "weight is a factor"),
     Fault("less what it has seen", Moving, CLASSES, "same seed, same bits"),
-    Fault("leaves the evaluation mode", Evaluates, CLASSES, "leaves no trace"),
+    Fault("leaves the evaluation mode", Evaluates, CLASSES, "no side effects"),
     Fault("weighs by place", Neighbours, CLASSES, "order does not matter"),
 )
 

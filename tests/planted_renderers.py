@@ -60,19 +60,19 @@ class Discs(Renderer):
 
 
 ALL = (
-    "only the channels asked for",
-    "what it cannot draw is refused",
+    "only the requested channels",
+    "scenes that cannot be drawn are refused",
     "same scene, same bits",
-    "nothing seen is background",
-    "no faces, nothing seen",
+    "empty view is background",
+    "no faces, only background",
     "bad triangles are left out",
     "lower face wins",
     "no holes",
     "nearer hides farther",
     "sphere: depth, metres",
     "one pixel, one row",
-    "where the camera says",
-    "what the near plane cuts",
+    "drawn at the projected pixel",
+    "faces cut by the near plane",
     "extreme scenes",
     "colours",
     "visible faces",
@@ -87,7 +87,7 @@ ALL = (
     "gradient in colours",
 )
 OF_POINTS: Mapping[str, str] = dict.fromkeys(
-    ("no faces, nothing seen", "bad triangles are left out"), "it draws vertices, of a set of points too"
+    ("no faces, only background", "bad triangles are left out"), "it draws vertices, of a set of points too"
 )
 RIGHT: dict[str, tuple[Callable[[], Renderer], Mapping[str, str]]] = {
     "discs": (Discs, OF_POINTS),

@@ -30,14 +30,14 @@ def test_torchs_von_mises_fails_and_the_table_says_where(framework: Framework) -
     }
     expected = {
         "NaN and infinity refused",
-        "finite for any raw numbers",
+        "finite for any raw parameters",
         "float32 against float64",
         "entropy",
     }
     assert expected <= failed
     findings = (done.folder / "check.csv").read_text(encoding="utf-8")
     # its sampler hangs at large concentrations
-    assert "finite for any raw numbers,TooSlow: did not end within 20 s" in findings
+    assert "finite for any raw parameters,TooSlow: did not end within 20 s" in findings
     assert "Traceback" not in done.out
 
 
@@ -46,10 +46,10 @@ def test_a_wrapper_that_mixes_densities_passes_and_one_that_averages_parameters_
 ) -> None:
     done = framework("mode=check", "uncertainty=[committee]")
     assert done.code == 0, done.out
-    assert "one member is the member" in done.out
+    assert "one member equals the model" in done.out
     done = framework("mode=check", "uncertainty=[averaged_committee]")
     assert done.code == 1, done.out
-    assert "averaged_committee: one member is the member" in done.out
+    assert "averaged_committee: one member equals the model" in done.out
 
 
 def test_a_strangers_renderer_passes_by_name(framework: Framework) -> None:
@@ -59,7 +59,7 @@ def test_a_strangers_renderer_passes_by_name(framework: Framework) -> None:
     for name in (
         "no holes",
         "sphere: depth",
-        "what the near plane cuts",
+        "faces cut by the near plane",
         "uv",
         "textures are drawn or refused",
     ):

@@ -96,8 +96,8 @@ def test_a_sound_encoder_passes():
         (Leaking, "gradients of padding"),
         (Silent, "bad clouds are named"),
         (Vague, "bad clouds are named"),
-        (Greedy, "what is no cloud is refused"),
-        (Curt, "what is no cloud is refused"),
+        (Greedy, "inputs that are not clouds are refused"),
+        (Curt, "inputs that are not clouds are refused"),
     ],
 )
 def test_an_unsound_encoder_is_caught(kind, caught):

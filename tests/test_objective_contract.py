@@ -149,11 +149,11 @@ def test_a_sound_objective_passes():
 @pytest.mark.parametrize(
     "kind, caught",
     [
-        (Averaging, "members train as if alone"),
-        (Learning, "leaves no trace"),
-        (Switching, "leaves no trace"),
-        (Backward, "leaves no trace"),
-        (Marking, "leaves no trace"),
+        (Averaging, "equal members train like one model"),
+        (Learning, "no side effects"),
+        (Switching, "no side effects"),
+        (Backward, "no side effects"),
+        (Marking, "no side effects"),
         (Squared, "weight is a factor"),
         (Detached, "a finite scalar"),
         (Halved, "gradient"),
@@ -161,7 +161,7 @@ def test_a_sound_objective_passes():
         (Unseeded, "same seed, same bits"),
         (Ordered, "order does not matter"),
         (Narrow, "number types"),
-        (Overflowing, "extreme raw numbers"),
+        (Overflowing, "extreme raw parameters"),
     ],
 )
 def test_an_unsound_objective_is_caught(kind, caught):
@@ -172,4 +172,4 @@ def test_an_unsound_objective_is_caught(kind, caught):
 def test_what_a_row_leaves_out_is_not_examined():
     row = ObjectiveRow("reals", ROW.target, leave_out={"gradient": "it has none"})
     names = [finding.name for finding in examine_objective(row, Spread)]
-    assert "gradient" not in names and "leaves no trace" in names
+    assert "gradient" not in names and "no side effects" in names

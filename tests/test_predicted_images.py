@@ -117,7 +117,7 @@ def test_the_contract_finds_metrics_that_name_other_images_than_they_read() -> N
     for told in (CHANNELS, {"color"}, {"depth"}, {"color", "depth"}):
         metric = Reads("color", "mask", told=frozenset(told))
         failed = [finding.name for finding in examine_metric(row, metric.clone) if not finding.holds]  # type: ignore[arg-type]
-        assert failed == ["only the images it names"], told
+        assert failed == ["only the images in reads are drawn"], told
     for metric in (
         Reads("color", "mask"),
         Reads("color", splits=("test", "outliers")),

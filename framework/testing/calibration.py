@@ -41,8 +41,8 @@ class Calibration:
     def checks(self) -> Iterator[tuple[str, float, Callable[[Worst], None]]]:
         """Yield name, limit and function of each check."""
         yield "calibration does not harm", 4.0, self.no_harm
-        yield "fits on all it is given", 0.05, self.use_of_all_rows
-        yield "what is wrapped is calibrated first", 0.0, self.wrapped_first
+        yield "calibration uses every row", 0.05, self.use_of_all_rows
+        yield "wrapped models are calibrated first", 0.0, self.wrapped_first
 
     @cached_property
     def target(self) -> Target:

@@ -65,10 +65,10 @@ def examine_data(row: DataRow, build: Build) -> Iterator[Finding]:
             "no sample in two splits": (0.0, _disjoint),
             "targets go with inputs": (0.0, lambda bench, worst: check_targets_belong(bench.data, worst)),
             "same data, same bits": (0.0, _repeatable),
-            "one by one or at once": (0.0, _fetching),
-            "a batch is nobody else's": (0.0, _owned),
+            "batches equal single samples": (0.0, _fetching),
+            "batches share no memory": (0.0, _owned),
             "fingerprint": (0.0, _fingerprint),
-            "synthetic is said": (0.0, _synthetic),
+            "synthetic is stated": (0.0, _synthetic),
             "pictures": (0.0, _pictures),
             "on the device of its inputs": (0.0, _on_one_device),
             "augment": (0.0, _augment),
@@ -103,7 +103,7 @@ def _applies(name: str, bench: Workbench) -> bool:
         case "images are 0 to 1":
             shape = getattr(bench.data, "input_shape", ())
             return len(shape) == 3 and shape[0] in (1, 3)
-        case "synthetic is said":
+        case "synthetic is stated":
             return row.synthetic is not None
         case "official layout read back":
             return bench.generated is not None

@@ -147,7 +147,7 @@ def _examine_protocol(subject: HeadSubject, draws: bool) -> Iterator[Finding]:
         ("marginals", 1.0, rows, check_marginals, few and not draws),
         ("tempered: power", 1.0, rows, check_powers, not draws),
         ("mixture: estimate", 1.0, mixture, check_estimate, not draws),
-        ("mixture: slope", 1.0, mixture, check_quadratic_bound, is_scalar and not draws),
+        ("mixture: quadratic_bound", 1.0, mixture, check_quadratic_bound, is_scalar and not draws),
     ]
     for name in MIXTURE_PROPERTIES:
         limit, check = next((limit, check) for known, limit, check, _ in CHECKS if known == name)

@@ -58,10 +58,10 @@ def examine_encoder(row: EncoderRow, build: Callable[[tuple[int, ...]], Encoder]
         "feature shapes": (0.0, lambda worst: _shapes(make, inputs, worst)),
         "number types": (0.0, lambda worst: _number_types(make, inputs, worst)),
         "same seed, same bits": (0.0, lambda worst: _repeatable(make, inputs, worst)),
-        "rows of a batch apart": (1e-4, lambda worst: _rows_apart(make, inputs, worst, slow=slow())),
+        "batch rows are independent": (1e-4, lambda worst: _rows_apart(make, inputs, worst, slow=slow())),
         "state-dict round trip": (0.0, lambda worst: _round_trip(make, inputs, worst)),
         "inputs are left as they are": (0.0, lambda worst: _untouched(make, inputs, worst)),
-        "what it says of itself": (1e-4, lambda worst: _claims(make, inputs, worst)),
+        "fixed and vectorises are true": (1e-4, lambda worst: _claims(make, inputs, worst)),
         "gradients reach every parameter": (0.0, lambda worst: _gradients(make, inputs, worst)),
         "gradient": (1e-4, lambda worst: _against_differences(make, inputs, worst)),
         "gradient in weights": (
@@ -72,7 +72,7 @@ def examine_encoder(row: EncoderRow, build: Callable[[tuple[int, ...]], Encoder]
     }
     if len(row.input_shape) == 3:
         checks["bytes are read as 0 to 1"] = (1e-5, lambda worst: _bytes(make, row, worst))
-        checks["all of an image counts"] = (
+        checks["every part of an image is read"] = (
             0.0,
             lambda worst: _every_part(make, inputs(4 if slow() else 16), worst),
         )
@@ -83,7 +83,7 @@ def examine_encoder(row: EncoderRow, build: Callable[[tuple[int, ...]], Encoder]
             "points in any order": (1e-5, lambda worst: any_order(make, clouds, worst)),
             "gradients of padding": (0.0, lambda worst: gradients_of_padding(make, clouds, worst)),
             "bad clouds are named": (0.0, lambda worst: bad_clouds(make, clouds, worst)),
-            "what is no cloud is refused": (0.0, lambda worst: other_shapes(build, worst)),
+            "inputs that are not clouds are refused": (0.0, lambda worst: other_shapes(build, worst)),
         }
     for name, (limit, check) in checks.items():
         if name not in row.leave_out:

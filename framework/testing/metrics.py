@@ -158,7 +158,7 @@ def examine_metric(row: MetricRow, build: Make) -> Iterator[Finding]:
     checks: dict[str, tuple[float, Callable[[Worst], None]]] = {
         "on the device of its inputs": (0.0, lambda worst: _on_one_device(build, whole, worst)),
         "named numbers": (0.0, lambda worst: _named(build, whole, worst)),
-        "nothing seen is NaN": (0.0, lambda worst: _nothing(build, whole, worst)),
+        "NaN without samples": (0.0, lambda worst: _nothing(build, whole, worst)),
         "batches do not matter": (1e-9, lambda worst: _batches(build, whole, many, worst)),
         "order does not matter": (1e-9, lambda worst: _order(build, whole, many, worst)),
         "states merge": (1e-9, lambda worst: _merge(build, whole, worst)),
@@ -174,7 +174,7 @@ def examine_metric(row: MetricRow, build: Make) -> Iterator[Finding]:
         checks["unit"] = (0.0, lambda worst: _unit(build, row, worst))
         checks["NaN is not hidden"] = (0.0, lambda worst: _nan(build, row, worst))
     else:
-        checks["only the images it names"] = (0.0, lambda worst: _images(build, whole, worst))
+        checks["only the images in reads are drawn"] = (0.0, lambda worst: _images(build, whole, worst))
     for name, (limit, check) in checks.items():
         if name not in row.leave_out:
             yield run_check(name, row.limits.get(name, limit), check)

@@ -25,26 +25,26 @@ from framework.testing.scenes import SIZE, camera, empty, sphere, square
 from framework.testing.surface_checks import barycentric, gradient, normal, texture, uv
 
 Make = Callable[[], Renderer]
-OF_TRIANGLES = {"no holes", "sphere: depth, metres", "what the near plane cuts", "extreme scenes"}
-"""Properties that are left out for a renderer of point sets, if its row leaves out "no faces, nothing seen"."""
+OF_TRIANGLES = {"no holes", "sphere: depth, metres", "faces cut by the near plane", "extreme scenes"}
+"""Properties that are left out for a renderer of point sets, if its row leaves out "no faces, only background"."""
 
 
 def examine_renderer(row: RendererRow, build: Make) -> Iterator[Finding]:
     """Yield one finding for each property of a renderer."""
     checks: dict[str, tuple[float, Callable[[Renderer, Worst], None]]] = {
-        "only the channels asked for": (0.0, _channels),
-        "what it cannot draw is refused": (0.0, _refusals),
+        "only the requested channels": (0.0, _channels),
+        "scenes that cannot be drawn are refused": (0.0, _refusals),
         "same scene, same bits": (0.0, _repeatable),
-        "nothing seen is background": (0.0, _background),
-        "no faces, nothing seen": (0.0, _no_faces),
+        "empty view is background": (0.0, _background),
+        "no faces, only background": (0.0, _no_faces),
         "bad triangles are left out": (0.0, _bad_triangles),
         "lower face wins": (0.0, _ties),
         "no holes": (0.0, _no_holes),
         "nearer hides farther": (0.0, _hiding),
         "sphere: depth, metres": (2e-3, _sphere),
         "one pixel, one row": (0.0, _small),
-        "where the camera says": (0.0, _places),
-        "what the near plane cuts": (2e-3, _cut),
+        "drawn at the projected pixel": (0.0, _places),
+        "faces cut by the near plane": (2e-3, _cut),
         "extreme scenes": (0.0, extremes),
         "colours": (2e-3, colors),
         "visible faces": (0.0, visibility),
@@ -62,7 +62,7 @@ def examine_renderer(row: RendererRow, build: Make) -> Iterator[Finding]:
         checks["gradient"] = (0.05, gradient)
         checks["gradient in colours"] = (5e-3, color_gradient)
     left_out = {*row.leave_out}
-    if "no faces, nothing seen" in row.leave_out and draws_points(renderer):
+    if "no faces, only background" in row.leave_out and draws_points(renderer):
         left_out |= OF_TRIANGLES
     for name, (limit, check) in checks.items():
         if name not in left_out:
@@ -99,11 +99,11 @@ def _channels(renderer: Renderer, worst: Worst) -> None:
 
 
 def _refusals(renderer: Renderer, worst: Worst) -> None:
-    scene, first_channel = sphere(), sorted(renderer.channels)[:1]
+    scene, first_channel = sphere(), tuple(sorted(renderer.channels)[:1])
     wrong: dict[str, tuple[Scene, tuple[str, ...]]] = {
         "a channel that does not exist": (scene, ("colour of the wind",)),
-        "faces beyond the vertices": (replace(scene, faces=scene.faces + len(scene.vertices)), tuple(first_channel)),
-        "negative faces": (replace(scene, faces=-scene.faces - 1), tuple(first_channel)),
+        "faces beyond the vertices": (replace(scene, faces=scene.faces + len(scene.vertices)), first_channel),
+        "negative faces": (replace(scene, faces=-scene.faces - 1), first_channel),
     }
     if "color" in renderer.channels:
         wrong["colour of a scene without colours"] = (replace(scene, colors=None), ("color",))

@@ -174,7 +174,7 @@ DAMAGES: tuple[Damage, ...] = ("missing", "empty", "cut", "garbage", "folder")
 
 NEEDS_ROWS: Mapping[str, str] = dict.fromkeys(
     (
-        "synthetic is said",
+        "synthetic is stated",
         "damaged files are named",
         "files left out are counted",
         "own files",

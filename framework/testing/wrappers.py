@@ -100,11 +100,11 @@ def examine_wrapper(
         "densities": (0.0, lambda worst: _densities(make, row, worst)),
         "number types": (0.0, lambda worst: _number_types(make, row, worst)),
         "same seed, same bits": (0.0, lambda worst: _repeatable(make, row, worst)),
-        "rows of a batch apart": (1e-5, lambda worst: _rows_apart(make, row, worst)),
-        "leaves no trace": (0.0, lambda worst: _traces(make, row, worst)),
-        "knobs turn": (0.0, lambda worst: _knobs(make, row, worst)),
+        "batch rows are independent": (1e-5, lambda worst: _rows_apart(make, row, worst)),
+        "no side effects": (0.0, lambda worst: _traces(make, row, worst)),
+        "knobs can be set": (0.0, lambda worst: _knobs(make, row, worst)),
         "loss and its gradient": (0.0, lambda worst: _loss(make, row, worst)),
-        "loss trains all it wraps": (0.0, lambda worst: _trains(make, row, worst)),
+        "loss trains all wrapped models": (0.0, lambda worst: _trains(make, row, worst)),
         "training densities": (1e-5, lambda worst: _training_densities(make, row, worst)),
         "state-dict round trip": (
             0.0,
@@ -126,7 +126,7 @@ def examine_wrapper(
             lambda worst, check=check: _check_densities(calibration.densities, check, worst),
         )
     if build_identity is not None:
-        checks["one member is the member"] = (0.0, lambda worst: _identity(build_identity, row, worst))
+        checks["one member equals the model"] = (0.0, lambda worst: _identity(build_identity, row, worst))
     for name, (limit, check) in checks.items():
         if name not in row.leave_out:
             yield run_check(name, row.limits.get(name, limit), check)

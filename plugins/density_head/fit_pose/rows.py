@@ -14,7 +14,7 @@ ROWS = {
             leave_out={
                 "integral by draws": "the check fits a covariance to its draws; of so many numbers it is further off "
                 "than what it looks for. A product of torch's normals; test_fit_pose.py has its log_prob and entropy",
-                "every raw number counts": "they are an image, of which one pixel alone may move no fit",
+                "every raw parameter is read": "they are an image, of which one pixel alone may move no fit",
                 "target's unit": "poses are radians and metres, in which its renderer draws",
             },
         ),

@@ -1,4 +1,4 @@
-"""Rows of the contract: CVAEs, with their sums written out in NumPy sample by sample."""
+"""Contract-test cases: CVAEs, with log-densities computed sample by sample in NumPy."""
 
 import math
 from collections.abc import Iterator
@@ -23,12 +23,12 @@ SMALL = {"latent": 2, "hidden": 16, "training_samples": 5, "samples": 50}
 
 
 def component(head: CVAEHead | SCVAEHead, number: np.ndarray, value: np.ndarray) -> float:
-    """Return one component's log-density; its own rows check it."""
+    """Return one component's log-density, nats; the contract-test cases of its own head check it."""
     return head.component(torch.from_numpy(number)).log_prob(torch.from_numpy(value)).item()
 
 
-def through(layers: nn.Sequential, numbers: np.ndarray) -> np.ndarray:
-    """Return the output of a network of linear layers and rectifiers for a vector."""
+def apply_layers(layers: nn.Sequential, numbers: np.ndarray) -> np.ndarray:
+    """Return the output of a network of linear layers and rectifiers for one input vector."""
     for layer in layers:
         if isinstance(layer, nn.Linear):
             numbers = layer.weight.detach().numpy() @ numbers + layer.bias.detach().numpy()
@@ -37,17 +37,17 @@ def through(layers: nn.Sequential, numbers: np.ndarray) -> np.ndarray:
     return numbers
 
 
-def decoded(decoder: LatentDecoder, raw: np.ndarray, z: np.ndarray) -> np.ndarray:
+def decode(decoder: LatentDecoder, raw: np.ndarray, z: np.ndarray) -> np.ndarray:
     """Return the component's raw parameters at one z (plugins.density_head.latent.decoder), layer by layer."""
     features, shared, turned = np.split(raw, np.cumsum(decoder.parts)[:2])
     spread = decoder.spread.detach().numpy() + turned.reshape(decoder.spread.shape)
     layer = features + decoder.from_latent.weight.detach().numpy() @ z
-    return through(decoder.body, layer) + shared + spread @ z
+    return apply_layers(decoder.body, layer) + shared + spread @ z
 
 
 def gaussian(layers: nn.Sequential, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean and standard deviation of z."""
-    mean, log_scale = np.split(through(layers, numbers), 2)
+    """Return the mean and the standard deviation of z that a network predicts from `numbers`."""
+    mean, log_scale = np.split(apply_layers(layers, numbers), 2)
     return mean, np.exp(LARGEST_LOG_SCALE * np.tanh(log_scale / LARGEST_LOG_SCALE))
 
 
@@ -59,20 +59,20 @@ def log_weights(
     For a simplified CVAE the noise is z, and the weights are the terms of eq. 3.21.
     """
     if isinstance(head, SCVAEHead):
-        return [component(head, decoded(head.decoder, raw, one), value) for one in noise]
+        return [component(head, decode(head.decoder, raw, point), value) for point in noise]
     for_prior, for_posterior, for_decoder = np.split(raw, [head.hidden, 2 * head.hidden])
     prior = gaussian(head.prior, for_prior)
-    seen = head.from_value.weight.detach().numpy() @ np.concatenate([np.cos(value), np.sin(value)])
-    posterior = gaussian(head.posterior, for_posterior + seen)
-    found = []
-    for one in noise:
-        z = posterior[0] + posterior[1] * one
+    encoded_value = head.from_value.weight.detach().numpy() @ np.concatenate([np.cos(value), np.sin(value)])
+    posterior = gaussian(head.posterior, for_posterior + encoded_value)
+    weights = []
+    for point in noise:
+        z = posterior[0] + posterior[1] * point
         ratio = (stats.norm.logpdf(z, *prior) - stats.norm.logpdf(z, *posterior)).sum()
-        found.append(component(head, decoded(head.decoder, for_decoder, z), value) + ratio)
-    return found
+        weights.append(component(head, decode(head.decoder, for_decoder, z), value) + ratio)
+    return weights
 
 
-def stiff(head: DensityHead) -> Iterator[Case]:
+def hard_cases(head: DensityHead) -> Iterator[Case]:
     """Yield cases with ordinary raw parameters, and hard ones.
 
     For a CVAE hard ones are large: narrow components, a narrow prior, and an encoder far from it. For a simplified CVAE
@@ -100,23 +100,23 @@ def stiff(head: DensityHead) -> Iterator[Case]:
 
 
 BOUND = {
-    "integral": "log_prob is a lower bound, loose with an untrained encoder; test_cvae.py integrates the mixture",
-    "samples follow log_prob": "they follow the mixture, and log_prob is a bound on it",
-    "entropy": "that of the mixture",
-    "mode": "that of the mixture",
-    "median": "that of the mixture",
-    "marginals": "those of the mixture",
+    "integral": "log_prob is a lower bound, loose for an untrained encoder; test_cvae.py integrates the mixture",
+    "samples follow log_prob": "samples follow the mixture, and log_prob is a bound on its log-density",
+    "entropy": "the entropy is that of the mixture",
+    "mode": "the mode is that of the mixture",
+    "median": "the median is that of the mixture",
+    "marginals": "the marginals are those of the mixture",
 }
 ADAPTIVE_BOUND = {
     **BOUND,
-    "float32 against float64": "either may stop a round of samples before the other",
-    "finite for any raw numbers": "slow: most of them take every sample there is; the other rows see them",
+    "float32 against float64": "one precision may stop a round of samples before the other",
+    "finite for any raw parameters": "slow, because most need the largest number of samples; the other cases test this",
 }
 ADAPTIVE = {
-    "float32 against float64": "either may stop a round of samples before the other",
+    "float32 against float64": "one precision may stop a round of samples before the other",
     "samples follow log_prob": "the samples do not depend on the tolerance",
-    "entropy": "that of the mixture",
-    "median": "that of the mixture",
+    "entropy": "the entropy is that of the mixture",
+    "median": "the median is that of the mixture",
 }
 MIXTURES = {**SMALL, "component": {"name": "mixture", "components": 2}}
 OF_CLASSES = {**SMALL, "component": {"name": "categorical"}}
@@ -124,20 +124,20 @@ TOLERANT = {**SMALL, "latent": 1, "tolerance": 0.05}
 
 ROWS = {
     "cvae": (
-        HeadRow("one angle", ONE, SMALL, cases=stiff, leave_out=BOUND),
-        HeadRow("two angles", TWO, SMALL, cases=stiff, leave_out=BOUND),
+        HeadRow("one angle", ONE, SMALL, cases=hard_cases, leave_out=BOUND),
+        HeadRow("two angles", TWO, SMALL, cases=hard_cases, leave_out=BOUND),
         HeadRow("mixtures", ONE, MIXTURES, leave_out=BOUND),
         HeadRow("classes", CLASSES, OF_CLASSES, leave_out=BOUND),
         HeadRow("to 0.05 nats", ONE, TOLERANT, leave_out=ADAPTIVE_BOUND),
     ),
     "scvae": (
-        HeadRow("one angle", ONE, SMALL, cases=stiff),
-        HeadRow("two angles", TWO, SMALL, cases=stiff),
+        HeadRow("one angle", ONE, SMALL, cases=hard_cases),
+        HeadRow("two angles", TWO, SMALL, cases=hard_cases),
         HeadRow(
             "one sample",
             ONE,
             {**SMALL, "samples": 1, "training_samples": 1},
-            cases=stiff,
+            cases=hard_cases,
         ),
         HeadRow("mixtures", ONE, MIXTURES),
         HeadRow("classes", CLASSES, OF_CLASSES),

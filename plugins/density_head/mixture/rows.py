@@ -1,4 +1,4 @@
-"""Rows of the contract: finite mixtures, with log-densities summed in NumPy from the head's parameters."""
+"""Contract-test cases: finite mixtures, with log-densities summed in NumPy from the head's parameters."""
 
 from collections.abc import Iterator
 
@@ -19,21 +19,21 @@ NESTED = {"components": 2, "component": {"name": "mixture", "components": 3}}
 
 
 def component(head: MixtureHead, number: np.ndarray, value: np.ndarray) -> float:
-    """Return one component's log-density; its own rows check it."""
+    """Return one component's log-density, nats; the contract-test cases of its own head check it."""
     return head.component(torch.from_numpy(number)).log_prob(torch.from_numpy(value)).item()
 
 
-def by_hand(head: MixtureHead, raw: np.ndarray, value: np.ndarray) -> float:
-    """Return log Σ_k w_k p_k (eq. 3.10), with the largest term factored out."""
-    count, each = head.components, head.component.size
-    numbers = raw[count : count + count * each].reshape(count, each)
+def expected_log_prob(head: MixtureHead, raw: np.ndarray, value: np.ndarray) -> float:
+    """Return the log-density log Σ_k w_k p_k (eq. 3.10), nats, with the largest term factored out."""
+    count, size = head.components, head.component.size
+    numbers = raw[count : count + count * size].reshape(count, size)
     if count > 1:
-        numbers = numbers + raw[-each:] + head.spread.detach().numpy()
+        numbers = numbers + raw[-size:] + head.spread.detach().numpy()
     terms = [component(head, number, value) for number in numbers]
     return float(np.logaddexp.reduce(np.array(terms) + special.log_softmax(raw[:count])))
 
 
-def stiff(head: DensityHead) -> Iterator[Case]:
+def hard_cases(head: DensityHead) -> Iterator[Case]:
     """Yield cases with ordinary raw parameters, vanishing weights, and components far narrower than their distance."""
     assert isinstance(head, MixtureHead)
     generator = torch.Generator().manual_seed(7)
@@ -45,22 +45,22 @@ def stiff(head: DensityHead) -> Iterator[Case]:
     for name, raw in {"ordinary": ordinary, "weights vanish": lopsided, "narrow": narrow}.items():
         raw, target = raw.double(), value.double()
         rows = zip(raw.numpy(), target.numpy(), strict=True)
-        log_prob = torch.tensor([by_hand(head, *row) for row in rows], dtype=torch.float64)
+        log_prob = torch.tensor([expected_log_prob(head, *row) for row in rows], dtype=torch.float64)
         yield Case(name, raw, target, log_prob)
 
 
 ROWS = {
     "mixture": (
-        HeadRow("five components", ONE, cases=stiff, scale=3.0),
+        HeadRow("five components", ONE, cases=hard_cases, scale=3.0),
         HeadRow(
             "one component",
             ONE,
             {"components": 1},
-            cases=stiff,
+            cases=hard_cases,
             scale=3.0,
-            leave_out={"every raw number counts": "one weight is 1, whatever its logit"},
+            leave_out={"every raw parameter is read": "the only weight is 1 for any logit"},
         ),
-        HeadRow("two angles", TWO, {"components": 3}, cases=stiff),
+        HeadRow("two angles", TWO, {"components": 3}, cases=hard_cases),
         HeadRow("mixture of mixtures", ONE, NESTED),
         HeadRow(
             "rotations",
@@ -68,8 +68,8 @@ ROWS = {
             {"components": 2, "component": {"name": "matrix_fisher"}},
             scale=0.5,
             leave_out={
-                "mode": "matrix_fisher's mode is the likeliest rotation, not the highest point in the angles",
-                "tempered: power": "matrix_fisher raises the density of rotations to it, not the chart's cos e",
+                "mode": "matrix_fisher's mode is the likeliest rotation, not the likeliest angles",
+                "tempered: power": "matrix_fisher raises only the density of rotations to the power, not cos e",
             },
         ),
         HeadRow("classes", CLASSES, {"component": {"name": "categorical"}}),

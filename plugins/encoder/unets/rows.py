@@ -4,7 +4,7 @@ from framework.testing.rows import EncoderRow
 
 UNET = {"width": 6, "levels": 3}
 SLIM = {"widths": [8, 12, 16]}
-LESS_PRECISE = {"rows of a batch apart": 1e-2}  # distance of two neighbouring bfloat16 numbers
+LESS_PRECISE = {"batch rows are independent": 1e-2}  # distance of two neighbouring bfloat16 numbers
 AT_FIRST = {"gradients reach every parameter": "the last layer's weights are 0 until the first step"}
 ROWS = {
     "unet": (

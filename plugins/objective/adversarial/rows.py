@@ -1,4 +1,4 @@
-"""Rows of the contract: adversarial training, for each kind of target."""
+"""Contract-test cases: adversarial training, for each kind of target."""
 
 from framework.target import Target
 from framework.testing.rows import ObjectiveRow
@@ -6,7 +6,7 @@ from framework.testing.rows import ObjectiveRow
 CLASSES = Target("class", ("a", "b", "c"))
 ANGLES = Target("angle", ("azimuth", "elevation"))
 REALS = Target("real", ("x", "y"))
-JOINT = {"members that differ": "x' is where the loss of all members together grows fastest"}
+JOINT = {"different members train separately": "x' follows the gradient of the joint loss of all members"}
 
 ROWS = {
     "adversarial": (

@@ -1,4 +1,4 @@
-"""Rows of the contract: checkpoints with random weights, for points, for splats, and for other image sizes."""
+"""Contract-test cases: checkpoints with random weights, for points, for splats, and for other image sizes."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,12 +23,12 @@ UNET = {"width": 6, "levels": 3}
 SLIM = {"widths": [8, 12, 16]}
 
 
-def seeing(size: tuple[int, int], name: str = "projection", **config: Any) -> dict[str, Any]:
-    """Return the settings of an encoder that projects points to an image of (height, width)."""
+def projection_settings(size: tuple[int, int], name: str = "projection", **config: Any) -> dict[str, Any]:
+    """Return the settings of an encoder that projects points onto an image of `size` (height, width)."""
     return {"name": name, "height": size[0], "width": size[1], **config}
 
 
-def checkpoint(
+def write_checkpoint(
     file: Path,
     encoders: Sequence[dict[str, Any]],
     size: tuple[int, int],
@@ -48,27 +48,29 @@ def checkpoint(
         "outliers": None,
     }
     shape = (points, len(COLUMNS))
-    made = build_predictor(config, target, shape, 0, COLUMNS)
+    predictor = build_predictor(config, target, shape, 0, COLUMNS)
     with torch.no_grad():
-        for parameter in made.parameters():
+        for parameter in predictor.parameters():
             parameter.add_(0.02 * torch.randn_like(parameter))
     described = Description(config, target, shape, COLUMNS, True, data_state=state)
-    weights = {PREFIX + key: value for key, value in made.state_dict().items()}
+    weights = {PREFIX + key: value for key, value in predictor.state_dict().items()}
     checkpoints.write({"framework": described.stored(), "state_dict": weights}, file)
     return str(file)
 
 
 POINTS_ARE_DRAWN = {
-    "no faces, nothing seen": "it draws vertices, of a set of points too",
-    "bad triangles are left out": "it draws vertices: those of a triangle without area too",
-    "points": "drawn weights paint them in any colour",
+    "no faces, only background": "the renderer also draws vertices without faces",
+    "bad triangles are left out": "the renderer draws vertices, including those of a triangle without area",
+    "points": "a network with random weights gives them arbitrary colours",
 }
-WHITE = {"nothing seen is background": 0.05}  # random weights paint an empty image only nearly white
-UNBOUNDED_WHITE = {"nothing seen is background": 0.2}  # less so where no sigmoid keeps the colour near 1
+WHITE = {"empty view is background": 0.05}  # with random weights, an empty image is only nearly white
+UNBOUNDED_WHITE = {
+    "empty view is background": 0.2
+}  # farther from white without a sigmoid that keeps the colour near 1
 SLIM_RUN, SURFACE_RUN, UNET_RUN = (
-    checkpoint(
+    write_checkpoint(
         Path(FOLDER.name) / f"{network['name']}_{size[0]}.ckpt",
-        [seeing(size, **of_points, **NEAR), network],
+        [projection_settings(size, **of_points, **NEAR), network],
         size,
     )
     for network, size, of_points in (
