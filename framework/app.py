@@ -32,11 +32,11 @@ def main() -> None:
     except KeyboardInterrupt:
         _fail("interrupted.", 130)
     except Exception as error:
-        from framework.configuration.composition import sentence
-        from framework.storage.files import unwritable
+        from framework.configuration.composition import describe_error
+        from framework.storage.files import describe_unwritable
 
-        refused = unwritable(error)
-        message = None if full_error == "1" else refused or sentence(error)
+        refused = describe_unwritable(error)
+        message = None if full_error == "1" else refused or describe_error(error)
         if message is None:
             raise
         _fail(message, 1 if refused else 2)

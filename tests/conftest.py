@@ -20,7 +20,7 @@ import yaml
 from _pytest.mark import ParameterSet
 from filelock import FileLock
 
-from framework.configuration.paths import paths_of, words
+from framework.configuration.paths import paths_of, shell_arguments
 from framework.storage.cache import folder as cache_folder
 
 Once = Callable[[str, Callable[[Path], None]], Path]
@@ -219,7 +219,7 @@ def paths_again(arguments: Sequence[str]) -> list[str]:
         config = Path(argument.removeprefix("resume=")) / "config.yaml"
         if argument.startswith("resume=") and config.is_file():
             stored = paths_of(yaml.safe_load(config.read_text(encoding="utf-8")))
-            return [word for word in shlex.split(" ".join(words(stored))) if word not in arguments]
+            return [word for word in shlex.split(" ".join(shell_arguments(stored))) if word not in arguments]
     return []
 
 

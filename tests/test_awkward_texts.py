@@ -235,7 +235,9 @@ def test_encodings_and_ends_of_lines_change_no_number(tmp_path: Path, name: str)
         assert reader.read(file) == whole, changed[:60]
     for encoding in ("utf-16", "utf-16-le", "utf-16-be", "utf-32"):
         file.write_bytes(plain.decode().encode(encoding))
-        with pytest.raises(DataError, match=r"UTF-(16|32).*wanted UTF-8. Save it as UTF-8") as raised:
+        with pytest.raises(
+            DataError, match=r"UTF-(16|32).*UTF-8 is required. Save the file as UTF-8"
+        ) as raised:
             reader.read(file)
         assert str(tmp_path) in str(raised.value)
 
@@ -383,5 +385,5 @@ def test_long_texts_take_linear_time(tmp_path: Path, number: int) -> None:
         (tmp_path / name).write_text(f"a;b\n{LONG[number]}", encoding="utf-8")
         with pytest.raises(DataError):
             read(tmp_path / name)
-    text.mended(LONG[number])
+    text.suggest_number(LONG[number])
     assert time.process_time() - start < 10

@@ -13,7 +13,7 @@ from torch.distributions import Distribution
 
 import framework as package
 from framework.configuration import schema
-from framework.configuration.loading import stored
+from framework.configuration.loading import read_stored
 from framework.distributions.protocol import value_set
 from framework.encoder import Encoder
 from framework.errors import ConfigError
@@ -49,7 +49,7 @@ def test_it_is_the_model_that_was_trained_with_the_wrappers(framework: Framework
     assert numbers(done) == numbers(both)
     assert numbers(done)["method"] == "vanilla_128 + temperature + conformal"
     for remark in ("temperature: ", "conformal: the threshold is set by 20 validation rows"):
-        assert remark in done.out and remark in both.out and remark in str(stored(done.folder)[0])
+        assert remark in done.out and remark in both.out and remark in str(read_stored(done.folder)[0])
     # what every other mode takes
     again = framework("mode=test", f"checkpoint={done.folder}", *QUIET, folder="again")
     assert numbers(again) == numbers(done) and "set by 20 validation rows" in again.out

@@ -104,20 +104,24 @@ def test_every_cut_is_refused(saved: Path, tmp_path: Path) -> None:
     whole = saved.read_bytes()
     for length in [*range(0, len(whole), 61), *range(len(whole) - 60, len(whole))]:
         saved.write_bytes(whole[:length])
-        with pytest.raises(CheckpointError, match=r"last\.ckpt cannot be used: it is (empty|cut short)"):
+        with pytest.raises(
+            CheckpointError, match=r"last\.ckpt cannot be used: the file is (empty|cut short)"
+        ):
             read(saved)
     saved.write_bytes(whole + b"\0")
-    with pytest.raises(CheckpointError, match="cut short, or not a checkpoint"):
+    with pytest.raises(CheckpointError, match="cut short, or it is no checkpoint"):
         read(saved)
 
 
 def test_a_refusal_names_the_newest_whole_checkpoint_beside_it(saved: Path) -> None:
     with pytest.raises(
-        CheckpointError, match=r"no checkpoint .*none\.ckpt\. Use .*last\.ckpt, the newest whole"
+        CheckpointError, match=r"no checkpoint .*none\.ckpt\. Use .*last\.ckpt, the newest undamaged"
     ):
         read(saved.with_name("none.ckpt"))
     saved.write_bytes(b"")
-    with pytest.raises(CheckpointError, match=r"last\.ckpt cannot .*it is empty\. No whole one .*train anew"):
+    with pytest.raises(
+        CheckpointError, match=r"last\.ckpt cannot .*the file is empty\. This folder contains no undamaged"
+    ):
         read(saved)
     with pytest.raises(CheckpointError, match="There is no checkpoint"):
         read(saved.parent / "no" / "folder.ckpt")
@@ -149,7 +153,7 @@ def test_code_in_a_checkpoint_is_refused_unrun(saved: Path, tmp_path: Path) -> N
     forged = saved.read_bytes()
     saved.write_bytes(forged + b"\nsha256 of above:" + hashlib.sha256(forged).digest())
     assert verify(saved) is None
-    with pytest.raises(CheckpointError, match=r"could run code.*did not write it"):
+    with pytest.raises(CheckpointError, match=r"could run code.*did not write the file"):
         read(saved)
     assert not (tmp_path / "was run").exists()
 
@@ -274,11 +278,11 @@ def test_describe_mismatch() -> None:
     found = {"a": torch.zeros(3, 2), "b": torch.zeros(()), "d": torch.zeros(1)}
     assert describe_mismatch(wanted, found) == (
         "9 of 11 weights are missing: c0, c1, c2, c3, c4 and 4 more; "
-        "1 of 3 weights found are unknown: d; "
-        "1 of 11 weights have another shape: a (3×2, wanted 2×3)."
+        "1 of 3 weights of the file are unknown: d; "
+        "1 of 11 weights have another shape: a (3×2 instead of 2×3)."
     )
     assert describe_mismatch({"b": torch.zeros(())}, {"b": torch.zeros(4)}) == (
-        "1 of 1 weights have another shape: b (4, wanted scalar)."
+        "1 of 1 weights have another shape: b (4 instead of scalar)."
     )
     assert describe_mismatch({"a.b": torch.zeros(2)}, {"a.b": torch.zeros(4), "a.c": 1}, ("a.",)) is None
 
@@ -306,7 +310,7 @@ def test_numbers_of_another_kind_do_not_fit(wanted: torch.dtype) -> None:
             if wanted == found or (wanted.is_floating_point and found.is_floating_point):
                 assert said is None
             else:
-                kinds = f"a ({str(found)[6:]}, wanted {str(wanted)[6:]})"
+                kinds = f"a ({str(found)[6:]} instead of {str(wanted)[6:]})"
                 assert said == f"1 of 1 weights have numbers of another type: {kinds}."
 
 
@@ -358,12 +362,12 @@ STRUCTURED: dict[str, Callable[[], Any]] = {
 @pytest.mark.parametrize("kind", STRUCTURED)
 def test_only_dense_tensors_are_written_and_read(kind: str, saved: Path) -> None:
     held = STRUCTURED[kind]()
-    with pytest.raises(CheckpointError, match=r"last\.ckpt was not written: .* Convert these"):
+    with pytest.raises(CheckpointError, match=r"last\.ckpt was not written: .* Convert other values"):
         WholeCheckpoints().save_checkpoint({"a": [held]}, saved)
     assert same(read(saved), CONTENTS)
     content = packed({"a": [held]})
     with pytest.raises(
-        CheckpointError, match=r"forged\.ckpt (holds more than .*, namely|cannot be used: a has )"
+        CheckpointError, match=r"forged\.ckpt (contains more than .*, namely|cannot be used: a has )"
     ):
         read(signed(content, saved.with_name("forged.ckpt")))
     saved.with_name("one.pth").write_bytes(content)
@@ -467,7 +471,7 @@ def test_what_a_pickle_calls_is_refused_before_it_is_called(name: str, saved: Pa
                     part.filename, pickled if part.filename.endswith("data.pkl") else sound.read(part)
                 )
         began = time.process_time()
-        with pytest.raises(CheckpointError, match=r"forged\.ckpt (holds more than|cannot be used)"):
+        with pytest.raises(CheckpointError, match=r"forged\.ckpt (contains more than|cannot be used)"):
             read(signed(stream.getvalue(), saved.with_name("forged.ckpt")))
         assert time.process_time() - began < 1
 
@@ -488,5 +492,5 @@ def test_an_archive_that_can_be_read_in_two_ways_is_refused(saved: Path) -> None
         b"PK\x03\x04" + sound,
         sound[:-22] + sound[-44:],
     ):
-        with pytest.raises(CheckpointError, match=r"forged\.ckpt (holds more than|cannot be used)"):
+        with pytest.raises(CheckpointError, match=r"forged\.ckpt (contains more than|cannot be used)"):
             read(signed(content, saved.with_name("forged.ckpt")))

@@ -22,7 +22,7 @@ from framework.distributions.description import LONGEST, one_line
 from framework.errors import LISTED, LISTED_WHOLE, CheckpointError, list_names, nearest_name
 from framework.storage import files
 from framework.storage.closed_pipes import DroppingWriter
-from framework.storage.files import alone, unwritable
+from framework.storage.files import describe_unwritable, hold_lock
 from framework.sweeps import jobs
 from framework.training.batches import outlive_signals
 from framework.training.schedules import WARMUP_SHARE, count_warmup_steps, make_schedule, smooth_factor
@@ -84,14 +84,14 @@ def test_a_file_system_without_flock_takes_a_sweep(
     monkeypatch.setattr(files, "FileLock", Lock)
     if not records:
         monkeypatch.setattr(fcntl, "lockf", refuse)
-    with alone(tmp_path / "lock"), alone(tmp_path / "lock"):
+    with hold_lock(tmp_path / "lock"), hold_lock(tmp_path / "lock"):
         pass
     job = jobs.Job(0, [], [], tmp_path, "", "")
     for _ in range(2):
         descriptor = jobs._lock(job)
         assert descriptor is not None
         os.close(descriptor)
-    assert ("no locks on this file system" in caplog.text) == (not records)
+    assert ("does not support locks" in caplog.text) == (not records)
 
 
 def test_output_that_nobody_reads_is_dropped() -> None:
@@ -114,9 +114,9 @@ def test_a_folder_that_cannot_be_made_gets_a_sentence(number: int) -> None:
 
     with pytest.raises(OSError, match="proc") as caught:
         mkdir()
-    assert "/proc/self/x cannot be written" in str(unwritable(caught.value))
+    assert "/proc/self/x cannot be written" in str(describe_unwritable(caught.value))
     missing = OSError(errno.ENOENT, "none", "x")
-    assert unwritable(missing) is None
+    assert describe_unwritable(missing) is None
 
 
 @pytest.mark.parametrize("kind", ["constant", "cosine", "plateau", "step"])
@@ -141,7 +141,7 @@ def test_warm_up_is_a_share_of_the_run(kind: str, steps: int, asked: int) -> Non
 
 
 def test_the_newest_run_is_that_whose_checkpoint_is_newest(tmp_path: Path) -> None:
-    with pytest.raises(CheckpointError, match="no run there has a checkpoint"):
+    with pytest.raises(CheckpointError, match="no run in that folder has a checkpoint"):
         newest_run(tmp_path)
     for age, name in enumerate(["a/2", "b/1", "sweeps/x/0"]):
         folder = tmp_path / name / "checkpoints"

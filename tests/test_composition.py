@@ -18,11 +18,11 @@ from omegaconf import DictConfig, OmegaConf
 
 from framework.configuration.command_line import command_line
 from framework.configuration.composition import (
+    describe_error,
     folder,
     in_quotes,
     plain,
     register,
-    sentence,
 )
 from framework.configuration.settings import (
     PRECISIONS,
@@ -157,7 +157,7 @@ def test_an_experiment_is_its_differences(name: str) -> None:
     [
         (
             ["experiment=pascal3d/scva"],
-            r"No configuration 'experiment/pascal3d/scva'\. Did you mean 'pascal3d/scvae'\?",
+            r"There is no config 'experiment/pascal3d/scva'\. Did you mean 'pascal3d/scvae'\?",
         ),
         (["density_head=mixtur"], r"Did you mean 'mixture'\?"),
         (["trainer.max_epoch=3"], r"trainer\.max_epoch: unknown key\. Did you mean 'max_epochs'\?"),
@@ -168,13 +168,13 @@ def test_an_experiment_is_its_differences(name: str) -> None:
 def test_a_mistake_becomes_a_sentence(overrides: list[str], message: str) -> None:
     with pytest.raises(Exception) as caught:
         composed(*overrides)
-    said = sentence(caught.value)
+    said = describe_error(caught.value)
     assert said is not None
     assert re.search(message, said), said
 
 
 def test_an_error_of_ours_is_not_taken_for_a_mistake() -> None:
-    assert sentence(RuntimeError("a bug")) is None
+    assert describe_error(RuntimeError("a bug")) is None
 
 
 def test_what_a_replaced_choice_leaves_is_dropped() -> None:
@@ -204,7 +204,7 @@ def test_what_an_experiment_sets_of_its_head_can_be_taken_out_for_another(name: 
             unknown = re.search(r"(density_head\.\S+): unknown key", str(error))
             if unknown is None or OmegaConf.select(OmegaConf.create(values), unknown[1]) is None:
                 break  # Hydra deletes no null
-            found = re.search(r"(~density_head\.\S+) leaves out what an experiment sets", str(error))
+            found = re.search(r"If an experiment sets the key, (~density_head\.\S+) removes it", str(error))
             assert found is not None and found[1] not in words, error
             words.append(found[1])
         else:
@@ -358,5 +358,5 @@ def test_a_preset_is_that_of_the_data_however_it_is_chosen(given: str, wanted: s
 
 
 def test_a_preset_of_several_data_sets_is_refused() -> None:
-    with pytest.raises(ConfigError, match="preset=thesis is another for each of these experiments"):
+    with pytest.raises(ConfigError, match="preset=thesis means several presets for these experiments"):
         command_line(["-m", "experiment=choice(pascal3d/scvae,moons/ensemble)", "preset=thesis"])

@@ -19,7 +19,7 @@ from framework.datasets.images import Crop, cut_square
 from framework.errors import ConfigError, DataError, quote, shorten
 from framework.storage import reading
 from framework.storage.plain_values import read_yaml, require_plain_pickle
-from framework.storage.reading import guarded, inflated
+from framework.storage.reading import inflate, translate_errors
 
 ROOT = Path(__file__).parent.parent
 
@@ -172,19 +172,19 @@ def test_the_guard_turns_any_error_into_a_sentence_that_names_the_file(tmp_path:
     ):
         with (
             pytest.raises(DataError, match=r"one\.x: cannot be read as a thing \(.*\)\. Mend it\.") as caught,
-            guarded(file, "a thing", "Mend it."),
+            translate_errors(file, "a thing", "Mend it."),
         ):
             raise error
         assert len(str(caught.value)) < len(str(file)) + 260
         assert str(caught.value).isprintable()
-    with pytest.raises(ConfigError, match=r"^.*one\.x: said$"), guarded(file, "a thing"):
+    with pytest.raises(ConfigError, match=r"^.*one\.x: said$"), translate_errors(file, "a thing"):
         raise ConfigError("said")
-    with pytest.raises(KeyboardInterrupt), guarded(file, "a thing"):
+    with pytest.raises(KeyboardInterrupt), translate_errors(file, "a thing"):
         raise KeyboardInterrupt
     gone = tmp_path / "gone.x"
     with (
-        pytest.raises(DataError, match=r"gone\.x: no such file; wanted a thing\. Mend the path\."),
-        guarded(gone, "a thing"),
+        pytest.raises(DataError, match=r"gone\.x: no such file; expected a thing\. Correct the path\."),
+        translate_errors(gone, "a thing"),
     ):
         reading.read_bytes(gone)
 
@@ -200,11 +200,11 @@ def test_inflating_stops_at_the_bound() -> None:
     import zlib
 
     packed = zlib.compress(bytes(1000))
-    assert inflated(packed, 1000) == bytes(1000)
-    assert inflated(packed, 10, part=True) == bytes(10)
+    assert inflate(packed, 1000) == bytes(1000)
+    assert inflate(packed, 10, part=True) == bytes(10)
     for content, most in ((packed, 999), (packed[:-5], 1000)):
-        with pytest.raises(ValueError, match="cut short, or unfolds"):
-            inflated(content, most)
+        with pytest.raises(ValueError, match="cut short, or decompress"):
+            inflate(content, most)
 
 
 def test_stored_values_are_plain(tmp_path: Path) -> None:
@@ -233,7 +233,7 @@ def test_a_pickle_of_tuples_that_hold_the_same_tuple_twice_is_refused() -> None:
         require_plain_pickle(
             pickle.dumps({"a": deep, "b": [(1, (2, 3))] * 9, "c": tuple(range(9999))}, protocol)
         )
-        with pytest.raises(ValueError, match="stands for more than"):
+        with pytest.raises(ValueError, match="contains a tuple of more than"):
             require_plain_pickle(pickle.dumps([nested], protocol))
 
 
@@ -294,7 +294,7 @@ def test_no_more_of_a_file_is_read_than_it_has(tmp_path: Path) -> None:
     """A chunk that announces 64 TB is no reason to allocate them, as Python's own files do."""
     file = tmp_path / "one.x"
     file.write_bytes(b"abcdef")
-    with reading.opened(file) as stream:
+    with reading.open_regular(file) as stream:
         assert [stream.read(2), stream.read(0), stream.read(2**46), stream.read(2**46), stream.read()] == [
             *(b"ab", b"", b"cdef", b"", b"")
         ]

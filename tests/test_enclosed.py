@@ -59,7 +59,7 @@ def test_nothing_but_plain_files_is_opened(
     require_plain_within(place, folder)  # missing
     kind(place, outside)
     for error in (DataError, ConfigError, CheckpointError):
-        with pytest.raises(error, match=r"file is (a link|no regular file|a file that has a second name)"):
+        with pytest.raises(error, match=r"file is (a link|not a regular file|a file that has a second name)"):
             require_enclosed(folder, error)
         with pytest.raises(error, match=r"file is "):
             require_plain_within(place, folder, error)

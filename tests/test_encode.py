@@ -41,8 +41,8 @@ def alone(root, name):
 
 
 def test_rows_of_the_parts_are_the_files_by_name(root, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(progress, "SHORT", 0.0)
-    monkeypatch.setattr(progress, "APART", 0.0)
+    monkeypatch.setattr(progress, "QUIET_TIME", 0.0)
+    monkeypatch.setattr(progress, "REPORT_INTERVAL", 0.0)
     collection = collected(root, tmp_path / "features", 4)
     describe(collection, CONFIG)
     assert encode(collection, CONFIG, range(3), SETTINGS) == 3

@@ -16,7 +16,7 @@ from framework.figures.style import save_figure
 from framework.geometry import meshes
 from framework.modes.encode import collected, describe
 from framework.reports import table
-from framework.storage.names import as_bytes, path_of, spelled
+from framework.storage.names import as_bytes, path_of, spell_name
 from framework.sweeps import jobs
 from tests.conftest import Framework
 
@@ -31,7 +31,7 @@ BYTES = st.binary(min_size=1, max_size=20).filter(lambda name: not {0, 47} & set
 
 @given(BYTES)
 def test_a_spelling_is_a_line_of_text_from_which_the_name_is_found(name: bytes) -> None:
-    spelling = spelled(os.fsdecode(name))
+    spelling = spell_name(os.fsdecode(name))
     assert len(spelling.encode().splitlines()) == 1
     assert os.fsencode(path_of(spelling)) == os.fsencode(Path(os.fsdecode(name)))
     if spelling == os.fsdecode(name):
@@ -41,13 +41,13 @@ def test_a_spelling_is_a_line_of_text_from_which_the_name_is_found(name: bytes) 
 @given(st.sets(BYTES, min_size=2, max_size=5))
 def test_spellings_and_hashed_names_tell_files_apart(names: set[bytes]) -> None:
     texts = [os.fsdecode(name) for name in names]
-    assert len({spelled(text) for text in texts}) == len({as_bytes(text) for text in texts}) == len(names)
+    assert len({spell_name(text) for text in texts}) == len({as_bytes(text) for text in texts}) == len(names)
 
 
 def test_a_plain_name_is_spelled_as_it_is() -> None:
     for name in ("a.png", "ä b/c.png", "back\\slash", "日本"):
-        assert spelled(name) == name
-    assert spelled(os.fsdecode(b"caf\xe9.png")) == r"caf\xe9.png"
+        assert spell_name(name) == name
+    assert spell_name(os.fsdecode(b"caf\xe9.png")) == r"caf\xe9.png"
     assert as_bytes("ä") == "ä".encode(), "seeds of files are those of earlier versions"
 
 

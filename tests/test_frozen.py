@@ -327,5 +327,5 @@ def test_a_run_folder_is_frozen(tmp_path):
     assert form.form.endswith("softmax")
     same(form, predictor, torch.randn(3, 6))
     (tmp_path / "empty").mkdir()
-    with pytest.raises(CheckpointError, match="holds no checkpoint"):
+    with pytest.raises(CheckpointError, match="contains no checkpoint"):
         framework.freeze(tmp_path / "empty")

@@ -22,7 +22,7 @@ def write(root: Path) -> None:
 
 
 def test_it_is_written_once_and_marked(cache: Path) -> None:
-    root = generated.generated(cache / "things" / "seed0", {"seed": 0}, write)
+    root = generated.ensure_generated(cache / "things" / "seed0", {"seed": 0}, write)
     assert root == cache / "things" / "seed0"
     assert (root / "content").read_text(encoding="utf-8") == "whole"
     assert read_mark(root) == {"seed": 0}
@@ -31,7 +31,7 @@ def test_it_is_written_once_and_marked(cache: Path) -> None:
     def again(root: Path) -> None:
         raise AssertionError("it is there")
 
-    assert generated.generated(cache / "things" / "seed0", {"seed": 0}, again) == root
+    assert generated.ensure_generated(cache / "things" / "seed0", {"seed": 0}, again) == root
 
 
 def test_interrupted_writing_leaves_nothing_and_is_done_again(cache: Path) -> None:
@@ -40,12 +40,12 @@ def test_interrupted_writing_leaves_nothing_and_is_done_again(cache: Path) -> No
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        generated.generated(cache / "things" / "a", {}, interrupted)
+        generated.ensure_generated(cache / "things" / "a", {}, interrupted)
     assert [path.name for path in cache.rglob("*") if path.is_file()] == [".a.lock"]
     left = cache / "things" / ".a.part"  # what a killed process would leave
     left.mkdir()
     (left / "half").write_bytes(b"")
-    root = generated.generated(cache / "things" / "a", {}, write)
+    root = generated.ensure_generated(cache / "things" / "a", {}, write)
     assert sorted(path.name for path in root.iterdir()) == ["content", MARK]
     assert not left.exists()
 
@@ -60,7 +60,7 @@ def test_two_at_once_write_it_once(cache: Path) -> None:
 
     def ask() -> None:
         both_wait.wait()
-        generated.generated(cache / "things" / "b", {}, counted)
+        generated.ensure_generated(cache / "things" / "b", {}, counted)
 
     askers = [threading.Thread(target=ask) for _ in range(2)]
     for asker in askers:
@@ -71,24 +71,24 @@ def test_two_at_once_write_it_once(cache: Path) -> None:
 
 
 def test_a_changed_mark_is_refused(cache: Path) -> None:
-    root = generated.generated(cache / "things" / "c", {"seed": 1}, write)
+    root = generated.ensure_generated(cache / "things" / "c", {"seed": 1}, write)
     (root / MARK).write_text(json.dumps({"seed": 2}), encoding="utf-8")
     with pytest.raises(DataError, match=r"does not describe \{'seed': 1\}; it was changed\. Delete"):
-        generated.generated(cache / "things" / "c", {"seed": 1}, write)
+        generated.ensure_generated(cache / "things" / "c", {"seed": 1}, write)
     (root / MARK).write_text("{", encoding="utf-8")
     with pytest.raises(DataError, match=r"synthetic\.json: cannot be read .* Delete"):
-        generated.generated(cache / "things" / "c", {"seed": 1}, write)
+        generated.ensure_generated(cache / "things" / "c", {"seed": 1}, write)
     (root / MARK).unlink()
     with pytest.raises(DataError, match="does not describe"):
-        generated.generated(cache / "things" / "c", {"seed": 1}, write)
+        generated.ensure_generated(cache / "things" / "c", {"seed": 1}, write)
 
 
 def test_a_cache_that_cannot_be_written_is_said(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (cache / "file").write_bytes(b"")
     with pytest.raises(DataError, match=r"cannot be written to .*file.d .* set FRAMEWORK_CACHE"):
-        generated.generated(cache / "file" / "d", {}, write)
+        generated.ensure_generated(cache / "file" / "d", {}, write)
     monkeypatch.setenv("FRAMEWORK_CACHE", str(cache / "file"))
-    with pytest.raises(DataError, match=r"cannot be made .* Set FRAMEWORK_CACHE to another folder"):
+    with pytest.raises(DataError, match=r"cannot be created .* Set FRAMEWORK_CACHE to another folder"):
         folder("things")
 
 

@@ -190,7 +190,7 @@ def test_what_learns_nothing_is_tested_as_it_is(framework: Framework, tmp_path: 
         ("objective=[random_features]", "Nothing in this model learns by gradient"),
         (
             "trainer.max_epochs=2",
-            "trainer.max_epochs=2 sets nothing: nothing in this model learns by gradient",
+            "trainer.max_epochs=2 has no effect: nothing in this model learns by gradient",
         ),
     ):
         refused = framework("experiment=smplpix/rasterised", *run, further, folder="no")

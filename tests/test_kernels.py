@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from framework.geometry.nearest import compiled
-from framework.storage.kernels import kept_in
+from framework.storage.kernels import kernel_cache
 from plugins.encoder.projection import compiled as projecting
 from plugins.renderer.rasterizer import raster
 
@@ -20,10 +20,10 @@ def test_code_is_kept_anew_where_any_of_its_files_changed(tmp_path: Path) -> Non
     sources = [tmp_path / "one.py", tmp_path / "other.py"]
     for source in sources:
         source.write_text("pass\n", encoding="utf-8")
-    first = kept_in("tested", sources)
-    assert first is not None and kept_in("tested", reversed(sources)) == first
+    first = kernel_cache("tested", sources)
+    assert first is not None and kernel_cache("tested", reversed(sources)) == first
     sources[1].write_text("pass  # changed\n", encoding="utf-8")
-    assert kept_in("tested", sources) not in (first, None)
+    assert kernel_cache("tested", sources) not in (first, None)
 
 
 @pytest.mark.parametrize(

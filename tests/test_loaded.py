@@ -99,7 +99,10 @@ def test_a_model_takes_files_when_its_training_data_are_gone(
         torch.testing.assert_close(copied(str(files[0])).mode, density[0].mode, rtol=0, atol=0)
         assert copied.double()(str(files[0])).log_prob(density[0].sample()).dtype == torch.float64
     np.testing.assert_array_equal(pickle.loads(pickle.dumps(frozen))(files[0]), frozen(files[0]))
-    with pytest.raises(CheckpointError, match=f"asked of a {type(model).__name__}; wanted a run folder"):
+    with pytest.raises(
+        CheckpointError,
+        match=f"Got a {type(model).__name__} as the source of a trained model; expected a run",
+    ):
         find_checkpoint(model)
     if kind == "registration":
         follows_the_scan(model, frozen, files[0], lines)

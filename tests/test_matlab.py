@@ -135,7 +135,7 @@ def bomb(size: int) -> bytes:
 def test_what_unfolds_to_far_more_than_the_file_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("framework.storage.reading.SMALL", 2**20)
     assert not parse_variables(bomb(2**20 - 200))["labels"].any()
-    with pytest.raises(ValueError, match="unfolds to more than"):
+    with pytest.raises(ValueError, match="decompress to more than"):
         parse_variables(bomb(2**22))
 
 

@@ -297,7 +297,7 @@ BROKEN = {
     "off: negative": (".off", b"OFF\n-1 2 0\n", "expected the numbers of vertices"),
     "off: cut short": (".off", text_off()[:-10], "only 7 lines follow; the file is cut short"),
     "off: cut within a line": (".off", text_off()[:-3], "expected 3 corners, got the line '3 1 2'"),
-    "off: a word": (".off", b"OFF\n1 0 0\n0 zero 0\n", "wanted a number, got 'zero'"),
+    "off: a word": (".off", b"OFF\n1 0 0\n0 zero 0\n", "expected a number, got 'zero'"),
     "off: two numbers": (".off", b"OFF\n2 0 0\n0 0\n0 0 0 0\n",
         "expected 3 numbers for each vertex, got the line '0 0'"),
     "off: no such vertex": (".off", text_off().replace(b"3 1 2 3", b"3 1 2 4"), r"triangle 3 .* \[1, 2, 4\]"),

@@ -23,13 +23,13 @@ experiment=moon/everything | Did you mean 'moons/everything'?
 experiment=moons | Did you mean 'moons/
 experiment= | Available in experiment: caviar
 experiment=null | A group takes a name
-experiment==moons | wanted key=value
-experiment moons/vanilla_128 | 'experiment' cannot be read; wanted key=value
-moons/vanilla_128 | wanted key=value
-train | wanted key=value
+experiment==moons | expected key=value
+experiment moons/vanilla_128 | 'experiment' cannot be read; expected key=value
+moons/vanilla_128 | expected key=value
+train | expected key=value
 --experiment=moons/vanilla_128 | without dashes: experiment=moons/vanilla_128
-seed 3 | wanted key=value
-'a=[1' | wanted key=value
+seed 3 | expected key=value
+'a=[1' | expected key=value
 learning_rate=0.01 | Did you mean 'optimizer.learning_rate'?
 lr=0.01 | lr: unknown key
 optimizer.lr=0.01 | Did you mean 'learning_rate'?
@@ -41,7 +41,7 @@ optimizer.learning_rate=-0.1 | greater than 0
 optimizer.weight_decay=-1 | optimizer.weight_decay = -1
 optimizer.schedule=cosin | Did you mean 'cosine'?
 optimizer.warmup_steps=1.5 | optimizer.warmup_steps = 1.5
-+optimizer.momentum=0.9 | momentum is a setting of sgd, adamw has none
++optimizer.momentum=0.9 | momentum is a setting of sgd only, and the optimiser is adamw
 optimizer=adm | Did you mean 'adam'?
 optimizer=adamax | Available in optimizer: adam, adamw, sgd
 epochs=3 | Did you mean 'trainer.max_epochs'?
@@ -52,19 +52,19 @@ trainer.max_epochs=many | trainer.max_epochs = 'many'
 trainer.max_epochs=1.5 | trainer.max_epochs = 1.5
 trainer.max_epochs=true | trainer.max_epochs = True
 trainer.accelerator=tpus | Did you mean 'tpu'?
-trainer.accelerator=gpu | PyTorch sees none
-trainer.accelerator=cuda | PyTorch sees none
+trainer.accelerator=gpu | PyTorch finds no such device
+trainer.accelerator=cuda | PyTorch finds no such device
 trainer.precision=bf16mixed | Did you mean 'bf16-mixed'?
 trainer.precision=17 | trainer.precision = 17
 trainer.strategy=dpp | Did you mean 'ddp'?
 trainer=dpp | Did you mean 'ddp'?
 +trainer.max_steps=abc | trainer.max_steps = 'abc'
 +trainer.max_steps=-5 | trainer.max_steps = -5
-+trainer.limit_train_batches=-3 | from 1 on, or a share
-+trainer.limit_train_batches=0 | from 1 on, or a share
-+trainer.limit_val_batches=1.5 | from 1 on, or a share
-trainer.devices=0 | wanted how many, from 1 on
-trainer.devices=two | wanted how many, from 1 on
++trainer.limit_train_batches=-3 | (an integer, 1 or more), or a share
++trainer.limit_train_batches=0 | (an integer, 1 or more), or a share
++trainer.limit_val_batches=1.5 | (an integer, 1 or more), or a share
+trainer.devices=0 | expected a number of devices (1 or more)
+trainer.devices=two | expected a number of devices (1 or more)
 trainer.num_nodes=0 | trainer.num_nodes = 0
 trainer.gradient_clip_val=-1 | trainer.gradient_clip_val = -1
 +trainer.gradient_clip_algorithm=nrm | Did you mean 'norm'?
@@ -74,7 +74,7 @@ trainer.keep=beest | Did you mean 'best'?
 +trainer.accumulate_grad_batches=0 | trainer.accumulate_grad_batches = 0
 +trainer.deterministic=maybe | trainer.deterministic = 'maybe'
 +trainer.max_time=soon | trainer.max_time = 'soon'
-mode=check checkpoint=outputs/run | mode=check reads no checkpoint, train, test, calibrate, predict, work_precision do
+mode=check checkpoint=outputs/run | mode=check reads no checkpoint; train, test, calibrate, predict, work_precision do
 experiment=moons/vanilla_128 checkpoint=outputs/run | outputs/run is neither a file, a folder nor an MLflow run id
 seed=-1 | seed = -1
 seed=one | seed = 'one'
@@ -97,7 +97,7 @@ logger.url=x | Did you mean 'uri'?
 debug=fats | Did you mean 'fast'?
 debug=true | A group takes a name
 experiment=coil20/mixture preset=thesis | no setting for data=coil20
-experiment=pascal3d/scvae preset=thesis | wanted a file of weights trained on ImageNet
+experiment=pascal3d/scvae preset=thesis | weights is missing: give a file of weights trained on ImageNet
 preset=thesi | Did you mean 'thesis'?
 hydra/job_logging=x | can run code
 hydra.verbos=true | Did you mean 'verbose'?
@@ -118,14 +118,14 @@ experiment=moons/vanilla_128 metric=[accuracy,psnr] | CategoricalDensity of even
 data=moons density_head=extra_trees metric=[psnr] | A metric reads the true 'color' of every image
 objective=[outlier] | Did you mean 'outlier_exposure'?
 renderer=zbufer | Did you mean 'zbuffer'?
-experiment=moons/vanilla_128 density_head=scvae | density_head scvae, of which
+experiment=moons/vanilla_128 density_head=scvae | density_head scvae, which contains
 experiment=pascal3d/scvae density_head=categorical | Choose another one, or other data
 experiment=pascal3d/scvae metric=[accuracy] | Choose another one, or other data
 experiment=moons/vanilla_128 +data._target_=os.system | must not be able to run code
 experiment=moons/vanilla_128 data@outliers=pascal3d | outliers.data_seed: unknown key
 mode=tran | Did you mean 'train'?
 mode=test | mode=test needs checkpoint=
-mode=test checkpoint=nowhere | Give the folder a run printed at its start
+mode=test checkpoint=nowhere | Give the folder that a run printed at its start
 mode=predict mode.file=x | Did you mean 'files'?
 mode=predict mode.files=nowhere | Give a file, or a folder of files
 mode=combine | mode.members is missing
@@ -139,7 +139,7 @@ mode=check | name a plugin
 -lr 0.1 | without dashes: optimizer.learning_rate=0.1
 --batch-size=3 | without dashes: batch_size=3
 --seed | without dashes: seed=...
---gpus 1 | no such flag
+--gpus 1 | is an unknown flag
 experiment=moons/vanilla_128 --seed 3 | without dashes: seed=3
 --cfg | expected one argument
 --cfg jobs | invalid choice: 'jobs'
@@ -150,8 +150,8 @@ experiment=moons/vanilla_128 -m seed=range(3,3) | seed=range(3,3) has no value, 
 experiment=moons/vanilla_128 -m seed=0,one | seed=one; none of the sweep was run
 experiment=moons/vanilla_128 hydra.run.dir=/proc/self/x | /proc/self/x cannot be written
 experiment=moons/vanilla_128 hydra.run.dir=/dev/null/x | /dev/null/x cannot be written
-mode=test checkpoint=last | no run there has a checkpoint
-experiment=moons/vanilla_128 checkpoint=last | no run there has a checkpoint
+mode=test checkpoint=last | no run in that folder has a checkpoint
+experiment=moons/vanilla_128 checkpoint=last | no run in that folder has a checkpoint
 encoder=[resnet50] | 'encoder/resnet50'. Available in encoder
 density_head=regression | 'density_head/regression'. Available in density_head
 density_head=pit | 'density_head/pit'. Available in density_head
@@ -165,8 +165,8 @@ samples=many | samples = 'many'
 workers=-1 | workers = -1
 workers=100000 | less than or equal to 1024
 batch_size=big | batch_size = 'big'
-optimizer.schedule=step | milestones names none
-optimizer.milestones=[3] | milestones are of schedule=step
+optimizer.schedule=step | milestones is empty
+optimizer.milestones=[3] | milestones are a setting of schedule=step only
 optimizer.factor=2 | optimizer.factor = 2
 optimizer.patience=0 | optimizer.patience = 0
 trainer.max_epoch=3 | Did you mean 'max_epochs'?
@@ -176,23 +176,23 @@ trainer.checkpoint_every_steps=-1 | trainer.checkpoint_every_steps = -1
 +trainer.logger=true | trainer.logger: unknown key
 logger.uri=http://me:secret@127.0.0.1 | came with a password
 mode=tests | Did you mean 'test'?
-mode=predict checkpoint=nowhere | Give the folder a run printed at its start
+mode=predict checkpoint=nowhere | Give the folder that a run printed at its start
 mode=work_precision | needs checkpoint=
 renderer=opengl | 'renderer/opengl'. Available in renderer
 uncertainty=[ensembl] | Did you mean 'ensemble'?
 data=cifar10 | 'data/cifar10'. Available in data
 experiment=moons/vanilla_128 'encoder.mlp.widths=[0]' | encoder
-experiment=moons/vanilla_128 renderer=zbuffer | renderer=zbuffer: mode=train reads no renderer, check does
+experiment=moons/vanilla_128 renderer=zbuffer | renderer=zbuffer: mode=train reads no renderer; check does
 -m experiment=moons/vanilla_128 renderer=zbuffer,rasterizer | renderer=zbuffer: mode=train reads no renderer
-mode=test checkpoint=nowhere density_head=bernoulli | mode=test reads no density_head, train, check do
-mode=test checkpoint=nowhere encoder=[mlp] | mode=test reads no encoder, train, encode, check do
-mode=test checkpoint=nowhere trainer.max_epochs=3 | mode=test reads no trainer.max_epochs, train does
-mode=test checkpoint=nowhere optimizer=sgd | mode=test reads no optimizer, train does
-mode=test checkpoint=nowhere debug=fast | debug=fast sets nothing
+mode=test checkpoint=nowhere density_head=bernoulli | mode=test reads no density_head; train, check do
+mode=test checkpoint=nowhere encoder=[mlp] | mode=test reads no encoder; train, encode, check do
+mode=test checkpoint=nowhere trainer.max_epochs=3 | mode=test reads no trainer.max_epochs; train does
+mode=test checkpoint=nowhere optimizer=sgd | mode=test reads no optimizer; train does
+mode=test checkpoint=nowhere debug=fast | debug=fast has no effect
 mode=predict checkpoint=nowhere metric=[accuracy] | mode=predict reads no metric
 mode=predict checkpoint=nowhere pictures=false | mode=predict reads no pictures
 mode=predict checkpoint=nowhere metric.x.y=1 | metric.x.y=1: mode=predict reads no metric
-mode=calibrate checkpoint=nowhere objective=[adversarial] | mode=calibrate reads no objective, train, check do
+mode=calibrate checkpoint=nowhere objective=[adversarial] | mode=calibrate reads no objective; train, check do
 mode=combine mode.members=nowhere checkpoint=nowhere | mode=combine reads no checkpoint
 mode=encode mode.files=a mode.into=b data=point_cloud_folder samples=3 | mode=encode reads no samples
 mode=plugins data=moons | mode=plugins reads no data
@@ -262,7 +262,7 @@ DAMAGED = {
     "tab": (TOP + b"trainer:\n\tmax_epochs: 1\n", r"mine\.yaml, line 3, column 1: .* found character '\\t'"),
     "twice": (TOP + b"seed: 1\nseed: 2\n", r"mine\.yaml, line 3, column 1: .* found duplicate key seed"),
     "two documents": (b"---\nseed: 1\n---\nseed: 2\n", r"mine\.yaml, line 3, column 1: .*another document"),
-    "alias": (TOP + b"seed: *none\n", r"mine\.yaml: cannot be read as a config \(an alias"),
+    "alias": (TOP + b"seed: *none\n", r"mine\.yaml: cannot be read as a config \(the file contains an alias"),
     "tag": (
         TOP + b"seed: !!python/object:os.system x\n",
         r"mine\.yaml, line 2, column 7: could not determine",
@@ -272,22 +272,22 @@ DAMAGED = {
     "null byte": (TOP + b"seed: 1\x00\n", r"#x0000: .*mine\.yaml\", position 27"),
     "latin-1": (
         TOP + b"seed: M\xfcller\n",
-        r"line 2 holds the byte 0xfc, which is not UTF-8\. Save",
+        r"line 2 contains the byte 0xfc, which is not UTF-8\. Save",
     ),
-    "utf-16": ("seed: 1\n".encode("utf-16"), r"it is text in UTF-16; wanted UTF-8\. Save"),
-    "list": (TOP + b"- seed\n- 1\n", r"In 'experiment/mine': .*Wanted keys and values"),
-    "list of keys": (TOP + b"- seed: 1\n", r"In 'experiment/mine': .*Wanted keys and values"),
+    "utf-16": ("seed: 1\n".encode("utf-16"), r"the file is text in UTF-16, but UTF-8 is required\. Save"),
+    "list": (TOP + b"- seed\n- 1\n", r"In 'experiment/mine': .*A config consists of keys and values"),
+    "list of keys": (TOP + b"- seed: 1\n", r"In 'experiment/mine': .*A config consists of keys and values"),
     "number": (
         TOP + b"3\n",
-        r"In 'experiment/mine': Invalid loaded object type: int\. Wanted keys and values",
+        r"In 'experiment/mine': Invalid loaded object type: int\. A config consists of keys and values",
     ),
     "text": (
         b"just words\n",
-        r"chosen as experiment sets nothing at the top level\. Wanted `# @package _global_`",
+        r"chosen as experiment sets nothing at the top level\. Its first line must be `# @package _global_`",
     ),
     "no package": (
         b"seed: 1\n",
-        r"chosen as experiment sets nothing at the top level\. Wanted `# @package _global_`",
+        r"chosen as experiment sets nothing at the top level\. Its first line must be `# @package _global_`",
     ),
     "nothing": (b"", r"chosen as experiment sets nothing at the top level"),
     "other package": (b"# @package nosuch\nseed: 1\n", r"nosuch: unknown key"),
@@ -295,10 +295,13 @@ DAMAGED = {
     "open interpolation": (TOP + b"seed: ${oops\n", r"In 'experiment/mine': no viable .* \(at seed\)"),
     "interpolation": (
         TOP + b"seed: ${nosuch.key}\n",
-        r"'nosuch\.key' not found \(at seed\)\. Give it a value",
+        r"'nosuch\.key' not found \(at seed\)\. Give the missing key a value",
     ),
     "resolver": (TOP + b"seed: ${nosuch:key}\n", r"Unsupported interpolation type nosuch \(at seed\)"),
-    "defaults is text": (TOP + b"defaults: moons\n", r"'experiment/mine', defaults must be a list .*Wanted"),
+    "defaults is text": (
+        TOP + b"defaults: moons\n",
+        r"'experiment/mine', defaults must be a list .*A config consists",
+    ),
     "defaults is a mapping": (
         TOP + b"defaults:\n  /data: moons\n",
         r"'experiment/mine', defaults must be a list",
@@ -341,14 +344,14 @@ def test_a_file_that_a_run_reads_is_not_taken_for_a_config() -> None:
     try:
         b"\xfc".decode()
     except UnicodeDecodeError as error:
-        assert composition.sentence(error) is None
-    assert composition.sentence(ValueError("Unsupported type in defaults : int")) is None
+        assert composition.describe_error(error) is None
+    assert composition.describe_error(ValueError("Unsupported type in defaults : int")) is None
     try:
         raise RuntimeError("cannot go on") from yaml.parser.ParserError(
             "while reading", None, "no YAML", None
         )
     except RuntimeError as error:
-        assert "no YAML. This cannot be read as YAML" in str(composition.sentence(error))
+        assert "no YAML. The file cannot be read as YAML" in str(composition.describe_error(error))
 
 
 def test_there_are_a_hundred_and_fifty() -> None:

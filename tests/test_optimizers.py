@@ -83,9 +83,11 @@ def test_step_reduces_after_the_epochs_that_it_names() -> None:
         if step % 5 == 4:
             theirs.step()
             reference.step()
-    with pytest.raises(ValueError, match="milestones names none"):
+    with pytest.raises(ValueError, match="milestones is empty"):
         OptimizerSettings(schedule="step")
-    with pytest.raises(ValueError, match="milestones are of schedule=step, plateau has none"):
+    with pytest.raises(
+        ValueError, match="milestones are a setting of schedule=step only, and the schedule is plateau"
+    ):
         OptimizerSettings(schedule="plateau", milestones=[3])
 
 

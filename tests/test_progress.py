@@ -5,7 +5,7 @@ import io
 import pytest
 from rich.console import Console
 
-from framework.storage.progress import APART, SHORT, Work, tracked
+from framework.storage.progress import QUIET_TIME, REPORT_INTERVAL, Work, track_progress
 
 
 class Clock:
@@ -32,21 +32,21 @@ def said(seconds: float, steps: int, *, terminal: bool = False, quiet: bool = Fa
 @pytest.mark.parametrize("terminal", [False, True])
 @pytest.mark.parametrize("steps", [1, 4, 1000])
 def test_short_work_and_other_ranks_say_nothing(terminal: bool, steps: int) -> None:
-    assert said(0.99 * SHORT, steps, terminal=terminal) == ""
+    assert said(0.99 * QUIET_TIME, steps, terminal=terminal) == ""
     assert said(1e4, steps, terminal=terminal, quiet=True) == ""
 
 
 def test_a_log_gets_a_line_every_half_minute() -> None:
-    assert said(0.99 * APART, 100) == ""
+    assert said(0.99 * REPORT_INTERVAL, 100) == ""
     lines = said(126, 504).splitlines()  # a step is a quarter of a second
     assert len(lines) == 4
     assert lines[0] == "reading [b]: 120 of 504 files in 30 s"
     assert lines[-1] == "reading [b]: 480 of 504 files in 120 s"
-    assert len(said(10 * APART, 5).splitlines()) == 5  # seldom heard of: each time
+    assert len(said(10 * REPORT_INTERVAL, 5).splitlines()) == 5  # seldom heard of: each time
 
 
 def test_a_terminal_gets_a_bar_that_goes_away() -> None:
-    found = said(10 * SHORT, 10, terminal=True)
+    found = said(10 * QUIET_TIME, 10, terminal=True)
     assert "reading [b]" in found and "10/10" in found and "files" in found
     assert found.endswith("\x1b[2K")  # the line is wiped, whatever comes next stands in its place
 
@@ -54,8 +54,8 @@ def test_a_terminal_gets_a_bar_that_goes_away() -> None:
 def test_items_pass_through_and_count_by_their_size(monkeypatch: pytest.MonkeyPatch) -> None:
     clock, told = Clock(), []
     monkeypatch.setattr("framework.storage.progress.time.monotonic", clock)
-    monkeypatch.setattr(Work, "advance", lambda self, count: told.append((self.what, self.total, count)))
-    assert list(tracked(["a", "bcd"], "adding", 4, "letters", len)) == ["a", "bcd"]
+    monkeypatch.setattr(Work, "advance", lambda self, count: told.append((self.name, self.total, count)))
+    assert list(track_progress(["a", "bcd"], "adding", 4, "letters", len)) == ["a", "bcd"]
     assert told == [("adding", 4, 1), ("adding", 4, 3)]
 
 

@@ -16,7 +16,7 @@ import framework.configuration.registry as registry
 from framework.configuration.assembly import entries
 from framework.configuration.composition import PluginConfigs, register
 from framework.configuration.composition import folder as folder_of_configs
-from framework.configuration.registry import GROUPS, config_folders, find, installed, load, refused
+from framework.configuration.registry import GROUPS, config_folders, find, installed, load, unusable_names
 from framework.errors import ConfigError
 from framework.modes.plugins import describe, show
 from framework.runs.provenance import package_versions
@@ -40,13 +40,13 @@ def fake(monkeypatch: pytest.MonkeyPatch):
     """Pretend that packages are installed; gives the list to fill."""
     entries: list[EntryPoint] = []
     installed.cache_clear()
-    refused.cache_clear()
+    unusable_names.cache_clear()
     monkeypatch.setattr(
         registry, "entry_points", lambda group: [item for item in entries if item.group == group]
     )
     yield entries
     installed.cache_clear()
-    refused.cache_clear()
+    unusable_names.cache_clear()
 
 
 def test_one_name_from_several_packages_is_refused_naming_all_and_breaks_only_itself(
@@ -97,7 +97,7 @@ def test_what_is_left_of_a_package_disturbs_nobody(
     assert list(installed("encoder")) == ["whole"]
     assert "torch" in package_versions()
     with pytest.raises(
-        ConfigError, match=r"'half' \(half:Encoder\) is of a package whose METADATA file is gone"
+        ConfigError, match=r"'half' \(half:Encoder\) belongs to a package whose METADATA file is missing"
     ):
         load("encoder", "half")
     show()
@@ -138,12 +138,15 @@ def test_a_plugin_that_raises_on_import_is_named_and_breaks_only_itself(
     [
         (
             ["gone-cpu>=3; (sys_platform == 'linux') and extra == 'trees'"],
-            r"package's extra, e\.g\. `pip install -e '\.\[trees\]'`",
+            r"extra of the plugin's package, e\.g\. `pip install -e '\.\[trees\]'`",
         ),
         (['Gone>=3; extra == "trees"'], r"`pip install -e '\.\[trees\]'`"),
-        (["gone>=3; extra == 'dev'", "other; extra == 'trees'"], r"dependencies, e\.g\. `pip install gone`"),
-        (["gone>=3"], r"dependencies, e\.g\. `pip install gone`"),
-        (None, r"dependencies, e\.g\. `pip install gone`"),
+        (
+            ["gone>=3; extra == 'dev'", "other; extra == 'trees'"],
+            r"dependencies of the plugin's package, e\.g\. `pip install gone`",
+        ),
+        (["gone>=3"], r"dependencies of the plugin's package, e\.g\. `pip install gone`"),
+        (None, r"dependencies of the plugin's package, e\.g\. `pip install gone`"),
     ],
 )
 def test_a_missing_module_is_had_by_the_extra_that_asks_for_it(
@@ -299,7 +302,7 @@ def test_a_package_that_hides_ours_is_named(tmp_path: Path, hiding: str) -> None
         timeout=120,
         check=False,
     )
-    told = f"not in the package 'plugins' at {tmp_path / hiding}. If that is another package, it hides"
+    told = f"the package 'plugins' at {tmp_path / hiding} does not contain. If that package is not the plugin's own"
     if hiding == "plugins/mine.py":  # a folder without __init__.py hides nothing
         told = ""
     assert told in done.stderr

@@ -66,7 +66,7 @@ def test_a_run_that_has_finished_says_no_error_any_more(
 
 
 def numbers(folder: Path) -> dict[str, torch.Tensor]:
-    return loading.stored(folder)[1]
+    return loading.read_stored(folder)[1]
 
 
 @pytest.mark.parametrize("place", ["calibrate", "save", "report_test"])

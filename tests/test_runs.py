@@ -310,7 +310,7 @@ def test_a_checkpoint_of_another_model_is_refused(framework: Framework, whole: D
     tested = framework("mode=test", f"checkpoint={changed}", "logger=none", folder="tested")
     assert tested.code == 1
     assert "belongs to another model" in tested.out
-    assert "(16, wanted 32)" in tested.out
+    assert "(16 instead of 32)" in tested.out
 
 
 def test_a_stored_config_cannot_run_code(framework: Framework, whole: Done, tmp_path: Path) -> None:

@@ -159,7 +159,7 @@ def test_parts_are_resolved_and_built_with_the_same_context() -> None:
         ({"name": "toy", "others": ["toy", {"name": "toy", "rate": 2}]}, r"encoder\.others\[1\]\.rate = 2"),
         ({"name": "nobody"}, "No encoder is called 'nobody'"),
         ({"width": 3}, r"encoder\.name is missing"),
-        (7, "wanted the name of a encoder"),
+        (7, "expected the name of a encoder"),
         ({"name": "toy", "inner": {"_target_": "os.system"}}, "_target_` is refused"),
     ],
 )
@@ -183,7 +183,7 @@ def test_the_fields_of_a_value_are_keys_beside_the_others() -> None:
 
 
 def test_a_constructor_that_asks_for_the_unknown_is_told_what_there_is() -> None:
-    with pytest.raises(ConfigError, match=r"asks the framework for `moon`.*may ask for: input_shape"):
+    with pytest.raises(ConfigError, match=r"the parameter `moon`.*the framework supplies input_shape\."):
         build("encoder", {"name": "demanding"}, input_shape=(1,))
 
 
@@ -353,19 +353,19 @@ def a_function() -> None:
         (
             Callable[[], None],
             a_function,
-            r"encoder\.value = .*it holds a function, which no checkpoint keeps",
+            r"encoder\.value = .*the value contains a function, which a checkpoint cannot store",
         ),
-        (torch.dtype, torch.float32, "it holds a dtype, which no checkpoint keeps"),
-        (Any, [{"a": torch.zeros(2)}], "it holds a Tensor, which no checkpoint keeps"),
+        (torch.dtype, torch.float32, "contains a dtype, which a checkpoint cannot store"),
+        (Any, [{"a": torch.zeros(2)}], "contains a Tensor, which a checkpoint cannot store"),
         (
             Annotated[float, AfterValidator(math.radians)],
             180.0,
-            "changes what it is given.*in its constructor",
+            "the annotation changes the value each time.*Let the constructor of Taking",
         ),
         (
             Annotated[Path, Field(strict=True)],
             Path("/x"),
-            r"encoder\.value = '/x': .*That is how Taking keeps what it was given",
+            r"encoder\.value = '/x': .*plain value that a checkpoint stores, which the annotation of Taking does not",
         ),
         (Annotated[int, Field(gt=0)], 0, r"encoder\.value = 0: Input should be greater than 0"),
         (int, None, r"encoder\.value = None: Input should be a valid integer"),
@@ -618,16 +618,17 @@ def test_a_constructor_may_refuse_by_a_value_error(config: dict[str, Any], inner
         build("encoder", resolved, input_shape=(1,))
     told = str(caught.value)
     assert said in told
-    assert "encoder choosy does not take width=" in told
+    assert "encoder choosy refuses width=" in told
     (line,) = re.findall(rf"\(ValueError at {re.escape(__file__)}:(\d+)\)", told)
     source = Path(__file__).read_text(encoding="utf-8").splitlines()[int(line) - 1]
     assert "Conv2d" in source or "raise ValueError" in source
-    assert told.startswith("encoder toy, of which inner is a part: ") == inner
+    assert told.startswith("encoder toy, which contains inner: ") == inner
 
 
 def test_plugins_that_no_config_can_name_are_refused() -> None:
     with pytest.raises(
-        ConfigError, match=r"Named: `experts` holds plugins of the group encoder as dict.*a list or a tuple"
+        ConfigError,
+        match=r"Named: the annotation of `experts`, dict.* of the group encoder .*a list or a tuple",
     ):
         resolve("encoder", "named")
 

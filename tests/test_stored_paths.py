@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 
 from framework.configuration import paths, registry
 from framework.configuration.loading import load_with_description, reader
-from framework.configuration.paths import FilePath, Words, holds_path, words
+from framework.configuration.paths import FilePath, Words, holds_path, shell_arguments
 from framework.configuration.signature import parts, signature
 from framework.configuration.stored_keys import as_stored
 from framework.errors import ConfigError
@@ -221,7 +221,7 @@ def test_a_path_is_one_by_annotation_or_by_its_looks(annotation: Any, value: Any
 @settings(max_examples=100, deadline=None)
 @given(st.text(st.characters(), min_size=1, max_size=20).filter(str.isprintable))
 def test_the_words_to_add_say_the_path(path: str) -> None:
-    (word,) = shlex.split(words({"data.root": path})[0])
+    (word,) = shlex.split(shell_arguments({"data.root": path})[0])
     (argument,) = as_stored(["resume=a/b", word])[1:]
     parsed = OverridesParser.create().parse_override(argument)
     assert parsed.key_or_group == "stored.data.root"
@@ -289,7 +289,7 @@ def test_a_path_said_again_is_used(framework: Framework, tmp_path: Path) -> None
     wrong = framework(*test, "data.pat=x", folder="test")
     assert wrong.code == 2 and "data.pat" in wrong.out
     changed = framework(*test, *again, "encoder.mlp.widths=[3]", folder="test")
-    assert changed.code == 2 and "only paths can be said again" in changed.out
+    assert changed.code == 2 and "may override only the paths of a trained model" in changed.out
 
     # a run that goes on: the same path, no other
     (run.folder / "run.json").unlink()

@@ -76,11 +76,11 @@ def test_packages_that_clash_or_are_damaged_break_only_what_is_theirs(
     assert done.code == 0, done.out
     listed = framework("mode=plugins", **here)
     assert listed.code == 0, listed.out
-    assert "gaussian  (refused) Several installed packages call a density_head 'gaussian'" in listed.out
+    assert "gaussian  (refused) Several installed packages define a density_head 'gaussian'" in listed.out
     assert "latin  Head of M\xfcller (latin)." in listed.out and "wrapped_cauchy" in listed.out
     for chosen, wanted in {
         "gaussian": "twin:Head of twin 1.0 and plugins.density_head.gaussian.head:GaussianHead of ",
-        "shared": "density_head/shared.yaml is a config of several plugins: 'second'",
+        "shared": "Several plugins ship the config density_head/shared.yaml: 'second'",
         "cut": "latin/conf/density_head/cut.yaml, line 2, column 1: while parsing a flow sequence",
     }.items():
         refused = framework(*TINY, "logger=none", f"density_head={chosen}", folder=chosen, **here)

@@ -180,7 +180,7 @@ def test_outliers_are_built_only_for_metrics_that_read_them() -> None:
     )  # the missing file disturbs nobody
     with pytest.raises(DataError, match=r"no_such_file\.csv"):
         build_outliers(resolve_all(chosen(broken, "nll", "out_of_distribution")), data)
-    with pytest.raises(ConfigError, match="none are chosen"):
+    with pytest.raises(ConfigError, match="no outliers are chosen"):
         resolve_all(chosen(None, "nll", "out_of_distribution"))
 
 
@@ -201,7 +201,7 @@ def test_a_mistake_on_the_command_line_is_said_before_training(framework: Framew
     assert "trainer.keep = 'first': Input should be 'best' or 'last'" in done.out
     done = framework("experiment=moons/vanilla_128", "data@outliers=null")
     assert done.code == 2, done.out
-    assert "Take it out with `~`" in done.out
+    assert "Remove a group with `~`" in done.out
     assert "Traceback" not in done.out
 
 

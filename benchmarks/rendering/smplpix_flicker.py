@@ -25,7 +25,7 @@ from torch import Tensor
 
 import framework
 from benchmarks.pages import machine, write_page
-from framework.configuration.loading import find_checkpoint, stored
+from framework.configuration.loading import find_checkpoint, read_stored
 from framework.configuration.schema import build, resolve
 from framework.figures.style import titled_figure
 from framework.geometry.srgb import bytes_from_linear, srgb_from_linear
@@ -51,7 +51,7 @@ def rendered(name: str, **config: Any) -> Renderer:
 
 def walk(run: str, file: Path, subject: str) -> tuple[Pictures, list[Scene]]:
     """Images of each way, as files hold them, 0…255; and what they are of."""
-    description, _ = stored(run)
+    description, _ = read_stored(run)
     data = data_of(description)
     height, width = description.target.size
     who, moments = moving(generated(data, subject), file, FRAMES, START)
@@ -161,7 +161,7 @@ def rates(run: str, scene: Scene) -> list[str]:
 
 def training(run: str) -> str:
     """What the network is and how it was trained, in a sentence."""
-    description, _ = stored(run)
+    description, _ = read_stored(run)
     results = json.loads((find_checkpoint(run).parent.parent / "results.json").read_text())
     journal = (find_checkpoint(run).parent.parent / "journal.jsonl").read_text().splitlines()
     epochs = 1 + max(json.loads(line).get("epoch") or 0 for line in journal)

@@ -16,11 +16,11 @@ import numpy as np
 from framework.bodies import restricted_pickle
 from framework.bodies.body import Body
 from framework.errors import DataError, shorten
-from framework.storage.arrays import archive
+from framework.storage.arrays import read_npz
 from framework.storage.files import replacing
 from framework.storage.limits import MOST_DISPLACEMENTS as LARGEST
 from framework.storage.limits import MOST_NUMBERS
-from framework.storage.reading import guarded, read_bytes, require_numbers
+from framework.storage.reading import read_bytes, require_numbers, translate_errors
 
 NEEDED = ("v_template", "shapedirs", "J_regressor", "weights", "kintree_table", "f")
 OWN = ("template", "faces", "weights", "parents", "joints", "shapes", "joint_shapes")
@@ -34,10 +34,10 @@ def read(file: Path) -> Body:
         DataError: the file does not exist, has another format, holds something other than arrays and plain values, or
             an array is missing or has another shape. The message names the cause.
     """
-    with guarded(file, "a body model", missing="wanted a body model. Mend the path."):
+    with translate_errors(file, "a body model", missing="wanted a body model. Mend the path."):
         if file.suffix == ".npz":
             content = read_bytes(file)
-            found = archive(content, (*NEEDED, "posedirs"))
+            found = read_npz(content, (*NEEDED, "posedirs"))
             require_numbers(sum(array.size for array in found.values()), MOST_NUMBERS, len(content))
             return _body(file, found)
         if file.suffix == ".pkl":
@@ -62,8 +62,8 @@ def load(file: Path) -> Body:
     Raises:
         DataError: the file is missing or damaged.
     """
-    with guarded(file, "a body", "Delete it: it is made anew."):
-        arrays = archive(read_bytes(file))
+    with translate_errors(file, "a body", "Delete it: it is made anew."):
+        arrays = read_npz(read_bytes(file))
         parents = tuple(int(parent) for parent in arrays.pop("parents"))
         names = tuple(str(name) for name in arrays.pop("names"))
         return Body(source=str(arrays.pop("source")), parents=parents, names=names, **arrays)

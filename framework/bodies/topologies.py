@@ -16,9 +16,9 @@ from framework.bodies.body import Body
 from framework.bodies.decimation import Decimated, decimated
 from framework.errors import DataError
 from framework.storage import cache as cached
-from framework.storage.arrays import archive
-from framework.storage.generated import generated
-from framework.storage.reading import guarded, read_bytes
+from framework.storage.arrays import read_npz
+from framework.storage.generated import ensure_generated
+from framework.storage.reading import read_bytes, translate_errors
 
 VERSION = 1
 """Version of the cached decimations; any change of them takes a new number."""
@@ -264,6 +264,6 @@ def _decimated(body: Body, corners: Corners, count: int) -> Decimated:
     def write(folder: Path) -> None:
         np.savez(folder / "mesh.npz", **decimated(body.template, *corners, count)._asdict())
 
-    generated(root, mark, write)
-    with guarded(root / "mesh.npz", "a decimated body", f"Delete {root}: it is made anew."):
-        return Decimated(**archive(read_bytes(root / "mesh.npz"), Decimated._fields))
+    ensure_generated(root, mark, write)
+    with translate_errors(root / "mesh.npz", "a decimated body", f"Delete {root}: it is made anew."):
+        return Decimated(**read_npz(read_bytes(root / "mesh.npz"), Decimated._fields))

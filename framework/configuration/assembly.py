@@ -31,7 +31,7 @@ def resolve_all(config: Mapping[str, Any]) -> Resolved:
     """
     for group in ("data", "density_head", "encoder"):
         # a head that is fitted in one step may read the inputs without an encoder
-        if not config.get(group) and not (group == "encoder" and _fitted_at_once(config["density_head"])):
+        if not config.get(group) and not (group == "encoder" and _is_fitted_at_once(config["density_head"])):
             raise ConfigError(
                 f"No {group} is chosen. Name an experiment (`experiment=...`; `--help` lists them), "
                 f"or one of the installed: {group}={'|'.join(installed(group))}."
@@ -47,7 +47,8 @@ def resolve_all(config: Mapping[str, Any]) -> Resolved:
         chosen = config.get(group) or {}
         if not isinstance(chosen, Mapping):
             raise ConfigError(
-                f"{group} = {quote(chosen)}: wanted a mapping, a name of your own for each {group}."
+                f"{group} = {quote(chosen)}: expected a mapping from names of your choice to one {group} each. "
+                f"Write {group}=[<name>], or {group}.<key>.name=<name>."
             )
         resolved[group] = [resolve(group, part, f"{group}.{key}") for key, part in chosen.items()]
     outliers = config.get("outliers")
@@ -58,7 +59,7 @@ def resolve_all(config: Mapping[str, Any]) -> Resolved:
     return resolved
 
 
-def _fitted_at_once(head: Any) -> bool:
+def _is_fitted_at_once(head: Any) -> bool:
     return issubclass(load("density_head", resolve("density_head", head)["name"]), Fitted)
 
 
@@ -68,15 +69,16 @@ def require_outliers(resolved: Resolved) -> None:
     Raises:
         ConfigError: A metric reads outliers and none are configured.
     """
-    wanting = reading_outliers(resolved)
-    if wanting and not resolved.get("outliers"):
+    metric_names = metrics_reading_outliers(resolved)
+    if metric_names and not resolved.get("outliers"):
         raise ConfigError(
-            f"metric {wanting[0]} compares the test split with outliers, but none are chosen. Name their data set, "
-            f"e.g. `data@outliers={resolved['data']['name']} outliers.<key>=...`, or leave this metric out."
+            f"The metric {metric_names[0]} compares the test split with outliers, but no outliers are chosen. Name a "
+            f"data set of outliers, e.g. `data@outliers={resolved['data']['name']} outliers.<key>=...`, or leave this "
+            "metric out."
         )
 
 
-def reading_outliers(resolved: Resolved) -> list[str]:
+def metrics_reading_outliers(resolved: Resolved) -> list[str]:
     """Return the names of the metrics that read predictions on outliers."""
     return [part["name"] for part in resolved["metric"] if "outliers" in load("metric", part["name"]).splits]
 
@@ -85,23 +87,24 @@ def build_outliers(resolved: Resolved, data: Data) -> Data | None:
     """Return the prepared data set of the outliers; None if no metric reads it.
 
     Raises:
-        ConfigError: Its inputs have another shape than those of `data`, which is already prepared.
+        ConfigError: The outliers have inputs of another shape than `data`, which is already prepared.
         DataError: `Data.prepare` fails.
     """
-    if not reading_outliers(resolved):
+    if not metrics_reading_outliers(resolved):
         return None
     outliers: Data = build("data", resolved["outliers"])
     outliers.prepare()
     if outliers.input_shape != data.input_shape:
         raise ConfigError(
-            f"outliers={resolved['outliers']['name']} has inputs of shape {outliers.input_shape}, the data "
-            f"{resolved['data']['name']} of shape {data.input_shape}; wanted one shape. Set the size of either."
+            f"The outliers {resolved['outliers']['name']} have inputs of shape {outliers.input_shape}, but the data "
+            f"{resolved['data']['name']} has inputs of shape {data.input_shape}. Set the size of one of them so that "
+            "both shapes are equal."
         )
     return outliers
 
 
 def build_data(resolved: Resolved) -> Data:
-    """Return the data set, not yet prepared."""
+    """Return the data set, whose `prepare` has not been called yet."""
     return build("data", resolved["data"])
 
 
@@ -120,38 +123,42 @@ def build_predictor(
     torch.default_generator.manual_seed(seed)
     parts = list(resolved["encoder"])
     fixed: list[Encoder] = []
-    ready: list[Encoder] = []  # the encoder that is built already is used for the first model
+    built_encoders: list[Encoder] = []  # the encoder that is built already is used for the first model
     shape, names = input_shape, columns
     while parts:
         encoder: Encoder = build("encoder", parts[0], input_shape=shape, input_columns=names)
         if not encoder.fixed:
-            ready.append(encoder)
+            built_encoders.append(encoder)
             break
         fixed.append(encoder)
         shape, names = encoder.output_shape, ()
         del parts[0]
 
-    def chain() -> tuple[list[Encoder], tuple[int, ...]]:
+    def build_encoders() -> tuple[list[Encoder], tuple[int, ...]]:
         encoders: list[Encoder] = []
-        inner, called = shape, names
+        feature_shape, column_names = shape, names
         for part in parts:
-            built = ready.pop() if ready else build("encoder", part, input_shape=inner, input_columns=called)
+            built = (
+                built_encoders.pop()
+                if built_encoders
+                else build("encoder", part, input_shape=feature_shape, input_columns=column_names)
+            )
             encoders.append(built)
-            inner, called = encoders[-1].output_shape, ()
-        return encoders, inner
+            feature_shape, column_names = encoders[-1].output_shape, ()
+        return encoders, feature_shape
 
-    def model() -> Predictor:
-        encoders, inner = chain()
+    def build_model() -> Predictor:
+        encoders, feature_shape = build_encoders()
         head: DensityHead = build("density_head", resolved["density_head"], target=target)
-        return Model(encoders, head, inner, [chain()[0] for _ in head.backbones[1:]])
+        return Model(encoders, head, feature_shape, [build_encoders()[0] for _ in head.backbones[1:]])
 
-    factory: Callable[[], Predictor] = model
+    factory: Callable[[], Predictor] = build_model
     for part in resolved["uncertainty"]:
-        factory = _wrapped(part, factory, target)
+        factory = _wrapper_factory(part, factory, target)
     return FrozenFrontEnd(fixed, factory()) if fixed else factory()
 
 
-def _wrapped(
+def _wrapper_factory(
     part: Mapping[str, Any], inner: Callable[[], Predictor], target: Target
 ) -> Callable[[], Predictor]:
     return lambda: build("uncertainty", part, model=inner, target=target)
@@ -172,7 +179,7 @@ def citations(resolved: Resolved) -> dict[str, str]:
 
     Metrics and objectives of a stored model that are not installed are left out, since the model predicts without them.
     """
-    found: dict[str, str] = {}
+    bibtex_by_part: dict[str, str] = {}
 
     def visit(group: str, part: Mapping[str, Any]) -> None:
         try:
@@ -183,7 +190,7 @@ def citations(resolved: Resolved) -> dict[str, str]:
             raise
         bibtex = str(getattr(cls, "bibtex", "")).strip()
         if bibtex:
-            found[f"{group} {part['name']}"] = bibtex
+            bibtex_by_part[f"{group} {part['name']}"] = bibtex
         for key, inner in parts(cls).items():
             for item in _items(part.get(key)):
                 visit(inner.group, item)
@@ -193,16 +200,16 @@ def citations(resolved: Resolved) -> dict[str, str]:
             visit(group, part)
     for part in _items(resolved.get("outliers")):
         visit("data", part)
-    return found
+    return bibtex_by_part
 
 
 def entries(bibtex: Iterable[str]) -> dict[str, str]:
     """Return the entries of several BibTeX texts by their keys, each once and in order."""
-    found: dict[str, str] = {}
+    entries_by_key: dict[str, str] = {}
     for entry in re.split(r"^(?=@)", "\n".join(bibtex), flags=re.MULTILINE):
         if entry.strip():
-            found.setdefault(entry.partition("{")[2].partition(",")[0].strip(), entry.strip())
-    return found
+            entries_by_key.setdefault(entry.partition("{")[2].partition(",")[0].strip(), entry.strip())
+    return entries_by_key
 
 
 def _items(value: Any) -> list[Any]:

@@ -27,13 +27,13 @@ def command_line(arguments: list[str]) -> list[str]:
             resume.
     """
     _refuse_code_and_passwords(arguments)
-    arguments = _flags_first(arguments)
+    arguments = _put_flags_first(arguments)
     require_harmless(arguments, groups())
-    arguments = _newest_checkpoint(_in_resumed_folder(as_stored(arguments)))
-    return _swept_with_experiment(_preset_for_the_data(arguments))
+    arguments = _name_newest_run(_use_resumed_folder(as_stored(arguments)))
+    return _sweep_single_values(_choose_preset(arguments))
 
 
-def _newest_checkpoint(arguments: list[str]) -> list[str]:
+def _name_newest_run(arguments: list[str]) -> list[str]:
     """Replace `checkpoint=last` by the folder of the newest run, so that the stored config names a fixed run.
 
     Raises:
@@ -49,7 +49,7 @@ def _newest_checkpoint(arguments: list[str]) -> list[str]:
     ]
 
 
-def _flags_first(arguments: list[str]) -> list[str]:
+def _put_flags_first(arguments: list[str]) -> list[str]:
     """Return Hydra's flags followed by the settings, because Hydra reads settings only if they follow each other.
 
     Raises:
@@ -58,12 +58,14 @@ def _flags_first(arguments: list[str]) -> list[str]:
     parser = get_args_parser()
 
     def refuse(message: str) -> NoReturn:
-        raise ConfigError(f"{message}. `--hydra-help` lists the flags; settings are written as key=value.")
+        raise ConfigError(
+            f"{message}. `--hydra-help` lists the flags. Write a setting as key=value, without dashes."
+        )
 
     parser.error = refuse  # type: ignore[method-assign]
     known, unknown = parser.parse_known_intermixed_args(arguments)
     if unknown:
-        raise ConfigError(_no_flag(unknown[0], arguments))
+        raise ConfigError(_describe_unknown_flag(unknown[0], arguments))
     settings: list[str] = list(known.overrides)
     flags = []
     left = iter(settings)
@@ -76,18 +78,18 @@ def _flags_first(arguments: list[str]) -> list[str]:
     return flags + settings
 
 
-def _no_flag(flag: str, arguments: list[str]) -> str:
+def _describe_unknown_flag(flag: str, arguments: list[str]) -> str:
     """Return an error message that says how to write an unknown flag, such as `--epochs 5`, as a setting."""
     key, equals, value = flag.lstrip("-").partition("=")
     after = arguments[arguments.index(flag) + 1 :] if flag in arguments else []
     if not equals:
         value = after[0] if after and not after[0].startswith("-") and "=" not in after[0] else "..."
     key = key.replace("-", "_") if "." not in key else key
-    return f"{flag}: no such flag. Settings are written without dashes: {_setting_like(key)}={value}"
+    return f"{flag} is an unknown flag. Write a setting without dashes: {_nearest_setting(key)}={value}"
 
 
-def _setting_like(key: str) -> str:
-    """Return the dotted key of the setting with the most similar name; the given key if there is none."""
+def _nearest_setting(key: str) -> str:
+    """Return the dotted key of the setting with the most similar name, or `key` itself if no name is similar."""
     from framework.configuration.settings import OptimizerSettings, Settings, TrainerSettings
 
     models = {"": Settings, "trainer.": TrainerSettings, "optimizer.": OptimizerSettings}
@@ -103,68 +105,71 @@ def _setting_like(key: str) -> str:
     return known[near] if near else key
 
 
-def _preset_for_the_data(arguments: list[str]) -> list[str]:
+def _choose_preset(arguments: list[str]) -> list[str]:
     """Replace `preset=a` by `preset=a/<experiment>` or `preset=a/<data>` if a folder `a` holds such presets.
 
     Raises:
-        ConfigError: There is no preset of that name or for this data, or a sweep over experiments needs several.
+        ConfigError: No preset has that name or fits this data, or a sweep over experiments needs several presets.
     """
-    arguments = [one.removeprefix("+") if one.startswith("+preset=") else one for one in arguments]
-    given = [one for one in arguments if one.startswith("preset=")]
-    swept = [one for one in arguments if one.startswith("experiment=")]
-    others = [one for one in arguments if one not in (*given, *swept)]
-    known = options("preset") if given else []
+    arguments = [item.removeprefix("+") if item.startswith("+preset=") else item for item in arguments]
+    preset_arguments = [item for item in arguments if item.startswith("preset=")]
+    experiment_arguments = [item for item in arguments if item.startswith("experiment=")]
+    other_arguments = [item for item in arguments if item not in (*preset_arguments, *experiment_arguments)]
+    known = options("preset") if preset_arguments else []
     presets = []
-    for name in _choices(given[-1]) if given else ():
-        if not any(one.startswith(f"{name}/") for one in known):
+    for name in _choices(preset_arguments[-1]) if preset_arguments else ():
+        if not any(item.startswith(f"{name}/") for item in known):
             if name not in (*known, ""):
-                folders = sorted({one.partition("/")[0] for one in known})
-                raise ConfigError(f"No configuration 'preset/{name}'.{did_you_mean(name, folders)}")
+                folders = sorted({item.partition("/")[0] for item in known})
+                raise ConfigError(
+                    f"There is no config 'preset/{name}'.{did_you_mean(name, folders)} Available presets: "
+                    f"{', '.join(folders)}."
+                )
             presets.append(name)
             continue
-        experiments = _choices(swept[-1]) if swept else [""]
-        chosen = {_preset(name, known, others, experiment) for experiment in experiments}
+        experiments = _choices(experiment_arguments[-1]) if experiment_arguments else [""]
+        chosen = {_preset(name, known, other_arguments, experiment) for experiment in experiments}
         if len(chosen) > 1:
             raise ConfigError(
-                f"preset={name} is another for each of these experiments: {', '.join(sorted(chosen))}. Sweep over "
-                "those of one alone."
+                f"preset={name} means several presets for these experiments: {', '.join(sorted(chosen))}. Sweep only "
+                "over experiments that use the same preset."
             )
         presets += chosen
-    return [f"preset={','.join(presets)}" if one in given else one for one in arguments]
+    return [f"preset={','.join(presets)}" if item in preset_arguments else item for item in arguments]
 
 
 def _choices(argument: str) -> list[str]:
     """Return the names that an argument chooses for a group: one, or several in a sweep."""
     with suppress(HydraException):
-        one = OverridesParser.create().parse_override(argument)
-        if one.is_sweep_override():
-            return [str(value) for value in one.sweep_string_iterator()]
+        override = OverridesParser.create().parse_override(argument)
+        if override.is_sweep_override():
+            return [str(value) for value in override.sweep_string_iterator()]
     return [argument.partition("=")[2]]
 
 
 def _preset(name: str, options: list[str], arguments: list[str], experiment: str) -> str:
-    """Return the preset of the folder `name` for the experiment or the data that the other arguments choose."""
-    own = [one for one in arguments if one.startswith("data=")]
+    """Return the preset in the folder `name` for the experiment, or for the data that the other arguments choose."""
+    data_arguments = [item for item in arguments if item.startswith("data=")]
     register()
     ready = GlobalHydra.instance().is_initialized()
     with nullcontext() if ready else initialize_config_dir(str(folder()), version_base="1.3"):
         composed = compose(
             "config",
-            [f"experiment={experiment}"] * bool(experiment) + own,
+            [f"experiment={experiment}"] * bool(experiment) + data_arguments,
             return_hydra_config=True,
         )
     groups = composed.hydra.runtime.choices
-    for one in (f"{name}/{experiment}", f"{name}/{groups['data']}"):
-        if one in options:
-            return one
-    available = ", ".join(sorted({one.split("/")[1] for one in options if one.startswith(f"{name}/")}))
+    for item in (f"{name}/{experiment}", f"{name}/{groups['data']}"):
+        if item in options:
+            return item
+    available = ", ".join(sorted({item.split("/")[1] for item in options if item.startswith(f"{name}/")}))
     raise ConfigError(
-        f"preset={name} has no setting for data={groups['data']}; it has one for {available}. Leave it out, or choose "
-        "an experiment on one of these."
+        f"preset={name} has no setting for data={groups['data']}, only for {available}. Leave the preset out, or "
+        "choose an experiment on one of these."
     )
 
 
-def _in_resumed_folder(arguments: list[str]) -> list[str]:
+def _use_resumed_folder(arguments: list[str]) -> list[str]:
     """Set Hydra's run folder to the folder of `resume=<run folder>`, so that Hydra creates no new one."""
     for index, argument in enumerate(arguments):
         key, _, value = argument.partition("=")
@@ -178,16 +183,21 @@ def _in_resumed_folder(arguments: list[str]) -> list[str]:
                     f"resume={value}: {path / 'config.yaml'} does not exist. Give the folder of a run, "
                     "as printed at its start (outputs/<experiment>/<time>)."
                 )
-            here = in_quotes(str(path))
-            return [*arguments[:index], f"resume={here}", *arguments[index + 1 :], f"hydra.run.dir={here}"]
+            quoted_path = in_quotes(str(path))
+            return [
+                *arguments[:index],
+                f"resume={quoted_path}",
+                *arguments[index + 1 :],
+                f"hydra.run.dir={quoted_path}",
+            ]
     return arguments
 
 
 def _refuse_code_and_passwords(arguments: list[str]) -> None:
     """Refuse arguments that would run code or store a password, before Hydra reads them.
 
-    Hydra passes its logging configs to logging.config.dictConfig, which calls the functions that they name. Hydra's
-    reruns unpickle a file.
+    Hydra passes its logging configs to logging.config.dictConfig, which calls the functions that the configs name.
+    Hydra's option --experimental-rerun unpickles a file.
 
     Raises:
         ConfigError: An argument chooses or changes such a config, names such a file, or contains a password.
@@ -195,24 +205,24 @@ def _refuse_code_and_passwords(arguments: list[str]) -> None:
     for argument in arguments:
         flag = argument.partition("=")[0]
         if flag in ("--experiment", "--exp"):
-            raise ConfigError(_no_flag(argument, arguments))
+            raise ConfigError(_describe_unknown_flag(argument, arguments))
         # argparse accepts abbreviations
         if flag.startswith("--e") and "--experimental-rerun".startswith(flag):
             raise ConfigError(
-                f"{argument}: refused, since Hydra unpickles that file, which runs what it holds. Use resume=<folder>, "
-                "or repeat the command that the run's overrides.yaml lists."
+                f"{argument} is refused, because Hydra unpickles that file, and unpickling can run code. Use "
+                "resume=<folder>, or repeat the command in the run's overrides.yaml."
             )
         if argument.lstrip("+").startswith("logger.uri="):
             require_no_password(argument.partition("=")[2].strip("'\""))
         key = argument.lstrip("+~").partition("=")[0]
         if key.replace(".", "/").startswith(("hydra/job_logging", "hydra/hydra_logging", "hydra/callbacks")):
             raise ConfigError(
-                f"{argument}: refused, since Hydra's logging and callback configs can run code. "
-                "Set the level with hydra.verbose=true instead."
+                f"{argument} is refused, because Hydra's logging and callback configs can run code. "
+                "Set the level of the log with hydra.verbose=true instead."
             )
 
 
-def _swept_with_experiment(arguments: list[str]) -> list[str]:
+def _sweep_single_values(arguments: list[str]) -> list[str]:
     """Return the arguments of a sweep over experiments, with single values written as sweeps over one value.
 
     Hydra first composes the config from the arguments that are not swept. With `experiment=a,b`, an argument
@@ -227,14 +237,20 @@ def _swept_with_experiment(arguments: list[str]) -> list[str]:
         parsed = dict(zip(overrides, OverridesParser.create().parse_overrides(overrides), strict=True))
     except HydraException:
         return arguments  # Hydra itself reports the error
-    if not any(one.key_or_group == "experiment" and one.is_sweep_override() for one in parsed.values()):
+    if not any(
+        override.key_or_group == "experiment" and override.is_sweep_override() for override in parsed.values()
+    ):
         return arguments
 
-    def written(argument: str) -> str:
-        one = parsed.get(argument)
-        if one is None or one.is_sweep_override() or (one.key_or_group or "").startswith("hydra"):
+    def as_sweep(argument: str) -> str:
+        override = parsed.get(argument)
+        if (
+            override is None
+            or override.is_sweep_override()
+            or (override.key_or_group or "").startswith("hydra")
+        ):
             return argument
         key, _, value = argument.partition("=")
         return f"{key}=choice({value})" if value else argument
 
-    return [written(argument) for argument in arguments]
+    return [as_sweep(argument) for argument in arguments]

@@ -22,7 +22,7 @@ from framework.configuration.registry import config_folders
 from framework.errors import ConfigError, did_you_mean, list_names, nearest_name, shorten
 
 PLURAL = ("encoder", "uncertainty", "objective", "metric")
-"""Groups of which an experiment may choose several plugins; their configs are keyed by name."""
+"""Groups from which an experiment may choose several plugins; the config maps a name to each of them."""
 GLOBAL = ("experiment", "preset", "debug")
 """Groups whose configs set keys at the top level."""
 
@@ -37,7 +37,7 @@ def folder() -> Path:
 
 
 class PluginConfigs(SearchPathPlugin):
-    """Hydra plugin that appends the plugins' config folders after the project's own, which takes priority."""
+    """Hydra plugin that adds the plugins' config folders to the search path, after the project's own folder."""
 
     folders: Mapping[str, Path] = {}
 
@@ -47,7 +47,7 @@ class PluginConfigs(SearchPathPlugin):
 
 
 class PluginFolder(FileConfigSource):
-    """Config folder of a plugin; it refuses a config that two plugins ship, of which Hydra would silently take one."""
+    """Config folder of a plugin that refuses a config which two plugins ship; Hydra would silently use one of them."""
 
     @staticmethod
     def scheme() -> str:
@@ -62,8 +62,8 @@ class PluginFolder(FileConfigSource):
         ]
         if len(shipped) > 1:
             raise ConfigError(
-                f"{file} is a config of several plugins: {', '.join(shipped)}. Uninstall all but one of them, or "
-                "rename its config; everything else still works."
+                f"Several plugins ship the config {file}: {', '.join(shipped)}. Uninstall all but one of these "
+                "plugins, or rename the config in one of them. All other configs still work."
             )
         return super().load_config(config_path)
 
@@ -77,7 +77,7 @@ def register() -> None:
 
 
 def in_quotes(text: str) -> str:
-    """Return a text in quotes such that Hydra's grammar reads it back unchanged."""
+    """Return a text in quotes, so that Hydra's grammar reads exactly this text."""
     ending = re.sub(r"(\\+)$", r"\1\1", text)
     return "'" + re.sub(r"(\\*)'", r"\1\1\\'", ending) + "'"
 
@@ -95,29 +95,32 @@ def plain(config: DictConfig) -> dict[str, Any]:
         values = OmegaConf.to_container(config, resolve=True)
     except OmegaConfBaseException as error:  # an interpolation of a missing key
         raise ConfigError(
-            f"{_in_its_config(error)}. Give it a value, or mend what stands between ${{ and }}."
+            f"{_message_with_config(error)}. Give the missing key a value, or correct the text between ${{ and }}."
         ) from error
     assert isinstance(values, dict)
     for group in GLOBAL:
         if group in values:
             raise ConfigError(
-                f"The config chosen as {group} sets nothing at the top level. Wanted `# @package _global_` as its "
-                f"first line, since its keys stand under `{group}` otherwise, and keys and values below it."
+                f"The config chosen as {group} sets nothing at the top level. Its first line must be "
+                f"`# @package _global_`, because Hydra puts its keys under `{group}` otherwise; keys and values follow."
             )
     for group in PLURAL:
         chosen = values.get(group) or {}
         values[group] = {
             key: part for key, part in chosen.items() if isinstance(part, Mapping) and "name" in part
         }
-    for key, wanted in _missing(values):
-        raise ConfigError(f"{key} is missing{wanted}. Give it a value: {key}=...")
+    for key, description in _missing(values):
+        raise ConfigError(f"{key} is missing{description}. Write {key}=...")
     return {str(key): value for key, value in values.items()}
 
 
 def _missing(values: Any, before: str = "") -> Iterator[tuple[str, str]]:
-    """Yield the dotted keys of missing required values, each with the description (`<a file of ...>`) in the config."""
+    """Yield the dotted key of each missing required value, and the part of the message that describes the value.
+
+    A config marks such a value as `<a file of ...>`, with a description, or as `???`, without one.
+    """
     if isinstance(values, str) and re.fullmatch(r"\?\?\?|<.*>", values):
-        yield before, f": wanted {values[1:-1]}" if values != "???" else ""
+        yield before, f": give {values[1:-1]}" if values != "???" else ""
     parts = enumerate(values) if isinstance(values, list) else ()
     for key, value in values.items() if isinstance(values, Mapping) else parts:
         yield from _missing(value, f"{before}.{key}" if before else str(key))
@@ -126,7 +129,7 @@ def _missing(values: Any, before: str = "") -> Iterator[tuple[str, str]]:
 def help_text() -> str:
     """Return the text of `--help`: the usage, and every group with its options.
 
-    Hydra's own function copies its store of configs for each group, which takes longer than everything else.
+    Hydra's own function is not used, because it copies Hydra's store of configs for each group, which is slow.
     """
     words = yaml.safe_load((folder() / "config.yaml").read_text(encoding="utf-8"))["hydra"]["help"]
     lines = [f"{group}: {', '.join(options(group))}" for group in groups()]
@@ -144,39 +147,39 @@ def _roots() -> list[Path]:
 
 def options(group: str) -> list[str]:
     """Return the names of all configs of a group, including subfolders, of the framework and the plugins."""
-    found = {path.relative_to(root / group) for root in _roots() for path in (root / group).rglob("*.yaml")}
-    return sorted(str(path.with_suffix("")) for path in found)
+    paths = {path.relative_to(root / group) for root in _roots() for path in (root / group).rglob("*.yaml")}
+    return sorted(str(path.with_suffix("")) for path in paths)
 
 
-def sentence(error: BaseException) -> str | None:
-    """Return a composition error of Hydra or OmegaConf as a message with a suggestion; None for any other error."""
+def describe_error(error: BaseException) -> str | None:
+    """Return the message for a composition error of Hydra or OmegaConf, with a remedy; None for any other error."""
     if isinstance(error, MissingConfigException):
         wanted = error.missing_cfg_file or ""
         group, _, name = wanted.partition("/")
         known = [str(option) for option in error.options or ()] or options(group)
         available = f" Available in {group}: {list_names(name, known)}." if known else ""
-        return f"No configuration {wanted!r}.{did_you_mean(name, known)}{available}"
+        return f"There is no config {wanted!r}.{did_you_mean(name, known)}{available}"
     if isinstance(error, ValueError) and "Config group override must be" in str(error):
         return (
-            "A group takes a name; it cannot be set to null, true or a number. Take it out with `~`, e.g. "
+            "A group takes a name; it cannot be set to null, true or a number. Remove a group with `~`, e.g. "
             "`~data@outliers` or `~density_head`."
         )
     cause: BaseException | None = error
     while cause is not None and not isinstance(cause, OmegaConfBaseException):
         cause = cause.__cause__ or cause.__context__
     if isinstance(cause, OmegaConfBaseException) and cause.parent_node is not None and "not in" in str(cause):
-        return _unknown(cause)
-    damaged = _damaged(error)
+        return _describe_unknown_key(cause)
+    damaged = _describe_damage(error)
     if damaged is not None:
         return damaged
     if isinstance(error, OverrideParseException):
-        return _cannot_be_read(error.override)
+        return _describe_unreadable(error.override)
     if isinstance(error, HydraException | OmegaConfBaseException):
-        return _in_its_config(error)
+        return _message_with_config(error)
     return None
 
 
-def _cannot_be_read(override: str) -> str:
+def _describe_unreadable(override: str) -> str:
     key, equals, value = override.partition("=")
     quoted = f"{key}={in_quotes(value)}"
     try:
@@ -184,12 +187,15 @@ def _cannot_be_read(override: str) -> str:
     except HydraException:
         equals = ""
     typed = shlex.quote(quoted) if set(quoted) & set('"$`\\!') else f'"{quoted}"'
-    meant = f" If all of it is one text: {typed}." if equals else ""
-    return f"{override!r} cannot be read; wanted key=value, quoted where it holds commas or brackets.{meant}"
+    meant = f" If the whole value is one text, write {typed}." if equals else ""
+    return (
+        f"{override!r} cannot be read; expected key=value, with quotes around a value that contains commas or "
+        f"brackets.{meant}"
+    )
 
 
-def _damaged(error: BaseException) -> str | None:
-    """Return an error message for a file that is no config at all; None for any other error."""
+def _describe_damage(error: BaseException) -> str | None:
+    """Return the message for an error that a file causes which is no config at all; None for any other error."""
     cause: BaseException | None = error
     while cause is not None and not isinstance(cause, yaml.YAMLError):
         cause = cause.__cause__
@@ -198,70 +204,77 @@ def _damaged(error: BaseException) -> str | None:
         during = f" {cause.context}," if cause.context else ""
         return (
             f"{mark.name}, line {mark.line + 1}, column {mark.column + 1}:{during} {shorten(cause.problem)}. "
-            "This cannot be read as YAML; mend it there."
+            "The file cannot be read as YAML. Correct it at that position."
         )
     if cause is not None:
-        return f"{shorten(cause)}. This cannot be read as YAML; mend it there."
-    if isinstance(error, UnicodeDecodeError) and _being_composed(error):
+        return f"{shorten(cause)}. The file cannot be read as YAML. Correct it."
+    if isinstance(error, UnicodeDecodeError) and _config_in_progress(error):
         byte = error.object[error.start]
         return (
-            f"In {_being_composed(error)!r}: byte {byte:#04x} at position {error.start} is not UTF-8. "
-            "Save the file in that encoding."
+            f"In {_config_in_progress(error)!r}: byte {byte:#04x} at position {error.start} is not UTF-8. "
+            "Save the file in UTF-8."
         )
     no_config = "Cannot merge DictConfig with ListConfig" in str(error)
-    if no_config or (isinstance(error, ValueError | OSError) and _being_composed(error)):
+    if no_config or (isinstance(error, ValueError | OSError) and _config_in_progress(error)):
         return (
-            f"{_in_its_config(error)}. Wanted keys and values (`key: value`), and under `defaults`, where it has any, "
-            "a list of `- group: name`."
+            f"{_message_with_config(error)}. A config consists of keys and values (`key: value`); `defaults`, if it is "
+            "set, is a list of `- group: name`."
         )
     return None
 
 
-def _in_its_config(error: BaseException) -> str:
-    """Return the message of Hydra or OmegaConf in one line, after the name of the config that it concerns."""
-    said = (str(error) or str(error.__cause__ or "")).split("\n\nSet the environment")[0]
-    said = " ".join(said.split("\nSee https://hydra.cc")[0].split())
-    said = re.sub(r" full_key: (\S*) ?object_type=\w+", lambda key: f" (at {key[1]})" * bool(key[1]), said)
-    here = _being_composed(error)
-    return f"In {here!r}: {said}" if here and here not in said else said
+def _message_with_config(error: BaseException) -> str:
+    """Return the message of Hydra or OmegaConf in one line, preceded by the name of the config that was composed."""
+    message = (str(error) or str(error.__cause__ or "")).split("\n\nSet the environment")[0]
+    message = " ".join(message.split("\nSee https://hydra.cc")[0].split())
+    message = re.sub(
+        r" full_key: (\S*) ?object_type=\w+", lambda key: f" (at {key[1]})" * bool(key[1]), message
+    )
+    config_name = _config_in_progress(error)
+    return f"In {config_name!r}: {message}" if config_name and config_name not in message else message
 
 
-def _being_composed(error: BaseException) -> str | None:
-    """Return the config that Hydra was reading or adding when it failed, such as 'experiment/moons/scvae', or None."""
-    found = None
+def _config_in_progress(error: BaseException) -> str | None:
+    """Return the name of the config that Hydra was reading when it failed, such as 'experiment/moons/scvae', or None.
+
+    The name is read from the local variables of Hydra's functions in the stack trace.
+    """
+    config_path = None
     for frame, _ in walk_tb(error.__traceback__):
         if frame.f_globals["__name__"] in (
             "hydra._internal.config_repository",
             "hydra._internal.config_loader_impl",
         ):
             default = frame.f_locals.get("default")
-            found = getattr(default, "config_path", None) or frame.f_locals.get("config_path") or found
-    return found if isinstance(found, str) else None
+            config_path = (
+                getattr(default, "config_path", None) or frame.f_locals.get("config_path") or config_path
+            )
+    return config_path if isinstance(config_path, str) else None
 
 
-def _unknown(cause: OmegaConfBaseException) -> str:
-    """Return a message about an unknown key that suggests a key of the same name elsewhere, or a similar name."""
+def _describe_unknown_key(cause: OmegaConfBaseException) -> str:
+    """Return the message for an unknown key; it suggests the same key elsewhere in the config, or a similar key."""
     assert cause.parent_node is not None
     key, root = str(cause.key), cause.parent_node._get_root()
     known = [str(name) for name in cause.parent_node if name != "hydra"]
     elsewhere = {
-        path.rpartition(".")[2]: path for path in _paths(OmegaConf.to_container(root, resolve=False))
+        path.rpartition(".")[2]: path for path in _dotted_keys(OmegaConf.to_container(root, resolve=False))
     }
     beside = [*known, *groups()] if cause.parent_node is root else known
     near = key if key in elsewhere else nearest_name(key, beside) or nearest_name(key, elsewhere, 0.7)
     if cause.parent_node is root and key in beside:
-        return f"No {key} is chosen, so {cause.full_key}... sets nothing. Choose one: {key}=<name>, or {key}=[<name>]."
+        return f"No {key} is chosen, so {cause.full_key}... has no effect. Choose {key}=<name>, or {key}=[<name>]."
     hint = f" Did you mean {(near if near in beside else elsewhere[near])!r}?" if near else ""
     return (
-        f"{cause.full_key}: unknown key.{hint} Known keys: {list_names(key, known) or 'none'}. "
-        f"(+{cause.full_key}=... adds one the plugin knows but its yaml does not show.)"
+        f"{cause.full_key}: unknown key.{hint} Known keys: {list_names(key, known) or 'none'}. (If the plugin has "
+        f"this parameter and its YAML config does not list it, write +{cause.full_key}=...)"
     )
 
 
-def _paths(values: Any, before: str = "") -> list[str]:
-    """Return the dotted keys of nested mappings, without Hydra's own keys."""
-    found = []
+def _dotted_keys(values: Any, before: str = "") -> list[str]:
+    """Return the dotted keys of all entries of nested mappings, without Hydra's own keys."""
+    keys = []
     for key, value in values.items() if isinstance(values, Mapping) else ():
         if before or key != "hydra":
-            found += [f"{before}{key}", *_paths(value, f"{before}{key}.")]
-    return found
+            keys += [f"{before}{key}", *_dotted_keys(value, f"{before}{key}.")]
+    return keys

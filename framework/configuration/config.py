@@ -29,7 +29,7 @@ class Config:
     """Config of a command, as a mode receives it.
 
     Attributes:
-        values: Composed config as plain values, which is kept in the run folder and compared when the run is resumed.
+        values: Composed config as plain values, which the run folder stores; a resumed run compares it with its own.
         settings: Checked settings of the core.
         folder: Folder of the run.
         overrides: Overrides on the command line.
@@ -44,7 +44,7 @@ class Config:
 
     @classmethod
     def of(cls, values: Mapping[str, Any], folder: Path, overrides: Sequence[str]) -> "Config":
-        """Check the core's part of composed values, and return the config.
+        """Return the config of a command after checking the settings that belong to no plugin.
 
         Raises:
             ConfigError: A key is unknown, or a value is out of range.
@@ -75,7 +75,7 @@ class Config:
         """
         return kind.model_validate(check(kind, self.values["mode"], "mode"))
 
-    def given(self, key: str) -> str | None:
-        """Return the first override on the command line of a key or of a key below it; None if there is none."""
-        found = (item for item in self.overrides if is_below(key_of(item).removeprefix("stored."), (key,)))
-        return next(found, None)
+    def first_override(self, key: str) -> str | None:
+        """Return the first override on the command line that sets `key` or a key below it; None if there is none."""
+        matches = (item for item in self.overrides if is_below(key_of(item).removeprefix("stored."), (key,)))
+        return next(matches, None)

@@ -7,7 +7,7 @@ from importlib.metadata import version
 from typing import Any, get_args
 
 from framework.configuration.assembly import Resolved
-from framework.configuration.paths import UNUSED, require_said, without_paths
+from framework.configuration.paths import UNUSED, remove_paths, require_paths
 from framework.configuration.registry import MODEL
 from framework.configuration.schema import check, resolve
 from framework.configuration.settings import Settings
@@ -17,9 +17,9 @@ from framework.storage.limits import LONGEST_NAME, MOST_DRAWN, MOST_DRAWS, MOST_
 from framework.target import Kind, Target
 
 MOST_REMARKS, LONGEST_REMARK = 8, 500
-"""Largest number of remarks of a stored model that are read, and of characters in each."""
+"""Largest number of remarks of a stored model that are read, and largest number of characters of a remark."""
 INHERITED = ("seed", "batch_size", "samples", "experiment_name")
-"""Settings that a later test of the model takes over, so that it gives the same numbers as the model's own run."""
+"""Settings that a later test of the model takes over, so that its numbers equal those of the model's own run."""
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,8 @@ class Description:
         settings: Settings of the model's run that are in `INHERITED`; none in checkpoints of version 0.1.
         data_state: `Data.state_dict` of the training data.
         path: Path of the checkpoint from which the description was read.
-        dropped: Paths in the stored config that the user has not repeated, by dotted keys; in `config` they have their
-            defaults.
+        dropped: Paths in the stored config that the user has not repeated, by dotted keys; in `config` these keys have
+            their defaults.
         remarks: Remarks of the wrappers from their calibration (`Uncertainty.remark`).
     """
 
@@ -58,10 +58,10 @@ class Description:
         cls, parts: Resolved, data: Data, method: str, settings: Settings, remarks: tuple[str, ...] = ()
     ) -> "Description":
         """Return the description of a model that consists of `parts`, for prepared `data`."""
-        kept = {key: getattr(settings, key) for key in INHERITED}
+        inherited = {key: getattr(settings, key) for key in INHERITED}
         state = dict(data.state_dict())
         about = data.target, data.input_shape, data.columns, data.synthetic
-        return cls(parts, *about, method, kept, state, remarks=remarks)
+        return cls(parts, *about, method, inherited, state, remarks=remarks)
 
     def __str__(self) -> str:
         parts = [*self.config["encoder"], self.config["density_head"], *self.config["uncertainty"]]
@@ -95,7 +95,7 @@ class Description:
     def read(
         cls, content: Mapping[str, Any], path: str, paths: Mapping[str, Any] | None = None
     ) -> "Description":
-        """Return the description in a checkpoint, after checking its config: it can only choose installed plugins.
+        """Return the description in a checkpoint after checking that its config chooses installed plugins only.
 
         Args:
             content: Contents of the checkpoint.
@@ -104,20 +104,20 @@ class Description:
 
         Raises:
             CheckpointError: The checkpoint holds no description.
-            ConfigError: A part of the config is unknown here, or the user does not repeat a path of the model.
+            ConfigError: A plugin of the config is not installed, or the user does not repeat a path of the model.
             LookupError, TypeError, ValueError: The description is incomplete.
         """
         stored = content.get("framework")
         if not isinstance(stored, Mapping) or stored.get("format") != 1:
             raise CheckpointError(
-                f"{path} was not written by this framework (it holds no model description of format 1). "
-                "Give a run folder, or a checkpoint from its checkpoints/."
+                f"{path} was not written by this framework: it contains no model description of format 1. "
+                "Give a run folder, or a checkpoint from the folder checkpoints/ of a run."
             )
         target = stored_target(stored["target"])
-        config, dropped = without_paths(stored["config"], paths or {}, UNUSED)
-        require_said(dropped, MODEL, path)
+        config, dropped = remove_paths(stored["config"], paths or {}, UNUSED)
+        require_paths(dropped, MODEL, path)
         return cls(
-            checked(config),
+            check_config(config),
             target,
             stored_shape(stored["input_shape"]),
             stored_names(stored.get("columns", ()), "columns"),
@@ -137,27 +137,27 @@ def stored_shape(stored: Sequence[Any]) -> tuple[int, ...]:
     """Return the stored shape of an input.
 
     Raises:
-        ValueError: It is no shape, or has more than MOST_SIDES dimensions or MOST_INPUT elements.
+        ValueError: The value is no shape, or has more than MOST_SIDES dimensions or MOST_INPUT elements.
     """
     shape = tuple(map(int, stored[: MOST_SIDES + 1]))
     if len(shape) > MOST_SIDES or min(shape, default=0) < 0 or math.prod(shape) > MOST_INPUT:
         raise ValueError(
-            f"inputs of shape {quote(list(shape))}; at most {MOST_SIDES} sides, and {MOST_INPUT} numbers in all"
+            f"inputs of shape {quote(list(shape))}; at most {MOST_SIDES} dimensions and {MOST_INPUT} numbers are read"
         )
     return shape
 
 
-def stored_names(stored: Sequence[Any], what: str) -> tuple[str, ...]:
-    """Return the stored names of columns or of a target.
+def stored_names(stored: Sequence[Any], description: str) -> tuple[str, ...]:
+    """Return the stored names of columns or of a target, which `description` calls by name in messages.
 
     Raises:
         ValueError: There are too many names, or one is too long.
     """
     if len(stored) > MOST_NAMES:
-        raise ValueError(f"{len(stored)} {what}; at most {MOST_NAMES}")
+        raise ValueError(f"{len(stored)} {description}; at most {MOST_NAMES} are read")
     names = tuple(map(str, stored))
     if any(len(name) > LONGEST_NAME for name in names):
-        raise ValueError(f"{what} of more than {LONGEST_NAME} letters")
+        raise ValueError(f"{description} with more than {LONGEST_NAME} characters")
     return names
 
 
@@ -168,14 +168,14 @@ def stored_settings(stored: Mapping[str, Any], target: Target) -> dict[str, Any]
         ConfigError: A value has the wrong type or range.
         ValueError: `samples` is so large that the samples would fill the memory.
     """
-    kept = {key: value for key, value in dict(stored).items() if key in INHERITED}
-    values = check(Settings, kept, "settings")
+    inherited = {key: value for key, value in dict(stored).items() if key in INHERITED}
+    values = check(Settings, inherited, "settings")
     samples, numbers = values["samples"], math.prod(target.event_shape)
     if samples > MOST_DRAWS or samples * numbers > max(MOST_DRAWN, 1000 * numbers):
         raise ValueError(
-            f"settings.samples = {samples}; at most {MOST_DRAWS}, and {MOST_DRAWN} numbers in all"
+            f"settings.samples = {samples}; at most {MOST_DRAWS} samples and {MOST_DRAWN} numbers in all are allowed"
         )
-    return {key: values[key] for key in kept}
+    return {key: values[key] for key in inherited}
 
 
 def stored_target(stored: Mapping[str, Any]) -> Target:
@@ -191,23 +191,21 @@ def stored_target(stored: Mapping[str, Any]) -> Target:
     if kind not in get_args(Kind):
         raise ValueError(f"a target of kind {quote(kind)} with the names {quote(names)}")
     if len(size) != 2 * (kind == "image") or min(size, default=1) < 1:
-        raise ValueError(f"a target of kind {kind!r} and of size {quote(size)}")
+        raise ValueError(f"a target of kind {kind!r} with the size {quote(size)}")
     if math.prod(size) * len(names) > MOST_INPUT:
         raise ValueError(
-            f"a target of size {quote(size)} and {len(names)} numbers; at most {MOST_INPUT} in all"
+            f"a target of size {quote(size)} with {len(names)} numbers; at most {MOST_INPUT} numbers in all are read"
         )
     if (
         sizes not in ({0}, {len(names)})
         or not all(map(math.isfinite, location + scale))
         or min(scale, default=1) <= 0
     ):
-        raise ValueError(
-            "a target's location and scale are no finite numbers of which the scales are above 0"
-        )
+        raise ValueError("a target whose location and scale are not finite, or whose scale is not above 0")
     return Target(kind, names, location, scale, size)
 
 
-def checked(config: Mapping[str, Any]) -> Resolved:
+def check_config(config: Mapping[str, Any]) -> Resolved:
     """Return a stored config after checking that it chooses only installed plugins and valid values.
 
     Data, metrics and objectives, without which the model can predict, are checked only where they are used, because

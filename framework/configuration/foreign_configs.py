@@ -13,16 +13,16 @@ from framework.storage.enclosed import require_enclosed
 from framework.storage.plain_values import read_yaml
 
 OWN = ("hydra", "logger", "mode")
-"""Parts of a config that determine the command, the output folder and the store that is contacted."""
+"""Parts of a config that only the user may set: they determine the command, the output folder and the store."""
 HARMLESS = {"hydra": ("sweeper", "launcher", "verbose"), "logger": ("name", "experiment"), "mode": ()}
-"""Keys of these parts that such a folder may set nevertheless."""
+"""Keys in the parts `OWN` that an added config folder may set nevertheless."""
 CHOSEN = re.compile(r"hydra/(launcher|sweeper)|logger")
 MOST = 1000
-"""Largest number of config files in such a folder."""
+"""Largest number of config files in an added config folder."""
 
 
 def require_harmless(arguments: Sequence[str], groups: Collection[str]) -> None:
-    """Refuse config folders on a command line that would determine what Hydra runs, or where results go.
+    """Refuse a command whose config folders would determine what Hydra runs, or where results go.
 
     Args:
         arguments: Arguments of the command.
@@ -44,7 +44,7 @@ def require_harmless(arguments: Sequence[str], groups: Collection[str]) -> None:
         files = [path for path in files if _group(path, folder) in (*groups, *OWN, *[""] * primary)]
         if len(files) > MOST:
             raise ConfigError(
-                f"{shorten(folder)} holds {len(files)} configs; wanted {MOST} at most. Give another."
+                f"{shorten(folder)} contains {len(files)} configs, but at most {MOST} are read. Give a smaller folder."
             )
         for file in files:
             _require_harmless(file, folder, groups)
@@ -57,7 +57,7 @@ def _group(file: Path, folder: Path) -> str:
 
 def _require_harmless(file: Path, folder: Path, groups: Collection[str]) -> None:
     try:
-        content = read_yaml(file, "a config", "Mend it, or take it out of the folder.", ConfigError)
+        content = read_yaml(file, "a config", "Correct it, or remove it from the folder.", ConfigError)
     except ConfigError as error:
         if isinstance(error.__cause__, yaml.YAMLError | UnicodeDecodeError):
             return  # Hydra cannot read it either, and reports the place of the error
@@ -68,13 +68,13 @@ def _require_harmless(file: Path, folder: Path, groups: Collection[str]) -> None
     if any(re.search("|".join([*OWN, "_name_", "_group_"]), package) for package in header) or {*OWN} & {
         *below
     }:
-        raise _refused(file, "stands in a part of the config that is the user's own")
+        raise _refusal(file, "sets a part of the config that only the user may set")
     if not isinstance(content, dict):
         return
     for key, harmless in HARMLESS.items():
         value = content.get(key)
         if value is not None and not (isinstance(value, dict) and set(value) <= set(harmless)):
-            raise _refused(file, f"sets {key}: {quote(value)}")
+            raise _refusal(file, f"sets {key}: {quote(value)}")
     try:
         forbid_targets(content)
     except ConfigError as error:
@@ -85,11 +85,11 @@ def _require_harmless(file: Path, folder: Path, groups: Collection[str]) -> None
             group, _, package = str(text).removeprefix("override ").partition("@")
             absolute = group.startswith("/") or not _group(file, folder)
             if _is_own(group.lstrip("/"), package) or ".." in f"{group}{name}":
-                raise _refused(file, f"chooses {quote(entry)}")
+                raise _refusal(file, f"chooses {quote(entry)}")
             first = group.lstrip("/").split("/")[0]
             # other files in the folder, which a sweep may have left, were not checked; Hydra reports missing ones
-            if absolute and first not in (*groups, "", "_self_") and _holds(folder, first):
-                raise _refused(file, f"chooses {quote(entry)}")
+            if absolute and first not in (*groups, "", "_self_") and _has_config(folder, first):
+                raise _refusal(file, f"chooses {quote(entry)}")
 
 
 def _is_own(group: str, package: str) -> bool:
@@ -99,12 +99,12 @@ def _is_own(group: str, package: str) -> bool:
     return any(word in f"{group}@{package}" for word in OWN)
 
 
-def _holds(folder: Path, name: str) -> bool:
+def _has_config(folder: Path, name: str) -> bool:
     return any((folder / f"{name}{ending}").exists() for ending in ("", ".yaml", ".yml"))
 
 
-def _refused(file: Path, what: str) -> ConfigError:
+def _refusal(file: Path, reason: str) -> ConfigError:
     return ConfigError(
-        f"{shorten(file)} {what}. A config folder may be a stranger's, so it says neither what is run nor where results "
-        "go. Take that out, and say it on the command line."
+        f"{shorten(file)} {reason}. A config folder may come from an untrusted source, so it may decide neither "
+        "what is run nor where results go. Remove this setting, and give it on the command line."
     )

@@ -15,7 +15,7 @@ from torch.utils.weak import WeakTensorKeyDictionary
 from framework.configuration import registry
 from framework.configuration.assembly import build_data, build_predictor
 from framework.configuration.description import Description, stored_names, stored_shape, stored_target
-from framework.configuration.paths import require_said
+from framework.configuration.paths import require_paths
 from framework.configuration.schema import resolve
 from framework.data import Batch, Data, Frame
 from framework.density_head import Fitted
@@ -25,11 +25,11 @@ from framework.model import FrozenFrontEnd, Predictor
 from framework.storage import budget
 from framework.storage.checkpoints import latest_good, read
 from framework.storage.enclosed import require_plain_within
-from framework.storage.reading import guarded
+from framework.storage.reading import translate_errors
 from framework.storage.weights import describe_mismatch
 from framework.target import Target
 
-FOREIGN = "This framework did not write it: do not use it."
+FOREIGN = "This framework did not write the file. Do not use it."
 PREFIX = "predictor."
 """Prefix of the predictor's parameter names in Lightning's checkpoints."""
 
@@ -37,16 +37,17 @@ PREFIX = "predictor."
 def load(
     run_or_checkpoint: str | Path, *, uri: str | None = None, paths: Mapping[str, Any] | None = None
 ) -> Predictor:
-    """Return the trained model in evaluation mode, on the CPU; it reads the user's own data and uses the user's unit.
+    """Return the trained model in evaluation mode, on the CPU; the model reads the user's own data.
 
-    `model(given)` returns the density over the target, with batch_shape (batch,). `given` are files, arrays or other
-    data that the data set accepts (`Data.inputs`). Angles are in radians and real numbers in their own unit. A class is
-    its index in `density.names`; for other targets, `density.names` are the names of the numbers. The other methods of
-    the model take inputs in the form that the data set produces.
+    `model(data)` returns the density over the target, with batch_shape (batch,). `data` are files, arrays or other
+    data that the data set accepts (`Data.inputs`). Angles are in radians, and real-valued targets in the unit of the
+    training data. A class is its index in `density.names`; for other targets, `density.names` are the names of the
+    numbers. The other methods of the model take inputs in the form that the data set produces.
 
     Random numbers (latent variables, dropout, samples) come from torch's global generator, so `torch.manual_seed`
-    before a call repeats them. Loading draws nothing from it. The weights require no gradient, so that NumPy, pandas
-    and Matplotlib accept the results; call `model.requires_grad_()` to continue training.
+    before a call makes the call repeatable. Loading takes no random number from this generator. The weights require no
+    gradient, so that NumPy, pandas and Matplotlib accept the results; call `model.requires_grad_()` to continue
+    training.
 
     Args:
         run_or_checkpoint: A run folder (`outputs/...`), a `.ckpt` file, or an MLflow run id.
@@ -62,15 +63,18 @@ def load(
     predictor.description = description
     predictor.requires_grad_(False)
     user = User(reader(description))
-    predictor.register_forward_pre_hook(user.asks, prepend=True)  # before other hooks, which check the inputs
-    predictor.register_forward_hook(user.hears)
+    predictor.register_forward_pre_hook(
+        user.convert_inputs, prepend=True
+    )  # before other hooks, which check the inputs
+    predictor.register_forward_hook(user.convert_density)
     return predictor
 
 
 class User:
     """Hooks of a loaded model that convert the user's data to inputs and the density to the user's unit.
 
-    The hooks are methods of an object, so that the model can be copied, pickled and sent to another process with them.
+    The hooks are methods of an object, so that a model with these hooks can be copied, pickled and sent to another
+    process.
 
     Args:
         data: Data set of the model, which converts the user's data to inputs and knows the unit of the target.
@@ -80,77 +84,87 @@ class User:
         self.data = data
         self.frames = WeakTensorKeyDictionary()  # frames of the inputs of the calls in progress
 
-    def asks(self, model: nn.Module, given: tuple[Any]) -> Tensor:
-        """Return the model's inputs for the user's data, and keep the frame in which the density is returned."""
-        batch = asked_of(model, self.data, *given)
+    def convert_inputs(self, model: nn.Module, arguments: tuple[Any]) -> Tensor:
+        """Return the model's inputs for the user's data, and store the frame in which the density is returned."""
+        batch = read_batch(model, self.data, *arguments)
         self.frames[batch["input"]] = self.data.frame(batch)
         return batch["input"]
 
-    def hears(self, model: nn.Module, inputs: tuple[Tensor], density: Distribution) -> Distribution:
+    def convert_density(self, model: nn.Module, inputs: tuple[Tensor], density: Distribution) -> Distribution:
         """Return the density in the frame of its inputs, with the names of the target."""
         frame: Frame | None = self.frames.pop(inputs[0])
-        answer = density if frame is None else AffineDensity(density, *(part.to(inputs[0]) for part in frame))
+        user_density = (
+            density if frame is None else AffineDensity(density, *(part.to(inputs[0]) for part in frame))
+        )
         with suppress(AttributeError):  # a density may have an attribute `names` that cannot be set
-            answer.names = self.data.target.names  # type: ignore[attr-defined]
-        return answer
+            user_density.names = self.data.target.names  # type: ignore[attr-defined]
+        return user_density
 
     def __reduce__(self) -> tuple[type["User"], tuple[Data]]:
         return User, (self.data,)  # weak references cannot be pickled, and the copy has no call in progress
 
 
-def asked_of(model: nn.Module, data: Data, given: Any) -> Batch:
+def read_batch(model: nn.Module, data: Data, user_data: Any) -> Batch:
     """Return the batch that a model reads for the user's data; a path may begin with `~`.
 
     Raises:
-        DataError: `Data.user_batch` refuses the data or fails on them, or they are empty.
+        DataError: The data are empty, or `Data.user_batch` refuses them or fails.
     """
-    given = _without_tilde(given)
-    if hasattr(given, "__len__") and not isinstance(given, str) and not len(given):
+    user_data = _expand_home(user_data)
+    if hasattr(user_data, "__len__") and not isinstance(user_data, str) and not len(user_data):
         raise DataError(
-            f"An empty {type(given).__name__} holds no input. Give at least one file, row or array."
+            f"Got an empty {type(user_data).__name__}, but at least one input is required. Give at least one file, "
+            "row or array."
         )
     try:
-        batch = data.user_batch(given)
+        batch = data.user_batch(user_data)
     except UserError:
         raise
     except Exception as error:
         # for example for a date or a tensor with a gradient
         raise DataError(
-            f"{type(given).__name__} cannot be read as inputs ({shorten(error)}). Give files, an array of numbers, or "
-            "what else the data set of this model takes."
+            f"The {type(user_data).__name__} cannot be read as inputs ({shorten(error)}). Give files, an array of "
+            "numbers, or another kind of input that the data set of this model reads."
         ) from error
     inputs = batch["input"]
     own = next(model.parameters(), inputs)
-    # bytes are pixels, which encoders scale; any other number is converted to the type of the model's weights
+    # encoders scale bytes, which are pixels; numbers of other types are converted to the type of the model's weights
     kind = inputs.dtype if inputs.dtype == torch.uint8 else own.dtype
     return {**batch, "input": inputs.to(own.device, kind)}
 
 
-def _without_tilde(given: Any) -> Any:
+def _expand_home(user_data: Any) -> Any:
     """Return paths with `~` replaced by the user's home folder; other values are returned unchanged."""
-    if isinstance(given, str | Path):
-        return type(given)(Path(given).expanduser()) if str(given).startswith("~") else given
-    if isinstance(given, list | tuple) and given and all(isinstance(item, str | Path) for item in given):
-        return [_without_tilde(item) for item in given]
-    return given
+    if isinstance(user_data, str | Path):
+        return type(user_data)(Path(user_data).expanduser()) if str(user_data).startswith("~") else user_data
+    if (
+        isinstance(user_data, list | tuple)
+        and user_data
+        and all(isinstance(item, str | Path) for item in user_data)
+    ):
+        return [_expand_home(item) for item in user_data]
+    return user_data
 
 
 def reader(description: Description) -> Data:
     """Return the data set of a model, not prepared, which converts the user's data to inputs.
 
-    If the user has not repeated one of its paths, preparing it is refused, because it would hold other data.
+    If the user has not repeated a path of the data set, its `prepare` raises an error, because the default path leads
+    to other data.
     """
-    with guarded(Path(description.path), "a checkpoint of this framework", FOREIGN, kind=CheckpointError):
+    with translate_errors(
+        Path(description.path), "a checkpoint of this framework", FOREIGN, kind=CheckpointError
+    ):
         try:
             data = build_data({"data": resolve("data", description.config["data"])})
         except ConfigError:
-            require_said(description.dropped, ("data",), description.path)
+            require_paths(description.dropped, ("data",), description.path)
             raise
         data.target, data.input_shape = description.target, description.input_shape
         data.columns, data.synthetic = description.columns, description.synthetic
         data.load_state_dict(description.data_state)
     if any(key.startswith("data.") for key in description.dropped):
-        refuse = partial(require_said, description.dropped, ("data",), description.path)
+        refuse = partial(require_paths, description.dropped, ("data",), description.path)
         data.prepare = refuse  # type: ignore[method-assign]
     return data
 
@@ -159,27 +173,29 @@ def load_with_description(
     run_or_checkpoint: str | Path, *, uri: str | None = None, paths: Mapping[str, Any] | None = None
 ) -> tuple[Predictor, Description]:
     """Return the trained predictor and the description in its checkpoint; arguments and errors are those of `load`."""
-    description, state = stored(run_or_checkpoint, uri=uri, paths=paths)
-    return rebuilt(description, state), description
+    description, state = read_stored(run_or_checkpoint, uri=uri, paths=paths)
+    return rebuild(description, state), description
 
 
-def stored(
+def read_stored(
     run_or_checkpoint: str | Path, *, uri: str | None = None, paths: Mapping[str, Any] | None = None
 ) -> tuple[Description, dict[str, torch.Tensor]]:
     """Return the description and the weights in a checkpoint; arguments and errors are those of `load`."""
     path = find_checkpoint(run_or_checkpoint, uri=uri)
     content = read(path)
-    with guarded(path, "a checkpoint of this framework", FOREIGN, kind=CheckpointError):
-        return Description.read(content, str(path), paths), weights(content)
+    with translate_errors(path, "a checkpoint of this framework", FOREIGN, kind=CheckpointError):
+        return Description.read(content, str(path), paths), predictor_weights(content)
 
 
-def interface(described: Mapping[str, Any], path: Path) -> tuple[Target, tuple[int, ...], tuple[str, ...]]:
+def read_interface(
+    described: Mapping[str, Any], path: Path
+) -> tuple[Target, tuple[int, ...], tuple[str, ...]]:
     """Return the target, the shape of an input and its columns that the checkpoint `path` describes.
 
     Raises:
         CheckpointError: The description is invalid.
     """
-    with guarded(path, "a checkpoint of this framework", FOREIGN, kind=CheckpointError):
+    with translate_errors(path, "a checkpoint of this framework", FOREIGN, kind=CheckpointError):
         return (
             stored_target(described["target"]),
             stored_shape(described["input_shape"]),
@@ -187,41 +203,43 @@ def interface(described: Mapping[str, Any], path: Path) -> tuple[Target, tuple[i
         )
 
 
-def rebuilt(description: Description, state: Mapping[str, torch.Tensor]) -> Predictor:
-    """Return the predictor of a description with the given weights, in evaluation mode.
+def rebuild(description: Description, state: Mapping[str, torch.Tensor]) -> Predictor:
+    """Build the predictor of a description, fill in its weights, and return it in evaluation mode.
 
     Raises:
         CheckpointError: The weights belong to another model.
     """
-    with guarded(Path(description.path), "a checkpoint of this framework", FOREIGN, kind=CheckpointError):
+    with translate_errors(
+        Path(description.path), "a checkpoint of this framework", FOREIGN, kind=CheckpointError
+    ):
         parts = description.config
         for part in parts["encoder"]:
-            # the checkpoint holds the weights, and the file of the initial weights may be gone
+            # the checkpoint contains the weights, and the file of the initial weights may have been removed
             part.update(dict.fromkeys(registry.load("encoder", part["name"]).initial))
         shape, columns = description.input_shape, description.columns
-        # the initial weights are drawn and then replaced; the state of the user's generator is preserved
+        # initial weights are sampled and then replaced; fork_rng preserves the state of the user's generator
         with budget.building(description.path, state.values()), torch.random.fork_rng(devices=[]):
             predictor = build_predictor(parts, description.target, shape, 0, columns)
             fill(predictor, state, description.path)
-    bounded_at_first(predictor, description.path)
+    bound_first_prediction(predictor, description.path)
     return predictor.eval()
 
 
-def bounded_at_first(predictor: Predictor, path: str) -> None:
+def bound_first_prediction(predictor: Predictor, path: str) -> None:
     """Limit the memory of the first prediction of a stored model (`budget.predicting`).
 
-    A prediction ends in an error before it takes far more memory than its weights and inputs account for.
+    A prediction raises an error before it takes far more memory than its weights and inputs explain.
     """
-    # fixed encoders and the predictor behind them are called separately by a frozen model
+    # a frozen model calls the fixed encoders and the predictor behind them separately
     split = isinstance(predictor, FrozenFrontEnd)
     for module in (predictor.encoders, predictor.predictor) if split else (predictor,):
         first = FirstPrediction(path)
-        module.register_forward_pre_hook(first.begins)
-        module.register_forward_hook(first.ends, always_call=True)
+        module.register_forward_pre_hook(first.start)
+        module.register_forward_hook(first.stop, always_call=True)
 
 
 class FirstPrediction:
-    """Hooks of `bounded_at_first`; they do nothing in later predictions for at most as many samples.
+    """Hooks of `bound_first_prediction`; they limit a prediction only if its batch is larger than all before.
 
     Args:
         path: Path of the checkpoint.
@@ -232,22 +250,22 @@ class FirstPrediction:
         self.bounded = 0  # number of samples of the largest batch so far
         self.active: dict[int, budget.Budget] = {}  # by thread
 
-    def begins(self, module: nn.Module, given: tuple[Any, ...]) -> None:
-        """Start the memory limit if the batch is larger than all before."""
-        if isinstance(given[0], Tensor) and len(given[0]) > self.bounded:
-            active = budget.predicting(self.path, module.state_dict().values(), given[0])
+    def start(self, module: nn.Module, inputs: tuple[Any, ...]) -> None:
+        """Start the memory limit if the batch is larger than every batch before."""
+        if isinstance(inputs[0], Tensor) and len(inputs[0]) > self.bounded:
+            active = budget.predicting(self.path, module.state_dict().values(), inputs[0])
             self.active[get_ident()] = active.__enter__()
 
-    def ends(self, module: nn.Module, given: tuple[Any, ...], density: Any) -> None:
+    def stop(self, module: nn.Module, inputs: tuple[Any, ...], density: Any) -> None:
         """End the memory limit, and note the size of the batch if the prediction succeeded."""
         active = self.active.pop(get_ident(), None)
         if active is not None:
             active.__exit__(None, None, None)
-            self.bounded = max(self.bounded, len(given[0]) if density is not None else 0)
+            self.bounded = max(self.bounded, len(inputs[0]) if density is not None else 0)
 
 
-def weights(content: Mapping[str, Any]) -> dict[str, torch.Tensor]:
-    """Return the predictor's own parameters and buffers in a checkpoint of Lightning or of `Session.save_model`."""
+def predictor_weights(content: Mapping[str, Any]) -> dict[str, torch.Tensor]:
+    """Return the predictor's parameters and buffers in a checkpoint of Lightning or of `Session.save_model`."""
     state = content["state_dict"]
     return {key.removeprefix(PREFIX): value for key, value in state.items() if key.startswith(PREFIX)}
 
@@ -258,21 +276,21 @@ def fill(predictor: Predictor, state: Mapping[str, torch.Tensor], name: str) -> 
     Raises:
         CheckpointError: The weights belong to another model; the message says what does not fit.
     """
-    # the state of a head that is fitted in one step depends on its training data
+    # the shapes of a head that is fitted in one step depend on its training data
     own = tuple(
         f"{name}." if name else "" for name, part in predictor.named_modules() if isinstance(part, Fitted)
     )
     require_match(describe_mismatch(predictor.state_dict(), state, any_shape=own), name)
     predictor.load_state_dict(dict(state))
-    # where torch expects one number, it takes the first of a row without an error
+    # torch copies the first number of a row into a scalar without an error
     require_match(describe_mismatch(predictor.state_dict(), state), name)
 
 
 def require_match(mismatch: str | None, name: str) -> None:
-    """Refuse weights with a mismatch; raises the error of `fill`."""
+    """Raise a CheckpointError if there is a mismatch between weights and the model of the checkpoint `name`."""
     if mismatch:
         raise CheckpointError(
-            f"{name} belongs to another model: {mismatch} Use the config it was trained with, or another checkpoint."
+            f"{name} belongs to another model: {mismatch} Use the config of its training, or give another checkpoint."
         )
 
 
@@ -284,8 +302,8 @@ def find_checkpoint(run_or_checkpoint: object, *, uri: str | None = None) -> Pat
     """
     if not isinstance(run_or_checkpoint, (str, Path)):
         raise CheckpointError(
-            f"A trained model was asked of a {type(run_or_checkpoint).__name__}; wanted a run folder, a checkpoint "
-            "file or an MLflow run id. Give what the model was loaded from."
+            f"Got a {type(run_or_checkpoint).__name__} as the source of a trained model; expected a run folder, a "
+            "checkpoint file or an MLflow run id. Give one of these."
         )
     path = Path(run_or_checkpoint).expanduser()
     if path.is_file():
@@ -297,10 +315,12 @@ def find_checkpoint(run_or_checkpoint: object, *, uri: str | None = None) -> Pat
                 if (folder / name).is_file():
                     require_plain_within(folder / name, path, CheckpointError)
                     return folder / name
-            good = latest_good(folder) if folder.is_dir() else None
-            if good is not None:
-                return good
-        raise CheckpointError(f"{path} holds no checkpoint. Give a run folder that has trained for an epoch.")
+            newest = latest_good(folder) if folder.is_dir() else None
+            if newest is not None:
+                return newest
+        raise CheckpointError(
+            f"{path} contains no checkpoint. Give the folder of a run that has trained for at least one epoch."
+        )
     name = str(run_or_checkpoint)
     if len(name) == 32 and all(letter in "0123456789abcdef" for letter in name):
         from framework.tracking.mlflow_store import run_folder
@@ -308,5 +328,5 @@ def find_checkpoint(run_or_checkpoint: object, *, uri: str | None = None) -> Pat
         return find_checkpoint(run_folder(name, uri))
     raise CheckpointError(
         f"{run_or_checkpoint} is neither a file, a folder nor an MLflow run id. "
-        "Give the folder a run printed at its start (outputs/<experiment>/<time>)."
+        "Give the folder that a run printed at its start (outputs/<experiment>/<time>)."
     )

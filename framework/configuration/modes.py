@@ -1,4 +1,4 @@
-"""Keys of a config that each mode reads; other settings in a command are refused (DESIGN, law 11)."""
+"""Keys of a config that each mode reads; a command that sets other keys is refused (DESIGN, law 11)."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ class Mode:
 
     Attributes:
         reads: Keys that the mode reads, including all keys below them.
-        stored: Groups of the stored model's config of which a command may repeat a key, such as `data.root=...`.
+        stored: Groups of the stored model's config whose keys a command may repeat, such as `data.root=...`.
     """
 
     reads: tuple[str, ...] = ()
@@ -53,7 +53,7 @@ MODES: Mapping[str, Mode] = {
 UNUSED_BY_TRAINING = {
     "limit_test_batches": "the test always covers its whole split",
     "limit_predict_batches": "training predicts nothing; mode=predict does",
-    "inference_mode": "Lightning reads it in its own tests alone, which are not used here",
+    "inference_mode": "only Lightning's own tests read it, and the framework does not use them",
     "log_every_n_steps": "metrics go to the run's journal; trainer.log_every_steps says how often",
     "enable_autolog_hparams": "parameters go to the run's store, which logger chooses",
     "model_registry": "the model goes to the run's store, which logger chooses",
@@ -63,12 +63,12 @@ UNUSED_BY_TRAINING = {
 
 @dataclass(frozen=True)
 class _Condition:
-    """Condition under which a setting is read.
+    """Condition under which a run reads a setting.
 
     Attributes:
         key: Dotted key of the setting.
         holds: Function that returns whether a config meets the condition.
-        why: Reason for which the setting is not read otherwise.
+        why: Reason why the setting is not read if the condition is not met.
     """
 
     key: str
@@ -80,7 +80,7 @@ def _setting(values: Mapping[str, Any], group: str, key: str) -> Any:
     return (values.get(group) or {}).get(key)
 
 
-def _scheduled(*names: str) -> Callable[[Mapping[str, Any]], bool]:
+def _has_schedule(*names: str) -> Callable[[Mapping[str, Any]], bool]:
     return lambda values: _setting(values, "optimizer", "schedule") in names
 
 
@@ -95,9 +95,9 @@ def _chooses_data(values: Mapping[str, Any]) -> bool:
 
 _CONDITIONS = (
     _Condition(
-        "optimizer.factor", _scheduled("step", "plateau"), "only the schedules step and plateau read it"
+        "optimizer.factor", _has_schedule("step", "plateau"), "only the schedules step and plateau read it"
     ),
-    _Condition("optimizer.patience", _scheduled("plateau"), "only the schedule plateau reads it"),
+    _Condition("optimizer.patience", _has_schedule("plateau"), "only the schedule plateau reads it"),
     _Condition(
         "trainer.gradient_clip_algorithm",
         lambda values: bool(_setting(values, "trainer", "gradient_clip_val")),
@@ -109,12 +109,13 @@ _CONDITIONS = (
         _Condition(
             key,
             _chooses_data,
-            "the model and its data are the stored ones, and this changes those of a command",
+            "the command uses the stored model and its stored data, and this setting changes only parts that a command "
+            "chooses",
         )
         for key in ("preset", "debug")
     ),
 )
-"""Conditions that a composed config decides; others are known after the parts are built (`runs.job.refuse_idle`)."""
+"""Conditions that depend on the composed config only; `runs.job.refuse_idle` serves those known later."""
 
 
 def require_read(mode: str, overrides: Sequence[str]) -> None:
@@ -125,7 +126,7 @@ def require_read(mode: str, overrides: Sequence[str]) -> None:
         overrides: Overrides on the command line.
 
     Raises:
-        ConfigError: There is such a setting; the message names the first, and the modes that read it.
+        ConfigError: The mode does not read a setting; the message names the first one and the modes that read it.
     """
     for override in overrides:
         key = key_of(override)
@@ -133,14 +134,14 @@ def require_read(mode: str, overrides: Sequence[str]) -> None:
         read = MODES[mode].stored if key != name else (*MODES[mode].reads, *EVERYWHERE)
         if not is_below(name, read):
             root = name.partition(".")[0]
-            root = shorten(name if any(one.startswith(f"{root}.") for one in read) else root)
+            root = shorten(name if any(readable.startswith(f"{root}.") for readable in read) else root)
             raise ConfigError(
-                f"{_written(override)}: mode={mode} reads no {root}{_readers(name)}. Leave it out."
+                f"{_as_typed(override)}: mode={mode} reads no {root}{_readers(name)}. Leave it out."
             )
 
 
-def idle(values: Mapping[str, Any], overrides: Sequence[str]) -> Iterator[str]:
-    """Yield a sentence about each setting of a command that has no effect because of its other settings.
+def idle_sentences(values: Mapping[str, Any], overrides: Sequence[str]) -> Iterator[str]:
+    """Yield a sentence for each setting of a command that has no effect because of the command's other settings.
 
     Args:
         values: Composed config.
@@ -149,16 +150,16 @@ def idle(values: Mapping[str, Any], overrides: Sequence[str]) -> Iterator[str]:
     for override in overrides:
         for condition in _CONDITIONS:
             if key_of(override) == condition.key and not condition.holds(values):
-                yield sets_nothing(override, condition.why)
+                yield idle_sentence(override, condition.why)
 
 
-def sets_nothing(override: str, why: str) -> str:
-    """Return the sentence about a setting that has no effect."""
-    return f"{_written(override)} sets nothing: {why}. Leave it out."
+def idle_sentence(override: str, why: str) -> str:
+    """Return the sentence that says that a setting has no effect, and why."""
+    return f"{_as_typed(override)} has no effect: {why}. Leave it out."
 
 
 def key_of(override: str) -> str:
-    """Return the dotted key that an override sets: `outliers` of `data@outliers=...`."""
+    """Return the dotted key that an override sets, such as `outliers` for `data@outliers=...`."""
     group, _, package = override.lstrip("+~").partition("=")[0].partition("@")
     return (package or group).replace("/", ".")
 
@@ -168,12 +169,12 @@ def is_below(key: str, roots: Sequence[str]) -> bool:
     return any(key == root or key.startswith(f"{root}.") for root in roots)
 
 
-def _written(override: str) -> str:
-    """Return an override as the user wrote it, without the prefix `stored` that the framework adds."""
+def _as_typed(override: str) -> str:
+    """Return an override as the user typed it, without the prefix `stored` that the framework adds."""
     return shorten(override.removeprefix("+stored."))
 
 
 def _readers(key: str) -> str:
-    """Return the end of a sentence that lists the modes that read a key; an empty text if there is none."""
+    """Return the end of a sentence that lists the modes that read a key; an empty text if no mode reads it."""
     names = [name for name, mode in MODES.items() if is_below(key, mode.reads)]
-    return f", {', '.join(names)} {'do' if len(names) > 1 else 'does'}" if names else ""
+    return f"; {', '.join(names)} {'do' if len(names) > 1 else 'does'}" if names else ""

@@ -13,7 +13,7 @@ def newest_run(outputs: Path) -> Path:
     """Return the folder of the run below `outputs` whose checkpoints were written last; links are not followed.
 
     Raises:
-        CheckpointError: No run there has a checkpoint.
+        CheckpointError: No run below `outputs` has a checkpoint.
     """
     written: dict[Path, float] = {}
     for name, below, files in os.walk(outputs):
@@ -24,7 +24,7 @@ def newest_run(outputs: Path) -> Path:
             below.clear()
     if not written:
         raise CheckpointError(
-            f"checkpoint={LAST} names the newest run in {outputs}, and no run there has a checkpoint. Train one, or "
-            "give the folder of a run elsewhere."
+            f"checkpoint={LAST} means the newest run in {outputs}, but no run in that folder has a checkpoint. Train "
+            "a model first, or give the folder of another run."
         )
     return max(written, key=lambda folder: (written[folder], str(folder)))

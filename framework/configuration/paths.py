@@ -1,8 +1,8 @@
 """Handling of paths in a stored config, which are used only if the user repeats them (DESIGN, law 15).
 
-A checkpoint or a run folder may come from an untrusted source. A text counts as a path by the annotation of its
-parameter (`FilePath`, `pathlib.Path`, pydantic's `FilePath` and `DirectoryPath`), or else if it looks like a path, so
-that a plugin without such annotations is safe too.
+The reason is that a checkpoint or a run folder may come from an untrusted source. A text is a path if the annotation
+of its parameter says so (`FilePath`, `pathlib.Path`, pydantic's `FilePath` and `DirectoryPath`). Without such an
+annotation, a text is a path if it looks like one, so that a plugin without annotations is safe too.
 """
 
 import argparse
@@ -26,16 +26,16 @@ from framework.storage.path_marks import Mark
 from framework.storage.path_marks import Words as Words
 
 SINGLE = ("data", "outliers", "density_head", "renderer")
-"""Groups of which a config names one plugin; of the other groups it names several."""
+"""Groups from which a config chooses one plugin; from each other group, a config may choose several."""
 OPTIONS = ("files", "into", "members", "run")
 """Options of modes that name files, folders or runs."""
 UNUSED = ("metric", "objective", "outliers", "renderer")
-"""Groups whose plugins are not imported to load a model; their parameters are checked as texts only."""
+"""Groups whose plugins are not imported to load a model; a parameter of theirs is a path if its text looks like one."""
 
 
 @dataclass
 class _Part:
-    """Config of a plugin that can be changed.
+    """Config of one plugin inside a larger config; its values can be changed.
 
     Attributes:
         key: Dotted key of the plugin in the whole config.
@@ -71,82 +71,86 @@ class _Part:
                 yield name
 
 
-def without_paths(
-    config: Mapping[str, Any], said: Mapping[str, Any], unused: Collection[str] = ()
+def remove_paths(
+    config: Mapping[str, Any], user_values: Mapping[str, Any], unused: Collection[str] = ()
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Remove from a stored config every path that the user does not repeat.
 
     Args:
-        config: Plugins by group, as a checkpoint or a run folder holds them; not checked yet.
-        said: Values of the user by dotted keys, such as "data.root" or "encoder.<name>.weights".
+        config: Plugins by group, as a checkpoint or a run folder stores them; not checked yet.
+        user_values: Values of the user by dotted keys, such as "data.root" or "encoder.<name>.weights".
         unused: Groups whose plugins are not imported for this.
 
     Returns:
-        A copy of the config with the user's values, in which the other paths have their defaults; and the removed
-        paths by their keys. Parameters that only training needs (`Encoder.initial`) are not among the removed paths.
+        A copy of the config with the user's values, in which all other paths are replaced by the defaults; and the
+        removed paths by dotted keys. Parameters that only training needs (`Encoder.initial`) are not among the latter.
 
     Raises:
-        ConfigError: The config has no part for a key of `said`, or the key is no path of the model.
+        ConfigError: The config has no part for a key of `user_values`, or the key is no path of the model.
     """
-    found = deepcopy(dict(config))
+    cleaned = deepcopy(dict(config))
     dropped: dict[str, Any] = {}
-    left = dict(said)
-    known = list(_parts(found, unused))
-    for part in known:
+    unmatched = dict(user_values)
+    all_parts = list(_parts(cleaned, unused))
+    for part in all_parts:
         paths = list(part.paths())
         for name in paths:
-            if f"{part.key}.{name}" not in said:
+            if f"{part.key}.{name}" not in user_values:
                 if name not in getattr(part.cls, "initial", ()):
                     dropped[f"{part.key}.{name}"] = part.values[name]
                 part.take_default(name)
-        for key in [key for key in said if key.rpartition(".")[0] == part.key]:
+        for key in [key for key in user_values if key.rpartition(".")[0] == part.key]:
             name = key.rpartition(".")[2]
             if (
                 part.key.partition(".")[0] in MODEL
                 and name not in paths
-                and not _marked(part.annotation(name))
+                and not _is_marked_path(part.annotation(name))
             ):
                 raise ConfigError(
-                    f"{shorten(key)} = {quote(said[key])} would change a trained model, of which only paths can be said "
-                    "again. Leave it out."
+                    f"{shorten(key)} = {quote(user_values[key])} would change a trained model. A command may override "
+                    "only the paths of a trained model. Leave this setting out."
                 )
-            value = said[key]
+            value = user_values[key]
             part.values[name] = str(value) if isinstance(value, PurePath) else value
-            left.pop(key, None)
-    for key in left:
-        near = [f"{part.key}.{name}" for part in known for name in (*part.values, *part.paths())]
+            unmatched.pop(key, None)
+    for key in unmatched:
+        candidates = [f"{part.key}.{name}" for part in all_parts for name in (*part.values, *part.paths())]
         raise ConfigError(
-            f"{shorten(key)} = {quote(left[key])}: the stored config has no such part."
-            f"{did_you_mean(key, [*near, *dropped])} "
-            f"It has: {', '.join(shorten(part.key) for part in known)}."
+            f"{shorten(key)} = {quote(unmatched[key])}: the stored config has no such key."
+            f"{did_you_mean(key, [*candidates, *dropped])} "
+            f"The stored config has the parts {', '.join(shorten(part.key) for part in all_parts)}."
         )
-    return found, dropped
+    return cleaned, dropped
 
 
 def paths_of(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return all paths of a composed config, by the keys under which a command gives them."""
+    """Return all paths of a composed config, by the dotted keys that a command uses for them."""
     config = deepcopy({group: values.get(group) for group in (*GROUPS, "outliers")})
-    found = {f"{part.key}.{name}": part.values[name] for part in _parts(config, ()) for name in part.paths()}
+    paths_by_key = {
+        f"{part.key}.{name}": part.values[name] for part in _parts(config, ()) for name in part.paths()
+    }
     mode = values.get("mode")
     for name, value in mode.items() if isinstance(mode, Mapping) else ():
         if name != "name" and holds_path(FilePath if name in OPTIONS else Any, value):
-            found[f"mode.{name}"] = value
-    said = values.get("stored")
-    found |= flat(said) if isinstance(said, Mapping) else {}
+            paths_by_key[f"mode.{name}"] = value
+    repeated = values.get("stored")
+    paths_by_key |= flatten(repeated) if isinstance(repeated, Mapping) else {}
     checkpoint = values.get("checkpoint")
-    return found if checkpoint is None else {**found, "checkpoint": checkpoint}
+    return paths_by_key if checkpoint is None else {**paths_by_key, "checkpoint": checkpoint}
 
 
-def flat(said: Mapping[str, Any]) -> dict[str, Any]:
+def flatten(nested: Mapping[str, Any]) -> dict[str, Any]:
     """Return the values of nested mappings by dotted keys."""
-    found: dict[str, Any] = {}
-    for key, value in said.items():
-        inner = flat(value) if isinstance(value, Mapping) else None
-        found |= {str(key): value} if inner is None else {f"{key}.{rest}": one for rest, one in inner.items()}
-    return found
+    flattened: dict[str, Any] = {}
+    for key, value in nested.items():
+        inner = flatten(value) if isinstance(value, Mapping) else None
+        flattened |= (
+            {str(key): value} if inner is None else {f"{key}.{rest}": item for rest, item in inner.items()}
+        )
+    return flattened
 
 
-def require_said(dropped: Mapping[str, Any], groups: Collection[str], source: str) -> None:
+def require_paths(dropped: Mapping[str, Any], groups: Collection[str], source: str) -> None:
     """Refuse to continue without the paths of some groups.
 
     Args:
@@ -162,49 +166,53 @@ def require_said(dropped: Mapping[str, Any], groups: Collection[str], source: st
         named = ", ".join(f"{shorten(key)} = {quote(value)}" for key, value in needed.items())
         example = ", ".join(f'"{shorten(key)}": ...' for key in needed)
         raise ConfigError(
-            f"{shorten(source)} names a path: {named}. A checkpoint may come from anybody, so a path in it is used only "
-            f"where you say it again, or another. Add to a command: {' '.join(words(needed))}; to one of a plugin the "
-            f"same behind --path; to framework.load or freeze: paths={{{example}}}."
+            f"{shorten(source)} contains a path: {named}. A checkpoint may come from an untrusted source, so its paths "
+            f"are used only if you repeat them; another path is allowed too. Add to a command: "
+            f"{' '.join(shell_arguments(needed))}; to a command of a plugin: the same after --path; to framework.load "
+            f"or freeze: paths={{{example}}}."
         )
 
 
-def require_repeated(stored: Mapping[str, Any], said: Mapping[str, Any], folder: object) -> None:
+def require_repeated(stored: Mapping[str, Any], repeated: Mapping[str, Any], folder: object) -> None:
     """Refuse to resume a run whose paths the command does not repeat.
 
     Args:
         stored: Paths of the stored config, by dotted keys.
-        said: Paths that the command gives, by dotted keys.
+        repeated: Paths that the command gives, by dotted keys.
         folder: Folder of the run.
 
     Raises:
-        ConfigError: A path is missing or differs; the message says what to write.
+        ConfigError: The command lacks a path, or gives another one; the message says what to write.
     """
-    for key, value in said.items():
+    for key, value in repeated.items():
         if key not in stored or not _equal(stored[key], value):
-            has = quote(stored[key]) if key in stored else "none"
+            stored_value = quote(stored[key]) if key in stored else "none"
             raise ConfigError(
-                f"resume={folder} goes on with that run's own config; {shorten(key)} = {quote(value)} would change it, "
-                f"which has {has}. Give the same, or start a new run."
+                f"resume={folder} continues that run with its own config, in which {shorten(key)} is {stored_value}. "
+                f"The command gives {quote(value)}, which would change it. Give the same value, or start a new run."
             )
-    missing = {key: value for key, value in stored.items() if key not in said}
+    missing = {key: value for key, value in stored.items() if key not in repeated}
     if missing:
         named = ", ".join(f"{shorten(key)} = {quote(value)}" for key, value in missing.items())
         raise ConfigError(
-            f"resume={folder}: its config names a path: {named}. A run folder may come from anybody, so a path in it "
-            f"is used only where the command says it again. Add: {' '.join(words(missing))}"
+            f"resume={folder}: the config of that run contains a path: {named}. A run folder may come from an "
+            "untrusted source, so its paths are used only if the command repeats them. Add to the command: "
+            f"{' '.join(shell_arguments(missing))}"
         )
 
 
-def words(paths: Mapping[str, Any]) -> list[str]:
-    """Return the arguments that give these paths on a command line, as typed into a shell."""
-    return [shlex.quote(f"{shorten(key)}={_typed(value)}") for key, value in paths.items()]
+def shell_arguments(paths: Mapping[str, Any]) -> list[str]:
+    """Return the command-line arguments that set these paths, quoted for a shell."""
+    return [shlex.quote(f"{shorten(key)}={_shell_value(value)}") for key, value in paths.items()]
 
 
-def _typed(value: Any) -> str:
+def _shell_value(value: Any) -> str:
     if isinstance(value, Mapping):
-        return "{" + ",".join(f"{_typed(key)}:{_typed(item)}" for key, item in value.items()) + "}"
+        return (
+            "{" + ",".join(f"{_shell_value(key)}:{_shell_value(item)}" for key, item in value.items()) + "}"
+        )
     if isinstance(value, list | tuple | set):
-        return "[" + ",".join(map(_typed, value)) + "]"
+        return "[" + ",".join(map(_shell_value, value)) + "]"
     text = escape_unprintable(str(value), allowed="")
     if isinstance(value, str) and not re.fullmatch(
         r"[A-Za-z0-9_.@-]*/[A-Za-z0-9_./@-]+", text
@@ -217,18 +225,18 @@ def _typed(value: Any) -> str:
 
 
 def add_option(parser: argparse.ArgumentParser) -> None:
-    """Add the option `--path KEY=PATH`, which `said` reads, to a command of a plugin."""
+    """Add the option `--path KEY=PATH`, whose values `parse_paths` reads, to the command line of a plugin."""
     parser.add_argument(
         "--path",
         action="append",
         default=[],
         metavar="KEY=PATH",
-        help="a path that the run's config names, said again: data.root=<folder>",
+        help="a path from the run's config, repeated or replaced: data.root=<folder>",
     )
 
 
-def said(options: Sequence[str]) -> dict[str, str]:
-    """Return the paths of the option `--path`, by their keys."""
+def parse_paths(options: Sequence[str]) -> dict[str, str]:
+    """Return the paths in the values KEY=PATH of the option `--path`, by their keys."""
     return {key: path for key, _, path in (option.partition("=") for option in options)}
 
 
@@ -244,10 +252,10 @@ def _parts(config: dict[str, Any], unused: Collection[str]) -> Iterator[_Part]:
             named = [(f"{group}.{_name(part)}", part) for part in chosen]
         for key, part in named:
             if isinstance(part, dict):
-                yield from _within("data" if group == "outliers" else group, key, part, group in unused)
+                yield from _nested_parts("data" if group == "outliers" else group, key, part, group in unused)
 
 
-def _within(group: str, key: str, values: dict[str, Any], unused: bool) -> Iterator[_Part]:
+def _nested_parts(group: str, key: str, values: dict[str, Any], unused: bool) -> Iterator[_Part]:
     cls = None
     if not unused and isinstance(values.get("name"), str):
         try:
@@ -259,10 +267,10 @@ def _within(group: str, key: str, values: dict[str, Any], unused: bool) -> Itera
     for name, part in inner.items():
         value = values.get(name)
         several = list(value) if isinstance(value, list | tuple) else [value]
-        for number, one in enumerate(several):
-            if isinstance(one, dict):
-                yield from _within(
-                    part.group, f"{key}.{name}" + f".{number}" * (value is not one), one, unused
+        for number, item in enumerate(several):
+            if isinstance(item, dict):
+                yield from _nested_parts(
+                    part.group, f"{key}.{name}" + f".{number}" * (value is not item), item, unused
                 )
 
 
@@ -271,11 +279,11 @@ def _name(part: Any) -> str:
 
 
 def holds_path(annotation: Any, value: Any) -> bool:
-    """Return whether the value of a parameter holds a path, as its annotation says or, without one, as it looks."""
+    """Return whether the value of a parameter contains a path, by its annotation or, without one, by its text."""
     if isinstance(value, str):
         if value in _literals(annotation):
             return False
-        mark = _mark(annotation)
+        mark = _path_mark(annotation)
         return bool(value) and (
             mark if mark is not None else "/" in value or "\\" in value or value[0] == "~"
         )
@@ -290,36 +298,36 @@ def holds_path(annotation: Any, value: Any) -> bool:
     return False
 
 
-def _marked(annotation: Any) -> bool:
-    return bool(_mark(annotation))
+def _is_marked_path(annotation: Any) -> bool:
+    return bool(_path_mark(annotation))
 
 
-def _mark(annotation: Any) -> bool | None:
+def _path_mark(annotation: Any) -> bool | None:
     """Return whether an annotation says that a text is a path (True), is never a path (False), or neither (None)."""
-    marks = [each.path for each in getattr(annotation, "__metadata__", ()) if isinstance(each, Mark)]
+    marks = [item.path for item in getattr(annotation, "__metadata__", ()) if isinstance(item, Mark)]
     if isinstance(annotation, type) and issubclass(annotation, PurePath):
         marks.append(True)
-    marks += [mark for inner in typing.get_args(annotation) if (mark := _mark(inner)) is not None]
+    marks += [mark for inner in typing.get_args(annotation) if (mark := _path_mark(inner)) is not None]
     return None if not marks else any(marks)
 
 
 def _literals(annotation: Any) -> set[Any]:
     if typing.get_origin(annotation) is typing.Literal:
-        return {one for one in typing.get_args(annotation) if isinstance(one, str)}
-    return {one for inner in typing.get_args(annotation) for one in _literals(inner)}
+        return {item for item in typing.get_args(annotation) if isinstance(item, str)}
+    return {item for inner in typing.get_args(annotation) for item in _literals(inner)}
 
 
 def _fields(annotation: Any) -> dict[str, Any]:
     """Return the annotations of the fields of all dataclasses and pydantic models inside an annotation."""
-    found: dict[str, Any] = {}
+    annotations: dict[str, Any] = {}
     if isinstance(annotation, type) and (is_dataclass(annotation) or issubclass(annotation, BaseModel)):
         try:
-            found = typing.get_type_hints(annotation, include_extras=True)
+            annotations = typing.get_type_hints(annotation, include_extras=True)
         except Exception:  # the annotation uses a name that exists for type checkers only
-            found = {}
+            annotations = {}
     for inner in typing.get_args(annotation):
-        found |= _fields(inner)
-    return found
+        annotations |= _fields(inner)
+    return annotations
 
 
 def _equal(value: Any, default: Any) -> bool:

@@ -15,42 +15,44 @@ MODEL = ("encoder", "density_head", "uncertainty")
 """Groups of the plugins with which a model predicts."""
 
 Entry = Any
-"""Type of an entry point: importlib.metadata's, or its backport's, which replaces it once MLflow was imported."""
+"""Type of an entry point: that of importlib.metadata, or that of its backport, which importing MLflow installs."""
 
 
 @cache
 def installed(group: str) -> dict[str, Entry]:
-    """Return the entry points under `framework.<group>` by name, sorted, without the `refused` names."""
-    return {name: found[0] for name, found in _entries(group).items() if name not in refused(group)}
+    """Return the usable entry points under `framework.<group>` by name, sorted (see `unusable_names`)."""
+    return {
+        name: entries[0] for name, entries in _entries(group).items() if name not in unusable_names(group)
+    }
 
 
 @cache
-def refused(group: str) -> dict[str, str]:
-    """Return the names that cannot be used, each with a sentence that says why; all other names still work."""
+def unusable_names(group: str) -> dict[str, str]:
+    """Return the names of a group that cannot be used, each with a sentence that says why."""
     reasons = {}
-    for name, found in _entries(group).items():
-        if len(found) > 1:
-            things = " and ".join(f"{entry.value} of {origin(entry)}" for entry in found)
+    for name, entries in _entries(group).items():
+        if len(entries) > 1:
+            objects = " and ".join(f"{entry.value} of {origin(entry)}" for entry in entries)
             reasons[name] = (
-                f"Several installed packages call a {group} {name!r}: {things}. Uninstall all but one, or rename their "
-                "entry points."
+                f"Several installed packages define a {group} {name!r}: {objects}. Uninstall all but one of these "
+                "packages, or rename their entry points."
             )
-        elif found[0].dist and not found[0].dist.name:  # a package that was only partly removed
+        elif entries[0].dist and not entries[0].dist.name:  # a package that was only partly removed
             reasons[name] = (
-                f"The {group} {name!r} ({found[0].value}) is of a package whose METADATA file is gone. Install that "
-                "package again, or remove what is left of it."
+                f"The {group} {name!r} ({entries[0].value}) belongs to a package whose METADATA file is missing. "
+                "Install that package again, or remove its remaining files."
             )
     return reasons
 
 
 def _entries(group: str) -> dict[str, list[Entry]]:
-    """Return the entry points of a group by name, sorted; a name has several if they refer to different objects."""
-    found: dict[str, list[Entry]] = {}
+    """Return the entry points of a group by name, sorted; those of the same name and object are listed once."""
+    entries_by_name: dict[str, list[Entry]] = {}
     for entry in sorted(entry_points(group=f"framework.{group}"), key=lambda entry: entry.name):
-        others = found.setdefault(entry.name, [])
-        if entry.value not in [other.value for other in others]:
-            others.append(entry)
-    return found
+        same_name = entries_by_name.setdefault(entry.name, [])
+        if entry.value not in [other.value for other in same_name]:
+            same_name.append(entry)
+    return entries_by_name
 
 
 def origin(entry: Entry) -> str:
@@ -62,16 +64,16 @@ def find(group: str, name: str) -> Entry:
     """Return the entry point called `name`.
 
     Raises:
-        ConfigError: No plugin of that name is installed, or the name is `refused`.
+        ConfigError: No plugin of that name is installed, or the name cannot be used (`unusable_names`).
     """
     names = installed(group)
-    if name in refused(group):
-        raise ConfigError(refused(group)[name])
+    if name in unusable_names(group):
+        raise ConfigError(unusable_names(group)[name])
     if name not in names:
         raise ConfigError(
-            f"No {group} is called {quote(name)}.{did_you_mean(name, [*names, *refused(group)])} "
+            f"No {group} is called {quote(name)}.{did_you_mean(name, [*names, *unusable_names(group)])} "
             f"Installed: {list_names(name, names) or 'none'}. "
-            "A name added to a pyproject.toml counts only after `pip install -e .`."
+            "If you added the name to a pyproject.toml, run `pip install -e .`."
         )
     return names[name]
 
@@ -85,56 +87,61 @@ def load(group: str, name: str) -> type[Any]:
     """
     entry = find(group, name)
     try:
-        found = entry.load()
+        cls = entry.load()
     except ModuleNotFoundError as error:
         raise ConfigError(
             f"The {group} {name!r} ({entry.value}, of {origin(entry)}) needs the module {error.name!r}, "
-            f"{_where_it_is_not(entry, str(error.name))}"
+            f"{_describe_missing_module(entry, str(error.name))}"
         ) from error
     except Exception as error:
         raise ConfigError(
             f"The {group} {name!r} ({entry.value}, of {origin(entry)}) cannot be imported: "
-            f"{type(error).__name__}: {error}. Mend or uninstall that package; other plugins still work."
+            f"{type(error).__name__}: {error}. Repair or uninstall that package; other plugins still work."
         ) from error
-    if not (isinstance(found, type) and group_of(found) == group):
+    if not (isinstance(cls, type) and group_of(cls) == group):
         raise ConfigError(
             f"The {group} {name!r} ({entry.value}, of {origin(entry)}) does not derive from "
             f"the {group} base in framework.{group}. See that module's docstring for the contract."
         )
-    missing = sorted(getattr(found, "__abstractmethods__", ()))
+    missing = sorted(getattr(cls, "__abstractmethods__", ()))
     if missing:
         raise ConfigError(
             f"The {group} {name!r} ({entry.value}, of {origin(entry)}) lacks {', '.join(missing)}, which the "
-            f"framework calls. Write what framework.{group} says of them."
+            f"framework calls. Implement what the docstrings of framework.{group} describe."
         )
-    return found
+    return cls
 
 
-def _where_it_is_not(entry: Entry, module: str) -> str:
+def _describe_missing_module(entry: Entry, module: str) -> str:
     package = entry.module.partition(".")[0]
     hiding = find_spec(package) if module.startswith(f"{package}.") else None
     if hiding is None:
         return f"which is not installed. {_remedy(entry, module)}"
     place = hiding.origin or next(iter(hiding.submodule_search_locations or ()))
     return (
-        f"which is not in the package {package!r} at {place}. "
-        "If that is another package, it hides the plugin's: rename it, or run from elsewhere."
+        f"which the package {package!r} at {place} does not contain. If that package is not the plugin's own, it "
+        "hides the plugin's package: rename it, or run the command in another folder."
     )
 
 
 def _remedy(entry: Entry, module: str) -> str:
-    """Return how to install a missing module: by an extra of the plugin's own package, if one requires the module."""
-    wanted = module.partition(".")[0].lower()
+    """Return how to install a missing module: by an extra of the plugin's package, if an extra requires the module."""
+    package = module.partition(".")[0].lower()
     for requirement in (entry.dist.requires if entry.dist else None) or ():
-        asked = re.match(r"[\w.-]+", requirement)
+        required = re.match(r"[\w.-]+", requirement)
         extra = re.search(r"extra == ['\"]([^'\"]+)", requirement)
-        if asked and extra and extra[1] != "dev" and asked[0].lower().replace("-", "_").startswith(wanted):
-            return f"Install that package's extra, e.g. `pip install -e '.[{extra[1]}]'` in its folder."
-    return f"Install that package's dependencies, e.g. `pip install {module}`."
+        if (
+            required
+            and extra
+            and extra[1] != "dev"
+            and required[0].lower().replace("-", "_").startswith(package)
+        ):
+            return f"Install the extra of the plugin's package, e.g. `pip install -e '.[{extra[1]}]'` in its folder."
+    return f"Install the dependencies of the plugin's package, e.g. `pip install {module}`."
 
 
 def group_of(annotation: object) -> str | None:
-    """Return the registry of a class, which is the attribute `group` of its abstract base; None for other objects."""
+    """Return the attribute `group` of the abstract base of a plugin class; None for other objects."""
     if not isinstance(annotation, type):
         return None
     group = getattr(annotation, "group", None)
@@ -157,8 +164,8 @@ def config_folders() -> dict[str, Path]:
         own = next(folder.glob("hydra/**/*.yaml"), None)
         if own is not None:
             raise ConfigError(
-                f"Plugin {entry.name!r} ({origin(entry)}) ships {own.relative_to(folder)}: a plugin may not configure "
-                "Hydra itself, whose logging config can run code. Uninstall it."
+                f"The plugin {entry.name!r} ({origin(entry)}) ships {own.relative_to(folder)}, but a plugin may not "
+                "configure Hydra itself, because Hydra's logging config can run code. Uninstall the plugin."
             )
         if folder not in folders.values():
             # two packages may give their folders the same name, and both are kept

@@ -39,27 +39,27 @@ WRITTEN = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
 
 
 def forbid_targets(config: Any, path: str = "") -> None:
-    """Refuse the key `_target_` anywhere, because a config holds names and values but never code.
+    """Refuse the key `_target_` at any depth, because a config contains names and values but never code.
 
     Raises:
         ConfigError: `config` contains a key `_target_`.
     """
     if isinstance(config, Mapping):
         for key, value in config.items():
-            here = f"{path}.{key}" if path else str(key)
+            key_path = f"{path}.{key}" if path else str(key)
             if key == "_target_":
                 raise ConfigError(
-                    f"{shorten(here)} = {quote(value)}: `_target_` is refused, since a config must not be able "
-                    "to run code. Write `name: <installed plugin>` instead (`mode=plugins` lists them)."
+                    f"{shorten(key_path)} = {quote(value)}: `_target_` is refused, because a config must not be able "
+                    "to run code. Write `name: <plugin>` instead (`mode=plugins` lists the installed plugins)."
                 )
-            forbid_targets(value, here)
+            forbid_targets(value, key_path)
     elif isinstance(config, list | tuple):
         for index, value in enumerate(config):
             forbid_targets(value, f"{path}[{index}]")
 
 
 def resolve(group: str, config: Any, path: str | None = None) -> dict[str, Any]:
-    """Return the config of one plugin with every default filled in, checked against its constructor.
+    """Check the config of one plugin against its constructor, and return the config with every default filled in.
 
     Args:
         group: Registry, such as "density_head".
@@ -74,18 +74,18 @@ def resolve(group: str, config: Any, path: str | None = None) -> dict[str, Any]:
         config = {"name": config}
     if not isinstance(config, Mapping):
         raise ConfigError(
-            f"{shorten(path)} = {quote(config)}: wanted the name of a {group}, or a mapping with `name` and "
-            "its parameters."
+            f"{shorten(path)} = {quote(config)}: expected the name of a {group}, or a mapping with `name` and "
+            "the parameters of the plugin."
         )
     forbid_targets(config, path)
     values = dict(config)
     name = values.pop("name", None)
     if not isinstance(name, str):
         raise ConfigError(
-            f"{shorten(path)}.name is missing: write the name of a {group} (`mode=plugins` lists them)."
+            f"{shorten(path)}.name is missing. Write the name of a {group} (`mode=plugins` lists all plugins)."
         )
     cls = load(group, name)
-    checked = _stored(cls, values, path)
+    checked = _checked_plain_values(cls, values, path)
     for key, part in parts(cls).items():
         value = checked[key]
         if value is None:
@@ -110,16 +110,17 @@ def build(group: str, config: Mapping[str, Any], **context: Any) -> Any:
         ConfigError: The constructor has a parameter that the framework cannot supply here, or raises a ValueError.
     """
     cls = load(group, config["name"])
-    given = []
+    supplied = []
     for parameter in positional(cls):
         if parameter.name not in context:
             raise ConfigError(
-                f"{cls.__name__} asks the framework for `{parameter.name}`, which a {group} is not given here; "
-                f"it may ask for: {', '.join(context) or 'nothing'}. Keyword-only parameters come from the config."
+                f"The constructor of {cls.__name__} has the parameter `{parameter.name}`, which the framework does not "
+                f"supply to a {group} here; the framework supplies {', '.join(context) or 'nothing'}. Make it a "
+                "keyword-only parameter, which comes from the config."
             )
-        given.append(context[parameter.name])
+        supplied.append(context[parameter.name])
     stored = _defaults(cls) | {key: value for key, value in config.items() if key != "name"}
-    values = _validated(cls, _kept(cls, stored, group), group, nullable=True)
+    values = _validate(cls, _to_plain_values(cls, stored, group), group, nullable=True)
     for key, part in parts(cls).items():
         if values[key] is None:
             continue
@@ -128,20 +129,20 @@ def build(group: str, config: Mapping[str, Any], **context: Any) -> Any:
                 values[key] = part.many(build(part.group, item, **context) for item in values[key])
             else:
                 values[key] = build(part.group, values[key], **context)
-        except ConfigError as error:  # the user may never have named the part
-            raise ConfigError(f"{group} {config['name']}, of which {key} is a part: {error}") from error
+        except ConfigError as error:  # the user may not know of the part, which has a default
+            raise ConfigError(f"{group} {config['name']}, which contains {key}: {error}") from error
     try:
-        return cls(*given, **arguments(cls, values))
+        return cls(*supplied, **arguments(cls, values))
     except ValueError as error:
-        said = " ".join(f"{key}={shorten(value)}" for key, value in config.items() if key != "name")
+        parameters = " ".join(f"{key}={shorten(value)}" for key, value in config.items() if key != "name")
         raise ConfigError(
-            f"{group} {config['name']} does not take {said or 'what it was given'}: {shorten(error)} (ValueError at "
-            f"{_place(error, cls)})."
+            f"{group} {config['name']} refuses {parameters or 'its arguments'}: {shorten(error)} (ValueError at "
+            f"{_error_line(error, cls)})."
         ) from error
 
 
-def _place(error: BaseException, cls: type) -> str:
-    """Return file and line of an error: the last line reached in the plugin's own file, or else the last of all."""
+def _error_line(error: BaseException, cls: type) -> str:
+    """Return file and line where an error was raised, in the file of `cls` if the stack trace reaches that file."""
     lines = [(frame.f_code.co_filename, line) for frame, line in walk_tb(error.__traceback__)]
     own = [place for place in lines if place[0] == inspect.getsourcefile(cls)]
     file, line = (own or lines)[-1]
@@ -149,48 +150,55 @@ def _place(error: BaseException, cls: type) -> str:
 
 
 def check(model: type[BaseModel], values: Mapping[str, Any], path: str) -> dict[str, Any]:
-    """Return `values` validated and completed by a pydantic model.
+    """Validate `values` with a pydantic model, and return them with the defaults of the model.
 
     Raises:
         ConfigError: A key is unknown or missing, or a value has the wrong type or range; the message describes the
             first fault.
     """
     try:
-        found = model.model_validate(dict(values)).model_dump()
+        checked = model.model_validate(dict(values)).model_dump()
     except ValidationError as error:
-        raise _refusal(error, path, list(model.model_fields)) from None
-    _require_numbers(values, found, path)
-    return found
+        raise _validation_error(error, path, list(model.model_fields)) from None
+    _require_numbers(values, checked, path)
+    return checked
 
 
-def _require_numbers(given: Any, read: Any, where: str) -> None:
-    """Refuse values that pydantic reads as a number but that are not meant as one: true, "1_0", " 1 ", "nan".
+def _require_numbers(written: Any, read: Any, where: str) -> None:
+    """Refuse values that pydantic converts to a number but that are not meant as one: true, "1_0", " 1 ", "nan".
+
+    Args:
+        written: Value of the config.
+        read: The same value after the conversion by pydantic.
+        where: Dotted key of the value, for the message.
 
     Raises:
-        ConfigError: `given` contains such a value where pydantic `read` a number.
+        ConfigError: `written` contains such a value.
     """
-    if isinstance(given, Mapping) and isinstance(read, Mapping):
-        for key in given.keys() & read.keys():
-            _require_numbers(given[key], read[key], f"{where}.{key}" if where else str(key))
-    elif isinstance(given, list | tuple) and isinstance(read, list | tuple) and len(given) == len(read):
-        for number, (one, other) in enumerate(zip(given, read, strict=True)):
-            _require_numbers(one, other, f"{where}[{number}]")
-    elif is_number(read) and not isinstance(read, Enum) and _no_number(given):
-        raise ConfigError(f"{shorten(where)} = {quote(given)}: wanted a number. Write one, such as {read}.")
+    if isinstance(written, Mapping) and isinstance(read, Mapping):
+        for key in written.keys() & read.keys():
+            _require_numbers(written[key], read[key], f"{where}.{key}" if where else str(key))
+    elif isinstance(written, list | tuple) and isinstance(read, list | tuple) and len(written) == len(read):
+        for number, (item, read_item) in enumerate(zip(written, read, strict=True)):
+            _require_numbers(item, read_item, f"{where}[{number}]")
+    elif is_number(read) and not isinstance(read, Enum) and _is_not_number(written):
+        raise ConfigError(
+            f"{shorten(where)} = {quote(written)}: expected a number. Write a number, such as {read}."
+        )
 
 
-def _no_number(given: Any) -> bool:
-    return isinstance(given, bool) or (isinstance(given, str) and not WRITTEN.fullmatch(given))
+def _is_not_number(written: Any) -> bool:
+    return isinstance(written, bool) or (isinstance(written, str) and not WRITTEN.fullmatch(written))
 
 
-def _refusal(error: ValidationError, path: str, known: Sequence[str]) -> ConfigError:
-    """Return an error that describes the first fault; `known` are the valid keys, for an unknown key."""
+def _validation_error(error: ValidationError, path: str, known: Sequence[str]) -> ConfigError:
+    """Return an error that describes the first fault; `known` are the valid keys, which it lists for an unknown key."""
     fault = error.errors()[0]
     where = shorten(".".join(filter(None, [path, *(str(item) for item in fault["loc"])])))
-    # the second kind comes from a dataclass
+    # pydantic reports an unknown key of a dataclass by the second type
     if fault["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
         left = path and fault["input"] is not None and "[" not in where
-        return _unknown(where, str(fault["loc"][-1]), known, bool(left))
+        return _unknown_key_error(where, str(fault["loc"][-1]), known, bool(left))
     if fault["type"] == "missing":
         return ConfigError(f"{where} is missing: {fault['msg']}. Give it a value.")
     hint = ""
@@ -200,45 +208,48 @@ def _refusal(error: ValidationError, path: str, known: Sequence[str]) -> ConfigE
     return ConfigError(f"{where} = {quote(fault['input'])}: {message}.{hint}")
 
 
-def _unknown(where: str, key: str, known: Sequence[str], left: bool) -> ConfigError:
+def _unknown_key_error(where: str, key: str, known: Sequence[str], left: bool) -> ConfigError:
     # the key may belong to another plugin that the experiment chose; Hydra cannot delete a key whose value is null
-    advice = f" ~{where} leaves out what an experiment sets." if left else ""
+    advice = f" If an experiment sets the key, ~{where} removes it." if left else ""
     return ConfigError(
         f"{where}: unknown key.{did_you_mean(key, known)} Known keys: {list_names(key, known) or 'none'}.{advice}"
     )
 
 
-def _stored(cls: type, values: Mapping[str, Any], path: str) -> dict[str, Any]:
-    """Return `values` checked and completed by the defaults of `cls`, as plain values that do not change when reread.
+def _checked_plain_values(cls: type, values: Mapping[str, Any], path: str) -> dict[str, Any]:
+    """Check `values`, add the defaults of `cls`, and return all of them as plain values.
 
     Raises:
-        ConfigError: A key is unknown or missing, or a value has the wrong type or range or cannot be stored.
+        ConfigError: A key is unknown or missing, a value has the wrong type or range or cannot be stored, or reading
+            the stored plain values would give other values.
     """
-    found = _kept(cls, _validated(cls, _defaults(cls) | dict(values), path), path)
+    plain_values = _to_plain_values(cls, _validate(cls, _defaults(cls) | dict(values), path), path)
     try:
-        again = _kept(cls, _validated(cls, found, path), path)
+        reread = _to_plain_values(cls, _validate(cls, plain_values, path), path)
     except ConfigError as error:
         raise ConfigError(
-            f"{error} That is how {cls.__name__} keeps what it was given, which its annotation does not take: "
-            "annotate the parameter with a type that also takes plain values."
+            f"{error} This is the plain value that a checkpoint stores, which the annotation of {cls.__name__} does "
+            "not accept. Annotate the parameter with a type that also accepts plain values."
         ) from None
-    for key, value in found.items():
+    for key, value in plain_values.items():
         # NaN does not equal itself, so its text is compared too
-        if again[key] != value and repr(again[key]) != repr(value):
+        if reread[key] != value and repr(reread[key]) != repr(value):
             raise ConfigError(
-                f"{shorten(f'{path}.{key}')} = {quote(value)} becomes {quote(again[key])} when a checkpoint that "
-                f"keeps it is read: the annotation changes what it is given. Let {cls.__name__} compute that in its "
-                "constructor."
+                f"{shorten(f'{path}.{key}')} = {quote(value)} becomes {quote(reread[key])} when a checkpoint with this "
+                f"value is read, because the annotation changes the value each time. Let the constructor of "
+                f"{cls.__name__} change the value instead."
             )
-    return found
+    return plain_values
 
 
 def _defaults(cls: type) -> dict[str, Any]:
-    return {key: own for key, (_, own) in signature(cls).items() if own is not inspect.Parameter.empty}
+    return {
+        key: default for key, (_, default) in signature(cls).items() if default is not inspect.Parameter.empty
+    }
 
 
-def _validated(cls: type, values: Mapping[str, Any], path: str, *, nullable: bool = False) -> dict[str, Any]:
-    """Return the value of every key of `cls`, converted as its annotation says.
+def _validate(cls: type, values: Mapping[str, Any], path: str, *, nullable: bool = False) -> dict[str, Any]:
+    """Return the value of every key of `cls`, converted to the type of its annotation.
 
     Args:
         cls: Class of the plugin.
@@ -250,28 +261,30 @@ def _validated(cls: type, values: Mapping[str, Any], path: str, *, nullable: boo
     Raises:
         ConfigError: A key is unknown or missing, or a value has the wrong type or range.
     """
-    found = {}
+    validated = {}
     models = _models(cls)
     for key in values:
         if key not in models:
             where = shorten(f"{path}.{key}")
-            raise _unknown(where, str(key), list(models), values[key] is not None and "[" not in where)
+            raise _unknown_key_error(
+                where, str(key), list(models), values[key] is not None and "[" not in where
+            )
     for key, (annotation, _) in signature(cls).items():
         if key not in values:
             raise ConfigError(f"{shorten(f'{path}.{key}')} is missing: Field required. Give it a value.")
         value = values[key]
         if nullable and value is None:
-            found[key] = None
+            validated[key] = None
             continue
         try:
             # without `extra`, a misspelt key of an inner model would be ignored silently
             read: Any = models[key].model_validate({key: value}, extra="forbid")
             # pydantic turns a value annotated as Iterable into an iterator, which can be read only once
-            found[key] = list(read.value) if isinstance(read.value, Iterator) else read.value
-            _require_numbers(value, found[key], f"{path}.{key}")
+            validated[key] = list(read.value) if isinstance(read.value, Iterator) else read.value
+            _require_numbers(value, validated[key], f"{path}.{key}")
         except ValidationError as error:
-            raise _refusal(error, path, _inner_keys(annotation)) from None
-    return found
+            raise _validation_error(error, path, _inner_keys(annotation)) from None
+    return validated
 
 
 def _inner_keys(annotation: Any) -> list[str]:
@@ -280,23 +293,23 @@ def _inner_keys(annotation: Any) -> list[str]:
     return [*named, *(name for inner in get_args(annotation) for name in _inner_keys(inner))]
 
 
-def _kept(cls: type, values: Mapping[str, Any], path: str) -> dict[str, Any]:
+def _to_plain_values(cls: type, values: Mapping[str, Any], path: str) -> dict[str, Any]:
     """Return the values in the form in which a checkpoint stores them.
 
     Raises:
         ConfigError: A value does not consist of plain values.
     """
-    found = {}
+    plain_values = {}
     for key, value in values.items():
         try:
-            found[key] = _plain(value)
+            plain_values[key] = _to_plain(value)
         except TypeError as error:
             raise ConfigError(
-                f"{shorten(f'{path}.{key}')} = {quote(value)}: {error}, which no checkpoint keeps. Annotate the "
+                f"{shorten(f'{path}.{key}')} = {quote(value)}: {error}, which a checkpoint cannot store. Annotate the "
                 f"parameter of {cls.__name__} with numbers, text, paths, enums, or lists, mappings, dataclasses or "
-                "pydantic models of these, and make what it needs of them in its constructor."
+                "pydantic models of these, and let the constructor build other objects from them."
             ) from None
-    return found
+    return plain_values
 
 
 @cache
@@ -306,51 +319,52 @@ def _models(cls: type) -> dict[str, type[BaseModel]]:
     Raises:
         ConfigError: An annotation is no type that pydantic can check.
     """
-    found = {}
+    models = {}
     config = ConfigDict(extra="forbid", arbitrary_types_allowed=True)
     for key, (annotation, _) in signature(cls).items():
         kind = Any if key in parts(cls) else annotation
         try:
-            found[key] = create_model(cls.__name__, __config__=config, value=(kind, Field(alias=key)))
-        except Exception as error:  # pydantic raises a dozen kinds
+            models[key] = create_model(cls.__name__, __config__=config, value=(kind, Field(alias=key)))
+        except Exception as error:  # pydantic raises errors of many classes
             raise ConfigError(
                 f"{cls.__name__}: the annotation of `{key}`, {shorten(annotation)}, cannot be checked: "
-                f"{shorten(str(error))} Annotate it with a type: numbers, text, lists, dataclasses, ..."
+                f"{shorten(str(error))} Annotate the parameter with a type that pydantic can check: numbers, text, "
+                "lists, dataclasses, ..."
             ) from error
-    return found
+    return models
 
 
 _SEVERAL: tuple[Any, ...] = (list, tuple, set)
 _SINGLE: tuple[Any, ...] = (bool, int, float, complex, str, bytes)
 
 
-def _plain(value: Any) -> Any:
+def _to_plain(value: Any) -> Any:
     """Return a copy that consists of None, numbers, text, lists, tuples, sets and dicts.
 
     Raises:
         TypeError: A value in it cannot be converted to these; the message names its type.
     """
     if isinstance(value, Enum):
-        return _plain(value.value)
+        return _to_plain(value.value)
     if isinstance(value, BaseModel):
-        return _plain(value.model_dump(by_alias=True))
+        return _to_plain(value.model_dump(by_alias=True))
     if isinstance(value, PurePath):
         return str(value)
     if isinstance(value, date | time | timedelta | Decimal | UUID):
         return to_jsonable_python(value)
     if isinstance(value, Mapping):
-        return {_plain(key): _plain(item) for key, item in value.items()}
+        return {_to_plain(key): _to_plain(item) for key, item in value.items()}
     if isinstance(value, frozenset):
         # torch does not read a frozenset, and a list cannot be an item of a set
-        return tuple(map(_plain, value))
+        return tuple(map(_to_plain, value))
     for kind in _SEVERAL:
         if isinstance(value, kind):
-            return kind(map(_plain, value))
+            return kind(map(_to_plain, value))
     for kind in _SINGLE:
         if isinstance(value, kind):
             return kind(value)
     if value is None:
         return None
     if is_dataclass(value) and not isinstance(value, type):
-        return {field.name: _plain(getattr(value, field.name)) for field in fields(value) if field.init}
-    raise TypeError(f"it holds a {type(value).__name__}")
+        return {field.name: _to_plain(getattr(value, field.name)) for field in fields(value) if field.init}
+    raise TypeError(f"the value contains a {type(value).__name__}")

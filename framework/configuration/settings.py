@@ -18,18 +18,22 @@ if TYPE_CHECKING:
 def _share(value: Any) -> Any:
     number = isinstance(value, int | float) and not isinstance(value, bool)
     if not number or not (value >= 1 if isinstance(value, int) else 0 < value <= 1):
-        raise ValueError("wanted a whole number of batches from 1 on, or a share of them, 0.0 < share <= 1.0")
+        raise ValueError(
+            "expected a number of batches (an integer, 1 or more), or a share of them (0.0 < share <= 1.0)"
+        )
     return value
 
 
 def _devices(value: Any) -> Any:
     listed = value if isinstance(value, list) else [value]
-    numbers = [int(one) for one in listed if not isinstance(one, bool) and re.fullmatch(r"-?\d+", str(one))]
+    numbers = [
+        int(item) for item in listed if not isinstance(item, bool) and re.fullmatch(r"-?\d+", str(item))
+    ]
     if value in (None, "auto", -1) or (listed is value and numbers == value and min(value, default=-1) >= 0):
         return value
     if listed is not value and (numbers > [0] or re.fullmatch(r"\d+(,\d+)+", str(value))):
         return value
-    raise ValueError("wanted how many, from 1 on, a list of their numbers, or auto")
+    raise ValueError("expected a number of devices (1 or more), a list of device indices, or auto")
 
 
 MOST_AT_ONCE = 1024
@@ -65,18 +69,18 @@ class _Strict(BaseModel):
 
 
 class OptimizerSettings(_Strict):
-    """Optimiser of torch.optim by its lower-case name, and schedule of its rate (framework.training.schedules)."""
+    """Optimiser of torch.optim, by its name in lower case, and schedule of its learning rate."""
 
     name: Literal["adam", "adamw", "sgd", "nadam", "radam"] = "adamw"
     learning_rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1e-3
     momentum: Annotated[float, Field(ge=0, lt=1)] | None = None
-    """Momentum of sgd, 0 if it is not given; the other optimisers have moments of their own and refuse it."""
+    """Momentum of sgd; None means 0. The other optimisers have fixed kinds of momentum and refuse this setting."""
     weight_decay: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
     schedule: Literal["constant", "cosine", "step", "plateau"] = "constant"
     warmup_steps: NotNegative = 0
-    """Number of steps over which the learning rate rises linearly; in a short training at most a quarter of them."""
+    """Number of steps in which the learning rate rises linearly, at most a quarter of the training's steps."""
     factor: Annotated[float, Field(gt=0, lt=1)] = 0.1
-    """Factor of a reduction by the schedule step or plateau."""
+    """Factor by which the schedules step and plateau multiply the learning rate to reduce it."""
     milestones: list[Count] = []
     """Epochs after which the schedule step reduces the learning rate."""
     patience: Count = 5
@@ -86,15 +90,18 @@ class OptimizerSettings(_Strict):
     def _fits(self) -> "OptimizerSettings":
         if self.momentum is not None and self.name != "sgd":
             raise ValueError(
-                f"momentum is a setting of sgd, {self.name} has none. Leave it out, or choose sgd"
+                f"momentum is a setting of sgd only, and the optimiser is {self.name}. Leave momentum out, or choose "
+                "sgd"
             )
         if self.schedule == "step" and not self.milestones:
             raise ValueError(
-                "schedule=step reduces the rate after some epochs and milestones names none. Give them: [2000]"
+                "schedule=step reduces the learning rate after the epochs in milestones, but milestones is empty. Set "
+                "milestones, such as [2000]"
             )
         if self.milestones and self.schedule != "step":
             raise ValueError(
-                f"milestones are of schedule=step, {self.schedule} has none. Leave them out, or choose step"
+                f"milestones are a setting of schedule=step only, and the schedule is {self.schedule}. Leave "
+                "milestones out, or choose step"
             )
         return self
 
@@ -104,7 +111,10 @@ class LoggerSettings(_Strict):
 
     name: Literal["mlflow", "none"] = "mlflow"
     uri: str | None = None
-    """Address of the store without a password; None means MLFLOW_TRACKING_URI, else mlflow.db in the outputs folder."""
+    """Address of the store, without a password.
+
+    None means the environment variable MLFLOW_TRACKING_URI or, if it is not set, mlflow.db in the outputs folder.
+    """
     experiment: str | None = None
 
 
@@ -170,11 +180,11 @@ class Settings(_Strict):
     workers: Annotated[int, Field(ge=0, le=MOST_AT_ONCE)] = 0
     samples: Positive = 1000
     pictures: Literal[True, False, "png", "pdf", "svg"] = True
-    """Format of the figures; True means png, and False draws none."""
+    """Format of the figures; True means png, and False means that no figures are drawn."""
     checkpoint: str | None = None
     resume: str | None = "auto"
     stored: dict[str, Any] = {}
-    """Keys of a stored config that a command repeats, by group: `data.root=...` beside `checkpoint=`, for example."""
+    """Values for keys of a stored config, by group, such as `data.root=...` in a command with `checkpoint=`."""
     experiment_name: str | None = None
     optimizer: OptimizerSettings = OptimizerSettings()
     logger: LoggerSettings = LoggerSettings()
@@ -183,12 +193,12 @@ class Settings(_Strict):
 
 
 def store_experiment(config: Mapping[str, Any], trained_on: str = "") -> str:
-    """Return the name of the experiment in the tracking store for a run.
+    """Return the name of the experiment to which a run belongs in the tracking store.
 
-    It is the name that the logger gives, if any. Otherwise it is "data" for `experiment=data/method`, the name of the
+    The name is `logger.experiment`, if it is set. Otherwise it is "data" for `experiment=data/method`, the name of the
     data set for a run without an experiment, or the data set on which a stored model was trained (`trained_on`). For a
     run without data it is "Default", which MLflow creates itself. All methods on the same data share one experiment, so
-    that a sweep over methods appears under its parent and can be compared.
+    that the runs of a sweep over methods appear under their parent and can be compared.
     """
     logger = config.get("logger") or {}
     name = config.get("experiment_name")
@@ -217,7 +227,7 @@ def settings(config: Mapping[str, Any]) -> Settings:
         require_no_password(checked.logger.uri)
     check(TrainerSettings, checked.trainer, "trainer")
     every, epochs = checked.trainer.get("check_val_every_n_epoch"), checked.trainer.get("max_epochs")
-    if every and epochs:  # so that a run with fewer epochs is validated at its end
+    if every and epochs:  # a run with fewer epochs is validated at its end
         checked.trainer["check_val_every_n_epoch"] = min(every, epochs)
     return checked
 
@@ -236,7 +246,8 @@ def device_of(accelerator: str | None) -> "torch.device":
     require_device(accelerator)
     if accelerator == "tpu":
         raise ConfigError(
-            "trainer.accelerator = 'tpu': a TPU only trains here. Choose auto, cpu, gpu, cuda or mps."
+            "trainer.accelerator = 'tpu': a TPU can only train, not test a stored model. Choose auto, cpu, gpu, cuda "
+            "or mps."
         )
     if accelerator in (None, "auto", "gpu"):
         accelerator = "cuda" if torch.cuda.is_available() else "mps" if accelerator == "gpu" else "cpu"
@@ -252,9 +263,9 @@ def require_device(accelerator: str | None) -> None:
     if accelerator in ("gpu", "cuda", "mps"):
         import torch
 
-        found = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
-        if not (any(found.values()) if accelerator == "gpu" else found[accelerator]):
+        available = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
+        if not (any(available.values()) if accelerator == "gpu" else available[accelerator]):
             raise ConfigError(
-                f"trainer.accelerator = {accelerator!r}: PyTorch sees none on this machine. Choose auto or cpu, or "
-                "install the PyTorch that fits your driver."
+                f"trainer.accelerator = {accelerator!r}: PyTorch finds no such device on this machine. Choose auto or "
+                "cpu, or install the PyTorch that fits your driver."
             )

@@ -14,7 +14,7 @@ from framework.errors import ConfigError, shorten
 
 
 class Part(typing.NamedTuple):
-    """Constructor parameter that is itself a plugin, or a list or tuple of plugins (`many`)."""
+    """Constructor parameter for a plugin of the registry `group`, or for a list or tuple of such plugins (`many`)."""
 
     group: str
     many: type[list[Any]] | type[tuple[Any, ...]] | None
@@ -25,9 +25,9 @@ def parts(cls: type) -> dict[str, Part]:
     """Return the keyword-only parameters of `cls` that are annotated with an abstract base.
 
     Raises:
-        ConfigError: A base is part of an annotation for which no config can name plugins, such as a dict.
+        ConfigError: An annotation contains a base in a form for which no config can name plugins, such as a dict.
     """
-    found = {}
+    part_by_name = {}
     for name, (annotation, _) in signature(cls).items():
         for candidate in typing.get_args(annotation) if _is_union(annotation) else (annotation,):
             if typing.get_origin(candidate) is typing.Annotated:
@@ -36,13 +36,14 @@ def parts(cls: type) -> dict[str, Part]:
             # a bare `List` has no arguments
             group = group_of(next(iter(typing.get_args(candidate)), None) if many else candidate)
             if group is not None:
-                found[name] = Part(group, many)
-        if name not in found and (group := next(_groups_within(annotation), None)):
+                part_by_name[name] = Part(group, many)
+        if name not in part_by_name and (group := next(_groups_within(annotation), None)):
             raise ConfigError(
-                f"{cls.__name__}: `{name}` holds plugins of the group {group} as {shorten(annotation)}, which no config "
-                "can name. Annotate it with their base, or with a list or a tuple of that."
+                f"{cls.__name__}: the annotation of `{name}`, {shorten(annotation)}, contains the base of the group "
+                f"{group} in a form for which a config cannot name plugins. Annotate the parameter with the base, or "
+                "with a list or a tuple of the base."
             )
-    return found
+    return part_by_name
 
 
 def _groups_within(annotation: Any) -> Iterator[str]:
@@ -60,33 +61,33 @@ def signature(cls: type) -> dict[str, tuple[Any, Any]]:
     Raises:
         ConfigError: Two parameters have the same key, or a key is `name`, which names the plugin.
     """
-    found: dict[str, tuple[Any, Any]] = {}
+    annotation_and_default: dict[str, tuple[Any, Any]] = {}
     owner: dict[str, str] = {"name": "the name of the plugin"}
     for name, key, annotation, default in _keys(cls):
-        here = f"the parameter `{name}`" if name == key else f"a field of `{name}`"
+        description = f"the parameter `{name}`" if name == key else f"a field of `{name}`"
         if key in owner:
             raise ConfigError(
-                f"{cls.__name__} has the key {key!r} twice, as {owner[key]} and as {here}, and a config has one "
-                "place for both. Rename one of them."
+                f"{cls.__name__} has the key {key!r} twice, as {owner[key]} and as {description}, but a config can "
+                "hold it only once. Rename one of them."
             )
-        owner[key] = here
-        found[key] = annotation, default
-    return found
+        owner[key] = description
+        annotation_and_default[key] = annotation, default
+    return annotation_and_default
 
 
-def _keys(cls: type, made: Any = None) -> Iterator[tuple[str, str, Any, Any]]:
-    """Yield parameter, key, annotation and default of every key; the defaults are attributes of `made`, if given."""
+def _keys(cls: type, instance: Any = None) -> Iterator[tuple[str, str, Any, Any]]:
+    """Yield parameter, key, annotation and default of every key; the defaults are read from `instance`, if given."""
     for name, (annotation, default) in _keywords(cls).items():
-        default = getattr(made, name, default)
+        default = getattr(instance, name, default)
         if _is_value(annotation):
-            for _, key, kind, own in _keys(annotation, default):
-                yield name, key, kind, own
+            for _, key, kind, key_default in _keys(annotation, default):
+                yield name, key, kind, key_default
         else:
             yield name, name, annotation, default
 
 
 def arguments(cls: type, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the keyword arguments of `cls`, made from the values of its keys."""
+    """Return the keyword arguments of the constructor of `cls`, built from the values of its keys."""
     return {
         name: kind(**arguments(kind, values)) if _is_value(kind) else values[name]
         for name, (kind, _) in _keywords(cls).items()
@@ -120,28 +121,36 @@ def _keywords(cls: type) -> dict[str, tuple[Any, Any]]:
 
 
 def _annotation(cls: type, name: str) -> Any:
-    """Return the evaluated annotation of one parameter, since other annotations may exist for type checkers only."""
+    """Return the evaluated annotation of one parameter.
+
+    The annotations are evaluated one by one, because those of other parameters may use names that exist for type
+    checkers only.
+    """
     written = getattr(cls.__init__, "__annotations__", {}).get(name, Any)
     names = getattr(inspect.unwrap(cls.__init__), "__globals__", {})
     # the constructor belongs to the module of the class, but a field may come from a base in another module
     if is_dataclass(cls):
         owner = next((base for base in cls.__mro__ if name in inspect.get_annotations(base)), cls)
         names = vars(sys.modules[owner.__module__])
-    one = types.SimpleNamespace(__annotations__={name: written})
+    holder = types.SimpleNamespace(__annotations__={name: written})
     try:
-        return typing.get_type_hints(one, globalns=names, include_extras=True)[name]
+        return typing.get_type_hints(holder, globalns=names, include_extras=True)[name]
     except Exception as error:
         raise ConfigError(
             f"{cls.__name__}: the annotation of `{name}`, {shorten(written)}, cannot be evaluated: "
-            f"{type(error).__name__}: {shorten(error)}. A keyword-only parameter is a key of the config, its annotation "
-            "the key's type: import it where the program runs too, not under `if TYPE_CHECKING`, or mend its name."
+            f"{type(error).__name__}: {shorten(error)}. The annotation of a keyword-only parameter is the type of a "
+            "key in the config. Import the names in it at run time, not under `if TYPE_CHECKING`, or correct them."
         ) from error
 
 
 def positional(cls: type) -> list[inspect.Parameter]:
     """Return the parameters of `cls` that the framework fills."""
     parameters = list(inspect.signature(cls.__init__).parameters.values())[1:]
-    return [one for one in parameters if one.kind in (one.POSITIONAL_ONLY, one.POSITIONAL_OR_KEYWORD)]
+    return [
+        parameter
+        for parameter in parameters
+        if parameter.kind in (parameter.POSITIONAL_ONLY, parameter.POSITIONAL_OR_KEYWORD)
+    ]
 
 
 def _is_union(annotation: object) -> bool:

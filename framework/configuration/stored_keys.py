@@ -1,4 +1,4 @@
-"""Keys of a stored config in a command, such as `data.root=...` beside `checkpoint=` or `resume=<folder>`."""
+"""Translation of keys in a command that belong to a stored config, such as `data.root=...` beside `checkpoint=`."""
 
 import re
 from collections.abc import Sequence
@@ -11,18 +11,20 @@ READING = tuple(name for name, mode in MODES.items() if mode.stored)
 
 
 def as_stored(arguments: Sequence[str]) -> list[str]:
-    """Rename keys of plugins that the command does not choose to keys of `stored`.
+    """Replace `data.root=...` by `+stored.data.root=...` if the key belongs to a stored config.
 
     Hydra refuses `data.root=<folder>` if no data is chosen. In a command with a checkpoint, or with the folder of a run
-    to resume, it is a key of the data that is stored there.
+    to resume, `data.root` is a key of the data in the stored config. The same holds for the other plugins.
     """
-    given = {key.lstrip("+"): value for key, _, value in (one.partition("=") for one in arguments)}
-    resumed = given.get("resume", "") not in ("auto", "never", "null", "")
-    mode, checkpoint = given.get("mode", "train"), given.get("checkpoint", "null")
+    values = {key.lstrip("+"): value for key, _, value in (argument.partition("=") for argument in arguments)}
+    resumed = values.get("resume", "") not in ("auto", "never", "null", "")
+    mode, checkpoint = values.get("mode", "train"), values.get("checkpoint", "null")
     reads = set(mode.split(",")) <= set(READING) and (checkpoint not in ("null", "") or mode == "combine")
-    if "experiment" in given or not (resumed or reads):
+    if "experiment" in values or not (resumed or reads):
         return list(arguments)
-    chosen = {key.partition("@")[2] or key for key in given}
+    chosen = {key.partition("@")[2] or key for key in values}
     groups = {*GROUPS, "outliers", *(("mode",) if resumed else ())} - chosen
     key = re.compile(rf"\+{{0,2}}((?:{'|'.join(sorted(groups))})\.[^=]*=.*)", re.DOTALL)
-    return [f"+stored.{found[1]}" if (found := key.fullmatch(one)) else one for one in arguments]
+    return [
+        f"+stored.{match[1]}" if (match := key.fullmatch(argument)) else argument for argument in arguments
+    ]

@@ -26,7 +26,7 @@ from framework.errors import DataError, did_you_mean, quote, shorten
 from framework.storage import text
 from framework.storage.limits import MOST_TABLE_COLUMNS as MOST_COLUMNS
 from framework.storage.path_marks import Words
-from framework.storage.reading import guarded, opened, read_bytes
+from framework.storage.reading import open_regular, read_bytes, translate_errors
 
 MISSING = frozenset(
     {"", "na", "n/a", "#n/a", "#na", "<na>", "nan", "-nan", "nan(ind)", "-nan(ind)", "null", "none", "nil", "nat", "?"}
@@ -107,7 +107,7 @@ class Writing:
 
     def split_unit(self, cell: str) -> tuple[str, str]:
         """Return a cell without its unit, and the unit, "" if the cell has none."""
-        cell = text.trimmed(cell).translate(text.MINUS)
+        cell = text.trim(cell).translate(text.MINUS)
         for unit in sorted(self.units or (), key=len, reverse=True):
             sign = cell[:1] if cell[:1] in ("+", "-") else ""
             if cell[len(sign) :].startswith(unit):
@@ -234,15 +234,15 @@ def csv_rows(file: Path, missing: str, writing: Writing | None = None) -> Iterat
         DataError: the file is missing or unreadable.
     """
     with (
-        guarded(file, "a table", "Save it as UTF-8 text with one row on each line.", missing),
-        opened(file) as stream,
+        translate_errors(file, "a table", "Save it as UTF-8 text with one row on each line.", missing),
+        open_regular(file) as stream,
     ):
-        text.plain(stream.peek(text.LOOKED_AT))
+        text.remove_byte_order_mark(stream.peek(text.LOOKED_AT))
         with io.TextIOWrapper(stream, encoding="utf-8-sig", newline="") as lines:
             try:
                 yield _rows(lines, writing or PLAIN)
             except UnicodeDecodeError:
-                text.decoded(read_bytes(file))  # raises an error that names the line
+                text.decode(read_bytes(file))  # raises an error that names the line
                 raise
 
 
@@ -430,7 +430,7 @@ def _is_row_count(cells: Sequence[str]) -> bool:
 
 def _is_distinct_whole(cells: Sequence[str]) -> bool:
     """Return whether all cells are whole numbers and no number occurs twice."""
-    values = [text.value(cell) for cell in cells]
+    values = [text.parse_number(cell) for cell in cells]
     whole = all(value is not None and math.isfinite(value) and value.is_integer() for value in values)
     return whole and len(set(values)) == len(values)
 
@@ -464,24 +464,24 @@ def _why_no_numbers(columns: Columns, name: str, setting: str) -> str:
         clear = (entry for entry in wrong if len(entry[2].settings) == 1)
         cell, line, mend = next(clear, wrong[0])
         raise DataError(
-            f"{columns.file} line {line}, column {quote(name)}: {quote(cell)} is a number {mend.what}. "
+            f"{columns.file} line {line}, column {quote(name)}: {quote(cell)} is a number {mend.form}. "
             f"{remedy(mend, columns.writing)} Or list the columns to read in {setting}, without this one."
         )
     return f"words; {plain / len(filled):.0%} of the cells are numbers" if plain else "words"
 
 
-def _other_reading(cell: str, writing: Writing) -> text.Mended | None:
+def _other_reading(cell: str, writing: Writing) -> text.Suggestion | None:
     """Return the number that a cell holds in another notation than the table's; None if it holds none."""
-    if not writing.plain and text.value(cell) is not None:
+    if not writing.plain and text.parse_number(cell) is not None:
         digits = cell.lstrip("+-")
         grouped = writing.sign == "," and re.fullmatch(GROUPED_BY_POINTS, digits)
         settings = ({"thousands": "point"},) if grouped else ()
         number = cell.replace(".", "") if grouped else f"{cell} in the notation of the other columns"
-        return text.Mended("with a point, which is no decimal sign in this table", number, settings)
-    return text.mended(cell)
+        return text.Suggestion("with a point, which is no decimal sign in this table", number, settings)
+    return text.suggest_number(cell)
 
 
-def remedy(mend: text.Mended, writing: Writing | None) -> str:
+def remedy(mend: text.Suggestion, writing: Writing | None) -> str:
     """Return advice for a number in another notation than the table's: settings that read it, or how to write it."""
     if writing is None or not mend.settings:
         return f"Write {mend.number}."
@@ -520,7 +520,7 @@ def number(cell: str, writing: Writing = PLAIN) -> float | None:
 
 def _parse_number(cell: str, writing: Writing) -> float | None:
     """Return the number in a cell that is not missing; None if it is a word."""
-    value = text.value(cell if writing.plain else writing.standard(cell))
+    value = text.parse_number(cell if writing.plain else writing.standard(cell))
     return None if value is not None and math.isnan(value) else value
 
 
@@ -564,7 +564,7 @@ def _hint(cell: str, value: float | None, columns: Columns, missing: str | None)
     if value is not None:
         return f" Or {missing}." if math.isnan(value) and missing else ""
     mend = _other_reading(cell, columns.notation)
-    return f" The cell is a number {mend.what}. {remedy(mend, columns.writing)}" if mend else ""
+    return f" The cell is a number {mend.form}. {remedy(mend, columns.writing)}" if mend else ""
 
 
 def _check_units(columns: Columns, name: str) -> None:
@@ -607,7 +607,7 @@ def _check_header(file: Path, header: Sequence[str]) -> None:
             f"{file} is empty or begins with a blank line, but the first line must name the columns. Write their "
             "names."
         )
-    if all(name and text.value(name) is not None for name in header):
+    if all(name and text.parse_number(name) is not None for name in header):
         raise DataError(
             f"{file} line 1: {quote(', '.join(header))} are numbers, but the first line must name the columns. "
             "Insert a line with the names."

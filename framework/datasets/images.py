@@ -24,7 +24,7 @@ from framework.datasets.fields import Fields
 from framework.errors import DataError
 from framework.storage import reading
 from framework.storage.limits import AT_ONCE, LONGEST_SIDE, MOST_PADDED, MOST_PIXELS, MOST_PIXELS_OF
-from framework.storage.progress import tracked
+from framework.storage.progress import track_progress
 
 READERS = min(8, os.cpu_count() or 1)
 """Number of threads that decode images at the same time."""
@@ -108,8 +108,10 @@ def open_image(file: Path) -> Iterator[Image.Image]:
         DataError: the file is missing, is no image, or is truncated; the message names it.
     """
     with (
-        reading.guarded(file, "an image", f"{reading.RESTORE} Scale the image down if it is too large."),
-        reading.opened(file) as stream,
+        reading.translate_errors(
+            file, "an image", f"{reading.RESTORE} Scale the image down if it is too large."
+        ),
+        reading.open_regular(file) as stream,
         open_stream(stream) as image,
     ):
         yield image
@@ -388,7 +390,9 @@ def load(
             faults[index] = error
 
     with ThreadPoolExecutor(READERS) as readers:
-        for _ in tracked(readers.map(visit, range(len(crops))), f"reading {name}", len(crops), "images"):
+        for _ in track_progress(
+            readers.map(visit, range(len(crops))), f"reading {name}", len(crops), "images"
+        ):
             pass
     good = [index for index in range(len(crops)) if index not in faults]
     good_fields = {key: field[good] if faults else field for key, field in fields.items()}

@@ -16,7 +16,7 @@ import numpy as np
 from framework.errors import DataError
 from framework.storage.limits import DEEPEST_ARRAYS as DEEPEST
 from framework.storage.limits import MOST_ARRAYS
-from framework.storage.reading import RESTORE, guarded, inflated, read_bytes, room
+from framework.storage.reading import RESTORE, inflate, most_decompressed, read_bytes, translate_errors
 
 HEADER_BYTES = 128
 NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
@@ -39,7 +39,7 @@ def read_variables(file: Path, names: Sequence[str] | None = None, remedy: str =
     Raises:
         DataError: the file does not exist, is damaged, or is of version 7.3.
     """
-    with guarded(file, "a MATLAB file", remedy):
+    with translate_errors(file, "a MATLAB file", remedy):
         content = read_bytes(file)
         if content[124:HEADER_BYTES] in (b"\x00\x02IM", b"\x02\x00MI"):
             raise DataError(f"{file}: got a MATLAB 7.3 file, but version 5 is required. Save it with '-v7'.")
@@ -63,17 +63,17 @@ def parse_variables(content: bytes, names: Sequence[str] | None = None) -> dict[
     if version != 0x0100:
         raise ValueError(f"the format version is {version:#06x} instead of 0x0100")
     reader, result = _Reader(order), {}
-    position, left = HEADER_BYTES, room(len(content))
+    position, left = HEADER_BYTES, most_decompressed(len(content))
     while position < len(content):
         kind, start, position = reader.element(content, position, len(content))
         packed = content[start:position]
         whole = (
-            inflated(packed, NAME_WITHIN, part=True) if kind == COMPRESSED else content[start - 8 : position]
+            inflate(packed, NAME_WITHIN, part=True) if kind == COMPRESSED else content[start - 8 : position]
         )
         name = reader.head(whole, 8, len(whole)).name
         if name and (names is None or name in names):
             if kind == COMPRESSED:
-                whole = inflated(packed, left)
+                whole = inflate(packed, left)
                 left -= len(whole)
             kind, start, end = reader.element(whole, 0, len(whole))
             if kind != MATRIX:

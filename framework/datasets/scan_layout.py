@@ -33,9 +33,9 @@ from framework.geometry import meshes
 from framework.geometry.camera import Camera
 from framework.geometry.mesh_files import COLOURS
 from framework.geometry.ply_writer import write_ply
-from framework.storage.arrays import archive
+from framework.storage.arrays import read_npz
 from framework.storage.plain_values import plain_numbers, read_json
-from framework.storage.reading import guarded, opened, read_bytes
+from framework.storage.reading import open_regular, read_bytes, translate_errors
 from framework.storage.text import lines_of
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
@@ -117,7 +117,7 @@ def read_splits(root: Path) -> dict[str, tuple[str, ...]]:
     seen: dict[str, Path] = {}
     for split in Splits._fields:
         file = root / f"{split}.txt"
-        with guarded(file, "names of subjects, a line each"):
+        with translate_errors(file, "names of subjects, a line each"):
             names = [line.strip() for line in lines_of(read_bytes(file)) if line.strip()]
             if not names:
                 raise ValueError("it names nobody")
@@ -198,7 +198,7 @@ def read_cameras(file: Path) -> dict[str, Camera]:
     """
     found: dict[str, Camera] = {}
     document = read_json(file, "cameras")
-    with guarded(file, "cameras"):
+    with translate_errors(file, "cameras"):
         views = document.get("views")
         if not isinstance(views, list) or not views:
             raise ValueError('wanted {"views": [...]} with one camera or more')
@@ -263,7 +263,7 @@ def _checked_view(folder: Path, name: str, camera: Camera) -> View:
 
 def tail(file: Path) -> bytes:
     """Return the last bytes of a PNG: the checksum of its pixels, and its end mark."""
-    with opened(file) as stream:
+    with open_regular(file) as stream:
         stream.seek(max(0, file.stat().st_size - 20))
         return stream.read()
 
@@ -297,8 +297,8 @@ def read_places(root: Path, topology: str) -> TexturePlaces:
         DataError: the file is missing or damaged, or its arrays do not fit together.
     """
     file = root / f"topology_{topology}.npz"
-    with guarded(file, "faces, uv and uv_faces of a topology"):
-        arrays = archive(read_bytes(file), ("faces", "uv", "uv_faces"))
+    with translate_errors(file, "faces, uv and uv_faces of a topology"):
+        arrays = read_npz(read_bytes(file), ("faces", "uv", "uv_faces"))
         found = TexturePlaces(
             arrays["faces"].astype(np.int64),
             arrays["uv"].astype(np.float32),

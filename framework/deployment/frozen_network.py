@@ -19,7 +19,7 @@ from torch.fx import Node
 
 from framework.density_head import DensityHead, Fitted
 from framework.model import Model
-from framework.storage.kernels import compiler, kept_in
+from framework.storage.kernels import compiler, kernel_cache
 
 LEAVES = (nn.Linear, nn.BatchNorm1d, nn.ReLU, nn.Dropout, nn.Flatten, nn.Identity, nn.Sequential)
 """Kinds of layers that a network may hold; the export of another one takes long and cannot succeed."""
@@ -286,7 +286,7 @@ def affine_logits(head: DensityHead) -> tuple[np.ndarray, np.ndarray] | None:
     return (matrix, constant) if error <= 1e-11 * max(1.0, np.abs(odds).max()) else None
 
 
-compiled = compiler(kept_in("frozen_network", [Path(__file__)]))
+compiled = compiler(kernel_cache("frozen_network", [Path(__file__)]))
 
 
 @compiled

@@ -21,7 +21,7 @@ import torch
 from PIL import Image
 
 from framework.configuration.description import Description
-from framework.configuration.loading import asked_of, load_with_description, reader
+from framework.configuration.loading import load_with_description, read_batch, reader
 from framework.data import Batch, Data
 from framework.datasets.png import encode_png
 from framework.deployment.request_bodies import MOST_CONTENT, MOST_FILES, MOST_INPUTS, MOST_ROWS
@@ -151,7 +151,7 @@ class Served:
             require_few(len(given), int(np.prod(given.shape)))
         if isinstance(given, list | tuple) and not given:
             raise DataError("Nothing came; wanted a row at least.")
-        return asked_of(self.predictor, self.data, given)
+        return read_batch(self.predictor, self.data, given)
 
     def _of_contents(self, texts: Sequence[Any], names: Sequence[str]) -> Batch:
         """Return the batch of files given as texts in base64."""
@@ -180,7 +180,7 @@ class Served:
         for file in files:
             if ticket is not None:
                 ticket.require_time()
-            parts.append(asked_of(self.predictor, self.data, [file]))
+            parts.append(read_batch(self.predictor, self.data, [file]))
             numbers += parts[-1]["input"].numel()
             require_few(sum(len(part["input"]) for part in parts), numbers)
         if len({part["input"].shape[1:] for part in parts}) == 1:
@@ -190,7 +190,7 @@ class Served:
         rows = sum(len(part["input"]) for part in parts)
         require_few(rows, rows * max(part["input"][0].numel() for part in parts))
         parts.clear()
-        return asked_of(self.predictor, self.data, files)
+        return read_batch(self.predictor, self.data, files)
 
 
 def require_few(rows: int, numbers: int) -> None:

@@ -23,7 +23,7 @@ from framework.evaluation.significance import mean
 from framework.evaluation.splits import evaluate
 from framework.metric import Metric
 from framework.model import Model, Predictor
-from framework.storage.progress import tracked
+from framework.storage.progress import track_progress
 from framework.uncertainty import Uncertainty
 
 
@@ -167,7 +167,7 @@ def tradeoff(
             compared = reference_value(log_probs, reference, last)
         taken = run_times(predict, values, inputs.device, calls=timed_calls, budget_seconds=budget_seconds)
         turns = list(zip(values, own, taken, strict=True))
-        for value, seeds, time in tracked(turns, "measuring errors", len(turns), f"values of {knob}"):
+        for value, seeds, time in track_progress(turns, "measuring errors", len(turns), f"values of {knob}"):
             numbers = averaged([measured(value, repeat) for repeat in range(repeats)]) if metrics else {}
             if compared is not None:
                 numbers |= errors(log_probs, value, seeds, compared)

@@ -5,9 +5,9 @@ from typing import no_type_check
 
 import numpy as np
 
-from framework.storage.kernels import compiler, kept_in
+from framework.storage.kernels import compiler, kernel_cache
 
-compiled = compiler(kept_in("unit_ball", [Path(__file__)]))
+compiled = compiler(kernel_cache("unit_ball", [Path(__file__)]))
 
 
 @compiled

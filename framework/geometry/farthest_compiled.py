@@ -6,9 +6,9 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
-from framework.storage.kernels import compiler, kept_in
+from framework.storage.kernels import compiler, kernel_cache
 
-compiled = compiler(kept_in("farthest", [Path(__file__)]))
+compiled = compiler(kernel_cache("farthest", [Path(__file__)]))
 
 
 @compiled

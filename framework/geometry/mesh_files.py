@@ -92,7 +92,7 @@ def line_numbers(
 
 
 def _lines(content: bytes, comment: bytes | None, names: Sequence[bytes]) -> list[bytes]:
-    content = text.plain(content).replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+    content = text.remove_byte_order_mark(content).replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     if comment is not None and comment in content:
         cut = rb"(?:(?<![\d.])%b|%b(?!\w))[^\n]*" % (2 * (re.escape(comment),))
         if names:  # a whole line with a name is found first, and stays
@@ -114,7 +114,7 @@ def numbers(lines: Sequence[bytes], dtype: type = np.float64, place: Place | Non
         values: list[float] = []
         for number, line in enumerate(lines):
             for word in line.split():
-                value = None if dtype is np.int64 else text.value(word.decode("utf-8", "replace"))
+                value = None if dtype is np.int64 else text.parse_number(word.decode("utf-8", "replace"))
                 if value is None:
                     value = _whole(word) if dtype is np.int64 else None
                 if value is None:
@@ -134,7 +134,7 @@ def _no_number(word: bytes, dtype: type, line: bytes) -> str:
     where = f" in the line {_excerpt(line)}"
     if dtype is np.int64:
         return f"expected a whole number, got {_excerpt(word)}{where}"
-    return text.no_number(word[:60].decode("utf-8", "replace"), where)
+    return text.describe_no_number(word[:60].decode("utf-8", "replace"), where)
 
 
 def _at(number: int, place: Place | None) -> str:
@@ -292,7 +292,7 @@ def stl(content: bytes) -> Parsed:
         record = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("more", "<u2")])
         table = np.frombuffer(content, record, announced_faces, offset=84)
         corners = table["corners"].astype(np.float64).reshape(-1, 3)
-    elif text.plain(content).lstrip()[:5].lower() == b"solid" and b"\0" not in content:
+    elif text.remove_byte_order_mark(content).lstrip()[:5].lower() == b"solid" and b"\0" not in content:
         corners = _stl_text(content)
     else:
         rest = len(content) - announced_bytes
@@ -342,7 +342,7 @@ def xyz(content: bytes) -> Parsed:
     The first three numbers are coordinates. A first line of as many names (`x y z red …`, also as a comment) names the
     columns, which may then be in any order; otherwise they are column_4 and so on.
     """
-    plain = _blank_separated(text.plain(content))
+    plain = _blank_separated(text.remove_byte_order_mark(content))
     if b"//" in plain:
         plain = re.sub(rb"(?:(?<![\d.])//|//(?!\w))[^\r\n]*", _as_comment, plain)
     head = re.split(rb"[\r\n]", plain.lstrip(), maxsplit=1)[0]
@@ -423,12 +423,12 @@ def _refuse(content: bytes, wrong: Callable[[bytes], bool], why: str) -> None:
 
 def npy(content: bytes) -> Parsed:
     """Parse a NumPy array of (points, 3 or more) numbers."""
-    return _table(_points(arrays.array(content)), None)
+    return _table(_points(arrays.read_npy(content)), None)
 
 
 def npz(content: bytes) -> Parsed:
     """Parse a NumPy archive: `points`, or the only array; `normals`, `colors` and other named columns; `faces`."""
-    stored_arrays = arrays.archive(content)
+    stored_arrays = arrays.read_npz(content)
     require_numbers(sum(array.size for array in stored_arrays.values()), MOST_NUMBERS, len(content))
     key = "points" if "points" in stored_arrays or len(stored_arrays) != 1 else next(iter(stored_arrays))
     if key not in stored_arrays:

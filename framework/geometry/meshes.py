@@ -14,7 +14,7 @@ from framework.geometry import mesh_files
 from framework.geometry.mesh_files import COLOURS, Parsed
 from framework.geometry.ply import ply
 from framework.storage.names import as_bytes
-from framework.storage.reading import guarded, read_bytes
+from framework.storage.reading import read_bytes, translate_errors
 
 READERS: dict[str, Callable[[bytes], Parsed]] = {
     ".off": mesh_files.off,
@@ -97,7 +97,7 @@ def read(file: Path, *, drop_non_finite: bool = False) -> Mesh:
     if parse is None:
         raise DataError(f"{file}: cannot be read; expected a file whose name ends in {', '.join(READERS)}.")
     missing = "expected a mesh or point cloud. Correct the path."
-    with guarded(file, file.suffix[1:].upper(), missing=missing):
+    with translate_errors(file, file.suffix[1:].upper(), missing=missing):
         parsed = parse(read_bytes(file))
     if not len(parsed.vertices):
         raise DataError(

@@ -68,7 +68,7 @@ def ply(content: bytes) -> Parsed:
     Raises:
         ValueError: no PLY, an unknown type, fewer or more data than the header announces, faces as strips.
     """
-    content = text.plain(content)
+    content = text.remove_byte_order_mark(content)
     # The last line of the header ends as the first does: after \r alone, \n may be the first byte of the data.
     last = rb"\r" if re.match(rb"ply[ \t]*\r(?!\n)", content) else rb"\r?\n"
     end = re.search(rb"(?:^|[\r\n])end_header[ \t]*" + last, content)

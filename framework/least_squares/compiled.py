@@ -14,9 +14,9 @@ from typing import no_type_check
 
 import numpy as np
 
-from framework.storage.kernels import compiler, kept_in
+from framework.storage.kernels import compiler, kernel_cache
 
-compiled = compiler(kept_in("least_squares", [Path(__file__)]))
+compiled = compiler(kernel_cache("least_squares", [Path(__file__)]))
 EPSILON = float(np.finfo(np.float64).eps)
 LEAST_DAMPING, MOST_DAMPING = 1e-30, 1e20
 """Smallest and largest damping."""

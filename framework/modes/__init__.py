@@ -8,7 +8,7 @@ from typing import Any
 
 from framework.configuration.config import Config
 from framework.configuration.modes import MODES as MODES
-from framework.configuration.modes import idle, require_read
+from framework.configuration.modes import idle_sentences, require_read
 from framework.configuration.settings import require_device
 from framework.errors import ConfigError, did_you_mean
 from framework.runs.job import refuse_idle
@@ -36,7 +36,7 @@ def run(values: dict[str, Any], folder: Path, overrides: Sequence[str]) -> float
     # a resumed run keeps its settings, which an earlier version may have accepted without this check
     if not resumed:
         require_read(name, overrides)
-        for sentence in idle(values, overrides):
+        for sentence in idle_sentences(values, overrides):
             refuse_idle(folder, sentence)
     if name == "train":  # finds mistakes before the import of Lightning, which takes seconds
         require_device(config.settings.trainer.get("accelerator"))
@@ -67,7 +67,7 @@ def _stored(
 
     Keys that do not affect the results (`HOW`) are taken from the present command, `given`, if it sets them.
     """
-    from framework.configuration.paths import flat, paths_of, require_repeated
+    from framework.configuration.paths import flatten, paths_of, require_repeated
     from framework.runs.run import HOW
     from framework.storage.plain_values import read_yaml
     from framework.tracking.run_info import read_run_info
@@ -101,7 +101,7 @@ def _stored(
     if recorded is not None and "logger.uri" not in keys.values():
         store = confirmed(str(recorded), None, folder, folder / "config.yaml")
         values["logger"]["uri"] = store.uri if store.named else None
-    said = flat(given.get("stored") or {})
+    said = flatten(given.get("stored") or {})
     said |= {"checkpoint": given["checkpoint"]} if "checkpoint" in keys.values() else {}
     require_repeated(paths_of(values), said, folder)
     values["resume"] = "auto"  # also if the run was started with resume=never

@@ -11,7 +11,7 @@ from framework.configuration.assembly import build_predictor
 from framework.configuration.config import Config, Options
 from framework.configuration.description import Description
 from framework.configuration.loading import load_with_description
-from framework.configuration.paths import flat
+from framework.configuration.paths import flatten
 from framework.configuration.registry import load
 from framework.configuration.schema import resolve
 from framework.data import Data
@@ -39,7 +39,7 @@ def run(config: Config) -> None:
     options = config.options(CombineOptions)
     console = begin(config.settings)
     sources = found(options.members)
-    again = flat(config.settings.stored)
+    again = flatten(config.settings.stored)
     members = [
         load_with_description(source, uri=config.settings.logger.uri, paths=again) for source in sources
     ]

@@ -24,7 +24,7 @@ from framework.runs.session import begin, record_citations
 from framework.runs.user_files import UNREADABLE, to_read
 from framework.storage.enclosed import require_enclosed
 from framework.storage.files import write_whole
-from framework.storage.names import spelled
+from framework.storage.names import spell_name
 from framework.storage.plain_values import read_json
 from framework.storage.progress import Work
 from framework.training.batches import Batches
@@ -109,7 +109,7 @@ def run(config: Config) -> None:
             raise
         describe(collection, parts)  # written again if another job failed meanwhile and removed it
         if bad:
-            left_out = "".join(f"{spelled(file.relative_to(collection.root))}\n" for file in bad)
+            left_out = "".join(f"{spell_name(file.relative_to(collection.root))}\n" for file in bad)
             write_whole(collection.into / UNREADABLE, left_out.encode())
         left = len(collection.missing())
         console.print(
@@ -159,7 +159,7 @@ def describe(collection: Collection, config: Mapping[str, Any]) -> None:
     Raises:
         ConfigError: The folder holds parts of other files or settings.
     """
-    text = "".join(f"{spelled(name)}\n" for name in collection.names).encode()
+    text = "".join(f"{spell_name(name)}\n" for name in collection.names).encode()
     said = {
         "version": 1,
         **config,

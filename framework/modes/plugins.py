@@ -11,7 +11,7 @@ from rich.padding import Padding
 from rich.text import Text
 
 from framework.configuration.config import Config, Options
-from framework.configuration.registry import GROUPS, Entry, installed, origin, package_folders, refused
+from framework.configuration.registry import GROUPS, Entry, installed, origin, package_folders, unusable_names
 from framework.errors import shorten
 
 
@@ -31,9 +31,9 @@ def show() -> None:
             console.print(Padding(Text.assemble((told.name, "cyan"), "  ", told.summary), (0, 0, 0, 2)))
             source = " · ".join(filter(None, (paper(told.bibtex), told.origin)))
             console.print(Padding(Text(source, style="dim"), (0, 0, 0, 6)))
-        for name, reason in refused(group).items():
+        for name, reason in unusable_names(group).items():
             console.print(Padding(Text.assemble((name, "cyan"), f"  (refused) {reason}"), (0, 0, 0, 2)))
-        if not (installed(group) or refused(group)):
+        if not (installed(group) or unusable_names(group)):
             console.print("  (none installed)")
 
 

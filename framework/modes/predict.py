@@ -27,7 +27,7 @@ from framework.prediction import Prediction, table_columns
 from framework.runs.run import opened
 from framework.runs.session import for_trained
 from framework.runs.user_files import UNREADABLE, files_in, say_left_out, to_read
-from framework.storage.names import spelled
+from framework.storage.names import spell_name
 from framework.target import Target
 from framework.training.batches import Batches, track_batches
 
@@ -61,7 +61,7 @@ def run(config: Config) -> None:
     with opened(session.config) as run:
         if bad:
             (run.folder / UNREADABLE).write_text(
-                "".join(f"{spelled(file)}\n" for file in bad), encoding="utf-8"
+                "".join(f"{spell_name(file)}\n" for file in bad), encoding="utf-8"
             )
         images = run.folder / "images"
         rows, mapped = predictions(
@@ -160,10 +160,10 @@ def _names(data: Data, files: Sequence[Path], samples: int) -> list[str]:
     if not files:
         return [f"test {number}" for number in range(samples)]
     if samples == len(files):
-        return [spelled(file) for file in files]
+        return [spell_name(file) for file in files]
     counts = [len(data.read([file])) for file in files]  # type: ignore[arg-type]
     return [
-        f"{spelled(file)} row {row}"
+        f"{spell_name(file)} row {row}"
         for file, count in zip(files, counts, strict=True)
         for row in range(count)
     ]

@@ -6,7 +6,7 @@ from pydantic import Field
 
 from framework.configuration.assembly import build_metrics
 from framework.configuration.config import Config, Options
-from framework.configuration.modes import sets_nothing
+from framework.configuration.modes import idle_sentence
 from framework.configuration.settings import Positive
 from framework.data import Batch
 from framework.density_head import DensityHead
@@ -121,9 +121,9 @@ def _refuse_unmeasured(config: Config, measured: bool, compared: bool) -> None:
             f"only {ERROR}, which mode.metrics may name, is compared with a reference",
         ),
     ):
-        given = config.given(key)
+        given = config.first_override(key)
         if given and not used:
-            refuse_idle(config.folder, sets_nothing(given, why))
+            refuse_idle(config.folder, idle_sentence(given, why))
 
 
 def _chosen(names: list[str] | None, metrics: list[Metric], *, own: bool) -> Better:

@@ -9,7 +9,7 @@ import pytorch_lightning as pl
 from rich.console import Console
 from torch import distributed as dist
 
-from framework.configuration.loading import fill, weights
+from framework.configuration.loading import fill, predictor_weights
 from framework.configuration.settings import TRAINER_OURS
 from framework.data import Data
 from framework.model import FrozenFrontEnd, fitted_models, learns
@@ -85,7 +85,7 @@ def _by_gradient(session: Session, run: Run) -> tuple[float, int]:
         f"{'stopped early at' if early else 'ended at'} epoch {trainer.current_epoch}, kept {keep.kept_epoch + 1}"
     )
     if first_rank():
-        fill(session.predictor, weights(read(keep.kept_path)), str(keep.kept_path))
+        fill(session.predictor, predictor_weights(read(keep.kept_path)), str(keep.kept_path))
     session.device = trainer.strategy.root_device
     return keep.kept_loss, keep.kept_epoch
 

@@ -86,7 +86,7 @@ def refuse_idle(folder: Path, sentence: str) -> None:
 
     Args:
         folder: Folder of the run.
-        sentence: Sentence about the setting (`framework.configuration.modes.sets_nothing`).
+        sentence: Sentence about the setting (`framework.configuration.modes.idle_sentence`).
 
     Raises:
         ConfigError: The run is not a job of a sweep.

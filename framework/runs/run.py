@@ -14,13 +14,13 @@ from typing import Any
 import yaml
 
 from framework.configuration.config import Config
-from framework.configuration.paths import paths_of, words
+from framework.configuration.paths import paths_of, shell_arguments
 from framework.configuration.settings import Settings, store_experiment
 from framework.errors import DataError, UserError, escape_undecodable
 from framework.runs.job import PARENT, SYNCED_WITHIN
 from framework.runs.provenance import flatten, package_versions
 from framework.runs.repository import git_commit
-from framework.storage.files import unwritable, write_whole
+from framework.storage.files import describe_unwritable, write_whole
 from framework.storage.first_rank import first_rank
 from framework.storage.plain_values import read_yaml
 from framework.tracking.run_info import Destination, read_run_info
@@ -129,7 +129,7 @@ def opened(config: Config) -> Iterator[Run]:
             tracker.close("KILLED" if killed else "FAILED")
             if killed:
                 sys.stderr.write(f"stopped; go on with: python -m framework {going_on(run)}\n")
-            if refused := unwritable(error):
+            if refused := describe_unwritable(error):
                 raise DataError(f"{refused} What was written is whole: {going_on(run)} goes on.") from error
             raise
         if resumed:
@@ -141,7 +141,7 @@ def going_on(run: Run) -> str:
     """Return the arguments of the command that continues a run, as typed into a shell."""
     store = run.settings.logger.uri  # a stored address or path is used only if the user repeats it
     own = [f"resume={run.folder}", *([f"logger.uri={store}"] if store else [])]
-    return " ".join([*map(shlex.quote, own), *words(paths_of(run.config.values))])
+    return " ".join([*map(shlex.quote, own), *shell_arguments(paths_of(run.config.values))])
 
 
 def _begin_folder(config: Config) -> None:

@@ -25,7 +25,7 @@ from framework.configuration.assembly import (
     build_predictor,
     citations,
     entries,
-    reading_outliers,
+    metrics_reading_outliers,
     require_outliers,
 )
 from framework.configuration.config import Config
@@ -34,13 +34,13 @@ from framework.configuration.loading import (
     PREFIX,
     fill,
     find_checkpoint,
-    interface,
     load_with_description,
+    predictor_weights,
+    read_interface,
     reader,
-    weights,
 )
-from framework.configuration.modes import MODES, sets_nothing
-from framework.configuration.paths import flat, require_said, without_paths
+from framework.configuration.modes import MODES, idle_sentence
+from framework.configuration.paths import flatten, remove_paths, require_paths
 from framework.configuration.registry import load
 from framework.configuration.schema import resolve
 from framework.configuration.settings import Settings, device_of
@@ -226,9 +226,9 @@ def refuse_unread_outliers(config: Config, parts: Resolved) -> None:
     Raises:
         ConfigError: The command chooses outliers, and no metric reads them.
     """
-    given = config.given("outliers")
-    if given and not reading_outliers(parts):
-        refuse_idle(config.folder, sets_nothing(given, "no metric of this run reads outliers"))
+    given = config.first_override("outliers")
+    if given and not metrics_reading_outliers(parts):
+        refuse_idle(config.folder, idle_sentence(given, "no metric of this run reads outliers"))
 
 
 def _refuse_training(config: Config, why: str) -> None:
@@ -238,9 +238,9 @@ def _refuse_training(config: Config, why: str) -> None:
         ConfigError: The command contains such a setting.
     """
     for group in ("optimizer", "trainer"):
-        given = config.given(group)
+        given = config.first_override(group)
         if given:
-            refuse_idle(config.folder, sets_nothing(given, why))
+            refuse_idle(config.folder, idle_sentence(given, why))
 
 
 @dataclass(frozen=True)
@@ -271,10 +271,10 @@ class Start:
         """
         path = find_checkpoint(str(settings.checkpoint), uri=settings.logger.uri)
         content = read(path)
-        state, described = weights(content), content.get("framework")
+        state, described = predictor_weights(content), content.get("framework")
         if not isinstance(described, Mapping):  # `predictor_for` raises the error about wrong weights
             return cls(path, state)
-        stored, shape, columns = interface(described, path)
+        stored, shape, columns = read_interface(described, path)
         target = getattr(data, "target", None) or stored
         try:
             predictor = build_predictor(parts, target, shape, settings.seed, columns)
@@ -408,7 +408,7 @@ def for_trained(config: Config, *, prepare: bool = True) -> Session:
             f"mode={config.mode} needs checkpoint=<run folder, checkpoint file or MLflow run id>."
         )
     predictor, description = load_with_description(
-        config.settings.checkpoint, uri=config.settings.logger.uri, paths=flat(config.settings.stored)
+        config.settings.checkpoint, uri=config.settings.logger.uri, paths=flatten(config.settings.stored)
     )
     return around(config, predictor, description, console, prepare=prepare)
 
@@ -430,9 +430,9 @@ def around(
     }
     used = {group: parts.get(group) for group in ("outliers", "metric") if group not in chosen}
     again = {
-        key: value for key, value in flat(config.settings.stored).items() if key.partition(".")[0] in used
+        key: value for key, value in flatten(config.settings.stored).items() if key.partition(".")[0] in used
     }
-    used, dropped = without_paths(used, again)
+    used, dropped = remove_paths(used, again)
     parts |= used
     dropped |= {
         key: value for key, value in description.dropped.items() if key.partition(".")[0] not in chosen
@@ -446,9 +446,9 @@ def around(
     if "outliers" in reads and not goes_on(config):
         refuse_unread_outliers(config, parts)
     if prepare:
-        outliers = "outliers" in {*reads} - chosen and bool(reading_outliers(parts))
+        outliers = "outliers" in {*reads} - chosen and bool(metrics_reading_outliers(parts))
         groups = ["data", *["metric"] * ("metric" in reads), *["outliers"] * outliers]
-        require_said(dropped, groups, description.path)
+        require_paths(dropped, groups, description.path)
         if "data" in chosen:
             require_target(getattr(build_data(parts), "target", None), description)
     data = reader(replace(description, config=parts, dropped=dropped))
@@ -491,14 +491,16 @@ def _reading(
             f"{description.path} reads inputs of shape {wanted}, but with data={description.config['data']['name']} as "
             f"this command sets it {files[0]} is one of shape {found}. Leave data out: the model knows its own."
         )
-    given = None if config is None else config.given("data")
+    given = None if config is None else config.first_override("data")
     if config is not None and given is not None and not isinstance(data, Mapped):
         skips = any(
             "unreadable=" in item for item in config.overrides
         )  # the mode reads this key, not the data set
         some = list(files[:FEW])
         if not skips and _same_samples(_by_itself(description, some), read(some)):
-            refuse_idle(config.folder, sets_nothing(given, f"the model reads {files[0]} the same without it"))
+            refuse_idle(
+                config.folder, idle_sentence(given, f"the model reads {files[0]} the same without it")
+            )
     return samples
 
 
@@ -506,7 +508,7 @@ def _by_itself(description: Description, files: Sequence[Path]) -> Dataset[Batch
     """Return the samples of files as the model reads them without the command's data settings; None if it cannot."""
     stored = read(Path(description.path))["framework"]["config"]["data"]
     try:
-        config, _ = without_paths({"data": stored}, {})
+        config, _ = remove_paths({"data": stored}, {})
         return reader(replace(description, config={**description.config, **config}, dropped={})).read(files)
     except UserError:  # for example, the data need a path that only the command gives
         return None

@@ -8,8 +8,8 @@ from rich.console import Console
 
 from framework.data import Data
 from framework.errors import DataError
-from framework.storage.names import spelled
-from framework.storage.progress import tracked
+from framework.storage.names import spell_name
+from framework.storage.progress import track_progress
 
 UNREADABLE = "unreadable.txt"
 """Name of the file that lists the files left out, one per line."""
@@ -90,7 +90,9 @@ def to_read(
     if config.get("unreadable") != "skip" and not config.get("skip_unreadable"):
         return kept, []
     bad = [
-        file for file in tracked(kept, "looking for damage", len(kept), "files") if not readable(data, file)
+        file
+        for file in track_progress(kept, "looking for damage", len(kept), "files")
+        if not readable(data, file)
     ]
     say_left_out(console, "files", "left out, since they cannot be read", bad)
     if len(bad) == len(kept):
@@ -105,4 +107,4 @@ def say_left_out(console: Console, kind: str, why: str, paths: Sequence[Path]) -
 
 
 def _listed(paths: Sequence[Path]) -> str:
-    return ", ".join(spelled(path.name) for path in paths[:10]) + (", …" if len(paths) > 10 else "")
+    return ", ".join(spell_name(path.name) for path in paths[:10]) + (", …" if len(paths) > 10 else "")

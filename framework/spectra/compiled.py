@@ -13,10 +13,10 @@ from typing import no_type_check
 
 import numpy as np
 
-from framework.storage.kernels import compiler, kept_in
+from framework.storage.kernels import compiler, kernel_cache
 
 # Sums may be reordered, so that several numbers are added at once.
-compiled = compiler(kept_in("spectra", [Path(__file__)]), fastmath={"reassoc", "contract", "arcp"})
+compiled = compiler(kernel_cache("spectra", [Path(__file__)]), fastmath={"reassoc", "contract", "arcp"})
 
 
 @compiled

@@ -1,12 +1,12 @@
 """Limit on the memory that building or running a model from an untrusted checkpoint may allocate.
 
-A checkpoint of a few kilobytes can describe a layer of 10⁹ weights. A mismatch of the weights is found only when they
-are copied into the model, and by then the model has been built. The limit therefore inspects every operation of torch
-before it runs. It computes the size of the result from shapes alone, and raises an error while the memory is still
-free.
+A checkpoint of a few kilobytes can describe a layer of 10⁹ weights. That the stored weights do not fit is noticed only
+when they are copied into the model, and by then the model has been built. `Budget` therefore inspects every operation
+of torch before it runs, computes the size of the result from shapes alone, and raises an error before the memory is
+allocated.
 
-The sizes are computed by formulas in this module. torch can compute shapes on its device "meta", but for some
-operations that imports its compiler, which takes 0.9 s.
+The sizes are computed by formulas in this module. torch can compute shapes on its device "meta", but some operations
+then import torch's compiler, which takes 0.9 s.
 """
 
 import math
@@ -40,7 +40,7 @@ class Budget(TorchDispatchMode):
     def __init__(self, path: str, most_bytes: int, most_calls: int | float = math.inf) -> None:
         super().__init__()
         self.path, self.most_bytes, self.calls = path, most_bytes, most_calls
-        self.held: list[tuple[StorageWeakRef, int]] = []
+        self.allocated: list[tuple[StorageWeakRef, int]] = []
 
     @classmethod
     def _should_skip_dynamo(cls) -> bool:
@@ -53,42 +53,42 @@ class Budget(TorchDispatchMode):
         args: tuple[Any, ...] = (),
         kwargs: dict[str, Any] | None = None,
     ) -> Any:
-        given = kwargs or {}
+        keywords = kwargs or {}
         self.calls -= 1
         if self.calls < 0:
             raise self._refusal("far more layers or steps")
-        size = result_bytes(func, args, given)
+        size = result_bytes(func, args, keywords)
         if size <= limits.SMALL_RESULT:
-            return func(*args, **given)
-        self.held = [(storage, held) for storage, held in self.held if not storage.expired()]
-        if size + sum(held for _, held in self.held) > self.most_bytes:
+            return func(*args, **keywords)
+        self.allocated = [(storage, nbytes) for storage, nbytes in self.allocated if not storage.expired()]
+        if size + sum(nbytes for _, nbytes in self.allocated) > self.most_bytes:
             raise self._refusal(f"far more memory (at last a tensor of {size / 1e6:.4g} MB)")
-        found = func(*args, **given)
-        for one in tree_iter(found):
-            if isinstance(one, Tensor) and one.layout is torch.strided:
-                storage = one.untyped_storage()
-                self.held.append((StorageWeakRef(storage), storage.nbytes()))
-        return found
+        result = func(*args, **keywords)
+        for tensor in tree_iter(result):
+            if isinstance(tensor, Tensor) and tensor.layout is torch.strided:
+                storage = tensor.untyped_storage()
+                self.allocated.append((StorageWeakRef(storage), storage.nbytes()))
+        return result
 
-    def _refusal(self, what: str) -> CheckpointError:
+    def _refusal(self, excess: str) -> CheckpointError:
         return CheckpointError(
-            f"{self.path} describes a model that takes {what} than its weights and inputs account for. Training "
-            "writes no such file: get it again from where it comes."
+            f"{self.path} describes a model that takes {excess} than its weights and inputs explain. Training "
+            "writes no such file. Copy the file again from its source."
         )
 
 
 def building(path: str, weights: Iterable[Tensor]) -> Budget:
-    """Return the budget of a model with these weights while it is built and its weights are copied into it."""
-    held = list(weights)
+    """Return the budget for building a model and copying these weights into it."""
+    tensors = list(weights)
     return Budget(
         path,
-        limits.BUILDING_BYTES + limits.BUILDING_TIMES * stored_bytes(held),
-        limits.BUILDING_CALLS + limits.CALLS_PER_WEIGHT * len(held),
+        limits.BUILDING_BYTES + limits.BUILDING_TIMES * stored_bytes(tensors),
+        limits.BUILDING_CALLS + limits.CALLS_PER_WEIGHT * len(tensors),
     )
 
 
 def predicting(path: str, weights: Iterable[Tensor], inputs: Tensor) -> Budget:
-    """Return the budget of a model with these weights while it predicts from these inputs."""
+    """Return the budget for the prediction of a model with these weights from these inputs."""
     accounted = stored_bytes(weights) + inputs.numel() * max(inputs.element_size(), 4)
     rows = len(inputs) if inputs.dim() else 1
     most = limits.PREDICTING_BYTES + limits.PREDICTING_ROW * rows + limits.PREDICTING_TIMES * accounted
@@ -96,40 +96,40 @@ def predicting(path: str, weights: Iterable[Tensor], inputs: Tensor) -> Budget:
 
 
 def stored_bytes(tensors: Iterable[Tensor]) -> int:
-    """Return the bytes of memory that tensors hold; storage that several tensors share or repeat counts once."""
+    """Return the bytes of memory that tensors occupy; storage that several tensors share counts once."""
     storages = {
         storage.data_ptr(): storage.nbytes()
-        for storage in (one.untyped_storage() for one in tensors if one.layout is torch.strided)
+        for storage in (tensor.untyped_storage() for tensor in tensors if tensor.layout is torch.strided)
     }
     return sum(storages.values())
 
 
-def result_bytes(func: Any, args: tuple[Any, ...], given: Mapping[str, Any]) -> int:
+def result_bytes(func: Any, args: tuple[Any, ...], keywords: Mapping[str, Any]) -> int:
     """Return the bytes that an operation will allocate for its result.
 
-    An operation without a formula counts as many bytes as its arguments. Its result is no larger than they are, or the
-    shape of the result depends on the values of the arguments.
+    For an operation without a formula, the result is the number of bytes of its arguments. Such an operation returns
+    no more than its arguments, or the shape of its result depends on the values of the arguments.
     """
     operation = _operation(func)
     if not operation.allocates:
         return 0
-    tensors = _tensors((*args, *given.values()))
-    if operation.elementwise and "dtype" not in given and len({one.shape for one in tensors}) == 1:
-        return tensors[0].numel() * max(one.element_size() for one in tensors)
-    called = dict(zip(operation.arguments, args, strict=False)) | dict(given)
-    width = max((one.element_size() for one in tensors), default=torch.get_default_dtype().itemsize)
-    if isinstance(called.get("dtype"), torch.dtype):
-        width = called["dtype"].itemsize
+    tensors = _tensors((*args, *keywords.values()))
+    if operation.elementwise and "dtype" not in keywords and len({tensor.shape for tensor in tensors}) == 1:
+        return tensors[0].numel() * max(tensor.element_size() for tensor in tensors)
+    arguments = dict(zip(operation.arguments, args, strict=False)) | dict(keywords)
+    width = max((tensor.element_size() for tensor in tensors), default=torch.get_default_dtype().itemsize)
+    if isinstance(arguments.get("dtype"), torch.dtype):
+        width = arguments["dtype"].itemsize
     try:
         if operation.formula is not None:
-            return int(width * operation.formula(called))
+            return int(width * operation.formula(arguments))
         if operation.elementwise:
-            return width * math.prod(np.broadcast_shapes(*(one.shape for one in tensors)))
-        if "size" in called and operation.name not in _SAME_SIZE:
-            return width * math.prod(map(int, called["size"]))
+            return width * math.prod(np.broadcast_shapes(*(tensor.shape for tensor in tensors)))
+        if "size" in arguments and operation.name not in _SAME_SIZE:
+            return width * math.prod(map(int, arguments["size"]))
     except (ArithmeticError, IndexError, KeyError, RuntimeError, TypeError, ValueError):
         pass  # the arguments are wrong, and the operation itself raises the error
-    return width * sum(one.numel() for one in tensors)
+    return width * sum(tensor.numel() for tensor in tensors)
 
 
 class _Operation(NamedTuple):
@@ -157,100 +157,113 @@ def _operation(func: Any) -> _Operation:
 
 
 def _tensors(values: Iterable[Any]) -> list[Tensor]:
-    """Return the tensors among the arguments and in lists among them; arguments of torch operations nest no deeper."""
-    found = []
+    """Return the tensors among the arguments of a torch operation, including those in lists and tuples."""
+    tensors = []
     for value in values:
         if isinstance(value, Tensor):
-            found.append(value)
+            tensors.append(value)
         elif isinstance(value, list | tuple):
-            found += [one for one in value if isinstance(one, Tensor)]
-    return found
+            tensors += [item for item in value if isinstance(item, Tensor)]
+    return tensors
 
 
 _SAME_SIZE = ("aten::_unsafe_view", "aten::_reshape_copy", "aten::view_copy", "aten::expand_copy")
 
 
-def _matrices(called: Mapping[str, Any]) -> int:
-    added = next((names for names in (("mat1", "mat2"), ("batch1", "batch2")) if names[0] in called), None)
-    first, second = (called[name] for name in added or ("self", "mat2"))
+def _product_size(arguments: Mapping[str, Any]) -> int:
+    matrix_names = next(
+        (names for names in (("mat1", "mat2"), ("batch1", "batch2")) if names[0] in arguments), None
+    )
+    first, second = (arguments[name] for name in matrix_names or ("self", "mat2"))
     return math.prod(first.shape[:-1]) * second.shape[-1]
 
 
-def _convolution(called: Mapping[str, Any]) -> int:
-    inputs, weight = called["input"], called["weight"]
-    groups, turned = called.get("groups", 1), called.get("transposed", False)
+def _convolution_size(arguments: Mapping[str, Any]) -> int:
+    inputs, weight = arguments["input"], arguments["weight"]
+    groups, transposed = arguments.get("groups", 1), arguments.get("transposed", False)
     sides = inputs.shape[2:]
-    stride, padding, dilation, more = (
-        _each(called.get(name, usual), len(sides))
-        for name, usual in (("stride", 1), ("padding", 0), ("dilation", 1), ("output_padding", 0))
+    stride, padding, dilation, output_padding = (
+        _per_side(arguments.get(name, default), len(sides))
+        for name, default in (("stride", 1), ("padding", 0), ("dilation", 1), ("output_padding", 0))
     )
-    found = len(inputs) * (weight.shape[1] * groups if turned else weight.shape[0])
-    kernels = zip(sides, weight.shape[2:], stride, padding, dilation, more, strict=True)
-    for side, kernel, step, pad, spread, end in kernels:
-        reach = spread * (kernel - 1) + 1
-        found *= (side - 1) * step - 2 * pad + reach + end if turned else (side + 2 * pad - reach) // step + 1
-    return found
+    elements = len(inputs) * (weight.shape[1] * groups if transposed else weight.shape[0])
+    kernels = zip(sides, weight.shape[2:], stride, padding, dilation, output_padding, strict=True)
+    for side, kernel, step, pad, dilated, end in kernels:
+        extent = dilated * (kernel - 1) + 1
+        elements *= (
+            (side - 1) * step - 2 * pad + extent + end
+            if transposed
+            else (side + 2 * pad - extent) // step + 1
+        )
+    return elements
 
 
-def _each(value: Any, count: int) -> list[int]:
+def _per_side(value: Any, count: int) -> list[int]:
     listed = list(value) if isinstance(value, list | tuple) else [value]
     return listed * count if len(listed) == 1 else listed
 
 
-def _padded(called: Mapping[str, Any]) -> int:
-    shape, pads = list(called["self"].shape), called["pad"]
+def _padded_size(arguments: Mapping[str, Any]) -> int:
+    shape, pads = list(arguments["self"].shape), arguments["pad"]
     for side in range(len(pads) // 2):
         shape[-1 - side] += pads[2 * side] + pads[2 * side + 1]
     return math.prod(shape)
 
 
-def _scaled(called: Mapping[str, Any]) -> int:
-    inputs = called["self"] if "self" in called else called["input"]
-    sides = called["output_size"]
+def _scaled_size(arguments: Mapping[str, Any]) -> int:
+    inputs = arguments["self"] if "self" in arguments else arguments["input"]
+    sides = arguments["output_size"]
     return math.prod(inputs.shape[: inputs.dim() - len(sides)]) * math.prod(sides)
 
 
-def _picked(called: Mapping[str, Any]) -> int:
-    held, index = called.get("self", called.get("weight")), called.get("index", called.get("indices"))
-    assert held is not None
+def _indexed_size(arguments: Mapping[str, Any]) -> int:
+    source, index = (
+        arguments.get("self", arguments.get("weight")),
+        arguments.get("index", arguments.get("indices")),
+    )
+    assert source is not None
     if isinstance(index, list | tuple):
-        chosen = [one for one in index if one is not None]
-        return math.prod(np.broadcast_shapes(*(one.shape for one in chosen))) * math.prod(
-            side for side, one in zip(held.shape, [*index, *[None] * held.dim()], strict=False) if one is None
+        chosen = [item for item in index if item is not None]
+        return math.prod(np.broadcast_shapes(*(item.shape for item in chosen))) * math.prod(
+            side
+            for side, item in zip(source.shape, [*index, *[None] * source.dim()], strict=False)
+            if item is None
         )
-    if "dim" in called:
-        return held.numel() // max(held.shape[called["dim"]], 1) * index.numel()
-    return index.numel() * math.prod(held.shape[1:])
+    if "dim" in arguments:
+        return source.numel() // max(source.shape[arguments["dim"]], 1) * index.numel()
+    return index.numel() * math.prod(source.shape[1:])
 
 
 _FORMULAS: dict[str, Callable[[Mapping[str, Any]], int | float]] = {
-    **dict.fromkeys(("mm", "addmm", "bmm", "baddbmm"), _matrices),
-    "convolution": _convolution,
-    "constant_pad_nd": _padded,
-    **dict.fromkeys(("reflection_pad1d", "reflection_pad2d", "reflection_pad3d"), _padded),
-    **dict.fromkeys(("replication_pad1d", "replication_pad2d", "replication_pad3d"), _padded),
-    **dict.fromkeys(("upsample_nearest1d", "upsample_nearest2d", "upsample_nearest3d"), _scaled),
-    **dict.fromkeys(("upsample_linear1d", "upsample_bilinear2d", "upsample_trilinear3d"), _scaled),
-    **dict.fromkeys(("upsample_bicubic2d", "_upsample_bilinear2d_aa", "_upsample_bicubic2d_aa"), _scaled),
-    **dict.fromkeys(("_adaptive_avg_pool2d", "_adaptive_avg_pool3d", "adaptive_max_pool2d"), _scaled),
-    **dict.fromkeys(("index", "index_select", "embedding"), _picked),
-    "gather": lambda called: called["index"].numel(),
-    "take": lambda called: called["index"].numel(),
-    "repeat": lambda called: called["self"].numel() * math.prod(called["repeats"]),
-    "arange": lambda called: (called["end"] - called.get("start", 0)) / (called.get("step") or 1),
-    "linspace": lambda called: called["steps"],
-    "logspace": lambda called: called["steps"],
-    "eye": lambda called: called["n"] * called.get("m", called["n"]),
-    "randperm": lambda called: called["n"],
-    "tril_indices": lambda called: 2 * called["row"] * called["col"],
-    "triu_indices": lambda called: 2 * called["row"] * called["col"],
-    "_euclidean_dist": lambda called: math.prod(called["x1"].shape[:-1]) * called["x2"].shape[-2],
-    "_cdist_forward": lambda called: math.prod(called["x1"].shape[:-1]) * called["x2"].shape[-2],
-    "im2col": lambda called: called["self"].numel() * math.prod(called["kernel_size"]),
-    "diag_embed": lambda called: called["self"].numel() * called["self"].shape[-1],
-    "histc": lambda called: called["bins"],
+    **dict.fromkeys(("mm", "addmm", "bmm", "baddbmm"), _product_size),
+    "convolution": _convolution_size,
+    "constant_pad_nd": _padded_size,
+    **dict.fromkeys(("reflection_pad1d", "reflection_pad2d", "reflection_pad3d"), _padded_size),
+    **dict.fromkeys(("replication_pad1d", "replication_pad2d", "replication_pad3d"), _padded_size),
+    **dict.fromkeys(("upsample_nearest1d", "upsample_nearest2d", "upsample_nearest3d"), _scaled_size),
+    **dict.fromkeys(("upsample_linear1d", "upsample_bilinear2d", "upsample_trilinear3d"), _scaled_size),
+    **dict.fromkeys(
+        ("upsample_bicubic2d", "_upsample_bilinear2d_aa", "_upsample_bicubic2d_aa"), _scaled_size
+    ),
+    **dict.fromkeys(("_adaptive_avg_pool2d", "_adaptive_avg_pool3d", "adaptive_max_pool2d"), _scaled_size),
+    **dict.fromkeys(("index", "index_select", "embedding"), _indexed_size),
+    "gather": lambda arguments: arguments["index"].numel(),
+    "take": lambda arguments: arguments["index"].numel(),
+    "repeat": lambda arguments: arguments["self"].numel() * math.prod(arguments["repeats"]),
+    "arange": lambda arguments: (arguments["end"] - arguments.get("start", 0)) / (arguments.get("step") or 1),
+    "linspace": lambda arguments: arguments["steps"],
+    "logspace": lambda arguments: arguments["steps"],
+    "eye": lambda arguments: arguments["n"] * arguments.get("m", arguments["n"]),
+    "randperm": lambda arguments: arguments["n"],
+    "tril_indices": lambda arguments: 2 * arguments["row"] * arguments["col"],
+    "triu_indices": lambda arguments: 2 * arguments["row"] * arguments["col"],
+    "_euclidean_dist": lambda arguments: math.prod(arguments["x1"].shape[:-1]) * arguments["x2"].shape[-2],
+    "_cdist_forward": lambda arguments: math.prod(arguments["x1"].shape[:-1]) * arguments["x2"].shape[-2],
+    "im2col": lambda arguments: arguments["self"].numel() * math.prod(arguments["kernel_size"]),
+    "diag_embed": lambda arguments: arguments["self"].numel() * arguments["self"].shape[-1],
+    "histc": lambda arguments: arguments["bins"],
 }
-"""Formulas for the number of elements in the result of operations that can return more than their arguments hold.
+"""Formulas for the number of elements in the result of operations that can return more elements than their arguments.
 
 The keys are the names of the operations in torch.
 """

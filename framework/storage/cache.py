@@ -1,4 +1,4 @@
-"""Location of the cache, which keeps generated data between runs."""
+"""Location of the cache, in which generated data stay between runs."""
 
 import os
 from pathlib import Path
@@ -9,7 +9,7 @@ from framework.errors import DataError
 def folder(name: str) -> Path:
     """Return the cache folder `name`, and create it if it is missing.
 
-    It lies under FRAMEWORK_CACHE if that variable is set, else under XDG_CACHE_HOME, else under ~/.cache.
+    The folder lies below FRAMEWORK_CACHE if that environment variable is set, else below XDG_CACHE_HOME or ~/.cache.
 
     Raises:
         DataError: The folder cannot be created.
@@ -24,6 +24,6 @@ def folder(name: str) -> Path:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise DataError(
-            f"The cache folder {path} cannot be made ({error}). Set FRAMEWORK_CACHE to another folder."
+            f"The cache folder {path} cannot be created ({error}). Set FRAMEWORK_CACHE to another folder."
         ) from error
     return path

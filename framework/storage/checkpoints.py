@@ -1,6 +1,6 @@
-"""Checkpoint files that are whole or absent.
+"""Writing and reading of checkpoint files, which are complete or absent.
 
-A checkpoint is written to a temporary file, synced to disk and renamed, and it is verified before it is read.
+A checkpoint is written to a temporary file, synced to disk and renamed, and its checksum is verified before it is read.
 """
 
 import hashlib
@@ -16,10 +16,10 @@ import torch
 from torch import Tensor
 
 from framework.errors import CheckpointError, shorten
-from framework.storage.files import full, remove_leftovers, replacing
+from framework.storage.files import is_disk_full, remove_leftovers, replacing
 from framework.storage.plain_tensors import load, require_admitted_pickles, require_dense
 from framework.storage.plain_values import Foreign
-from framework.storage.reading import opened
+from framework.storage.reading import open_regular
 
 # A checkpoint is the output of `torch.save` (which `torch.load` can still read), followed by this mark and the
 # SHA-256 of everything before the mark. The checksums inside torch's zip do not suffice: they leave out the zip
@@ -29,13 +29,14 @@ TRAILER = len(MARK) + hashlib.sha256().digest_size
 
 
 def write(checkpoint: Mapping[str, Any], path: Path) -> None:
-    """Write a tree of dicts, lists, tuples, plain values and tensors, whole or not at all.
+    """Write nested dicts, lists, tuples, plain values and tensors to a file, completely or not at all.
 
-    This holds across SIGKILL and power loss, because the bytes are on disk before the file gets its name.
+    This is true even if the process is killed or the power fails, because the bytes are on disk before the file gets
+    its name.
 
     Raises:
-        CheckpointError: The disk has too little room (nothing was written), or the contents are not plain values.
-            A file that was there before is unchanged.
+        CheckpointError: The disk has too little free space, or the contents are not plain values. Nothing was written,
+            and an older file at `path` is unchanged.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     remove_leftovers(path.parent)
@@ -45,14 +46,14 @@ def write(checkpoint: Mapping[str, Any], path: Path) -> None:
     try:
         with replacing(path) as partial:
             with partial.open("wb") as file:
-                hashed = _Hashed(file)
-                torch.save(checkpoint, cast(BinaryIO, hashed))
-                file.write(MARK + hashed.digest.digest())
+                hashing_file = _HashingFile(file)
+                torch.save(checkpoint, cast(BinaryIO, hashing_file))
+                file.write(MARK + hashing_file.digest.digest())
             _require_plain(partial, path, checkpoint)
     except (OSError, RuntimeError) as error:
         # after a failed write, torch raises a second error when it closes the file
         fault = error if isinstance(error, OSError) else error.__context__
-        if isinstance(fault, OSError) and full(fault):
+        if isinstance(fault, OSError) and is_disk_full(fault):
             raise _no_room(path, needed) from fault
         raise
 
@@ -61,12 +62,12 @@ def read(path: Path) -> dict[str, Any]:
     """Return the contents of a checkpoint, with tensors on the CPU, after its bytes passed the checksum.
 
     Raises:
-        CheckpointError: The file is missing, empty, cut short or damaged, or holds anything but plain values. The
-            message names the newest whole checkpoint in the same folder, if there is one.
+        CheckpointError: The file is missing, empty, cut short or damaged, or contains anything but plain values. The
+            message names the newest undamaged checkpoint in the same folder, if there is one.
     """
     if not path.is_file():
         raise CheckpointError(f"There is no checkpoint {path}. {_remedy(path)}")
-    with opened(path) as file:
+    with open_regular(path) as file:
         fault = _fault(file)
         if fault is not None:
             raise CheckpointError(f"The checkpoint {path} cannot be used: {fault}. {_remedy(path)}")
@@ -75,15 +76,18 @@ def read(path: Path) -> dict[str, Any]:
             _require_unfolded(file)
             content = load(file)
             if not isinstance(content, dict):
-                raise ValueError(f"it holds {type(content).__name__}")
+                raise ValueError(f"the file contains a {type(content).__name__}, no dict")
             return content
         except (Foreign, UnpicklingError) as error:
-            named = shorten(error) if isinstance(error, Foreign) else "what pickle could make anything of"
+            content_name = shorten(error) if isinstance(error, Foreign) else "arbitrary pickled objects"
             raise CheckpointError(
-                f"The checkpoint {path} holds more than dicts, lists, numbers, strings and dense tensors, namely "
-                f"{named}, which could run code or harm. This framework did not write it: do not use it."
+                f"The checkpoint {path} contains more than dicts, lists, numbers, strings and dense tensors, namely "
+                f"{content_name}, which could run code or exhaust the memory. This framework did not write the file. "
+                "Do not use it."
             ) from None
-        except Exception as error:  # with a correct checksum and wrong contents, torch raises a dozen kinds
+        except (
+            Exception
+        ) as error:  # for wrong contents with a correct checksum, torch raises errors of many classes
             raise CheckpointError(
                 f"The checkpoint {path} cannot be used: {shorten(error)}. {_remedy(path)}"
             ) from error
@@ -95,11 +99,11 @@ def _require_unfolded(file: BinaryIO) -> None:
         parts = archive.infolist()
         size = os.fstat(file.fileno()).st_size
         if any(part.compress_type for part in parts) or sum(part.file_size for part in parts) > size:
-            raise ValueError("its parts unfold to more than the file")
+            raise ValueError("the parts of the archive decompress to more bytes than the file has")
 
 
 def verify(path: Path) -> str | None:
-    """Return what is wrong with a checkpoint file as a clause, or None where it is whole.
+    """Return a clause that says what is wrong with a checkpoint file, or None if its checksum is correct.
 
     The file is read once, and nothing is unpickled.
     """
@@ -111,7 +115,7 @@ def latest_good(folder: Path, names: Collection[str] | None = None) -> Path | No
     """Return the most recently written checkpoint of a folder that passes `verify`, or None.
 
     Args:
-        folder: Folder that holds the checkpoints.
+        folder: Folder of the checkpoints.
         names: File names to consider, or None for all.
     """
     files = [
@@ -126,28 +130,32 @@ def latest_good(folder: Path, names: Collection[str] | None = None) -> Path | No
 def _fault(file: BinaryIO) -> str | None:
     size = os.fstat(file.fileno()).st_size
     if size == 0:
-        return "it is empty"
+        return "the file is empty"
     file.seek(max(0, size - TRAILER))
     mark, wanted = file.read(len(MARK)), file.read()
     if mark != MARK:
-        return "it is cut short, or not a checkpoint of this framework"
+        return "the file is cut short, or it is no checkpoint of this framework"
     file.seek(0)
     digest = hashlib.sha256()
     rest = size - TRAILER
     while rest > 0 and (data := file.read(min(rest, 1 << 20))):
         digest.update(data)
         rest -= len(data)
-    return None if digest.digest() == wanted else "it is damaged, its contents fail their checksum"
-
-
-def _remedy(path: Path) -> str:
-    good = latest_good(path.parent)
     return (
-        f"Use {good}, the newest whole one beside it." if good else "No whole one is beside it: train anew."
+        None if digest.digest() == wanted else "the file is damaged, since its contents fail their checksum"
     )
 
 
-class _Hashed:
+def _remedy(path: Path) -> str:
+    newest = latest_good(path.parent)
+    return (
+        f"Use {newest}, the newest undamaged checkpoint in this folder."
+        if newest
+        else "This folder contains no undamaged checkpoint. Train the model again."
+    )
+
+
+class _HashingFile:
     """Output file for `torch.save` that also computes the checksum of the bytes written to it."""
 
     def __init__(self, file: BinaryIO) -> None:
@@ -171,25 +179,25 @@ def _require_plain(partial: Path, path: Path, checkpoint: Mapping[str, Any]) -> 
             require_admitted_pickles(file)
         require_dense(checkpoint, partial.stat().st_size)
     except ValueError as error:
-        held = f"it would hold {shorten(error)}" if isinstance(error, Foreign) else shorten(error)
+        content = f"the state contains {shorten(error)}" if isinstance(error, Foreign) else shorten(error)
         raise CheckpointError(
-            f"The checkpoint {path} was not written: {held}, and only dicts, lists, tuples, numbers, strings and dense "
-            "tensors are read. Convert these where the state is made."
+            f"The checkpoint {path} was not written: {content}, but only dicts, lists, tuples, numbers, strings and "
+            "dense tensors can be read again. Convert other values in `state_dict`."
         ) from None
 
 
 def _no_room(path: Path, needed: int) -> CheckpointError:
     free = shutil.disk_usage(path.parent).free
     return CheckpointError(
-        f"The checkpoint {path} needs {needed / 1e6:.3g} MB and its disk has {free / 1e6:.3g} MB free. "
-        "It was not written; earlier ones are untouched. Free some space and resume the run."
+        f"The checkpoint {path} needs {needed / 1e6:.3g} MB, but the disk has only {free / 1e6:.3g} MB free. The "
+        "checkpoint was not written; earlier checkpoints are unchanged. Free some space and resume the run."
     )
 
 
 def _bytes_needed(checkpoint: object) -> int:
-    """Return an upper estimate of the file's size in bytes: each storage and text once, and what pickle and zip add."""
+    """Return an upper bound of the file's size in bytes; storages and texts that occur several times count once."""
     needed = 8192
-    seen: set[int] = set()
+    counted: set[int] = set()
     stack: list[Any] = [checkpoint]
     while stack:
         item = stack.pop()
@@ -197,12 +205,12 @@ def _bytes_needed(checkpoint: object) -> int:
         if not isinstance(item, Tensor | Mapping | list | tuple | set | str | bytes):
             continue
         if isinstance(item, Tensor) and item.layout is not torch.strided:
-            continue  # it has no storage whose size could be read; a disk that fills up is handled when that happens
+            continue  # the size of such a tensor is unknown; `write` handles a disk that fills up
         identity = item.untyped_storage().data_ptr() if isinstance(item, Tensor) else id(item)
-        if identity in seen:
+        if identity in counted:
             needed += 128
             continue
-        seen.add(identity)
+        counted.add(identity)
         if isinstance(item, Tensor):
             needed += item.untyped_storage().nbytes() + 512
         elif isinstance(item, Mapping):

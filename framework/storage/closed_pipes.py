@@ -1,4 +1,4 @@
-"""Output streams whose reader may end first, as in `... | head`; later output is then dropped."""
+"""Output streams whose reader may end before the program, as in `... | head`; later output is then dropped."""
 
 import io
 import os
@@ -17,7 +17,7 @@ class DroppingWriter(io.FileIO):
     """
 
     def write(self, data: Any, /) -> int | None:
-        """Write the data, or drop it where no process reads the stream any more."""
+        """Write the data, or drop them if no process reads the stream any more."""
         try:
             return super().write(data)
         except (BrokenPipeError, ConnectionResetError):

@@ -1,11 +1,11 @@
-"""Start of the commands other than `python -m framework`: errors become sentences, and `| head` does not end them."""
+"""Function that runs the command line of a module other than `framework`, and prints errors as sentences."""
 
 import sys
 from collections.abc import Callable
 
 from framework.errors import UserError
 from framework.storage.closed_pipes import survive_closed_pipes
-from framework.storage.files import unwritable
+from framework.storage.files import describe_unwritable
 
 
 def run_command(main: Callable[[list[str]], object]) -> None:
@@ -23,9 +23,9 @@ def run_command(main: Callable[[list[str]], object]) -> None:
         sys.stderr.write("error: interrupted.\n")
         sys.exit(130)
     except OSError as error:
-        refused = unwritable(error)
+        refused = describe_unwritable(error)
         if refused is None and error.filename is None:
             raise
         sys.exit(
-            f"error: {refused or f'{error.filename} cannot be written ({error.strerror}). Choose another place.'}"
+            f"error: {refused or f'{error.filename} cannot be written ({error.strerror}). Choose another path.'}"
         )

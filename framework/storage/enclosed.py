@@ -1,9 +1,9 @@
 """Safe access to run folders from untrusted sources: only plain files inside the folder are opened, never links.
 
-A folder from somebody else can hold a symbolic or a hard link, a pipe or a device in place of any file. A program that
-followed such an entry would read, change or truncate a file of the user, or wait for ever. A command therefore calls
-`require_enclosed` before it uses a folder, and opens single files through `open_plain`, `read_plain` or
-`require_plain_within`.
+A folder from an untrusted source can contain a symbolic or hard link, a pipe or a device in place of any file. A
+program that followed such an entry would read, change or truncate a file of the user, or wait for ever. A command
+therefore calls `require_enclosed` before it uses a folder, opens single files with `open_plain` or `read_plain`, and
+checks other paths with `require_plain_within`.
 """
 
 import os
@@ -15,11 +15,14 @@ from framework.errors import DataError, UserError, shorten
 
 MOST_ENTRIES = 1_000_000
 """Largest number of files and folders in a run or sweep folder; a folder with more is refused."""
-REMEDY = "A run folder may be a stranger's, so no link in it is followed. Replace it by a copy or remove it."
+REMEDY = (
+    "A run folder may come from an untrusted source, so only plain files in it are opened. Replace this entry by a "
+    "copy of the file, or remove it."
+)
 
 
 def require_enclosed(folder: Path, error: type[UserError] = DataError) -> None:
-    """Refuse a folder that holds anything but folders and plain files; a folder that does not exist passes.
+    """Refuse a folder that contains anything but folders and plain files; accept a folder that does not exist.
 
     The folder itself may be a link, because its name comes from the user.
 
@@ -34,33 +37,34 @@ def require_enclosed(folder: Path, error: type[UserError] = DataError) -> None:
     if not folder.exists():
         return
     if not folder.is_dir():
-        raise error(f"{shorten(folder)} is no folder. Give the folder of a run.")
-    folders, seen = [os.fspath(folder)], 0
+        raise error(f"{shorten(folder)} is not a folder. Give the folder of a run.")
+    folders, entry_count = [os.fspath(folder)], 0
     while folders:
         try:
             with os.scandir(folders.pop()) as entries:
                 for entry in entries:
-                    seen += 1
+                    entry_count += 1
                     status = entry.stat(follow_symlinks=False)
                     if fault := _fault(status):
                         raise error(f"{shorten(entry.path)} is {fault}. {REMEDY}")
                     if stat.S_ISDIR(status.st_mode):
                         folders.append(entry.path)
-        except FileNotFoundError:  # removed meanwhile by the process that writes there
+        except FileNotFoundError:  # the process that writes this run has removed the folder in the meantime
             continue
         except OSError as refused:
             raise error(
-                f"{shorten(refused.filename or folder)} cannot be looked through ({refused.strerror}). Give a "
-                "folder that you may read."
+                f"{shorten(refused.filename or folder)} cannot be read ({refused.strerror}). Give a folder that you "
+                "may read."
             ) from refused
-        if seen > MOST_ENTRIES:
+        if entry_count > MOST_ENTRIES:
             raise error(
-                f"{shorten(folder)} holds more than {MOST_ENTRIES:,} files; wanted the folder of a run. Give that one."
+                f"{shorten(folder)} contains more than {MOST_ENTRIES:,} files, but no run has so many. Give the folder "
+                "of a run."
             )
 
 
 def require_plain_within(file: Path, folder: Path, error: type[UserError] = DataError) -> None:
-    """Refuse a file whose path below `folder` contains a link; a missing file passes.
+    """Refuse a file whose path below `folder` contains a link; accept a missing file.
 
     Raises:
         error: The file or a folder on its path is an entry that `require_enclosed` refuses.
@@ -79,11 +83,11 @@ def require_plain_within(file: Path, folder: Path, error: type[UserError] = Data
 def open_plain(path: Path, flags: int, mode: int = 0o644) -> int:
     """Open a file of a run folder as `os.open` does, but never through a link, and return the descriptor.
 
-    `flags` must not contain O_TRUNC, which would truncate a file before it is known to be one of the folder's own.
+    `flags` must not contain O_TRUNC, which would truncate the file before this function has checked it.
 
     Raises:
         DataError: The entry is a link, has a second name elsewhere (a hard link), or is no regular file.
-        OSError: `os.open` cannot open it.
+        OSError: The file cannot be opened.
     """
     assert not flags & os.O_TRUNC
     try:
@@ -109,23 +113,24 @@ def read_plain(path: Path, most: int) -> bytes:
 
     Raises:
         DataError: `open_plain` refuses the file, or it has more than `most` bytes.
-        OSError: `os.open` cannot open it.
+        OSError: The file cannot be opened.
     """
     with read_stream(path) as stream:
         size = os.fstat(stream.fileno()).st_size
         if size > most:
             raise DataError(
-                f"{shorten(path)} has {size:,} bytes; wanted {most:,} at most. Restore it from its source."
+                f"{shorten(path)} has {size:,} bytes, but at most {most:,} bytes are read. Copy the file again from "
+                "its source."
             )
         return stream.read(most + 1)
 
 
 def _fault(status: os.stat_result) -> str:
-    """Return what kind of forbidden entry a status describes; an empty text for a folder or a plain file."""
+    """Return the name of the kind of a forbidden entry, such as "a link"; "" for a folder or a plain file."""
     if stat.S_ISLNK(status.st_mode):
         return "a link"
     if stat.S_ISDIR(status.st_mode):
         return ""
     if not stat.S_ISREG(status.st_mode):
-        return "no regular file"
+        return "not a regular file"
     return "" if status.st_nlink <= 1 else "a file that has a second name elsewhere (a hard link)"

@@ -1,4 +1,4 @@
-"""Atomic writing of files, which are whole or absent afterwards, and locks between processes."""
+"""Atomic writing of files, which are complete or absent afterwards, and locks between processes."""
 
 import errno
 import fcntl
@@ -29,22 +29,22 @@ _CLOSED = (
 )
 
 
-def full(error: OSError) -> bool:
+def is_disk_full(error: OSError) -> bool:
     """Return whether an error says that the disk is full or the user's quota is used up."""
     return error.errno in _FULL
 
 
-def unwritable(error: BaseException) -> str | None:
-    """Return a sentence on why a place cannot be written and what to do; None for an error of another kind."""
-    if not isinstance(error, OSError) or not (error.errno in (*_FULL, *_CLOSED) or _unmade(error)):
+def describe_unwritable(error: BaseException) -> str | None:
+    """Return a sentence that says which file cannot be written, why, and what to do; None for any other error."""
+    if not isinstance(error, OSError) or not (error.errno in (*_FULL, *_CLOSED) or _is_missing_parent(error)):
         return None
     where = f"{error.filename} cannot be written" if error.filename else "A file cannot be written"
-    remedy = "Free some space" if full(error) else "Choose another place"
+    remedy = "Free some space" if is_disk_full(error) else "Choose another path"
     return f"{where} ({error.strerror}). {remedy}."
 
 
-def _unmade(error: OSError) -> bool:
-    """Return whether an error comes from creating a folder; /proc, for example, then reports "no such file"."""
+def _is_missing_parent(error: OSError) -> bool:
+    """Return whether a folder could not be created below its parent, for which /proc reports "no such file"."""
     frames = [frame.f_code.co_name for frame, _ in walk_tb(error.__traceback__)]
     return error.errno == errno.ENOENT and frames[-1:] == ["mkdir"]
 
@@ -57,7 +57,7 @@ def replacing(path: Path) -> Iterator[Path]:
     `path` is created if it is missing.
 
     Raises:
-        OSError: There is no room on the disk, or no permission to write.
+        OSError: The disk is full, or there is no permission to write.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(
@@ -79,14 +79,14 @@ def write_whole(path: Path, content: bytes) -> None:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Delete temporary files of `replacing` in `folder` that ended processes of this machine have left."""
+    """Delete temporary files of `replacing` in `folder` whose processes on this machine have ended."""
     for partial in folder.glob(f".*.{socket.gethostname()}.*.partial"):
         try:
             os.kill(int(partial.suffixes[-2][1:]), 0)
         except ProcessLookupError:
             partial.unlink(missing_ok=True)
         except (PermissionError, ValueError):
-            continue  # the process still runs under another user, or the file is not one of `replacing`
+            continue  # the process still runs under another user, or `replacing` did not create the file
 
 
 def sync(path: Path) -> None:
@@ -99,7 +99,7 @@ def sync(path: Path) -> None:
 
 
 def lock_within(descriptor: int, seconds: float) -> None:
-    """Take the POSIX record lock of a file; this process holds it until it closes any descriptor of that file.
+    """Take the POSIX record lock of a file, which this process holds until it closes any descriptor of the file.
 
     Raises:
         BlockingIOError, PermissionError: Another process still holds the lock after `seconds`.
@@ -116,19 +116,19 @@ def lock_within(descriptor: int, seconds: float) -> None:
 
 
 @contextmanager
-def alone(path: Path) -> Iterator[None]:
+def hold_lock(path: Path) -> Iterator[None]:
     """Hold the lock file `path` during the block, after waiting for other processes and threads.
 
-    The lock is released when the process ends, in whatever way it ends. A file system without `flock` (some mounts of
-    Lustre and NFS) gets a POSIX record lock; on a file system without either, a warning is logged.
+    The lock is released when the process ends, even if it is killed. On a file system without `flock` (some mounts of
+    Lustre and NFS), a POSIX record lock is used; on a file system without both, a warning is logged.
     """
     lock = FileLock(path, thread_local=False)
     try:
         lock.acquire()
     except (NotImplementedError, OSError) as error:
-        if not unlockable(error):
+        if not lacks_locks(error):
             raise
-        with _alone_by_record(path):
+        with _hold_record_lock(path):
             yield
         return
     try:
@@ -137,20 +137,20 @@ def alone(path: Path) -> Iterator[None]:
         lock.release()
 
 
-def unlockable(error: BaseException) -> bool:
+def lacks_locks(error: BaseException) -> bool:
     """Return whether an error says that the file system does not support the lock."""
     return isinstance(error, NotImplementedError) or (isinstance(error, OSError) and error.errno in _NO_LOCKS)
 
 
 @contextmanager
-def _alone_by_record(path: Path) -> Iterator[None]:
+def _hold_record_lock(path: Path) -> Iterator[None]:
     with _THREADS:  # a record lock belongs to the whole process, so threads need a lock of their own
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
         try:
             try:
                 fcntl.lockf(descriptor, fcntl.LOCK_EX)
             except OSError as error:
-                if not unlockable(error):
+                if not lacks_locks(error):
                     raise
                 warn_unlocked(path, error)
             yield
@@ -161,4 +161,8 @@ def _alone_by_record(path: Path) -> Iterator[None]:
 def warn_unlocked(path: Path, error: BaseException) -> None:
     """Log a warning that no lock keeps other processes away from the folder of `path`."""
     why = error.strerror if isinstance(error, OSError) else error
-    _log.warning("%s: no locks on this file system (%s); let one command at a time use it.", path.parent, why)
+    _log.warning(
+        "The file system of %s does not support locks (%s). Run only one command at a time in this folder.",
+        path.parent,
+        why,
+    )

@@ -1,10 +1,10 @@
-"""Choice of the process that writes files and prints, where several processes train together."""
+"""Choice of the process that writes files and prints if several processes train together."""
 
 import os
 
 
 def first_rank() -> bool:
-    """Return whether this process keeps the run's record: it is the only one, or rank 0 of those that train together.
+    """Return whether this process writes the files of the run: it trains alone, or it has rank 0.
 
     A launcher (Lightning, torchrun, srun) sets the rank and the number of ranks in the environment. A rank without a
     number of ranks was set by another program and is ignored.

@@ -1,4 +1,4 @@
-"""Generated data sets in the cache: written whole or not at all, by one process at a time, and marked as synthetic."""
+"""Generated data sets in the cache, which one process at a time writes and which are marked as synthetic."""
 
 import json
 import shutil
@@ -8,31 +8,31 @@ from pathlib import Path
 from typing import Any
 
 from framework.errors import DataError
-from framework.storage.files import alone
+from framework.storage.files import hold_lock
 from framework.storage.plain_values import read_json
-from framework.storage.progress import tracked
+from framework.storage.progress import track_progress
 
 MARK = "synthetic.json"
 PAINTERS = 2
 """Number of threads that draw files at the same time."""
 
 
-def generated(root: Path, mark: Mapping[str, Any], write: Callable[[Path], None]) -> Path:
-    """Return the folder `root` of generated data, after writing it if it does not exist.
+def ensure_generated(root: Path, mark: Mapping[str, Any], write: Callable[[Path], None]) -> Path:
+    """Generate data in the folder `root` if the folder does not exist, and return the folder.
 
     Args:
         root: Folder of the generated data.
-        mark: Everything that the content depends on, as JSON values; stored beside the content in `synthetic.json`.
-        write: Function that fills an empty folder, which is renamed to `root` when it is complete.
+        mark: Values that determine the content, as JSON values; they are stored in `synthetic.json` in the folder.
+        write: Function that writes the data into an empty folder, which is renamed to `root` when it is complete.
 
     Raises:
-        DataError: The cache cannot be written, or `root` holds data with another mark.
+        DataError: The cache cannot be written, or `root` contains data with another mark.
     """
     try:
         root.parent.mkdir(parents=True, exist_ok=True)
         if not root.exists():
-            with alone(root.with_name(f".{root.name}.lock")):
-                if not root.exists():  # another process may have written it while this one waited
+            with hold_lock(root.with_name(f".{root.name}.lock")):
+                if not root.exists():  # another process may have written the data while this one waited
                     _write(root, mark, write)
     except OSError as error:
         raise DataError(
@@ -41,27 +41,30 @@ def generated(root: Path, mark: Mapping[str, Any], write: Callable[[Path], None]
         ) from error
     if read_mark(root) != mark:
         raise DataError(
-            f"{root / MARK} does not describe {dict(mark)}; it was changed. Delete {root}: it is made anew."
+            f"{root / MARK} does not describe {dict(mark)}, so it was changed. Delete {root}; the data are then "
+            "generated again."
         )
     return root
 
 
 def read_mark(root: Path) -> dict[str, Any] | None:
-    """Return the content of `synthetic.json` in a folder, or None where there is no such file: the data are recorded.
+    """Return the content of `synthetic.json` in a folder, or None if the file is missing, as for recorded data.
 
     Raises:
         DataError: The file cannot be read.
     """
     if not (root / MARK).exists():
         return None
-    return read_json(root / MARK, "the mark of generated data", f"Delete {root}: it is made anew.")
+    return read_json(
+        root / MARK, "the mark of generated data", f"Delete {root}; the data are then generated again."
+    )
 
 
-def draw_all(count: int, draw: Callable[[int], None], what: str) -> None:
-    """Call `draw` with 0 … count - 1, in several threads; `what` names the result in the progress report."""
+def draw_all(count: int, draw: Callable[[int], None], name: str) -> None:
+    """Call `draw` with 0 … count - 1, in several threads; `name` is the name of the files in the progress report."""
     with ThreadPoolExecutor(PAINTERS) as painters:
         try:
-            for _ in tracked(painters.map(draw, range(count)), f"drawing {what}", count, "files"):
+            for _ in track_progress(painters.map(draw, range(count)), f"drawing {name}", count, "files"):
                 pass
         except BaseException:
             painters.shutdown(cancel_futures=True)
@@ -70,7 +73,7 @@ def draw_all(count: int, draw: Callable[[int], None], what: str) -> None:
 
 def _write(root: Path, mark: Mapping[str, Any], write: Callable[[Path], None]) -> None:
     part = root.with_name(f".{root.name}.part")
-    # left by a process that was killed, because this one holds the lock
+    # this process holds the lock, so the process that left such a folder was killed
     shutil.rmtree(part, ignore_errors=True)
     try:
         part.mkdir()

@@ -1,4 +1,4 @@
-"""Limits on the memory and time that an untrusted file can make this program use; every reader takes its limits here.
+"""Limits on the memory and time that an untrusted file can make this program use, for all readers of such files.
 
 A limit is checked before anything is allocated. Most limits are far above what valid files need. They are low enough
 that reading a file of a few megabytes takes less than 1 GB and 5 s, whether it succeeds or ends with an error message.
@@ -7,7 +7,7 @@ that reading a file of a few megabytes takes less than 1 GB and 5 s, whether it 
 # models that a checkpoint describes
 
 BUILDING_TIMES, BUILDING_BYTES = 8, 2**27
-"""Memory that building a stored model may hold: this multiple of the size of its weights, plus this number of bytes.
+"""Memory for building a stored model: this multiple of the size of its weights, plus this number of bytes.
 
 Members that are stacked are allocated twice, and orthogonal initial weights three times. Bases of point sets and tables
 of constants take memory although they have no weights.
@@ -18,10 +18,10 @@ CALLS_PER_WEIGHT, BUILDING_CALLS = 200, 10_000
 A layer takes about ten operations; the second number of operations takes less than a second.
 """
 PREDICTING_TIMES, PREDICTING_BYTES, PREDICTING_ROW = 8, 2**27, 2**26
-"""Memory that the first prediction of a stored model may hold.
+"""Memory for the first prediction of a stored model.
 
-It is this multiple of the size of weights and inputs, plus this number of bytes, plus this number of bytes for each
-sample (for an occupancy grid of side 256, for example).
+The limit is PREDICTING_TIMES × the bytes of weights and inputs, plus PREDICTING_BYTES, plus PREDICTING_ROW bytes for
+each sample (for an occupancy grid of side 256, for example).
 """
 SMALL_RESULT = 2**17
 """Size, in bytes, up to which the result of an operation is not counted."""
@@ -35,9 +35,9 @@ MOST_SIDES = 8
 MOST_NAMES, LONGEST_NAME = 100_000, 1000
 """Largest number of names of targets, classes or columns in a checkpoint, and of characters in one name."""
 MOST_DRAWS = 2**17
-"""Largest number of samples of a density that a stored setting may ask for; the usual number is 1000."""
+"""Largest number of samples of a density that a stored setting may request; the usual number is 1000."""
 MOST_DRAWN = 2**26
-"""Largest number of elements in all samples of one density together; up to 1000 samples may be drawn in any case."""
+"""Largest number of elements in all samples of one density together; 1000 samples are always allowed."""
 
 # compressed files
 
@@ -49,11 +49,11 @@ UNFOLDED_BYTES, UNFOLDED_TIMES = 2**27, 20
 MOST_PIXELS, LONGEST_SIDE = 2**25 + 2**24, 2**16
 """Largest number of pixels of a stored image (8,688 × 5,792, from a camera of 50 megapixels), and of its longer side.
 
-Pillow holds 4 bytes for each decoded pixel. An image with an alpha channel, or one that is padded to a square, is held
-twice.
+Pillow uses 4 bytes for each decoded pixel. An image with an alpha channel, or one that is padded to a square, takes
+this memory twice.
 """
 MOST_PIXELS_OF = {"WEBP": 2**25, "JPEG2000": 2**25, "AVIF": 2**25}
-"""Largest number of pixels in formats whose decoders hold two or three further copies of the image."""
+"""Largest number of pixels in formats whose decoders create two or three further copies of the image."""
 MOST_PADDED = 2**26
 """Largest number of pixels of an image padded to a square; a larger one is scaled down before the padding."""
 AT_ONCE = 2**25
@@ -62,21 +62,21 @@ AT_ONCE = 2**25
 # meshes and point clouds
 
 MOST_ANNOUNCED = 2**31
-"""Largest number of vertices or faces that a header may announce; a larger number means that the file is damaged."""
+"""Largest number of vertices or faces in the header of a file; a larger number means that the file is damaged."""
 MOST_COLUMNS = 1000
 """Largest number of values of a vertex."""
 MOST_NUMBERS = 2**24
-"""Number of values to which a compressed archive of points or of a body may decompress, whatever its size.
+"""Number of values to which a compressed archive of points or of a body may decompress, even if the file is small.
 
-A file with more bytes than this may hold as many values as it has bytes. Each value takes 8 bytes when it is read.
+A file with more bytes than this may contain as many values as it has bytes. Each value takes 8 bytes in memory.
 """
 
 # volumes
 
 MOST_OF_SPECTRA, MOST_VOXELS = 2**24, 2**22
-"""Number of values and number of voxels that a volume of spectra may hold, whatever the size of its file.
+"""Number of values and number of voxels that a volume of spectra may contain, even if its file is small.
 
-A larger file may hold as many values as it has bytes, and a quarter as many voxels. Without the limit, 128 kB of
+A larger file may contain as many values as it has bytes, and a quarter as many voxels. Without the limit, 128 kB of
 compressed zeros would decompress to 134 million values.
 """
 
@@ -87,8 +87,8 @@ MOST_PARTS, MOST_MATERIALS = 10_000, 10_000
 MOST_TEXELS, FEW_TEXELS, TEXELS_PER_BYTE = 2**25, 2**24, 16
 """Largest number of texels in all textures of a scene, which fits two textures of 4096 × 4096.
 
-The limit is the second number (one such texture) where the textures have more texels than the third number for each
-byte of their files, which photographs never have. A texel takes 44 bytes while the scene is drawn.
+If the textures have more than TEXELS_PER_BYTE texels for each byte of their files, which photographs never have, the
+limit is FEW_TEXELS (one such texture). A texel takes 44 bytes while the scene is drawn.
 """
 SCENE_BYTES = 2**25
 """Number of bytes to which a small glTF file may expand, because a mesh is copied for each node that shows it.

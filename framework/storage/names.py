@@ -1,4 +1,4 @@
-r"""File names as text, in which bytes that are not UTF-8 are escaped.
+r"""Conversion of file names to text, in which bytes that are not UTF-8 are escaped, and back.
 
 A file name on Linux consists of arbitrary bytes; a name from an old archive may be Latin-1. Python represents a byte
 that is not UTF-8 by a lone surrogate, which no text file, font or database accepts.
@@ -13,7 +13,7 @@ from framework.errors import escape_undecodable
 _UNSAFE = re.compile("[\ud800-\udfff\x00-\x1f\x7f]")
 
 
-def spelled(name: str | os.PathLike[str]) -> str:
+def spell_name(name: str | os.PathLike[str]) -> str:
     r"""Return the name of a file as one line of text, from which `path_of` recovers the name.
 
     Bytes that are not UTF-8, line ends and terminal control characters are escaped, for example as \xe9. If a name
@@ -27,7 +27,7 @@ def spelled(name: str | os.PathLike[str]) -> str:
 
 
 def path_of(spelling: str) -> Path:
-    """Return the path whose text `spelled` returned."""
+    """Return the path for which `spell_name` returned the text `spelling`."""
     if "\\x" not in spelling:
         return Path(spelling)
     name = re.sub(rb"\\(\\|x([0-9a-f]{2}))", _read, os.fsencode(spelling))

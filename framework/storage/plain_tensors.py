@@ -1,8 +1,8 @@
 """Reader for files of `torch.save` that admits plain values and dense tensors only.
 
 `torch.load(weights_only=True)` runs no code. It does, however, build sparse, nested and quantised tensors without
-checking their internal arrays, storages of any size, and tensors that show one number millions of times. The pickle is
-therefore inspected before torch reads it, and the tensors afterwards.
+checking their internal arrays, storages of any size, and tensors that repeat one stored number millions of times. The
+pickle is therefore inspected before torch reads it, and the tensors are inspected afterwards.
 """
 
 import math
@@ -58,13 +58,13 @@ NAMED = frozenset(
 )
 """Globals that a pickle of plain values and dense tensors names without calling them, as "module name" of Python 3.
 
-`CALLED` holds the globals that it calls.
+`CALLED` contains the globals that such a pickle calls.
 """
 TYPES = frozenset(getattr(torch, name) for name in NUMBERS)
 MOST_EXPANDED = 1000
 """Number of elements up to which a tensor may have more elements than its storage, as an expanded tensor has."""
 MOST_SHARED = 1000
-"""Ratio of the bytes of all tensors to the bytes of the file that is allowed, since members may share weights."""
+"""Largest ratio of the bytes of all tensors to the bytes of the file; above 1, because tensors may share storage."""
 PICKLES_BEFORE_ZIP = 5
 """Number of pickles in a file of torch before 1.6: mark, version, system, values, and names of the storages."""
 LENGTH_OF_MARK = 20
@@ -74,11 +74,11 @@ def load(file: BinaryIO) -> Any:
     """Return the object that `torch.save` wrote to a file, with its tensors on the CPU.
 
     Args:
-        file: File that `framework.storage.reading.opened` returned.
+        file: File that `framework.storage.reading.open_regular` returned.
 
     Raises:
-        Foreign: The file holds something other than plain values and dense tensors.
-        Exception: The file is damaged; torch, pickle and zipfile raise a dozen kinds.
+        Foreign: The file contains something other than plain values and dense tensors.
+        Exception: The file is damaged; torch, pickle and zipfile raise errors of many classes.
     """
     size = os.fstat(file.fileno()).st_size
     require_admitted_pickles(file)
@@ -107,15 +107,15 @@ def _pickles(file: BinaryIO) -> Iterator[bytes]:
     file.seek(0)
     reader = _reader(file)
     names = reader.get_all_records()
-    found = {name: (reader.get_record_header_offset(name), _record_size(reader, name)) for name in names}
+    records = {name: (reader.get_record_header_offset(name), _record_size(reader, name)) for name in names}
     file.seek(0)
     with zipfile.ZipFile(file) as archive:
         parts = {
             part.filename.partition("/")[2]: (part.header_offset, part.file_size)
             for part in archive.infolist()
         }
-        if parts != found or len(archive.infolist()) != len(names) or "data.pkl" not in found:
-            raise ValueError("its directory can be read in two ways, or has no values")
+        if parts != records or len(archive.infolist()) != len(names) or "data.pkl" not in records:
+            raise ValueError("the directory of the archive is ambiguous, or the archive contains no values")
     yield reader.get_record("data.pkl")
 
 
@@ -137,7 +137,7 @@ def _pickles_before_zip(file: BinaryIO) -> Iterator[bytes]:
         start = file.tell()
         for _, _, place in instructions(file):
             if number == 0 and (place or 0) > LENGTH_OF_MARK:
-                raise ValueError("it does not begin as a file of torch does")
+                raise ValueError("the file does not begin like a file of torch")
         end = file.tell()
         file.seek(start)
         yield file.read(end - start)
@@ -154,19 +154,19 @@ def require_dense(content: Any, size: int | float = math.inf) -> None:
         Foreign: A tensor has another layout, data type or class.
         ValueError: A tensor has far more elements than its storage, or all tensors have far more bytes than the file.
     """
-    seen: set[int] = set()
-    left = MOST_SHARED * size
+    visited: set[int] = set()
+    bytes_left = MOST_SHARED * size
     stack: list[tuple[str, Any]] = [("", content)]
     while stack:
         name, item = stack.pop()
         if isinstance(item, Tensor):
-            left -= _require_dense(item, name or "a tensor")
-            if left < 0:
-                raise ValueError("its tensors share so much that they are far more than the file")
+            bytes_left -= _require_dense(item, name or "a tensor")
+            if bytes_left < 0:
+                raise ValueError("the tensors share storage and have far more bytes in all than the file")
         elif isinstance(item, torch.UntypedStorage | torch.TypedStorage):
             raise Foreign("a storage without a tensor")
-        elif isinstance(item, dict | list | tuple | set) and id(item) not in seen:
-            seen.add(id(item))
+        elif isinstance(item, dict | list | tuple | set) and id(item) not in visited:
+            visited.add(id(item))
             inner = item.items() if isinstance(item, dict) else enumerate(item)
             stack += [(str(key) if isinstance(key, str) else name, value) for key, value in inner]
 
@@ -176,11 +176,13 @@ def _require_dense(tensor: Tensor, name: str) -> int:
     if type(tensor) not in (Tensor, nn.Parameter) or tensor.layout != torch.strided:
         raise Foreign(f"{shorten(name)}, a {type(tensor).__name__} of layout {tensor.layout}")
     if tensor.dtype not in TYPES or tensor.is_nested or tensor.is_conj() or tensor.is_neg():
-        raise Foreign(f"{shorten(name)}, a tensor of type {tensor.dtype} that is no array of plain numbers")
-    size, held = tensor.numel() * tensor.element_size(), tensor.untyped_storage().nbytes()
-    if size > held and tensor.numel() > MOST_EXPANDED:
+        raise Foreign(
+            f"{shorten(name)}, a tensor of type {tensor.dtype} that is not an array of plain numbers"
+        )
+    size, stored = tensor.numel() * tensor.element_size(), tensor.untyped_storage().nbytes()
+    if size > stored and tensor.numel() > MOST_EXPANDED:
         raise ValueError(
-            f"{shorten(name)} has {tensor.numel()} numbers that are views of {held // tensor.element_size()}; "
-            "wanted each stored (.contiguous())"
+            f"{shorten(name)} has {tensor.numel()} numbers, but only {stored // tensor.element_size()} of them are "
+            "stored. Store every number (.contiguous())"
         )
     return size

@@ -1,4 +1,4 @@
-"""Readers for untrusted JSON, YAML and pickle files: plain values only, and no more of them than the file can hold."""
+"""Readers for untrusted JSON, YAML and pickle files, which admit plain values only and limit their number."""
 
 import json
 import pickletools
@@ -11,8 +11,8 @@ from typing import Any, TypeGuard
 import yaml
 
 from framework.errors import DataError, UserError, quote, shorten
-from framework.storage.reading import RESTORE, guarded, read_bytes
-from framework.storage.text import decoded
+from framework.storage.reading import RESTORE, read_bytes, translate_errors
+from framework.storage.text import decode
 
 LARGEST_JSON, LARGEST_YAML = 2**24, 2**17
 """Largest size of a file, in bytes."""
@@ -24,8 +24,8 @@ class PlainLoader(yaml.SafeLoader):
 
 
 PlainLoader.yaml_implicit_resolvers = {
-    first: [(tag, words) for tag, words in found if tag.rpartition(":")[2] not in ("int", "float")]
-    for first, found in yaml.SafeLoader.yaml_implicit_resolvers.items()
+    first: [(tag, words) for tag, words in resolvers if tag.rpartition(":")[2] not in ("int", "float")]
+    for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
 }
 _INT = re.compile(r"[-+]?(?:0|[1-9][0-9]*)$")
 _FLOAT = re.compile(
@@ -36,37 +36,40 @@ PlainLoader.add_implicit_resolver("tag:yaml.org,2002:float", _FLOAT, list("-+.01
 
 
 def read_json(file: Path, wanted: str, remedy: str = RESTORE) -> dict[str, Any]:
-    """Return the object that a JSON file holds.
+    """Return the object in a JSON file.
 
     Raises:
-        DataError: The file is missing or damaged, or holds something other than an object. The message names `wanted`.
+        DataError: The file is missing or damaged, or contains something else. The message contains `wanted`, the
+            description of the file, and `remedy`.
     """
-    with guarded(file, wanted, remedy):
-        found = json.loads(decoded(_content(file, LARGEST_JSON)))
-        if not isinstance(found, dict):
-            raise ValueError(f"it holds {type(found).__name__}")
-        return found
+    with translate_errors(file, wanted, remedy):
+        content = json.loads(decode(_content(file, LARGEST_JSON)))
+        if not isinstance(content, dict):
+            raise ValueError(f"the file contains a {type(content).__name__}, no object")
+        return content
 
 
 def read_yaml(file: Path, wanted: str, remedy: str = RESTORE, error: type[UserError] = DataError) -> Any:
-    """Return the values that a YAML file holds.
+    """Return the values in a YAML file.
 
     Raises:
         error: The file is missing or damaged, or contains a tag that stands for a Python object, or an alias. With
             aliases, a few lines could stand for more values than any memory holds.
     """
-    with guarded(file, wanted, remedy, kind=error):
-        text = decoded(_content(file, LARGEST_YAML))
+    with translate_errors(file, wanted, remedy, kind=error):
+        text = decode(_content(file, LARGEST_YAML))
         depth = 0
         for event in yaml.parse(text, PlainLoader):
             depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
             if depth > DEEPEST or isinstance(event, yaml.AliasEvent):
-                raise ValueError(f"an alias, or values more than {DEEPEST} deep in others")
+                raise ValueError(
+                    f"the file contains an alias, or values nested more than {DEEPEST} levels deep"
+                )
         return yaml.load(text, PlainLoader)
 
 
 def is_number(value: Any) -> TypeGuard[int | float]:
-    """Return whether a value of JSON or YAML is a number; true and false are not, although Python's bool is an int."""
+    """Return whether a value of JSON or YAML is a number; true and false are no numbers here, unlike in Python."""
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
@@ -81,12 +84,12 @@ def plain_numbers(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [plain_numbers(item) for item in value]
     if not is_number(value):
-        raise ValueError(f"wanted a number, got {quote(value)}")
+        raise ValueError(f"expected a number, got {quote(value)}")
     return value
 
 
 class Foreign(ValueError):
-    """Error for a file that holds something other than plain values and dense tensors; its text names that content."""
+    """Error for a file with content other than plain values and dense tensors; its text names that content."""
 
 
 @dataclass(slots=True)
@@ -94,8 +97,8 @@ class _Item:
     """Description of a value on the stack of a pickle; the value itself is not built.
 
     Attributes:
-        size: Size of its text or of its contents.
-        values: Number of values that a tuple stands for.
+        size: Size of the text or of the contents.
+        values: Number of values that a tuple contains, including nested values.
         name: Name of a global as "module name"; "" for any other value.
         text: Text of a short string, or of the last string of a tuple.
         mark: Whether the value is a mark.
@@ -129,7 +132,7 @@ RENAMED = {"__builtin__": "builtins"}
 ENCODE = "_codecs encode"
 """Function that a pickle of protocol 2 calls to build bytes."""
 TIMES_ITSELF = 4
-"""Ratio of the size of all objects built by calls to the size of the pickle that is allowed."""
+"""Largest ratio of the size of all objects built by calls to the size of the pickle."""
 HIGHEST = 2**62
 MOST_INSTRUCTIONS = 1_000_000
 """Largest number of instructions in a pickle; a tensor takes 30 of them, a number 1 or 2."""
@@ -138,22 +141,22 @@ MOST_INSTRUCTIONS = 1_000_000
 def require_plain_pickle(pickled: bytes, called: Collection[str] = (), named: Collection[str] = ()) -> None:
     """Inspect a pickle without building any object.
 
-    A tuple may not stand for more than MOST_ITEMS values. A few nested tuples that each repeat the one below can stand
-    for so many values that hashing them as a key would never end.
+    A tuple may not contain more than MOST_ITEMS values, including nested values. Without this limit, a few tuples that
+    each contain the one before twice could have so many values that hashing them as a key would never end.
 
     Args:
         pickled: Bytes of one pickle.
-        called: Globals that it may name and call, as "module name" of Python 3.
-        named: Globals that it may name but not call.
+        called: Globals that the pickle may name and call, as "module name" of Python 3.
+        named: Globals that the pickle may name but not call.
 
     Raises:
-        Foreign: It names another global, or calls something else.
-        ValueError: It would build objects far larger than itself.
-        Exception: It is damaged.
+        Foreign: The pickle names another global, or calls another object.
+        ValueError: The pickle would build objects far larger than itself.
+        Exception: The pickle is damaged.
     """
     stack: list[_Item] = []
     memo: dict[int, _Item] = {}
-    left = TIMES_ITSELF * len(pickled) + 1000
+    size_left = TIMES_ITSELF * len(pickled) + 1000
     for opcode, argument, _ in instructions(pickled):
         name = opcode.name
         if name in PUTS:
@@ -172,39 +175,39 @@ def require_plain_pickle(pickled: bytes, called: Collection[str] = (), named: Co
             )
             values = 1 + sum(item.values for item in inner)
             if values > MOST_ITEMS:
-                raise ValueError(f"a tuple that stands for more than {MOST_ITEMS} values")
+                raise ValueError(f"the pickle contains a tuple of more than {MOST_ITEMS} values")
             text = inner[-1].text if inner else ""
             stack.append(_Item(1 + sum(item.size for item in inner), values, text=text))
         elif name == "GLOBAL":
             module, _, word = str(argument).partition(" ")
-            found = f"{RENAMED.get(module, module)} {word}"
-            if found not in called and found not in named:
-                raise Foreign(shorten(found.replace(" ", ".", 1)))
-            stack.append(_Item(name=found))
+            global_name = f"{RENAMED.get(module, module)} {word}"
+            if global_name not in called and global_name not in named:
+                raise Foreign(shorten(global_name.replace(" ", ".", 1)))
+            stack.append(_Item(name=global_name))
         elif name in ADDS:
             inner = [stack.pop() for _ in range(ADDS[name])] or _above_mark(stack)
             # the size of an object that is added to itself would double each time
             stack[-1].size = min(stack[-1].size + sum(item.size for item in inner), HIGHEST)
         elif name in ("REDUCE", "NEWOBJ"):
-            given, function = stack.pop(), stack.pop()
+            arguments, function = stack.pop(), stack.pop()
             if function.name not in called:
-                raise Foreign(f"a call of {function.name or 'what is no function'}")
-            if function.name == ENCODE and given.text != "latin1":  # some codecs take quadratic time
+                raise Foreign(f"a call of {function.name or 'an object that is no function'}")
+            if function.name == ENCODE and arguments.text != "latin1":  # some codecs take quadratic time
                 raise Foreign("bytes that pickle did not write")
-            left -= given.size
-            if left < 0:
-                raise ValueError("it would make far more of itself than it is")
-            stack.append(_Item(given.size))
+            size_left -= arguments.size
+            if size_left < 0:
+                raise ValueError("the pickle would build objects that are far larger than the pickle")
+            stack.append(_Item(arguments.size))
         elif name == "MARK":
             stack.append(_Item(mark=True))
         elif name in OTHERS:
-            raise Foreign(f"what the instruction {name} makes")
+            raise Foreign(f"the result of the instruction {name}")
         else:
-            taken = list(opcode.stack_before)
-            if pickletools.markobject in taken:
+            removed = list(opcode.stack_before)
+            if pickletools.markobject in removed:
                 _above_mark(stack)
-                taken = taken[: taken.index(pickletools.markobject)]
-            size = sum(stack.pop().size for _ in taken)
+                removed = removed[: removed.index(pickletools.markobject)]
+            size = sum(stack.pop().size for _ in removed)
             stack += [_Item(min(1 + size, HIGHEST)) for _ in opcode.stack_after]
 
 
@@ -212,28 +215,28 @@ def instructions(pickled: Any) -> Iterator[tuple[pickletools.OpcodeInfo, Any, in
     """Yield the instructions of one pickle, as `pickletools.genops` does.
 
     Raises:
-        ValueError: There are more than MOST_INSTRUCTIONS, which would take seconds.
+        ValueError: The pickle has more than MOST_INSTRUCTIONS instructions, which would take seconds.
     """
-    for number, found in enumerate(pickletools.genops(pickled)):
+    for number, instruction in enumerate(pickletools.genops(pickled)):
         if number == MOST_INSTRUCTIONS:
-            raise ValueError(f"a pickle of more than {MOST_INSTRUCTIONS} instructions")
-        yield found
+            raise ValueError(f"the pickle has more than {MOST_INSTRUCTIONS} instructions")
+        yield instruction
 
 
 def _above_mark(stack: list[_Item]) -> list[_Item]:
     """Remove the last mark and the items above it from the stack, and return those items."""
-    place = len(stack) - 1
-    while not stack[place].mark:
-        place -= 1
-        if place < 0:
-            raise ValueError("a pickle without the mark that it asks for")
-    found = stack[place + 1 :]
-    del stack[place:]
-    return found
+    index = len(stack) - 1
+    while not stack[index].mark:
+        index -= 1
+        if index < 0:
+            raise ValueError("the pickle lacks a mark that one of its instructions needs")
+    items = stack[index + 1 :]
+    del stack[index:]
+    return items
 
 
 def _content(file: Path, most: int) -> bytes:
-    found = read_bytes(file)
-    if len(found) > most:
-        raise ValueError(f"{len(found)} bytes; at most {most}")
-    return found
+    content = read_bytes(file)
+    if len(content) > most:
+        raise ValueError(f"the file has {len(content)} bytes, but at most {most} are read")
+    return content

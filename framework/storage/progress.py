@@ -1,4 +1,4 @@
-"""Progress reports of long work: a bar on a terminal, or a line every half minute in a log."""
+"""Progress reports of long work: a bar on a terminal, or a line every half minute in a log file."""
 
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -11,14 +11,14 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from framework.storage.first_rank import first_rank
 
 Item = TypeVar("Item")
-SHORT, APART = 2.0, 30.0
-"""Seconds that work takes before it reports anything, and seconds between two lines in a log."""
+QUIET_TIME, REPORT_INTERVAL = 2.0, 30.0
+"""Seconds before work reports its progress for the first time, and seconds between two lines in a log file."""
 WIDE = 160
-"""Number of characters in a line of a log."""
+"""Number of characters in a line of a log file."""
 
 
 def output() -> Console:
-    """Return the console for results: it wraps lines of a log at `WIDE`, and prints on the first rank only."""
+    """Return the console for results, which prints on the first rank only and wraps lines in a log file at `WIDE`."""
     console = Console(quiet=not first_rank())
     return console if console.is_terminal else Console(quiet=console.quiet, width=WIDE)
 
@@ -28,7 +28,7 @@ class Work:
     """Progress of work that consists of `total` units, reported on the error stream by the first rank only.
 
     Args:
-        what: Name of the work, such as "testing".
+        name: Name of the work, such as "testing".
         total: Number of units.
         units: Name of the units, such as "samples".
         console: Console to print on; None for the error stream.
@@ -37,19 +37,19 @@ class Work:
 
     def __init__(
         self,
-        what: str,
+        name: str,
         total: int,
         units: str,
         *,
         console: Console | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self.what, self.total, self.units = what, total, units
+        self.name, self.total, self.units = name, total, units
         self.console = console or Console(stderr=True, quiet=not first_rank())
         self.clock = clock
-        self.done = 0
+        self.completed = 0
         self._start = clock()
-        self._told = self._start
+        self._last_report = self._start
         self._bar: Progress | None = None
 
     def __enter__(self) -> "Work":
@@ -63,32 +63,34 @@ class Work:
 
     def advance(self, count: int = 1) -> None:
         """Report that another `count` units are done."""
-        self.done += count
+        self.completed += count
         now = self.clock()
-        if self.console.quiet or now - self._start < SHORT:
+        if self.console.quiet or now - self._start < QUIET_TIME:
             return
         if self.console.is_terminal:
             self._show()
-        elif now - self._told >= APART:
-            self._told = now
-            said = f"{self.what}: {self.done} of {self.total} {self.units} in {now - self._start:.0f} s"
-            self.console.print(said, soft_wrap=True, highlight=False, markup=False)
+        elif now - self._last_report >= REPORT_INTERVAL:
+            self._last_report = now
+            report = (
+                f"{self.name}: {self.completed} of {self.total} {self.units} in {now - self._start:.0f} s"
+            )
+            self.console.print(report, soft_wrap=True, highlight=False, markup=False)
 
     def _show(self) -> None:
         if self._bar is None:
             text = TextColumn("{task.description}", markup=False)
             shown = text, BarColumn(), MofNCompleteColumn(), TextColumn(self.units), TimeRemainingColumn()
             self._bar = Progress(*shown, console=self.console, transient=True)
-            self._bar.add_task(self.what, total=self.total)
+            self._bar.add_task(self.name, total=self.total)
             self._bar.start()
-        self._bar.update(self._bar.task_ids[0], completed=self.done)
+        self._bar.update(self._bar.task_ids[0], completed=self.completed)
 
 
-def tracked(
-    items: Iterable[Item], what: str, total: int, units: str, size: Callable[[Item], int] = lambda _: 1
+def track_progress(
+    items: Iterable[Item], name: str, total: int, units: str, size: Callable[[Item], int] = lambda _: 1
 ) -> Iterator[Item]:
     """Yield the items and report progress as the consumer takes them; `size` returns the number of units of an item."""
-    with Work(what, total, units) as work:
+    with Work(name, total, units) as work:
         for item in items:
             yield item
             work.advance(size(item))

@@ -1,7 +1,7 @@
 """Readers for files that may be damaged or come from an untrusted source; every failure becomes a one-sentence error.
 
-Only regular files are read. The size to which a file may decompress is limited by its own size (`room`), and the limit
-is checked before anything is allocated.
+Only regular files are read. The size to which a file may decompress is limited by its own size (`most_decompressed`),
+and the limit is checked before anything is allocated.
 """
 
 import io
@@ -15,23 +15,23 @@ from pathlib import Path
 from framework.errors import DataError, UserError, shorten
 from framework.storage import limits
 
-RESTORE = "Restore it from its source."
+RESTORE = "Copy the file again from its source."
 SMALL, MOST_TIMES = limits.UNFOLDED_BYTES, limits.UNFOLDED_TIMES
 
 
 @contextmanager
-def guarded(
+def translate_errors(
     file: Path, wanted: str, remedy: str = RESTORE, missing: str = "", kind: type[UserError] = DataError
 ) -> Iterator[None]:
-    """Turn every exception that a damaged file causes inside the block into an error of class `kind`.
+    """Convert every exception that a damaged file causes inside the block to an error of class `kind`.
 
-    A `UserError` keeps its class. Every message names the file.
+    A `UserError` keeps its class. Every message contains the name of the file.
 
     Args:
         file: File that is read in the block.
         wanted: Description of the expected content, such as "a MATLAB file".
         remedy: Advice for a damaged file.
-        missing: Further text of the message for a missing file.
+        missing: End of the message for a missing file, after "no such file; ".
         kind: Class of the error.
     """
     try:
@@ -42,29 +42,31 @@ def guarded(
         raise type(error)(f"{file}: {error}") from error
     except Exception as error:
         if isinstance(error, FileNotFoundError) and not file.exists():
-            raise kind(f"{file}: no such file; {missing or f'wanted {wanted}. Mend the path.'}") from None
+            raise kind(
+                f"{file}: no such file; {missing or f'expected {wanted}. Correct the path.'}"
+            ) from None
         why = shorten(error) or type(error).__name__
         raise kind(f"{file}: cannot be read as {wanted} ({why}). {remedy}") from error
 
 
-def opened(file: Path) -> "Bounded":
+def open_regular(file: Path) -> "Bounded":
     """Open a regular file for reading; the caller closes it.
 
     Raises:
-        OSError: The file is missing or is no regular file. A pipe could block for ever, and a device may never end.
+        OSError: The file is missing or is not a regular file. Reading a pipe or a device might never end.
     """
     stream = Bounded(io.FileIO(file, "rb", opener=lambda path, flags: os.open(path, flags | os.O_NONBLOCK)))
     if not stat.S_ISREG(os.fstat(stream.fileno()).st_mode):
         stream.close()
-        raise OSError("no regular file")
+        raise OSError("not a regular file")
     return stream
 
 
 class Bounded(io.BufferedReader):
-    """File whose `read` never asks for more bytes than the file still has.
+    """File whose `read` never requests more bytes than the file still has.
 
-    Python allocates the requested size before it reads. A chunk of an image or a text of a pickle can announce 4 GB in
-    four bytes.
+    Python allocates the requested size before it reads, and a damaged image or pickle can state a size of 4 GB in four
+    bytes.
     """
 
     def read(self, size: int | None = -1, /) -> bytes:
@@ -74,43 +76,45 @@ class Bounded(io.BufferedReader):
 
 
 def read_bytes(file: Path) -> bytes:
-    """Return the whole content of a file; raises the errors of `opened`."""
-    with opened(file) as stream:
+    """Return the whole content of a regular file; raises the errors of `open_regular`."""
+    with open_regular(file) as stream:
         return stream.read()
 
 
-def room(size: int) -> int:
+def most_decompressed(size: int) -> int:
     """Return the number of bytes to which a compressed file of `size` bytes may decompress."""
     return max(SMALL, MOST_TIMES * size)
 
 
 def require_numbers(numbers: int, small: int, size: int) -> None:
-    """Refuse a file that decompresses to more than `small` numbers and to more numbers than its `size` in bytes.
+    """Refuse a file that decompresses to more numbers than `small` and than `size`, its number of bytes.
 
     A number of one byte takes eight bytes in computations, and a file of zeros decompresses to a thousand times its
     size.
 
     Raises:
-        ValueError: There are more numbers than that; the message states how many.
+        ValueError: The file decompresses to more numbers; the message states how many.
     """
     if numbers > max(small, size):
-        raise ValueError(f"it unfolds to {numbers} numbers; at most {max(small, size)} in {size} bytes")
+        raise ValueError(
+            f"the file decompresses to {numbers} numbers, but at most {max(small, size)} are allowed for {size} bytes"
+        )
 
 
-def inflated(data: bytes, most: int, *, part: bool = False) -> bytes:
+def inflate(data: bytes, most: int, *, part: bool = False) -> bytes:
     """Return the decompressed bytes of zlib or gzip data.
 
     Args:
         data: Compressed bytes.
         most: Largest number of decompressed bytes.
-        part: Return the first `most` bytes only, and accept more of them and a missing end.
+        part: Whether to return the first `most` bytes only, and to accept data that are longer or cut short.
 
     Raises:
         ValueError: The data are cut short, or decompress to more than `most` bytes.
         zlib.error: The data are damaged.
     """
     unpacker = zlib.decompressobj(zlib.MAX_WBITS | 32)  # accept the header of zlib or of gzip
-    found = unpacker.decompress(data, most if part else most + 1)
-    if not part and (len(found) > most or not unpacker.eof):
-        raise ValueError(f"what is compressed is cut short, or unfolds to more than {most} bytes")
-    return found
+    content = unpacker.decompress(data, most if part else most + 1)
+    if not part and (len(content) > most or not unpacker.eof):
+        raise ValueError(f"the compressed data are cut short, or decompress to more than {most} bytes")
+    return content

@@ -1,8 +1,8 @@
 """Decoding of text files, names of columns, and parsing of the numbers that people and programs write.
 
 Every reader of text uses these functions, so that a cell means the same in a table, a point cloud, a mesh, a flight, a
-list of offsets and a motion. A number in an unusual form is read if it can mean only one number (a Unicode minus,
-Fortran's exponent). Any other is described by `mended`, for the error message.
+list of offsets and a motion. A number in an unusual form is read if its meaning is unique (a Unicode minus, Fortran's
+exponent). For any other unusual form, `suggest_number` provides a correction for the error message.
 """
 
 import codecs
@@ -15,7 +15,7 @@ from typing import Literal, NamedTuple
 
 from framework.errors import quote
 
-SAVE = "Save it as UTF-8"
+SAVE = "Save the file as UTF-8"
 WIDE = (
     (codecs.BOM_UTF32_LE, "UTF-32"),  # before UTF-16, because this mark begins with the mark of UTF-16
     (codecs.BOM_UTF32_BE, "UTF-32"),
@@ -23,7 +23,7 @@ WIDE = (
     (codecs.BOM_UTF16_BE, "UTF-16"),
 )
 LONGEST = 64
-"""Largest number of characters in a word that `mended` examines, since its patterns take more than linear time."""
+"""Largest number of characters in a word for `suggest_number`, whose patterns take more than linear time."""
 LOOKED_AT = 64
 """Number of leading bytes in which UTF-16 without a byte-order mark is detected: every second byte is 0."""
 MINUS = str.maketrans(
@@ -40,7 +40,7 @@ INVISIBLE = "\ufeff\u200b\u200c\u200d\u200e\u200f\u2060"
 """Zero-width characters, which text copied from web pages and office programs contains."""
 
 
-def plain(content: bytes) -> bytes:
+def remove_byte_order_mark(content: bytes) -> bytes:
     """Return the bytes of a text, or of a file that begins with text, without the byte-order mark of UTF-8.
 
     Raises:
@@ -48,41 +48,41 @@ def plain(content: bytes) -> bytes:
     """
     for mark, name in WIDE:
         if content.startswith(mark):
-            raise ValueError(f"it is text in {name}; wanted UTF-8. {SAVE}")
+            raise ValueError(f"the file is text in {name}, but UTF-8 is required. {SAVE}")
     first = content[:LOOKED_AT]
     odd, even = first[1::2], first[::2]
     if len(first) >= 4 and any(not any(zero) and all(other) for zero, other in ((odd, even), (even, odd))):
-        raise ValueError(f"every second byte of it is 0, as in UTF-16; wanted UTF-8. {SAVE}")
+        raise ValueError(f"every second byte of the file is 0, as in UTF-16, but UTF-8 is required. {SAVE}")
     return content.removeprefix(codecs.BOM_UTF8)
 
 
-def decoded(content: bytes) -> str:
+def decode(content: bytes) -> str:
     """Return the text that UTF-8 bytes encode, without its byte-order mark.
 
     Raises:
         ValueError: The bytes have another encoding; the message names the line.
     """
-    content = plain(content)
+    content = remove_byte_order_mark(content)
     try:
         return content.decode("utf-8")
     except UnicodeDecodeError as error:
         line = len(re.split(rb"\r\n|\r|\n", content[: error.start]))
         raise ValueError(
-            f"line {line} holds the byte 0x{content[error.start]:02x}, which is not UTF-8. {SAVE}"
+            f"line {line} contains the byte 0x{content[error.start]:02x}, which is not UTF-8. {SAVE}"
         ) from None
 
 
 def lines_of(content: bytes) -> list[str]:
-    """Return the lines of a text, split at the line ends of any system but not at Python's other line separators.
+    r"""Return the lines of a text, split at \r\n, \r and \n only.
 
     Raises:
-        ValueError: `decoded` refuses the bytes.
+        ValueError: `decode` refuses the bytes.
     """
-    return re.split(r"\r\n|\r|\n", decoded(content))
+    return re.split(r"\r\n|\r|\n", decode(content))
 
 
 def words_of(written: str) -> list[str]:
-    """Return the words between blanks, tabs and line ends; a no-break space does not separate words, as in 1 234."""
+    """Return the words between blanks, tabs and line ends; a no-break space, as in 1 234, does not separate words."""
     return (
         written.split()
         if written.isascii()
@@ -90,7 +90,7 @@ def words_of(written: str) -> list[str]:
     )
 
 
-def trimmed(cell: str) -> str:
+def trim(cell: str) -> str:
     """Return a cell without blanks and zero-width characters at its ends."""
     cell = cell.strip()
     while cell and (cell[0] in INVISIBLE or cell[-1] in INVISIBLE):
@@ -100,13 +100,13 @@ def trimmed(cell: str) -> str:
 
 def column_name(cell: str) -> str:
     """Return the name of a column from its header cell: trimmed, without quotation marks, composed (NFC)."""
-    name = trimmed(cell)
+    name = trim(cell)
     if len(name) > 1 and name[0] == name[-1] and name[0] in "\"'":
-        name = trimmed(name[1:-1])
+        name = trim(name[1:-1])
     return unicodedata.normalize("NFC", name)
 
 
-def require_distinct(names: Sequence[str], what: str = "column") -> None:
+def require_distinct(names: Sequence[str], kind: str = "column") -> None:
     """Refuse a list of names in which a name occurs twice; empty names may repeat.
 
     Raises:
@@ -114,14 +114,16 @@ def require_distinct(names: Sequence[str], what: str = "column") -> None:
     """
     twice = [name for name, count in Counter(names).items() if count > 1 and name]
     if twice:
-        raise ValueError(f"names the {what} {quote(twice[0])} twice; wanted each once. Rename one.")
+        raise ValueError(
+            f"names the {kind} {quote(twice[0])} twice, but every name must be unique. Rename one of them."
+        )
 
 
-def value(word: str) -> float | None:
-    """Return the number that a word represents, which may be NaN or infinite; None where it represents none.
+def parse_number(word: str) -> float | None:
+    """Return the number that a word represents, which may be NaN or infinite, or None if the word is no number.
 
-    In addition to the forms of Python, it reads a Unicode minus, Fortran's 1.5D+3, and 1.#INF or -1.#IND of Microsoft's
-    C library.
+    In addition to the forms of Python, the function reads a Unicode minus, Fortran's 1.5D+3, and 1.#INF or -1.#IND of
+    Microsoft's C library.
     """
     if "_" in word:
         return None  # Python reads 1_0 as 10, but no file means that
@@ -130,32 +132,32 @@ def value(word: str) -> float | None:
     except ValueError:
         if not FIGURE.search(word):
             return None
-    word = trimmed(word).translate(MINUS)
-    found = NOT_FINITE.fullmatch(word)
-    if found:
+    word = trim(word).translate(MINUS)
+    match = NOT_FINITE.fullmatch(word)
+    if match:
         sign = -1 if word.startswith("-") else 1
-        return sign * math.inf if found[1].upper().startswith("INF") else math.nan
-    found = FORTRAN.fullmatch(word)
-    if found:
-        word = f"{found[1] or found[3]}e{found[2] or found[4]}"
+        return sign * math.inf if match[1].upper().startswith("INF") else math.nan
+    match = FORTRAN.fullmatch(word)
+    if match:
+        word = f"{match[1] or match[3]}e{match[2] or match[4]}"
     try:
         return float(word)
     except ValueError:
         return None
 
 
-class Mended(NamedTuple):
-    """Description of a word that would be a number if it were written differently.
+class Suggestion(NamedTuple):
+    """Correction of a word that is a number in an unusual form.
 
     Attributes:
-        what: How the number is written, such as "with a decimal comma".
-        number: How to write it instead.
+        form: Form of the word, such as "with a decimal comma".
+        number: The number in plain form.
         settings: Settings of `framework.datasets.csv_columns.Writing` that would read the word, by key; one dictionary
             for each meaning that the word can have.
-        unit: Unit beside the number.
+        unit: Unit before or after the number.
     """
 
-    what: str
+    form: str
     number: str
     settings: tuple[dict[str, str], ...] = ()
     unit: str = ""
@@ -183,72 +185,72 @@ OTHERS: tuple[tuple[str, str, str], ...] = (
     (rf"([+-]?{FIGURES})\s*[x×*·]\s*10\s*\^?\s*([+-]?\d+)", "as a product with a power of ten", r"\1e\2"),
     (rf"[<>≤≥~≈]\s*([+-]?{FIGURES})", "as a bound", r"\1"),
 )
-"""Patterns of numbers that no setting reads, with a description of each form and the replacement in plain form."""
+"""Patterns of numbers that no setting reads, each with a description of the form and the replacement in plain form."""
 UNIT = re.compile(
     r"([+-]?)([A-Z]{3}(?=[ \xa0])|[^\w\s.,()+\-'\"<>≤≥~≈=#]{1,3})?\s*([+-]?[\d.,].*?)\s*"
     r"([^\W\d_]{1,8}(?:/[^\W\d_]{1,4})?[²³]?|[^\w\s.,()+\-'\"#*]{1,3})?"
 )
-"""Pattern of a sign, a unit before the number ($, EUR), the number, and a unit behind it (%, kg, mm²)."""
+"""Pattern of a sign, a unit before the number ($, EUR), the number, and a unit after the number (%, kg, mm²)."""
 
 
-def mended(word: str) -> Mended | None:
-    """Return how to write a word as a number (decimal comma, thousands separators, unit, …), or None."""
-    word = trimmed(word).translate(MINUS)
+def suggest_number(word: str) -> Suggestion | None:
+    """Return how to write a word with a decimal comma, thousands separators, a unit, … as a plain number, or None."""
+    word = trim(word).translate(MINUS)
     if len(word) > LONGEST or not any(letter.isdigit() for letter in word):
         return None
     sign, figures = (word[0], word[1:]) if word[:1] in "+-" else ("", word)
-    found = _separated(sign, figures)
-    if found:
-        return found
-    for pattern, what, number in OTHERS:
+    suggestion = _separated(sign, figures)
+    if suggestion:
+        return suggestion
+    for pattern, form, number in OTHERS:
         if re.fullmatch(pattern, word):
-            return Mended(what, re.sub(pattern, number, word))
+            return Suggestion(form, re.sub(pattern, number, word))
     return _with_unit(word)
 
 
-def _separated(sign: str, figures: str) -> Mended | None:
+def _separated(sign: str, figures: str) -> Suggestion | None:
     """Return how to write a number that has a decimal comma or digits in groups, or None."""
     decimal = {"decimal": "comma"}
     if re.fullmatch(r"\d*,\d+(?:[eE][+-]?\d+)?|\d+,", figures):
         number = sign + figures.replace(",", ".")
         if re.fullmatch(r"[1-9]\d{0,2},\d{3}", figures):
             whole = sign + figures.replace(",", "")
-            return Mended("with a comma", f"{number} or {whole}", (decimal, {"thousands": "comma"}))
-        return Mended("with a decimal comma", number, (decimal,))
+            return Suggestion("with a comma", f"{number} or {whole}", (decimal, {"thousands": "comma"}))
+        return Suggestion("with a decimal comma", number, (decimal,))
     for name, pattern in GROUPED.items():
-        found = re.fullmatch(rf"({pattern})(?:([.,])(\d*))?", figures)
-        if found is None or found[2] == BETWEEN[name]:
+        match = re.fullmatch(rf"({pattern})(?:([.,])(\d*))?", figures)
+        if match is None or match[2] == BETWEEN[name]:
             continue
-        if name == "point" and found[2] is None and figures.count(".") == 1:
+        if name == "point" and match[2] is None and figures.count(".") == 1:
             continue  # 1.234 is a plain number
-        whole = re.sub(r"\D", "", found[1]) + (f".{found[3]}" if found[3] else "")
-        settings = {"thousands": name} | (decimal if found[2] == "," else {})
-        return Mended("with figures in groups", sign + whole, (settings,))
+        whole = re.sub(r"\D", "", match[1]) + (f".{match[3]}" if match[3] else "")
+        settings = {"thousands": name} | (decimal if match[2] == "," else {})
+        return Suggestion("with digits in groups", sign + whole, (settings,))
     return None
 
 
-def _with_unit(word: str) -> Mended | None:
-    found = UNIT.fullmatch(word)
-    if found is None or not (found[2] or found[4]) or (found[1] and not found[2]):
+def _with_unit(word: str) -> Suggestion | None:
+    match = UNIT.fullmatch(word)
+    if match is None or not (match[2] or match[4]) or (match[1] and not match[2]):
         return None
-    unit = found[2] or found[4]
-    if (found[2] and found[4]) or found[3].endswith("."):  # a file name such as 0.png
+    unit = match[2] or match[4]
+    if (match[2] and match[4]) or match[3].endswith("."):  # a file name such as 0.png
         return None
-    inner = found[1] + found[3]
-    if value(inner) is not None:
-        return Mended(f"with the unit {unit!r}", inner, ({"units": f'["{unit}"]'},), unit)
+    inner = match[1] + match[3]
+    if parse_number(inner) is not None:
+        return Suggestion(f"with the unit {unit!r}", inner, ({"units": f'["{unit}"]'},), unit)
     sign, figures = (inner[0], inner[1:]) if inner[:1] in "+-" else ("", inner)
     core = _separated(sign, figures)
     if core is None:
         return None
-    settings = tuple({"units": f'["{unit}"]'} | one for one in core.settings)
-    return Mended(
-        f"with the unit {unit!r} and {core.what.removeprefix('with ')}", core.number, settings, unit
+    settings = tuple({"units": f'["{unit}"]'} | core_setting for core_setting in core.settings)
+    return Suggestion(
+        f"with the unit {unit!r} and {core.form.removeprefix('with ')}", core.number, settings, unit
     )
 
 
 def line_of_word(text: str, number: int) -> int:
-    """Return the line, counted from 1, that holds the word with this number, counted from 0."""
+    """Return the number of the line, from 1, in which the word with the index `number` (from 0) stands."""
     line = 1
     for line, words in enumerate(re.split(r"\r\n|\r|\n", text), 1):
         number -= len(words_of(words))
@@ -262,27 +264,27 @@ def require_numbers_in(words: Sequence[str], text: str, first: int = 0) -> list[
 
     Args:
         words: Consecutive words of the text.
-        text: Whole text, from which an error message takes the line.
-        first: Index of the first of the words among all words of the text.
+        text: Whole text, in which an error message counts the lines.
+        first: Index of words[0] among all words of the text.
 
     Raises:
         ValueError: A word is no number; the message names its line.
     """
     try:
-        found = list(map(float, words))
+        numbers = list(map(float, words))
     except ValueError:
-        found = []
-    if len(found) == len(words) and "_" not in "".join(words):
-        return found
-    values = [value(word) for word in words]
-    for place, (word, number) in enumerate(zip(words, values, strict=True)):
+        numbers = []
+    if len(numbers) == len(words) and "_" not in "".join(words):
+        return numbers
+    values = [parse_number(word) for word in words]
+    for index, (word, number) in enumerate(zip(words, values, strict=True)):
         if number is None:
-            raise ValueError(f"line {line_of_word(text, first + place)}: {no_number(word)}")
+            raise ValueError(f"line {line_of_word(text, first + index)}: {describe_no_number(word)}")
     return [number for number in values if number is not None]
 
 
-def no_number(word: str, where: str = "") -> str:
-    """Return an error message for a word where a number was wanted, with a correction if there is one."""
-    remedy = mended(word)
-    why = f": a number {remedy.what}; write {remedy.number}" if remedy else ""
-    return f"wanted a number, got {quote(word)}{where}{why}"
+def describe_no_number(word: str, where: str = "") -> str:
+    """Return the error message for a word that is no number, with a correction if there is one."""
+    remedy = suggest_number(word)
+    why = f": a number {remedy.form}; write {remedy.number}" if remedy else ""
+    return f"expected a number, got {quote(word)}{where}{why}"

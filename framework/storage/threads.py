@@ -8,16 +8,16 @@ from concurrent.futures import ThreadPoolExecutor
 def wait_passively() -> None:
     """Make OpenMP threads sleep between two parallel operations; call this before torch is imported.
 
-    They spin by default. As soon as another process uses a core, a thread spins while it waits for a thread that does
-    not run. A training with two threads then took several times the processor time and the wall time of one thread.
-    Values that the user set in OMP_WAIT_POLICY or GOMP_SPINCOUNT are kept.
+    By default, waiting threads spin. If another process uses one of the cores, a thread may spin while it waits for a
+    thread that does not run. A training with two threads then took several times the processor time and the wall time
+    of one thread. Values that the user set in OMP_WAIT_POLICY or GOMP_SPINCOUNT are not changed.
     """
     if "GOMP_SPINCOUNT" not in os.environ:
         os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 
 class Pool:
-    """Pool of threads that are started on first use, and started again in a child process, since a fork ends them."""
+    """Pool of threads that are started on first use, and again in a forked child process, which inherits no threads."""
 
     def __init__(self) -> None:
         self.threads: ThreadPoolExecutor | None = None
@@ -29,7 +29,7 @@ class Pool:
         self.threads = None
 
     def run(self, work: Callable[[int], object], threads: int) -> None:
-        """Call work(0) … work(threads - 1) at the same time, the first in this thread; `work` must not use the pool."""
+        """Call work(0) … work(threads - 1) concurrently, work(0) in this thread; `work` must not use the pool."""
         if threads <= 1:
             work(0)
             return
@@ -38,11 +38,11 @@ class Pool:
             self.threads = ThreadPoolExecutor(self.size, "compiled")
         waiting = [self.threads.submit(work, i) for i in range(1, threads)]
         work(0)
-        for one in waiting:
-            one.result()
+        for future in waiting:
+            future.result()
 
     def share(self, work: Callable[[int], object], count: int, threads: int) -> None:
-        """Call work(0) … work(count - 1), each in the thread that is free next."""
+        """Call work(0) … work(count - 1), each in the next free one of `threads` threads."""
         waiting = iter(range(count))
 
         def some(_: int) -> None:

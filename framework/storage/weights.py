@@ -1,4 +1,4 @@
-"""Loading of pretrained weights from a local file of named tensors, with a message on what does not fit."""
+"""Loading of pretrained weights from a local file of named tensors, and description of weights that do not fit."""
 
 import logging
 import zipfile
@@ -17,12 +17,12 @@ from torch import Tensor, nn
 from framework.errors import CheckpointError, ConfigError, shorten
 from framework.storage.plain_tensors import load
 from framework.storage.plain_values import Foreign
-from framework.storage.reading import opened, room
+from framework.storage.reading import most_decompressed, open_regular
 
 _log = logging.getLogger(__name__)
 
 LISTED = 5
-"""Number of names of weights that a message lists before it counts the rest."""
+"""Largest number of names of weights that a message lists; the message states the number of the others."""
 NUMBERS = (torch.float64, torch.float32, torch.float16, torch.bfloat16, torch.int64, torch.int32)
 """Data types that weights may have; complex numbers would lose their imaginary parts silently."""
 
@@ -34,97 +34,98 @@ def fill_from_file(network: nn.Module, file: str, ignored: tuple[str, ...], with
         network: Network whose `state_dict` names the weights.
         file: Path of a file that `read_weights` reads.
         ignored: Prefixes of names that the network does not use, such as the classifier's; they may be absent.
-        within: Prefix of all names in the file (or of none) that the network's names lack, such as "features.".
+        within: Prefix that is removed from the names in the file, such as "features.".
 
     Raises:
-        ConfigError: There is no such file.
+        ConfigError: The file does not exist.
         CheckpointError: The file cannot be read, or its names or shapes differ from the network's.
     """
-    found = read_weights(file)
-    kept = {name: tensor for name, tensor in found.items() if not name.startswith(ignored)}
-    if len(kept) < len(found):
-        names = ", ".join(sorted(found.keys() - kept.keys()))
-        _log.info("%s: ignored %s, not used here.", file, names)
-    kept = {name.removeprefix(within): tensor for name, tensor in kept.items()}
+    file_weights = read_weights(file)
+    weights = {name: tensor for name, tensor in file_weights.items() if not name.startswith(ignored)}
+    if len(weights) < len(file_weights):
+        names = ", ".join(sorted(file_weights.keys() - weights.keys()))
+        _log.info("The network does not use these weights of %s: %s.", file, names)
+    weights = {name.removeprefix(within): tensor for name, tensor in weights.items()}
     wanted = network.state_dict()
-    # Batch norm counts its batches since torch 0.4.1; older files lack the count, which nothing reads.
+    # Since torch 0.4.1, batch norm counts its batches. Older files lack this count, which nothing reads.
     counters = {name: tensor for name, tensor in wanted.items() if name.endswith(".num_batches_tracked")}
-    kept = counters | kept
-    mismatch = describe_mismatch(wanted, kept)
+    weights = counters | weights
+    mismatch = describe_mismatch(wanted, weights)
     if mismatch:
         raise CheckpointError(
-            f"{file} does not fit {type(network).__name__}: {mismatch} Give a file with its names and shapes."
+            f"{file} does not fit {type(network).__name__}: {mismatch} Give a file with the names and shapes of "
+            f"{type(network).__name__}."
         )
-    network.load_state_dict(kept)
+    network.load_state_dict(weights)
 
 
 def read_weights(file: str) -> dict[str, Shaped[Tensor, "..."]]:
     """Return the named tensors of a `.safetensors` file or a file of `torch.save` (`.pth`, `.pt`), on the CPU.
 
     The tensors of a torch file may lie under the key "state_dict" or "model", and their names may begin with
-    "module.", as training scripts write them. Damage is found by the checksums of torch's format. Files of
-    `.safetensors` and files older than torch 1.6 have no checksums, so only damage to their structure is found.
+    "module.", as training scripts write them. Damage is detected by the checksums of torch's format. Files of
+    `.safetensors` and files older than torch 1.6 have no checksums, so only damage to their structure is detected.
 
     Raises:
-        ConfigError: There is no such file.
-        CheckpointError: The file is damaged, holds more than plain values, or has no named tensors.
+        ConfigError: The file does not exist.
+        CheckpointError: The file is damaged, contains more than plain values, or has no named tensors.
     """
     path = Path(file).expanduser()
     if not path.is_file():
         raise ConfigError(
-            f"There is no weight file {path}. Nothing is downloaded: fetch the weights yourself and give "
-            "their path."
+            f"The weight file {path} does not exist. Weights are not downloaded automatically. Download them and give "
+            "the path of the file."
         )
-    content = _safetensors(path) if path.suffix == ".safetensors" else _torch(path)
+    content = _read_safetensors(path) if path.suffix == ".safetensors" else _read_torch(path)
     for key in ("state_dict", "model"):
         if isinstance(content, Mapping) and isinstance(content.get(key), Mapping):
             content = content[key]
     if not isinstance(content, Mapping) or not content or not all(map(torch.is_tensor, content.values())):
         raise CheckpointError(
-            f"{path} holds no named tensors; wanted what `torch.save(network.state_dict(), ...)` writes."
+            f"{path} contains no named tensors. Give a file that `torch.save(network.state_dict(), ...)` has written."
         )
     return {str(name).removeprefix("module."): tensor for name, tensor in content.items()}
 
 
-def _torch(path: Path) -> Any:
+def _read_torch(path: Path) -> Any:
     try:
-        # torch does not check the checksums in its own zip: a flipped bit would load as another number
+        # torch does not verify the checksums of its zip format, so a flipped bit would load as another number
         if zipfile.is_zipfile(path):
             with zipfile.ZipFile(path) as archive:
-                # nor does torch read a part marked as a folder (attribute 0x10): that tensor stays uninitialised
+                # torch does not read a part that is marked as a folder (attribute 0x10); its tensor stays uninitialised
                 folders = [part.filename for part in archive.infolist() if part.external_attr & 0x10]
                 size = sum(part.file_size for part in archive.infolist())
-                if size > room(path.stat().st_size):
-                    raise ValueError(f"its parts unfold to {size} bytes")
+                if size > most_decompressed(path.stat().st_size):
+                    raise ValueError(f"the parts of the archive decompress to {size} bytes")
                 failed = archive.testzip() or next(iter(folders), None)
             if failed:
-                raise ValueError(f"its part {failed} fails its checksum")
-        with opened(path) as file:
+                raise ValueError(f"the part {failed} of the archive fails its checksum")
+        with open_regular(path) as file:
             return load(file)
     except (Foreign, UnpicklingError) as error:
         raise CheckpointError(
-            f"{path} is no file of plain tensors ({_first_line(error)}). Reading anything else could run "
-            "code: save it again where it comes from, with `torch.save(network.state_dict(), ...)`."
+            f"{path} contains more than plain tensors ({_first_line(error)}), and reading other objects could run "
+            "code. Save the weights again with `torch.save(network.state_dict(), ...)`."
         ) from None
-    except Exception as error:  # for damaged bytes zipfile and torch raise a dozen kinds, even AssertionError
-        raise _damaged(path, _first_line(error)) from None
+    except Exception as error:  # for damaged bytes, zipfile and torch raise many classes, even AssertionError
+        raise _damage_error(path, _first_line(error)) from None
 
 
-def _safetensors(path: Path) -> dict[str, Tensor]:
+def _read_safetensors(path: Path) -> dict[str, Tensor]:
     try:
-        found = load_file(path)
+        tensors = load_file(path)
     except (SafetensorError, OSError, ValueError) as error:
-        raise _damaged(path, _first_line(error)) from None
-    for name, tensor in found.items():
+        raise _damage_error(path, _first_line(error)) from None
+    for name, tensor in tensors.items():
         if tensor.dtype not in NUMBERS:
-            raise _damaged(
-                path, f"{name} has numbers of type {tensor.dtype}, wanted {', '.join(map(str, NUMBERS))}"
+            raise _damage_error(
+                path, f"{name} has numbers of type {tensor.dtype}; expected {', '.join(map(str, NUMBERS))}"
             )
-    return found
+    return tensors
 
 
-def _damaged(path: Path, why: str) -> CheckpointError:
-    return CheckpointError(f"The weight file {path} is damaged: {why}. Fetch it again.")
+def _damage_error(path: Path, why: str) -> CheckpointError:
+    return CheckpointError(f"The weight file {path} is damaged: {why}. Download the file again.")
 
 
 def _first_line(error: Exception) -> str:
@@ -132,37 +133,39 @@ def _first_line(error: Exception) -> str:
 
 
 def describe_mismatch(
-    wanted: Mapping[str, Shaped[Tensor, "..."]], found: Mapping[str, Any], any_shape: tuple[str, ...] = ()
+    wanted: Mapping[str, Shaped[Tensor, "..."]],
+    file_weights: Mapping[str, Any],
+    any_shape: tuple[str, ...] = (),
 ) -> str | None:
-    """Return one sentence on how the weights of a file differ from those of a model, or None where they fit.
+    """Return one sentence on how the weights of a file differ from those of a model, or None if they fit.
 
-    Floating-point numbers may have any width, because they are cast when they are copied. Other types must agree: a
-    complex number would lose its imaginary part, and an integer its upper half, without an error.
+    Floating-point numbers may have any width, because copying casts them. Other types must agree, because copying
+    would silently drop the imaginary part of a complex number and the upper half of an integer.
 
     Args:
         wanted: Weights of the model, by name.
-        found: Weights of the file, by name.
+        file_weights: Weights of the file, by name.
         any_shape: Prefixes of names whose weights may have any shape or be absent.
     """
-    names = {name for name in (*wanted, *found) if not name.startswith(any_shape)}
-    missing = [name for name in wanted if name in names and name not in found]
-    unexpected = [name for name in found if name in names and name not in wanted]
-    both = [(name, tensor, found[name]) for name, tensor in wanted.items() if name in found]
+    names = {name for name in (*wanted, *file_weights) if not name.startswith(any_shape)}
+    missing = [name for name in wanted if name in names and name not in file_weights]
+    unexpected = [name for name in file_weights if name in names and name not in wanted]
+    both = [(name, tensor, file_weights[name]) for name, tensor in wanted.items() if name in file_weights]
     retyped = [
-        f"{name} ({_kind(given)}, wanted {_kind(tensor)})"
-        for name, tensor, given in both
-        if not (isinstance(given, Tensor) and _same_kind(tensor, given))
+        f"{name} ({_kind(file_tensor)} instead of {_kind(tensor)})"
+        for name, tensor, file_tensor in both
+        if not (isinstance(file_tensor, Tensor) and _same_kind(tensor, file_tensor))
     ]
     reshaped = [
-        f"{name} ({_shape(given)}, wanted {_shape(tensor)})"
-        for name, tensor, given in both
-        if name in names and isinstance(given, Tensor) and given.shape != tensor.shape
+        f"{name} ({_shape(file_tensor)} instead of {_shape(tensor)})"
+        for name, tensor, file_tensor in both
+        if name in names and isinstance(file_tensor, Tensor) and file_tensor.shape != tensor.shape
     ]
     parts = [
-        f"{len(names)} of {total} {what}: {_some(names)}"
-        for names, total, what in (
+        f"{len(names)} of {total} {difference}: {_list_names(names)}"
+        for names, total, difference in (
             (missing, len(wanted), "weights are missing"),
-            (unexpected, len(found), "weights found are unknown"),
+            (unexpected, len(file_weights), "weights of the file are unknown"),
             (reshaped, len(wanted), "weights have another shape"),
             (retyped, len(wanted), "weights have numbers of another type"),
         )
@@ -173,7 +176,7 @@ def describe_mismatch(
 
 LARGEST = torch.finfo(torch.float64).max
 FINITE, FROM_0, ABOVE_0 = (-LARGEST, LARGEST), (0.0, LARGEST), (torch.finfo(torch.float64).tiny, LARGEST)
-"""Bounds of the values of a buffer: least and largest."""
+"""Least and largest value of a buffer, for `require_state`: any finite number, 0 or more, above 0."""
 
 
 def require_state(module: nn.Module, **bounds: tuple[float, float] | tuple[Tensor, Tensor]) -> None:
@@ -195,35 +198,40 @@ def _require_state(
     *_: Any,
 ) -> None:
     for name, (least, most) in bounds.items():
-        buffer, found = module.get_buffer(name), state.get(prefix + name)
-        if found is None:
-            continue  # torch says what is missing
-        mismatch = describe_mismatch({name: buffer}, {name: found})
-        if mismatch is None and not ((found.double() >= least) & (found.double() <= most)).all():
-            mismatch = f"{name} has numbers that are not between {_told(least)} and {_told(most)}."
+        buffer, stored = module.get_buffer(name), state.get(prefix + name)
+        if stored is None:
+            continue  # torch raises the error for a missing buffer
+        mismatch = describe_mismatch({name: buffer}, {name: stored})
+        if mismatch is None and not ((stored.double() >= least) & (stored.double() <= most)).all():
+            mismatch = (
+                f"{name} has numbers that are not between {_bounds_text(least)} and {_bounds_text(most)}."
+            )
         if mismatch:
             raise CheckpointError(
-                f"The state of {type(module).__name__} is damaged: {mismatch} Load another checkpoint, or train anew."
+                f"The state of {type(module).__name__} is damaged: {mismatch} Load another checkpoint, or train the "
+                "model again."
             )
 
 
-def _told(bound: float | Tensor) -> str:
+def _bounds_text(bound: float | Tensor) -> str:
     numbers = bound.tolist() if isinstance(bound, Tensor) else [bound]
-    return _some([f"{number:.4g}" for number in numbers])
+    return _list_names([f"{number:.4g}" for number in numbers])
 
 
-def _same_kind(wanted: Tensor, found: Tensor) -> bool:
-    return wanted.dtype == found.dtype or (wanted.is_floating_point() and found.is_floating_point())
+def _same_kind(wanted: Tensor, file_tensor: Tensor) -> bool:
+    return wanted.dtype == file_tensor.dtype or (
+        wanted.is_floating_point() and file_tensor.is_floating_point()
+    )
 
 
-def _kind(found: Any) -> str:
-    return str(found.dtype).removeprefix("torch.") if isinstance(found, Tensor) else type(found).__name__
+def _kind(value: Any) -> str:
+    return str(value.dtype).removeprefix("torch.") if isinstance(value, Tensor) else type(value).__name__
 
 
 def _shape(tensor: Shaped[Tensor, "..."]) -> str:
     return "×".join(map(str, tensor.shape)) or "scalar"
 
 
-def _some(names: list[str]) -> str:
+def _list_names(names: list[str]) -> str:
     rest = len(names) - LISTED
     return shorten(", ".join(names[:LISTED]), 400) + (f" and {rest} more" if rest > 0 else "")

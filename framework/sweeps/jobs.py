@@ -19,10 +19,10 @@ from typing import Any
 from framework.errors import ConfigError, UserError
 from framework.runs.job import PARENT, RECORD, VALUE, read_record, recorded
 from framework.storage.enclosed import read_plain, read_stream
-from framework.storage.files import unlockable, warn_unlocked, write_whole
+from framework.storage.files import lacks_locks, warn_unlocked, write_whole
 from framework.storage.names import as_bytes
 from framework.storage.plain_values import plain_numbers
-from framework.storage.reading import guarded
+from framework.storage.reading import translate_errors
 from framework.sweeps.processes import Fresh, Process, Starter
 from framework.tracking.signals import ENDING, SIGNALS, Stopped, ends_with_parent, handled
 
@@ -98,7 +98,7 @@ class Job:
     def value(self) -> float | None:
         """Return the value that the job left for the sweeper to minimise (`leave_value`), or None."""
         path = self.folder / VALUE
-        with guarded(path, "a number", "Delete it, and the job runs anew."):
+        with translate_errors(path, "a number", "Delete it, and the job runs anew."):
             return (
                 float(plain_numbers(json.loads(read_plain(path, LONGEST_VALUE)))) if path.is_file() else None
             )
@@ -377,12 +377,12 @@ def _lock(job: Job) -> int | None:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
-            if not unlockable(error):
+            if not lacks_locks(error):
                 raise
             try:
                 fcntl.lockf(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError as none:
-                if not unlockable(none):
+                if not lacks_locks(none):
                     raise
                 if not job.attempts and not job.unlocked:
                     warn_unlocked(path, none)

@@ -15,7 +15,7 @@ from framework.errors import DataError
 from framework.storage.enclosed import open_plain, read_stream
 from framework.storage.files import lock_within, replacing
 from framework.storage.plain_values import is_number
-from framework.storage.reading import guarded
+from framework.storage.reading import translate_errors
 
 _log = logging.getLogger(__name__)
 # json.dumps with options builds a new encoder at each call; this encoder is built once.
@@ -107,7 +107,7 @@ class Journal:
             rewritten = self._rewritten
             if not os.path.lexists(self.path):
                 return []
-            with guarded(self.path, "a journal"):
+            with translate_errors(self.path, "a journal"):
                 # stays open on the old file if drop_after replaces it meanwhile
                 file = read_stream(self.path)
         records: list[dict[str, Any]] = []

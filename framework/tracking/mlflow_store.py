@@ -16,8 +16,8 @@ from typing import final
 from framework.errors import CheckpointError, DataError, escape_undecodable, shorten
 from framework.storage.cache import folder as cache_folder
 from framework.storage.enclosed import require_enclosed, require_plain_within
-from framework.storage.files import alone, remove_leftovers, replacing
-from framework.storage.names import path_of, spelled
+from framework.storage.files import hold_lock, remove_leftovers, replacing
+from framework.storage.names import path_of, spell_name
 from framework.tracking.run_info import MODEL, RunInfo, read_run_info
 from framework.tracking.sender import Record, Store, reason
 from framework.tracking.stores import address, require_own_files, sqlite_path, sqlite_uri, without_password
@@ -74,7 +74,9 @@ class MlflowStore(Store):
             raise RuntimeError(f"run {run.info.run_id} was deleted there; restore it in MLflow")
         elif info.status == "RUNNING":
             self._client.update_run(run.info.run_id, status="RUNNING")
-            self._client.set_tag(run.info.run_id, _FOLDER, spelled(folder))  # the folder may have been moved
+            self._client.set_tag(
+                run.info.run_id, _FOLDER, spell_name(folder)
+            )  # the folder may have been moved
         self.identity = {
             "run_id": run.info.run_id,
             "experiment_id": run.info.experiment_id,
@@ -184,7 +186,7 @@ class MlflowStore(Store):
         return found[0] if found else None
 
     def _created(self, info: RunInfo, experiment_id: str) -> Run:
-        tags = {_KEY: info.key, _FOLDER: spelled(self._folder), "mlflow.user": _user()}
+        tags = {_KEY: info.key, _FOLDER: spell_name(self._folder), "mlflow.user": _user()}
         tags |= {"mlflow.source.name": "python -m framework", "mlflow.source.type": "LOCAL"}
         if info.parent:
             tags["mlflow.parentRunId"] = info.parent
@@ -339,7 +341,7 @@ def _opened(info: RunInfo) -> tuple[MlflowClient, str]:
     if not info.named:
         require_own_files(info.uri)
     # MLflow's own migrations and get-or-create fail when several processes begin at the same time.
-    with alone(path.with_name(f".{path.name}.lock")):
+    with hold_lock(path.with_name(f".{path.name}.lock")):
         if not path.exists() or path.stat().st_size == 0:
             _make_database(path, info)
         client = MlflowClient(tracking_uri=info.uri)

@@ -15,7 +15,7 @@ from pydantic import TypeAdapter
 from framework.storage.enclosed import read_plain
 from framework.storage.files import write_whole
 from framework.storage.plain_values import LARGEST_JSON
-from framework.storage.reading import guarded
+from framework.storage.reading import translate_errors
 from framework.tracking.stores import Address, address, artifact_folder, require_own_files, without_password
 
 _log = logging.getLogger(__name__)
@@ -114,7 +114,7 @@ def read_run_info(folder: Path) -> RunInfo | None:
     path = folder / SIDECAR
     if not os.path.lexists(path):
         return None
-    with guarded(path, "what a tracker wrote", "Remove it, and the run begins anew."):
+    with translate_errors(path, "what a tracker wrote", "Remove it, and the run begins anew."):
         found = TypeAdapter(RunInfo).validate_json(read_plain(path, LARGEST_JSON), strict=True)
     return replace(found, named=False)
 

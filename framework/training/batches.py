@@ -18,7 +18,7 @@ from framework.datasets.fields import as_batch
 from framework.distributions.class_probabilities import require_labels
 from framework.distributions.noise import stable_hash
 from framework.errors import ConfigError, DataError
-from framework.storage.progress import tracked
+from framework.storage.progress import track_progress
 from framework.target import Target
 from framework.tracking.signals import SIGNALS
 
@@ -282,4 +282,4 @@ def track_batches(loader: DataLoader[Batch], activity: str) -> Iterator[Batch]:
         activity: name of the activity.
     """
     samples: int = len(loader.dataset)  # type: ignore[arg-type]
-    return tracked(loader, activity, samples, "samples", lambda batch: len(batch["input"]))
+    return track_progress(loader, activity, samples, "samples", lambda batch: len(batch["input"]))

@@ -19,7 +19,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from framework.configuration.composition import in_quotes
 from framework.errors import ConfigError
 from framework.storage.enclosed import require_enclosed
-from framework.storage.files import alone
+from framework.storage.files import hold_lock
 from framework.sweeps import jobs as sweep
 from framework.sweeps.processes import Forks, Fresh, Starter
 
@@ -92,7 +92,7 @@ class PoolLauncher(Launcher):
             values = [_plain(config, folder) for config in configs]
             rehearsal.refuse_mistakes(list(zip(job_overrides, values, strict=True)))
             folder.mkdir(parents=True, exist_ok=True)
-            with alone(folder / _LOCK):  # another sweep may begin in this folder
+            with hold_lock(folder / _LOCK):  # another sweep may begin in this folder
                 jobs = self._jobs(folder, configs, job_overrides, initial_job_idx)
                 sweep.reserve(jobs)
         except ConfigError:

@@ -21,7 +21,7 @@ from benchmarks.pages import machine, write_page
 from benchmarks.rendering.smplpix_flicker import rendered, training
 from framework.bodies import poses
 from framework.bodies.shape_space import in_few_shapes
-from framework.configuration.loading import stored
+from framework.configuration.loading import read_stored
 from framework.configuration.schema import build, resolve
 from framework.figures.style import titled_figure
 from framework.geometry.camera import Camera
@@ -78,12 +78,12 @@ def main(runs: Sequence[str]) -> None:
     if not runs:
         sys.exit(__doc__)
     torch.set_num_threads(1)
-    description, _ = stored(runs[0])
+    description, _ = read_stored(runs[0])
     data = data_of(description)
     height, width = description.target.size or (256, 192)
     renderers = {"mesh": rendered("rasterizer", supersampling=4)}
     for run in runs:
-        method = stored(run)[0].method
+        method = read_stored(run)[0].method
         renderers[NAMES.get(method, method)] = rendered("smplpix", checkpoint=run)
     ways = Ways(renderers, data.renderer, (height, width))
     people = [generated(data, name) for name in SUBJECTS]

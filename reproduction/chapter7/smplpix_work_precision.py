@@ -18,7 +18,7 @@ import torch
 from benchmarks.pages import machine, read_rows, write_page
 from framework.configuration.assembly import build_predictor
 from framework.configuration.description import Description
-from framework.configuration.loading import rebuilt, stored
+from framework.configuration.loading import read_stored, rebuild
 from framework.configuration.schema import build, resolve
 from framework.data import Data
 from framework.figures.style import save_figure
@@ -75,16 +75,16 @@ def meshes(description: Description) -> Iterator[tuple[str, int, Predictor, Data
 
 def networks(run: str) -> Iterator[tuple[str, Predictor, Data]]:
     """A run with float32 and bfloat16, its box alone and whole frames."""
-    description, state = stored(run)
+    description, state = read_stored(run)
     data = prepared(description, description.config["data"]["topology"])
     first = f"{description.method} {description.config['data']['topology']}"
     for precision, crop in product(("float32", "bfloat16"), ("box", "frame")):
-        description, state = stored(run)
+        description, state = read_stored(run)
         for part in description.config["encoder"]:
             if "precision" in part:
                 part["precision"] = precision
                 part["crop"] = None if crop == "frame" else part["crop"]
-        yield f"{first}, {precision}, {crop}", rebuilt(description, state), data
+        yield f"{first}, {precision}, {crop}", rebuild(description, state), data
 
 
 def feature_distance(predictor: Predictor, data: Data) -> float:
@@ -119,7 +119,7 @@ def main(runs: list[str]) -> None:
         sys.exit("No run was given; wanted folders of trained runs of smplpix/quick or its like.")
     torch.set_num_threads(1)
     rows: list[dict[str, Any]] = []
-    description, _ = stored(runs[0])
+    description, _ = read_stored(runs[0])
     about = ""
     for method, samples, predictor, data in meshes(description):
         numbers = row(examined(predictor, data, None), feature_distance(predictor, data))
@@ -172,7 +172,7 @@ def drawn(rows: Sequence[Row]) -> None:
 
 def trained(run: str) -> str:
     """What a run was, in a few words."""
-    description, _ = stored(run)
+    description, _ = read_stored(run)
     settings = description.settings
     return f"{description.method}, seed {settings.get('seed', '?')}"
 

@@ -19,7 +19,7 @@ from PIL import Image
 from framework.storage.checkpoints import MARK
 
 BOMB = 2**27 + 2**20
-"""Bytes that a compressed file of a thousandth unfolds to; more than `framework.storage.reading.room` allows."""
+"""Bytes to which a compressed file of a thousandth of them decompresses; more than `most_decompressed` allows."""
 HUGE = 10**9
 
 

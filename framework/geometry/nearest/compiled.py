@@ -7,13 +7,13 @@ from typing import Any, no_type_check
 from numba import njit, types
 from numba.core.extending import intrinsic
 
-from framework.storage.kernels import compiler, kept_in
+from framework.storage.kernels import compiler, kernel_cache
 
 PARTS = "compiled", "lanes", "pack", "search", "processor"
 """Names of the files whose functions call each other."""
 
 
-KEPT_IN = kept_in("nearest", (Path(__file__).with_name(f"{part}.py") for part in PARTS))
+KEPT_IN = kernel_cache("nearest", (Path(__file__).with_name(f"{part}.py") for part in PARTS))
 compiled = compiler(KEPT_IN)
 
 

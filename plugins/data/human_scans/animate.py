@@ -18,8 +18,8 @@ from PIL import Image
 
 from framework.bodies import motion
 from framework.configuration.description import Description
-from framework.configuration.loading import stored
-from framework.configuration.paths import add_option, require_said, said
+from framework.configuration.loading import read_stored
+from framework.configuration.paths import add_option, parse_paths, require_paths
 from framework.configuration.schema import build, resolve
 from framework.datasets.scan_layout import read_registration, read_splits
 from framework.errors import ConfigError, DataError, did_you_mean
@@ -73,7 +73,7 @@ def main(arguments: list[str]) -> None:
             f"--out {given.out} --frames {given.frames}: wanted a {', '.join(KINDS)} and 1 frame or more."
         )
     sheets = animated(
-        given.run, given.who, given.motion, given.frames, given.start, given.azimuth, said(given.path)
+        given.run, given.who, given.motion, given.frames, given.start, given.azimuth, parse_paths(given.path)
     )
     given.out.parent.mkdir(parents=True, exist_ok=True)
     write(given.out, sheets)
@@ -93,7 +93,7 @@ def animated(
 
     The arguments are those of the command; `paths` is the argument of the same name of `framework.load`.
     """
-    description, _ = stored(run, paths=paths)
+    description, _ = read_stored(run, paths=paths)
     data = data_of(description)
     mesh: Renderer = build("renderer", resolve("renderer", {"name": "rasterizer", "supersampling": 4}))
     network: Renderer = build(
@@ -116,7 +116,7 @@ def data_of(description: Description) -> HumanScans:
             f"{description.path} was trained on data {part['name']!r}; wanted a model trained on `human_scans`, which "
             "paints people."
         )
-    require_said(description.dropped, ("data",), description.path)
+    require_paths(description.dropped, ("data",), description.path)
     return build("data", resolve("data", part))
 
 

@@ -22,7 +22,7 @@ from framework.geometry.meshes import READERS, stream
 from framework.geometry.srgb import linear_from_bytes
 from framework.renderer import Renderer, Scene
 from framework.storage.commands import run_command
-from framework.storage.generated import draw_all, generated
+from framework.storage.generated import draw_all, ensure_generated
 from plugins.data.human_scans.photographs import photographed, rig
 
 Pair = tuple[Path, Path]
@@ -73,7 +73,7 @@ def main(arguments: list[str]) -> None:
 
         draw_all(len(everyone), one, "people")
 
-    generated(given.root, mark, write)
+    ensure_generated(given.root, mark, write)
     sys.stdout.write(f"{given.root}: {count} people\n")
 
 

@@ -25,7 +25,7 @@ from framework.errors import ConfigError
 from framework.geometry.srgb import linear_from_bytes
 from framework.renderer import Renderer, Scene
 from framework.storage import cache
-from framework.storage.generated import draw_all, generated
+from framework.storage.generated import draw_all, ensure_generated
 from plugins.data.human_scans import skins
 from plugins.data.human_scans.dressed import Wardrobe
 from plugins.data.human_scans.photographs import photographed, rig, texture
@@ -72,7 +72,7 @@ def scans_root(renderer: Renderer, counts: Mapping[str, int], drawing: Drawing, 
         ConfigError: there are fewer skins than splits, or skins for a body without texture coordinates.
     """
     crowd = Crowd(renderer, counts, drawing, seed)
-    return generated(crowd.root, crowd.mark, crowd.write)
+    return ensure_generated(crowd.root, crowd.mark, crowd.write)
 
 
 class Person(NamedTuple):

@@ -11,7 +11,7 @@ from numpy.random import Generator
 from framework.datasets import images
 from framework.errors import DataError
 from framework.geometry.srgb import linear_from_bytes
-from framework.storage.reading import guarded, read_bytes
+from framework.storage.reading import read_bytes, translate_errors
 from plugins.data.human_scans.anatomy import Anatomy
 from plugins.data.human_scans.fabrics import Color, hue, noise
 
@@ -39,7 +39,7 @@ def content(file: Path) -> bytes:
     Raises:
         DataError: the file is missing, or is no regular file.
     """
-    with guarded(file, "a picture of skin"):
+    with translate_errors(file, "a picture of skin"):
         return read_bytes(file)
 
 

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from framework.bodies import motion
 from framework.configuration.description import Description
-from framework.configuration.loading import stored
+from framework.configuration.loading import read_stored
 from framework.configuration.schema import build, resolve
 from framework.datasets import scan_layout
 from framework.errors import ConfigError, DataError
@@ -188,7 +188,7 @@ def test_pictures_show_a_mesh_on_white_and_the_data_sets_photograph(data, person
 @pytest.mark.parametrize("walks", [False, True])
 def test_a_run_and_a_motion_become_pictures_side_by_side(data, tmp_path, walks, capsys, monkeypatch):
     run = contract("renderer", "smplpix").rows[0].config["checkpoint"]
-    description, _ = stored(run)
+    description, _ = read_stored(run)
     height, width = animate.data_of(description).size
     # data of a doll, because the run's own data needs the default body
     monkeypatch.setattr(animate, "data_of", lambda description: data)

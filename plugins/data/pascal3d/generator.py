@@ -16,7 +16,7 @@ from PIL import Image
 from framework.errors import ConfigError
 from framework.renderer import Renderer
 from framework.storage.generated import draw_all
-from framework.storage.generated import generated as whole
+from framework.storage.generated import ensure_generated as whole
 from plugins.data.pascal3d.families import FAMILIES
 from plugins.data.pascal3d.layout import VOC_LISTS
 from plugins.data.pascal3d.scene import Shot, Thing, shoot

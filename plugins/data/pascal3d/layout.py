@@ -15,7 +15,7 @@ import numpy as np
 from framework.datasets.images import Box
 from framework.datasets.matlab import read_variables
 from framework.errors import DataError, quote
-from framework.storage.reading import guarded, read_bytes
+from framework.storage.reading import read_bytes, translate_errors
 from framework.storage.text import lines_of
 
 CLASSES = (
@@ -96,7 +96,7 @@ def read_list(file: Path) -> list[str]:
         DataError: a line is neither a name nor a name and one of the flags -1, 0, 1.
     """
     names = []
-    with guarded(file, "a list of image names", "Restore it from the release."):
+    with translate_errors(file, "a list of image names", "Restore it from the release."):
         lines = lines_of(read_bytes(file))
     for number, line in enumerate(lines, start=1):
         match line.split():
@@ -121,7 +121,7 @@ def read_annotations(root: Path, category: str, source: str, name: str) -> list[
         DataError: the file is missing, is not a MATLAB file, or does not have the structure of an annotation.
     """
     file = root / "Annotations" / f"{category}_{source}" / f"{name}.mat"
-    with guarded(file, "a PASCAL3D+ annotation", "Restore it from the release."):
+    with translate_errors(file, "a PASCAL3D+ annotation", "Restore it from the release."):
         return _objects(file, _load(file), root / "Images" / file.parent.name, category, source)
 
 

@@ -9,7 +9,7 @@ import torch
 
 from framework.bodies.people import chosen_body
 from framework.configuration.loading import load_with_description
-from framework.configuration.paths import add_option, require_said, said
+from framework.configuration.paths import add_option, parse_paths, require_paths
 from framework.configuration.schema import build, resolve
 from framework.distributions.protocol import median
 from framework.errors import ConfigError
@@ -35,7 +35,7 @@ def main(arguments: list[str]) -> None:
     add_option(parser)
     given = parser.parse_intermixed_args(arguments)
     given.folder.mkdir(parents=True, exist_ok=True)
-    for file in register(given.checkpoint, given.scans, given.folder, said(given.path)):
+    for file in register(given.checkpoint, given.scans, given.folder, parse_paths(given.path)):
         sys.stdout.write(f"{file}\n")
 
 
@@ -54,7 +54,7 @@ def register(
             f"{checkpoint} was trained on data {part['name']!r}; wanted a model trained on `registration`, which says "
             "what body its vertices are of."
         )
-    require_said(description.dropped, ("data",), description.path)
+    require_paths(description.dropped, ("data",), description.path)
     data: Registration = build("data", resolve("data", part))
     faces = chosen_body(data.body)[0].faces
     written = []

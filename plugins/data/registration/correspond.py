@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float, Int
 
 from framework.configuration.loading import load_with_description
-from framework.configuration.paths import add_option, require_said, said
+from framework.configuration.paths import add_option, parse_paths, require_paths
 from framework.configuration.schema import build, resolve
 from framework.data import Data
 from framework.distributions.protocol import median
@@ -61,7 +61,7 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--out", type=Path, default=Path("outputs/faust"), help="default: outputs/faust")
     add_option(parser)
     given = parser.parse_intermixed_args(arguments)
-    registered, generated = model(given.checkpoint, said(given.path))
+    registered, generated = model(given.checkpoint, parse_paths(given.path))
     folder = generated() if given.root is None else Path(given.root).expanduser()
     marked = "" if read_mark(folder) is None else " (synthetic)"
     for challenge in CHALLENGES:
@@ -99,7 +99,7 @@ def model(checkpoint: str, paths: Mapping[str, str] | None = None) -> tuple[Regi
         return denormalise_clouds(local, batch["centre"], batch["scale"])[0].float().numpy()
 
     def generated() -> Path:
-        require_said(description.dropped, ("data",), description.path)
+        require_paths(description.dropped, ("data",), description.path)
         return people_root(part.get("body"))
 
     return registered, generated

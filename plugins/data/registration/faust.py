@@ -9,8 +9,8 @@ import numpy as np
 
 from framework.errors import DataError
 from framework.geometry.meshes import read
-from framework.storage.reading import guarded, read_bytes
-from framework.storage.text import decoded
+from framework.storage.reading import read_bytes, translate_errors
+from framework.storage.text import decode
 
 SUBJECTS, POSES = 10, 10
 TEST = 200
@@ -79,8 +79,8 @@ def pairs(folder: Path, challenge: Challenge) -> list[Pair]:
         DataError: the list does not exist, a line is no pair, or a scan of a pair does not exist.
     """
     file = pairs_file(folder, challenge)
-    with guarded(file, "pairs of a challenge", "Wanted: two test scans a line, such as 000_001."):
-        lines = decoded(read_bytes(file)).split()
+    with translate_errors(file, "pairs of a challenge", "Wanted: two test scans a line, such as 000_001."):
+        lines = decode(read_bytes(file)).split()
     found = []
     for number, line in enumerate(lines, 1):
         match = re.fullmatch(r"(\d{3})_(\d{3})", line)

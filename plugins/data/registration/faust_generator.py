@@ -13,7 +13,7 @@ from framework.bodies.people import People, chosen_body
 from framework.geometry.meshes import Mesh
 from framework.geometry.ply_writer import write_ply
 from framework.storage import cache
-from framework.storage.generated import draw_all, generated
+from framework.storage.generated import draw_all, ensure_generated
 from plugins.data.registration import faust
 from plugins.data.registration.faust import CHALLENGES, POSES, SUBJECTS, Pair
 from plugins.data.registration.scanner import KINDS, Kinds, Scanner, scan
@@ -42,7 +42,7 @@ def people_root(body: str | None) -> Path:
     digest = hashlib.sha256(people.body.template.tobytes() + people.body.faces.tobytes()).hexdigest()[:16]
     mark = {"faust": VERSION, "seed": SEED, "scanner": str(SCANNER), "kinds": str(SHARES), "body": digest}
     root = cache.folder("faust") / hashlib.sha256(repr(sorted(mark.items())).encode()).hexdigest()[:16]
-    return generated(root, mark, lambda folder: _write(folder, people))
+    return ensure_generated(root, mark, lambda folder: _write(folder, people))
 
 
 def _write(folder: Path, people: People) -> None:

@@ -19,7 +19,7 @@ from framework.errors import DataError, shorten
 from framework.flights.frames import PARTS
 from framework.flights.physics import Constants
 from framework.geometry.meshes import stream
-from framework.storage.arrays import real
+from framework.storage.arrays import to_real
 from framework.storage.generated import read_mark
 from framework.target import Target
 from plugins.data.table_tennis.picture import side_view
@@ -196,7 +196,7 @@ class TableTennis(Data):
         """Return inputs from files, from one flight as an array (frame, 4) of t, x, y, z, or from ready inputs."""
         if isinstance(user_data, np.ndarray) and user_data.ndim == 2 and user_data.shape[1] == 4:
             try:
-                table = real(user_data, "the given flight")
+                table = to_real(user_data, "the given flight")
             except ValueError as error:
                 raise DataError(f"{error}.") from error
             return self._last(Flight("the given flight", table[:, 0], table[:, 1:]))[None]

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from framework.datasets.csv_columns import Writing, numbers, read_columns, require
 from framework.datasets.matlab import read_variables
 from framework.errors import DataError, shorten
-from framework.storage.arrays import real
+from framework.storage.arrays import to_real
 
 COLUMNS = ("t", "x", "y", "z")
 TRUE = ("true_x", "true_y", "true_z")
@@ -105,7 +105,7 @@ def _from_matlab(file: Path) -> list[Flight]:
     found = read_variables(file)
     held: Any = found.get("ballTrain")
     if isinstance(held, Mapping) and "data" in held:
-        tables = [real(one, "a flight") for one in np.atleast_1d(held["data"])]
+        tables = [to_real(one, "a flight") for one in np.atleast_1d(held["data"])]
     elif "time" in found and "ball" in found:
         pairs = zip(np.atleast_1d(found["time"]), np.atleast_1d(found["ball"]), strict=False)
         tables = [_joined(time, ball) for time, ball in pairs]
@@ -124,7 +124,7 @@ def _from_matlab(file: Path) -> list[Flight]:
 
 
 def _joined(time: Any, ball: Any) -> np.ndarray:
-    time, ball = np.atleast_1d(real(time, "time")), np.atleast_2d(real(ball, "ball"))
+    time, ball = np.atleast_1d(to_real(time, "time")), np.atleast_2d(to_real(ball, "ball"))
     same = time.ndim == 1 and ball.ndim == 2 and len(time) == len(ball)
     return np.column_stack([time, ball]) if same else ball
 

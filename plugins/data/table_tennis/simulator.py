@@ -14,7 +14,7 @@ from framework.flights.physics import Constants, Positive
 from framework.flights.trajectories import simulate
 from framework.geometry.meshes import stream
 from framework.storage import cache
-from framework.storage.generated import draw_all, generated
+from framework.storage.generated import draw_all, ensure_generated
 from plugins.data.table_tennis.contact import Spring
 from plugins.data.table_tennis.recordings import COLUMNS, TRUE
 from plugins.data.table_tennis.solvers import SolverGaveUp, flight
@@ -68,7 +68,7 @@ def simulated(what: Simulation, constants: Constants, step: float) -> Path:
     """
     mark = {"version": VERSION, "step": step, **asdict(what), **asdict(constants)}
     name = stream(what.generator_seed, repr(sorted(mark.items()))).integers(2**62)
-    return generated(
+    return ensure_generated(
         cache.folder("table_tennis") / f"seed_{what.generator_seed}_{name:016x}",
         mark,
         lambda root: write(root, what, constants, step),

@@ -30,7 +30,7 @@ from framework.datasets.fields import Fields
 from framework.distributions.circular import wrap
 from framework.errors import DataError, did_you_mean, quote, shorten
 from framework.storage import text
-from framework.storage.arrays import real
+from framework.storage.arrays import to_real
 from framework.target import Target
 
 Kind = Literal["class", "real", "degrees", "radians"]
@@ -194,7 +194,7 @@ def of_rows(given: Any, reading: Reading) -> Float[Tensor, "row column"]:
             )
         given = np.stack([np.atleast_1d(np.asarray(given[name])) for name in reading.columns], -1)
     try:
-        rows = real(given, "it")
+        rows = to_real(given, "it")
     except (TypeError, ValueError) as error:
         raise DataError(
             f"{str(error)[:200]}; wanted rows of numbers: {', '.join(reading.columns)}."
@@ -407,7 +407,7 @@ def _check_labels(
             f"{cells.file}, column {name!r}: every row is {labels[0]!r}; wanted two classes or more. Add rows of "
             "others, or name another data.target."
         )
-    found = [text.value(label) for label in labels]
+    found = [text.parse_number(label) for label in labels]
     numeric = all(value is not None for value in found)
     broken = any(value is not None and not value.is_integer() for value in found)
     if numeric and len(labels) > (MANY_LABELS if broken else max(MANY_LABELS, len(rows) / 2)):

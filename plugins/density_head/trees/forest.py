@@ -14,9 +14,9 @@ from typing import no_type_check
 
 import numpy as np
 
-from framework.storage.kernels import compiler, kept_in
+from framework.storage.kernels import compiler, kernel_cache
 
-compiled = compiler(kept_in("forest", [Path(__file__)]))
+compiled = compiler(kernel_cache("forest", [Path(__file__)]))
 
 
 def at_most(threshold: np.ndarray) -> np.ndarray:

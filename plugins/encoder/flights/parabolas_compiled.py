@@ -5,9 +5,9 @@ from typing import no_type_check
 
 import numpy as np
 
-from framework.storage.kernels import compiler, kept_in
+from framework.storage.kernels import compiler, kernel_cache
 
-compiled = compiler(kept_in("parabolas", [Path(__file__)]))
+compiled = compiler(kernel_cache("parabolas", [Path(__file__)]))
 FITS, STRANGE = 5.0, 2
 """Criterion of a fit: frames farther than FITS standard deviations are outliers, of which it has at most STRANGE."""
 ROUNDS = 8

@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from framework.storage.kernels import compiler, kept_in
+from framework.storage.kernels import compiler, kernel_cache
 
-compiled = compiler(kept_in("balls", [Path(__file__)]))
+compiled = compiler(kernel_cache("balls", [Path(__file__)]))
 
 
 @torch.no_grad()

@@ -13,11 +13,11 @@ from typing import no_type_check
 
 import numpy as np
 
-from framework.storage.kernels import compiler, kept_in
+from framework.storage.kernels import compiler, kernel_cache
 
 KERNELS = ("compiled",)
 """Names of the compiled files whose functions call each other."""
-compiled = compiler(kept_in("projection", [Path(__file__)]))
+compiled = compiler(kernel_cache("projection", [Path(__file__)]))
 
 
 @compiled

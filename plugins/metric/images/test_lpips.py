@@ -121,7 +121,7 @@ def test_without_weights_there_is_no_number():
 
 def test_what_lpips_cannot_read_gets_a_sentence(tmp_path):
     file = written(tmp_path, weights("alex"))
-    with pytest.raises(ConfigError, match="no weight file"):
+    with pytest.raises(ConfigError, match="The weight file"):
         lpips(weights=str(tmp_path / "none.pth"))
     with pytest.raises(CheckpointError, match=r"does not fit VGG16: .*weights are missing"):
         lpips(backbone="vgg", weights=file)

@@ -152,7 +152,7 @@ def test_other_weights_are_refused(tmp_path: Path) -> None:
         ConfigError, match=r"weights is null; wanted torchvision's file of VGG16.*random_features"
     ):
         Perceptual()
-    with pytest.raises(ConfigError, match=r"no weight file .*gone\.pth"):
+    with pytest.raises(ConfigError, match=r"The weight file .*gone\.pth does not exist"):
         Perceptual(weights=str(tmp_path / "gone.pth"))
     (tmp_path / "bad.pth").write_bytes(b"PK\3\4 nonsense")
     with pytest.raises(CheckpointError, match=r"bad\.pth"):

@@ -18,7 +18,7 @@ from framework.geometry.camera import Camera
 from framework.renderer import Report
 from framework.storage.commands import run_command
 from framework.storage.limits import MOST_SAMPLES
-from framework.storage.progress import tracked
+from framework.storage.progress import track_progress
 from plugins.renderer.rasterizer import pictures, turntable
 from plugins.renderer.rasterizer.parts import Axis
 from plugins.renderer.rasterizer.renderer import Rasterizer
@@ -188,7 +188,7 @@ def main(arguments: list[str]) -> None:
     camera = chosen_camera(given, around, up)
     check_size(camera, given, out)
     count = given.turntable or 1
-    cameras = tracked(turntable.around(camera, around.centre, up, count), "drawing", count, "frames")
+    cameras = track_progress(turntable.around(camera, around.centre, up, count), "drawing", count, "frames")
     renderer = Rasterizer(supersampling=given.supersampling if given.channel == "color" else 1)
     seconds: list[float] = []
     staged = pictures.stage(subject, given.shade if given.channel == "color" else False)

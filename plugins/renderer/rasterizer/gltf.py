@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from framework.errors import DataError, quote, shorten
 from framework.renderer import Wrap
 from framework.storage.limits import MOST_JOINT_SETS, MOST_PARTS
-from framework.storage.reading import guarded
+from framework.storage.reading import translate_errors
 from plugins.renderer.rasterizer.gltf_document import WIDTHS, Document, numbers, opened, whole
 from plugins.renderer.rasterizer.parts import Part, Subject, drawn_without, subject
 
@@ -42,7 +42,7 @@ def read(file: Path) -> Subject:
             not understood, or shows no surface.
     """
     # overflow gives numbers that are not finite, which are refused at the end
-    with guarded(file, "glTF"), np.errstate(all="ignore"):
+    with translate_errors(file, "glTF"), np.errstate(all="ignore"):
         document = opened(file)
         version = str(document.content["asset"]["version"])
         if not version.startswith("2."):

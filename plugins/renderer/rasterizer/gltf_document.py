@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from framework.errors import quote, shorten
 from framework.storage.limits import SCENE_BYTES, UNFOLDED_TIMES
 from framework.storage.plain_values import plain_numbers
-from framework.storage.reading import guarded, read_bytes
+from framework.storage.reading import read_bytes, translate_errors
 from plugins.renderer.rasterizer.parts import Pictures, beside
 
 NUMBERS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -80,7 +80,7 @@ class Document:
 
     def of_file(self, file: Path) -> bytes:
         """Return the content of a file beside this file."""
-        with guarded(file, "a part of a glTF file"):
+        with translate_errors(file, "a part of a glTF file"):
             found = read_bytes(file)
         self.size += len(found)
         return found

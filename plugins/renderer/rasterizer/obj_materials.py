@@ -12,7 +12,7 @@ from framework.geometry import mesh_files
 from framework.geometry.mesh_files import join_continued_lines, line_numbers, text_lines
 from framework.renderer import Wrap
 from framework.storage.limits import MOST_MATERIALS
-from framework.storage.reading import guarded, read_bytes
+from framework.storage.reading import read_bytes, translate_errors
 from plugins.renderer.rasterizer.parts import Part, Pictures, drawn_without
 
 OPTIONS = {"-blendu": 1, "-blendv": 1, "-cc": 1, "-boost": 1, "-imfchan": 1, "-texres": 1}
@@ -111,7 +111,7 @@ def _part(
         return Part(vertices, faces, colors)
     image = pictures.known(texture)
     if image is None:
-        with guarded(texture, "a texture"):
+        with translate_errors(texture, "a texture"):
             content = read_bytes(texture)
         image = pictures.decode(texture, content, str(texture))
     own, places = np.unique(places, return_inverse=True)
@@ -122,7 +122,7 @@ def _part(
 def _texture_of(material: Material, notes: list[str]) -> Path | None:
     if not material.texture:
         return None
-    with guarded(material.library, "an MTL file"):
+    with translate_errors(material.library, "an MTL file"):
         return drawn_without(material.library.parent, material.texture, "texture is", notes)
 
 
@@ -168,7 +168,7 @@ def _statement(line: bytes) -> tuple[bytes, bytes]:
 def _materials(library: Path) -> dict[str, Material]:
     """Return the colours (Kd) and textures (map_Kd) of an MTL file, by name."""
     found: dict[str, Material] = {}
-    with guarded(library, "an MTL file"):
+    with translate_errors(library, "an MTL file"):
         current = Material()
         content = read_bytes(library)
         for number, line in enumerate(text_lines(content, names=NAMES)):

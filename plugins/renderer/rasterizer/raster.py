@@ -21,7 +21,7 @@ from typing import no_type_check
 
 import numpy as np
 
-from framework.storage.kernels import compiler, kept_in
+from framework.storage.kernels import compiler, kernel_cache
 
 SUBPIXELS = 256.0
 EXACT = 2.0**25
@@ -41,7 +41,7 @@ REASONS = {BEHIND: "behind", FLAT: "flat", BACK: "back", OUTSIDE: "outside", HID
 # Without fastmath: products must be rounded before they are subtracted, see `_draw_far`.
 KERNELS = "boundary", "canvas", "clipping", "interior", "nmr", "raster", "shading", "soft", "textures"
 """Files whose compiled functions call each other."""
-KEPT_IN = kept_in("rasterizer", (Path(__file__).with_name(f"{name}.py") for name in KERNELS))
+KEPT_IN = kernel_cache("rasterizer", (Path(__file__).with_name(f"{name}.py") for name in KERNELS))
 compiled = compiler(KEPT_IN)
 
 

@@ -12,7 +12,7 @@ from framework.errors import DataError, did_you_mean
 from framework.geometry import meshes
 from framework.geometry.mesh_files import COLOURS
 from framework.geometry.srgb import linear_from_bytes
-from framework.storage.reading import guarded, read_bytes
+from framework.storage.reading import read_bytes, translate_errors
 from plugins.renderer.rasterizer import gltf, obj_materials
 from plugins.renderer.rasterizer.parts import Axis, Part, Pictures, Subject, drawn_without, subject
 
@@ -43,7 +43,7 @@ def read(file: Path) -> Subject:
     if suffix in (".glb", ".gltf"):
         return gltf.read(file)
     notes: list[str] = []
-    with guarded(file, suffix[1:].upper()):
+    with translate_errors(file, suffix[1:].upper()):
         mesh = meshes.read(file)
         part = Part(mesh.vertices, mesh.faces, _colors(mesh))
         parts = [part]
@@ -76,6 +76,6 @@ def _textured(file: Path, mesh: meshes.Mesh, part: Part, notes: list[str]) -> Pa
     texture = drawn_without(file.parent, name, "texture is", notes)
     if texture is None:
         return part
-    with guarded(texture, "a texture"):
+    with translate_errors(texture, "a texture"):
         image = Pictures().decode(name, read_bytes(texture), str(texture))
     return Part(part.vertices, part.faces, part.colors, image, mesh.attribute(places))

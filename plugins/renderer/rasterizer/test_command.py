@@ -378,7 +378,7 @@ def test_as_a_program_it_ends_with_a_sentence_and_no_stack_trace(cube: Path, tmp
     assert done.returncode == 1 and done.stdout == ""
     assert (
         done.stderr
-        == "error: /proc/none cannot be written (No such file or directory). Choose another place.\n"
+        == "error: /proc/none cannot be written (No such file or directory). Choose another path.\n"
     )
 
 

@@ -16,8 +16,8 @@ from framework.geometry.camera import Camera, focal_length
 from framework.geometry.rotation import about_z, viewpoint_rotation
 from framework.renderer import Scene
 from framework.storage.plain_values import LARGEST_YAML, plain_numbers, read_yaml
-from framework.storage.reading import guarded, read_bytes
-from framework.storage.text import decoded
+from framework.storage.reading import read_bytes, translate_errors
+from framework.storage.text import decode
 from plugins.renderer.rasterizer.parts import Axis
 
 MARGIN = 1.03
@@ -148,11 +148,11 @@ def read_camera(file: Path) -> Camera:
 def _values(file: Path) -> dict[str, Any]:
     wanted = "a camera"
     if file.suffix.lower() == ".json":
-        with guarded(file, wanted):
+        with translate_errors(file, wanted):
             content = read_bytes(file)
             if len(content) > LARGEST_YAML:
                 raise ValueError(f"{len(content)} bytes; at most {LARGEST_YAML}")
-            found = json.loads(decoded(content))
+            found = json.loads(decode(content))
     elif file.suffix.lower() in (".yaml", ".yml"):
         found = read_yaml(file, wanted)
     else:

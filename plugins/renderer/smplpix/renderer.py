@@ -9,8 +9,8 @@ from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor
 
-from framework.configuration.loading import rebuilt, stored
-from framework.configuration.paths import FilePath, flat
+from framework.configuration.loading import read_stored, rebuild
+from framework.configuration.paths import FilePath, flatten
 from framework.distributions.protocol import images
 from framework.errors import CheckpointError, ConfigError, DataError
 from framework.geometry.mesh_files import COLOURS, XYZ
@@ -72,7 +72,7 @@ class SMPLpix(Renderer):
                 "renderer smplpix draws with a trained network, but renderer.checkpoint is null. Train one (`python -m "
                 "framework experiment=smplpix/quick`) and give the run folder it prints."
             )
-        self.description, self._weights = stored(checkpoint, paths=flat(paths or {}))
+        self.description, self._weights = read_stored(checkpoint, paths=flatten(paths or {}))
         target, columns = self.description.target, self.description.columns
         if target.kind != "image" or len(target.names) != 3 or columns[: len(COLUMNS)] != COLUMNS:
             raise ConfigError(
@@ -120,7 +120,7 @@ class SMPLpix(Renderer):
                 devices=[]
             ):  # building draws random weights, which are then overwritten
                 try:
-                    made = rebuilt(changed, self._weights)
+                    made = rebuild(changed, self._weights)
                 except CheckpointError as error:
                     if size == self.size:
                         raise
