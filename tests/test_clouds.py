@@ -102,7 +102,7 @@ def test_an_empty_cloud_is_refused(batch):
     [torch.zeros(4, 3), torch.zeros(1, 4, 2), torch.zeros(1, 4, 3).int(), torch.zeros(1, 4, 3).half()],
 )
 def test_what_is_no_batch_of_clouds_is_refused(batch):
-    with pytest.raises(DataError, match=r"wanted \(batch, points, columns\) of float32 or float64"):
+    with pytest.raises(DataError, match=r"expected \(batch, points, columns\) of float32 or float64"):
         sizes(batch)
 
 

@@ -269,7 +269,7 @@ def test_inputs_that_are_not_finite_are_refused_with_their_row(bad, count):
     inputs = torch.randn(count, 6)
     inputs[-1, 2] = bad
     for predict in (frozen(model, (6,)), model):
-        with pytest.raises(ValueError, match=f"raw numbers are not finite in batch row {count - 1}"):
+        with pytest.raises(ValueError, match=f"raw parameters are not finite in batch row {count - 1}"):
             predict(inputs)
 
 

@@ -291,7 +291,7 @@ def test_nothing_extreme_gives_a_nan_or_hangs(seed, scale, start, width, curved)
 def test_impossible_boxes_are_refused():
     model = Decays(torch.zeros(2, 40).double())
     for start, lower in ((math.nan, 0.0), (1.0, math.nan), (1.0, 3.0)):
-        with pytest.raises(ValueError, match="problem 0 of the least squares starts at"):
+        with pytest.raises(ValueError, match="Least-squares problem 0 starts at"):
             least_squares(model, torch.full((2, 3), start), torch.full((3,), lower), torch.full((3,), 2.0))
     empty = least_squares(model, torch.zeros(0, 3), torch.zeros(3), torch.ones(3))
     assert empty.parameters.shape == (0, 3) and empty.covariance.shape == (0, 3, 3)

@@ -299,10 +299,10 @@ BAD = [
     ({"clouds": torch.zeros(2, 4, 3).half()}, r"float16 .* \.float\(\)"),
     ({"queries": torch.zeros(3, 3).double()}, "same type and device"),
     ({"queries": torch.zeros(3, 2, 3)}, "as many sets of queries as clouds"),
-    ({"sizes": torch.tensor([0, 4])}, "number 0 has 0; wanted 1 to 4"),
-    ({"sizes": torch.tensor([4, 5])}, "number 1 has 5"),
+    ({"sizes": torch.tensor([0, 4])}, "number 0 has the size 0; expected a size from 1 to 4"),
+    ({"sizes": torch.tensor([4, 5])}, "number 1 has the size 5"),
     ({"sizes": torch.tensor([4])}, "there are 1 sizes"),
-    ({"query_sizes": torch.tensor([1, 1])}, "Leave them out"),
+    ({"query_sizes": torch.tensor([1, 1])}, "Leave query_sizes out"),
 ]
 
 

@@ -598,7 +598,7 @@ def test_answers_that_are_not_finite_get_a_sentence(framework: Framework) -> Non
         *("trainer.precision=16-true", "optimizer.learning_rate=1e3"),
     )
     assert done.code == 1
-    assert "the network's raw numbers are not finite in batch row" in done.out
+    assert "The raw parameters are not finite in batch row" in done.out
     assert "trainer.precision=32-true" in done.out
     assert "Traceback" not in done.out
 

@@ -22,13 +22,13 @@ def nonempty_batches(batches: Iterable[Batch], by: str) -> list[Batch]:
     Raises:
         UserError: there is no sample in any batch.
     """
-    held = [batch for batch in batches if len(batch["target"])]
-    if not held:
+    nonempty = [batch for batch in batches if len(batch["target"])]
+    if not nonempty:
         raise UserError(
             f"{by} is calibrated on the validation split, but got no sample of it. Give the data set one "
             f"(its README says how), or leave {by} out."
         )
-    return held
+    return nonempty
 
 
 @torch.no_grad()
@@ -41,24 +41,24 @@ def predict_densities(model: Predictor, batches: Sequence[Batch]) -> list[Distri
         model.train(training)
 
 
-def require_numbers(found: Float[Tensor, "sample"], batches: Sequence[Batch], what: str) -> None:
+def require_numbers(values: Float[Tensor, "sample"], batches: Sequence[Batch], quantity: str) -> None:
     """Refuse NaN, because the mean of numbers with NaN has no meaning.
 
     Args:
-        found: one number per sample of all batches, in order.
+        values: one number per sample of all batches, in order.
         batches: the batches.
-        what: name of the numbers, for the message.
+        quantity: name of the numbers, for the message.
 
     Raises:
         UserError: a number is NaN; the message names the samples.
     """
-    bad = found.isnan().nonzero().flatten().tolist()
+    bad = values.isnan().nonzero().flatten().tolist()
     if bad:
         # "index" is the number of a sample in its split, if batches have it
         numbered = all("index" in batch for batch in batches)
         names = torch.cat([batch["index"] for batch in batches])[bad].tolist() if numbered else bad
         more = f" and {len(names) - 10} more" if len(names) > 10 else ""
         raise UserError(
-            f"The {what} of validation samples {names[:10]}{more} is not a number; wanted numbers, or infinities. "
-            "Nothing is fitted to the others. Look at these samples and at the training, which may have diverged."
+            f"The {quantity} of validation samples {names[:10]}{more} is NaN; expected numbers, which may be infinite. "
+            "Nothing is fitted to the other samples. Check these samples and the training, which may have diverged."
         )

@@ -107,7 +107,7 @@ class Frozen:
             softmax(probability)
             if np.isnan(probability[:, 0]).any():
                 row = int(np.isnan(probability[:, 0]).argmax())
-                raise ValueError(f"raw numbers are not finite in batch row {row}.")
+                raise ValueError(f"The raw parameters are not finite in batch row {row}.")
             return probability
         with torch.inference_mode():
             density = self._density(features, network)

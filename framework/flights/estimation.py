@@ -72,15 +72,15 @@ def observed_frames(frames: Float[Tensor, "flight frame 5"], step: float) -> Obs
     frames = frames.double()
     count = frames.shape[1]
     slots = step * (torch.arange(count, dtype=torch.float64, device=frames.device) - (count - 1))
-    there = (frames[..., 4] > 0.5) & (frames[..., 1:4].abs() <= BELIEVED).all(-1)
-    times = torch.where(there, frames[..., 0].clamp(slots - step / 2, slots + step / 2), slots)
-    first = torch.where(there, times, 0.0).amin(-1, keepdim=True)
-    places = torch.where(there.unsqueeze(-1), frames[..., 1:4], torch.nan)
+    observed = (frames[..., 4] > 0.5) & (frames[..., 1:4].abs() <= BELIEVED).all(-1)
+    times = torch.where(observed, frames[..., 0].clamp(slots - step / 2, slots + step / 2), slots)
+    first = torch.where(observed, times, 0.0).amin(-1, keepdim=True)
+    places = torch.where(observed.unsqueeze(-1), frames[..., 1:4], torch.nan)
     return ObservedFrames(torch.maximum(times, first), places)
 
 
 def estimate_states(
-    seen: ObservedFrames,
+    frames: ObservedFrames,
     constants: Constants,
     noise: float,
     prior: Prior = Prior(),  # noqa: B008 - never changed
@@ -93,55 +93,57 @@ def estimate_states(
     (r/c)²) of a residual r is half the square of c √log(1 + (r/c)²) (Holland & Welsch 1977).
 
     Args:
-        seen: the observed frames.
+        frames: the observed frames.
         constants: constants of the physics.
         noise: standard deviation of each coordinate, m.
         prior: prior density of a state.
-        start: start of the search; None: `guessed`.
+        start: start of the search; None: `guess_states`.
         most: largest number of steps of the search.
     """
-    scale = prior.scale.to(seen.times.device)
+    scale = prior.scale.to(frames.times.device)
 
     def model(states: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-        places, slopes = simulate_with_jacobian(states, seen.times[rows], constants)
-        apart = ((places - seen.places[rows]) / noise).flatten(1)
-        bent, steep = cauchy(apart)
+        places, slopes = simulate_with_jacobian(states, frames.times[rows], constants)
+        residual = ((places - frames.places[rows]) / noise).flatten(1)
+        bent, steep = cauchy(residual)
         jacobian = steep.unsqueeze(-1) * slopes.flatten(1, 2) / noise
         own = torch.diag_embed((1 / scale).expand(len(states), 9))
         return torch.cat([bent, states / scale], 1), torch.cat([jacobian, own], 1)
 
-    begin = guess_states(seen, constants.gravity) if start is None else start
-    bound = MOST.to(seen.times.device)
+    begin = guess_states(frames, constants.gravity) if start is None else start
+    bound = MOST.to(frames.times.device)
     # An error of a tenth of a per cent of a standard deviation does not matter.
-    found = least_squares(model, begin, -bound, bound, most=most, decrease=1e-7, step=1e-9)
-    residuals, jacobian = model(found.parameters, torch.arange(len(begin)))
+    solution = least_squares(model, begin, -bound, bound, most=most, decrease=1e-7, step=1e-9)
+    residuals, jacobian = model(solution.parameters, torch.arange(len(begin)))
     jacobian = torch.where(residuals.isnan().unsqueeze(-1), 0.0, jacobian)
     precision = jacobian.mT @ jacobian * scale * scale.unsqueeze(-1)  # scaled so that the prior's part is 1
     covariance = torch.linalg.inv(precision) * scale * scale.unsqueeze(-1)
-    return Estimate(found.parameters, (covariance + covariance.mT) / 2, found.cost)
+    return Estimate(solution.parameters, (covariance + covariance.mT) / 2, solution.cost)
 
 
-def cauchy(apart: Float[Tensor, "*shape"]) -> tuple[Float[Tensor, "*shape"], Float[Tensor, "*shape"]]:
+def cauchy(residual: Float[Tensor, "*shape"]) -> tuple[Float[Tensor, "*shape"], Float[Tensor, "*shape"]]:
     """Return c √log(1 + (r/c)²) with the sign of the residual r, and its derivative."""
-    square = (apart / CAUCHY).square()
+    square = (residual / CAUCHY).square()
     root = CAUCHY * torch.log1p(square).sqrt()
-    steep = torch.where(apart.abs() < 1e-6, 1.0, apart.abs() / (root * (1 + square)))
-    return torch.copysign(root, apart), steep
+    steep = torch.where(residual.abs() < 1e-6, 1.0, residual.abs() / (root * (1 + square)))
+    return torch.copysign(root, residual), steep
 
 
-def guess_states(seen: ObservedFrames, gravity: float) -> Float[Tensor, "flight 9"]:
+def guess_states(frames: ObservedFrames, gravity: float) -> Float[Tensor, "flight 9"]:
     """Return a state at the first frame from medians of slopes between pairs of the first frames.
 
     These are the medians of Theil (1950) and Sen (1968); a third of outliers does not move them. The state has no spin,
     and is 0 if fewer than two frames are observed.
     """
-    there = seen.observed & (seen.observed.cumsum(-1) <= FIRST)
-    since = seen.times - seen.times[:, :1]
-    straight = torch.where(there.unsqueeze(-1), seen.places, torch.nan)
+    observed = frames.observed & (frames.observed.cumsum(-1) <= FIRST)
+    since = frames.times - frames.times[:, :1]
+    straight = torch.where(observed.unsqueeze(-1), frames.places, torch.nan)
     straight = straight + torch.stack([0 * since, 0 * since, gravity / 2 * since.square()], -1)
-    apart = since.unsqueeze(-1) - since.unsqueeze(-2)
+    intervals = since.unsqueeze(-1) - since.unsqueeze(-2)
     rise = straight.unsqueeze(-2) - straight.unsqueeze(-3)
-    slopes = torch.where((apart > 1e-4).unsqueeze(-1), rise / apart.clamp(min=1e-4).unsqueeze(-1), torch.nan)
+    slopes = torch.where(
+        (intervals > 1e-4).unsqueeze(-1), rise / intervals.clamp(min=1e-4).unsqueeze(-1), torch.nan
+    )
     speed = slopes.flatten(1, 2).nanmedian(1).values
     place = (straight - speed.unsqueeze(1) * since.unsqueeze(-1)).nanmedian(1).values
     place = torch.where(place.isnan(), straight.nanmedian(1).values, place)

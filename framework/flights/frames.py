@@ -40,9 +40,9 @@ def future_frames(names: tuple[str, ...], by: str) -> int:
     axes = [name.partition("_")[0] for name in names]
     if not axes or axes != list(AXES) * (len(axes) // len(AXES)):
         more = len(names) - MOST_NAMES
-        told = ", ".join(names[:MOST_NAMES]) + (f" and {more} more" if more > 0 else "")
+        target_names = ", ".join(names[:MOST_NAMES]) + (f" and {more} more" if more > 0 else "")
         raise ConfigError(
-            f"{by} predicts x, y and z at one time after the other, but the target is {told}. Choose data of flights, "
+            f"{by} predicts x, y and z at successive times, but the target is {target_names}. Choose data of flights, "
             "whose numbers are called x_16ms, y_16ms, z_16ms and so on."
         )
     return len(axes) // len(AXES)

@@ -66,19 +66,19 @@ def step(
     root = (climb.square() + 2 * constants.gravity * height.clamp(min=0) + 1e-18).sqrt()
     until = torch.minimum(((climb + root) / constants.gravity).clamp(min=0), whole)
     for _ in range(NEWTON):
-        there = free(before, until, constants)
-        until = until - (there[:, 2] - touching) / there[:, 5].clamp(max=-1e-3)
+        bounce_state = free(before, until, constants)
+        until = until - (bounce_state[:, 2] - touching) / bounce_state[:, 5].clamp(max=-1e-3)
         until = torch.minimum(until.clamp(min=0), whole)
-    there = free(before, until, constants)
-    u, v, w, a, b, c = there[:, 3:].unbind(-1)
+    bounce_state = free(before, until, constants)
+    u, v, w, a, b, c = bounce_state[:, 3:].unbind(-1)
     velocity, spin = bounce((u, v, w), (a, b, c), constants)
     level = torch.full_like(u, touching)
-    left = torch.stack([there[:, 0], there[:, 1], level, *velocity, *spin], -1)
+    left = torch.stack([bounce_state[:, 0], bounce_state[:, 1], level, *velocity, *spin], -1)
     risen = free(left, whole - until, constants)
     lies = (risen[:, 2] < touching) & (risen[:, 1] < constants.far)
     risen = torch.where(lies.unsqueeze(-1) & (torch.arange(9) == 2), risen.clamp(min=touching), risen)
     risen = torch.where(lies.unsqueeze(-1) & (torch.arange(9) == 5), risen.clamp(min=0), risen)
-    over = (there[:, 1] > constants.near) & (there[:, 1] < constants.far)
+    over = (bounce_state[:, 1] > constants.near) & (bounce_state[:, 1] < constants.far)
     return after.index_put((rows,), torch.where(over.unsqueeze(-1), risen, after[rows]))
 
 
@@ -107,7 +107,7 @@ def simulate_with_jacobian(
     flights, time = times.shape
     shift = torch.diag(start.new_tensor([1e-5] * 6 + [1e-3] * 3))
     states = torch.cat([start[:, None], start[:, None] + shift, start[:, None] - shift], 1)  # (flight, 19, 9)
-    found = simulate(states.reshape(-1, 9), times.repeat_interleave(19, 0), constants)[..., :3]
-    found = found.reshape(flights, 19, time, 3)
-    change = (found[:, 1:10] - found[:, 10:]) / (2 * shift.diagonal()[:, None, None])
-    return found[:, 0], change.permute(0, 2, 3, 1)
+    positions = simulate(states.reshape(-1, 9), times.repeat_interleave(19, 0), constants)[..., :3]
+    positions = positions.reshape(flights, 19, time, 3)
+    change = (positions[:, 1:10] - positions[:, 10:]) / (2 * shift.diagonal()[:, None, None])
+    return positions[:, 0], change.permute(0, 2, 3, 1)

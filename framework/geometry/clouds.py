@@ -105,7 +105,7 @@ def pad(clouds: Sequence[Tensor]) -> Float[Tensor, "batch points columns"]:
     if len(shapes) != 1 or len(next(iter(shapes))) != 1:
         shape_names = ", ".join(str(tuple(cloud.shape)) for cloud in clouds[:4]) or "none"
         raise DataError(
-            f"Clouds of shapes {shape_names} do not form a batch; expected at least one cloud, and each (points, columns) "
+            f"Clouds of shapes {shape_names} do not form a batch; expected at least one cloud, each (points, columns), "
             "with the same number of columns. Give every cloud the same attributes."
         )
     return pad_sequence(list(clouds), batch_first=True, padding_value=math.nan)

@@ -1,8 +1,8 @@
 """Parsers of mesh and cloud files, one function for each format; they never make up what a file does not hold.
 
 Every parser takes the bytes of a file. It raises a ValueError that says what it got, in which line, and what it
-expected; the caller, `geometry.meshes`, names the file. PLY has a module of its own. Comments are skipped, and line ends may be
-those of any system. Polygons are cut into fans of triangles (correct for convex ones).
+expected; the caller, `geometry.meshes`, names the file. PLY has a module of its own. Comments are skipped, and the
+line ends of all systems are read. Polygons are cut into fans of triangles (correct for convex ones).
 """
 
 import re

@@ -114,8 +114,8 @@ def _check_faces(file: Path, parsed: Parsed) -> None:
     if wrong.any():
         row = int(np.flatnonzero(wrong.any(1))[0])
         raise DataError(
-            f"{file}: triangle {row} (from 0) has the corners {parsed.faces[row].tolist()}, but there are only vertices "
-            f"0 to {len(parsed.vertices) - 1}. Copy the file again from its source."
+            f"{file}: triangle {row} (from 0) has the corners {parsed.faces[row].tolist()}, but there are only "
+            f"vertices 0 to {len(parsed.vertices) - 1}. Copy the file again from its source."
         )
 
 

@@ -14,16 +14,18 @@ def require_finite(raw: Tensor, size: int) -> Tensor:
 
     Raises:
         ValueError: the last dimension is not `size`.
-        NonFiniteAnswer: a number is not finite; it is also a ValueError, and its message names the first such batch
+        NonFiniteParameters: a number is not finite; it is also a ValueError, and its message names the first such batch
             row.
     """
     if raw.shape[-1] != size:
-        raise ValueError(f"raw numbers of shape {tuple(raw.shape)}; wanted {size} in the last dimension.")
+        raise ValueError(
+            f"Got raw parameters of shape {tuple(raw.shape)}; expected {size} in the last dimension."
+        )
     # If the sum is finite, so is every number. This takes one pass; heads of very many numbers notice a second one.
     if not math.isfinite(float(raw.detach().sum())) and not raw.isfinite().all():
         row = tuple((~raw.isfinite().all(-1)).nonzero()[0].tolist())
         raise NonFiniteParameters(
-            f"raw numbers are not finite in batch row {row[0] if len(row) == 1 else row}."
+            f"The raw parameters are not finite in batch row {row[0] if len(row) == 1 else row}."
         )
     return raw.float() if raw.dtype in (torch.float16, torch.bfloat16) else raw
 
@@ -37,13 +39,13 @@ def require_trained(component: DensityHead) -> DensityHead:
     """
     if component.backbones:
         raise ConfigError(
-            "density_head.component wants networks of its own for its parts, which only the head of a model has; leave "
-            "density_head.component.backbones at shared."
+            "density_head.component requires separate networks for its parts, but only the head of a model has networks. "
+            "Leave density_head.component.backbones at shared."
         )
     fitted = set(component.state_dict()) - {name for name, _ in component.named_parameters()}
     if fitted:
         raise ConfigError(
-            f"density_head.component fits {', '.join(sorted(fitted))} after training, which a component cannot; "
-            "choose one that predicts it, such as concentration=predicted."
+            f"density_head.component fits {', '.join(sorted(fitted))} after training, but a component cannot be "
+            "fitted after training. Choose a component that predicts these parameters, such as concentration=predicted."
         )
     return component

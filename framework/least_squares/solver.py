@@ -68,7 +68,7 @@ class _Active(NamedTuple):
 
 
 class _Step(NamedTuple):
-    """Steps of all problems; framework.least_squares.compiled.stepped describes the fields."""
+    """Steps of all problems; framework.least_squares.compiled.compute_steps describes the fields."""
 
     move: Tensor
     gain: Tensor
@@ -82,7 +82,7 @@ class _Problems:
 
     Attributes:
         curved: True if second derivatives are available.
-        there: (problem,), number of residuals that are not missing.
+        residual_counts: (problem,), number of residuals that are not missing.
     """
 
     def __init__(
@@ -91,12 +91,12 @@ class _Problems:
         self._model, self._normal, self._curvature = model, normal, curvature
         self._count, self._device = len(start), start.device
         self.curved = curvature is not None
-        self.there = torch.zeros(self._count, dtype=torch.int64)
+        self.residual_counts = torch.zeros(self._count, dtype=torch.int64)
         self._present: Tensor | None = None
 
-    def written(self, at: Tensor, rows: Tensor, first: bool = False) -> tuple[Tensor, Tensor]:
+    def residuals_and_jacobian(self, at: Tensor, rows: Tensor, first: bool = False) -> tuple[Tensor, Tensor]:
         """Return residuals and Jacobian, with 0 for missing residuals."""
-        residuals, jacobian = self._moved(self._model, at, rows)
+        residuals, jacobian = self._call(self._model, at, rows)
         if self._normal is not None:
             present = ~residuals.isnan()
         else:
@@ -109,30 +109,30 @@ class _Problems:
             residuals = residuals.where(present, 0.0)
             jacobian = jacobian.where(present.unsqueeze(-1), 0.0)
         if first:
-            self.there[rows] = present.sum(-1)
+            self.residual_counts[rows] = present.sum(-1)
         return residuals, jacobian
 
     def normal(self, at: Tensor, rows: Tensor, first: bool = False) -> tuple[Tensor, Tensor, Tensor]:
         """Return cost, gradient and normal matrix JᵀJ."""
         if self._normal is None:
-            residuals, jacobian = self.written(at, rows, first)
+            residuals, jacobian = self.residuals_and_jacobian(at, rows, first)
             gradient = torch.bmm(jacobian.mT, residuals.unsqueeze(-1)).squeeze(-1)
             return residuals.square().sum(-1) / 2, gradient, torch.bmm(jacobian.mT, jacobian)
-        cost, gradient, gram, there = self._moved(self._normal, at, rows)
+        cost, gradient, gram, residual_counts = self._call(self._normal, at, rows)
         if first:
-            self.there[rows] = there.long()
+            self.residual_counts[rows] = residual_counts.long()
         return cost, gradient, gram
 
     def curve(self, at: Tensor, rows: Tensor) -> Tensor:
         """Return the second derivatives, see `Curvature`."""
         assert self._curvature is not None
         curvature = self._curvature
-        return self._moved(lambda *given: (curvature(*given),), at, rows)[0]
+        return self._call(lambda *arguments: (curvature(*arguments),), at, rows)[0]
 
-    def _moved(self, function: Callable[..., tuple[Tensor, ...]], *given: Tensor) -> tuple[Tensor, ...]:
+    def _call(self, function: Callable[..., tuple[Tensor, ...]], *arguments: Tensor) -> tuple[Tensor, ...]:
         """Call a function on the device of the start, and return its results in double on the processor."""
-        found = function(*(part.to(self._device) for part in given))
-        return tuple(part.to("cpu", torch.float64) for part in found)
+        results = function(*(part.to(self._device) for part in arguments))
+        return tuple(part.to("cpu", torch.float64) for part in results)
 
 
 class _Rules(NamedTuple):
@@ -192,7 +192,7 @@ def least_squares(
     problems = _Problems(model, normal, curvature, start)
     device, count = start.device, len(start)
     start, lower, upper = start.cpu(), lower.cpu(), upper.cpu()
-    found = Solution(
+    solution = Solution(
         start.clamp(lower, upper),
         start.new_zeros(count),
         torch.diag_embed(torch.full_like(start, torch.inf)),
@@ -202,21 +202,21 @@ def least_squares(
     )
     rules = _Rules(most, decrease, step)
     waiting = together
-    active = _begin(problems, torch.arange(min(together, count)), found, lower, upper, damping)
+    active = _begin(problems, torch.arange(min(together, count)), solution, lower, upper, damping)
     while waiting < count or len(active.rows):
         room = together - len(active.rows)
         if waiting < count and 4 * room >= together:
             rows = torch.arange(waiting, min(waiting + room, count))
             waiting += room
-            fresh = _begin(problems, rows, found, lower, upper, damping)
+            fresh = _begin(problems, rows, solution, lower, upper, damping)
             active = _Active(*map(torch.cat, zip(active, fresh, strict=True)))
         if len(active.rows):
             ended = _advance(problems, rules, active)
-            done = (ended != GOES_ON).nonzero().squeeze(1)
-            if len(done):
-                _finish(problems, active.only(done), ended[done], found)
+            finished = (ended != GOES_ON).nonzero().squeeze(1)
+            if len(finished):
+                _finish(problems, active.only(finished), ended[finished], solution)
                 active = active.only((ended == GOES_ON).nonzero().squeeze(1))
-    return Solution(*(part.to(device) for part in found))
+    return Solution(*(part.to(device) for part in solution))
 
 
 def _require_box(start: Tensor, lower: Tensor, upper: Tensor) -> None:
@@ -224,16 +224,16 @@ def _require_box(start: Tensor, lower: Tensor, upper: Tensor) -> None:
     if bool(bad.any()):
         row = int(bad.nonzero()[0])
         raise ValueError(
-            f"problem {row} of the least squares starts at {start[row].tolist()} between {lower[row].tolist()} and "
-            f"{upper[row].tolist()}; wanted finite numbers, and lower bounds that are not above the upper ones."
+            f"Least-squares problem {row} starts at {start[row].tolist()} between the bounds {lower[row].tolist()} and "
+            f"{upper[row].tolist()}; expected finite numbers, and no lower bound above its upper bound."
         )
 
 
 def _begin(
-    problems: _Problems, rows: Tensor, found: Solution, lower: Tensor, upper: Tensor, damping: float
+    problems: _Problems, rows: Tensor, solution: Solution, lower: Tensor, upper: Tensor, damping: float
 ) -> _Active:
     """Return the problems at these rows at their start, without those that cannot be evaluated there."""
-    at = found.parameters[rows]
+    at = solution.parameters[rows]
     cost, gradient, gram = problems.normal(at, rows, first=True)
     active = _Active(
         rows=rows,
@@ -251,8 +251,8 @@ def _begin(
         quiet=torch.zeros_like(rows),
         steps=torch.zeros_like(rows),
     )
-    found.cost[rows] = cost.nan_to_num(torch.inf, torch.inf)
-    usable = problems.there[rows] > 0
+    solution.cost[rows] = cost.nan_to_num(torch.inf, torch.inf)
+    usable = problems.residual_counts[rows] > 0
     usable &= cost.isfinite() & gradient.isfinite().all(-1) & gram.isfinite().all(-1).all(-1)
     return active if bool(usable.all()) else active.only(usable)
 
@@ -264,7 +264,7 @@ def _advance(problems: _Problems, rules: _Rules, active: _Active) -> Tensor:
     cost, gradient, gram = problems.normal(tried, active.rows)
     ended, near = torch.empty_like(active.rows), torch.empty(len(tried), dtype=torch.bool)
     state = ("at", "cost", "gradient", "gram", "curve", "scale", "damping", "streak", "quiet", "steps")
-    compiled.judged(
+    compiled.judge_steps(
         *active.arrays(*state),
         *(part.numpy() for part in (*step, tried, cost, gradient.contiguous(), gram.contiguous())),
         *rules,
@@ -281,8 +281,8 @@ def _step(problems: _Problems, active: _Active) -> _Step:
     gain, slope, least = (torch.empty_like(active.cost) for _ in range(3))
     cut, careful = (torch.empty(len(gain), dtype=torch.bool) for _ in range(2))
     step = _Step(torch.empty_like(active.at), gain, slope, least, cut)
-    given = ("at", "lower", "upper", "cost", "gradient", "gram", "curve", "scale", "damping")
-    compiled.stepped(*active.arrays(*given), *(part.numpy() for part in (*step, careful)))
+    inputs = ("at", "lower", "upper", "cost", "gradient", "gram", "curve", "scale", "damping")
+    compiled.compute_steps(*active.arrays(*inputs), *(part.numpy() for part in (*step, careful)))
     if len(where := careful.nonzero().squeeze(1)):
         some = _Step(*(part[where] for part in step))
         for part, mended in zip(step, _careful_step(problems, active.only(where), some), strict=True):
@@ -292,62 +292,66 @@ def _step(problems: _Problems, active: _Active) -> _Step:
 
 def _careful_step(problems: _Problems, active: _Active, step: _Step) -> _Step:
     """Return the damped step from the singular values of the Jacobian, because JᵀJ has lost digits."""
-    held = (active.at <= active.lower) & (active.gradient >= 0)
-    held |= (active.at >= active.upper) & (active.gradient <= 0)
-    held |= active.gram.diagonal(dim1=-2, dim2=-1).sqrt() <= EPSILON * active.scale
+    fixed = (active.at <= active.lower) & (active.gradient >= 0)
+    fixed |= (active.at >= active.upper) & (active.gradient <= 0)
+    fixed |= active.gram.diagonal(dim1=-2, dim2=-1).sqrt() <= EPSILON * active.scale
     scale = active.scale.where(active.scale > 0, 1.0)
     below, above = (active.lower - active.at) * scale, (active.upper - active.at) * scale
-    residuals, jacobian = problems.written(active.at, active.rows)
+    residuals, jacobian = problems.residuals_and_jacobian(active.at, active.rows)
     jacobian = jacobian / scale.unsqueeze(-2)
 
     known, cut = torch.zeros_like(active.at), torch.zeros_like(step.cut)
-    move = _solved(jacobian, residuals, held, known, active.damping)
+    move = _solve_damped(jacobian, residuals, fixed, known, active.damping)
     for _ in range(CLIPS):
-        out = ((move < below) | (move > above)) & ~held
+        out = ((move < below) | (move > above)) & ~fixed
         some = out.any(-1).nonzero().squeeze(1)
         if not len(some):
             break
         known = torch.where(out, torch.minimum(torch.maximum(move, below), above), known)
-        held, cut[some] = held | out, True
-        system = (part[some] for part in (jacobian, residuals, held, known, active.damping))
-        move[some] = _solved(*system)
+        fixed, cut[some] = fixed | out, True
+        system = (part[some] for part in (jacobian, residuals, fixed, known, active.damping))
+        move[some] = _solve_damped(*system)
     move = torch.minimum(torch.maximum(move, below), above)
     after = residuals + torch.bmm(jacobian, move.unsqueeze(-1)).squeeze(-1)
     least = step.least.where(step.least >= SINGULAR**2, 0.0)
     return _Step(move / scale, active.cost - after.square().sum(-1) / 2, step.slope, least, cut)
 
 
-def _solved(jacobian: Tensor, residuals: Tensor, held: Tensor, known: Tensor, damping: Tensor) -> Tensor:
-    """Return the scaled step m that minimises |J m + r|² + damping |m|²; parameters in `held` move by `known`."""
+def _solve_damped(
+    jacobian: Tensor, residuals: Tensor, fixed: Tensor, known: Tensor, damping: Tensor
+) -> Tensor:
+    """Return the scaled step m that minimises |J m + r|² + damping |m|²; parameters in `fixed` move by `known`."""
     residuals = residuals + torch.bmm(jacobian, known.unsqueeze(-1)).squeeze(-1)
-    left, values, right = torch.linalg.svd(jacobian * ~held.unsqueeze(-2), full_matrices=False)
+    left, values, right = torch.linalg.svd(jacobian * ~fixed.unsqueeze(-2), full_matrices=False)
     values = values.where(values > EPSILON * values.amax(-1, keepdim=True), 0.0)
     shares = values / (values.square() + damping.unsqueeze(-1))
     shares = shares * torch.bmm(left.mT, residuals.unsqueeze(-1)).squeeze(-1)
-    return torch.where(held, known, -torch.bmm(right.mT, shares.unsqueeze(-1)).squeeze(-1))
+    return torch.where(fixed, known, -torch.bmm(right.mT, shares.unsqueeze(-1)).squeeze(-1))
 
 
-def _finish(problems: _Problems, active: _Active, status: Tensor, found: Solution) -> None:
+def _finish(problems: _Problems, active: _Active, status: Tensor, solution: Solution) -> None:
     """Store the results of problems that have ended, with their covariance and rank."""
     size = active.at.shape[-1]
     inverse, trace = torch.empty_like(active.gram), torch.empty_like(active.cost)
-    compiled.inverted(active.gram.numpy(), inverse.numpy(), trace.numpy())
+    compiled.invert(active.gram.numpy(), inverse.numpy(), trace.numpy())
     rank = torch.full_like(active.rows, size)
     # The trace is between 1/σ² and p/σ², with the smallest singular value σ.
     doubtful = (~(trace < DOUBTFUL)).nonzero().squeeze(1)
     if len(doubtful):
-        one = active.only(doubtful)
-        _, jacobian = problems.written(one.at, one.rows)
-        length = one.gram.diagonal(dim1=-2, dim2=-1).sqrt()
+        doubtful_problems = active.only(doubtful)
+        _, jacobian = problems.residuals_and_jacobian(doubtful_problems.at, doubtful_problems.rows)
+        length = doubtful_problems.gram.diagonal(dim1=-2, dim2=-1).sqrt()
         length = length.where(length > 0, 1.0)
         _, values, right = torch.linalg.svd(jacobian / length.unsqueeze(-2), full_matrices=False)
-        kept = values > ILL_CONDITIONED * values.amax(-1, keepdim=True)
-        spread = torch.where(kept, values.reciprocal(), 0.0).unsqueeze(-1) * right / length.unsqueeze(-2)
+        above_cutoff = values > ILL_CONDITIONED * values.amax(-1, keepdim=True)
+        spread = (
+            torch.where(above_cutoff, values.reciprocal(), 0.0).unsqueeze(-1) * right / length.unsqueeze(-2)
+        )
         inverse[doubtful] = spread.mT @ spread
-        rank[doubtful] = kept.sum(-1)
+        rank[doubtful] = above_cutoff.sum(-1)
     rows = active.rows
-    variance = 2 * active.cost / (problems.there[rows] - size).clamp(min=1)
-    found.parameters[rows], found.cost[rows] = active.at, active.cost
-    found.covariance[rows] = variance[:, None, None] * inverse
-    found.rank[rows], found.steps[rows] = rank, active.steps
-    found.status[rows] = torch.where((rank < size) & (status > 0), int(Status.ILL_POSED), status)
+    variance = 2 * active.cost / (problems.residual_counts[rows] - size).clamp(min=1)
+    solution.parameters[rows], solution.cost[rows] = active.at, active.cost
+    solution.covariance[rows] = variance[:, None, None] * inverse
+    solution.rank[rows], solution.steps[rows] = rank, active.steps
+    solution.status[rows] = torch.where((rank < size) & (status > 0), int(Status.ILL_POSED), status)

@@ -21,14 +21,14 @@ compiled = compiler(kernel_cache("spectra", [Path(__file__)]), fastmath={"reasso
 
 @compiled
 @no_type_check
-def lines(parameters, measured, offsets, centres, jacobian, residuals):
-    """Fill `jacobian` (p, offset) and `residuals` (offset,) of one spectrum, and return how many offsets were measured.
+def evaluate_lines(parameters, measured, offsets, centres, jacobian, residuals):
+    """Fill `jacobian` (p, offset) and `residuals` (offset,) of one spectrum, and return the number of measured offsets.
 
     Both are 0 where nothing was measured.
     """
     pools, size, count = centres.shape[0], parameters.shape[0], offsets.shape[0]
     shift = 2 * pools
-    there = 0
+    measured_count = 0
     residuals[:] = 1.0
     jacobian[shift] = 0.0
     for pool in range(pools):
@@ -56,13 +56,13 @@ def lines(parameters, measured, offsets, centres, jacobian, residuals):
             jacobian[:, index] = 0.0
         else:
             residuals[index] -= measured[index]
-            there += 1
-    return there
+            measured_count += 1
+    return measured_count
 
 
 @compiled
 @no_type_check
-def summed(parameters, rows, measured, offsets, centres, cost, gradient, gram, there):
+def compute_sums(parameters, rows, measured, offsets, centres, cost, gradient, gram, measured_counts):
     """Fill the sums over offsets of many spectra, with residuals r and their Jacobian J.
 
     They are half the sum of squared residuals (spectrum,), Jᵀr (spectrum, p), JᵀJ (spectrum, p, p), and the number of
@@ -70,41 +70,43 @@ def summed(parameters, rows, measured, offsets, centres, cost, gradient, gram, t
     """
     size = parameters.shape[1]
     jacobian, residuals = np.empty((size, offsets.shape[0])), np.empty(offsets.shape[0])
-    for one in range(parameters.shape[0]):
-        there[one] = lines(parameters[one], measured[rows[one]], offsets, centres, jacobian, residuals)
+    for spectrum in range(parameters.shape[0]):
+        measured_counts[spectrum] = evaluate_lines(
+            parameters[spectrum], measured[rows[spectrum]], offsets, centres, jacobian, residuals
+        )
         total = 0.0
         for index in range(residuals.shape[0]):
             total += residuals[index] * residuals[index]
-        cost[one] = total / 2
+        cost[spectrum] = total / 2
         for row in range(size):
             total = 0.0
             for index in range(residuals.shape[0]):
                 total += jacobian[row, index] * residuals[index]
-            gradient[one, row] = total
+            gradient[spectrum, row] = total
             for column in range(row + 1):
                 total = 0.0
                 for index in range(residuals.shape[0]):
                     total += jacobian[row, index] * jacobian[column, index]
-                gram[one, row, column] = gram[one, column, row] = total
+                gram[spectrum, row, column] = gram[spectrum, column, row] = total
 
 
 @compiled
 @no_type_check
-def curved(parameters, rows, measured, offsets, centres, curvature):
+def compute_curvature(parameters, rows, measured, offsets, centres, curvature):
     """Fill `curvature` with Σ residual ∇²Z (spectrum, p, p)."""
     pools, size, count = centres.shape[0], parameters.shape[1], offsets.shape[0]
     shift = 2 * pools
     jacobian, residuals = np.empty((size, count)), np.empty(count)
-    for one in range(parameters.shape[0]):
-        lines(parameters[one], measured[rows[one]], offsets, centres, jacobian, residuals)
-        curvature[one] = 0.0
+    for spectrum in range(parameters.shape[0]):
+        evaluate_lines(parameters[spectrum], measured[rows[spectrum]], offsets, centres, jacobian, residuals)
+        curvature[spectrum] = 0.0
         for pool in range(pools):
-            amplitude, half = parameters[one, pool], parameters[one, pools + pool] / 2
-            centre = parameters[one, shift]
+            amplitude, half = parameters[spectrum, pool], parameters[spectrum, pools + pool] / 2
+            centre = parameters[spectrum, shift]
             if size == shift + 1:
                 centre += centres[pool]
             elif pool > 0:
-                centre += parameters[one, shift + pool]
+                centre += parameters[spectrum, shift + pool]
             square = half * half
             # Sums of the residuals times powers of the distance d and of e = 1 / (h² + d²).
             e2 = de2 = dde2 = de3 = dde3 = 0.0
@@ -118,20 +120,22 @@ def curved(parameters, rows, measured, offsets, centres, curvature):
                 dde2 += second * distance * distance
                 de3 += third * distance
                 dde3 += third * distance * distance
-            both = -half * dde2  # amplitude and width
-            bent = amplitude * (4 * square * dde3 - dde2) / 2  # width twice
-            apart = -2 * square * de2  # amplitude and centre
-            wide = amplitude * half * (4 * square * de3 - 2 * de2)  # width and centre
-            moved = amplitude * square * (2 * e2 - 8 * dde3)  # centre twice
+            amplitude_width = -half * dde2  # amplitude and width
+            width_width = amplitude * (4 * square * dde3 - dde2) / 2  # width twice
+            amplitude_centre = -2 * square * de2  # amplitude and centre
+            width_centre = amplitude * half * (4 * square * de3 - 2 * de2)  # width and centre
+            centre_centre = amplitude * square * (2 * e2 - 8 * dde3)  # centre twice
             width = pools + pool
-            curvature[one, pool, width] = curvature[one, width, pool] = both
-            curvature[one, width, width] = bent
+            curvature[spectrum, pool, width] = curvature[spectrum, width, pool] = amplitude_width
+            curvature[spectrum, width, width] = width_width
             # The shift of water moves every centre; the centre of another pool moves that pool only.
             for place in (shift, shift + pool):
                 if place < size and (place == shift or size > shift + 1):
-                    curvature[one, pool, place] = curvature[one, place, pool] = apart
-                    curvature[one, width, place] = curvature[one, place, width] = wide
-            curvature[one, shift, shift] += moved
+                    curvature[spectrum, pool, place] = curvature[spectrum, place, pool] = amplitude_centre
+                    curvature[spectrum, width, place] = curvature[spectrum, place, width] = width_centre
+            curvature[spectrum, shift, shift] += centre_centre
             if size > shift + 1 and pool > 0:
                 own = shift + pool
-                curvature[one, own, own] = curvature[one, shift, own] = curvature[one, own, shift] = moved
+                curvature[spectrum, own, own] = curvature[spectrum, shift, own] = curvature[
+                    spectrum, own, shift
+                ] = centre_centre

@@ -46,16 +46,16 @@ class Fit(NamedTuple):
 def fit(
     measured: Float[Tensor, "spectrum offset"],
     offsets: Float[Tensor, "offset"],
-    wanted: Parameters,
+    parameter_set: Parameters,
     start: Float[Tensor, "spectrum p"] | None = None,
     most: int = 300,
 ) -> Fit:
     """Fit each spectrum by least squares, from the preset's start or a given one.
 
-    The covariance comes from the Jacobian J with the residuals' variance s², and from a box whose sides u - l say no
-    more than a uniform density does: (JᵀJ / s² + diag 12 / (u - l)²)⁻¹. If the data determine a parameter, the second
-    term is negligible. If they do not (a pool without amplitude has no width), the first term is, and the parameter may
-    be anywhere in its box.
+    The covariance comes from the Jacobian J with the residuals' variance s², and from a box whose sides u - l count
+    as much as a uniform density: (JᵀJ / s² + diag 12 / (u - l)²)⁻¹. If the data determine a parameter, the second
+    term is negligible. If they do not (a pool without amplitude has no width), the first term is negligible, and the
+    parameter may be anywhere in its box.
 
     If a pool has vanished (amplitude 0), it has no width that could lead the search back. Such spectra are fitted once
     more from another start, and the better fit is kept. The same is done for all spectra if centres are free and no
@@ -65,7 +65,7 @@ def fit(
     Args:
         measured: measured Z; NaN where nothing was measured.
         offsets: ppm.
-        wanted: the parameters to fit.
+        parameter_set: the parameters to fit.
         start: (spectrum, p), or without the parameters that are not targets.
         most: largest number of steps tried.
     """
@@ -73,13 +73,14 @@ def fit(
     measured = measured.detach().cpu().double().clamp(-CUT, CUT)
     offsets = offsets.to(measured)
     lower, upper, first, second = (
-        measured.new_tensor(side) for side in (wanted.lower, wanted.upper, wanted.start, wanted.elsewhere)
+        measured.new_tensor(side)
+        for side in (parameter_set.lower, parameter_set.upper, parameter_set.start, parameter_set.elsewhere)
     )
     begin, damping = first.expand(len(measured), -1), CAREFUL
     if start is not None:
-        given = start.detach().to(begin)
-        given = given.where(given.isfinite(), begin[:, : given.shape[1]])
-        begin, damping = torch.cat((given, begin[:, given.shape[1] :]), 1), BOLD
+        given_start = start.detach().to(begin)
+        given_start = given_start.where(given_start.isfinite(), begin[:, : given_start.shape[1]])
+        begin, damping = torch.cat((given_start, begin[:, given_start.shape[1] :]), 1), BOLD
 
     def search(measured: Tensor, begin: Tensor, damping: float) -> Solution:
         misfit = Misfit(measured, offsets)
@@ -95,17 +96,17 @@ def fit(
             damping=damping,
         )
 
-    found = search(measured, begin, damping)
-    parameters, cost, status = found.parameters, found.cost, found.status
+    solution = search(measured, begin, damping)
+    parameters, cost, status = solution.parameters, solution.cost, solution.status
     again = status == Status.ILL_POSED
-    if start is None and wanted.target_count > 2 * COUNT:
+    if start is None and parameter_set.target_count > 2 * COUNT:
         again = status != Status.NOT_FINITE
     if len(lost := again.nonzero().squeeze(1)):
         again = search(measured[lost], second.expand(len(lost), -1), CAREFUL)
         better = again.cost < cost[lost]
-        kept = lost[better]
-        parameters[kept], cost[kept] = again.parameters[better], again.cost[better]
-        status[kept] = again.status[better]
+        improved = lost[better]
+        parameters[improved], cost[improved] = again.parameters[better], again.cost[better]
+        status[improved] = again.status[better]
     root = _root(Misfit(measured, offsets), parameters, upper - lower)
     return Fit(*(part.to(device) for part in (parameters, root, cost, status)))
 
@@ -117,8 +118,8 @@ def _root(misfit: Misfit, parameters: Tensor, sides: Tensor) -> Tensor:
     """
     size = parameters.shape[1]
     rows = torch.arange(len(parameters))
-    cost, _, gram, there = misfit.normal(parameters, rows)
-    variance = (2 * cost / (there - size).clamp(min=1)).clamp(min=LEAST_SHARE**2)
+    cost, _, gram, measured_counts = misfit.normal(parameters, rows)
+    variance = (2 * cost / (measured_counts - size).clamp(min=1)).clamp(min=LEAST_SHARE**2)
     # The inverse covariance is A = Uᵀ U with a lower triangle U, so that U⁻¹ is the lower factor of A⁻¹.
     precision = gram * (sides.unsqueeze(-1) * sides) / variance[:, None, None]
     precision.diagonal(dim1=-2, dim2=-1).add_(12)
@@ -154,11 +155,16 @@ def _careful_root(
     return lower * lower.diagonal(dim1=-2, dim2=-1).sign().unsqueeze(-2)
 
 
-def density(found: Fit, told: int, shape: torch.Size | tuple[int, ...], zero: Tensor) -> Distribution:
+def density(
+    fitted: Fit, target_count: int, shape: torch.Size | tuple[int, ...], zero: Tensor
+) -> Distribution:
     """Return the Gaussian over the first `target_count` parameters.
 
     It has the type of `zero` (*shape, 1), which is added to its mean. The first rows of a lower Cholesky factor are the
     factor of the marginal.
     """
-    mean = found.parameters[:, :told].reshape(*shape, told).to(zero) + zero
-    return JointNormal(mean, found.root[:, :told, :told].reshape(*shape, told, told).to(zero))
+    mean = fitted.parameters[:, :target_count].reshape(*shape, target_count).to(zero) + zero
+    return JointNormal(
+        mean,
+        fitted.root[:, :target_count, :target_count].reshape(*shape, target_count, target_count).to(zero),
+    )

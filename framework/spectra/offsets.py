@@ -20,13 +20,15 @@ OFFSETS = (
 """Offsets in ppm, those of the spectra of the human brain at 7 T published with CESTEval (V. Khlebnikov, MIT)."""
 
 
-def offsets_of(wanted: Sequence[float] | None) -> tuple[float, ...]:
+def offsets_of(configured: Sequence[float] | None) -> tuple[float, ...]:
     """Return the offsets of a config; None means OFFSETS.
 
     Raises:
         DataError: there are fewer than two offsets, or they do not ascend.
     """
-    found = OFFSETS if wanted is None else tuple(map(float, wanted))
-    if len(found) < 2 or not np.all(np.diff(found) > 0):
-        raise DataError(f"offsets {list(found)}: wanted two or more, ascending, in ppm.")
-    return found
+    offsets = OFFSETS if configured is None else tuple(map(float, configured))
+    if len(offsets) < 2 or not np.all(np.diff(offsets) > 0):
+        raise DataError(
+            f"Got the offsets {list(offsets)}; expected two or more offsets, in ppm and ascending order."
+        )
+    return offsets

@@ -23,7 +23,7 @@ Preset = Literal["ten", "fifteen"]
 
 
 class Parameters(NamedTuple):
-    """The fitted parameters: names, box and start of the search, and how many of them are the target.
+    """The fitted parameters: names, box and start of the search, and the number of those that are the target.
 
     Attributes:
         names: with units; amplitudes are shares of the unsaturated signal.
@@ -142,22 +142,23 @@ class Misfit:
         p) are those of the residuals' Jacobian. The number of measured offsets is (batch,).
         """
         gram = parameters.new_empty(*parameters.shape, parameters.shape[1])
-        cost, gradient, there = (
+        cost, gradient, measured_counts = (
             gram.new_empty(len(gram)),
             torch.empty_like(parameters),
             torch.empty_like(rows),
         )
-        compiled.summed(
-            *self._arrays(parameters, rows), *(part.numpy() for part in (cost, gradient, gram, there))
+        compiled.compute_sums(
+            *self._arrays(parameters, rows),
+            *(part.numpy() for part in (cost, gradient, gram, measured_counts)),
         )
-        return cost, gradient, gram, there
+        return cost, gradient, gram, measured_counts
 
     def curvature(self, parameters: Tensor, rows: Tensor) -> Tensor:
         """Return Σ residual ∇²Z, (batch, p, p), on the processor."""
-        found = parameters.new_empty(*parameters.shape, parameters.shape[1])
-        compiled.curved(*self._arrays(parameters, rows), found.numpy())
-        return found
+        curvature = parameters.new_empty(*parameters.shape, parameters.shape[1])
+        compiled.compute_curvature(*self._arrays(parameters, rows), curvature.numpy())
+        return curvature
 
-    def _arrays(self, *given: Tensor) -> tuple[np.ndarray, ...]:
-        parameters, rows = (part.contiguous().numpy() for part in given)
+    def _arrays(self, *tensors: Tensor) -> tuple[np.ndarray, ...]:
+        parameters, rows = (tensor.contiguous().numpy() for tensor in tensors)
         return parameters, rows, self.measured.numpy(), self.offsets.numpy(), np.array(CENTRES)

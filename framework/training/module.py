@@ -111,9 +111,9 @@ class Training(pl.LightningModule):
         """Return the predictor's loss per sample; errors of the network become messages for the user."""
         try:
             return self.learner.loss(batch["input"], batch["target"])
-        except NonFiniteParameters:
+        except NonFiniteParameters as error:
             raise NonFiniteLoss(
-                f"After step {self.global_step} (epoch {self.current_epoch}) the network's {error} Earlier "
+                f"Training failed after step {self.global_step} (epoch {self.current_epoch}). {error} Earlier "
                 "checkpoints are kept. Lower optimizer.learning_rate, set trainer.gradient_clip_val, or train in "
                 "trainer.precision=32-true."
             ) from error

@@ -40,7 +40,7 @@ class Queries:
 
     Attributes:
         points: finite.
-        once: whether they are used for one batch alone, so that packing them well does not pay.
+        once: true if the queries are used for one batch only, so that packing them well takes longer than it saves.
     """
 
     points: Float[Tensor, "query 3"]
@@ -67,7 +67,7 @@ def prepare(queries: Tensor, once: bool = False) -> Queries:
         DataError: there is no query, or a coordinate is NaN or infinite.
     """
     queries = queries.detach().contiguous()
-    checked(queries[None], "queries")
+    require_points(queries[None], "queries")
     refuse_bad(queries[None], None, "queries")
     return Queries(queries, once)
 
@@ -96,21 +96,21 @@ def nearest(
     if isinstance(queries, Tensor) and not own:
         queries = prepare(queries, once=True)
     points = queries.points if isinstance(queries, Queries) else queries.detach()
-    checked(clouds, "clouds")
-    checked(points if own else points[None], "queries")
+    require_points(clouds, "clouds")
+    require_points(points if own else points[None], "queries")
     if points.dtype != clouds.dtype or points.device != clouds.device or (own and len(points) != len(clouds)):
         raise DataError(
-            f"Queries of shape {tuple(points.shape)}, {points.dtype} on {points.device} do not go with clouds of shape "
+            f"Queries of shape {tuple(points.shape)}, {points.dtype} on {points.device} do not fit clouds of shape "
             f"{tuple(clouds.shape)}, {clouds.dtype} on {clouds.device}. Give both the same type and device, "
             "and as many sets of queries as clouds, or one."
         )
     if query_sizes is not None and not own:
         raise DataError(
-            "query_sizes came with queries that all clouds share; they say how many queries each cloud has. "
-            "Leave them out, or give queries (batch, query, 3)."
+            "Got query_sizes with queries that all clouds share, but query_sizes are numbers of queries of each cloud. "
+            "Leave query_sizes out, or give queries (batch, query, 3)."
         )
-    sizes = counted(clouds, sizes, "clouds")
-    query_sizes = counted(points, query_sizes, "queries") if own else None
+    sizes = require_sizes(clouds, sizes, "clouds")
+    query_sizes = require_sizes(points, query_sizes, "queries") if own else None
     if len(clouds) == 0:
         return Nearest(clouds.new_empty(0, points.shape[-2]), clouds.new_empty(0, points.shape[-2]).long())
     if clouds.device.type == "cpu":
@@ -118,7 +118,7 @@ def nearest(
     return on_device(clouds, points, sizes, query_sizes)
 
 
-def checked(points: Tensor, name: str) -> None:
+def require_points(points: Tensor, name: str) -> None:
     """Check that points are (batch, points ≥ 1, 3) of float32 or float64.
 
     Raises:
@@ -126,14 +126,14 @@ def checked(points: Tensor, name: str) -> None:
     """
     if points.dim() != 3 or points.shape[2] != 3 or points.dtype not in (torch.float32, torch.float64):
         raise DataError(
-            f"{name} of shape {tuple(points.shape)} and type {points.dtype} came where coordinates x, y, z of "
-            "float32 or float64 are wanted. Take the first three columns and call .float()."
+            f"Got {name} of shape {tuple(points.shape)} and type {points.dtype}; expected coordinates x, y, z of "
+            "float32 or float64. Take the first three columns and call .float()."
         )
     if points.shape[1] == 0:
-        raise DataError(f"{name} of shape {tuple(points.shape)} hold no point; wanted one at least.")
+        raise DataError(f"{name} of shape {tuple(points.shape)} hold no point; expected at least one.")
 
 
-def counted(points: Tensor, sizes: Tensor | None, name: str) -> Tensor | None:
+def require_sizes(points: Tensor, sizes: Tensor | None, name: str) -> Tensor | None:
     """Return the sizes as int64 on the CPU.
 
     Raises:
@@ -144,14 +144,14 @@ def counted(points: Tensor, sizes: Tensor | None, name: str) -> Tensor | None:
     sizes = sizes.to("cpu", torch.int64)
     wrong = ((sizes < 1) | (sizes > points.shape[1])).nonzero()
     if len(sizes) != len(points) or len(wrong):
-        told = (
-            f"number {int(wrong[0])} has {int(sizes[wrong[0]])}"
+        fault = (
+            f"number {int(wrong[0])} has the size {int(sizes[wrong[0]])}"
             if len(wrong)
             else f"there are {len(sizes)} sizes"
         )
         raise DataError(
-            f"Of {len(points)} {name} of up to {points.shape[1]} points, {told}; wanted 1 to {points.shape[1]} for "
-            "each. Leave out what is empty."
+            f"Of {len(points)} {name} of up to {points.shape[1]} points, {fault}; expected a size from 1 to "
+            f"{points.shape[1]} for each. Leave out empty ones."
         )
     return sizes
 
@@ -168,8 +168,8 @@ def refuse_bad(points: Tensor, sizes: Tensor | None, name: str) -> None:
     if bad.any():
         cloud, point = bad.nonzero()[0].tolist()
         raise DataError(
-            f"{name}: point {point} of number {cloud} of the batch is {points[cloud, point].tolist()}; wanted finite "
-            "coordinates. Mend the file, drop such points, or give `sizes` so that padding is not read."
+            f"{name}: point {point} of number {cloud} of the batch is {points[cloud, point].tolist()}; expected "
+            "finite coordinates. Correct the file, remove such points, or give `sizes` so that padding is not read."
         )
 
 
@@ -182,15 +182,15 @@ def on_processor(
     shared = isinstance(queries, Queries)
     points = queries.points if isinstance(queries, Queries) else queries.detach().contiguous()
     clouds = clouds.contiguous()
-    answered = processor.answers(
+    results = processor.search_batch(
         clouds.numpy(),
         None if sizes is None else sizes.numpy(),
         queries.packed if isinstance(queries, Queries) else points.numpy(),
         None if query_sizes is None else query_sizes.numpy(),
         queries.largest if isinstance(queries, Queries) else 0.0,
     )
-    distance, index = torch.from_numpy(answered.distance), torch.from_numpy(answered.index)
-    for i, outcome in enumerate(answered.outcome.tolist() if answered.outcome.any() else ()):
+    distance, index = torch.from_numpy(results.distance), torch.from_numpy(results.index)
+    for i, outcome in enumerate(results.outcome.tolist() if results.outcome.any() else ()):
         if outcome == processor.BAD_CLOUD:
             refuse_bad(clouds, sizes, "clouds")
         elif outcome == processor.BAD_QUERIES:
@@ -200,10 +200,10 @@ def on_processor(
             some = some if query_sizes is None else some[: int(query_sizes[i])]
             cloud = clouds[i] if sizes is None else clouds[i, : int(sizes[i])]
             scale = scaling(cloud, some)
-            found = nearest(cloud[None] * scale, some * scale)
+            scaled_result = nearest(cloud[None] * scale, some * scale)
             distance[i, : len(some)], index[i, : len(some)] = (
-                unscaled(found.distance[0], scale, i),
-                found.index[0],
+                unscale(scaled_result.distance[0], scale, i),
+                scaled_result.index[0],
             )
     return Nearest(distance, index)
 
@@ -217,24 +217,24 @@ def on_device(clouds: Tensor, points: Tensor, sizes: Tensor | None, query_sizes:
         refuse_bad(points, query_sizes, "queries")
     distance, index = nearest_of(clouds, points, sizes, query_sizes)
     for i in distance.isinf().any(1).nonzero().flatten().tolist():
-        unscaled(distance[i], 1.0, i)
+        unscale(distance[i], 1.0, i)
     return Nearest(distance, index)
 
 
 def scaling(cloud: Tensor, queries: Tensor) -> float:
     """Return a power of two, by which multiplying is exact, that scales the largest coordinate to about 1.
 
-    If the dtype cannot hold such a power, the coordinate comes nearer to 1, and `nearest` then scales once more.
+    If the dtype cannot hold such a power, the coordinate only becomes closer to 1, and `nearest` then scales again.
     """
     largest = max(float(cloud.abs().max()), float(queries.abs().max()))
     return 2.0 ** max(-MOST[cloud.dtype], min(MOST[cloud.dtype], -math.frexp(largest)[1]))
 
 
-def unscaled(distance: Tensor, scale: float, cloud: int) -> Tensor:
+def unscale(distance: Tensor, scale: float, cloud: int) -> Tensor:
     """Return distances divided by the scale.
 
     Raises:
-        DataError: the dtype cannot hold one.
+        DataError: the dtype cannot hold a distance.
     """
     distance = distance / scale
     if not distance.isfinite().all():
@@ -259,20 +259,20 @@ def chamfer(
         DataError: as `nearest`; or the dtype cannot hold the mean of the squares: it is too large, or too small and not
             0.
     """
-    there, back = offsets(a, b, sizes_a, sizes_b), offsets(b, a, sizes_b, sizes_a)
-    found = mean_square(there, sizes_a) + mean_square(back, sizes_b)
-    apart = there.detach().any(2).any(1) | back.detach().any(2).any(1)
-    lost = ~found.detach().isfinite() | ((found.detach() == 0) & apart)
+    forward_offsets, backward_offsets = offsets(a, b, sizes_a, sizes_b), offsets(b, a, sizes_b, sizes_a)
+    distance = mean_square(forward_offsets, sizes_a) + mean_square(backward_offsets, sizes_b)
+    are_different = forward_offsets.detach().any(2).any(1) | backward_offsets.detach().any(2).any(1)
+    lost = ~distance.detach().isfinite() | ((distance.detach() == 0) & are_different)
     if lost.any():
         cloud = int(lost.nonzero()[0])
         lies, unit = (
-            ("near each other", "smaller") if found[cloud] == 0 else ("far from each other", "larger")
+            ("near each other", "smaller") if distance[cloud] == 0 else ("far from each other", "larger")
         )
         raise DataError(
             f"Clouds {cloud} of the batch lie so {lies} that {a.dtype} cannot hold their mean squared distance. Use "
             f"float64 or a {unit} unit."
         )
-    return found
+    return distance
 
 
 def offsets(
@@ -283,8 +283,8 @@ def offsets(
     real = None if query_sizes is None else point_mask(queries, query_sizes)[..., None]
     if real is not None:
         queries = queries.where(real, 0)  # before anything is subtracted: NaN × 0 is no gradient
-    found = queries - clouds.gather(1, index[..., None].expand(-1, -1, 3))
-    return found if real is None else found.where(real, 0)
+    vectors = queries - clouds.gather(1, index[..., None].expand(-1, -1, 3))
+    return vectors if real is None else vectors.where(real, 0)
 
 
 def mean_square(offsets: Float[Tensor, "batch query 3"], sizes: Tensor | None) -> Float[Tensor, "batch"]:
@@ -294,7 +294,7 @@ def mean_square(offsets: Float[Tensor, "batch query 3"], sizes: Tensor | None) -
 
 
 class MeanSquare(torch.autograd.Function):
-    """Mean of the squares of offsets, in units of the largest, so that only a mean that the dtype cannot hold is lost.
+    """Mean of the squared lengths of offsets, computed in units of the largest, so that no square over- or underflows.
 
     A unit is a power of two, by which multiplying is exact. The derivative is that of the formula, since a chain of the
     single steps would multiply by the square of the unit, which the dtype may not hold.

@@ -24,7 +24,7 @@ def inlined(function: Callable[..., Any]) -> Any:
 
 @intrinsic
 @no_type_check
-def taken_from(typing, counter, number):
+def fetch_and_add(typing, counter, number):
     """Return counter[0], an int64, and add the number atomically, so that several threads get different values."""
 
     def generate(context, builder, sig, values):

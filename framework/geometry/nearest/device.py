@@ -26,34 +26,34 @@ def nearest_of(
     chosen.
     """
     batch, points, _ = clouds.shape
-    asked = queries.shape[-2]
+    query_count = queries.shape[-2]
     if queries.dim() == 2:
         queries = queries.expand(batch, -1, -1)
     # division by a power of two is exact, and no square over- or underflows afterwards
-    real, asking = point_mask(clouds, sizes), point_mask(queries, query_sizes)
-    clouds, queries = clouds.where(real[..., None], 0), queries.where(asking[..., None], 0)
+    real_points, real_queries = point_mask(clouds, sizes), point_mask(queries, query_sizes)
+    clouds, queries = clouds.where(real_points[..., None], 0), queries.where(real_queries[..., None], 0)
     largest = torch.maximum(clouds.abs().amax((1, 2)), queries.abs().amax((1, 2)))
     exponent = torch.frexp(largest).exponent.clamp(-MOST[clouds.dtype], MOST[clouds.dtype])
     clouds = torch.ldexp(clouds, -exponent[:, None, None])
     queries = torch.ldexp(queries, -exponent[:, None, None])
 
-    distance = clouds.new_empty(batch, asked)
-    index = torch.empty(batch, asked, dtype=torch.int64, device=clouds.device)
+    distance = clouds.new_empty(batch, query_count)
+    index = torch.empty(batch, query_count, dtype=torch.int64, device=clouds.device)
     # the batch is cut first, then the queries; points are cut only if they exceed `pairs`
     cut_points = min(points, pairs)
-    cut_queries = max(1, min(asked, pairs // cut_points))
+    cut_queries = max(1, min(query_count, pairs // cut_points))
     cut_batch = max(1, min(batch, pairs // (cut_points * cut_queries)))
     for b in range(0, batch, cut_batch):
-        for q in range(0, asked, cut_queries):
-            some = queries[b : b + cut_batch, q : q + cut_queries]
-            best = some.new_full(some.shape[:2], torch.inf)
+        for q in range(0, query_count, cut_queries):
+            query_piece = queries[b : b + cut_batch, q : q + cut_queries]
+            best = query_piece.new_full(query_piece.shape[:2], torch.inf)
             which = torch.zeros_like(best, dtype=torch.int64)
             for p in range(0, points, cut_points):
-                piece = clouds[b : b + cut_batch, p : p + cut_points]
-                square = (some[:, :, None, 0] - piece[:, None, :, 0]).square_()
-                square += (some[:, :, None, 1] - piece[:, None, :, 1]).square_()
-                square += (some[:, :, None, 2] - piece[:, None, :, 2]).square_()
-                square.masked_fill_(~real[b : b + cut_batch, None, p : p + cut_points], torch.inf)
+                cloud_piece = clouds[b : b + cut_batch, p : p + cut_points]
+                square = (query_piece[:, :, None, 0] - cloud_piece[:, None, :, 0]).square_()
+                square += (query_piece[:, :, None, 1] - cloud_piece[:, None, :, 1]).square_()
+                square += (query_piece[:, :, None, 2] - cloud_piece[:, None, :, 2]).square_()
+                square.masked_fill_(~real_points[b : b + cut_batch, None, p : p + cut_points], torch.inf)
                 least = square.argmin(2)  # the first of equal ones
                 square = square.gather(2, least[..., None])[..., 0]
                 nearer = square < best
@@ -61,4 +61,4 @@ def nearest_of(
             distance[b : b + cut_batch, q : q + cut_queries] = best.sqrt()
             index[b : b + cut_batch, q : q + cut_queries] = which
     distance = torch.ldexp(distance, exponent[:, None])
-    return distance.where(asking, torch.nan), index.where(asking, 0)
+    return distance.where(real_queries, torch.nan), index.where(real_queries, 0)

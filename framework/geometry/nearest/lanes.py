@@ -172,8 +172,8 @@ def splat(typing, number):
     def generate(context, builder, sig, values):
         vector = context.get_value_type(sig.return_type)
         empty = ir.Constant(vector, ir.Undefined)
-        one = builder.insert_element(empty, values[0], ir.Constant(INT32, 0))
-        return builder.shuffle_vector(one, empty, places([0] * LANES))
+        with_number = builder.insert_element(empty, values[0], ir.Constant(INT32, 0))
+        return builder.shuffle_vector(with_number, empty, places([0] * LANES))
 
     return Lanes(number)(number), generate
 
@@ -321,11 +321,11 @@ def loaded(array, stride, parts, count=LANES):
         if stride == 1:
             return value
         empty = ir.Constant(line, ir.Undefined)
-        taken = [
+        vectors = [
             builder.shuffle_vector(value, empty, places([stride * i + part for i in range(count)]))
             for part in range(parts)
         ]
-        return context.make_tuple(builder, sig.return_type, taken)
+        return context.make_tuple(builder, sig.return_type, vectors)
 
     result = vector if stride == 1 else types.UniTuple(vector, parts)
     return result(array, types.intp), generate

@@ -220,10 +220,10 @@ def histogram(cloud, box, bits, begin, end, key, count):
 @compiled
 @no_type_check
 def places(count, bits, cells, crowded):
-    """Replace the counts (threads, cells) by the position of each cell's first point; return how many are crowded."""
+    """Replace the counts (threads, cells) by the position of each cell's first point; return the number of crowded cells."""
     start = (8**bits - 8) // 7
     place = np.int32(0)
-    found = 0
+    crowded_count = 0
     for i in range(8**bits):
         cell = take(cells, start + i)
         before = place
@@ -232,10 +232,10 @@ def places(count, bits, cells, crowded):
             count[thread, cell] = place
             place += points
         if place - before > CROWD:
-            crowded[2 * found] = before
-            crowded[2 * found + 1] = place
-            found += 1
-    return found
+            crowded[2 * crowded_count] = before
+            crowded[2 * crowded_count + 1] = place
+            crowded_count += 1
+    return crowded_count
 
 
 @compiled
@@ -257,17 +257,17 @@ def scatter(cloud, size, begin, end, key, count, points, ids):
 
 @compiled
 @no_type_check
-def sort_crowded(points, crowded, found, cells):
+def sort_crowded(points, crowded, crowded_count, cells):
     """Sort the records of crowded cells by grids of their own, and those of cells that are crowded there."""
     largest = 0
-    for i in range(found):
+    for i in range(crowded_count):
         largest = max(largest, crowded[2 * i + 1] - crowded[2 * i])
     spare = np.empty(4 * largest, points.dtype)
     key = np.empty(largest, np.int32)
     count = np.empty(8 ** cell_bits(largest), np.int32)
-    while found > 0:  # ranges do not overlap, so that `crowded` has room for all
-        found -= 1
-        begin, end = crowded[2 * found], crowded[2 * found + 1]
+    while crowded_count > 0:  # ranges do not overlap, so that `crowded` has room for all
+        crowded_count -= 1
+        begin, end = crowded[2 * crowded_count], crowded[2 * crowded_count + 1]
         low = load4(points, 4 * begin)
         high = low
         for i in range(begin + 1, end):
@@ -294,9 +294,9 @@ def sort_crowded(points, crowded, found, cells):
             number = count[cell]
             count[cell] = place
             if number > CROWD:
-                crowded[2 * found] = place
-                crowded[2 * found + 1] = place + number
-                found += 1
+                crowded[2 * crowded_count] = place
+                crowded[2 * crowded_count + 1] = place + number
+                crowded_count += 1
             place += number
         for i in range(end - begin):
             cell = key[i]
@@ -364,9 +364,9 @@ def pack(cloud, size, box, cells, bench, packed):
     bits = cell_bits(size)
     count = bench.count[:1]
     histogram(cloud, box, bits, 0, size, bench.key, count[0])
-    found = places(count, bits, cells, bench.crowded)
+    crowded_count = places(count, bits, cells, bench.crowded)
     scatter(cloud, size, 0, size, bench.key, count[0], packed.points, packed.ids)
-    if found > 0:
-        sort_crowded(packed.points, bench.crowded, found, cells)
+    if crowded_count > 0:
+        sort_crowded(packed.points, bench.crowded, crowded_count, cells)
     box_leaves(packed, size, 0, (size + 15) // 16)
     box_nodes(packed, size)

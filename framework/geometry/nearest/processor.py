@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from framework.geometry.nearest.compiled import compiled, taken_from
+from framework.geometry.nearest.compiled import compiled, fetch_and_add
 from framework.geometry.nearest.lanes import LANES
 from framework.geometry.nearest.pack import (
     BITS,
@@ -33,9 +33,9 @@ from framework.storage.threads import POOL
 
 Array = NDArray[np.floating]
 FINE, BAD_CLOUD, BAD_QUERIES, IMMODERATE = 0, 1, 2, 3
-"""Outcome of a cloud: answered; a number is not finite, in it or in its queries; must be scaled first."""
-ASKED = 17
-"""Index in `levels` at which packed queries keep their number."""
+"""Outcome of a cloud: searched; a number of the cloud is not finite; one of its queries is not; must be scaled first."""
+QUERY_COUNT = 17
+"""Index in `levels` at which packed queries store their number."""
 LARGE = 2**15
 """Number of points or queries from which one cloud is shared by several threads."""
 TURNS = 16
@@ -70,7 +70,7 @@ class Problem(NamedTuple):
 @compiled
 @no_type_check
 def worth_packing(size, packets):
-    """Return whether packing a cloud pays, by measurement.
+    """Return true if a cloud is searched faster after it is packed, as measured.
 
     Packing a cloud costs as much as comparing it with three packets, a search as much as some hundred points.
     """
@@ -89,7 +89,7 @@ def largest_of(box):
 
 @compiled
 @no_type_check
-def answer(problem, begin, end, cells, work, packed, own):
+def search_clouds(problem, begin, end, cells, work, packed, own):
     """Search clouds begin…end of a batch, one after the other."""
     shared = problem.query_sizes.shape[0] == 0
     box = np.empty(6, problem.clouds.dtype)
@@ -125,25 +125,25 @@ def answer(problem, begin, end, cells, work, packed, own):
 
 @compiled
 @no_type_check
-def answer_share(problem, taken, step, limit, cells, work, packed, own):
-    """Search one thread's part of a batch: `step` clouds in turn, until it has done `limit` or none are left."""
+def search_clouds_share(problem, counter, step, limit, cells, work, packed, own):
+    """Search one thread's part of a batch: `step` clouds at a time, until `limit` clouds are searched or none are left."""
     batch = problem.sizes.shape[0]
-    answered = 0
-    while answered < limit:
-        begin = taken_from(taken, step)
+    searched = 0
+    while searched < limit:
+        begin = fetch_and_add(counter, step)
         if begin >= batch:
             return
-        answer(problem, begin, min(batch, begin + step), cells, work, packed, own)
-        answered += step
+        search_clouds(problem, begin, min(batch, begin + step), cells, work, packed, own)
+        searched += step
 
 
 @compiled
 @no_type_check
-def search_share(packed, packets, taken, step, distance, index):
-    """Search one thread's part of the packets: `step` packets in turn, until none are left."""
+def search_share(packed, packets, counter, step, distance, index):
+    """Search one thread's part of the packets: `step` packets at a time, until none are left."""
     number = packets.levels[8]
     while True:
-        begin = taken_from(taken, step)
+        begin = fetch_and_add(counter, step)
         if begin >= number:
             return
         search(packed, packets, begin, min(number, begin + step), distance, index)
@@ -151,11 +151,11 @@ def search_share(packed, packets, taken, step, distance, index):
 
 @compiled
 @no_type_check
-def search_all_share(cloud, size, packets, taken, step, distance, index):
+def search_all_share(cloud, size, packets, counter, step, distance, index):
     """Search one thread's part of the packets in a cloud that is not packed."""
     number = packets.levels[8]
     while True:
-        begin = taken_from(taken, step)
+        begin = fetch_and_add(counter, step)
         if begin >= number:
             return
         search_all(cloud, size, packets, begin, min(number, begin + step), distance, index)
@@ -176,7 +176,7 @@ def packed_once(points: Array) -> Packed:
         return packed_well(points)
     packed = room(size, points.dtype)
     pack(flat, size, box, curves(cell_bits(size)), bench(size), packed)
-    packed.levels[ASKED] = size
+    packed.levels[QUERY_COUNT] = size
     return packed
 
 
@@ -202,7 +202,7 @@ def packed_well(points: Array) -> Packed:
     box = packed.box.reshape(6, -1)
     box[:3, : len(order)] = blocks[:, :3].min(2).T
     box[3:, : len(order)] = blocks[:, :3].max(2).T
-    packed.levels[8], packed.levels[ASKED] = len(order), len(points)
+    packed.levels[8], packed.levels[QUERY_COUNT] = len(order), len(points)
     return packed
 
 
@@ -210,27 +210,27 @@ UNUSED = {dtype.itemsize: room(1, dtype) for dtype in (np.dtype(np.float32), np.
 
 
 class Desks(local):
-    """Working memory of each thread; that for small clouds is kept, since allocating it takes as long as the search."""
+    """Working memory of each thread; memory for small clouds is reused, since allocating takes as long as searching."""
 
     def __init__(self) -> None:
-        self.kept: dict[tuple[int, int, np.dtype], tuple[Bench, Packed, Packed]] = {}
+        self.cached: dict[tuple[int, int, np.dtype], tuple[Bench, Packed, Packed]] = {}
 
     def of(self, points: int, queries: int, dtype: np.dtype) -> tuple[Bench, Packed, Packed]:
         """Return memory for clouds of up to `points` points, with up to `queries` queries of their own."""
         key = points, queries, dtype
-        if key in self.kept:
-            return self.kept[key]
+        if key in self.cached:
+            return self.cached[key]
         own = room(queries, dtype) if queries else UNUSED[dtype.itemsize]
-        made = bench(max(points, queries)), room(points, dtype), own
+        memory = bench(max(points, queries)), room(points, dtype), own
         if max(points, queries) < LARGE:
-            self.kept = {key: made}  # at most one entry
-        return made
+            self.cached = {key: memory}  # at most one entry
+        return memory
 
 
 DESKS = Desks()
 
 
-class Answers(NamedTuple):
+class Results(NamedTuple):
     """Distance and index (batch, queries), NaN and 0 for absent queries; outcome (batch,), one of the four."""
 
     distance: Array
@@ -238,64 +238,66 @@ class Answers(NamedTuple):
     outcome: NDArray[np.int64]
 
 
-def answers(
+def search_batch(
     clouds: Array,
     sizes: NDArray[np.int64] | None,
     queries: Array | Packed,
     query_sizes: NDArray[np.int64] | None,
     largest: float,
-) -> Answers:
+) -> Results:
     """Return nearest points of clouds (batch, points, 3) to packed queries, or to queries (batch, queries, 3).
 
     All arrays are contiguous. `largest` is the largest coordinate of packed queries.
     """
     batch, points, _ = clouds.shape
     shared = isinstance(queries, Packed)
-    asked = int(queries.levels[ASKED]) if isinstance(queries, Packed) else queries.shape[1]
-    distance = np.empty((batch, asked), clouds.dtype)
-    index = np.empty((batch, asked), np.int64)
+    query_count = int(queries.levels[QUERY_COUNT]) if isinstance(queries, Packed) else queries.shape[1]
+    distance = np.empty((batch, query_count), clouds.dtype)
+    index = np.empty((batch, query_count), np.int64)
     if query_sizes is not None:
         distance.fill(np.nan)
         index.fill(0)
-    found = Answers(distance, index, np.zeros(batch, np.int64))
+    results = Results(distance, index, np.zeros(batch, np.int64))
     all_points, all_queries = np.empty(batch, np.int64), np.empty(0 if shared else batch, np.int64)
     all_points.fill(points)
-    all_queries.fill(asked)
+    all_queries.fill(query_count)
     nothing = np.empty((0, 0), clouds.dtype)
     problem = Problem(
         clouds=clouds.reshape(batch, 3 * points),
         sizes=all_points if sizes is None else sizes,
-        queries=nothing if isinstance(queries, Packed) else queries.reshape(batch, 3 * asked),
+        queries=nothing if isinstance(queries, Packed) else queries.reshape(batch, 3 * query_count),
         query_sizes=all_queries if query_sizes is None else query_sizes,
         packets=queries if isinstance(queries, Packed) else UNUSED[clouds.itemsize],
         moderate=MODERATE[clouds.itemsize],
         largest=largest,
-        distance=found.distance,
-        index=found.index,
-        outcome=found.outcome,
+        distance=results.distance,
+        index=results.index,
+        outcome=results.outcome,
     )
     threads = torch.get_num_threads()
-    widest = max(points, 1 if shared else asked)
+    widest = max(points, 1 if shared else query_count)
     cells = curves(cell_bits(widest))
-    if batch < threads and max(points, asked) >= LARGE and shared:
+    if batch < threads and max(points, query_count) >= LARGE and shared:
         for i in range(batch):
             solve_one(problem, i, cells, threads)
-        return found
-    threads = 1 if points * asked * batch < 2**20 else min(threads, batch)  # starting a thread takes as long
-    limit = max(1, AT_ONCE // (points + asked))
+        return results
+    threads = (
+        1 if points * query_count * batch < 2**20 else min(threads, batch)
+    )  # starting a thread takes as long
+    limit = max(1, AT_ONCE // (points + query_count))
     step = min(limit, max(1, batch // (TURNS * threads)))
-    taken = np.zeros(1, np.int64)
+    counter = np.zeros(1, np.int64)
 
     def share(_: int) -> None:
-        mine = DESKS.of(points, 0 if shared else asked, clouds.dtype)
-        while taken[0] < batch:
-            answer_share(problem, taken, step, limit, cells, *mine)
+        own_memory = DESKS.of(points, 0 if shared else query_count, clouds.dtype)
+        while counter[0] < batch:
+            search_clouds_share(problem, counter, step, limit, cells, *own_memory)
 
     try:
         POOL.run(share, threads)
     finally:
-        taken[0] = batch  # if this thread was interrupted, the others stop too
-    return found
+        counter[0] = batch  # if this thread was interrupted, the others stop too
+    return results
 
 
 def solve_one(problem: Problem, i: int, cells: NDArray[np.int32], threads: int) -> None:
@@ -315,13 +317,15 @@ def solve_one(problem: Problem, i: int, cells: NDArray[np.int32], threads: int) 
     if packed is not None:
         pack_together(cloud, size, box, cells, packed, threads)
     step = max(1, number // (TURNS * threads))
-    taken = np.zeros(1, np.int64)
+    counter = np.zeros(1, np.int64)
 
     def share(_: int) -> None:
         if packed is None:
-            search_all_share(cloud, size, problem.packets, taken, step, problem.distance[i], problem.index[i])
+            search_all_share(
+                cloud, size, problem.packets, counter, step, problem.distance[i], problem.index[i]
+            )
         else:
-            search_share(packed, problem.packets, taken, step, problem.distance[i], problem.index[i])
+            search_share(packed, problem.packets, counter, step, problem.distance[i], problem.index[i])
 
     POOL.run(share, threads)
     problem.outcome[i] = FINE
@@ -354,12 +358,12 @@ def pack_together(
         return LANES * cuts[thread], min(size, LANES * cuts[thread + 1])
 
     POOL.run(lambda t: histogram(cloud, box, bits, *shares(t), work.key, work.count[t]), threads)
-    found = places(work.count, bits, cells, work.crowded)
+    crowded_count = places(work.count, bits, cells, work.crowded)
     POOL.run(
         lambda t: scatter(cloud, size, *shares(t), work.key, work.count[t], packed.points, packed.ids),
         threads,
     )
-    if found > 0:
-        sort_crowded(packed.points, work.crowded, found, cells)
+    if crowded_count > 0:
+        sort_crowded(packed.points, work.crowded, crowded_count, cells)
     POOL.run(lambda t: box_leaves(packed, size, cuts[t], cuts[t + 1]), threads)
     box_nodes(packed, size)

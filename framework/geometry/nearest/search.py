@@ -109,7 +109,7 @@ def children(level, node, levels):
 @inlined
 @no_type_check
 def nearest_bit(open_, gaps, at):
-    """Return which of the open children is nearest, and its distance; `gaps` holds those of the 16 from `at` on."""
+    """Return the index of the nearest open child, and its distance; `gaps` holds the distances of all 16 from `at` on."""
     gap = where(mask(open_), load(gaps, at), splat(gaps.dtype.type(np.inf)))
     nearest = lowest(gap)
     return first(bits(gap == splat(nearest)) & open_), nearest
@@ -173,16 +173,16 @@ def lowest_id(packed, x, y, z, best, number):
         height -= 1
         level, node = stack[height, 0], stack[height, 1]
         if level < 0:
-            found = bits(to_leaf(points, node, qx, qy, qz) == splat(best))
-            while found != 0:
-                number = min(number, np.int64(take(ids, 64 * node + 48 + first(found))))
-                found &= found - 1
+            open_bits = bits(to_leaf(points, node, qx, qy, qz) == splat(best))
+            while open_bits != 0:
+                number = min(number, np.int64(take(ids, 64 * node + 48 + first(open_bits))))
+                open_bits &= open_bits - 1
             continue
         start, valid = children(level, node, levels)
-        found = bits(to_boxes(box, nodes, start, (qx, qy, qz), (qx, qy, qz), zero) <= splat(best)) & valid
-        while found != 0:
-            child = first(found)
-            found &= found - 1
+        open_bits = bits(to_boxes(box, nodes, start, (qx, qy, qz), (qx, qy, qz), zero) <= splat(best)) & valid
+        while open_bits != 0:
+            child = first(open_bits)
+            open_bits &= open_bits - 1
             if low[start + child] < number:
                 stack[height, 0], stack[height, 1] = level - 1, 16 * node + child
                 height += 1
@@ -195,14 +195,14 @@ def open_node(box, nodes, start, valid, low, high, query, best, worst, near, at)
     """Store the squared distances of children from each query; return a bit for each child to be searched."""
     zero = splat(box.dtype.type(0))
     close = bits(to_boxes(box, nodes, start, low, high, zero) <= splat(worst)) & valid
-    kept = 0
+    needed = 0
     while close != 0:
         child = first(close)
         close &= close - 1
         gap = to_box(box, nodes, start + child, query, zero)
         store(near, at + 16 * child, gap)
-        kept |= np.int64(bits(gap <= best) != 0) << child
-    return kept
+        needed |= np.int64(bits(gap <= best) != 0) << child
+    return needed
 
 
 @compiled
@@ -219,10 +219,14 @@ def search(packed, packets, begin, end, distance, index):
     near = np.empty(8 * 256, box.dtype)  # of a node's 16 children from 16 queries, at each level
     opened, opened_alone = np.empty(16, np.int64), np.empty(16, np.int64)
     gaps = np.empty(8 * LANES, box.dtype)
-    guess = np.zeros(16, np.int64)  # places of points, from the packet before
+    guess = np.zeros(16, np.int64)  # positions of points, from the packet before
     for packet in range(begin, end):
-        here = 64 * packet
-        query = (load(queries, here), load(queries, here + 16), load(queries, here + 32))
+        packet_start = 64 * packet
+        query = (
+            load(queries, packet_start),
+            load(queries, packet_start + 16),
+            load(queries, packet_start + 32),
+        )
         low = (
             splat(take(packets.box, packet)),
             splat(take(packets.box, sides + packet)),
@@ -275,13 +279,13 @@ def search(packed, packets, begin, end, distance, index):
                 while busy != 0:
                     i = first(busy)
                     busy &= busy - 1
-                    one = (
-                        take(queries, here + i),
-                        take(queries, here + i + 16),
-                        take(queries, here + i + 32),
+                    lane_query = (
+                        take(queries, packet_start + i),
+                        take(queries, packet_start + i + 16),
+                        take(queries, packet_start + i + 32),
                     )
                     bests[i], leaves[i], again = alone(
-                        packed, level - 1, node, one, bests[i], np.int64(leaves[i]), opened_alone, gaps
+                        packed, level - 1, node, lane_query, bests[i], np.int64(leaves[i]), opened_alone, gaps
                     )
                     ties |= np.int64(again) << i
                 best, leaf = load(bests, 0), load(leaves, 0)
@@ -296,12 +300,12 @@ def search(packed, packets, begin, end, distance, index):
                         i = first(busy)
                         busy &= busy - 1
                         x, y, z = (
-                            take(queries, here + i),
-                            take(queries, here + i + 16),
-                            take(queries, here + i + 32),
+                            take(queries, packet_start + i),
+                            take(queries, packet_start + i + 16),
+                            take(queries, packet_start + i + 32),
                         )
-                        one = lowest(to_leaf(points, node, splat(x), splat(y), splat(z)))
-                        gap = where(mask(np.int64(1) << i), splat(one), gap)
+                        leaf_distance = lowest(to_leaf(points, node, splat(x), splat(y), splat(z)))
+                        gap = where(mask(np.int64(1) << i), splat(leaf_distance), gap)
                 this = splat(np.int32(node))
                 tie = tie | ((gap == best) & (leaf != this))
                 leaf = where(gap < best, this, leaf)  # no branch, since it could not be predicted
@@ -312,13 +316,17 @@ def search(packed, packets, begin, end, distance, index):
         store(leaves, 0, leaf)
         for i in range(16):
             node = np.int64(leaves[i])
-            x, y, z = take(queries, here + i), take(queries, here + i + 16), take(queries, here + i + 32)
-            found = bits(to_leaf(points, node, splat(x), splat(y), splat(z)) == splat(bests[i]))
-            guess[i] = 16 * node + first(found)
-            number = np.int64(take(ids, 64 * node + 48 + first(found)))
-            if found & (found - 1) != 0 or (ties >> i) & 1 != 0:
+            x, y, z = (
+                take(queries, packet_start + i),
+                take(queries, packet_start + i + 16),
+                take(queries, packet_start + i + 32),
+            )
+            nearest_bits = bits(to_leaf(points, node, splat(x), splat(y), splat(z)) == splat(bests[i]))
+            guess[i] = 16 * node + first(nearest_bits)
+            number = np.int64(take(ids, 64 * node + 48 + first(nearest_bits)))
+            if nearest_bits & (nearest_bits - 1) != 0 or (ties >> i) & 1 != 0:
                 number = lowest_id(packed, x, y, z, bests[i], number)
-            place = take(packets.ids, here + 48 + i)
+            place = take(packets.ids, packet_start + 48 + i)
             distance[place] = np.sqrt(bests[i])
             index[place] = number
 
@@ -337,8 +345,12 @@ def search_all(cloud, size, packets, begin, end, distance, index):
         for axis in range(3):
             tail[3 * i + axis] = cloud[3 * min(16 * (blocks - 1) + i, size - 1) + axis]
     for packet in range(begin, end):
-        here = 64 * packet
-        x, y, z = load(queries, here), load(queries, here + 16), load(queries, here + 32)
+        packet_start = 64 * packet
+        x, y, z = (
+            load(queries, packet_start),
+            load(queries, packet_start + 16),
+            load(queries, packet_start + 32),
+        )
         best, leaf = splat(cloud.dtype.type(np.inf)), splat(np.int32(0))
         for block in range(blocks):
             from_, at = (cloud, 48 * block) if block < blocks - 1 else (tail, 0)
@@ -358,9 +370,13 @@ def search_all(cloud, size, packets, begin, end, distance, index):
             block = np.int64(lane(leaf, i))
             from_, at = (cloud, 48 * block) if block < blocks - 1 else (tail, 0)
             a, b, c = load_triples(from_, at)
-            qx, qy, qz = take(queries, here + i), take(queries, here + i + 16), take(queries, here + i + 32)
+            qx, qy, qz = (
+                take(queries, packet_start + i),
+                take(queries, packet_start + i + 16),
+                take(queries, packet_start + i + 32),
+            )
             gap = squared(a - splat(qx), b - splat(qy), c - splat(qz))
             nearest = lowest(gap)
-            place = take(packets.ids, here + 48 + i)
+            place = take(packets.ids, packet_start + 48 + i)
             distance[place] = np.sqrt(nearest)
             index[place] = min(16 * block + first(bits(gap == splat(nearest))), size - 1)

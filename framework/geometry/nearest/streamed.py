@@ -53,11 +53,11 @@ class Stream:
             return
         if self.best is not None and chunk.shape[1] != self.best.point.shape[1]:
             raise DataError(
-                f"A chunk of {chunk.shape[1]} columns follows chunks of {self.best.point.shape[1]}; wanted as many. "
+                f"A chunk of {chunk.shape[1]} columns follows chunks of {self.best.point.shape[1]} columns. "
                 "Read the same columns from every part of the cloud."
             )
-        found = nearest(chunk[None, :, :3], self.queries)
-        distance, index = found.distance[0], found.index[0]
+        chunk_nearest = nearest(chunk[None, :, :3], self.queries)
+        distance, index = chunk_nearest.distance[0], chunk_nearest.index[0]
         if self.best is None:
             self.best = Streamed(distance, index, chunk[index])
         else:
@@ -70,7 +70,7 @@ class Stream:
     def nearer(
         self, distance: Float[Tensor, "query"], points: Float[Tensor, "query 3"]
     ) -> Bool[Tensor, "query"]:
-        """Return which points are nearer than the best so far; none at a tie, so that the lower index stays."""
+        """Return a mask of the points that are nearer than the best so far; false at a tie, so that the lower index stays."""
         assert self.best is not None
         nearer = distance < self.best.distance
         # squared distances that differ may have the same root, and `nearest` compares the squares
@@ -87,7 +87,9 @@ class Stream:
             DataError: no chunk had a point.
         """
         if self.best is None:
-            raise DataError("A stream of chunks held no point; wanted one at least. Leave out what is empty.")
+            raise DataError(
+                "A stream of chunks held no point; expected at least one. Leave out empty clouds."
+            )
         return Streamed(*(tensor.clone() for tensor in self.best))
 
 
@@ -148,8 +150,8 @@ def finite(chunk: Tensor) -> Float[Tensor, "points 3"]:
     bad = (~points.isfinite().all(1)).nonzero()
     if len(bad):
         raise DataError(
-            f"Point {int(bad[0])} of a chunk of {len(points)} is {points[bad[0, 0]].tolist()}; wanted finite "
-            "coordinates. Mend the file or drop such points."
+            f"Point {int(bad[0])} of a chunk of {len(points)} is {points[bad[0, 0]].tolist()}; expected finite "
+            "coordinates. Correct the file, or remove such points."
         )
     return points
 

@@ -185,7 +185,7 @@ class BallisticHead(DensityHead, Fitted):
         finite = estimate.covariance.flatten(1).isfinite().all(-1) & places.flatten(1).isfinite().all(-1)
         if not finite.all():
             raise NonFiniteParameters(
-                f"the flight in batch row {int((~finite).nonzero()[0])} has no finite course with step={self.step:g} "
+                f"The flight in batch row {int((~finite).nonzero()[0])} has no finite course with step={self.step:g} "
                 f"and {self.constants}. Set density_head.step and density_head.constants to those of the recordings."
             )
 

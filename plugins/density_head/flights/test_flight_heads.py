@@ -33,7 +33,7 @@ def test_the_physics_covers_what_it_simulated(density: str) -> None:
 def test_heads_refuse_what_is_no_flight() -> None:
     target = Target("real", ("x", "y"))
     for name in ("ballistic", "lstm"):
-        with pytest.raises(ConfigError, match="predicts x, y and z at one time after the other"):
+        with pytest.raises(ConfigError, match="predicts x, y and z at successive times"):
             build("density_head", resolve("density_head", name), target=target)
 
 

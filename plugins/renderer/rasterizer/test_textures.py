@@ -165,7 +165,7 @@ def test_joined_indices_are_those_of_int64_whatever_types_came(
 
 def test_subjects_of_other_channels_are_not_joined() -> None:
     vertices, faces, colors = blob(4)
-    with pytest.raises(ValueError, match="1 and 3 channels; wanted as many"):
+    with pytest.raises(ValueError, match="1 and 3 channels; expected the same number"):
         join_scenes([Scene(vertices, faces, colors[:, :1], camera()), covered()])
     with pytest.raises(ValueError, match="Got no scene to join"):
         join_scenes([])

@@ -234,9 +234,7 @@ def test_bad_sets_get_a_sentence():
     _, mine = halves(list(batches(inputs, label)))
     first, second = mine[0]["index"][:2].tolist()
     inputs[[first, second]] = math.nan
-    with pytest.raises(
-        UserError, match=rf"score of validation samples \[{first}, {second}\] is not a number"
-    ):
+    with pytest.raises(UserError, match=rf"score of validation samples \[{first}, {second}\] is NaN"):
         around(Given(sure_classifier)).calibrate(batches(inputs, label))
     with pytest.raises(UserError, match="conformal is calibrated on the validation split, but got no sample"):
         around(Given(sure_classifier)).calibrate(iter(()))

@@ -209,7 +209,7 @@ def test_probabilities_of_exactly_zero_and_one(caplog):
 def test_nan_is_named_and_an_empty_set_refused():
     logits, label = labelled(120, 1.0)
     logits[[3, 70]] = math.nan
-    with pytest.raises(UserError, match=r"log-likelihood of validation samples \[3, 70\] is not a number"):
+    with pytest.raises(UserError, match=r"log-likelihood of validation samples \[3, 70\] is NaN"):
         around(Given(classes)).calibrate(once(logits, label))
     for nothing in (iter(()), once(logits[:0], label[:0])):
         with pytest.raises(
