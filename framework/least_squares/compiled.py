@@ -177,7 +177,7 @@ def judge_steps(
     move, gain, slope, least, cut, tried, new_cost, new_gradient, new_gram,
     most, decrease, shortest, ended, near,
 ):  # fmt: skip
-    """Accept or reject each step, in place; fill `ended`, and `near`, which is true where second derivatives are needed."""
+    """Accept or reject each step, in place; fill `ended` and `near` (true where second derivatives are needed)."""
     count, size = at.shape
     for problem in range(count):
         moved, reached, finite = 0.0, 0.0, 0.0

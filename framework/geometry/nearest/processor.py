@@ -33,7 +33,7 @@ from framework.storage.threads import POOL
 
 Array = NDArray[np.floating]
 FINE, BAD_CLOUD, BAD_QUERIES, IMMODERATE = 0, 1, 2, 3
-"""Outcome of a cloud: searched; a number of the cloud is not finite; one of its queries is not; must be scaled first."""
+"""Outcome of a cloud: searched; the cloud is not finite; its queries are not finite; must be scaled first."""
 QUERY_COUNT = 17
 """Index in `levels` at which packed queries store their number."""
 LARGE = 2**15
@@ -126,7 +126,7 @@ def search_clouds(problem, begin, end, cells, work, packed, own):
 @compiled
 @no_type_check
 def search_clouds_share(problem, counter, step, limit, cells, work, packed, own):
-    """Search one thread's part of a batch: `step` clouds at a time, until `limit` clouds are searched or none are left."""
+    """Search one thread's part of a batch: `step` clouds at a time, until `limit` are searched or none are left."""
     batch = problem.sizes.shape[0]
     searched = 0
     while searched < limit:

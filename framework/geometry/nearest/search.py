@@ -109,7 +109,7 @@ def children(level, node, levels):
 @inlined
 @no_type_check
 def nearest_bit(open_, gaps, at):
-    """Return the index of the nearest open child, and its distance; `gaps` holds the distances of all 16 from `at` on."""
+    """Return the index of the nearest open child, and its distance; `gaps` holds the 16 distances from `at` on."""
     gap = where(mask(open_), load(gaps, at), splat(gaps.dtype.type(np.inf)))
     nearest = lowest(gap)
     return first(bits(gap == splat(nearest)) & open_), nearest

@@ -70,7 +70,7 @@ class Stream:
     def nearer(
         self, distance: Float[Tensor, "query"], points: Float[Tensor, "query 3"]
     ) -> Bool[Tensor, "query"]:
-        """Return a mask of the points that are nearer than the best so far; false at a tie, so that the lower index stays."""
+        """Return a mask of points nearer than the best so far; false at a tie, so that the lower index stays."""
         assert self.best is not None
         nearer = distance < self.best.distance
         # squared distances that differ may have the same root, and `nearest` compares the squares

@@ -200,7 +200,7 @@ class BallisticHead(DensityHead, Fitted):
         if failed.any():
             deviation, noise = float(factor.square().sum(-1).amax().sqrt()), float(self.noise)
             raise NonFiniteParameters(
-                f"the covariance of the flight in batch row {int(failed.nonzero()[0])} is not positive definite: it "
+                f"The covariance of the flight in batch row {int(failed.nonzero()[0])} is not positive definite: it "
                 f"has deviations of {deviation:.2g} m beside a noise of {noise:.2g} m. No training ends with such "
                 "constants: train the head again, or restore its checkpoint."
             )
