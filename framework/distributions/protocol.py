@@ -356,16 +356,16 @@ def images(density: Distribution, channels: Collection[str]) -> dict[str, Tensor
     """
     raise UserError(
         f"{type(density).__name__} of event_shape {tuple(density.event_shape)} provides no "
-        f"{', '.join(sorted(channels))}. Register its images with `framework.distributions.protocol.images.register`, or leave out the metric or "
-        "figure that needs them."
+        f"{', '.join(sorted(channels))}. Register its images with `framework.distributions.protocol.images.register`, "
+        "or leave out the metric or figure that needs them."
     )
 
 
 class ValueSet(ABC):
-    """A prediction set for each item of the batch: a set of values that is stated to contain the target.
+    """A set of values for each item of the batch that is stated to contain the target.
 
     Attributes:
-        stated_probability: least share of targets that the sets are stated to contain; None if nothing is stated.
+        stated_probability: least share of targets that the sets are stated to contain; None if not stated.
     """
 
     stated_probability: float | None = None

@@ -39,8 +39,8 @@ def require_trained(component: DensityHead) -> DensityHead:
     """
     if component.backbones:
         raise ConfigError(
-            "density_head.component requires separate networks for its parts, but only the head of a model has networks. "
-            "Leave density_head.component.backbones at shared."
+            "density_head.component requires separate networks for its parts, but only the head of a model has "
+            "networks. Leave density_head.component.backbones at shared."
         )
     fitted = set(component.state_dict()) - {name for name, _ in component.named_parameters()}
     if fitted:

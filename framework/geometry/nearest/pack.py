@@ -220,7 +220,7 @@ def histogram(cloud, box, bits, begin, end, key, count):
 @compiled
 @no_type_check
 def places(count, bits, cells, crowded):
-    """Replace the counts (threads, cells) by the position of each cell's first point; return the count of crowded cells."""
+    """Replace the counts (threads, cells) by the position of each cell's first point; return how many are crowded."""
     start = (8**bits - 8) // 7
     place = np.int32(0)
     crowded_count = 0
