@@ -64,7 +64,7 @@ class Report:
 
     Attributes:
         faces: number of faces of the scene.
-        drawn: number of faces whose pixels were visited.
+        drawn_faces: number of faces whose pixels were visited.
         left_out: number of the other faces by the first reason that held: "outside" (the box around the face holds no
             pixel centre of the image), "behind" (the near plane), "back" (seen from behind), "flat" (no area, or not
             finite), "hidden" (behind faces that were drawn before). A reason that held for no face is absent.
@@ -75,7 +75,7 @@ class Report:
     """
 
     faces: int
-    drawn: int
+    drawn_faces: int
     left_out: Mapping[str, int]
     visited: int
     reused: frozenset[str]

@@ -213,7 +213,7 @@ def main(arguments: list[str]) -> None:
 
     with torch.no_grad():
         pictures.write(out, frames(), given.rate)
-    if renderer.report is not None and not renderer.report.drawn:
+    if renderer.report is not None and not renderer.report.drawn_faces:
         sys.stderr.write(f"note: {given.scene}: no face of it is seen in the last picture.\n")
     if given.report:
         sys.stderr.write(told(renderer.report, seconds))
@@ -285,7 +285,7 @@ def told(report: Report | None, seconds: list[float]) -> str:
     if report is not None:
         left = ", ".join(f"{count} {reason}" for reason, count in report.left_out.items()) or "none"
         lines.append(
-            f"{report.drawn} of {report.faces} faces drawn, in {report.visited} pixels; left out: {left}; kept from "
+            f"{report.drawn_faces} of {report.faces} faces drawn, in {report.visited} pixels; left out: {left}; kept from "
             f"the picture before: {', '.join(sorted(report.reused)) or 'nothing'}"
         )
     lines.append(f"{1000 * statistics.median(seconds):.1f} ms a frame (median of {len(seconds)})")

@@ -46,12 +46,12 @@ def test_each_face_is_counted_once_and_savings_change_no_bit_however_wild_the_sc
     for _ in range(2):
         found, report = renderer(scene, channels), renderer.report
         assert report is not None
-        assert report.faces == len(scene.faces) == report.drawn + sum(report.left_out.values())
-        assert report.drawn >= 0 and all(count > 0 for count in report.left_out.values())
+        assert report.faces == len(scene.faces) == report.drawn_faces + sum(report.left_out.values())
+        assert report.drawn_faces >= 0 and all(count > 0 for count in report.left_out.values())
         assert all(torch.equal(found[name], plain[name]) for name in channels)
         if "face" in channels:
             shown = found["face"].unique()
-            assert len(shown[shown >= 0]) <= report.drawn
+            assert len(shown[shown >= 0]) <= report.drawn_faces
 
 
 def with_number(scene: Scene, where: str, number: float) -> Scene:
@@ -168,7 +168,7 @@ def test_of_a_million_faces_in_one_pixel_the_nearest_is_seen() -> None:
         found = renderer(scene, ("face", "depth"))
         assert found["face"][4, 5] == depth.argmin() and found["depth"][4, 5] == 1
         assert (found["face"] >= 0).sum() == 1 and renderer.report is not None
-        assert renderer.report.drawn + renderer.report.left_out.get("hidden", 0) == len(depth)
+        assert renderer.report.drawn_faces + renderer.report.left_out.get("hidden", 0) == len(depth)
 
 
 @pytest.mark.parametrize("gradient", KINDS)

@@ -104,7 +104,7 @@ def test_what_did_not_change_is_not_computed_again() -> None:
     first = renderer.report
     renderer(scene, ("depth",))
     assert renderer.report is not None and renderer.report.reused == {"places", "faces"}
-    assert (renderer.report.left_out, renderer.report.drawn) == (first.left_out, first.drawn)
+    assert (renderer.report.left_out, renderer.report.drawn_faces) == (first.left_out, first.drawn)
     renderer(replace(scene, faces=scene.faces.flip(0)), ("depth",))
     assert renderer.report.reused == {"places"}
     renderer(replace(scene, vertices=scene.vertices + 1e-6), ("depth",))
@@ -151,7 +151,7 @@ def test_the_report_is_what_brute_force_counts(cull: bool, shift: float) -> None
         assert report is not None
         wanted = by_hand(scene, cull)
         assert report.faces == len(degenerate) == sum(wanted.values())
-        assert report.drawn == wanted.pop("drawn")
+        assert report.drawn_faces == wanted.pop("drawn")
         assert dict(report.left_out) == {name: count for name, count in wanted.items() if count}
         assert report.channels == set(channels) and report.visited <= 60 * 70
         rows, columns = np.nonzero(picture[channels[0]].reshape(60, 70, -1).numpy().any(-1))
@@ -199,9 +199,9 @@ def test_blended_pictures_report_what_became_of_every_face() -> None:
         hard(scene)
         one, other = renderer.report, hard.report
         assert one is not None and other is not None
-        assert one.drawn + sum(one.left_out.values()) == one.faces == other.faces
+        assert one.drawn_faces + sum(one.left_out.values()) == one.faces == other.faces
         assert one.left_out.get("back", 0) == pytest.approx(other.left_out.get("back", 0), abs=20)
-        assert one.left_out["flat"] >= 5 and one.drawn > 100
+        assert one.left_out["flat"] >= 5 and one.drawn_faces > 100
     renderer(replace(scene, camera=replace(scene.camera, near=4.0)))
     assert renderer.report is not None and 0 < renderer.report.left_out["behind"] < len(scene.faces)
 
