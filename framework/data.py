@@ -61,7 +61,7 @@ class Data(ABC):
 
     The constructor only keeps its keyword-only parameters (the config) and reads nothing. `prepare` does the work. The
     framework calls it once, before every other method but `read`. After it all attributes below are set. Bad input
-    raises a DataError that says which file is bad, what was wanted and what to do. A sample that cannot be read is
+    raises a DataError that says which file is bad, what was expected and what to do. A sample that cannot be read is
     never replaced silently.
 
     A data set that cannot be shipped may be generated. Its generator writes the official layout to the cache

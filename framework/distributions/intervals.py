@@ -151,9 +151,9 @@ def _normal_quantiles(known: Normals, below: Float[Tensor, "place"]) -> Float[Te
         standard = torch.where(residual == 0, residual, residual / known.scale)
         return torch.where(counts, weights * torch.special.ndtr(standard), 0.0).sum(-1)
 
-    wanted = below.reshape(-1, *(1,) * (known.mean.dim() - 1))
+    levels = below.reshape(-1, *(1,) * (known.mean.dim() - 1))
     center = torch.where(counts, known.mean, 0.0).sum(-1) / counts.sum(-1).clamp(min=1)
-    return find_crossing(mass_below, wanted, low, high, center)
+    return find_crossing(mass_below, levels, low, high, center)
 
 
 def _widen_bracket(
@@ -170,64 +170,64 @@ def _widen_bracket(
     wide = samples[-1 - len(samples) // 4] - samples[len(samples) // 4]
     # if all draws are equal, the width is the last digit of this number
     step = torch.maximum(wide, 1e-7 * center.abs()).clamp(min=1e-300)
-    wanted = below.reshape(-1, *(1,) * center.dim())
+    levels = below.reshape(-1, *(1,) * center.dim())
     low, high = (
         (center - step).expand(len(below), *center.shape),
         (center + step).expand(len(below), *center.shape),
     )
     for _ in range(_FURTHEST):
-        above, under = mass_below(low) > wanted, mass_below(high) < wanted
+        above, under = mass_below(low) > levels, mass_below(high) < levels
         if not bool((above | under).any()):
             break
         step = 2 * step
         low, high = torch.where(above, center - step, low), torch.where(under, center + step, high)
-    return find_crossing(mass_below, wanted, low, high, center)
+    return find_crossing(mass_below, levels, low, high, center)
 
 
 def find_crossing(
-    rising: Callable[[Tensor], Tensor], wanted: Tensor, low: Tensor, high: Tensor, center: Tensor
+    rising: Callable[[Tensor], Tensor], level: Tensor, low: Tensor, high: Tensor, center: Tensor
 ) -> Tensor:
-    """Return the argument at which a function that never falls reaches `wanted`; NaN where the function is NaN.
+    """Return the argument at which a function that never falls reaches `level`; NaN where the function is NaN.
 
     The search uses inverse quadratic interpolation where it is safe and bisection elsewhere (Chandrupatla 1997), item
     by item.
 
     Args:
         rising: the function, which never falls.
-        wanted: the value to reach.
+        level: the value to reach.
         low: lower end of a bracket.
         high: upper end of the bracket.
         center: reference point; the search ends where the bracket is as narrow as EXACT times the distance from it,
             or where two neighbouring numbers are left.
     """
-    wanted, low, high = torch.broadcast_tensors(wanted, low, high)
+    level, low, high = torch.broadcast_tensors(level, low, high)
     a, b = high, low
-    over_a, over_b = rising(a) - wanted, rising(b) - wanted
-    broken = over_a.isnan() | over_b.isnan()
+    excess_a, excess_b = rising(a) - level, rising(b) - level
+    broken = excess_a.isnan() | excess_b.isnan()
     part = torch.full_like(a, 0.5)
-    best, least_over = (
-        torch.where(over_a.abs() < over_b.abs(), a, b),
-        torch.minimum(over_a.abs(), over_b.abs()),
+    best, least_excess = (
+        torch.where(excess_a.abs() < excess_b.abs(), a, b),
+        torch.minimum(excess_a.abs(), excess_b.abs()),
     )
     for _ in range(ROUNDS):
-        place = a + part * (b - a)
-        over = rising(place) - wanted
-        same = (over >= 0) == (over_a >= 0)
+        point = a + part * (b - a)
+        excess = rising(point) - level
+        same = (excess >= 0) == (excess_a >= 0)
         # c is the end that was given up: the third point of the parabola
-        c, over_c = torch.where(same, a, b), torch.where(same, over_a, over_b)
-        b, over_b = torch.where(same, b, a), torch.where(same, over_b, over_a)
-        a, over_a = place, over
-        best = torch.where(over.abs() <= least_over, place, best)
-        least_over = torch.minimum(least_over, over.abs())
+        c, excess_c = torch.where(same, a, b), torch.where(same, excess_a, excess_b)
+        b, excess_b = torch.where(same, b, a), torch.where(same, excess_b, excess_a)
+        a, excess_a = point, excess
+        best = torch.where(excess.abs() <= least_excess, point, best)
+        least_excess = torch.minimum(least_excess, excess.abs())
         least = torch.maximum(EXACT * (best - center).abs(), 4e-16 * best.abs()) + 1e-320
         width = (b - a).abs()
-        if bool(((width <= least) | (least_over == 0) | broken).all()):
+        if bool(((width <= least) | (least_excess == 0) | broken).all()):
             break
-        across, rise = (a - b) / (c - b), (over_a - over_b) / (over_c - over_b)
+        across, rise = (a - b) / (c - b), (excess_a - excess_b) / (excess_c - excess_b)
         safe = (1 - (1 - across).sqrt() < rise) & (rise < across.sqrt())
-        interpolated = over_a / (over_b - over_a) * over_c / (over_b - over_c) + (c - a) / (
+        interpolated = excess_a / (excess_b - excess_a) * excess_c / (excess_b - excess_c) + (c - a) / (
             b - a
-        ) * over_a / (over_c - over_a) * over_b / (over_c - over_b)
+        ) * excess_a / (excess_c - excess_a) * excess_b / (excess_c - excess_b)
         part = torch.where(safe & interpolated.isfinite(), interpolated, 0.5)
         edge = (least / (2 * width)).nan_to_num(nan=0.5).clamp(max=0.5)
         part = torch.maximum(edge, torch.minimum(part, 1 - edge))
@@ -261,16 +261,16 @@ def _interval_of_angle(density: Distribution, mass: float) -> Interval | None:
 
 
 def _width_of_mass(
-    mass_within: Callable[[Tensor], Tensor], wanted: float, center: Float[Tensor, "item"]
+    mass_within: Callable[[Tensor], Tensor], mass: float, center: Float[Tensor, "item"]
 ) -> Float[Tensor, "item"]:
-    """Return the width, radians up to π, of the arc next to `center` that holds the mass `wanted`."""
+    """Return the width, radians up to π, of the arc next to `center` that holds the mass `mass`."""
     power = torch.arange(RUNGS, dtype=torch.float64, device=center.device).unsqueeze(-1)
     rungs = (math.pi * NARROWER**-power).expand(RUNGS, len(center))
-    enough = (mass_within(rungs) >= wanted).sum(0).clamp(min=1)  # falling
+    enough = (mass_within(rungs) >= mass).sum(0).clamp(min=1)  # falling
     high = math.pi * NARROWER ** (1.0 - enough)
     low = torch.where(enough < RUNGS, high / NARROWER, 0.0)
-    none = torch.zeros_like(center)
-    return find_crossing(mass_within, torch.full_like(center, wanted), low, high, none)
+    zeros = torch.zeros_like(center)
+    return find_crossing(mass_within, torch.full_like(center, mass), low, high, zeros)
 
 
 def _arc_function(flat: Distribution) -> Callable[[Tensor, Tensor], Tensor]:

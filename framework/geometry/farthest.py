@@ -14,8 +14,8 @@ def farthest(
 
     Of equally far points the first is chosen. No point is chosen twice before all were chosen; then the sequence
     repeats. So every order of a cloud's points gives the same positions, unless distances are equal, and a
-    smaller `count` gives the beginning of the result of a larger one. The result is computed in float64 on the CPU, whatever
-    device the clouds are on.
+    smaller `count` gives the beginning of the result of a larger one. The result is
+    computed in float64 on the CPU, on whatever device the clouds are.
 
     Args:
         positions: positions of the points, (batch, points, 3).

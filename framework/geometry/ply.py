@@ -187,7 +187,7 @@ def _lists(body: bytes, start: int, element: Element, order: str) -> tuple[Int[n
     empty = np.empty((0, 3), np.int64)
     if element.count == 0 or not element.properties:
         return empty, start
-    wanted = _corners(element) if element.name == "face" else None
+    corner_list = _corners(element) if element.name == "face" else None
     kind = _first_record(
         body, start, element, order
     )  # assumes that all items are like the first, as they nearly always are
@@ -196,17 +196,17 @@ def _lists(body: bytes, start: int, element: Element, order: str) -> tuple[Int[n
         lengths = [name for name in table.dtype.names or () if name.startswith("length")]
         if all((table[name] == table[name][0]).all() for name in lengths):
             end = start + element.count * kind.itemsize
-            if wanted is None:
+            if corner_list is None:
                 return empty, end
-            corners = table[f"value{element.properties.index(wanted)}"]
+            corners = table[f"value{element.properties.index(corner_list)}"]
             return fans(np.full(len(corners), corners.shape[1]), corners.astype(np.int64).ravel()), end
     least = sum(int((entry.length or entry.kind)[1]) for entry in element.properties)
     _require(body, start + element.count * least)
-    counts, places = _locate_lists(body, start, element, wanted, order)
+    counts, places = _locate_lists(body, start, element, corner_list, order)
     end = int(places[-1])
-    if wanted is None:
+    if corner_list is None:
         return empty, end
-    kind = np.dtype(order + wanted.kind)
+    kind = np.dtype(order + corner_list.kind)
     first = np.repeat(places[:-1] - kind.itemsize * (np.cumsum(counts) - counts), counts)
     byte = (first + kind.itemsize * np.arange(len(first)))[:, None] + np.arange(kind.itemsize)
     corners = np.frombuffer(body, np.uint8)[byte].view(kind)[:, 0]
@@ -214,16 +214,16 @@ def _lists(body: bytes, start: int, element: Element, order: str) -> tuple[Int[n
 
 
 def _locate_lists(
-    body: bytes, start: int, element: Element, wanted: Property | None, order: str
+    body: bytes, start: int, element: Element, target_list: Property | None, order: str
 ) -> tuple[Int[np.ndarray, "items"], Int[np.ndarray, "places"]]:
-    """Return for each item the length of its list `wanted`, and the list's position; the last position is the end."""
+    """Return for each item the length of its list `target_list`, and the list's position; the last position is the end."""
     counts, places = np.zeros(element.count, np.int64), np.zeros(element.count + 1, np.int64)
     lengths = [
         struct.Struct((order or "=") + CODES[entry.length]) if entry.length else None
         for entry in element.properties
     ]
     entries = [
-        (entry is wanted, int(entry.kind[1]), length)
+        (entry is target_list, int(entry.kind[1]), length)
         for entry, length in zip(element.properties, lengths, strict=True)
     ]
     for item in range(element.count):
