@@ -216,7 +216,7 @@ def _lists(body: bytes, start: int, element: Element, order: str) -> tuple[Int[n
 def _locate_lists(
     body: bytes, start: int, element: Element, target_list: Property | None, order: str
 ) -> tuple[Int[np.ndarray, "items"], Int[np.ndarray, "places"]]:
-    """Return for each item the length of its list `target_list`, and the list's position; the last position is the end."""
+    """Return the length and the position of the list `target_list` of each item; the last position is the end."""
     counts, places = np.zeros(element.count, np.int64), np.zeros(element.count + 1, np.int64)
     lengths = [
         struct.Struct((order or "=") + CODES[entry.length]) if entry.length else None

@@ -104,7 +104,7 @@ def test_what_did_not_change_is_not_computed_again() -> None:
     first = renderer.report
     renderer(scene, ("depth",))
     assert renderer.report is not None and renderer.report.reused == {"places", "faces"}
-    assert (renderer.report.left_out, renderer.report.drawn_faces) == (first.left_out, first.drawn)
+    assert (renderer.report.left_out, renderer.report.drawn_faces) == (first.left_out, first.drawn_faces)
     renderer(replace(scene, faces=scene.faces.flip(0)), ("depth",))
     assert renderer.report.reused == {"places"}
     renderer(replace(scene, vertices=scene.vertices + 1e-6), ("depth",))
