@@ -1,4 +1,4 @@
-"""Surroundings of an object: textures, a horizon, clutter, and things that stand in front of it."""
+"""Surroundings of an object: textures, a horizon, clutter, and shapes in front of the object."""
 
 import math
 
@@ -7,11 +7,11 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-Picture = NDArray[np.float32]
+FloatImage = NDArray[np.float32]
 """Image with values 0…1; (height, width, 3) unless stated otherwise."""
 
 
-def texture(random: Generator, height: int, width: int) -> Picture:
+def texture(random: Generator, height: int, width: int) -> FloatImage:
     """Return smooth noise on three scales between two random colours."""
     noise = np.zeros((height, width), np.float32)
     for cells, weight in ((3, 1.0), (9, 0.5), (30, 0.3)):
@@ -23,23 +23,23 @@ def texture(random: Generator, height: int, width: int) -> Picture:
     return np.asarray(first + share * (second - first), dtype=np.float32)
 
 
-def muted(random: Generator) -> Picture:
-    """Return a colour (3,) of any brightness and little saturation, as most surroundings have."""
+def muted(random: Generator) -> FloatImage:
+    """Return a random colour (3,) of any brightness and little saturation."""
     grey = random.uniform(0.12, 0.9)
     return np.clip(grey + random.normal(0, 0.1, 3), 0, 1).astype(np.float32)
 
 
 def background(
     random: Generator, height: int, width: int, horizon: tuple[float, float], tilt: float
-) -> Picture:
+) -> FloatImage:
     """Return a texture, or ground and sky that meet at the horizon, with clutter.
 
     Args:
-        random: source of all draws.
-        height: height of the image, pixels.
-        width: width of the image, pixels.
-        horizon: a point of the horizon (x, y), pixels.
-        tilt: angle by which the horizon leans, radians, counter-clockwise in the image.
+        random: Source of all random numbers.
+        height: Height of the image, pixels.
+        width: Width of the image, pixels.
+        horizon: A point of the horizon (x, y), pixels.
+        tilt: Angle of the horizon to the horizontal, radians, counter-clockwise in the image.
     """
     ground = texture(random, height, width)
     if random.random() < 0.5:
@@ -66,9 +66,9 @@ def blob(
     if kind < 0.35:
         draw.ellipse((x - across, y - along, x + across, y + along), fill=255)
     elif kind < 0.75:
-        turn = random.uniform(0, math.pi)
+        angle = random.uniform(0, math.pi)
         corners = [(-across, -along), (across, -along), (across, along), (-across, along)]
-        cos, sin = math.cos(turn), math.sin(turn)
+        cos, sin = math.cos(angle), math.sin(angle)
         draw.polygon([(x + u * cos - v * sin, y + u * sin + v * cos) for u, v in corners], fill=255)
     else:
         thick = 0.06 * size

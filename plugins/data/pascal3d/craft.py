@@ -1,4 +1,4 @@
-"""Parametric aeroplanes and boats; every number is in metres."""
+"""Parametric aeroplanes and boats; all lengths are in metres."""
 
 import numpy as np
 from numpy.random import Generator
@@ -10,11 +10,11 @@ from plugins.data.pascal3d.shapes import (
     Solid,
     box,
     loft,
-    off,
+    loft_rectangles,
+    offset_point,
     plate,
     rod,
     side_plate,
-    tapered,
     wheel,
 )
 
@@ -64,22 +64,30 @@ def aeroplane(random: Generator) -> Body:
     body.add(side_plate(fin, 0, 0.18 * radius), mark)
 
     if jet:
-        for place in (0.34,) if random.random() < 0.7 else (0.28, 0.55):
-            along = root + place * sweep - 0.25 * chord
-            engine = np.array([place * span, along, height + place * lift - 0.55 * radius])
-            front = off(engine, 0, -0.6 * chord, 0)
-            behind = off(engine, 0, 0.35 * chord, 0)
+        for share in (0.34,) if random.random() < 0.7 else (0.28, 0.55):  # of the span
+            along = root + share * sweep - 0.25 * chord
+            engine = np.array([share * span, along, height + share * lift - 0.55 * radius])
+            front = offset_point(engine, 0, -0.6 * chord, 0)
+            behind = offset_point(engine, 0, 0.35 * chord, 0)
             body.pair(rod(front, behind, 0.42 * radius, 0.3 * radius, sides=10), METAL)
-            body.pair(rod(off(front, 0, -0.02, 0), off(front, 0, -0.05, 0), 0.34 * radius, sides=10), DARK)
+            body.pair(
+                rod(
+                    offset_point(front, 0, -0.02, 0),
+                    offset_point(front, 0, -0.05, 0),
+                    0.34 * radius,
+                    sides=10,
+                ),
+                DARK,
+            )
     else:
         hub = np.array([0, nose - 0.15, -0.2 * radius])
-        body.add(rod(off(hub, 0, -0.15, 0), off(hub, 0, 0.25, 0), 0.05, 0.3 * radius), mark)
-        turn = random.uniform(0, np.pi)
-        blade = np.array([np.cos(turn), 0, np.sin(turn)]) * length * 0.13
+        body.add(rod(offset_point(hub, 0, -0.15, 0), offset_point(hub, 0, 0.25, 0), 0.05, 0.3 * radius), mark)
+        angle = random.uniform(0, np.pi)
+        blade = np.array([np.cos(angle), 0, np.sin(angle)]) * length * 0.13
         body.add(rod(hub - blade, hub + blade, 0.07), DARK)
         axle = np.array([0.9, -0.15 * length, -2.0 * radius])
         body.pair(rod((0, -0.15 * length, -0.8 * radius), axle, 0.06), METAL)
-        body.pair(wheel(off(axle, 0, 0, -0.1 * radius), 0.3, 0.2, 10), RUBBER)
+        body.pair(wheel(offset_point(axle, 0, 0, -0.1 * radius), 0.3, 0.2, 10), RUBBER)
     return body
 
 
@@ -97,7 +105,7 @@ def _fuselage(length: float, nose: float, radius: float) -> Solid:
 
 
 def boat(random: Generator) -> Body:
-    """Return a sailing boat, a motor boat with a cabin, or an open rowing boat: bow in front, broad stern behind."""
+    """Return a sailing boat, a motor boat with a cabin, or an open rowing boat, with the bow in front."""
     body = Body()
     hull = paint(random) if random.random() < 0.6 else (0.92, 0.92, 0.9)
     deck = (0.75, 0.6, 0.42) if random.random() < 0.5 else (0.85, 0.85, 0.82)
@@ -129,19 +137,19 @@ def boat(random: Generator) -> Body:
         roof = floor + high
 
         def level(share: float, grow: float = 0.0) -> tuple[float, float, float, float]:
-            """Return the cabin's outline at a share of its height."""
+            """Return the outline of the cabin at a share of its height, enlarged by `grow`."""
             wide = (0.33 - 0.03 * share) * beam + grow
             return wide, front + 0.1 * share * length - grow, behind + grow, floor + share * high
 
-        body.add(tapered([level(0.0), level(1.0)]), (0.93, 0.93, 0.92))
-        body.add(tapered([level(0.45, 0.02), level(0.79, 0.02)]), GLASS)
+        body.add(loft_rectangles([level(0.0), level(1.0)]), (0.93, 0.93, 0.92))
+        body.add(loft_rectangles([level(0.45, 0.02), level(0.79, 0.02)]), GLASS)
         size = (0.66 * beam, behind - front - 0.06 * length, 0.1)
         body.add(box(size, (0, (front + behind) / 2 + 0.06 * length, roof)), hull)
         body.add(rod((0, behind - 0.2, roof), (0, behind - 0.1, roof + 0.7 * high), 0.04), METAL)
         body.add(box((0.3, 0.35, 0.5), (0, 0.53 * length, 0.85 * depth)), DARK)  # outboard motor
         for share in (-0.42, -0.32, -0.22):  # railing
             foot = np.array([0.85 * np.interp(share * length, along, half), share * length, depth])
-            body.pair(rod(foot, off(foot, 0, 0, 0.9 * depth), 0.035), METAL)
+            body.pair(rod(foot, offset_point(foot, 0, 0, 0.9 * depth), 0.035), METAL)
     else:  # rowing boat
         for share in (-0.2, 0.05, 0.3):
             wide = 1.8 * float(np.interp(share * length, along, half))
@@ -153,7 +161,14 @@ def boat(random: Generator) -> Body:
 
 
 def _hull(along: Array, half: Array, rim: Array, keel: Array) -> Solid:
-    """Return the hull of a boat from bow to stern: half widths, and heights of the rim and of the keel."""
+    """Return the hull of a boat from bow to stern.
+
+    Args:
+        along: Positions (y) along the boat.
+        half: Half width at each position.
+        rim: Height of the rim at each position.
+        keel: Height of the keel at each position.
+    """
     rings = []
     for y, wide, high, low in zip(along, half, rim, keel, strict=True):
         side = [(1.0, high), (0.92, 0.45 * high + 0.55 * max(low, 0.0)), (0.5, low)]

@@ -24,16 +24,16 @@ from framework.storage.generated import read_mark
 from framework.storage.names import as_bytes
 from framework.target import Target
 from plugins.data.pascal3d import layout
-from plugins.data.pascal3d.generator import VERSION, generated
+from plugins.data.pascal3d.generator import VERSION, generate_class
 from plugins.data.pascal3d.layout import CLASSES, Annotation
 
 SPLIT_SEED = 13  # the seed of the thesis authors' code
 MIRRORED = (-1.0, 1.0, -1.0)
-"""Factors of azimuth, elevation and tilt in a mirror image of a mirror-symmetric object."""
+"""Factors by which mirroring an image multiplies the azimuth, elevation and tilt of a mirror-symmetric object."""
 
 
 class Sample(NamedTuple):
-    """One object, and the index of its class among the data set's groups."""
+    """One object, and the index of its class among the groups of the data set."""
 
     annotation: Annotation
     group: int
@@ -41,7 +41,13 @@ class Sample(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Selection:
-    """Choice of the objects to learn from: one class or several, and the share of their images for validation."""
+    """Choice of the objects.
+
+    Attributes:
+        category: The class, or a list of classes.
+        include_occluded: Whether training uses truncated and occluded objects too.
+        validation_share: Share of the training images that are for validation.
+    """
 
     category: str | list[str] = "car"
     include_occluded: bool = False
@@ -50,7 +56,12 @@ class Selection:
 
 @dataclass(frozen=True, kw_only=True)
 class Framing:
-    """Crop of an object: a square of `image_size` pixels with a margin, a share of the box's longer side."""
+    """Settings of the crop of an object.
+
+    Attributes:
+        image_size: Side of the square input, pixels.
+        margin: Margin at each side of the box, as a share of the longer side of the box.
+    """
 
     image_size: Annotated[int, Field(ge=8, le=1024)] = 48
     margin: Annotated[float, Field(ge=0, le=2, allow_inf_nan=False)] = 0.1
@@ -60,14 +71,19 @@ class Framing:
         return Crop(annotation.image, annotation.box, self.margin, self.image_size)
 
     def scale(self, box: Box) -> float:
-        """Return how many pixels of the input show one pixel of the image."""
+        """Return the number of pixels of the input per pixel of the image."""
         left, top, right, bottom = box
         return self.image_size / ((1 + 2 * self.margin) * max(right - left, bottom - top))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Variation:
-    """Variation of training images: half are mirrored, all are shifted, scaled and made brighter by up to `jitter`."""
+    """Random variation of training images.
+
+    Attributes:
+        mirror: Whether half of the images are mirrored.
+        jitter: Largest share by which images are shifted, scaled and made brighter or darker.
+    """
 
     mirror: bool = True
     jitter: Annotated[float, Field(ge=0, le=0.5, allow_inf_nan=False)] = 0.08
@@ -75,7 +91,13 @@ class Variation:
 
 @dataclass(frozen=True, kw_only=True)
 class Drawing:
-    """Settings of the images that are generated without a root: number per class, seed, and renderer."""
+    """Settings of the images that are generated if no root is given.
+
+    Attributes:
+        images: Number of images of each class.
+        generator_seed: Seed of the images.
+        renderer: Renderer of the objects.
+    """
 
     images: Annotated[int, Field(ge=20, le=1_000_000)] = 2400
     generator_seed: Annotated[int, Field(ge=0)] = 0
@@ -83,13 +105,13 @@ class Drawing:
 
 
 class Pascal3D(Data):
-    """Rigid objects in photographs and their azimuth, elevation and tilt; generated where no root is given.
+    """Rigid objects in photographs and their azimuth, elevation and tilt; generated if no root is given.
 
-    Beside the contract's fields a batch has "symmetry" (1 for real data) and, for generated data, "blur" (float32:
-    standard deviation of the blur, pixels of the input).
+    In addition to the fields that `framework.data.Batch` requires, a batch holds "symmetry" (1 for real data) and, for
+    generated data, "blur" (float32, the standard deviation of the blur, pixels of the input).
 
     Attributes:
-        excluded: number of objects that the protocol left out, by reason; set by `prepare`.
+        excluded: Number of objects that the protocol leaves out, by reason; `prepare` sets it.
     """
 
     bibtex = """@inproceedings{xiang2014beyond,
@@ -122,8 +144,8 @@ class Pascal3D(Data):
         self.variation = variation
         self.drawing = drawing
         self.input_shape = (3, framing.image_size, framing.image_size)
-        named = self.categories if len(self.categories) < 4 else (f"{len(self.categories)} classes",)
-        self.title = " ".join(["pascal3d", *named])
+        names = self.categories if len(self.categories) < 4 else (f"{len(self.categories)} classes",)
+        self.title = " ".join(["pascal3d", *names])
 
     def prepare(self) -> None:
         roots = self._roots()
@@ -134,15 +156,15 @@ class Pascal3D(Data):
         samples: dict[str, list[Sample]] = {"train": [], "validation": [], "test": []}
         for group, (category, root) in enumerate(roots.items()):
             lists = layout.split_lists(category)
-            learned = list(
-                self._kept(root, category, lists["train"], self.selection.include_occluded, faults)
+            training = list(
+                self._select(root, category, lists["train"], self.selection.include_occluded, faults)
             )
-            held_out = validation_files(learned, self.selection.validation_share)
-            for annotation in learned:
+            held_out = validation_files(training, self.selection.validation_share)
+            for annotation in training:
                 split = "validation" if annotation.file in held_out else "train"
                 samples[split].append(Sample(annotation, group))
-            tested = self._kept(root, category, lists["test"], False, faults)
-            samples["test"] += [Sample(annotation, group) for annotation in tested]
+            test = self._select(root, category, lists["test"], False, faults)
+            samples["test"] += [Sample(annotation, group) for annotation in test]
         _refuse_wrong_labels(samples)
         self._read(samples, faults)
         self._digest = _digest(samples)
@@ -153,22 +175,24 @@ class Pascal3D(Data):
             if category not in CLASSES:
                 raise DataError(
                     f"data.category = {category!r} is no class of PASCAL3D+."
-                    f"{did_you_mean(category, CLASSES)} Wanted one or more of: {', '.join(CLASSES)}."
+                    f"{did_you_mean(category, CLASSES)} Choose one or more of {', '.join(CLASSES)}."
                 )
         if not self.categories:
-            raise DataError(f"data.category is empty; wanted one or more of: {', '.join(CLASSES)}.")
+            raise DataError(f"data.category is empty. Choose one or more of {', '.join(CLASSES)}.")
         if self.root is not None:
             root = Path(self.root).expanduser()
             for category in self.categories:
                 layout.check_root(root, category)
             return dict.fromkeys(self.categories, root)
-        parent, of = cache.folder("pascal3d"), self.drawing
+        parent, drawing = cache.folder("pascal3d"), self.drawing
         return {
-            category: generated(parent, category, of.images, of.generator_seed, of.renderer)
+            category: generate_class(
+                parent, category, drawing.images, drawing.generator_seed, drawing.renderer
+            )
             for category in self.categories
         }
 
-    def _kept(
+    def _select(
         self,
         root: Path,
         category: str,
@@ -176,7 +200,7 @@ class Pascal3D(Data):
         include_occluded: bool,
         faults: list[DataError],
     ) -> Iterator[Annotation]:
-        """Yield the objects of a split that the protocol keeps; errors of unreadable ones are added to `faults`."""
+        """Yield the objects of a split that the protocol uses; add the errors of unreadable files to `faults`."""
         names = [(source, name) for source, file in lists for name in layout.read_list(root / file)]
         for source, name in dict.fromkeys(names):
             try:
@@ -192,9 +216,15 @@ class Pascal3D(Data):
                     self.excluded[reason] += 1
 
     def _read(self, samples: Mapping[str, Sequence[Sample]], faults: Sequence[DataError]) -> None:
-        """Read every split's crops, and refuse all together that could not be read, here or before."""
+        """Read the crops of all splits.
+
+        One error names all files that cannot be read: those of `faults` and those of the crops.
+        """
         self._tables, self.skipped = images.load_splits(
-            {split: [self.framing.crop(one) for one, _ in chosen] for split, chosen in samples.items()},
+            {
+                split: [self.framing.crop(annotation) for annotation, _ in chosen]
+                for split, chosen in samples.items()
+            },
             {split: self._fields(chosen) for split, chosen in samples.items()},
             faults,
             skip_unreadable=self.skip_unreadable,
@@ -204,11 +234,12 @@ class Pascal3D(Data):
             if len(table) == 0:
                 reasons = ", ".join(f"{count} {reason}" for reason, count in self.excluded.items()) or "none"
                 raise DataError(
-                    f"The {split} split of {', '.join(self.groups)} is empty: no object is left of its lists "
+                    f"The {split} split of {', '.join(self.groups)} is empty: none of the objects in its lists is used "
                     f"(left out: {reasons}; unreadable: {self.skipped}). Check the lists, or use other data."
                 )
 
     def _fields(self, samples: Sequence[Sample]) -> dict[str, Tensor]:
+        """Return the fields of samples besides "input" and "index"."""
         labels = [[layout.radians(angle) for angle in annotation.angles or ()] for annotation, _ in samples]
         fields = {
             "target": torch.tensor(labels, dtype=torch.float32).reshape(len(samples), 3),
@@ -216,7 +247,9 @@ class Pascal3D(Data):
             "symmetry": torch.tensor([annotation.symmetry for annotation, _ in samples], dtype=torch.int64),
         }
         if self.synthetic:
-            blur = [self.framing.scale(one.box) * (one.blur or 0.0) for one, _ in samples]
+            blur = [
+                self.framing.scale(annotation.box) * (annotation.blur or 0.0) for annotation, _ in samples
+            ]
             fields["blur"] = torch.tensor(blur, dtype=torch.float32)
         return fields
 
@@ -247,7 +280,7 @@ class Pascal3D(Data):
 
 
 def reason_to_exclude(annotation: Annotation, include_occluded: bool) -> str | None:
-    """Return why the protocol leaves an object out; None where it does not."""
+    """Return why the protocol leaves an object out; None if it uses the object."""
     if annotation.angles is None:
         return "without a fine label"
     if annotation.difficult:
@@ -258,7 +291,7 @@ def reason_to_exclude(annotation: Annotation, include_occluded: bool) -> str | N
 
 
 def validation_files(annotations: Sequence[Annotation], share: float) -> set[Path]:
-    """Return the files held out of training; whole images are chosen, so that no image is in both splits."""
+    """Return the annotation files of the images for validation; no image is in both splits."""
     files = sorted({annotation.file for annotation in annotations})
     order = np.random.default_rng(SPLIT_SEED).permutation(len(files))
     return {files[index] for index in order[: round(share * len(files))]}
@@ -273,8 +306,8 @@ def _refuse_wrong_labels(samples: Mapping[str, Sequence[Sample]]) -> None:
     ]
     if wrong:
         raise DataError(
-            f"{len(wrong)} objects have an angle that is not finite; wanted degrees:{images.list_lines(wrong)}\n"
-            "Mend these annotations, or take the images off their lists."
+            f"{len(wrong)} objects have an angle that is not a finite number of degrees:{images.list_lines(wrong)}\n"
+            "Correct these annotations, or remove the images from their lists."
         )
 
 

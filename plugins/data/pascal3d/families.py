@@ -10,9 +10,10 @@ from plugins.data.pascal3d.shapes import Body
 
 
 class Family(NamedTuple):
-    """Builder of an object of a class, and the symmetry of the object.
+    """Builder of random objects of a class, and the symmetry of these objects about the vertical axis.
 
-    `symmetry` about the vertical axis is 1 for none, 2 for invariance under 180°, 4 under 90°, 0 under any rotation.
+    `symmetry` is n if the objects look the same after a rotation by 360°/n; 1 means no symmetry. It is 0 if they look
+    the same after any rotation.
     """
 
     build: Callable[[Generator], Body]

@@ -1,18 +1,28 @@
-"""Parametric household objects: bottle, chair, diningtable, sofa and tvmonitor; every number is in metres."""
+"""Parametric household objects: bottle, chair, diningtable, sofa and tvmonitor; all lengths are in metres."""
 
 import numpy as np
 from numpy.random import Generator
 
 from plugins.data.pascal3d.paint import DARK, METAL, paint, shade, wood
-from plugins.data.pascal3d.shapes import Body, Color, Solid, box, ellipsoid, lathe, rod, tapered, transformed
+from plugins.data.pascal3d.shapes import (
+    Body,
+    Color,
+    Solid,
+    box,
+    ellipsoid,
+    lathe,
+    loft_rectangles,
+    rod,
+    transform,
+)
 
 BOTTLE_GLASS: tuple[Color, ...] = ((0.1, 0.28, 0.12), (0.35, 0.18, 0.06), (0.55, 0.72, 0.8), (0.2, 0.3, 0.6))
 
 
 def bottle(random: Generator) -> Body:
-    """Return a wine, beer or water bottle: a body of revolution whose colours are rings about the vertical.
+    """Return a wine, beer or water bottle: a solid of revolution whose colours are rings about the vertical.
 
-    The polygon that approximates the circle is rotated by a random angle, so that not even its edges show the azimuth.
+    The polygon that approximates the circle is rotated by a random angle, so that its edges do not show the azimuth.
     """
     body = Body()
     glass = BOTTLE_GLASS[int(random.integers(len(BOTTLE_GLASS)))]
@@ -34,8 +44,8 @@ def bottle(random: Generator) -> Body:
     ]
     body.add(lathe(profile), glass)
 
-    def band(reach: float, low: float, high: float, color: Color) -> None:
-        body.add(lathe([(reach, low), (reach, high)]), color)
+    def band(radius: float, low: float, high: float, color: Color) -> None:
+        body.add(lathe([(radius, low), (radius, high)]), color)
 
     label = paint(random) if random.random() < 0.6 else (0.93, 0.92, 0.86)
     low, high = random.uniform(0.1, 0.18) * height, shoulder - random.uniform(0.04, 0.12) * height
@@ -45,7 +55,7 @@ def bottle(random: Generator) -> Body:
         stop = start + random.uniform(0.08, 0.25) * (high - low)
         band(1.03 * radius, start, stop, paint(random, vivid=True))
     band(1.3 * thin, 0.955 * height, 1.02 * height, paint(random))  # cap
-    return body.turned(random.uniform(0, 2 * np.pi))
+    return body.rotated_copies(random.uniform(0, 2 * np.pi))
 
 
 def chair(random: Generator) -> Body:
@@ -63,20 +73,20 @@ def chair(random: Generator) -> Body:
     body.pair(rod((x, rear, seat), (x, rear + lean, top), 0.65 * thick, sides=4), frame)
 
     def board(low: float, high: float, half: float, middle: float = 0.0) -> Solid:
-        """Return a board in the leaning plane of the back, between two heights."""
+        """Return a board of half width `half` about x = `middle`, in the inclined plane of the back."""
         levels = []
         for z in (low, high):
             y = rear + lean * (z - seat) / (top - seat)
             levels.append((half, y - 0.015, y + 0.015, z))
-        return tapered(levels, middle)
+        return loft_rectangles(levels, middle)
 
     body.add(board(top - 0.08, top, x), frame)
     style = random.random()
     if style < 0.4:
         body.add(board(seat + 0.1, top - 0.04, x), cloth)
     elif style < 0.7:
-        for place in np.linspace(-0.7, 0.7, int(random.integers(3, 6))).tolist():
-            body.add(board(seat, top - 0.05, 0.018, place * x), frame)
+        for share in np.linspace(-0.7, 0.7, int(random.integers(3, 6))).tolist():
+            body.add(board(seat, top - 0.05, 0.018, share * x), frame)
     else:
         for z in (seat + 0.12, top - 0.16):
             body.add(board(z, z + 0.06, x), frame)
@@ -91,9 +101,9 @@ def chair(random: Generator) -> Body:
 
 
 def diningtable(random: Generator) -> Body:
-    """Return a rectangular table with twofold symmetry: half of it is built, and copied with half a turn.
+    """Return a rectangular table that looks the same after a rotation by 180°: one half is built, copied and rotated.
 
-    A long side faces the front. Plates and chairs, where there are any, come in pairs that are rotated likewise.
+    A long side faces the front. Plates and chairs, if there are any, are copied and rotated in the same way.
     """
     half = Body()
     color = wood(random)
@@ -115,18 +125,18 @@ def diningtable(random: Generator) -> Body:
         china = shade((0.95, 0.95, 0.93), random.uniform(0.85, 1.0))
         dish = lathe([(0.07, height), (0.13, height + 0.02), (0.12, height + 0.022)], 16)
         for side in (-0.3 * depth, 0.3 * depth):
-            half.add(transformed(dish, shift=(0.3 * width, side, 0)), china)
+            half.add(transform(dish, shift=(0.3 * width, side, 0)), china)
     if random.random() < 0.5:  # chairs along the sides
         paintwork = wood(random) if random.random() < 0.6 else paint(random)
         away = depth / 2 + random.uniform(0.0, 0.25)
-        for place in (-0.24 * width, 0.24 * width) if random.random() < 0.7 else (0.0,):
-            half.add(box((0.42, 0.4, 0.04), (place, away, 0.45)), paintwork)
-            half.add(box((0.42, 0.035, 0.36), (place, away + 0.2, 0.78)), paintwork)
-            for side in (place - 0.18, place + 0.18):
+        for middle in (-0.24 * width, 0.24 * width) if random.random() < 0.7 else (0.0,):
+            half.add(box((0.42, 0.4, 0.04), (middle, away, 0.45)), paintwork)
+            half.add(box((0.42, 0.035, 0.36), (middle, away + 0.2, 0.78)), paintwork)
+            for side in (middle - 0.18, middle + 0.18):
                 foot = away + 0.2
                 half.add(rod((side, foot, 0), (side, foot, 0.65), 0.025, sides=4), paintwork)
                 half.add(rod((side, foot - 0.37, 0), (side, foot - 0.37, 0.45), 0.025, sides=4), paintwork)
-    return half.turned(0.0, np.pi)
+    return half.rotated_copies(0.0, np.pi)
 
 
 def sofa(random: Generator) -> Body:
@@ -153,7 +163,7 @@ def sofa(random: Generator) -> Body:
             (0.47 * wide, rear - 0.36, rear - 0.18, seat),
             (0.47 * wide, rear - 0.29, rear - 0.11, top + 0.04),
         ]
-        body.add(tapered(levels, middle), shade(cloth, 1.15))
+        body.add(loft_rectangles(levels, middle), shade(cloth, 1.15))
     if random.random() < 0.5:
         pillow = ellipsoid((inner / 2 - 0.2, rear - 0.42, seat + 0.2), (0.2, 0.09, 0.19), 10, 7)
         body.pair(pillow, paint(random, vivid=True))
@@ -164,7 +174,7 @@ def sofa(random: Generator) -> Body:
 
 
 def tvmonitor(random: Generator) -> Body:
-    """Return a flat screen on a foot, or an old set with a deep back; the screen is lit and faces the front."""
+    """Return a flat screen on a foot, or an old set with a deep back; the screen faces the front and is on or off."""
     body = Body()
     case = DARK if random.random() < 0.6 else ((0.8, 0.79, 0.74) if random.random() < 0.6 else METAL)
     width = random.uniform(0.5, 1.0)
@@ -192,7 +202,7 @@ def tvmonitor(random: Generator) -> Body:
             (0.82 * half, -0.82 * high, 0.82 * high, 0.45),
             (0.49 * half, -0.49 * high, 0.49 * high, 1.0),
         ]
-        lying = tapered(tube)  # its height runs backwards: (x, y, z) becomes (x, z, y)
+        lying = loft_rectangles(tube)  # the stack runs backwards: (x, y, z) becomes (x, z, y)
         back = Solid(lying.vertices[:, [0, 2, 1]] * (1, deep, 1) + (0, thick / 2, middle), lying.faces)
         body.add(back, shade(case, 0.85))
         body.add(box((0.6 * width, 0.5 * deep, 0.04), (0, 0.3 * deep, 0.02)), shade(case, 0.6))
@@ -202,5 +212,5 @@ def tvmonitor(random: Generator) -> Body:
         neck = (0, 0.03 * width, (low + 0.1) / 2)
         body.add(box((0.1 * width, 0.05 * width, low + 0.1), neck), shade(case, 0.9))
         foot = lathe([(0.2 * width, 0.0), (0.2 * width, 0.012), (0.07 * width, 0.03)], 18)
-        body.add(transformed(foot, scale=(1.2, 0.8, 1.0), shift=(0, 0.03 * width, 0)), case)
+        body.add(transform(foot, scale=(1.2, 0.8, 1.0), shift=(0, 0.03 * width, 0)), case)
     return body

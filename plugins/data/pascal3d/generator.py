@@ -1,7 +1,7 @@
 """Generator of images in the layout of PASCAL3D+: annotation files, lists and images, and `synthetic.json`.
 
-A root is a function of class, number of images, seed and renderer, to the byte: each image has its own random stream,
-whichever thread draws it. A root is written beside its place and renamed when it is complete.
+The same class, number of images, seed and renderer give the same bytes. Each image has its own random stream, so the
+order in which threads draw the images does not matter.
 """
 
 import io
@@ -15,46 +15,55 @@ from PIL import Image
 
 from framework.errors import ConfigError
 from framework.renderer import Renderer
-from framework.storage.generated import draw_all
-from framework.storage.generated import ensure_generated as whole
+from framework.storage.generated import draw_all, ensure_generated
 from plugins.data.pascal3d.families import FAMILIES
 from plugins.data.pascal3d.layout import VOC_LISTS
-from plugins.data.pascal3d.scene import Shot, Thing, shoot
+from plugins.data.pascal3d.scene import AnnotatedObject, Shot, shoot
 
 VERSION = 1
-"""Version of the generator; a change in what it draws or writes takes a new number, and thus a new folder."""
+"""Version of the generator; increase it if the output changes, so that a new folder is written."""
 SHARES = {"imagenet_train": 0.4, "imagenet_val": 0.2, "pascal_train": 0.2, "pascal_val": 0.2}
 SAVING = Lock()
 """Lock for SciPy's writers of MATLAB files.
 
-They share the tag with which they write sizes: two of them at once would write each other's.
+All writers share one variable for the sizes that they write, so two writers at the same time would mix them up.
 """
-HEADER = b"MATLAB 5.0 MAT-file, synthetic annotation".ljust(116)  # SciPy's holds the date
+# SciPy's own header holds the date, which would change the bytes of the file
+HEADER = b"MATLAB 5.0 MAT-file, synthetic annotation".ljust(116)
 
 
-def generated(parent: Path, category: str, images: int, seed: int, renderer: Renderer) -> Path:
-    """Return the root of a generated class; it is drawn now if it is not there.
+def generate_class(parent: Path, category: str, images: int, seed: int, renderer: Renderer) -> Path:
+    """Return the root of a generated class, after generating it if it does not exist.
+
+    Args:
+        parent: Folder of the generated roots.
+        category: Name of the class.
+        images: Number of images.
+        seed: Seed of the images.
+        renderer: Renderer of the objects.
 
     Raises:
-        DataError: the cache cannot be written, or holds something else in its place.
-        ConfigError: the renderer cannot draw what is needed.
+        DataError: The cache cannot be written, or holds other data under the same name.
+        ConfigError: The renderer does not draw colours and masks.
     """
     missing = {"color", "mask"} - renderer.channels
     if missing:
         raise ConfigError(
-            f"data.renderer = {type(renderer).__name__} draws no {' and no '.join(sorted(missing))}; wanted "
-            "color and mask. Choose another renderer."
+            f"data.renderer = {type(renderer).__name__} draws no {' and no '.join(sorted(missing))}, but color and "
+            "mask are required. Choose another renderer."
         )
-    drawn_by = f"{type(renderer).__module__}.{type(renderer).__qualname__}"
+    renderer_name = f"{type(renderer).__module__}.{type(renderer).__qualname__}"
     mark = {
         "generator_version": VERSION,
         "seed": seed,
         "images": images,
         "symmetry": {category: FAMILIES[category].symmetry},
-        "renderer": drawn_by,
+        "renderer": renderer_name,
     }
-    folder = parent / f"v{VERSION}-{drawn_by}-seed{seed}-images{images}"
-    return whole(folder / category, mark, lambda root: _draw_all(root, category, images, seed, renderer))
+    folder = parent / f"v{VERSION}-{renderer_name}-seed{seed}-images{images}"
+    return ensure_generated(
+        folder / category, mark, lambda root: _draw_all(root, category, images, seed, renderer)
+    )
 
 
 def _draw_all(part: Path, category: str, images: int, seed: int, renderer: Renderer) -> None:
@@ -62,10 +71,10 @@ def _draw_all(part: Path, category: str, images: int, seed: int, renderer: Rende
     for source in ("pascal", "imagenet"):
         for top in ("Annotations", "Images"):
             (part / top / f"{category}_{source}").mkdir(parents=True)
-    one_at_a_time = Lock()  # a renderer may keep buffers between calls
+    renderer_lock = Lock()  # a renderer may keep buffers between calls
 
     def render(*arguments: Any) -> Any:
-        with one_at_a_time:
+        with renderer_lock:
             return renderer(*arguments)
 
     flags = [False] * images
@@ -75,14 +84,14 @@ def _draw_all(part: Path, category: str, images: int, seed: int, renderer: Rende
         random = np.random.default_rng([seed, sorted(FAMILIES).index(category), number])
         shot = shoot(category, random, render)
         _save(part, f"{category}_{split.partition('_')[0]}", name, shot)
-        flags[number] = any(thing.category == category and not thing.difficult for thing in shot.things)
+        flags[number] = any(entry.category == category and not entry.difficult for entry in shot.objects)
 
     draw_all(images, draw, f"the synthetic {category} images")
     _save_lists(part, category, names, flags)
 
 
 def _names(images: int) -> Iterator[tuple[str, str]]:
-    """Yield list and name of every image."""
+    """Yield the list and the name of every image."""
     ends = np.round(np.cumsum([0.0, *SHARES.values()]) * images).astype(int)
     for split, first, last in zip(SHARES, ends, ends[1:], strict=False):
         for number in range(first, last):
@@ -102,7 +111,9 @@ def _save(part: Path, folder: str, name: str, shot: Shot) -> None:
         "database": "synthetic",
         "objects": _objects(shot),
     }
-    from scipy.io import savemat  # takes a quarter of a second, which only the generation needs
+    from scipy.io import (
+        savemat,  # this import takes a quarter of a second, and reading the data does not need it
+    )
 
     content = io.BytesIO()
     with SAVING:
@@ -114,18 +125,18 @@ def _objects(shot: Shot) -> np.ndarray:
     """Return the struct array `record.objects`; `symmetry` and `blur` are not in the official files."""
     entries = [
         {
-            "class": thing.category,
+            "class": annotated.category,
             "view": "",
-            "truncated": float(thing.truncated),
-            "occluded": float(thing.occluded),
-            "difficult": float(thing.difficult),
-            "bbox": np.array([thing.box], dtype=np.float64) + 1,  # the official boxes count from 1
+            "truncated": float(annotated.truncated),
+            "occluded": float(annotated.occluded),
+            "difficult": float(annotated.difficult),
+            "bbox": np.array([annotated.box], dtype=np.float64) + 1,  # the official boxes count from 1
             "cad_index": 1.0,
-            "viewpoint": _viewpoint(thing),
-            "symmetry": float(thing.symmetry),
+            "viewpoint": _viewpoint(annotated),
+            "symmetry": float(annotated.symmetry),
             "blur": float(shot.blur),
         }
-        for thing in shot.things
+        for annotated in shot.objects
     ]
     array = np.empty((1, len(entries)), dtype=[(name, object) for name in entries[0]])
     for index, entry in enumerate(entries):
@@ -133,18 +144,20 @@ def _objects(shot: Shot) -> np.ndarray:
     return array
 
 
-def _viewpoint(thing: Thing) -> dict[str, float]:
+def _viewpoint(annotated: AnnotatedObject) -> dict[str, float]:
     """Return the official fields; `focal` × `viewport` is the focal length, (px, py) the principal point, pixels."""
-    view = thing.view
+    view = annotated.view
     coarse = {
         "azimuth_coarse": float(45 * round(view.azimuth / 45) % 360),
         "elevation_coarse": float(15 * round(view.elevation / 15)),
     }
-    fine = {"azimuth": view.azimuth, "elevation": view.elevation, "theta": view.tilt} if thing.fine else {}
+    fine = (
+        {"azimuth": view.azimuth, "elevation": view.elevation, "theta": view.tilt} if annotated.fine else {}
+    )
     return {
         **coarse,
         **fine,
-        "distance": view.distance if thing.fine else 0.0,
+        "distance": view.distance if annotated.fine else 0.0,
         "focal": 1.0,
         "viewport": view.focal,
         "px": view.principal[0] + 1,
@@ -153,7 +166,7 @@ def _viewpoint(thing: Thing) -> dict[str, float]:
 
 
 def _save_lists(part: Path, category: str, names: Sequence[tuple[str, str]], easy: Sequence[bool]) -> None:
-    """Write the lists; those of VOC flag an image 1, or 0 where its only objects of the class are difficult."""
+    """Write the lists of images; those of VOC flag an image with 1, or with 0 if all its objects are difficult."""
     (part / "Image_sets").mkdir()
     (part / VOC_LISTS).mkdir(parents=True)
     for split in SHARES:

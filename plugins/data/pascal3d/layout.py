@@ -1,4 +1,4 @@
-"""Official folders of PASCAL3D+ release 1.1: its lists of images, and its annotations in MATLAB files.
+"""Reading of PASCAL3D+ release 1.1: its folders, its lists of images, and its annotations in MATLAB files.
 
 Annotations/<class>_{pascal,imagenet}/<name>.mat, Images/<class>_{pascal,imagenet}/<name>.{jpg,JPEG},
 Image_sets/<class>_imagenet_{train,val}.txt, PASCAL/VOCdevkit/VOC2012/ImageSets/Main/<class>_{train,val}.txt.
@@ -32,13 +32,13 @@ class Annotation:
     """One object of the requested class.
 
     Attributes:
-        file: file of the annotation.
-        image: where the image should be.
-        box: box in pixels from the image's outer corner; it may reach beyond the image.
-        angles: azimuth, elevation and tilt in degrees, any number of turns; None where there is only a coarse label, or
-            none at all.
-        symmetry: symmetry of a generated object; 1 elsewhere.
-        blur: blur of a generated image; None elsewhere.
+        file: File of the annotation.
+        image: Path of the image, which may not exist.
+        box: Left, top, right and bottom edge, pixels from the corner of the image; it may reach beyond the image.
+        angles: Azimuth, elevation and tilt in degrees, of any size; None if there is only a coarse label, or none.
+        truncated, occluded, difficult: Flags of the annotation.
+        symmetry: Symmetry of a generated object (`Family.symmetry`); 1 for a real object.
+        blur: Blur of a generated image, pixels; None for a real image.
     """
 
     file: Path
@@ -56,11 +56,12 @@ def check_root(root: Path, category: str) -> None:
     """Refuse a folder that does not hold the release.
 
     Raises:
-        DataError: the folder is missing, or a folder or list is missing from it; the message says which.
+        DataError: The folder is missing, or lacks a folder or a list of the class; the message names them.
     """
     if not root.is_dir():
         raise DataError(
-            f"data.root = {root}: no such folder; wanted the unpacked PASCAL3D+_release1.1, or null."
+            f"data.root = {root} does not exist or is no folder. Set data.root to the unpacked PASCAL3D+_release1.1, "
+            "or to null for synthetic images."
         )
     folders = [Path(top, f"{category}_{source}") for top in ("Annotations", "Images") for source in SUFFIXES]
     lists = [name for names in split_lists(category).values() for _, name in names]
@@ -68,9 +69,10 @@ def check_root(root: Path, category: str) -> None:
     missing += [str(path) for path in lists if not (root / path).is_file()]
     if missing:
         inner = [child.name for child in sorted(root.iterdir()) if (child / "Annotations").is_dir()]
-        hint = f" Did you mean {root / inner[0]}?" if inner else " Unpack the whole release there."
+        hint = f"Did you mean {root / inner[0]}?" if inner else "Unpack the whole release into this folder."
         raise DataError(
-            f"data.root = {root} is not laid out as PASCAL3D+ release 1.1: no {', no '.join(missing)}.{hint}"
+            f"data.root = {root} has not the layout of PASCAL3D+ release 1.1: it holds no {', no '.join(missing)}. "
+            f"{hint}"
         )
 
 
@@ -93,10 +95,10 @@ def read_list(file: Path) -> list[str]:
     """Return the image names of a list; names whose flag is -1 (the class is not in the image) are left out.
 
     Raises:
-        DataError: a line is neither a name nor a name and one of the flags -1, 0, 1.
+        DataError: The file cannot be read, or a line is neither a name nor a name and one of the flags -1, 0, 1.
     """
     names = []
-    with translate_errors(file, "a list of image names", "Restore it from the release."):
+    with translate_errors(file, "a list of image names", "Copy it again from the release."):
         lines = lines_of(read_bytes(file))
     for number, line in enumerate(lines, start=1):
         match line.split():
@@ -108,8 +110,8 @@ def read_list(file: Path) -> list[str]:
                 continue
             case _:
                 raise DataError(
-                    f"{file} line {number}: {quote(line)}; wanted an image name, or a name and one of -1, 0, 1. "
-                    "Restore the list from the release."
+                    f"{file} line {number}: {quote(line)} is neither an image name nor a name and one of -1, 0, 1. "
+                    "Copy the list again from the release."
                 )
     return list(dict.fromkeys(names))
 
@@ -118,32 +120,32 @@ def read_annotations(root: Path, category: str, source: str, name: str) -> list[
     """Return the objects of class `category` in one annotation file.
 
     Raises:
-        DataError: the file is missing, is not a MATLAB file, or does not have the structure of an annotation.
+        DataError: The file is missing, is not a MATLAB file, or does not have the structure of an annotation.
     """
     file = root / "Annotations" / f"{category}_{source}" / f"{name}.mat"
-    with translate_errors(file, "a PASCAL3D+ annotation", "Restore it from the release."):
+    with translate_errors(file, "a PASCAL3D+ annotation", "Copy it again from the release."):
         return _objects(file, _load(file), root / "Images" / file.parent.name, category, source)
 
 
 def _objects(file: Path, record: Struct, images: Path, category: str, source: str) -> list[Annotation]:
     image = _image(images, file.stem, source, _text(record, "filename"))
-    found = []
+    annotations = []
     for number, entry in enumerate(_structs(record.get("objects")), start=1):
         if _text(entry, "class") != category:
             continue
         corners = _numbers(entry, "bbox")
         if len(corners) != 4 or not all(map(math.isfinite, corners)):
             raise DataError(
-                f"{file}: object {number} has the bbox {corners}; wanted four finite numbers x1 y1 x2 y2. "
-                "Mend the annotation."
+                f"{file}: Object {number} has the bbox {corners}, but four finite numbers x1 y1 x2 y2 are required. "
+                "Correct the annotation."
             )
         x1, y1, x2, y2 = corners
         symmetry = _number(entry, "symmetry")
-        found.append(
+        annotations.append(
             Annotation(
                 file=file,
                 image=image,
-                box=(x1 - 1, y1 - 1, x2, y2),  # counted from 1, both ends included
+                box=(x1 - 1, y1 - 1, x2, y2),  # the file counts pixels from 1, and (x2, y2) is inside the box
                 angles=_angles(entry.get("viewpoint")),
                 truncated=bool(_number(entry, "truncated")),
                 occluded=bool(_number(entry, "occluded")),
@@ -152,22 +154,24 @@ def _objects(file: Path, record: Struct, images: Path, category: str, source: st
                 blur=_number(entry, "blur"),
             )
         )
-    return found
+    return annotations
 
 
 def _load(file: Path) -> Struct:
+    """Return the struct `record` of an annotation file."""
     if not file.exists():
-        raise DataError(f"{file}: no such file, though a list names it. Restore it from the release.")
-    record = read_variables(file, ["record"], "Restore it from the release.").get("record")
+        raise DataError(f"{file}: no such file, although a list names it. Copy it again from the release.")
+    record = read_variables(file, ["record"], "Copy it again from the release.").get("record")
     if not isinstance(record, dict):
         raise DataError(
-            f"{file}: holds no struct `record`; wanted a PASCAL3D+ annotation. Restore it from the release."
+            f"{file}: The file holds no struct `record`, so it is no PASCAL3D+ annotation. Copy it again from the "
+            "release."
         )
     return record
 
 
 def _image(folder: Path, name: str, source: str, recorded: str) -> Path:
-    """Return the image in the folder; the most likely name where there is none."""
+    """Return the path of the image of an annotation; if there is no such file, the path that is most likely."""
     candidates = [folder / f"{name}{suffix}" for suffix in SUFFIXES[source]]
     if recorded:
         candidates.append(folder / Path(recorded).name)
@@ -175,34 +179,35 @@ def _image(folder: Path, name: str, source: str, recorded: str) -> Path:
 
 
 def _structs(value: Any) -> Iterator[Struct]:
-    """Yield the structs of a struct array or cell array of any length; a single struct comes without the array."""
+    """Yield the structs of a struct array or cell array, or a struct that is stored without an array."""
     for item in np.atleast_1d(np.asarray(value, dtype=object)).ravel():
         if isinstance(item, dict):
             yield item
 
 
 def _text(entry: Struct, name: str) -> str:
-    """Return a field's text; an empty string where it is missing, empty or not text."""
+    """Return the text of a field; an empty string if the field is missing, empty or holds something else."""
     value = entry.get(name)
     return value.strip() if isinstance(value, str) else ""
 
 
 def _numbers(entry: Struct, name: str) -> list[float]:
-    """Return a field's numbers, at most five; an empty list where it is missing, empty or holds something else."""
+    """Return at most five numbers of a field; an empty list if the field is missing, empty or holds something else."""
     value = np.asarray(entry.get(name))
     real = np.issubdtype(value.dtype, np.integer) or np.issubdtype(value.dtype, np.floating)
     return value.ravel()[:5].astype(np.float64).tolist() if real else []
 
 
 def _number(entry: Struct, name: str) -> float | None:
-    """Return a field's first number; None where there is none."""
+    """Return the first number of a field; None if there is none."""
     return next(iter(_numbers(entry, name)), None)
 
 
 def _angles(viewpoint: Any) -> tuple[float, float, float] | None:
-    """Return the fine labels in degrees, which may be NaN in a damaged file; None where there are only coarse ones.
+    """Return azimuth, elevation and tilt of the fine label, degrees; None if there is no fine label.
 
-    An object is finely annotated where the fields are filled and its distance is not 0.
+    An object has a fine label if the three fields are filled and its distance is not 0. In a damaged file the angles
+    may be NaN.
     """
     if not isinstance(viewpoint, dict) or _number(viewpoint, "distance") == 0:
         return None
@@ -213,5 +218,5 @@ def _angles(viewpoint: Any) -> tuple[float, float, float] | None:
 
 
 def radians(degrees: float) -> float:
-    """Return an angle given in degrees as radians in [-π, π)."""
+    """Return the angle in radians, in [-π, π)."""
     return math.radians((degrees + 180) % 360 - 180)

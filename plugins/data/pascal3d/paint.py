@@ -15,7 +15,7 @@ TAIL_LAMP: Color = (0.85, 0.08, 0.08)
 
 
 def paint(random: Generator, *, vivid: bool = False) -> Color:
-    """Return a random lacquer of any hue; sometimes white, silver or nearly black unless `vivid`."""
+    """Return a random colour of lacquer, of any hue; unless `vivid`, sometimes white, silver or nearly black."""
     hue, saturation, value = random.random(), random.uniform(0.5, 0.9), random.uniform(0.45, 0.95)
     grey, level = random.random() < 0.4, random.random()
     if grey and not vivid:

@@ -1,4 +1,4 @@
-"""Rows of the contract: a few generated cars, alone and with bottles."""
+"""Contract-test cases: a few generated cars, alone and with bottles."""
 
 from dataclasses import replace
 
@@ -33,7 +33,7 @@ ROWS = {
             },
             fragile={},
             skip={},
-            leave_out={"official layout read back": "each class is generated in a root of its own"},
+            leave_out={"official layout read back": "each class is generated into its own root"},
         ),
     )
 }

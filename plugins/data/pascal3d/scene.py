@@ -1,4 +1,4 @@
-"""One labelled image: objects from random viewpoints over a backdrop, and the effects of a camera."""
+"""Generator of one labelled image: objects from random viewpoints in front of a backdrop, blur and noise."""
 
 import dataclasses
 import math
@@ -14,19 +14,27 @@ from torch import Tensor
 
 from framework.geometry.camera import Camera, look_from
 from framework.renderer import Scene
-from plugins.data.pascal3d.backdrop import Picture, background, blob, texture
+from plugins.data.pascal3d.backdrop import FloatImage, background, blob, texture
 from plugins.data.pascal3d.families import FAMILIES
 from plugins.data.pascal3d.shapes import Mesh
 from plugins.data.pascal3d.viewpoints import viewpoint
 
 SUPERSAMPLING = 2
 Edges = tuple[float, float, float, float]
-Draw = Callable[[Scene, Collection[str]], Mapping[str, Tensor]]
-"""Type of a framework.renderer.Renderer."""
+"""Left, top, right and bottom edge, pixels."""
+RenderFunction = Callable[[Scene, Collection[str]], Mapping[str, Tensor]]
+"""Type of `framework.renderer.Renderer.__call__`."""
 
 
 class View(NamedTuple):
-    """Viewpoint: degrees; `distance` in object diagonals; `focal`, `principal` in pixels (as framework.geometry)."""
+    """Viewpoint of a camera.
+
+    Attributes:
+        azimuth, elevation, tilt: Angles, degrees.
+        distance: Distance of the camera from the object's centre, in diagonals of the object.
+        focal: Focal length, pixels.
+        principal: Principal point (x, y), pixels, as in `framework.geometry.camera`.
+    """
 
     azimuth: float
     elevation: float
@@ -36,11 +44,16 @@ class View(NamedTuple):
     principal: tuple[float, float]
 
 
-class Thing(NamedTuple):
+class AnnotatedObject(NamedTuple):
     """Annotation of an object in an image.
 
-    `box` holds its first column and row and its last ones, counted from 0; `fine` is False where only a coarse label is
-    given.
+    Attributes:
+        category: Name of the class.
+        view: Viewpoint.
+        box: First column, first row, last column and last row of the object, counted from 0.
+        truncated, occluded, difficult: Flags of the annotation.
+        fine: False if only a coarse label is given.
+        symmetry: See `Family`.
     """
 
     category: str
@@ -54,22 +67,30 @@ class Thing(NamedTuple):
 
 
 class Layer(NamedTuple):
-    """Rendered object: colour times cover, (height, width, 3), and cover, (height, width), both 0…1."""
+    """Rendered object, as an image with premultiplied alpha.
 
-    color: Picture
-    cover: NDArray[np.float32]
+    Attributes:
+        color: Colour times opacity, (height, width, 3), 0…1.
+        opacity: Opacity, (height, width), 0…1.
+    """
+
+    color: FloatImage
+    opacity: NDArray[np.float32]
 
 
 def camera_of(view: View) -> Camera:
-    """Return the camera of a view; its image is one pixel, until `window` chooses a part."""
+    """Return the camera of a view; its image has one pixel, and `crop_camera` gives it another size."""
     angles = (math.radians(angle) for angle in (view.azimuth, view.elevation, view.tilt))
     camera = look_from(*angles, distance=view.distance, field_of_view=1.0, size=(1, 1))
     return dataclasses.replace(camera, focal=(view.focal, view.focal), principal=view.principal)
 
 
-def window(camera: Camera, corner: tuple[int, int], size: tuple[int, int], scale: int) -> Camera:
-    """Return the camera for `size` (height, width) pixels from `corner` (x, y) on, each divided `scale` times."""
-    middle = (scale - 1) / 2  # position of a pixel's centre among its parts
+def crop_camera(camera: Camera, corner: tuple[int, int], size: tuple[int, int], scale: int) -> Camera:
+    """Return the camera of a part of the image, with `scale` × `scale` pixels for each pixel.
+
+    The part begins at `corner` (x, y) and has `size` (height, width) pixels of the original image.
+    """
+    middle = (scale - 1) / 2  # index of the centre of a pixel among the finer pixels
     (fx, fy), (cx, cy) = camera.focal, camera.principal
     return dataclasses.replace(
         camera,
@@ -80,16 +101,16 @@ def window(camera: Camera, corner: tuple[int, int], size: tuple[int, int], scale
     )
 
 
-def outline(mesh: Mesh, camera: Camera) -> Edges:
-    """Return left, top, right and bottom of the projected vertices, pixels."""
+def projected_edges(mesh: Mesh, camera: Camera) -> Edges:
+    """Return the edges of the projected vertices."""
     inside = camera.rotation.double().numpy() @ mesh.vertices.T + camera.translation.double().numpy()[:, None]
     column = camera.focal[0] * inside[0] / inside[2] + camera.principal[0]
     row = camera.focal[1] * inside[1] / inside[2] + camera.principal[1]
     return float(column.min()), float(row.min()), float(column.max()), float(row.max())
 
 
-def lit(mesh: Mesh, random: Generator) -> NDArray[np.float64]:
-    """Return vertex colours under sky light and one lamp, whose azimuth is independent of the camera's."""
+def shade_vertices(mesh: Mesh, random: Generator) -> NDArray[np.float64]:
+    """Return the vertex colours (vertices, 3) under sky light and one lamp at a random position."""
     azimuth, height = random.uniform(0, 2 * np.pi), random.uniform(0.2, 1.4)
     lamp = np.array([np.cos(azimuth) * np.cos(height), np.sin(azimuth) * np.cos(height), np.sin(height)])
     ambient = random.uniform(0.4, 0.7)
@@ -98,15 +119,18 @@ def lit(mesh: Mesh, random: Generator) -> NDArray[np.float64]:
     return np.clip(mesh.colors * (sky + direct)[:, None], 0, 1)
 
 
-def draw(
-    renderer: Draw,
+def render_object(
+    renderer: RenderFunction,
     mesh: Mesh,
     colors: NDArray[np.float64],
     camera: Camera,
     edges: Edges,
     size: tuple[int, int],
 ) -> Layer:
-    """Return the object alone, (height, width) = `size`; only the part within `edges` (`outline`) is rendered."""
+    """Return an image of `size` (height, width) that shows only the object.
+
+    Only the part within `edges`, the result of `projected_edges`, is rendered.
+    """
     height, width = size
     left, top, right, bottom = edges
     x0, x1 = max(0, math.floor(left)), min(width, math.ceil(right) + 1)
@@ -118,15 +142,15 @@ def draw(
         vertices=torch.from_numpy(mesh.vertices).float(),
         faces=torch.from_numpy(mesh.faces),
         colors=torch.from_numpy(colors).float(),
-        camera=window(camera, (x0, y0), (y1 - y0, x1 - x0), SUPERSAMPLING),
+        camera=crop_camera(camera, (x0, y0), (y1 - y0, x1 - x0), SUPERSAMPLING),
     )
-    drawn = renderer(scene, ("color", "mask"))
-    layer.color[y0:y1, x0:x1] = _averaged(drawn["color"].cpu().numpy())
-    layer.cover[y0:y1, x0:x1] = _averaged(drawn["mask"].cpu().numpy().astype(np.float32))
+    channels = renderer(scene, ("color", "mask"))
+    layer.color[y0:y1, x0:x1] = _average_blocks(channels["color"].cpu().numpy())
+    layer.opacity[y0:y1, x0:x1] = _average_blocks(channels["mask"].cpu().numpy().astype(np.float32))
     return layer
 
 
-def _averaged(fine: Picture) -> Picture:
+def _average_blocks(fine: FloatImage) -> FloatImage:
     """Return the mean of every block of SUPERSAMPLING × SUPERSAMPLING pixels."""
     step = range(SUPERSAMPLING)
     total = sum(fine[row::SUPERSAMPLING, column::SUPERSAMPLING] for row in step for column in step)
@@ -134,15 +158,21 @@ def _averaged(fine: Picture) -> Picture:
 
 
 class Shot(NamedTuple):
-    """Finished image; `blur` is the standard deviation of the Gaussian that blurred it, pixels."""
+    """Finished image with its annotations.
+
+    Attributes:
+        pixels: The image, (height, width, 3).
+        objects: Annotations of its objects.
+        blur: Standard deviation of the Gaussian that blurred the image, pixels.
+    """
 
     pixels: NDArray[np.uint8]
-    things: list[Thing]
+    objects: list[AnnotatedObject]
     blur: float
 
 
-def shoot(category: str, random: Generator, renderer: Draw) -> Shot:
-    """Return an image of an object of `category`; sometimes with a second object, or something in front of it."""
+def shoot(category: str, random: Generator, renderer: RenderFunction) -> Shot:
+    """Return an image of an object of `category`, sometimes with a second object, or with a shape in front of it."""
     size = height, width = int(random.integers(96, 129)), int(random.integers(112, 145))
     main = _place(category, random, renderer, size, aside=random.random() < 0.1)
     pieces = [main]
@@ -151,16 +181,16 @@ def shoot(category: str, random: Generator, renderer: Draw) -> Shot:
         pieces.insert(int(random.random() < 0.25), _place(other, random, renderer, size, aside=True))
 
     view = main.view
-    drop = -view.focal * math.tan(
-        math.radians(view.elevation)
-    )  # distance to the horizon of a camera that looks down
+    # distance of the horizon from the principal point, pixels
+    drop = -view.focal * math.tan(math.radians(view.elevation))
     tilt = math.radians(view.tilt)
     horizon = (view.principal[0] + drop * math.sin(tilt), view.principal[1] + drop * math.cos(tilt))
     pixels = background(random, height, width, horizon, tilt)
     hidden: list[NDArray[np.float32]] = []
     for piece in pieces:  # from far to near
-        pixels = pixels * (1 - piece.layer.cover[..., None]) + piece.layer.color
-        hidden = [np.maximum(mask, piece.layer.cover) for mask in hidden] + [np.zeros_like(piece.layer.cover)]
+        pixels = pixels * (1 - piece.layer.opacity[..., None]) + piece.layer.color
+        hidden = [np.maximum(mask, piece.layer.opacity) for mask in hidden]
+        hidden.append(np.zeros_like(piece.layer.opacity))
     if random.random() < 0.1:
         left, top, right, bottom = box_of(main.layer)
         center = (random.uniform(left, right), random.uniform(top, bottom))
@@ -169,54 +199,63 @@ def shoot(category: str, random: Generator, renderer: Draw) -> Shot:
         hidden = [np.maximum(other, mask) for other in hidden]
 
     blur = random.uniform(0.5, 3.5) if random.random() < 0.25 else 0.0
-    things = [_annotated(piece, mask, random) for piece, mask in zip(pieces, hidden, strict=True)]
-    return Shot(_exposed(pixels, blur, random), things, blur)
+    objects = [_annotate(piece, mask, random) for piece, mask in zip(pieces, hidden, strict=True)]
+    return Shot(_expose(pixels, blur, random), objects, blur)
 
 
 class _Piece(NamedTuple):
+    """Rendered object; `inside` is the share of its bounding box that lies in the image."""
+
     category: str
     view: View
     layer: Layer
-    inside: float  # share of its outline's box that lies in the picture
+    inside: float
 
 
-def _place(category: str, random: Generator, renderer: Draw, size: tuple[int, int], *, aside: bool) -> _Piece:
-    """Return a new rendered object of `category`; `aside` lets it extend beyond the image."""
+def _place(
+    category: str, random: Generator, renderer: RenderFunction, size: tuple[int, int], *, aside: bool
+) -> _Piece:
+    """Return a new object of `category`, rendered at a random position; `aside` lets it extend beyond the image."""
     mesh = FAMILIES[category].build(random).mesh()
     view = View(*viewpoint(category, random), float(random.uniform(2.2, 6.0)), 1.0, (0.0, 0.0))
     camera = camera_of(view)
-    left, top, right, bottom = outline(mesh, camera)
+    left, top, right, bottom = projected_edges(mesh, camera)
     extent = np.array([right - left, bottom - top])
     longest = random.uniform(56, 100) if random.random() < 0.9 else random.uniform(28, 56)
     room = np.array([size[1], size[0]], dtype=np.float64)
     focal = float(min(longest / extent.max(), ((room - 6) / extent).min()))
     span = focal * extent
-    low, high = span / 2 + 2, room - 3 - span / 2  # limits of the middle that keep the whole object visible
+    low, high = (
+        span / 2 + 2,
+        room - 3 - span / 2,
+    )  # between these limits of the middle the whole object is visible
     if aside:
         low, high = low - 0.4 * span, high + 0.4 * span
     middle = random.uniform(low, high)
     x, y = (middle - focal * np.array([left + right, top + bottom]) / 2).tolist()
     camera = dataclasses.replace(camera, focal=(focal, focal), principal=(x, y))
     (left, top), (right, bottom) = (middle - span / 2).tolist(), (middle + span / 2).tolist()
-    layer = draw(renderer, mesh, lit(mesh, random), camera, (left, top, right, bottom), size)
-    if aside and layer.cover.max() < 0.5:  # only a gap of the object lies in the picture
+    colors = shade_vertices(mesh, random)
+    layer = render_object(renderer, mesh, colors, camera, (left, top, right, bottom), size)
+    if aside and layer.opacity.max() < 0.5:  # hardly any part of the object lies in the image
         return _place(category, random, renderer, size, aside=False)
     cut = np.minimum(middle + span / 2, room - 0.5) - np.maximum(middle - span / 2, -0.5)
     return _Piece(category, view._replace(focal=focal, principal=(x, y)), layer, float((cut / span).prod()))
 
 
 def box_of(layer: Layer) -> tuple[int, int, int, int]:
-    """Return first column and row and last column and row of what the object clearly covers."""
-    covered = layer.cover >= 0.5 * layer.cover.max()
+    """Return first column, first row, last column and last row of the pixels that the object clearly covers."""
+    covered = layer.opacity >= 0.5 * layer.opacity.max()
     columns, rows = np.flatnonzero(covered.any(0)), np.flatnonzero(covered.any(1))
     return int(columns[0]), int(rows[0]), int(columns[-1]), int(rows[-1])
 
 
-def _annotated(piece: _Piece, hidden: NDArray[np.float32], random: Generator) -> Thing:
-    cover = piece.layer.cover
-    share = float((cover * hidden).sum() / cover.sum())
+def _annotate(piece: _Piece, hidden: NDArray[np.float32], random: Generator) -> AnnotatedObject:
+    """Return the annotation of an object; `hidden` (height, width) is the opacity of what is in front of it."""
+    opacity = piece.layer.opacity
+    share = float((opacity * hidden).sum() / opacity.sum())
     left, top, right, bottom = box_of(piece.layer)
-    return Thing(
+    return AnnotatedObject(
         category=piece.category,
         view=piece.view,
         box=(left, top, right, bottom),
@@ -228,7 +267,7 @@ def _annotated(piece: _Piece, hidden: NDArray[np.float32], random: Generator) ->
     )
 
 
-def _exposed(pixels: Picture, blur: float, random: Generator) -> NDArray[np.uint8]:
+def _expose(pixels: FloatImage, blur: float, random: Generator) -> NDArray[np.uint8]:
     """Return the image with random brightness, blur and sensor noise."""
     gain, offset = random.uniform(0.8, 1.2), random.uniform(-0.05, 0.05)
     image = Image.fromarray((255 * np.clip(gain * pixels + offset, 0, 1)).astype(np.uint8))

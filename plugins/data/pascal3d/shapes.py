@@ -1,6 +1,6 @@
-"""Closed solids from which the object families are built: boxes, lofts, lathes, rings and plates.
+"""Closed solids from which the object families are built: boxes, lofts, solids of revolution, rings and plates.
 
-Object coordinates are those of PASCAL3D+ models: the front faces -y, z is up, x is the object's left.
+Object coordinates are those of PASCAL3D+ models: the front faces -y, z points up, and x to the left of the object.
 """
 
 import math
@@ -21,11 +21,12 @@ Color = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Solid:
-    """Closed surface; vertices that two facets share are shaded smoothly across them.
+    """Closed surface, which is shaded smoothly across edges whose facets share vertices.
 
     Attributes:
-        vertices: (vertices, 3).
-        faces: (faces, 3), all with the same orientation seen from outside; `Body.mesh` finds out which one.
+        vertices: Vertices, (vertices, 3).
+        faces: Vertex indices, (faces, 3), all clockwise or all counter-clockwise seen from outside; `Body.mesh` finds
+            out which.
     """
 
     vertices: Array
@@ -34,13 +35,13 @@ class Solid:
 
 @dataclass(frozen=True)
 class Mesh:
-    """Coloured object, centred, the diagonal of its bounding box 1.
+    """Coloured object, whose bounding box is centred at the origin and has a diagonal of length 1.
 
     Attributes:
-        vertices: (vertices, 3).
-        faces: (faces, 3), counter-clockwise seen from outside.
-        colors: (vertices, 3), reflectance in [0, 1].
-        normals: (vertices, 3), unit length, outward.
+        vertices: Vertices, (vertices, 3).
+        faces: Vertex indices, (faces, 3), counter-clockwise seen from outside.
+        colors: Reflectances in [0, 1], (vertices, 3).
+        normals: Outward unit normals, (vertices, 3).
     """
 
     vertices: Array
@@ -64,20 +65,20 @@ class Body:
     def pair(self, solid: Solid, color: Color) -> None:
         """Add a solid and its mirror image in x."""
         self.add(solid, color)
-        self.add(transformed(solid, scale=(-1.0, 1.0, 1.0)), color)
+        self.add(transform(solid, scale=(-1.0, 1.0, 1.0)), color)
 
-    def turned(self, *angles: Number) -> "Body":
-        """Return a body with one copy of this one for each angle (radians), rotated by it about the vertical."""
+    def rotated_copies(self, *angles: Number) -> "Body":
+        """Return a body of one copy of this body for each angle (radians), rotated by this angle about z."""
         whole = Body()
         for angle in angles:
             cos, sin = np.cos(angle), np.sin(angle)
-            turn = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
+            rotation = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
             for solid, color in zip(self._solids, self._colors, strict=True):
-                whole.add(Solid(solid.vertices @ turn.T, solid.faces), color)
+                whole.add(Solid(solid.vertices @ rotation.T, solid.faces), color)
         return whole
 
     def mesh(self) -> Mesh:
-        """Return all solids as one mesh, centred, scaled, with faces counter-clockwise seen from outside."""
+        """Return all solids as one centred and scaled mesh, with faces counter-clockwise seen from outside."""
         counts = [len(solid.vertices) for solid in self._solids]
         starts = np.cumsum([0, *counts[:-1]])
         vertices = np.concatenate([solid.vertices for solid in self._solids])
@@ -104,19 +105,19 @@ class Body:
         )
 
 
-def transformed(solid: Solid, *, scale: Points = (1.0, 1.0, 1.0), shift: Points = (0.0, 0.0, 0.0)) -> Solid:
-    """Return the solid scaled per axis, then shifted."""
+def transform(solid: Solid, *, scale: Points = (1.0, 1.0, 1.0), shift: Points = (0.0, 0.0, 0.0)) -> Solid:
+    """Return the solid scaled along each axis and then shifted."""
     return Solid(solid.vertices * np.asarray(scale) + np.asarray(shift), solid.faces)
 
 
-def off(point: Points, x: Number, y: Number, z: Number) -> Array:
-    """Return the point at the offset (x, y, z) from another point."""
+def offset_point(point: Points, x: Number, y: Number, z: Number) -> Array:
+    """Return a point shifted by (x, y, z)."""
     return np.asarray(point) + np.array([x, y, z])
 
 
 def box(size: Points, center: Points) -> Solid:
     """Return an upright box of size (width in x, length in y, height in z)."""
-    return transformed(_unit_box(), scale=size, shift=center)
+    return transform(_unit_box(), scale=size, shift=center)
 
 
 @cache
@@ -126,9 +127,9 @@ def _unit_box() -> Solid:
 
 
 def loft(rings: Points, *, smooth: bool = False) -> Solid:
-    """Return the hull of a stack of rings (rings, points, 3), closed by a flat cap at either end.
+    """Return the surface through a stack of rings (rings, points, 3), closed by a flat cap at either end.
 
-    A ring may shrink to a point. `smooth` shades across the ring's points, but not over the rim of a cap.
+    A ring may shrink to a point. With `smooth`, the side is shaded smoothly, but not across the rim of a cap.
     """
     stack = np.asarray(rings, dtype=np.float64)
     layers, points, _ = stack.shape
@@ -154,7 +155,7 @@ def _loft_faces(layers: int, points: int, smooth: bool) -> NDArray[np.int64]:
 
 
 def _quads(layers: int, points: int, *, closed: bool) -> NDArray[np.int64]:
-    """Return corner indices of the quadrangles between rings; `closed` joins the last ring to the first."""
+    """Return the corner indices (quads, 4) of the quads between rings; `closed` joins the last ring to the first."""
     layer, point = np.meshgrid(np.arange(layers if closed else layers - 1), np.arange(points), indexing="ij")
     above, after = (layer + 1) % layers, (point + 1) % points
     corners = [layer * points + point, layer * points + after, above * points + after, above * points + point]
@@ -168,7 +169,7 @@ def _circle(sides: int) -> Array:
 
 
 def lathe(profile: Sequence[tuple[Number, Number]], sides: int = 24) -> Solid:
-    """Return a body of revolution about z, from (radius, height) pairs from the bottom up."""
+    """Return a solid of revolution about z; the profile is a list of (radius, height), from bottom to top."""
     rings = np.empty((len(profile), sides, 3))
     for layer, (radius, height) in enumerate(profile):
         rings[layer, :, :2] = radius * _circle(sides)
@@ -179,7 +180,7 @@ def lathe(profile: Sequence[tuple[Number, Number]], sides: int = 24) -> Solid:
 def rod(
     start: Points, end: Points, radius: Number, end_radius: Number | None = None, sides: int = 6
 ) -> Solid:
-    """Return a straight round bar, or a cone."""
+    """Return a straight round bar, or a frustum of a cone if `end_radius` differs from `radius`."""
     first, last = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
     x, y, z = (last - first).tolist()
     length, flat = math.hypot(x, y, z), math.hypot(y, z)
@@ -203,13 +204,16 @@ def wheel(center: Points, radius: Number, width: Number, sides: int = 16) -> Sol
 
 
 def ring(center: Points, radius: Number, thickness: Number, sides: int = 20, around: int = 5) -> Solid:
-    """Return a torus whose axis is parallel to x: `radius` reaches to the middle of a tyre of diameter `thickness`."""
+    """Return a torus whose axis is parallel to x.
+
+    `radius` is the distance from the axis to the middle of the tube, and `thickness` the diameter of the tube.
+    """
     out, along = _circle(sides), _circle(around)
-    reach = radius + thickness / 2 * along[:, 0]
+    distance = radius + thickness / 2 * along[:, 0]
     vertices = np.empty((sides, around, 3))
     vertices[..., 0] = thickness / 2 * along[:, 1]
-    vertices[..., 1] = reach * out[:, :1]
-    vertices[..., 2] = reach * out[:, 1:]
+    vertices[..., 1] = distance * out[:, :1]
+    vertices[..., 2] = distance * out[:, 1:]
     return Solid(vertices.reshape(-1, 3) + np.asarray(center), _ring_faces(sides, around))
 
 
@@ -223,22 +227,22 @@ def ellipsoid(center: Points, radii: Points, sides: int = 14, layers: int = 9) -
     """Return an ellipsoid with half axes `radii`."""
     angle = np.linspace(-np.pi / 2, np.pi / 2, layers)
     unit = lathe([(float(np.cos(a)), float(np.sin(a))) for a in angle], sides)
-    return transformed(unit, scale=radii, shift=center)
+    return transform(unit, scale=radii, shift=center)
 
 
 def plate(outline: Points, offset: Points) -> Solid:
-    """Return a convex plane outline (points, 3), thickened by the vector `offset`, half to either side."""
+    """Return a plate: a convex plane outline (points, 3), thickened by the vector `offset`, half to either side."""
     points, half = np.asarray(outline, dtype=np.float64), np.asarray(offset, dtype=np.float64) / 2
     return loft([points - half, points + half])
 
 
 def side_plate(outline: Sequence[tuple[Number, Number]], x: Number, thickness: Number) -> Solid:
-    """Return a convex outline of (y, z) pairs, thickened in x, its middle at `x`."""
+    """Return a plate in the plane x = `x` with a convex outline (y, z)."""
     return plate([(x, y, z) for y, z in outline], (thickness, 0, 0))
 
 
-def tapered(levels: Sequence[tuple[Number, Number, Number, Number]], middle: Number = 0.0) -> Solid:
-    """Return a stack of level rectangles (half width, y in front, y behind, height) about x = `middle`."""
+def loft_rectangles(levels: Sequence[tuple[Number, Number, Number, Number]], middle: Number = 0.0) -> Solid:
+    """Return the solid through a stack of horizontal rectangles (half width, front y, rear y, z) about x = `middle`."""
     rings = [
         [(middle + half, near, z), (middle + half, far, z), (middle - half, far, z), (middle - half, near, z)]
         for half, near, far, z in levels
@@ -246,8 +250,11 @@ def tapered(levels: Sequence[tuple[Number, Number, Number, Number]], middle: Num
     return loft(rings)
 
 
-def rounded(width: Number, low: Number, high: Number, y: Number, bevel: Number = 0.25) -> Array:
-    """Return a ring of eight points across y: a rectangle, its corners cut by `bevel` of the shorter half side."""
+def bevelled(width: Number, low: Number, high: Number, y: Number, bevel: Number = 0.25) -> Array:
+    """Return a ring (8, 3) in the plane of this y: a rectangle with cut corners.
+
+    `low` and `high` are its limits in z. The cut has the length of `bevel` times the shorter half side.
+    """
     half, middle, tall = width / 2, (low + high) / 2, (high - low) / 2
     cut = bevel * min(half, tall)
     plan = [

@@ -20,7 +20,16 @@ from framework.storage import generated
 from plugins.data.pascal3d import generator, shapes
 from plugins.data.pascal3d.families import FAMILIES
 from plugins.data.pascal3d.layout import CLASSES
-from plugins.data.pascal3d.scene import Shot, Thing, View, camera_of, draw, outline, shoot, window
+from plugins.data.pascal3d.scene import (
+    AnnotatedObject,
+    Shot,
+    View,
+    camera_of,
+    crop_camera,
+    projected_edges,
+    render_object,
+    shoot,
+)
 from plugins.data.pascal3d.shapes import Mesh
 from plugins.data.pascal3d.viewpoints import LEVELS, QUANTILES, viewpoint
 
@@ -33,22 +42,24 @@ def renderer() -> Renderer:
 # ---- shapes and families ---------------------------------------------------------------------------------
 
 
-def closed(solid: shapes.Solid) -> trimesh.Trimesh:
-    """Return the solid as an outward mesh with its shading seams welded."""
+def weld(solid: shapes.Solid) -> trimesh.Trimesh:
+    """Return the solid as a mesh with outward faces, in which equal vertices are merged."""
     body = shapes.Body()
     body.add(solid, (1.0, 1.0, 1.0))
-    faces = body.mesh().faces  # outward
+    faces = body.mesh().faces
     mesh = trimesh.Trimesh(solid.vertices, faces, process=True, merge_norm=True, merge_tex=True)
     mesh.update_faces(mesh.nondegenerate_faces())  # at the tip of a cone
     return mesh
 
 
 SQUARE = [(0.0, 0.0), (2.0, 0.0), (2.0, 1.0), (0.0, 1.0)]
-POLYGON_24 = 24 / 2 * math.sin(2 * math.pi / 24)  # area of the polygon that stands for a unit circle
+POLYGON_24 = (
+    24 / 2 * math.sin(2 * math.pi / 24)
+)  # area of the 24-sided polygon that approximates a unit circle
 SOLIDS = {
     "box": (shapes.box((1, 2, 3), (4, 5, 6)), 6.0, (4, 5, 6)),
     "mirrored box": (
-        shapes.transformed(shapes.box((1, 2, 3), (4, 5, 6)), scale=(-1, 1, 1)),
+        shapes.transform(shapes.box((1, 2, 3), (4, 5, 6)), scale=(-1, 1, 1)),
         6.0,
         (-4, 5, 6),
     ),
@@ -58,13 +69,13 @@ SOLIDS = {
     "rod askew": (shapes.rod((1, 1, 1), (1, 4, 5), 2.0, sides=24), 20 * POLYGON_24, (1, 2.5, 3)),
     "wheel": (shapes.wheel((1, 2, 3), 1.0, 0.5, 24), 0.5 * POLYGON_24, (1, 2, 3)),
     "side plate": (shapes.side_plate(SQUARE, 3.0, 0.5), 1.0, (3, 1, 0.5)),
-    "tapered": (
-        shapes.tapered([(1, -1, 1, 0), (0.5, -0.5, 0.5, 3)]),
+    "rectangles": (
+        shapes.loft_rectangles([(1, -1, 1, 0), (0.5, -0.5, 0.5, 3)]),
         3 / 3 * (4 + 1 + math.sqrt(4)),
         (0, 0, 33 / 28),  # h/4 (A + 2√(AB) + 3B) / (A + √(AB) + B)
     ),
-    "rounded": (
-        shapes.loft([shapes.rounded(4, 0, 2, y, 0.5) for y in (0, 3)]),
+    "bevelled": (
+        shapes.loft([shapes.bevelled(4, 0, 2, y, 0.5) for y in (0, 3)]),
         3 * (8 - 4 * 0.5**2 / 2),
         (0, 1.5, 1),
     ),
@@ -72,20 +83,20 @@ SOLIDS = {
 
 
 @pytest.mark.parametrize("name", SOLIDS)
-def test_solid_is_closed_and_has_its_volume_and_place(name: str) -> None:
+def test_solid_is_closed_and_has_its_volume_and_center(name: str) -> None:
     solid, volume, center = SOLIDS[name]
-    mesh = closed(solid)
+    mesh = weld(solid)
     assert mesh.is_watertight
     assert mesh.volume == pytest.approx(volume)
     np.testing.assert_allclose(mesh.center_mass, center, atol=1e-9)
 
 
 def test_round_solids_approach_their_ideals() -> None:
-    torus = closed(shapes.ring((1, 2, 3), 2.0, 1.0, sides=96, around=48))
-    ellipsoid = closed(shapes.ellipsoid((1, 2, 3), (1, 2, 3), sides=96, layers=49))
+    torus = weld(shapes.ring((1, 2, 3), 2.0, 1.0, sides=96, around=48))
+    ellipsoid = weld(shapes.ellipsoid((1, 2, 3), (1, 2, 3), sides=96, layers=49))
     assert torus.is_watertight
     assert torus.volume == pytest.approx(2 * math.pi**2 * 2 * 0.5**2, rel=0.01)
-    assert np.ptp(torus.vertices, axis=0) == pytest.approx([1, 5, 5], rel=0.01)  # it turns about x
+    assert np.ptp(torus.vertices, axis=0) == pytest.approx([1, 5, 5], rel=0.01)  # its axis is x
     assert ellipsoid.volume == pytest.approx(4 / 3 * math.pi * 6, rel=0.01)
 
 
@@ -103,47 +114,47 @@ def test_family_is_a_unit_object_with_outward_normals(category: str) -> None:
         assert mesh.colors.min() >= 0
         assert mesh.colors.max() <= 1
         corners = mesh.vertices[mesh.faces]
-        across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        assert np.einsum("fi,fi->", across, corners[:, 0]) > 0  # six times the volume
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        assert np.einsum("fi,fi->", normals, corners[:, 0]) > 0  # six times the volume
         lengths = np.linalg.norm(mesh.normals, axis=1)
         assert np.all((lengths < 1e-9) | (abs(lengths - 1) < 1e-9))
 
 
-def seen(renderer: Renderer, mesh: Mesh, azimuth: float, elevation: float, tilt: float) -> np.ndarray:
-    """Return the object's unlit colours, 96 × 96."""
+def render(renderer: Renderer, mesh: Mesh, azimuth: float, elevation: float, tilt: float) -> np.ndarray:
+    """Return an image (96, 96, 4) of the object without shading: its colours and its opacity."""
     view = View(azimuth, elevation, tilt, 3.0, 230.0, (47.5, 47.5))
     camera = camera_of(view)
-    layer = draw(renderer, mesh, mesh.colors, camera, outline(mesh, camera), (96, 96))
-    return np.concatenate([layer.color, layer.cover[..., None]], axis=2)
+    layer = render_object(renderer, mesh, mesh.colors, camera, projected_edges(mesh, camera), (96, 96))
+    return np.concatenate([layer.color, layer.opacity[..., None]], axis=2)
 
 
 @pytest.mark.parametrize("category", CLASSES)
-def test_symmetry_is_what_the_family_says(category: str, renderer: Renderer) -> None:
-    turns = {0: (37.0, 90.0, 180.0), 1: (), 2: (180.0,), 4: (90.0, 180.0)}[FAMILIES[category].symmetry]
+def test_objects_have_the_symmetry_of_their_family(category: str, renderer: Renderer) -> None:
+    symmetric = {0: (37.0, 90.0, 180.0), 1: (), 2: (180.0,), 4: (90.0, 180.0)}[FAMILIES[category].symmetry]
     for seed in range(4):
         mesh = FAMILIES[category].build(np.random.default_rng(seed)).mesh()
-        here = seen(renderer, mesh, 25.0, 15.0, 5.0)
-        for turn in (37.0, 90.0, 180.0):
-            changed = abs(here - seen(renderer, mesh, 25.0 + turn, 15.0, 5.0)).mean()
-            # silhouettes of a polygon that stands for a circle differ in single pixels
-            assert (changed < 0.002) if turn in turns else (changed > 0.004), (seed, turn, changed)
+        image = render(renderer, mesh, 25.0, 15.0, 5.0)
+        for angle in (37.0, 90.0, 180.0):
+            difference = abs(image - render(renderer, mesh, 25.0 + angle, 15.0, 5.0)).mean()
+            # a polygon that approximates a circle is not quite symmetric, so that single pixels differ
+            assert (difference < 0.002) if angle in symmetric else (difference > 0.004), (seed, angle)
 
 
 @pytest.mark.parametrize("category", [name for name in CLASSES if name != "aeroplane"])
-def test_mirrored_picture_is_the_picture_at_the_mirrored_angles(category: str, renderer: Renderer) -> None:
-    """Check the rule that `augment` uses; only an aeroplane's propeller is not mirror-symmetric."""
+def test_mirror_image_is_the_image_at_the_mirrored_angles(category: str, renderer: Renderer) -> None:
+    """Check the rule that `augment` uses; only the propeller of an aeroplane is not mirror-symmetric."""
     mesh = FAMILIES[category].build(np.random.default_rng(3)).mesh()
-    picture = seen(renderer, mesh, 35.0, 20.0, 12.0)[:, ::-1]
-    assert abs(picture - seen(renderer, mesh, -35.0, 20.0, -12.0)).mean() < 0.002
-    assert abs(picture - seen(renderer, mesh, -35.0, 20.0, 12.0)).mean() > 0.01
-    assert abs(picture - seen(renderer, mesh, -35.0, -20.0, -12.0)).mean() > 0.01
+    image = render(renderer, mesh, 35.0, 20.0, 12.0)[:, ::-1]
+    assert abs(image - render(renderer, mesh, -35.0, 20.0, -12.0)).mean() < 0.002
+    assert abs(image - render(renderer, mesh, -35.0, 20.0, 12.0)).mean() > 0.01
+    assert abs(image - render(renderer, mesh, -35.0, -20.0, -12.0)).mean() > 0.01
 
 
 # ---- the convention of angles ----------------------------------------------------------------------------
 
 
-def projected_as_in_the_toolbox(points: np.ndarray, viewpoint: dict[str, float]) -> np.ndarray:
-    """Return pixels counted from 1, by the steps of `project_3d.m` of the PASCAL3D+ toolbox (release 1.1)."""
+def project_as_the_toolbox(points: np.ndarray, viewpoint: dict[str, float]) -> np.ndarray:
+    """Return the pixels (x, y) of points, counted from 1, computed as `project_3d.m` of PASCAL3D+ 1.1 does."""
     a, e, t = (math.radians(viewpoint[name]) for name in ("azimuth", "elevation", "theta"))
     d, f = viewpoint["distance"], viewpoint["focal"] * viewpoint["viewport"]
     center = np.array([d * math.cos(e) * math.sin(a), -d * math.cos(e) * math.cos(a), d * math.sin(e)])
@@ -159,37 +170,37 @@ def projected_as_in_the_toolbox(points: np.ndarray, viewpoint: dict[str, float])
 def first_mesh(category: str, seed: int) -> Mesh:
     """Return the first object that `shoot` passes to the renderer."""
 
-    class Kept(Exception):
+    class StopRendering(Exception):
         pass
 
-    handed: list[np.ndarray] = []
+    vertices: list[np.ndarray] = []
 
-    def keep(scene: Scene, channels: Collection[str]) -> Mapping[str, torch.Tensor]:
-        handed.append(scene.vertices.double().numpy())
-        raise Kept
+    def record(scene: Scene, channels: Collection[str]) -> Mapping[str, torch.Tensor]:
+        vertices.append(scene.vertices.double().numpy())
+        raise StopRendering
 
-    with pytest.raises(Kept):
-        shoot(category, np.random.default_rng(seed), keep)
-    return Mesh(handed[0], np.empty((0, 3), dtype=np.int64), np.empty((0, 3)), np.empty((0, 3)))
+    with pytest.raises(StopRendering):
+        shoot(category, np.random.default_rng(seed), record)
+    return Mesh(vertices[0], np.empty((0, 3), dtype=np.int64), np.empty((0, 3)), np.empty((0, 3)))
 
 
 @pytest.mark.parametrize("category", ["car", "aeroplane", "bottle"])
 def test_annotated_viewpoint_projects_the_object_onto_its_box(category: str, renderer: Renderer) -> None:
-    """Check that the official formula on the official fields gives the place of the object in the image."""
+    """Check that the official formula, applied to the annotated fields, gives the position of the object in the image.
+
+    Thin tips that cover less than half a pixel do not count.
+    """
     for seed in range(6):
         shot = shoot(category, np.random.default_rng(seed), renderer)
         mesh = first_mesh(category, seed)
         boxes = []
-        for thing in shot.things:
-            fields = generator._viewpoint(thing._replace(fine=True))
-            pixels = projected_as_in_the_toolbox(mesh.vertices, fields)
+        for annotated in shot.objects:
+            fields = generator._viewpoint(annotated._replace(fine=True))
+            pixels = project_as_the_toolbox(mesh.vertices, fields)
             height, width, _ = shot.pixels.shape
             low, high = np.maximum(pixels.min(0), 1), np.minimum(pixels.max(0), (width, height))
-            boxes.append(abs(np.array([*low, *high]) - [edge + 1 for edge in thing.box]).max())
-        assert min(boxes) < 1.7, (
-            seed,
-            boxes,
-        )  # pixels; thin tips that cover less than half a pixel do not count
+            boxes.append(abs(np.array([*low, *high]) - [edge + 1 for edge in annotated.box]).max())
+        assert min(boxes) < 1.7, (seed, boxes)  # pixels
 
 
 @pytest.mark.parametrize(
@@ -202,17 +213,18 @@ def test_annotated_viewpoint_projects_the_object_onto_its_box(category: str, ren
     ],
 )
 def test_azimuth_names_the_side_that_is_seen(azimuth: float, nearest: str, to_the_left: str) -> None:
-    """Check the axes: the front is -y, up is z, so the object's left is x; at 90° it is seen from its left and faces
-    left.
+    """Check the axes of objects: the front is -y, up is z, and left is x.
+
+    At azimuth 90° the image shows the left side of the object, which faces left in the image.
     """
     points = {"front": (0, -1, 0), "rear": (0, 1, 0), "left side": (1, 0, 0), "right side": (-1, 0, 0)}
     camera = camera_of(View(azimuth, 0.0, 0.0, 3.0, 100.0, (0.0, 0.0)))
-    seen_at = {name: camera.rotation.double() @ torch.tensor(p).double() for name, p in points.items()}
-    assert min(seen_at, key=lambda name: float(seen_at[name][2])) == nearest
-    assert min(seen_at, key=lambda name: float(seen_at[name][0])) == to_the_left
+    in_camera = {name: camera.rotation.double() @ torch.tensor(p).double() for name, p in points.items()}
+    assert min(in_camera, key=lambda name: float(in_camera[name][2])) == nearest
+    assert min(in_camera, key=lambda name: float(in_camera[name][0])) == to_the_left
 
 
-def test_elevation_lifts_the_camera_and_tilt_turns_the_picture_counter_clockwise() -> None:
+def test_elevation_lifts_the_camera_and_tilt_rotates_the_object_counter_clockwise() -> None:
     above = camera_of(View(0.0, 30.0, 0.0, 3.0, 100.0, (0.0, 0.0))).rotation.double()
     assert (above @ torch.tensor([0.0, 0.0, 1.0]).double())[2] < 0  # the top is nearer than the middle
     tilted = camera_of(View(0.0, 0.0, 20.0, 3.0, 100.0, (0.0, 0.0))).rotation.double()
@@ -220,27 +232,27 @@ def test_elevation_lifts_the_camera_and_tilt_turns_the_picture_counter_clockwise
     assert math.degrees(math.atan2(-x, -y)) == pytest.approx(20.0)
 
 
-def test_a_window_shows_the_same_picture() -> None:
-    """Check that whole pixels, drawn fine and averaged, lie where the camera sees them."""
+def test_a_cropped_camera_shows_the_same_image() -> None:
+    """Check that the averages of finer pixels lie at the positions of the pixels of the original camera."""
     camera = camera_of(View(10.0, 20.0, 5.0, 3.0, 80.0, (31.5, 20.25)))
-    part = window(camera, (7, 11), (30, 40), 2)
+    part = crop_camera(camera, (7, 11), (30, 40), 2)
     assert (part.height, part.width) == (60, 80)
     point = camera.rotation.double() @ torch.tensor([0.1, -0.2, 0.3]).double() + camera.translation.double()
     for axis in (0, 1):
         whole = camera.focal[axis] * point[axis] / point[2] + camera.principal[axis]
         fine = part.focal[axis] * point[axis] / point[2] + part.principal[axis]
-        # the fine pixels 2i and 2i + 1 make up pixel i, whose centre lies between theirs
+        # pixel i consists of the finer pixels 2i and 2i + 1, and its centre lies between their centres
         assert float(fine) == pytest.approx(2 * (float(whole) - (7, 11)[axis]) + 0.5, abs=1e-4)
 
 
 def test_viewpoints_follow_the_measured_quantiles() -> None:
     random = np.random.default_rng(0)
     for category in CLASSES:
-        drawn = np.array([viewpoint(category, random) for _ in range(2000)])
-        assert np.all((drawn[:, 0] >= 0) & (drawn[:, 0] < 360))
-        assert abs(np.exp(1j * np.deg2rad(drawn[:, 0])).mean()) < 0.08
+        angles = np.array([viewpoint(category, random) for _ in range(2000)])
+        assert np.all((angles[:, 0] >= 0) & (angles[:, 0] < 360))
+        assert abs(np.exp(1j * np.deg2rad(angles[:, 0])).mean()) < 0.08
         for column, levels in zip((1, 2), QUANTILES[category], strict=True):
-            middle = np.quantile(drawn[:, column], LEVELS[3:-3])
+            middle = np.quantile(angles[:, column], LEVELS[3:-3])
             np.testing.assert_allclose(middle, levels[3:-3], atol=0.2 * np.ptp(levels) ** 0.5 + 2)
 
 
@@ -253,12 +265,12 @@ def test_viewpoints_are_distributed_as_in_the_real_lists() -> None:
         lines = (folder / f"{category}.txt").read_text(encoding="utf-8").splitlines()
         real = (np.array([line.split()[3:5] for line in lines], dtype=float) + 180) % 360 - 180
         objects += len(real)
-        drawn = np.array([viewpoint(category, random)[1:] for _ in range(4000)])
+        synthetic = np.array([viewpoint(category, random)[1:] for _ in range(4000)])
         for column in (0, 1):
             levels = np.arange(-90, 91)  # the lists hold whole degrees
-            below = [(np.round(angles[:, column])[:, None] <= levels).mean(0) for angles in (real, drawn)]
+            below = [(np.round(angles[:, column])[:, None] <= levels).mean(0) for angles in (real, synthetic)]
             assert abs(below[0] - below[1]).max() < 0.1, category
-            assert abs(real[:, column].mean() - drawn[:, column].mean()) < 2, category
+            assert abs(real[:, column].mean() - synthetic[:, column].mean()) < 2, category
     assert objects == 2108
 
 
@@ -277,51 +289,49 @@ def test_generation_is_the_same_to_the_byte_whatever_the_threads(
     roots = []
     for painters in (1, 3):
         monkeypatch.setattr(generated, "PAINTERS", painters)
-        roots.append(generator.generated(tmp_path / str(painters), "boat", 24, 5, renderer))
+        roots.append(generator.generate_class(tmp_path / str(painters), "boat", 24, 5, renderer))
     first, second = map(files_of, roots)
     assert len(first) == 2 * 24 + 5
     assert first == second
-    other = files_of(generator.generated(tmp_path / "other", "boat", 24, 6, renderer))
+    other = files_of(generator.generate_class(tmp_path / "other", "boat", 24, 6, renderer))
     assert first.keys() == other.keys()
     assert sum(first[name] == other[name] for name in first if name.endswith((".jpg", ".JPEG"))) == 0
 
 
 def test_a_larger_set_begins_with_the_smaller_one(tmp_path: Path, renderer: Renderer) -> None:
-    small = files_of(generator.generated(tmp_path, "chair", 20, 0, renderer))
-    large = files_of(generator.generated(tmp_path, "chair", 40, 0, renderer))
-    pictures = [Path(name).stem for name in large if Path(name).suffix == ".jpg"]
-    assert len(set(pictures)) == len(pictures) == 16
+    small = files_of(generator.generate_class(tmp_path, "chair", 20, 0, renderer))
+    large = files_of(generator.generate_class(tmp_path, "chair", 40, 0, renderer))
+    voc_images = [Path(name).stem for name in large if Path(name).suffix == ".jpg"]
+    assert len(set(voc_images)) == len(voc_images) == 16
     stems = {Path(name).stem: content for name, content in large.items() if "Images/" in name}
     for name, content in small.items():
         if "Images/" in name:
             assert stems[Path(name).stem] == content
 
 
-def test_interrupted_generation_leaves_nothing_and_is_done_again(
+def test_interrupted_generation_leaves_nothing_and_is_repeated(
     tmp_path: Path, renderer: Renderer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def interrupted(category: str, random: np.random.Generator, draw: Any) -> Any:
+    def interrupt_some(category: str, random: np.random.Generator, renderer: Any) -> Any:
         if random.random() < 0.2:
             raise KeyboardInterrupt
-        return shoot(category, random, draw)
+        return shoot(category, random, renderer)
 
     with monkeypatch.context() as patch:
-        patch.setattr(generator, "shoot", interrupted)
+        patch.setattr(generator, "shoot", interrupt_some)
         with pytest.raises(KeyboardInterrupt):
-            generator.generated(tmp_path, "sofa", 30, 0, renderer)
+            generator.generate_class(tmp_path, "sofa", 30, 0, renderer)
     assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == [".sofa.lock"]
-    part = next(tmp_path.iterdir()) / ".sofa.part"  # what a killed process would leave
+    part = next(tmp_path.iterdir()) / ".sofa.part"  # a folder that a killed process would leave
     (part / "Images").mkdir(parents=True)
     (part / "Images" / "half").write_bytes(b"")
-    root = generator.generated(tmp_path, "sofa", 30, 0, renderer)
+    root = generator.generate_class(tmp_path, "sofa", 30, 0, renderer)
     assert not part.exists()
     assert not any(name.endswith("half") for name in files_of(root))
 
 
-def test_mark_says_what_was_generated_and_a_changed_one_is_refused(
-    tmp_path: Path, renderer: Renderer
-) -> None:
-    root = generator.generated(tmp_path, "bottle", 20, 3, renderer)
+def test_the_mark_describes_the_generated_set_and_must_not_change(tmp_path: Path, renderer: Renderer) -> None:
+    root = generator.generate_class(tmp_path, "bottle", 20, 3, renderer)
     mark = generated.read_mark(root)
     assert mark is not None
     assert mark["seed"] == 3
@@ -329,10 +339,10 @@ def test_mark_says_what_was_generated_and_a_changed_one_is_refused(
     assert mark["symmetry"] == {"bottle": 0}
     (root / generated.MARK).write_text(json.dumps({**mark, "seed": 4}), encoding="utf-8")
     with pytest.raises(DataError, match=r"it was changed\. Delete"):
-        generator.generated(tmp_path, "bottle", 20, 3, renderer)
+        generator.generate_class(tmp_path, "bottle", 20, 3, renderer)
 
 
-def test_cache_that_cannot_be_written_is_said(
+def test_the_message_about_a_cache_that_cannot_be_written_names_a_remedy(
     tmp_path: Path, renderer: Renderer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "file").write_bytes(b"")
@@ -340,7 +350,7 @@ def test_cache_that_cannot_be_written_is_said(
     with pytest.raises(DataError, match="Set FRAMEWORK_CACHE to another folder"):
         schema.build("data", schema.resolve("data", "pascal3d")).prepare()
     with pytest.raises(DataError, match=r"cannot be written to .* set FRAMEWORK_CACHE"):
-        generator.generated(tmp_path / "file", "car", 20, 0, renderer)
+        generator.generate_class(tmp_path / "file", "car", 20, 0, renderer)
 
 
 def test_renderer_that_draws_no_mask_is_refused(tmp_path: Path) -> None:
@@ -348,47 +358,48 @@ def test_renderer_that_draws_no_mask_is_refused(tmp_path: Path) -> None:
         channels = frozenset({"color"})
 
         def __call__(self, scene: Scene, channels: Collection[str] = ("color",)) -> dict[str, torch.Tensor]:
-            raise AssertionError("never asked")
+            raise AssertionError("this renderer is refused before it is called")
 
-    with pytest.raises(ConfigError, match="Colors draws no mask; wanted color and mask"):
-        generator.generated(tmp_path, "car", 20, 0, Colors())
+    with pytest.raises(ConfigError, match="Colors draws no mask, but color and mask are required"):
+        generator.generate_class(tmp_path, "car", 20, 0, Colors())
 
 
-def test_pictures_hold_what_the_protocol_leaves_out(renderer: Renderer) -> None:
-    things = [
-        (thing, shot)
+def test_images_hold_objects_of_every_kind_that_the_protocol_leaves_out(renderer: Renderer) -> None:
+    objects = [
+        (annotated, shot)
         for number in range(150)
         for shot in [shoot("chair", np.random.default_rng([1, number]), renderer)]
-        for thing in shot.things
+        for annotated in shot.objects
     ]
     for flag in ("truncated", "occluded", "difficult"):
-        assert 0.005 < np.mean([getattr(thing, flag) for thing, _ in things]) < 0.25, flag
-    assert 0.9 < np.mean([thing.fine for thing, _ in things]) < 1
-    assert len(things) > 160  # some pictures hold two objects
-    assert 0.1 < np.mean([shot.blur > 0 for _, shot in things]) < 0.4
-    for thing, shot in things:
-        left, top, right, bottom = thing.box
+        assert 0.005 < np.mean([getattr(annotated, flag) for annotated, _ in objects]) < 0.25, flag
+    assert 0.9 < np.mean([annotated.fine for annotated, _ in objects]) < 1
+    assert len(objects) > 160  # some images hold two objects
+    assert 0.1 < np.mean([shot.blur > 0 for _, shot in objects]) < 0.4
+    for annotated, shot in objects:
+        left, top, right, bottom = annotated.box
         assert 0 <= left <= right < shot.pixels.shape[1]
         assert 0 <= top <= bottom < shot.pixels.shape[0]
-        assert thing.symmetry == FAMILIES[thing.category].symmetry
+        assert annotated.symmetry == FAMILIES[annotated.category].symmetry
 
 
-def test_annotations_written_at_once_are_those_written_one_after_the_other(
+def test_annotations_written_by_threads_equal_those_written_one_after_the_other(
     tmp_path: Path,
 ) -> None:
-    """Check with threads that switch every microsecond, because SciPy's writers share a tag."""
+    """Check with threads that switch every microsecond, because SciPy's writers share a variable."""
     pixels = np.zeros((8, 9, 3), np.uint8)
     view = View(10.0, 20.0, 0.0, 3.0, 100.0, (4.0, 4.0))
-    things = [
-        Thing(name, view, (1, 2, 3, 4), False, False, False, True, 0) for name in ("car", "aeroplane", "tv")
+    objects = [
+        AnnotatedObject(name, view, (1, 2, 3, 4), False, False, False, True, 0)
+        for name in ("car", "aeroplane", "tv")
     ]
-    for when in ("alone", "together"):
+    for folder in ("alone", "together"):
         for kind in ("Annotations", "Images"):
-            (tmp_path / when / kind / "car_pascal").mkdir(parents=True)
+            (tmp_path / folder / kind / "car_pascal").mkdir(parents=True)
 
-    def save(when: str, number: int) -> None:
-        shot = Shot(pixels, things[: 1 + number % 3], 0.0)
-        generator._save(tmp_path / when, "car_pascal", f"{number:03d}", shot)
+    def save(folder: str, number: int) -> None:
+        shot = Shot(pixels, objects[: 1 + number % 3], 0.0)
+        generator._save(tmp_path / folder, "car_pascal", f"{number:03d}", shot)
 
     for number in range(240):
         save("alone", number)
@@ -399,7 +410,7 @@ def test_annotations_written_at_once_are_those_written_one_after_the_other(
     finally:
         sys.setswitchinterval(before)
     alone, together = (
-        sorted((tmp_path / when / "Annotations").rglob("*.mat")) for when in ("alone", "together")
+        sorted((tmp_path / folder / "Annotations").rglob("*.mat")) for folder in ("alone", "together")
     )
     assert len(alone) == 240
     assert [file.read_bytes() for file in alone] == [file.read_bytes() for file in together]

@@ -20,7 +20,7 @@ from framework.errors import ConfigError, DataError
 from framework.renderer import Renderer
 from plugins.data.pascal3d import layout
 from plugins.data.pascal3d.data import Pascal3D, validation_files
-from plugins.data.pascal3d.generator import generated
+from plugins.data.pascal3d.generator import generate_class
 from plugins.data.pascal3d.layout import VOC_LISTS, read_annotations
 from plugins.data.pascal3d.scene import shoot
 
@@ -31,15 +31,15 @@ def renderer() -> Renderer:
 
 
 @pytest.fixture(scope="session")
-def drawn(tmp_path_factory: pytest.TempPathFactory, renderer: Renderer) -> Path:
-    """Return a generated root of 80 cars, which tests read and do not change."""
-    return generated(tmp_path_factory.mktemp("roots"), "car", 80, 0, renderer)
+def shared_root(tmp_path_factory: pytest.TempPathFactory, renderer: Renderer) -> Path:
+    """Return a generated root of 80 images of cars, which tests must not change."""
+    return generate_class(tmp_path_factory.mktemp("roots"), "car", 80, 0, renderer)
 
 
 @pytest.fixture
-def root(drawn: Path, tmp_path: Path) -> Path:
-    """Return a copy of that root, which a test may damage."""
-    return Path(shutil.copytree(drawn, tmp_path / "root"))
+def root(shared_root: Path, tmp_path: Path) -> Path:
+    """Return a copy of the shared root, which a test may change."""
+    return Path(shutil.copytree(shared_root, tmp_path / "root"))
 
 
 def prepared(root: Path | None, **config: Any) -> Pascal3D:
@@ -71,48 +71,50 @@ def struct_array(entries: list[dict[str, Any]]) -> np.ndarray:
     return array
 
 
-def annotated(
-    folder: Path, *objects: dict[str, Any], filename: str = "one.jpg", **record: Any
+def write_and_read(
+    folder: Path, *objects: dict[str, Any], filename: str = "image.jpg", **record: Any
 ) -> list[layout.Annotation]:
-    """Return what the reader reads from one annotation file with these objects."""
-    place = folder / "Annotations" / "car_pascal"
-    place.mkdir(parents=True, exist_ok=True)
+    """Write an annotation file with these objects, and return what the reader reads from it."""
+    annotations = folder / "Annotations" / "car_pascal"
+    annotations.mkdir(parents=True, exist_ok=True)
     content = {"filename": filename, "objects": struct_array(list(objects)), **record}
-    scipy.io.savemat(place / "one.mat", {"record": content})
-    return read_annotations(folder, "car", "pascal", "one")
+    scipy.io.savemat(annotations / "image.mat", {"record": content})
+    return read_annotations(folder, "car", "pascal", "image")
 
 
 def test_one_object(tmp_path: Path) -> None:
-    (one,) = annotated(tmp_path, CAR)
-    assert one.box == (10.0, 20.0, 50.0, 60.0)  # counted from 1 and both ends included: 40 × 40 pixels
-    assert one.angles == (30.0, 10.0, -5.0)
-    assert (one.truncated, one.occluded, one.difficult) == (False, False, False)
-    assert (one.symmetry, one.blur) == (1, None)
-    assert one.image == tmp_path / "Images" / "car_pascal" / "one.jpg"
+    (annotation,) = write_and_read(tmp_path, CAR)
+    # the bbox counts pixels from 1 and includes both ends: 40 × 40 pixels
+    assert annotation.box == (10.0, 20.0, 50.0, 60.0)
+    assert annotation.angles == (30.0, 10.0, -5.0)
+    assert (annotation.truncated, annotation.occluded, annotation.difficult) == (False, False, False)
+    assert (annotation.symmetry, annotation.blur) == (1, None)
+    assert annotation.image == tmp_path / "Images" / "car_pascal" / "image.jpg"
 
 
 def test_one_object_that_is_a_plain_struct(tmp_path: Path) -> None:
-    (one,) = annotated(tmp_path, objects=CAR)
-    assert one.angles == (30.0, 10.0, -5.0)
+    (annotation,) = write_and_read(tmp_path, objects=CAR)
+    assert annotation.angles == (30.0, 10.0, -5.0)
 
 
 def test_objects_in_a_cell_array(tmp_path: Path) -> None:
     cells = np.empty((1, 2), dtype=object)
     cells[0, 0], cells[0, 1] = CAR, {**CAR, "truncated": 1}
-    assert [one.truncated for one in annotated(tmp_path, objects=cells)] == [False, True]
+    annotations = write_and_read(tmp_path, objects=cells)
+    assert [annotation.truncated for annotation in annotations] == [False, True]
 
 
 def test_many_objects_of_many_classes_and_flags(tmp_path: Path) -> None:
     person = {"class": "person", "bbox": [1, 2, 3, 4]}
-    found = annotated(
+    annotations = write_and_read(
         tmp_path, person, {**CAR, "truncated": 1}, {**CAR, "occluded": True}, {**CAR, "difficult": 1.0}, CAR
     )
-    flags = [(one.truncated, one.occluded, one.difficult) for one in found]
+    flags = [(entry.truncated, entry.occluded, entry.difficult) for entry in annotations]
     assert flags == [(True, False, False), (False, True, False), (False, False, True), (False, False, False)]
 
 
 def test_no_objects(tmp_path: Path) -> None:
-    assert annotated(tmp_path, objects=EMPTY) == []
+    assert write_and_read(tmp_path, objects=EMPTY) == []
 
 
 @pytest.mark.parametrize(
@@ -134,21 +136,22 @@ def test_no_objects(tmp_path: Path) -> None:
     ],
     ids=["missing", "empty", "coarse", "empty fields", "distance 0", "no theta", "text"],
 )
-def test_what_has_no_fine_label(tmp_path: Path, viewpoint: Any) -> None:
-    changed = {name: value for name, value in CAR.items() if name != "viewpoint"}
+def test_objects_without_a_fine_label(tmp_path: Path, viewpoint: Any) -> None:
+    entry = {name: value for name, value in CAR.items() if name != "viewpoint"}
     if viewpoint is not None:
-        changed["viewpoint"] = viewpoint
-    (one,) = annotated(tmp_path, changed)
-    assert one.angles is None
+        entry["viewpoint"] = viewpoint
+    (annotation,) = write_and_read(tmp_path, entry)
+    assert annotation.angles is None
 
 
-def test_distance_that_is_not_given_does_not_make_a_label_coarse(tmp_path: Path) -> None:
-    (one,) = annotated(tmp_path, {**CAR, "viewpoint": {"azimuth": 1.0, "elevation": 2, "theta": 3}})
-    assert one.angles == (1.0, 2.0, 3.0)
+def test_a_fine_label_without_a_distance_stays_fine(tmp_path: Path) -> None:
+    viewpoint = {"azimuth": 1.0, "elevation": 2, "theta": 3}
+    (annotation,) = write_and_read(tmp_path, {**CAR, "viewpoint": viewpoint})
+    assert annotation.angles == (1.0, 2.0, 3.0)
 
 
 @pytest.mark.parametrize("degrees", [-725.0, -180.0, -0.0, 179.5, 180.0, 359.0, 360.0, 1000.25])
-def test_angles_of_any_number_of_turns(degrees: float) -> None:
+def test_angles_of_any_size_become_radians(degrees: float) -> None:
     angle = layout.radians(degrees)
     assert -math.pi <= angle < math.pi
     assert math.cos(angle) == pytest.approx(math.cos(math.radians(degrees)), abs=1e-9)
@@ -158,64 +161,64 @@ def test_angles_of_any_number_of_turns(degrees: float) -> None:
 @pytest.mark.parametrize(
     "bbox", ["text", EMPTY, [1.0, 2.0, 3.0], [1.0, 2.0, math.nan, 4.0], [1.0, 2.0, math.inf, 4.0]]
 )
-def test_box_that_is_none(tmp_path: Path, bbox: Any) -> None:
-    with pytest.raises(DataError, match=r"one\.mat: object 2 has the bbox .* wanted four finite numbers"):
-        annotated(tmp_path, {"class": "person", "bbox": [1, 2, 3, 4]}, {**CAR, "bbox": bbox})
+def test_a_bbox_that_is_no_box_is_refused(tmp_path: Path, bbox: Any) -> None:
+    with pytest.raises(DataError, match=r"image\.mat: Object 2 has the bbox .* four finite numbers"):
+        write_and_read(tmp_path, {"class": "person", "bbox": [1, 2, 3, 4]}, {**CAR, "bbox": bbox})
 
 
 def test_image_is_found_by_either_suffix_and_by_the_recorded_name(tmp_path: Path) -> None:
-    place = tmp_path / "Images" / "car_pascal"
-    place.mkdir(parents=True)
-    for name in ("odd.png", "one.JPEG", "one.jpg"):  # each is preferred to those before it
-        (place / name).write_bytes(b"")
-        (one,) = annotated(tmp_path, CAR, filename="odd.png")
-        assert one.image == place / name
+    folder = tmp_path / "Images" / "car_pascal"
+    folder.mkdir(parents=True)
+    for name in ("odd.png", "image.JPEG", "image.jpg"):  # each is preferred to those before it
+        (folder / name).write_bytes(b"")
+        (annotation,) = write_and_read(tmp_path, CAR, filename="odd.png")
+        assert annotation.image == folder / name
 
 
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (None, r"one\.mat: no such file, though a list names it\. Restore it from the release"),
-        (b"", r"one\.mat: cannot be read as a MATLAB file"),
-        (b"not a matrix at all" * 20, r"one\.mat: cannot be read as a MATLAB file"),
+        (None, r"image\.mat: no such file, although a list names it\. Copy it again from the release"),
+        (b"", r"image\.mat: cannot be read as a MATLAB file"),
+        (b"not a matrix at all" * 20, r"image\.mat: cannot be read as a MATLAB file"),
         (
             b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + bytes(400),
-            r"one\.mat: got a MATLAB 7\.3 file, .* '-v7'",
+            r"image\.mat: got a MATLAB 7\.3 file, .* '-v7'",
         ),
     ],
     ids=["missing", "empty", "text", "7.3"],
 )
 def test_annotation_that_cannot_be_read(tmp_path: Path, content: bytes | None, message: str) -> None:
-    place = tmp_path / "Annotations" / "car_pascal"
-    place.mkdir(parents=True)
+    folder = tmp_path / "Annotations" / "car_pascal"
+    folder.mkdir(parents=True)
     if content is not None:
-        (place / "one.mat").write_bytes(content)
+        (folder / "image.mat").write_bytes(content)
     with pytest.raises(DataError, match=message):
-        read_annotations(tmp_path, "car", "pascal", "one")
+        read_annotations(tmp_path, "car", "pascal", "image")
 
 
 def test_annotation_that_is_cut_short_or_is_another_matrix(tmp_path: Path) -> None:
-    annotated(tmp_path, CAR)
-    file = tmp_path / "Annotations" / "car_pascal" / "one.mat"
+    write_and_read(tmp_path, CAR)
+    file = tmp_path / "Annotations" / "car_pascal" / "image.mat"
     whole = file.read_bytes()
     for length in range(0, len(whole), 97):
         file.write_bytes(whole[:length])
-        with pytest.raises(DataError, match=r"one\.mat"):
-            read_annotations(tmp_path, "car", "pascal", "one")
+        with pytest.raises(DataError, match=r"image\.mat"):
+            read_annotations(tmp_path, "car", "pascal", "image")
     scipy.io.savemat(file, {"other": 1})
     with pytest.raises(DataError, match="holds no struct `record`"):
-        read_annotations(tmp_path, "car", "pascal", "one")
+        read_annotations(tmp_path, "car", "pascal", "image")
     scipy.io.savemat(file, {"record": 1})
     with pytest.raises(DataError, match="holds no struct `record`"):
-        read_annotations(tmp_path, "car", "pascal", "one")
+        read_annotations(tmp_path, "car", "pascal", "image")
 
 
-@pytest.mark.filterwarnings("ignore")  # SciPy warns of some damage beside
+@pytest.mark.filterwarnings("ignore")  # SciPy warns about some kinds of damage
 @pytest.mark.parametrize("compressed", [False, True])
 def test_damaged_annotations_are_read_or_named(tmp_path: Path, compressed: bool) -> None:
-    """Check damaged files, of which SciPy alone crashes the process on about one in twenty of the uncompressed ones."""
-    annotated(tmp_path, CAR, {**CAR, "truncated": 1})
-    file = tmp_path / "Annotations" / "car_pascal" / "one.mat"
+    """Check files with three random bytes; on one in twenty of the uncompressed ones, SciPy's reader would crash."""
+    write_and_read(tmp_path, CAR, {**CAR, "truncated": 1})
+    file = tmp_path / "Annotations" / "car_pascal" / "image.mat"
     record = scipy.io.loadmat(file)["record"]
     scipy.io.savemat(file, {"record": record}, do_compression=compressed)
     whole = file.read_bytes()
@@ -223,16 +226,16 @@ def test_damaged_annotations_are_read_or_named(tmp_path: Path, compressed: bool)
     refused = 0
     for _ in range(300):
         damaged = np.frombuffer(whole, np.uint8).copy()
-        places = random.integers(0, len(whole), 3)
-        damaged[places] = random.integers(0, 256, 3)
+        positions = random.integers(0, len(whole), 3)
+        damaged[positions] = random.integers(0, 256, 3)
         file.write_bytes(damaged.tobytes())
         try:
-            found = read_annotations(tmp_path, "car", "pascal", "one")
+            annotations = read_annotations(tmp_path, "car", "pascal", "image")
         except DataError as error:
             assert str(error).startswith(str(file))
             refused += 1
         else:
-            assert len(found) <= 2
+            assert len(annotations) <= 2
     assert refused > 200
 
 
@@ -243,11 +246,13 @@ def test_lists(tmp_path: Path) -> None:
     )
     assert layout.read_list(file) == ["2008_000002", "2008_000003", "n01_2"]
     file.write_text("2008_000001 1\n2008_000002 7\n", encoding="utf-8")
-    with pytest.raises(DataError, match=r"car_train\.txt line 2: '2008_000002 7'; wanted"):
+    with pytest.raises(DataError, match=r"car_train\.txt line 2: '2008_000002 7' is neither"):
         layout.read_list(file)
-    for end in "\x0b\x0c\x1c\x1d\x1e\x85\u2028\u2029":  # of lines of Python's text, not of files
+    for (
+        end
+    ) in "\x0b\x0c\x1c\x1d\x1e\x85\u2028\u2029":  # Python ends lines at these characters, but files do not
         file.write_bytes(f"2008_000001{end}n01_2\n".encode())
-        with pytest.raises(DataError, match=r"car_train\.txt line 1: .* wanted an image name"):
+        with pytest.raises(DataError, match=r"car_train\.txt line 1: .* is neither an image name"):
             layout.read_list(file)
     file.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(DataError, match=r"car_train\.txt: cannot be read"):
@@ -257,27 +262,27 @@ def test_lists(tmp_path: Path) -> None:
 # ---- whole roots -----------------------------------------------------------------------------------------
 
 
-def test_generated_root_reads_back_what_was_drawn(drawn: Path, renderer: Renderer) -> None:
-    """Check against images that are drawn again, with the protocol applied by hand."""
-    data = prepared(drawn)
+def test_reading_a_generated_root_gives_the_drawn_objects(shared_root: Path, renderer: Renderer) -> None:
+    """Compare with images that are drawn again, to which this test applies the protocol itself."""
+    data = prepared(shared_root)
     assert data.synthetic
-    expected: dict[str, list[tuple[float, ...]]] = {"learned": [], "test": []}
+    expected: dict[str, list[tuple[float, ...]]] = {"training": [], "test": []}
     left_out = {"without a fine label": 0, "difficult": 0, "truncated or occluded": 0}
     for number in range(80):
         shot = shoot("car", np.random.default_rng([0, 5, number]), renderer)
-        for thing in (thing for thing in shot.things if thing.category == "car"):
-            if not thing.fine:
+        for car in (annotated for annotated in shot.objects if annotated.category == "car"):
+            if not car.fine:
                 left_out["without a fine label"] += 1
-            elif thing.difficult:
+            elif car.difficult:
                 left_out["difficult"] += 1
-            elif thing.truncated or thing.occluded:
+            elif car.truncated or car.occluded:
                 left_out["truncated or occluded"] += 1
             else:
-                angles = (thing.view.azimuth, thing.view.elevation, thing.view.tilt)
-                left, top, right, bottom = thing.box
+                angles = (car.view.azimuth, car.view.elevation, car.view.tilt)
+                left, top, right, bottom = car.box
                 side = 1.2 * (1 + max(right - left, bottom - top))
                 blur = shot.blur * 48 / side
-                expected["test" if number >= 64 else "learned"].append((*angles, blur))
+                expected["test" if number >= 64 else "training"].append((*angles, blur))
     assert dict(data.excluded) == {reason: count for reason, count in left_out.items() if count}
     assert data.skipped == 0
 
@@ -288,13 +293,13 @@ def test_generated_root_reads_back_what_was_drawn(drawn: Path, renderer: Rendere
         rows[:, 0] %= 360
         return rows[np.argsort(rows[:, 0])]
 
-    for name, splits in (("test", ("test",)), ("learned", ("train", "validation"))):
+    for name, splits in (("test", ("test",)), ("training", ("train", "validation"))):
         rows = np.array(expected[name])
         np.testing.assert_allclose(labels(*splits), rows[np.argsort(rows[:, 0])], atol=1e-4)
 
 
-def test_fields_of_a_batch(drawn: Path) -> None:
-    data = prepared(drawn, image_size=32)
+def test_fields_of_a_batch(shared_root: Path) -> None:
+    data = prepared(shared_root, image_size=32)
     fields = table(data, "train")
     count = len(data.splits().train)  # type: ignore[arg-type]
     assert data.input_shape == (3, 32, 32)
@@ -306,62 +311,62 @@ def test_fields_of_a_batch(drawn: Path) -> None:
     assert np.array_equal(data.preview(fields["input"][0]), fields["input"][0].permute(1, 2, 0).numpy())
 
 
-def test_crop_holds_the_object_and_its_margin(drawn: Path) -> None:
-    """Check that the crop's middle is the box's middle, against the image itself, cut by hand."""
-    data = prepared(drawn, margin=0.25, image_size=64)
-    first = layout.read_list(drawn / VOC_LISTS / "car_val.txt")
+def test_crop_holds_the_object_and_its_margin(shared_root: Path) -> None:
+    """Compare a crop with pixels of the image that this test selects itself, about the middle of the box."""
+    data = prepared(shared_root, margin=0.25, image_size=64)
+    first = layout.read_list(shared_root / VOC_LISTS / "car_val.txt")
     annotation = next(
-        one
+        car
         for name in first
-        for one in read_annotations(drawn, "car", "pascal", name)
-        if not (one.truncated or one.occluded or one.difficult) and one.angles
+        for car in read_annotations(shared_root, "car", "pascal", name)
+        if not (car.truncated or car.occluded or car.difficult) and car.angles
     )
     left, top, right, bottom = annotation.box
     half = 0.75 * max(right - left, bottom - top)
     x, y = (left + right) / 2, (top + bottom) / 2
     with Image.open(annotation.image) as image:
-        picture = np.asarray(image.convert("RGB"), dtype=float)
-    rows = np.clip(
-        np.floor(y - half + 2 * half * (np.arange(64) + 0.5) / 64), 0, picture.shape[0] - 1
-    ).astype(int)
+        pixels = np.asarray(image.convert("RGB"), dtype=float)
+    rows = np.clip(np.floor(y - half + 2 * half * (np.arange(64) + 0.5) / 64), 0, pixels.shape[0] - 1).astype(
+        int
+    )
     columns = np.clip(
-        np.floor(x - half + 2 * half * (np.arange(64) + 0.5) / 64), 0, picture.shape[1] - 1
+        np.floor(x - half + 2 * half * (np.arange(64) + 0.5) / 64), 0, pixels.shape[1] - 1
     ).astype(int)
-    nearest = picture[rows][:, columns]
+    nearest = pixels[rows][:, columns]
     crop = table(data, "test")["input"][0].permute(1, 2, 0).numpy().astype(float)
     assert abs(crop - nearest).mean() < 12
     shifted = np.roll(nearest, 6, axis=1)
     assert abs(crop - nearest).mean() < 0.7 * abs(crop - shifted).mean()
 
 
-def test_whole_images_are_held_out_whatever_their_order(drawn: Path) -> None:
-    learned = [
-        one
+def test_whole_images_are_held_out_independent_of_their_order(shared_root: Path) -> None:
+    annotations = [
+        annotation
         for source, file in layout.split_lists("car")["train"]
-        for name in layout.read_list(drawn / file)
-        for one in read_annotations(drawn, "car", source, name)
+        for name in layout.read_list(shared_root / file)
+        for annotation in read_annotations(shared_root, "car", source, name)
     ]
-    held_out = validation_files(learned, 0.2)
-    files = {one.file for one in learned}
+    held_out = validation_files(annotations, 0.2)
+    files = {annotation.file for annotation in annotations}
     assert len(files) == 64
     assert len(held_out) == 13
     assert held_out < files
-    assert validation_files(learned[::-1], 0.2) == held_out
+    assert validation_files(annotations[::-1], 0.2) == held_out
 
 
-def test_occluded_objects_may_be_learned_from_but_are_never_tested(drawn: Path) -> None:
-    without, with_them = prepared(drawn), prepared(drawn, include_occluded=True)
-    learned = [
-        len(table(d, "train")["index"]) + len(table(d, "validation")["index"]) for d in (without, with_them)
+def test_occluded_objects_can_be_used_for_training_but_never_for_the_test(shared_root: Path) -> None:
+    without, including = prepared(shared_root), prepared(shared_root, include_occluded=True)
+    counts = [
+        len(table(d, "train")["index"]) + len(table(d, "validation")["index"]) for d in (without, including)
     ]
-    assert learned[1] > learned[0]
-    assert torch.equal(table(without, "test")["target"], table(with_them, "test")["target"])
-    freed = without.excluded["truncated or occluded"] - with_them.excluded["truncated or occluded"]
-    assert learned[1] - learned[0] == freed
+    assert counts[1] > counts[0]
+    assert torch.equal(table(without, "test")["target"], table(including, "test")["target"])
+    added = without.excluded["truncated or occluded"] - including.excluded["truncated or occluded"]
+    assert counts[1] - counts[0] == added
 
 
 def test_real_data_have_no_symmetry_and_no_blur(root: Path) -> None:
-    """Check that a root without the mark counts as real, whatever its annotations hold."""
+    """Check that a root without synthetic.json counts as real, independent of its annotations."""
     (root / "synthetic.json").unlink()
     data = prepared(root)
     assert "blur" not in table(data, "train")
@@ -382,9 +387,9 @@ def test_several_classes_are_groups(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert torch.equal(table(alone, "train")["target"], fields["target"][bottles])
 
 
-def test_grey_and_cmyk_pictures_are_read_as_colour(root: Path) -> None:
-    pictures = sorted((root / "Images" / "car_pascal").glob("*.jpg"))
-    for file, mode in zip(pictures, ("L", "CMYK"), strict=False):
+def test_grey_and_cmyk_images_are_read_as_colour(root: Path) -> None:
+    files = sorted((root / "Images" / "car_pascal").glob("*.jpg"))
+    for file, mode in zip(files, ("L", "CMYK"), strict=False):
         with Image.open(file) as image:
             converted = image.convert(mode)
         converted.save(file)
@@ -407,14 +412,18 @@ def test_box_beyond_the_image_is_clipped(root: Path) -> None:
 def change_objects(
     root: Path, list_name: str, change: Callable[[dict[str, Any]], None], only: int = 1
 ) -> list[str]:
-    """Rewrite the first `only` annotations of a VOC list whose first object is kept, and return their names."""
+    """Change annotations of a VOC list and return their names.
+
+    The first `only` annotations are changed that have a single object which the protocol uses. `change` is called with
+    the struct of an object similar to `CAR`.
+    """
     changed = []
     for name in layout.read_list(root / VOC_LISTS / f"{list_name}.txt"):
         file = root / "Annotations" / "car_pascal" / f"{name}.mat"
-        (one, *others) = read_annotations(root, "car", "pascal", name)
-        if others or one.angles is None or one.truncated or one.occluded or one.difficult:
+        (car, *further) = read_annotations(root, "car", "pascal", name)
+        if further or car.angles is None or car.truncated or car.occluded or car.difficult:
             continue
-        entry = {**CAR, "bbox": np.add(one.box, (1, 1, 0, 0)), "viewpoint": dict(FINE), "symmetry": 1}
+        entry = {**CAR, "bbox": np.add(car.box, (1, 1, 0, 0)), "viewpoint": dict(FINE), "symmetry": 1}
         change(entry)
         scipy.io.savemat(file, {"record": {"filename": f"{name}.jpg", "objects": struct_array([entry])}})
         changed.append(name)
@@ -423,11 +432,11 @@ def change_objects(
     raise AssertionError(f"fewer than {only} annotations to change in {list_name}")
 
 
-# ---- complaints ------------------------------------------------------------------------------------------
+# ---- errors ----------------------------------------------------------------------------------------------
 
 
-def test_wrong_layout_says_what_is_missing_and_where_it_may_be(root: Path, tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"no Annotations/bus_pascal/.*Unpack the whole release there"):
+def test_the_message_about_a_wrong_layout_names_the_fault_and_a_remedy(root: Path, tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"no Annotations/bus_pascal/.*Unpack the whole release into"):
         prepared(root, category="bus")
     (root / "Image_sets" / "car_imagenet_val.txt").unlink()
     shutil.rmtree(root / "Images" / "car_imagenet")
@@ -437,13 +446,13 @@ def test_wrong_layout_says_what_is_missing_and_where_it_may_be(root: Path, tmp_p
         prepared(tmp_path)
 
 
-def test_class_that_is_misspelt_or_none(drawn: Path) -> None:
+def test_a_misspelt_class_and_an_empty_list_are_refused(shared_root: Path) -> None:
     with pytest.raises(
         DataError, match=r"'motorbyke' is no class of PASCAL3D\+\. Did you mean 'motorbike'\?"
     ):
-        prepared(drawn, category="motorbyke")
+        prepared(shared_root, category="motorbyke")
     with pytest.raises(DataError, match="category is empty"):
-        prepared(drawn, category=[])
+        prepared(shared_root, category=[])
 
 
 def test_all_unreadable_files_are_named_or_skipped(root: Path) -> None:
@@ -451,8 +460,8 @@ def test_all_unreadable_files_are_named_or_skipped(root: Path) -> None:
     (root / "Annotations" / "car_imagenet" / f"{names[0]}.mat").write_bytes(b"broken")
     (root / "Annotations" / "car_imagenet" / f"{names[1]}.mat").unlink()
     test_name = change_objects(root, "car_val", lambda entry: None)[0]
-    picture = root / "Images" / "car_pascal" / f"{test_name}.jpg"
-    picture.write_bytes(picture.read_bytes()[:900])
+    image = root / "Images" / "car_pascal" / f"{test_name}.jpg"
+    image.write_bytes(image.read_bytes()[:900])
     other = change_objects(root, "car_train", lambda entry: entry.update(bbox=[500.0, 500, 600, 600]))[0]
     with pytest.raises(DataError) as caught:
         prepared(root)
@@ -469,7 +478,7 @@ def test_all_unreadable_files_are_named_or_skipped(root: Path) -> None:
         assert {len(field) for field in fields.values()} == {len(fields["input"])}
 
 
-def test_generated_data_that_are_damaged_are_to_be_deleted(
+def test_the_message_about_damaged_generated_data_says_to_delete_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("FRAMEWORK_CACHE", str(tmp_path))
@@ -489,14 +498,14 @@ def test_angle_that_is_not_finite_is_never_skipped(root: Path, name: str, value:
     )
     with pytest.raises(DataError) as caught:
         prepared(root, skip_unreadable=True)
-    assert str(caught.value).startswith("2 objects have an angle that is not finite; wanted degrees")
-    assert all(f"{one}.mat" in str(caught.value) for one in changed)
+    assert str(caught.value).startswith("2 objects have an angle that is not a finite number of degrees")
+    assert all(f"{name}.mat" in str(caught.value) for name in changed)
 
 
 def test_empty_split(root: Path) -> None:
     (root / VOC_LISTS / "car_val.txt").write_text("", encoding="utf-8")
     with pytest.raises(
-        DataError, match=r"The test split of car is empty: no object is left .*left out: \d+ "
+        DataError, match=r"The test split of car is empty: none of the objects .*left out: \d+ "
     ):
         prepared(root)
     (root / VOC_LISTS / "car_train.txt").write_text("", encoding="utf-8")
@@ -525,13 +534,12 @@ def test_config_out_of_range(key: str, value: Any) -> None:
 # ---- the rest of the contract ----------------------------------------------------------------------------
 
 
-def test_large_data_are_read_when_used(drawn: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    inside = prepared(drawn)
+def test_large_data_are_read_when_used(shared_root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    in_memory = prepared(shared_root)
     monkeypatch.setattr(images, "IN_MEMORY", 0)
-    outside = prepared(drawn)
-    lazy = outside.splits().train
+    lazy = prepared(shared_root).splits().train
     assert isinstance(lazy, Crops)
-    eager = table(inside, "train")
+    eager = table(in_memory, "train")
     assert len(lazy) == len(eager["input"])
     for index in (0, len(lazy) - 1):
         item = lazy[index]
@@ -539,7 +547,7 @@ def test_large_data_are_read_when_used(drawn: Path, monkeypatch: pytest.MonkeyPa
         assert all(torch.equal(item[name], eager[name][index]) for name in eager)
 
 
-def test_missing_image_is_noticed_before_training_when_reading_late(
+def test_a_missing_image_is_noticed_before_training_even_if_images_are_read_when_used(
     root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     name = change_objects(root, "car_val", lambda entry: None)[0]
@@ -549,8 +557,8 @@ def test_missing_image_is_noticed_before_training_when_reading_late(
         prepared(root)
 
 
-def test_read_takes_a_users_own_files(drawn: Path, tmp_path: Path) -> None:
-    data = prepared(drawn, image_size=16)
+def test_read_takes_a_users_own_files(shared_root: Path, tmp_path: Path) -> None:
+    data = prepared(shared_root, image_size=16)
     Image.new("RGB", (30, 10), (255, 0, 0)).save(tmp_path / "wide.png")
     Image.new("L", (5, 9), 128).save(tmp_path / "small.png")
     samples = data.read([tmp_path / "wide.png", tmp_path / "small.png"])
@@ -564,8 +572,8 @@ def test_read_takes_a_users_own_files(drawn: Path, tmp_path: Path) -> None:
         data.read([tmp_path / "wide.png", tmp_path / "note.txt"])
 
 
-def test_augment_mirrors_half_of_a_batch_with_its_labels(drawn: Path) -> None:
-    data = prepared(drawn, image_size=16, jitter=0.0)
+def test_augment_mirrors_half_of_a_batch_with_its_labels(shared_root: Path) -> None:
+    data = prepared(shared_root, image_size=16, jitter=0.0)
     torch.manual_seed(0)
     pixels = torch.randint(0, 256, (200, 3, 16, 16), dtype=torch.uint8)
     batch = {"input": pixels, "target": torch.rand(200, 3) + 0.1, "index": torch.arange(200)}
@@ -581,13 +589,13 @@ def test_augment_mirrors_half_of_a_batch_with_its_labels(drawn: Path) -> None:
     assert torch.equal(batch["input"], pixels)
 
 
-def test_augment_can_be_switched_off(drawn: Path) -> None:
-    data = prepared(drawn)
+def test_augment_can_be_switched_off(shared_root: Path) -> None:
+    data = prepared(shared_root)
     batch = {name: field[:8] for name, field in table(data, "train").items()}
     assert not torch.equal(data.augment(batch)["input"], data.augment(batch)["input"])
-    off = prepared(drawn, mirror=False, jitter=0.0)
+    off = prepared(shared_root, mirror=False, jitter=0.0)
     assert off.augment(batch) is batch
-    unmirrored = prepared(drawn, mirror=False)
+    unmirrored = prepared(shared_root, mirror=False)
     assert torch.equal(unmirrored.augment(batch)["target"], batch["target"])
 
 
@@ -600,9 +608,9 @@ def test_fingerprint_changes_with_a_label(root: Path) -> None:
     assert before["sha256"] != after["sha256"]
 
 
-def test_crop_of_an_annotation_shows_no_other_pixels_than_the_image_has(drawn: Path) -> None:
-    """Check a box that spans the image, made square: the border is repeated, and nothing black is added."""
-    file = next((drawn / "Images" / "car_pascal").glob("*.jpg"))
+def test_a_crop_beyond_the_image_repeats_the_border(shared_root: Path) -> None:
+    """Check that a box as large as the image is made square without adding black pixels."""
+    file = next((shared_root / "Images" / "car_pascal").glob("*.jpg"))
     with Image.open(file) as image:
         width, height = image.size
         whole = np.asarray(image.convert("RGB"))

@@ -1,10 +1,20 @@
-"""Parametric vehicles of road and rail: bus, car and train; every number is in metres."""
+"""Parametric vehicles of road and rail: bus, car and train; all lengths are in metres."""
 
 import numpy as np
 from numpy.random import Generator
 
 from plugins.data.pascal3d.paint import DARK, GLASS, LAMP, METAL, RUBBER, TAIL_LAMP, paint, shade
-from plugins.data.pascal3d.shapes import Body, box, loft, off, plate, rod, rounded, tapered, wheel
+from plugins.data.pascal3d.shapes import (
+    Body,
+    bevelled,
+    box,
+    loft,
+    loft_rectangles,
+    offset_point,
+    plate,
+    rod,
+    wheel,
+)
 
 
 def bus(random: Generator) -> Body:
@@ -17,7 +27,7 @@ def bus(random: Generator) -> Body:
     if two_decks:
         length, height = 0.85 * length, 4.0
     front, rear, roof = -length / 2, length / 2, ground + height
-    body.add(loft([rounded(width, ground, roof, y, 0.15) for y in (front, rear)]), skin)
+    body.add(loft([bevelled(width, ground, roof, y, 0.15) for y in (front, rear)]), skin)
     body.add(box((width + 0.04, length * 0.996, 0.35), (0, 0, ground + 0.18)), second)
     for low in (0.2, 0.62) if two_decks else (0.42,):
         z, tall = ground + (low + 0.13) * height, (0.2 if two_decks else 0.32) * height
@@ -36,7 +46,7 @@ def bus(random: Generator) -> Body:
     body.add(box((0.65 * width, 0.07, 0.5), (0, rear, ground + 0.75)), shade(skin, 0.45))
     arm = np.array([width / 2 + 0.28, front - 0.25, roof - 0.6])
     body.pair(rod((width / 2, front + 0.1, roof - 0.5), arm, 0.04), DARK)
-    body.pair(box((0.12, 0.08, 0.4), off(arm, 0, 0, -0.25)), DARK)  # mirrors
+    body.pair(box((0.12, 0.08, 0.4), offset_point(arm, 0, 0, -0.25)), DARK)  # mirrors
     for y in (front + 1.7, rear - 2.0):
         body.pair(wheel((width / 2 - 0.1, y, 0.5), 0.5, 0.36), RUBBER)
         body.pair(wheel((width / 2 + 0.09, y, 0.5), 0.25, 0.04, 10), METAL)
@@ -46,7 +56,9 @@ def bus(random: Generator) -> Body:
 
 
 CAR_REAR = {"saloon": (0.2, 0.5), "hatchback": (0.03, 0.42), "estate": (0.01, 0.15), "pickup": (0.43, 0.1)}
-"""Start of the cabin's rear window, in car lengths from the back, and how far it leans, metres, by kind of car."""
+"""Kind of car → distance of the lower edge of the rear window from the rear end, in car lengths, and the distance in y
+between its lower and upper edge, metres.
+"""
 
 
 def car(random: Generator) -> Body:
@@ -60,13 +72,13 @@ def car(random: Generator) -> Body:
     kind = list(CAR_REAR)[int(random.choice(4, p=(0.4, 0.25, 0.2, 0.15)))]
     hood, trunk = belt - random.uniform(0.05, 0.15), belt - 0.03 * (kind == "saloon")
     lower = [
-        rounded(0.88 * width, ground + 0.08, hood - 0.22, front, 0.4),
-        rounded(0.98 * width, ground, hood - 0.08, front + 0.2, 0.3),
-        rounded(width, ground - 0.03, hood + 0.02, front + 0.28 * length, 0.25),
-        rounded(width, ground - 0.05, belt, 0.0, 0.2),
-        rounded(width, ground - 0.02, trunk, rear - 0.5, 0.25),
-        rounded(0.97 * width, ground + 0.02, trunk - 0.04, rear - 0.12, 0.3),
-        rounded(0.9 * width, ground + 0.1, trunk - 0.15, rear, 0.4),
+        bevelled(0.88 * width, ground + 0.08, hood - 0.22, front, 0.4),
+        bevelled(0.98 * width, ground, hood - 0.08, front + 0.2, 0.3),
+        bevelled(width, ground - 0.03, hood + 0.02, front + 0.28 * length, 0.25),
+        bevelled(width, ground - 0.05, belt, 0.0, 0.2),
+        bevelled(width, ground - 0.02, trunk, rear - 0.5, 0.25),
+        bevelled(0.97 * width, ground + 0.02, trunk - 0.04, rear - 0.12, 0.3),
+        bevelled(0.9 * width, ground + 0.1, trunk - 0.15, rear, 0.4),
     ]
     body.add(loft(lower), skin)
 
@@ -75,22 +87,23 @@ def car(random: Generator) -> Body:
     end = rear - room * length
 
     def level(share: float, grow: float = 0.0) -> tuple[float, float, float, float]:
-        """Return the cabin's outline at a share of its height."""
+        """Return the outline of the cabin at a share of its height, enlarged by `grow`."""
         half, z = (0.47 - 0.09 * share) * width + grow, belt - 0.03 + share * (roof - belt + 0.03)
         return half, start + share * rake - grow, end - share * slope + grow, z
 
     def pillar(low: float, high: float, along: float, grow: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return foot and tip of a post at a share of the cabin's length."""
+        """Return the foot and the tip of a post at the share `along` of the cabin's length."""
         (x, near, far, z), (top_x, top_near, top_far, top_z) = level(low, grow), level(high, grow)
         foot, tip = near + along * (far - near), top_near + along * (top_far - top_near)
         return np.array([x, foot, z]), np.array([top_x, tip, top_z])
 
-    body.add(tapered([level(0.0), level(1.0)]), skin)
-    body.add(tapered([level(0.16, 0.012), level(0.86, 0.012)]), GLASS)
+    body.add(loft_rectangles([level(0.0), level(1.0)]), skin)
+    body.add(loft_rectangles([level(0.16, 0.012), level(0.86, 0.012)]), GLASS)
     for along in (0.52,) if kind == "pickup" else (0.42, 0.72):
         foot, tip = pillar(0.1, 0.9, along, 0.02)
         outline = [
-            off(point, 0, y, 0) for point, y in ((foot, -0.06), (foot, 0.06), (tip, 0.06), (tip, -0.06))
+            offset_point(point, 0, y, 0)
+            for point, y in ((foot, -0.06), (foot, 0.06), (tip, 0.06), (tip, -0.06))
         ]
         body.pair(plate(outline, (0.03, 0, 0)), skin)
     for along in (0.0, 1.0):
@@ -128,14 +141,14 @@ def train(random: Generator) -> Body:
     along = np.array([0.0, 0.3, 0.65, 1.0])  # shares of the nose's length
     share = np.array([0.5, 0.78, 0.93, 1.0]) if streamlined else np.array([0.93, 0.97, 0.99, 1.0])
     rings = [
-        rounded(width * size, ground, ground + height * size, front + nose * place, 0.3)
-        for size, place in zip(share, along, strict=True)
+        bevelled(width * size, ground, ground + height * size, front + nose * position, 0.3)
+        for size, position in zip(share, along, strict=True)
     ]
     rear = front + length
-    body.add(loft([*rings, rounded(width, ground, roof, rear, 0.3)]), skin)
+    body.add(loft([*rings, bevelled(width, ground, roof, rear, 0.3)]), skin)
     coach = rear + 0.5
     tail = coach + random.uniform(5, 9)
-    body.add(loft([rounded(width, ground, roof, y, 0.3) for y in (coach, tail)]), shade(skin, 0.9))
+    body.add(loft([bevelled(width, ground, roof, y, 0.3) for y in (coach, tail)]), shade(skin, 0.9))
     body.add(box((0.7 * width, 0.6, 0.7 * height), (0, rear + 0.25, ground + 0.45 * height)), DARK)
     for start, stop in ((front + nose + 0.3, rear), (coach, tail)):
         body.add(box((width + 0.05, stop - start, 0.45), (0, (start + stop) / 2, ground + 0.3)), second)
@@ -146,7 +159,7 @@ def train(random: Generator) -> Body:
 
     # the windscreen: on the slope of a streamlined nose, upright on a flat one
     low, high = (0.45, 0.75) if streamlined else (0.0, 0.0)
-    small, large = (float(np.interp(place, along, share)) for place in (low, high))
+    small, large = (float(np.interp(position, along, share)) for position in (low, high))
     wide = 0.8 * width * small
     z_low = ground + height * small * (0.92 if streamlined else 0.58)
     z_high = ground + height * large * (1.0 if streamlined else 0.9)

@@ -56,13 +56,13 @@ QUANTILES: dict[str, tuple[tuple[int, ...], tuple[int, ...]]] = {
 }
 """Elevation and tilt of each class, degrees, at `LEVELS`.
 
-They were measured on the 2,108 objects of PASCAL3D+ (Xiang et al., WACV 2014) that are in the VOC 2012 validation set
-and neither truncated, occluded nor difficult.
+The angles were measured on the 2,108 objects of PASCAL3D+ (Xiang et al., WACV 2014) that are in the VOC 2012 validation
+set and neither truncated, occluded nor difficult.
 """
 
 
 def viewpoint(category: str, random: Generator) -> tuple[float, float, float]:
-    """Return azimuth (uniform), elevation and tilt (between the measured quantiles), degrees."""
+    """Return a random azimuth (uniform), elevation and tilt (interpolated between the measured quantiles), degrees."""
     elevation, tilt = (
         float(np.interp(random.uniform(LEVELS[0], LEVELS[-1]), LEVELS, levels))
         for levels in QUANTILES[category]
