@@ -26,8 +26,8 @@ class DensityHead(nn.Module, ABC):
     `entropy` (nats) and `mode`. Angles are radians and read modulo 2π; the `support` of their density is
     `distributions.circular.circular`. framework.distributions.protocol describes all other functions of a density. A
     density over several numbers registers `marginal`. A density over an image registers `images`. A density whose
-    log_prob draws nothing registers `estimate` with `exactly`. The other functions have defaults that claim nothing
-    they do not know.
+    log_prob draws nothing registers `exact_estimate` as its `estimate`. The other functions have defaults, none of
+    which claims to be exact.
 
     Raw parameters may be any finite numbers, however large. The head maps them to a density whose log_prob is finite
     wherever the true one is, in float32 and float64; half precision is upcast to float32. Non-finite raw parameters are

@@ -36,7 +36,7 @@ class Uncertainty(Predictor):
     A wrapper of several predictors does not set it, and overrides these methods.
     """
     remark: str = ""
-    """A sentence for the model's user about what `calibrate` found; "" if there is nothing to say.
+    """A sentence for the user about the result of `calibrate`; "" if there is nothing to report.
 
     `calibrate` sets it, runs print it, and it travels with the model.
     """
@@ -84,7 +84,7 @@ class SeveralModels(ABC):
 
 
 def remarks(predictor: Predictor) -> tuple[str, ...]:
-    """Return the remarks that the wrappers of a predictor made at calibration, the innermost last."""
+    """Return the remarks that the wrappers of a predictor set in `calibrate`, the innermost last."""
     notes = (module.remark for module in predictor.modules() if isinstance(module, Uncertainty))
     return tuple(dict.fromkeys(remark for remark in notes if remark))
 

@@ -76,7 +76,7 @@ class CircularMoments:
 
     @property
     def spread(self) -> Float[Tensor, "*batch"]:
-        """E d(X, X'), radians, by the same series; X' is an independent copy of X."""
+        """Mean angular distance E d(X, X'), radians, of X and an independent copy X', by the series of `distance`."""
         squares = self.moments[1:].abs().square()
         return math.pi / 2 - 4 / math.pi * (squares / self.order.square())[::2].sum(0)
 

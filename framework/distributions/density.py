@@ -219,13 +219,13 @@ class Mixture(Distribution):
 
 
 def estimate_of_sum(parts: Estimate, log_terms: Tensor, log_sum: Tensor) -> Estimate:
-    """Return the estimate of log Σ_k t_k from the estimates of log t_k, up to constants, along the last dimension.
+    """Return the estimate of log Σ_k t_k, summed along the last dimension, from estimates of the terms.
 
     The terms must be drawn independently of one another. By the delta method, the squared relative error of the sum is
     Σ_k (t_k / Σ_j t_j)² s_k². The numbers of samples add up.
 
     Args:
-        parts: estimates of the terms, with errors and numbers of samples, (*items, K).
+        parts: estimates of log t_k or of these plus constants, with errors and numbers of samples, (*items, K).
         log_terms: log t_k, (*items, K).
         log_sum: log Σ_k t_k, (*items,).
     """
@@ -241,7 +241,7 @@ def estimate_of_sum(parts: Estimate, log_terms: Tensor, log_sum: Tensor) -> Esti
 
 @estimate.register
 def _(density: Mixture, value: Tensor) -> Estimate:
-    """Return the estimate of a mixture of independent components; of one component its own, to the last bit."""
+    """Return the estimate of a mixture of independent components; for one component its estimate, to the last bit."""
     several = density.split_values(value)
     if len(several) > 1:
         return concatenate_estimates([estimate(density, part) for part in several])
@@ -254,7 +254,7 @@ def _(density: Mixture, value: Tensor) -> Estimate:
 
 
 def concatenate_estimates(parts: Sequence[Estimate]) -> Estimate:
-    """Return one estimate from those of several batches, concatenated along the first dimension."""
+    """Return the estimates of several batches as one, concatenated along the first dimension."""
     return Estimate(*map(torch.cat, zip(*parts, strict=True)))
 
 
@@ -346,10 +346,7 @@ def _(density: Mixture, index: Tensor) -> Distribution:
 
 @pick.register
 def _(density: Reshaped, index: Tensor) -> Distribution:
-    """Pick the matching items of the inner density, whose batch becomes one line of items.
-
-    So no draw is thrown away.
-    """
+    """Return the picked items of the inner density, whose batch is flattened; no draw is discarded."""
     inner = density.density
     # a picked mixture draws from all its items for each pick; here these would be the items of the whole batch
     if len(inner.batch_shape) != 1 or isinstance(inner, Mixture):

@@ -112,7 +112,7 @@ def _exact_interval(low: Tensor, high: Tensor) -> Interval:
 
 
 def _tails(mass: float) -> Tensor:
-    """Return the masses below the two ends, (2,)."""
+    """Return the probabilities below the lower and the upper end of an interval of probability `mass`, (2,)."""
     return torch.tensor([(1 - mass) / 2, (1 + mass) / 2], dtype=torch.float64)
 
 
@@ -126,7 +126,7 @@ def _interval_of_real(density: Distribution, mass: float) -> Interval | None:
     below = below.to(like.device)
     if cdf(density, like[0].to(density.sample().dtype)) is None:
         return None
-    return _exact_interval(*_widen_bracket(partial(_cdf_of, density), below, like.squeeze(-1)))
+    return _exact_interval(*_quantiles_by_search(partial(_cdf_of, density), below, like.squeeze(-1)))
 
 
 def _cdf_of(density: Distribution, value: Float[Tensor, "place *batch"]) -> Tensor:
@@ -156,7 +156,7 @@ def _normal_quantiles(known: Normals, below: Float[Tensor, "place"]) -> Float[Te
     return find_crossing(mass_below, levels, low, high, center)
 
 
-def _widen_bracket(
+def _quantiles_by_search(
     mass_below: Callable[[Tensor], Tensor],
     below: Float[Tensor, "place"],
     samples: Float[Tensor, "draw *batch"],
@@ -263,7 +263,7 @@ def _interval_of_angle(density: Distribution, mass: float) -> Interval | None:
 def _width_of_mass(
     mass_within: Callable[[Tensor], Tensor], mass: float, center: Float[Tensor, "item"]
 ) -> Float[Tensor, "item"]:
-    """Return the width, radians up to π, of the arc next to `center` that holds the mass `mass`."""
+    """Return the width, radians up to π, of the arc next to `center` whose probability is `mass`."""
     power = torch.arange(RUNGS, dtype=torch.float64, device=center.device).unsqueeze(-1)
     rungs = (math.pi * NARROWER**-power).expand(RUNGS, len(center))
     enough = (mass_within(rungs) >= mass).sum(0).clamp(min=1)  # falling

@@ -54,7 +54,10 @@ COARSE[1::2] = torch.from_numpy(np.polynomial.legendre.leggauss(7)[1])
 
 
 class Panels(NamedTuple):
-    """Panels of items' ranges, x = place + scale · sinh(v) with v from low to high; each column is (panel,)."""
+    """Panels, which are parts of the ranges of densities: x = place + scale · sinh(v), low ≤ v ≤ high.
+
+    Each column has the shape (panel,); `item` is the index of the density.
+    """
 
     item: Tensor
     place: Tensor
@@ -74,14 +77,14 @@ class Panels(NamedTuple):
 
 
 def has_range(density: Distribution) -> bool:
-    """Return whether the density is of one number on a circle, a part of a circle, or the whole real line."""
+    """Return true for a density of one number on a circle, a part of a circle, or the whole real line."""
     support = density.support
     real = isinstance(support, constraints.independent) and support.base_constraint is constraints.real
     return tuple(density.event_shape) == (1,) and (real or isinstance(support, Circular))
 
 
 def entropy_of_one(density: Distribution) -> Float[Tensor, "*batch"]:
-    """Return the entropy of a density of one number, nats: to 1e-9 in float64, and to its rounding in float32.
+    """Return the entropy of a density of one number, nats, accurate to 1e-9 in float64 and to rounding in float32.
 
     Panels begin at the `mode_candidates` of the density, and the first panels are as wide as the `peak_widths`. Panels
     are halved until two rules agree. Their nodes are given relative to the peak, so that the rounding of the number
@@ -146,7 +149,7 @@ def split(panels: Panels, step: int) -> list[Panels]:
 
 
 def integrate(density: Distribution, panels: Panels) -> tuple[Tensor, Tensor]:
-    """Return ∫ p and -∫ p log p on each panel, (2, panel), and the coarse rule's largest difference there, (panel,)."""
+    """Return ∫ p and -∫ p log p on each panel, (2, panel), and the largest difference between the two rules, (panel,)."""
     like = panels.place
     half = (panels.high - panels.low) / 2
     v = (panels.high + panels.low) / 2 + half * NODES.to(like).unsqueeze(-1)
@@ -243,7 +246,7 @@ def _smallest_scale_at(some: Tensor, place: Tensor, scale: Tensor, closed: bool)
 def first_in_cell(
     place: Float[Tensor, "peak item"], scale: Float[Tensor, "peak item"], width: float
 ) -> Bool[Tensor, "peak item"]:
-    """Return which of the ascending peaks are the first in their cell.
+    """Return a mask of the ascending peaks that are the first in their cell.
 
     A cell is at most `width` times as wide as the peak's scale, and at least half of that.
     """

@@ -171,7 +171,7 @@ def tempered_density(density: Distribution, temperature: Tensor) -> Distribution
 
 
 class Estimate(NamedTuple):
-    """A log-density and its Monte Carlo error; all fields have the same shape, in nats where not said otherwise.
+    """A log-density and its Monte Carlo error; all fields have the same shape and are in nats unless stated otherwise.
 
     Attributes:
         log_mean: the value of log_prob; its expectation is below the truth by about standard_error²/2 (Jensen).
@@ -206,7 +206,7 @@ def estimate(density: Distribution, value: Tensor) -> Estimate:
     """Return the log-density at `value` (*sample, *batch, *event) with its Monte Carlo error, (*sample, *batch).
 
     Default: log_prob with an error of NaN, "not known", since it is not known whether log_prob draws. A density whose
-    log_prob is computed without drawing registers `exactly`; one that draws registers its own function.
+    log_prob is computed without drawing registers `exact_estimate`; one that draws registers its own function.
     """
     result = exact_estimate(density, value)
     unknown = torch.full_like(result.log_mean, math.nan)
@@ -214,7 +214,7 @@ def estimate(density: Distribution, value: Tensor) -> Estimate:
 
 
 def exact_estimate(density: Distribution, value: Tensor) -> Estimate:
-    """Return the estimate of a density whose log_prob draws nothing: `estimate.register(Mine, exactly)`."""
+    """Return the estimate of a density whose log_prob draws nothing: `estimate.register(Mine, exact_estimate)`."""
     log_prob = density.log_prob(value)
     samples = torch.zeros(log_prob.shape, dtype=torch.int64, device=log_prob.device)
     return Estimate(log_prob, log_prob, torch.zeros_like(log_prob), samples, samples > 0)
@@ -397,9 +397,9 @@ class ValueSet(ABC):
 
 @singledispatch
 def value_set(density: Distribution) -> ValueSet | None:
-    """Return the set that comes with the density.
+    """Return the prediction sets of the items of the density.
 
-    Default: None, there is no set. Structures return None too: a guarantee for a density does not hold for a mixture, a
-    power or a marginal of it. An affine transform (`affine.AffineDensity`) has the transformed set.
+    Default: None, there are no sets. Structures return None too: a guarantee for a density does not hold for a mixture, a
+    power or a marginal of it. An affine transform (`affine.AffineDensity`) has the transformed sets.
     """
     return None

@@ -236,7 +236,7 @@ class CircularPower(Distribution):
         return self._angles_at(u.reshape(points, *(1,) * self.start.dim()), 2 * math.pi / points)
 
     def _angles_at(self, u: Float[Tensor, "number *batch 1"], step: float) -> tuple[Tensor, Tensor]:
-        """Return the angles at u, and log(dθ/du · step)."""
+        """Return the angles θ of the stretched grid at u, and log(dθ/du · step)."""
         half_sine, half_cosine = (u / 2).sin(), (u / 2).cos()
         offset = 2 * torch.atan2(self.stretch * half_sine, half_cosine)
         arc = self.stretch / (half_cosine.square() + (self.stretch * half_sine).square())
@@ -244,7 +244,7 @@ class CircularPower(Distribution):
         return angle, (arc.log() + math.log(step)).squeeze(-1).expand(angle.shape[:-1])
 
     def _narrow(self) -> Float[Tensor, "*batch 1"]:
-        """Return how much closer than equally spaced angles a grid must be at each mode, as a factor of at most 1."""
+        """Return the stretch that the grid needs at each mode: its spacing there over equal spacing, at most 1."""
         # width of the normal density with the same height; p^(1/T) is √T times as wide
         width = (-self.density.log_prob(self.start).detach().double()).exp() / math.sqrt(2 * math.pi)
         width = width * self.temperature.detach().double().sqrt()
@@ -262,7 +262,7 @@ class CircularPower(Distribution):
         return self.power_of(self.density.log_prob(value))
 
     def power_of(self, log_prob: Tensor) -> Tensor:
-        """Return log_prob of the power where log_prob of p is `log_prob`."""
+        """Return the log-density of the power, given the log-density `log_prob` of p."""
         # relative to the mode's log-density, so that large log-densities do not cancel
         return divide_by_temperature(log_prob - self.top, self.temperature) - self.log_normaliser
 
@@ -293,7 +293,7 @@ class CircularPower(Distribution):
     @cached_property
     @torch.no_grad()
     def _between(self) -> tuple[Float[Tensor, "item node"], Float[Tensor, "item node"]]:
-        """Ascending angles minus the mode, from 0 to a whole turn, and the height of the power there."""
+        """Ascending angles relative to the mode, from 0 to 2π, and the height of the power at these angles."""
         batch = self.batch_shape.numel()
         u = (
             2

@@ -31,7 +31,7 @@ def free(
     lift, decay = constants.lift * spin, constants.spin_decay * h
 
     def faster(velocity: Tensor, left: Tensor | float) -> Tensor:
-        """physics.acceleration, of vectors; `left` of the spin."""
+        """Return physics.acceleration for vectors; `left` is the share of the spin that is left."""
         drag = constants.drag * (velocity.square().sum(-1, keepdim=True) + 1e-24).sqrt()
         return torch.linalg.cross(left * lift, velocity) - drag * velocity - gravity
 

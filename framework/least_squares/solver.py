@@ -37,7 +37,7 @@ It is the difference between the Hessian of the cost and JᵀJ.
 
 
 class _Active(NamedTuple):
-    """The problems that are being solved, first dimension the problem.
+    """The problems that are being solved; the first dimension of each tensor counts them.
 
     `gram` is JᵀJ. `curve` is the difference between the Hessian and JᵀJ, 0 far from the minimum. `scale` is the largest
     length of each column of the Jacobian so far. `damping` is in units of its square. `streak` counts successive steps

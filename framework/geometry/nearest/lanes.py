@@ -46,13 +46,13 @@ class LanesModel(models.PrimitiveModel):
 
 @no_type_check
 def real(element):
-    """Return whether the element type is floating-point."""
+    """Return true if the element type is floating-point."""
     return isinstance(element, types.Float)
 
 
 @no_type_check
 def truths(like):
-    """Return the type of as many truth values."""
+    """Return the type of truth values with as many lanes as `like`."""
     return Lanes(types.boolean, like.count)
 
 
@@ -120,7 +120,7 @@ def most_of(builder, element, x, y):
 
 @no_type_check
 def coded(result, arguments, make):
-    """Return what an intrinsic returns: its signature, and code that depends on the values alone."""
+    """Return the signature of an intrinsic and its code generator, which depends on the values alone."""
 
     def generate(context, builder, sig, values):
         return make(builder, *values)

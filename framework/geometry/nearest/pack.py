@@ -71,7 +71,7 @@ class Bench(NamedTuple):
 
 
 def room(points: int, dtype: np.dtype) -> Packed:
-    """Return memory for a packed cloud of up to so many points."""
+    """Return memory for a packed cloud of up to `points` points."""
     leaves = -(-points // LANES)
     nodes, level = 0, leaves
     while True:
@@ -86,7 +86,7 @@ def room(points: int, dtype: np.dtype) -> Packed:
 
 
 def bench(points: int, threads: int = 1) -> Bench:
-    """Return working memory for packing up to so many points."""
+    """Return working memory for packing up to `points` points in `threads` threads."""
     cells = 8 ** cell_bits(points)
     return Bench(
         np.empty(points, np.int32),
