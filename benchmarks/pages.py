@@ -63,7 +63,7 @@ def replace_section(page: Path, heading: str, text: str) -> None:
 
 
 def read_rows(table: Path) -> list[dict[str, object]]:
-    """Return the rows that `framework.reports.table.csv` wrote, so that a figure can be drawn again without measuring.
+    """Return the rows that `framework.reports.table.write_csv` wrote, to draw a figure again without measuring.
 
     Values are numbers, words, True and False; an empty cell has no key.
     """

@@ -112,12 +112,12 @@ def test_a_label_of_no_class_is_refused_wherever_it_is_read(label: float, worker
         ),
         (
             ["density_head=von_mises", "+metric.two.name=listed"],
-            "'mean_entropy' of shape (3,): wanted one number",
+            "'mean_entropy' with shape (3,), but each name must have one number",
         ),
-        (["density_head=von_mises", "+metric.two.name=log_likelihood"], "Two metrics call a number"),
+        (["density_head=von_mises", "+metric.two.name=log_likelihood"], "Two metrics use the name"),
         (
             ["density_head=von_mises", "+metric.two.name=mean_entropy", "+metric.three.name=listed"],
-            "Two metrics call a number 'mean_entropy': MeanEntropy and Listed",
+            "Two metrics use the name 'mean_entropy': MeanEntropy and Listed",
         ),
     ],
 )
@@ -154,7 +154,7 @@ def test_a_picture_that_nobody_asked_for_costs_no_table(framework: Framework) ->
         "+metric.m.name=mean_entropy",
     )
     assert done.code == 0, done.out
-    assert "no picture of predictions" in done.out
+    assert "No figure of predictions" in done.out
     results = json.loads((done.folder / "results.json").read_text(encoding="utf-8"))
     assert math.isfinite(results["mean_entropy"])
 

@@ -8,7 +8,7 @@ from hypothesis.extra import numpy as arrays
 from matplotlib.colors import to_hex
 
 from framework.figures.style import BLUE, GREEN, RED
-from framework.reports.class_picture import choose_classified, classified
+from framework.reports.class_picture import choose_classified, draw_classified
 from tests.test_pictures import drawn, words
 
 NAMES = ("cone", "a_chair_with_a_very_long_name", "cup", "lamp")
@@ -54,7 +54,7 @@ def test_no_sample_stands_twice_and_each_in_its_row(logits, count):
 
 def sheet(rows, order):
     images = [np.full((10, 12, 3), 20 * index, np.uint8) for index in range(len(order))]
-    return classified(
+    return draw_classified(
         images, PROBABILITY[order], LABEL[order], NAMES, rows=rows, title="Things", synthetic=True
     )
 

@@ -88,7 +88,7 @@ def test_a_spent_budget_still_times_three_calls_after_two_to_warm_up() -> None:
 
 def test_wall_time_is_the_median_without_the_warm_up(monkeypatch: pytest.MonkeyPatch) -> None:
     script = iter([100.0, 100.0, 3.0, 1.0, 50.0, 2.0, 4.0])
-    monkeypatch.setattr(cost, "seconds", lambda call, device: next(script))
+    monkeypatch.setattr(cost, "time_call", lambda call, device: next(script))
     assert wall_time(lambda: None, CPU, repeats=5, budget_seconds=60.0) == 3.0
 
 

@@ -62,7 +62,7 @@ def test_what_is_made_of_a_name_takes_any(name: bytes, tmp_path: Path) -> None:
     figure = Figure()
     figure.suptitle(text.replace("$", r"\$"))
     save_figure(figure, tmp_path / "figure", "svg")
-    table.csv([{"class": text, "nll": 1.0}], None, tmp_path / "table.csv")
+    table.write_csv([{"class": text, "nll": 1.0}], None, tmp_path / "table.csv")
     with (tmp_path / "table.csv").open(encoding="utf-8", newline="") as stream:
         assert list(csv.reader(stream))[1][0] == escape_undecodable(text).replace("\r", r"\x0d")
 

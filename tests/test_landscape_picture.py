@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from framework.reports.landscape_picture import POINTS, Plane, half_width, landscapes, probabilities
+from framework.reports.landscape_picture import POINTS, Plane, draw_landscapes, half_width, probabilities
 from framework.target import Target
 from tests.test_tradeoff import predictor
 
@@ -26,6 +26,6 @@ def test_a_landscape_holds_the_probabilities_at_its_points(names, head, tmp_path
     assert found[50, 10] == pytest.approx(wanted, abs=1e-5)
     points, labels = np.random.default_rng(0).normal(size=(9, 2)), np.arange(9) % len(names)
     plane = Plane(points, labels, points[:0], names, half_width(points, points[:0]))
-    figure = landscapes({"one": found, "two": found}, plane, title="t", synthetic=True)
+    figure = draw_landscapes({"one": found, "two": found}, plane, title="t", synthetic=True)
     figure.savefig(tmp_path / "x.png")
     assert figure.get_suptitle() == "t (synthetic data)"

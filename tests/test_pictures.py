@@ -20,11 +20,11 @@ from scipy.stats import vonmises
 
 from framework.distributions.density import Mixture
 from framework.figures.style import save_figure, titled_figure
-from framework.reports.prediction_pictures import around, deviation
+from framework.reports.prediction_pictures import deviation, log_density_on_circle
 from framework.reports.table import aggregate
 from framework.reports.tradeoff_picture import Floor, error_against_run_time
 from framework.reports.training_curve import training_curve
-from framework.reports.viewing_circles import RING, choose, peaks, scale, viewing_circles
+from framework.reports.viewing_circles import RING, choose, count_peaks, outer_density, viewing_circles
 from framework.sweeps import comparison
 from plugins.density_head.von_mises.density import VonMises
 
@@ -61,7 +61,7 @@ def test_peaks_are_counted_around_the_circle() -> None:
         np.full(720, -math.log(2 * math.pi)),
         np.where(np.arange(720) == 7, 3.0, -math.inf),
     ]
-    assert peaks(np.array(densities).T).tolist() == [1, 1, 2, 1, 3, 1, 1]
+    assert count_peaks(np.array(densities).T).tolist() == [1, 1, 2, 1, 3, 1, 1]
 
 
 def test_rows_are_the_certain_the_ambiguous_and_the_confident_mistakes() -> None:
@@ -198,7 +198,7 @@ def test_thickness_is_the_density_whose_scale_each_panel_says() -> None:
 
 @pytest.mark.parametrize("peak", [0.0, 1.5, 1.6, 5.1, 14.9, 15.1, 40.0, 1e9, math.exp(700)])
 def test_a_scale_holds_its_peak_and_is_not_much_larger(peak: float) -> None:
-    assert peak <= scale(peak) <= max(1.5, 2.6 * peak)
+    assert peak <= outer_density(peak) <= max(1.5, 2.6 * peak)
 
 
 @pytest.mark.parametrize(
@@ -219,14 +219,14 @@ def test_no_density_falls_between_the_angles_where_it_is_drawn(
     weight, mean, sharp = torch.tensor(parts, dtype=torch.float64)[None].unbind(-1)  # of a batch of one
     density = Mixture(weight.log(), VonMises(mean[..., None], sharp[..., None]))
     torch.manual_seed(0)
-    angles, log_density = around(density)
+    angles, log_density = log_density_on_circle(density)
     mass = log_density.exp()[:, 0].numpy() * 2 * math.pi / len(angles)
     assert mass.sum() == pytest.approx(1, abs=0.02)
     for share, middle, concentration in parts:
         if concentration > 1e3:
             near = np.abs(np.angle(np.exp(1j * (angles.numpy() - middle)))) < 0.05
             assert mass[near].sum() == pytest.approx(share, abs=0.06)
-    assert scale(float(log_density.exp().max())) <= 150
+    assert outer_density(float(log_density.exp().max())) <= 150
 
 
 def test_every_equally_true_angle_is_marked(tmp_path: Path) -> None:
@@ -368,7 +368,7 @@ def test_the_diagram_is_logarithmic_with_units_bars_and_knob_values(tmp_path: Pa
     assert "first (samples)" in text and "second (tolerance)" in text and "third" not in text
     assert text.count("by hand") == 1
     assert "below 0.004 nats the reference itself is uncertain" in text
-    assert "not drawn for want of a finite error and run time: 1" in text
+    assert "not drawn, without finite error and run time: 1" in text
     assert "Diagram (synthetic data)" in text
     drawn(figure, tmp_path)
 

@@ -205,7 +205,7 @@ def rates(**changes: Any) -> tuple[float, ...]:
     found = []
     for step in range(120):
         if step and step % 10 == 0 and isinstance(factor, Plateau):
-            factor.see(1.0, step // 10)
+            factor.record_loss(1.0, step // 10)
         found.append(factor(step))
     return tuple(found)
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from framework.errors import ConfigError
-from framework.reports.table import aggregate, csv, format_number, markdown, results_table
+from framework.reports.table import aggregate, format_number, markdown, results_table, write_csv
 
 COLUMNS = {"method": "method", "log_likelihood": "log-likelihood nats", "maad_deg": "MAAD °"}
 ROWS = [
@@ -229,7 +229,7 @@ def test_csv_keeps_every_digit_and_the_errors(tmp_path: Path) -> None:
         {"method": "two", "log_likelihood": np.float32(0.5), "maad_deg": 10**18, "synthetic": False},
     ]
     path = tmp_path / "deep" / "results.csv"
-    csv(rows, COLUMNS, path)
+    write_csv(rows, COLUMNS, path)
     with path.open(newline="", encoding="utf-8") as file:
         found = list(reader.DictReader(file))
     assert list(found[0]) == ["method", "log_likelihood", "log_likelihood_sem", "maad_deg", "synthetic"]

@@ -21,11 +21,11 @@ from framework.density_head import DensityHead
 from framework.distributions.density import Mixture
 from framework.encoder import Encoder
 from framework.errors import ConfigError
-from framework.evaluation.pareto import TIMES_APART, front
+from framework.evaluation.pareto import TIME_NOISE, front
 from framework.evaluation.significance import Mean, least_significant, mean
-from framework.evaluation.tradeoff import Curve, Point, first_knob, owners, rows, run_times, tradeoff
+from framework.evaluation.tradeoff import Curve, Point, first_knob, knob_owners, rows, run_times, tradeoff
 from framework.model import Model
-from framework.reports.table import csv
+from framework.reports.table import write_csv
 from framework.target import Target
 
 CPU = torch.device("cpu")
@@ -105,15 +105,15 @@ def test_repeats_differ_where_something_is_drawn():
 def test_the_wrappers_knob_hides_a_heads_of_the_same_name():
     angle = Target("angle", ("azimuth",))
     whole = predictor({"name": "mc_dropout"}, head="scvae", target=angle)
-    assert owners(whole, "samples") == [whole]
-    assert owners(predictor(head="scvae", target=angle), "samples")[0].knobs
-    assert owners(whole, "") == []
+    assert knob_owners(whole, "samples") == [whole]
+    assert knob_owners(predictor(head="scvae", target=angle), "samples")[0].knobs
+    assert knob_owners(whole, "") == []
     with pytest.raises(ConfigError, match="Did you mean 'samples'"):
-        owners(whole, "sample")
-    with pytest.raises(ConfigError, match="at least one batch, got none"):
+        knob_owners(whole, "sample")
+    with pytest.raises(ConfigError, match="Got no batch"):
         tradeoff(whole, [], metrics(), knob="samples", values=(1,), samples=1, seed=0)
     assert first_knob(whole) == "samples"
-    with pytest.raises(ConfigError, match="nothing to trade"):
+    with pytest.raises(ConfigError, match="trade error for run time"):
         first_knob(predictor())
 
 
@@ -274,7 +274,7 @@ def test_no_batches_get_a_sentence(model: Model) -> None:
 
 def test_a_head_without_knobs_gets_a_sentence(model: Model, pairs: list[Batch]) -> None:
     model.head.knobs = {}
-    with pytest.raises(ConfigError, match="nothing to trade"):
+    with pytest.raises(ConfigError, match="trade error for run time"):
         curve_of(model, pairs)
 
 
@@ -357,7 +357,7 @@ def test_beyond_noise_no_two_hide_each_other_and_each_hidden_one_is_beaten(
 def test_rings_stand_beyond_noise(points: list[tuple[float, float, float]], wanted: str) -> None:
     """`wanted`: 1 where a point is hidden."""
     errors, noise, times = zip(*points, strict=True)
-    assert front(known(errors, noise), times, TIMES_APART) == [hidden == "0" for hidden in wanted]
+    assert front(known(errors, noise), times, TIME_NOISE) == [hidden == "0" for hidden in wanted]
 
 
 def drawn_from(*points: tuple[int, float, float]) -> Curve:
@@ -380,7 +380,7 @@ def test_the_file_holds_every_number_under_a_key_with_its_unit(
     curves = {"toy": curve_of(model, pairs)}
     path = tmp_path / "work_precision.csv"
     table = rows(curves, {"error_nats": "lower"}, synthetic=True)
-    csv(table, None, path)
+    write_csv(table, None, path)
     with path.open(newline="", encoding="utf-8") as file:
         found = list(DictReader(file))
     assert len(found) == 3
@@ -394,7 +394,7 @@ def test_the_file_holds_every_number_under_a_key_with_its_unit(
         assert (line["repeats"], line["reference_value"]) == ("6", "2000")
     times = [point.milliseconds for point in curves["toy"].points]
     means = [mean({**point.numbers, "repeats": 6}, "error_nats", 6) for point in curves["toy"].points]
-    best = front(means, times, TIMES_APART)
+    best = front(means, times, TIME_NOISE)
     assert [line["error_nats_pareto"] for line in found] == [str(one).lower() for one in best]
 
 

@@ -337,7 +337,7 @@ def main() -> None:
     for method, config in HEADS.items():
         rows += curve(method, *trained(config))
     mark(rows)
-    table.csv(rows, [*COLUMNS, "family_excess_nats"], HERE.with_suffix(".csv"))
+    table.write_csv(rows, [*COLUMNS, "family_excess_nats"], HERE.with_suffix(".csv"))
     picture(rows)
     shown = [
         row

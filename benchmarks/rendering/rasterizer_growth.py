@@ -21,7 +21,7 @@ from framework.configuration.schema import build, resolve
 from framework.figures.style import COLOURS, MARKERS, save_figure, titled_figure
 from framework.geometry.camera import look_from
 from framework.renderer import Scene
-from framework.reports.table import Row, csv
+from framework.reports.table import Row, write_csv
 from framework.testing.scenes import sphere
 
 FACES = (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000)
@@ -76,7 +76,7 @@ def report(picture: Path) -> list[str]:
             lines.append(
                 f"- {channel} against {name}, ms: {told}; slope of the upper half {slope(sizes, times):.2f}"
             )
-    csv(rows, None, picture.with_suffix(".csv"))
+    write_csv(rows, None, picture.with_suffix(".csv"))
     drawn(rows, picture)
     return [*lines, "", f"![Milliseconds against faces and pixels]({picture.name})"]
 

@@ -23,7 +23,7 @@ from framework.bodies.topologies import Name, sheet, topology
 from framework.configuration.schema import build, resolve
 from framework.encoder import Encoder
 from framework.figures.style import COLOURS, MARKERS, save_figure, titled_figure
-from framework.reports.table import Row, csv
+from framework.reports.table import Row, write_csv
 from plugins.data.human_scans.data import in_front
 from plugins.encoder.unets.canvas import fast_bfloat16
 
@@ -95,7 +95,7 @@ def report(picture: Path) -> str:
         for way, times in found.items()
         for count, each in zip(counts, times, strict=True)
     ]
-    csv(measured, None, picture.with_suffix(".csv"))
+    write_csv(measured, None, picture.with_suffix(".csv"))
     drawn(measured, picture)
     rows = [
         f"| {way} | {' | '.join(f'{each:.2f}' for each in times)} | {times[-1] / times[0]:.1f} | "

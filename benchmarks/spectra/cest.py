@@ -27,7 +27,7 @@ from framework.data import Batch
 from framework.distributions.protocol import marginal
 from framework.figures.style import BLUE, GREEN, GREY, RED, save_figure, titled_figure
 from framework.model import Predictor
-from framework.reports.table import Row, csv, markdown
+from framework.reports.table import Row, markdown, write_csv
 from framework.spectra.fit import fit
 from framework.spectra.spectrum import COUNT, spectrum
 from framework.target import Target
@@ -254,7 +254,7 @@ def main() -> None:
         for name, several in found.items()
         for ms, off, share in several
     ]
-    csv(points, None, HERE.with_suffix(".csv"))
+    write_csv(points, None, HERE.with_suffix(".csv"))
     drawn(points)
     mapped(network, data, file)
     scipy = found["SciPy"][-1][0]

@@ -28,8 +28,8 @@ from framework.deployment.request_bodies import MOST_CONTENT, MOST_FILES, MOST_I
 from framework.deployment.request_bounds import TICKET, bound_server
 from framework.distributions.noise import Draw
 from framework.errors import DataError, UserError, quote, shorten
-from framework.evaluation.promises import promised
-from framework.evaluation.splits import BLOCK, predicted
+from framework.evaluation.prediction_sets import set_columns
+from framework.evaluation.splits import BLOCK, predict
 from framework.model import Predictor
 from framework.prediction import named_columns, table_columns
 
@@ -74,7 +74,7 @@ class Served:
 
     @torch.no_grad()
     def answer(self, given: Any) -> pd.DataFrame:
-        """Return a table with one row per sample, and with the set that the model predicts (`promised`).
+        """Return a table with one row per sample, and with the set that the model predicts (`set_columns`).
 
         An image is a PNG in base64. The remarks that `mode=predict` prints about the sets are in `attrs["remarks"]` of
         the table.
@@ -96,7 +96,7 @@ class Served:
             if ticket is not None:
                 ticket.require_time()
             block = {name: values[rows] for name, values in asked.items()}
-            prediction = predicted(self.predictor, block, samples, Draw(seed, number))
+            prediction = predict(self.predictor, block, samples, Draw(seed, number))
             prediction = prediction.in_frame(self.data.frame(block))
             target = self.description.target
             found = table_columns(target, prediction)
@@ -114,7 +114,7 @@ class Served:
             else:
                 labels, found = {}, {**found, **named_columns(target, mode, "_mode")}
             numbers = {key: column.numpy() for key, column in found.items()}
-            parts.append(pd.DataFrame({**labels, **numbers, **promised(target, prediction)}))
+            parts.append(pd.DataFrame({**labels, **numbers, **set_columns(target, prediction)}))
         table = pd.concat(parts, ignore_index=True)
         table.attrs["remarks"] = list(self.description.remarks)
         return table

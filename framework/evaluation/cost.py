@@ -1,4 +1,4 @@
-"""The cost of a prediction: run time, FLOPs, parameters and memory, measured on this machine."""
+"""The cost of a prediction: run time, FLOPs, parameters and memory on this machine."""
 
 import ctypes
 import math
@@ -23,13 +23,13 @@ class Cost:
         latency_milliseconds: median wall time of a batch of one.
         flops_per_sample: floating-point operations of matrix products, convolutions and attention; one multiply-add
             counts as two. Not counted are element-wise and special functions, normalisation, pooling, sorting, random
-            numbers, compiled graphs, and everything outside torch. So 0 says that no operation of the counted kinds
-            ran, not that the work was free. None if `parameters` is None.
-        parameters: number of parameters of the predictor, as the caller counted them. None if what it has learned is
-            not numbers that torch computes with (trees), so that neither parameters nor FLOPs can be counted.
-        peak_memory_mib: largest amount of memory that one call on the batch held beyond what was held before it, MiB;
-            it contains neither weights nor inputs. On a CPU it is the growth of resident memory, on CUDA of allocated
-            memory. NaN if the system does not report it (a CPU without Linux's /proc or without glibc).
+            numbers, compiled graphs, and everything outside torch. So 0 means that no counted kind of operation ran,
+            not that the prediction was free. None if `parameters` is None.
+        parameters: number of parameters of the predictor, as the caller counted them. None if torch does not compute
+            with them (trees), so that neither parameters nor FLOPs can be counted.
+        peak_memory_mib: largest growth of memory during one call on the batch, MiB, without weights and inputs. On a
+            CPU this is resident memory, on CUDA allocated memory. NaN if the system does not report it (a CPU without
+            Linux's /proc or without glibc).
         batch_size: number of samples in the batch.
         device: the device, e.g. "cpu (AMD EPYC)".
         threads: number of CPU threads that torch used for one operation.
@@ -56,7 +56,7 @@ def measure(
 ) -> Cost:
     """Return the cost of `predict` on a batch of inputs.
 
-    Random numbers drawn by `predict` leave torch's global generators as they were.
+    The states of torch's global random generators are restored afterwards.
 
     Args:
         predict: function whose result a user waits for, such as the density and the point prediction; it is called
@@ -71,7 +71,8 @@ def measure(
     """
     if inputs.dim() == 0 or len(inputs) == 0:
         raise ValueError(
-            f"wanted a batch of at least one sample to measure, got inputs of shape {tuple(inputs.shape)}."
+            f"Got inputs of shape {tuple(inputs.shape)}, but a batch of at least one sample is required to measure the "
+            "cost."
         )
     device = inputs.device
     size = len(inputs)
@@ -98,25 +99,28 @@ def measure(
 def wall_time(
     call: Callable[[], object], device: torch.device, *, repeats: int = 20, budget_seconds: float = 5.0
 ) -> float:
-    """Return the median wall time of `call` after two calls to warm up, seconds.
+    """Return the median wall time of `call` in seconds, after two warm-up calls.
 
-    At least three calls are timed, at most `repeats`, and after the third no more than fit in `budget_seconds`.
+    Up to `repeats` calls are timed. Timing stops earlier when `budget_seconds` are over, but not before the third call.
     """
     if repeats < 1 or not budget_seconds > 0:
-        raise ValueError(f"wanted repeats >= 1 and budget_seconds > 0, got {repeats} and {budget_seconds}.")
+        raise ValueError(
+            f"Got repeats = {repeats} and budget_seconds = {budget_seconds}; expected repeats >= 1 and budget_seconds "
+            "> 0."
+        )
     start = time.perf_counter()
     for _ in range(2):
-        seconds(call, device)
-    taken: list[float] = []
-    while len(taken) < min(3, repeats) or (
-        len(taken) < repeats and time.perf_counter() - start < budget_seconds
+        time_call(call, device)
+    times: list[float] = []
+    while len(times) < min(3, repeats) or (
+        len(times) < repeats and time.perf_counter() - start < budget_seconds
     ):
-        taken.append(seconds(call, device))
-    return statistics.median(taken)
+        times.append(time_call(call, device))
+    return statistics.median(times)
 
 
-def seconds(call: Callable[[], object], device: torch.device) -> float:
-    """Return the wall time of one call until the device has finished, seconds."""
+def time_call(call: Callable[[], object], device: torch.device) -> float:
+    """Return the wall time of one call in seconds, including the time until the device has finished."""
     _finish(device)
     start = time.perf_counter()
     call()
@@ -125,7 +129,7 @@ def seconds(call: Callable[[], object], device: torch.device) -> float:
 
 
 def peak_memory(call: Callable[[], object], device: torch.device) -> float:
-    """Return the most memory that one call holds beyond what is held before it, bytes; NaN if it cannot be measured."""
+    """Return the largest growth of memory during one call, bytes; NaN if it cannot be measured."""
     if device.type == "cuda":
         _finish(device)
         torch.cuda.reset_peak_memory_stats(device)
@@ -135,13 +139,13 @@ def peak_memory(call: Callable[[], object], device: torch.device) -> float:
         return float(torch.cuda.max_memory_allocated(device) - before)
     if device.type != "cpu" or not Path("/proc/self/clear_refs").exists():
         return math.nan
-    # The call would fill pages that the allocator kept from earlier calls, without growth, so they are given back.
+    # Return free pages to the system; otherwise the call would reuse them, and resident memory would not grow.
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
     if trim is None:
         return math.nan
     trim(0)
     try:
-        Path("/proc/self/clear_refs").write_text("5")  # resets the resident peak: proc(5)
+        Path("/proc/self/clear_refs").write_text("5")  # resets the peak of resident memory: proc(5)
     except OSError:  # a container may forbid it
         return math.nan
     before = _resident_peak()
@@ -165,7 +169,7 @@ def device_name(device: torch.device) -> str:
 
 
 def _resident_peak() -> float:
-    """Return the most memory that was resident since the peak was last reset, bytes; NaN if it is not reported."""
+    """Return the peak of resident memory since its last reset, bytes; NaN if the system does not report it."""
     for line in Path("/proc/self/status").read_text().splitlines():
         if line.startswith("VmHWM:"):
             return 1024.0 * int(line.split()[1])

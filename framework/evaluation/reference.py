@@ -1,4 +1,4 @@
-"""Error of log-likelihoods against a reference: the log-likelihoods at a far more expensive value of the knob."""
+"""Error of log-likelihoods compared with a reference, which is computed at a far more expensive value of the knob."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -15,13 +15,13 @@ COLUMNS = {
     "sample_error_nats": "one sample's error (nats)",
     "log_likelihood_nats": "log-likelihood (nats)",
 }
-"""Keys of the numbers that `errors` returns, with their headings."""
+"""Headings of the numbers that `errors` returns, by key."""
 BETTER: Mapping[str, Literal["higher", "lower"]] = {
     "error_nats": "lower",
     "bias_nats": "lower",
     "sample_error_nats": "lower",
 }
-"""Direction in which the errors are better."""
+"""Direction in which each error is better."""
 
 LogProbs = Callable[[int, int], Tensor]
 """Function that returns the log-likelihoods of all samples: (value of the knob, seed) → (samples,), nats."""
@@ -29,13 +29,14 @@ LogProbs = Callable[[int, int], Tensor]
 
 @dataclass(frozen=True)
 class Reference:
-    """Log-likelihoods that others are compared with.
+    """Log-likelihoods with which other log-likelihoods are compared.
 
     Attributes:
         value: value of the knob.
-        log_probs: of each sample the logarithm of its density averaged over the repeats, nats.
+        log_probs: for each sample, the logarithm of the density averaged over the repeats, nats.
         mean: mean of `log_probs` over the samples.
-        standard_error: standard error of `mean` over the repeats (jackknife), nats; smaller errors mean nothing.
+        standard_error: standard error of `mean` over the repeats (jackknife), nats; differences below it are not
+            meaningful.
         repeats: number of seeds.
     """
 
@@ -56,45 +57,46 @@ def reference_value(log_probs: LogProbs, value: int, seeds: Sequence[int]) -> Re
     Args:
         log_probs: log-likelihoods at a value and a seed.
         value: the large value of the knob.
-        seeds: at least two.
+        seeds: at least two seeds.
 
     Raises:
-        ValueError: a log-likelihood is not finite, so that there is nothing to compare with.
+        ValueError: a log-likelihood is not finite, so it cannot serve as a reference.
     """
-    found = torch.stack([log_probs(value, seed) for seed in seeds]).double()  # (repeats, samples)
-    pooled = torch.logsumexp(found, 0) - math.log(len(seeds))
+    per_seed = torch.stack([log_probs(value, seed) for seed in seeds]).double()  # (repeats, samples)
+    pooled = torch.logsumexp(per_seed, 0) - math.log(len(seeds))
     wrong = (~pooled.isfinite()).nonzero()
     if len(wrong):
         raise ValueError(
             f"The reference log-likelihood of sample {int(wrong[0])} is {pooled[wrong[0]].item()} "
-            f"({len(wrong)} such); wanted finite numbers. Raise the reference's value, or mend the head."
+            f"({len(wrong)} samples have such a value), but must be finite. Raise the reference value, or correct the "
+            "density head."
         )
     left_out = torch.stack(
-        [torch.cat([found[:r], found[r + 1 :]]).logsumexp(0).mean() for r in range(len(seeds))]
+        [torch.cat([per_seed[:r], per_seed[r + 1 :]]).logsumexp(0).mean() for r in range(len(seeds))]
     )
     spread = (left_out - left_out.mean()).square().sum() * (len(seeds) - 1) / len(seeds)
     return Reference(value, pooled, float(pooled.mean()), float(spread.sqrt()), len(seeds))
 
 
 def errors(log_probs: LogProbs, value: int, seeds: Sequence[int], reference: Reference) -> dict[str, float]:
-    """Return the errors of log-likelihoods at one value of the knob, nats; they are infinite if a log-likelihood is.
+    """Return the errors of log-likelihoods at one value of the knob, nats; infinite if a log-likelihood is infinite.
 
     "error_nats" is the root mean square, over the seeds, of the mean log-likelihood minus the reference. "bias_nats" is
     the absolute value of their mean difference. "sample_error_nats" is the root mean square, over seeds and samples, of
-    one sample's log-likelihood minus its reference; it is the error for a user who asks about one sample.
+    one sample's log-likelihood minus its reference, which is the typical error for a single sample.
     "log_likelihood_nats" is averaged over samples and seeds. The standard errors "<key>_sem" are over the seeds, NaN
     for a single seed. The standard error of a root mean square sqrt(m) is that of m divided by 2 sqrt(m) (delta
     method).
     """
-    found = torch.stack([log_probs(value, seed) for seed in seeds]).double()  # (repeats, samples)
-    means = found.mean(1)
+    per_seed = torch.stack([log_probs(value, seed) for seed in seeds]).double()  # (repeats, samples)
+    means = per_seed.mean(1)
     squares = (means - reference.mean).square()
     error = float(squares.mean().sqrt())
     return {
         "error_nats": error,
         "error_nats_sem": _standard_error(squares) / (2 * error) if error > 0 else 0.0,
         "bias_nats": abs(float(means.mean()) - reference.mean),
-        "sample_error_nats": float((found - reference.log_probs).square().mean().sqrt()),
+        "sample_error_nats": float((per_seed - reference.log_probs).square().mean().sqrt()),
         "log_likelihood_nats": float(means.mean()),
         "log_likelihood_nats_sem": _standard_error(means),
     }

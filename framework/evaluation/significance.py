@@ -1,4 +1,4 @@
-"""Significance of differences between means: which of them are larger than chance explains."""
+"""Significance of differences between means: which differences are larger than chance explains."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -9,27 +9,27 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 SHARE = 0.04
-"""Share of tables of two equal methods in which a difference is called significant.
+"""Probability that a difference between two equal methods is called significant.
 
-It is one percentage point below the stated 5 %, because Welch's test is approximate if runs are few and their standard
-deviations differ.
+It is one percentage point below the stated 5 %, because Welch's test is only approximate for few runs with unequal
+standard deviations.
 """
 RULE = "every difference significant at 95 %, Welch's t-test"
-"""The rule, as text for a caption."""
+"""Rule of significance, as text for a caption."""
 
 _SOURCES = ("runs", "samples")
 
 
 @dataclass(frozen=True)
 class Mean:
-    """A mean, and what is known of its error.
+    """A mean and its standard error.
 
     Attributes:
         value: the mean.
         standard_error: standard error of the mean; 0 if the mean is exact, NaN if the error is not known.
         degrees: degrees of freedom of the standard error; infinite if it comes from many test samples.
-        source: what the standard error was taken over, "runs" or "samples"; "" if the mean is exact or the error not
-            known.
+        source: "runs" or "samples", over which the standard error was computed; "" if the mean is exact or the error
+            not known.
     """
 
     value: float
@@ -39,28 +39,32 @@ class Mean:
 
 
 def mean(numbers: Mapping[str, object], key: str, runs: object) -> Mean:
-    """Return the mean `key` of a result with its error.
+    """Return the mean `key` of a result with its standard error.
 
     The error is "<key>_sem", the standard error over the test samples of one run. If there is none, it is computed from
     "<key>_std", the standard deviation over `runs` runs. A whole number (such as a count of parameters) without either
     is exact.
 
     Args:
-        numbers: a result, as for `framework.reports.table`. "repeats" is the number of repeats that all its errors are
-            over, if there were any; otherwise "test_samples" is the number of test samples that a "<key>_sem" is over.
+        numbers: a result, as for `framework.reports.table`. "repeats", if given, is the number of repeats over which
+            its errors were computed; otherwise "test_samples" is the number of test samples over which a "<key>_sem"
+            was computed.
         key: key of the mean.
-        runs: number of runs that the mean is over; anything but a whole number means that it is not known.
+        runs: number of runs over which the mean was computed; anything but a whole number means that it is not known.
     """
     value = numbers.get(key)
     exact = isinstance(value, int | np.integer) and not isinstance(value, bool)
     number = float(value) if isinstance(value, int | float | np.integer | np.floating) else math.nan
-    own, spread = numbers.get(f"{key}_sem"), numbers.get(f"{key}_std")
-    if isinstance(own, int | float) and math.isfinite(own):
+    sample_error, spread = numbers.get(f"{key}_sem"), numbers.get(f"{key}_std")
+    if isinstance(sample_error, int | float) and math.isfinite(sample_error):
         repeats, samples = numbers.get("repeats"), numbers.get("test_samples")
         if isinstance(repeats, int):
-            return Mean(number, float(own), float(repeats - 1), "runs")
+            return Mean(number, float(sample_error), float(repeats - 1), "runs")
         return Mean(
-            number, float(own), float(samples - 1) if isinstance(samples, int) else math.inf, "samples"
+            number,
+            float(sample_error),
+            float(samples - 1) if isinstance(samples, int) else math.inf,
+            "samples",
         )
     if isinstance(spread, int | float) and math.isfinite(spread) and isinstance(runs, int) and runs > 1:
         return Mean(number, spread / math.sqrt(runs), float(runs - 1), "runs")
@@ -70,20 +74,20 @@ def mean(numbers: Mapping[str, object], key: str, runs: object) -> Mean:
 def least_significant(means: Sequence[Mean]) -> Float[np.ndarray, "means means"]:
     """Return for each pair of means the smallest significant difference, (means, means).
 
-    It is the quantile of Student's t times the standard error of the difference. The degrees of freedom are those of B.
-    L. Welch (1947), "The generalization of 'Student's' problem when several different population variances are
-    involved", Biometrika 34, 28-35. It is NaN if an error is not known, and if one error is over runs and the other
-    over the samples of a single run, because the latter does not contain the differences between runs.
+    It is the quantile of Student's t times the standard error of the difference, with the degrees of freedom of B. L.
+    Welch (1947), "The generalization of 'Student's' problem when several different population variances are
+    involved", Biometrika 34, 28-35. It is NaN if an error is not known, or if one error was computed over runs and the
+    other over the samples of a single run, which does not include the differences between runs.
     """
     from scipy.special import stdtrit
 
-    errors = np.array([one.standard_error for one in means], np.float64)
+    errors = np.array([mean.standard_error for mean in means], np.float64)
     # A single test sample or run leaves no degree of freedom, and so no standard error.
-    degrees = np.array([one.degrees if one.degrees > 0 else math.nan for one in means], np.float64)
-    sources = np.array([_SOURCES.index(one.source) if one.source else -1 for one in means])
+    degrees = np.array([mean.degrees if mean.degrees > 0 else math.nan for mean in means], np.float64)
+    sources = np.array([_SOURCES.index(mean.source) if mean.source else -1 for mean in means])
     variances = errors**2
     total = variances[:, None] + variances
-    # Shares of the variance neither overflow nor underflow, but squares of the variance do.
+    # Squares of the variance may overflow or underflow; squares of its shares do not.
     with np.errstate(invalid="ignore", divide="ignore"):
         share = np.where(total > 0, variances[:, None] / total, 0.0)
         pooled = 1.0 / (share**2 / degrees[:, None] + (share**2 / degrees[:, None]).T)
@@ -97,12 +101,12 @@ def least_significant(means: Sequence[Mean]) -> Float[np.ndarray, "means means"]
 def significantly_best(
     means: Sequence[Mean], better: Literal["higher", "lower"]
 ) -> Bool[np.ndarray, "means"]:
-    """Return which mean is better than every other mean by more than chance explains: one of them, or none.
+    """Return which mean is better than every other mean by more than chance explains: at most one.
 
-    No correction for the number of means is needed. The best must differ from every other one, and so from the second
-    best, which is the nearest of them (an intersection-union test: R. L. Berger (1982), Technometrics 24, 295-300).
+    No correction for the number of means is needed, because the best must differ from every other mean, and so from
+    the second best, which is the nearest (an intersection-union test: R. L. Berger (1982), Technometrics 24, 295-300).
     """
-    values = np.array([one.value for one in means], np.float64) * (1 if better == "higher" else -1)
+    values = np.array([mean.value for mean in means], np.float64) * (1 if better == "higher" else -1)
     with np.errstate(invalid="ignore"):
         ahead = values[:, None] - values > least_significant(means)
     np.fill_diagonal(ahead, True)

@@ -1,4 +1,4 @@
-"""Evaluation of a predictor on a split: metrics, per group and in total, and the cost of a prediction."""
+"""Evaluation of a predictor on a split: metrics in total and per group, and the cost of a prediction."""
 
 import math
 from collections.abc import Collection, Iterable, Iterator, Sequence
@@ -19,14 +19,14 @@ from framework.prediction import Prediction, Split
 BLOCK = 64
 """Number of samples that are evaluated at once.
 
-Draws are a function of (seed, sample) only if this number is the same everywhere, because a density may draw for a
-whole batch at once. No gradient is kept, so evaluation takes less memory than training on as many samples.
+Random samples are a function of (seed, sample) only if this number is the same everywhere, because a density may draw
+for a whole batch at once. No gradients are kept, so the evaluation takes less memory than training on as many samples.
 """
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Numbers of one split: over all samples, and per group if there are several groups."""
+    """Metrics of one split, over all samples and, if there are several groups, per group."""
 
     total: dict[str, float]
     groups: dict[str, dict[str, float]]
@@ -52,9 +52,9 @@ def evaluate(
     device: torch.device,
     outliers: Iterable[Batch] = (),
 ) -> Evaluation:
-    """Return every metric over all batches; noise is a function of (seed, batch, metric).
+    """Return every metric over all batches.
 
-    A second call therefore gives the same bits, also if other metrics are computed beside.
+    Noise is a function of (seed, batch, metric), so a second call returns the same bits, even with other metrics added.
 
     Args:
         predictor: the trained predictor; it is moved to `device`.
@@ -64,31 +64,31 @@ def evaluate(
         samples: as in `Prediction`.
         seed: seed of the noise.
         device: device to predict on.
-        outliers: batches of another data set, given to the metrics that read outliers, in every group.
+        outliers: batches of another data set, which are passed to the metrics that read outliers, in every group.
     """
     predictor.eval().to(device)
     several = len(groups) > 1
-    apart = {name: _fresh(metrics, device) for name in groups} if several else {}
-    together = _fresh(metrics, device)
+    by_group = {name: _fresh(metrics, device) for name in groups} if several else {}
+    overall = _fresh(metrics, device)
     for number, batch in enumerate(on_device(batches, device)):
-        _update(together, predictor, batch, samples, Draw(seed, number))
+        _update(overall, predictor, batch, samples, Draw(seed, number))
         for index, name in enumerate(groups if several else ()):
             rows = (batch["group"] == index).nonzero().flatten()
             if len(rows):
-                some = {key: value[rows] for key, value in batch.items()}
-                _update(apart[name], predictor, some, samples, Draw(seed, number))
-    everyone = [metric for group in (together, *apart.values()) for metric in group]
+                group_batch = {key: value[rows] for key, value in batch.items()}
+                _update(by_group[name], predictor, group_batch, samples, Draw(seed, number))
+    all_metrics = [metric for group in (overall, *by_group.values()) for metric in group]
     for number, batch in enumerate(on_device(outliers, device)):
-        _update(everyone, predictor, batch, samples, Draw(seed, number), "outliers")
-    return Evaluation(numbers(together), {name: numbers(group) for name, group in apart.items()}, together)
+        _update(all_metrics, predictor, batch, samples, Draw(seed, number), "outliers")
+    return Evaluation(numbers(overall), {name: numbers(group) for name, group in by_group.items()}, overall)
 
 
 def _fresh(metrics: Sequence[Metric], device: torch.device) -> list[Metric]:
-    """Return copies of metrics on a device."""
+    """Return copies of the metrics on a device."""
     return [cast(Metric, metric.clone().to(device)) for metric in metrics]
 
 
-def predicted(
+def predict(
     predictor: Predictor,
     batch: Batch,
     samples: int,
@@ -96,7 +96,7 @@ def predicted(
     split: Split = "test",
     reads: Collection[str] = (),
 ) -> Prediction:
-    """Return the prediction for a batch, the same in every mode: its random numbers are a function of `draw`."""
+    """Return the prediction for a batch; its random numbers depend on `draw` only, so it is the same in every mode."""
     with draw(split):
         density = predictor(batch["input"])
     return Prediction(density, batch, samples, split, draw, reads)
@@ -110,42 +110,42 @@ def _update(
     draw: Draw,
     split: Split = "test",
 ) -> None:
-    """Give the prediction for a batch to the metrics that read its split."""
+    """Update the metrics that read this split with the prediction for a batch."""
     readers = [metric for metric in metrics if split in metric.splits]
     reads = {channel for metric in readers for channel in metric.reads}
-    prediction = predicted(predictor, batch, samples, draw, split, reads)
+    prediction = predict(predictor, batch, samples, draw, split, reads)
     for metric in readers:
         with draw(f"{split} {type(metric).__name__}"):
             metric.update(prediction)
 
 
 def numbers(metrics: Sequence[Metric]) -> dict[str, float]:
-    """Return the numbers that all metrics compute, by name.
+    """Return the values of all metrics, by name.
 
     Raises:
         ConfigError: a value is not a single number, or two metrics use the same name.
     """
-    found: dict[str, float] = {}
+    values: dict[str, float] = {}
     owners: dict[str, Metric] = {}
     for metric in metrics:
         computed: dict[str, Any] = metric.compute()
         for name, value in computed.items():
-            require_own(owners, name, metric)
+            require_unique_name(owners, name, metric)
             shape = tuple(getattr(value, "shape", ()))
             if math.prod(shape) != 1:
                 raise ConfigError(
-                    f"{type(metric).__name__}.compute gives {name!r} of shape {shape}: wanted one number. Give each "
-                    "a name of its own."
+                    f"{type(metric).__name__}.compute returns {name!r} with shape {shape}, but each name must have "
+                    "one number. Return every number under a name of its own."
                 )
-            found[name] = float(value)
-    return found
+            values[name] = float(value)
+    return values
 
 
-def require_own(owners: dict[str, Metric], name: str, metric: Metric) -> None:
-    """Refuse a name that another metric already uses; one of the two numbers would be hidden.
+def require_unique_name(owners: dict[str, Metric], name: str, metric: Metric) -> None:
+    """Raise an error if another metric already uses a name, because one of the two numbers would be lost.
 
     Args:
-        owners: the metric of each name so far; `name` is added.
+        owners: the metric of each name so far; `name` is added to it.
         name: the name to check.
         metric: the metric that uses it.
 
@@ -155,20 +155,20 @@ def require_own(owners: dict[str, Metric], name: str, metric: Metric) -> None:
     other = owners.setdefault(name, metric)
     if other is not metric:
         raise ConfigError(
-            f"Two metrics call a number {name!r}: {type(other).__name__} and {type(metric).__name__}. Leave one out; "
-            "mode=test with the other gives its number of the same model."
+            f"Two metrics use the name {name!r}: {type(other).__name__} and {type(metric).__name__}. Leave one of them "
+            "out; mode=test computes it for the same model."
         )
 
 
 @torch.no_grad()
 def cost(predictor: Predictor, batch: Batch, *, samples: int, device: torch.device) -> Cost:
-    """Return the cost of one prediction: the density and the point prediction derived from it."""
+    """Return the cost of predicting the density and the point prediction for a batch."""
     predictor.eval().to(device)
 
     def predict(inputs: torch.Tensor) -> torch.Tensor:
         return Prediction(predictor(inputs), {}, samples).point
 
-    # a head that is fitted at once has no weights to count
+    # A head that is fitted at once has no weights to count.
     fitted = any(isinstance(part, Fitted) for part in predictor.modules())
     parameters = None if fitted else sum(parameter.numel() for parameter in predictor.parameters())
     return measure(predict, batch["input"].to(device), parameters=parameters)

@@ -1,4 +1,4 @@
-"""Error against run time as a knob is turned: any metric, and the error of log-likelihoods against a reference."""
+"""Error against run time for several values of a knob: any metric, and the error of log-likelihoods."""
 
 import math
 import statistics
@@ -16,8 +16,8 @@ from torch import Tensor
 from framework.data import Batch
 from framework.density_head import DensityHead
 from framework.errors import ConfigError, did_you_mean
-from framework.evaluation.cost import device_name, seconds
-from framework.evaluation.pareto import TIMES_APART, front
+from framework.evaluation.cost import device_name, time_call
+from framework.evaluation.pareto import TIME_NOISE, front
 from framework.evaluation.reference import COLUMNS, LogProbs, Reference, errors, reference_value
 from framework.evaluation.significance import mean
 from framework.evaluation.splits import evaluate
@@ -33,8 +33,8 @@ class Point:
 
     Attributes:
         value: value of the knob.
-        numbers: for each metric "<key>" its mean over the repeats, and "<key>_std", their standard deviation; also the
-            numbers that `framework.evaluation.reference.errors` returns.
+        numbers: for each metric, its mean over the repeats, "<key>", and their standard deviation, "<key>_std"; also
+            the numbers that `framework.evaluation.reference.errors` returns.
         milliseconds: median wall time per sample, from input to log-likelihood.
     """
 
@@ -45,7 +45,7 @@ class Point:
 
 @dataclass(frozen=True)
 class Curve:
-    """Points of one method, in the order of the knob's values, and the conditions of the measurement."""
+    """Points of one method in the order of the knob's values, and the conditions of the measurement."""
 
     knob: str
     points: list[Point]
@@ -57,8 +57,8 @@ class Curve:
     threads: int
 
 
-def owners(predictor: Predictor, knob: str) -> list[Uncertainty | DensityHead]:
-    """Return the parts that have a knob of that name: wrappers, or else heads; no parts for the name "".
+def knob_owners(predictor: Predictor, knob: str) -> list[Uncertainty | DensityHead]:
+    """Return the wrappers that have the knob, or, if no wrapper has it, the heads; the name "" returns no parts.
 
     Raises:
         ConfigError: no part has the knob; the message lists the existing knobs.
@@ -66,15 +66,15 @@ def owners(predictor: Predictor, knob: str) -> list[Uncertainty | DensityHead]:
     if not knob:
         return []
     parts = parts_with_knobs(predictor)
-    found = [part for part in parts if knob in part.knobs]
-    if not found:
+    with_knob = [part for part in parts if knob in part.knobs]
+    if not with_knob:
         known = sorted({name for part in parts for name in part.knobs})
         raise ConfigError(
             f"No part of this model has a knob {knob!r}.{did_you_mean(knob, known)} "
-            f"Its knobs: {', '.join(known) or 'none; there is nothing to trade for run time'}."
+            f"Knobs of the model: {', '.join(known) or 'none; it cannot trade error for run time'}."
         )
-    wrappers = [part for part in found if isinstance(part, Uncertainty)]
-    return list(wrappers) or list(found)
+    wrappers = [part for part in with_knob if isinstance(part, Uncertainty)]
+    return list(wrappers) or list(with_knob)
 
 
 def first_knob(predictor: Predictor) -> str:
@@ -85,7 +85,9 @@ def first_knob(predictor: Predictor) -> str:
     """
     for part in parts_with_knobs(predictor):
         return next(iter(part.knobs))
-    raise ConfigError("No part of this model has a knob: there is nothing to trade for run time.")
+    raise ConfigError(
+        "No part of this model has a knob, so the model cannot trade error for run time. Choose another model."
+    )
 
 
 def parts_with_knobs(predictor: Predictor) -> list[Uncertainty | DensityHead]:
@@ -108,18 +110,18 @@ def tradeoff(
     timed_calls: int = 20,
     budget_seconds: float = 20.0,
 ) -> Curve:
-    """Return the curve of a trained predictor: metrics, and errors against a reference, for each value of its knob.
+    """Return the curve of a trained predictor: metrics, errors against a reference, and run time for each knob value.
 
-    The times are those of the whole predictor, from input to log-likelihood, on the first batch. The predictor, its
-    knob and torch's random numbers are left as they were.
+    Run times are those of the whole predictor, from input to log-likelihood, on the first batch. The predictor's mode,
+    its knob and the states of torch's random generators are restored afterwards.
 
     Args:
         predictor: the trained predictor.
         batches: labelled batches on the predictor's device.
         metrics: metrics to compute at each value.
-        knob: name of the knob, as in `owners`.
+        knob: name of the knob, as in `knob_owners`.
         values: values of the knob to try.
-        reference: a value so large that its own error does not matter, at least the largest of `values`; None: no
+        reference: a value so large that its own error is negligible, at least the largest of `values`; None: no
             comparison with a reference.
         samples: as in `Prediction`.
         repeats: number of seeds for each value and for the reference, which needs two.
@@ -131,63 +133,67 @@ def tradeoff(
         ConfigError: there is no batch, no value or no such knob; the reference is below the largest value; or there are
             too few repeats for a reference.
     """
-    kept, parts = list(batches), owners(predictor, knob)
-    _check(kept, parts, knob, values, reference, repeats)
-    inputs, target = kept[0]["input"], kept[0]["target"]
+    all_batches, parts = list(batches), knob_owners(predictor, knob)
+    _check(all_batches, parts, knob, values, reference, repeats)
+    inputs, target = all_batches[0]["input"], all_batches[0]["target"]
 
-    def turn(value: int) -> None:
+    def set_knob(value: int) -> None:
         for part in parts:
             setattr(part, knob, value)
 
     def predict(value: int) -> None:
-        turn(value)
+        set_knob(value)
         predictor(inputs).log_prob(target)
 
-    def measured(value: int, repeat: int) -> dict[str, float]:
-        turn(value)
-        found = evaluate(
+    def compute_metrics(value: int, repeat: int) -> dict[str, float]:
+        set_knob(value)
+        evaluation = evaluate(
             predictor,
-            kept,
+            all_batches,
             metrics,
             groups=("all",),
             samples=samples,
             seed=seed + repeat,
             device=inputs.device,
         )
-        return found.total
+        return evaluation.total
 
     points: list[Point] = []
-    with _undisturbed(predictor, parts, knob, inputs.device), torch.no_grad():
+    with _restore_afterwards(predictor, parts, knob, inputs.device), torch.no_grad():
         # No two estimates share random numbers.
         *own, last = (
             _seeds(stream, repeats) for stream in np.random.SeedSequence(seed).spawn(len(values) + 1)
         )
-        log_probs, compared = _log_probs(predictor, kept, turn), None
+        log_probs, reference_result = _log_probs(predictor, all_batches, set_knob), None
         if reference is not None:
-            compared = reference_value(log_probs, reference, last)
-        taken = run_times(predict, values, inputs.device, calls=timed_calls, budget_seconds=budget_seconds)
-        turns = list(zip(values, own, taken, strict=True))
-        for value, seeds, time in track_progress(turns, "measuring errors", len(turns), f"values of {knob}"):
-            numbers = averaged([measured(value, repeat) for repeat in range(repeats)]) if metrics else {}
-            if compared is not None:
-                numbers |= errors(log_probs, value, seeds, compared)
+            reference_result = reference_value(log_probs, reference, last)
+        times = run_times(predict, values, inputs.device, calls=timed_calls, budget_seconds=budget_seconds)
+        points_to_measure = list(zip(values, own, times, strict=True))
+        for value, seeds, time in track_progress(
+            points_to_measure, "measuring errors", len(points_to_measure), f"values of {knob}"
+        ):
+            numbers = (
+                average_runs([compute_metrics(value, repeat) for repeat in range(repeats)]) if metrics else {}
+            )
+            if reference_result is not None:
+                numbers |= errors(log_probs, value, seeds, reference_result)
             points.append(Point(value, numbers, 1e3 * time / len(inputs)))
-    count = sum(len(batch["input"]) for batch in kept)
+    count = sum(len(batch["input"]) for batch in all_batches)
     device, threads = device_name(inputs.device), torch.get_num_threads()
-    return Curve(knob, points, compared, repeats, count, len(inputs), device, threads)
+    return Curve(knob, points, reference_result, repeats, count, len(inputs), device, threads)
 
 
-def averaged(runs: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    """Return for each number its mean over the runs and, as "<key>_std", its standard deviation, NaN for one run.
+def average_runs(runs: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """Return the mean of each number over the runs and, as "<key>_std", the standard deviation, NaN for one run.
 
-    The standard errors "<key>_sem" over the samples of a run are left out.
+    Standard errors over the samples of a run, "<key>_sem", are left out.
     """
-    found: dict[str, float] = {}
+    averages: dict[str, float] = {}
     for key in (key for key in runs[0] if not key.endswith("_sem")):
         numbers = [run[key] for run in runs]
-        found[key] = float(np.mean(numbers))
-        found[f"{key}_std"] = float(np.std(numbers, ddof=1)) if len(numbers) > 1 else math.nan
-    return found
+        averages[key] = float(np.mean(numbers))
+        averages[f"{key}_std"] = float(np.std(numbers, ddof=1)) if len(numbers) > 1 else math.nan
+    return averages
 
 
 def run_times(
@@ -198,46 +204,46 @@ def run_times(
     calls: int = 20,
     budget_seconds: float = 20.0,
 ) -> list[float]:
-    """Return the median wall time of `predict(value)` for each value, seconds, after two calls to warm up.
+    """Return the median wall time of `predict(value)` for each value, seconds, after two warm-up calls.
 
-    The values take turns, so that a machine that slows down affects all of them. An untimed call precedes each timed
-    call, so that no call pays for the caches that another value left behind. If the turns would last longer than
-    `budget_seconds`, there are fewer than `calls`, but at least three.
+    In every round, each value is timed once, so that a slowdown of the machine affects all values. An untimed call
+    precedes each timed call, so that caches filled by another value do not matter. There are `calls` rounds, or fewer,
+    but at least three, if they would last longer than `budget_seconds`.
     """
-    taken: list[list[float]] = [[] for _ in values]
+    times_by_value: list[list[float]] = [[] for _ in values]
     start = perf_counter()
-    for turn in range(calls + 1):
-        for value, times in zip(values, taken, strict=True):
+    for round_number in range(calls + 1):
+        for value, times in zip(values, times_by_value, strict=True):
             predict(value)
-            time = seconds(lambda value=value: predict(value), device)
-            if turn > 0:  # the first turn is to warm up
+            time = time_call(lambda value=value: predict(value), device)
+            if round_number > 0:  # the first round warms up
                 times.append(time)
-        if turn >= 3 and perf_counter() - start > budget_seconds:
+        if round_number >= 3 and perf_counter() - start > budget_seconds:
             break
-    return [statistics.median(times) for times in taken]
+    return [statistics.median(times) for times in times_by_value]
 
 
 def rows(
     curves: Mapping[str, Curve], better: Mapping[str, Literal["higher", "lower"]], *, synthetic: bool
 ) -> list[dict[str, object]]:
-    """Return one row per method and value for a result table; the key of a number with a unit contains the unit.
+    """Return one row per method and knob value, for a result table; the keys of numbers contain their units.
 
     Args:
         curves: curves by method.
         better: metrics to report, with the direction in which each is better. Each gets a column "<key>_pareto", which
-            is true on the front of its own curve, beyond noise (`framework.evaluation.pareto.front`).
+            is true for points on the Pareto front of their own curve (`framework.evaluation.pareto.front`).
         synthetic: whether the data are generated.
     """
-    told = {f"{key}{suffix}" for key in (*better, *COLUMNS) for suffix in ("", "_std", "_sem")}
-    found: list[dict[str, object]] = []
+    reported_keys = {f"{key}{suffix}" for key in (*better, *COLUMNS) for suffix in ("", "_std", "_sem")}
+    table: list[dict[str, object]] = []
     for method, curve in curves.items():
         times, repeats = [point.milliseconds for point in curve.points], curve.repeats
         best = {}
         for key, way in better.items():
             sign = 1 if way == "lower" else -1
             means = [mean({**point.numbers, "repeats": repeats}, key, repeats) for point in curve.points]
-            signed = [replace(one, value=sign * one.value) for one in means]
-            best[f"{key}_pareto"] = front(signed, times, TIMES_APART)
+            signed = [replace(value, value=sign * value.value) for value in means]
+            best[f"{key}_pareto"] = front(signed, times, TIME_NOISE)
         circumstances: dict[str, object] = {"repeats": repeats}
         if curve.reference is not None:
             circumstances["reference_value"] = curve.reference.value
@@ -247,28 +253,28 @@ def rows(
         circumstances |= {"device": curve.device, "threads": curve.threads, "synthetic": synthetic}
         for index, point in enumerate(curve.points):
             row: dict[str, object] = {"method": method, "value": point.value, "knob": curve.knob}
-            row |= {key: number for key, number in point.numbers.items() if key in told}
-            row |= {key: kept[index] for key, kept in best.items()}
-            found.append({**row, "milliseconds_per_sample": point.milliseconds, **circumstances})
-    return found
+            row |= {key: number for key, number in point.numbers.items() if key in reported_keys}
+            row |= {key: on_front[index] for key, on_front in best.items()}
+            table.append({**row, "milliseconds_per_sample": point.milliseconds, **circumstances})
+    return table
 
 
-def _log_probs(predictor: Predictor, batches: Sequence[Batch], turn: Callable[[int], None]) -> LogProbs:
-    """Return the function that computes log-likelihoods of all samples at a value and a seed."""
+def _log_probs(predictor: Predictor, batches: Sequence[Batch], set_knob: Callable[[int], None]) -> LogProbs:
+    """Return the function that computes the log-likelihoods of all samples at a knob value and a seed."""
 
-    def unchanged(inputs: Tensor) -> Tensor:
+    def identity(inputs: Tensor) -> Tensor:
         return inputs
 
-    density, read = (
-        (predictor.head, predictor.raw) if isinstance(predictor, Model) else (predictor, unchanged)
+    density, encode = (
+        (predictor.head, predictor.raw) if isinstance(predictor, Model) else (predictor, identity)
     )
 
-    @cache  # the encoder of a model runs once, because the knob belongs to the head
+    @cache  # a model's encoder runs once, because the knob belongs to its head
     def pairs() -> list[tuple[Tensor, Tensor]]:
-        return [(read(batch["input"]), batch["target"]) for batch in batches]
+        return [(encode(batch["input"]), batch["target"]) for batch in batches]
 
     def log_probs(value: int, seed: int) -> Tensor:
-        turn(value)
+        set_knob(value)
         torch.manual_seed(seed)
         return torch.cat([density(numbers).log_prob(target) for numbers, target in pairs()])
 
@@ -284,25 +290,28 @@ def _check(
     repeats: int,
 ) -> None:
     if not batches:
-        raise ConfigError("Error against run time is measured on at least one batch, got none.")
+        raise ConfigError("Got no batch, but error against run time is measured on at least one.")
     if not values:
-        worth = f"; those of {type(parts[0]).__name__} worth trying: {parts[0].knobs[knob]}" if parts else ""
-        raise ConfigError(f"No values of {knob} to try{worth}.")
+        advice = f", for example {parts[0].knobs[knob]} for {type(parts[0]).__name__}" if parts else ""
+        raise ConfigError(f"Got no values of {knob}. Give at least one value{advice}.")
     if reference is None:
         return
     if reference < max(values):
         raise ConfigError(
-            f"The reference {knob}={reference} is below the largest value tried, {max(values)}; wanted more."
+            f"The reference {knob}={reference} is below the largest value of the curve, {max(values)}. Set the "
+            "reference to a larger value."
         )
     if repeats < 2:
-        raise ConfigError(f"repeats = {repeats}: two at least are needed to know an error's error.")
+        raise ConfigError(
+            f"repeats = {repeats}, but at least 2 are required for standard errors. Raise repeats."
+        )
 
 
 @contextmanager
-def _undisturbed(
+def _restore_afterwards(
     predictor: Predictor, parts: Sequence[Uncertainty | DensityHead], knob: str, device: torch.device
 ) -> Iterator[None]:
-    """Set evaluation mode inside the block, and restore mode, knob and random numbers afterwards."""
+    """Set evaluation mode inside the `with` block; restore mode, knob and random generators afterwards."""
     training = predictor.training
     before = [getattr(part, knob) for part in parts]
     try:
@@ -316,5 +325,5 @@ def _undisturbed(
 
 
 def _seeds(stream: np.random.SeedSequence, count: int) -> list[int]:
-    """Return `count` seeds of a stream of random numbers."""
+    """Return `count` seeds from a seed sequence."""
     return [int(seed) for seed in stream.generate_state(count, np.uint64) >> np.uint64(1)]

@@ -13,7 +13,7 @@ from rich.text import Text
 
 from framework.configuration.config import Config, Options
 from framework.errors import ConfigError, UserError
-from framework.reports.table import csv
+from framework.reports.table import write_csv
 from framework.testing.contract import CONTRACTS, Contract, Row, contract
 from framework.testing.finding import Finding
 from framework.testing.rows import HeadRow
@@ -62,7 +62,7 @@ def run(config: Config) -> None:
         lines += found
         failed += broken
     config.folder.mkdir(parents=True, exist_ok=True)
-    csv(lines, COLUMNS, config.folder / "check.csv")
+    write_csv(lines, COLUMNS, config.folder / "check.csv")
     console.print(f"every finding of every row: {config.folder / 'check.csv'}", soft_wrap=True)
     if failed:
         raise ContractBroken(

@@ -20,8 +20,13 @@ from framework.datasets.png import encode_png
 from framework.distributions.intervals import DRAWS
 from framework.distributions.noise import Draw
 from framework.distributions.protocol import value_set
-from framework.evaluation.promises import ends, promised, require_interval, require_promised
-from framework.evaluation.splits import BLOCK, predicted
+from framework.evaluation.prediction_sets import (
+    interval_columns,
+    require_interval,
+    require_matching_set,
+    set_columns,
+)
+from framework.evaluation.splits import BLOCK, predict
 from framework.model import Predictor
 from framework.prediction import Prediction, table_columns
 from framework.runs.run import opened
@@ -111,7 +116,7 @@ def predictions(
     rows: list[dict[str, str]] = []
     mapped: list[tuple[Tensor, Tensor]] = []
     for number, batch in enumerate(track_batches(loader, "predicting")):
-        prediction = predicted(predictor, batch, settings.samples, Draw(settings.seed, number))
+        prediction = predict(predictor, batch, settings.samples, Draw(settings.seed, number))
         prediction = prediction.in_frame(data.frame(batch))
         columns = table_columns(target, prediction)
         if isinstance(data, Mapped) and files:
@@ -139,10 +144,10 @@ def _intervals(
     """Return the columns of the density's prediction set or, without a set, of the intervals of a given probability."""
     sets = value_set(prediction.density)
     if sets is None:
-        return ends(target, prediction.interval(mass)) if mass else {}
+        return interval_columns(target, prediction.interval(mass)) if mass else {}
     if mass:
-        require_promised(sets, mass, by="mode.interval")
-    return promised(target, prediction)
+        require_matching_set(sets, mass, by="mode.interval")
+    return set_columns(target, prediction)
 
 
 def _maps(

@@ -13,10 +13,10 @@ from framework.density_head import DensityHead
 from framework.errors import ConfigError, did_you_mean
 from framework.evaluation import reference
 from framework.evaluation.splits import on_device
-from framework.evaluation.tradeoff import first_knob, owners, rows, tradeoff
+from framework.evaluation.tradeoff import first_knob, knob_owners, rows, tradeoff
 from framework.metric import Metric
-from framework.reports.report import picture
-from framework.reports.table import Better, csv, machine, results_table
+from framework.reports.report import save_picture
+from framework.reports.table import Better, machine, results_table, write_csv
 from framework.runs.job import refuse_idle
 from framework.runs.run import Run, opened
 from framework.runs.session import Session, for_trained
@@ -51,7 +51,7 @@ def _run(run: Run, session: Session, options: WorkPrecisionOptions) -> None:
     predictor, data, parts, settings = session.predictor, session.data, session.parts, session.settings
     metrics = [metric for metric in build_metrics(parts, session.target) if "outliers" not in metric.splits]
     knob = options.knob or first_knob(predictor)
-    owner = owners(predictor, knob)[0]
+    owner = knob_owners(predictor, knob)[0]
     better = _chosen(options.metrics, metrics, own=isinstance(owner, DensityHead))
     measured = [key for key in better if key not in reference.COLUMNS]
     compared = len(measured) < len(better)
@@ -70,7 +70,7 @@ def _run(run: Run, session: Session, options: WorkPrecisionOptions) -> None:
     )
     found = rows({session.method: curve}, better, synthetic=data.synthetic)
     path = run.folder / "work_precision.csv"
-    csv(found, None, path)
+    write_csv(found, None, path)
     run.tracker.log_artifact(path)
     for row, point in zip(found, curve.points, strict=True):
         numbers = {key: value for key, value in point.numbers.items() if key in row}
@@ -93,7 +93,7 @@ def _run(run: Run, session: Session, options: WorkPrecisionOptions) -> None:
         floors=floors,
         machine=f"{machine(curve.device, curve.threads)}, batches of {curve.batch_size}",
     )
-    where = [picture(run, figure, "work_precision")] if settings.pictures else []
+    where = [save_picture(run, figure, "work_precision")] if settings.pictures else []
     columns = {"method": "method", "value": knob, **headings, "milliseconds_per_sample": "ms / sample"}
     for key in better:
         columns[f"{key}_pareto"] = "Pareto" if len(better) == 1 else f"Pareto: {headings[key]}"

@@ -1,4 +1,4 @@
-"""Contact sheet of classified samples: certain, ambiguous and failed ones, each with its most likely classes."""
+"""Contact sheet of classified samples: certain, ambiguous and failed ones, with their most likely classes."""
 
 from collections.abc import Mapping, Sequence
 
@@ -14,43 +14,47 @@ from framework.reports.sample_sheet import sample_sheet
 LISTED = 3
 """Number of classes that are named below each sample."""
 LONGEST = 18
-"""Largest number of letters of a class name that fits."""
+"""Largest number of letters of a class name; longer names are shortened."""
 
 
 def choose_classified(
     probability: Float[np.ndarray, "samples classes"], label: Int[np.ndarray, "samples"], count: int = 6
 ) -> dict[str, list[int]]:
-    """Return up to `count` samples for each row; the same arguments give the same samples, and no sample occurs twice.
+    """Return the indices of up to `count` samples for each row of the figure; no sample occurs twice.
 
-    "failed": wrong, highest probability first. "ambiguous": right or wrong, smallest difference between the two most
-    likely classes first. "certain": right, the surest sample of each class before a second one of any class.
+    "failed": wrong predictions, most probable first. "ambiguous": right or wrong, smallest difference between the two
+    most likely classes first. "certain": right, the most probable sample of each class before a second one of any
+    class. The choice is deterministic.
     """
     if len(probability) == 0:
         return {"certain": [], "ambiguous": [], "failed": []}
     guess = probability.argmax(1)
     ordered = np.sort(probability, 1)
-    sure = ordered[:, -1]
-    between = sure - (ordered[:, -2] if probability.shape[1] > 1 else 0)
+    highest = ordered[:, -1]
+    margin = highest - (ordered[:, -2] if probability.shape[1] > 1 else 0)
     free = np.ones(len(probability), bool)
 
-    def first(order: np.ndarray) -> list[int]:
-        taken = order[free[order]][:count]
-        free[taken] = False
-        return taken.tolist()
+    def take(order: np.ndarray) -> list[int]:
+        indices = order[free[order]][:count]
+        free[indices] = False
+        return indices.tolist()
 
-    failed = first(np.flatnonzero(guess != label)[np.argsort(-sure[guess != label], kind="stable")])
+    failed = take(np.flatnonzero(guess != label)[np.argsort(-highest[guess != label], kind="stable")])
     right = np.flatnonzero(guess == label)
-    right = right[np.argsort(-sure[right], kind="stable")]
-    turn = np.array([int((guess[right[:place]] == guess[one]).sum()) for place, one in enumerate(right)], int)
-    certain = first(right[np.argsort(turn, kind="stable")])
+    right = right[np.argsort(-highest[right], kind="stable")]
+    # For each right sample, the number of samples of its class that precede it.
+    rank = np.array(
+        [int((guess[right[:position]] == guess[sample]).sum()) for position, sample in enumerate(right)], int
+    )
+    certain = take(right[np.argsort(rank, kind="stable")])
     return {
         "certain": certain,
-        "ambiguous": first(np.argsort(between, kind="stable")),
+        "ambiguous": take(np.argsort(margin, kind="stable")),
         "failed": failed,
     }
 
 
-def classified(
+def draw_classified(
     images: Sequence[np.ndarray],
     probability: Float[np.ndarray, "samples classes"],
     label: Int[np.ndarray, "samples"],
@@ -60,14 +64,14 @@ def classified(
     title: str,
     synthetic: bool,
 ) -> Figure:
-    """Draw each sample's image, and bars for its most likely classes and the true one.
+    """Draw each sample's image with bars for its most likely classes and the true one.
 
     Args:
         images: images of the samples, as `Data.preview` gives them.
         probability: predicted probabilities.
         label: true classes.
         names: names of the classes.
-        rows: heading of each row, and its number of samples in their order; may be 0.
+        rows: heading and number of samples of each row, in the order of the samples; a number may be 0.
         title: title of the figure.
         synthetic: whether the data are generated.
     """
@@ -87,7 +91,7 @@ def classified(
 
 
 def _bars(axes: Axes, probability: Float[np.ndarray, "classes"], label: int, names: Sequence[str]) -> None:
-    """Draw the most likely classes; the true class replaces the last of them if it is not among them."""
+    """Draw bars for the most likely classes; the true class replaces the last bar if it is not among them."""
     shown: list[int] = np.argsort(-probability, kind="stable")[:LISTED].tolist()
     if label not in shown:
         shown[-1] = label

@@ -14,22 +14,22 @@ from framework.figures.style import BLUE, ORANGE, titled_figure
 from framework.model import Predictor
 
 POINTS = 61
-"""Number of points along each side of the plane."""
+"""Number of grid points along each side of the plane."""
 SHOWN = 300
-"""Largest number of points of each kind that are drawn over a landscape."""
+"""Largest number of samples of a class, and of outliers, that are drawn over a landscape."""
 
 
 @dataclass(frozen=True)
 class Plane:
-    """Points and axes that are drawn over the landscapes.
+    """Samples and axes that are drawn over the landscapes.
 
     Attributes:
         points: the two inputs of each sample.
         labels: classes of the samples.
-        outliers: inputs of no class, (count, 2); may be empty.
+        outliers: inputs that belong to no class, (count, 2); may be empty.
         names: names of the classes.
         axes: names of the two inputs.
-        half_width: half the side of the square shown, which is centred at 0.
+        half_width: half the side of the drawn square, which is centred at 0.
     """
 
     points: Float[np.ndarray, "count 2"]
@@ -41,35 +41,35 @@ class Plane:
 
 
 def half_width(*points: Float[np.ndarray, "_ 2"]) -> float:
-    """Return half the side of a square around 0 that holds every point, plus a tenth."""
-    return 1.1 * max((float(np.abs(some).max()) for some in points if len(some)), default=1.0)
+    """Return half the side of the smallest square around 0 that contains all points, plus a tenth."""
+    return 1.1 * max((float(np.abs(group).max()) for group in points if len(group)), default=1.0)
 
 
 @torch.no_grad()
 def probabilities(predictor: Predictor, half_width: float, rows_at_once: int = 4096) -> np.ndarray:
-    """Return what is shown at each point of the plane: (POINTS, POINTS), first row at the bottom.
+    """Return the drawn number at each grid point of the plane, (POINTS, POINTS), first row at the bottom.
 
-    With two classes it is p(y = 1), with more the entropy divided by its largest value, log K.
+    For two classes it is p(y = 1); for K > 2 classes, the entropy divided by its largest value, log K.
     """
     axis = torch.linspace(-half_width, half_width, POINTS)
     plane = torch.stack(torch.meshgrid(axis, axis, indexing="xy"), -1).reshape(-1, 2)
-    found = []
+    values = []
     for part in plane.split(rows_at_once):
         density = predictor(part)
         log_prob = density.log_prob(density.enumerate_support()).double()
         if len(log_prob) == 2:
-            found.append(log_prob[1].exp())
+            values.append(log_prob[1].exp())
         else:
-            found.append(-(log_prob.exp() * log_prob.clamp(min=-1e4)).sum(0) / np.log(len(log_prob)))
-    return torch.cat(found).reshape(POINTS, POINTS).numpy()
+            values.append(-(log_prob.exp() * log_prob.clamp(min=-1e4)).sum(0) / np.log(len(log_prob)))
+    return torch.cat(values).reshape(POINTS, POINTS).numpy()
 
 
-def landscapes(panels: Mapping[str, np.ndarray], plane: Plane, *, title: str, synthetic: bool) -> Figure:
-    """Draw one panel for each model, in rows of three, with one scale of colours.
+def draw_landscapes(panels: Mapping[str, np.ndarray], plane: Plane, *, title: str, synthetic: bool) -> Figure:
+    """Draw one panel for each model, in rows of three, with a common colour scale.
 
     Args:
-        panels: caption → result of `probabilities`.
-        plane: points and axes.
+        panels: result of `probabilities` for each model, by caption.
+        plane: samples and axes.
         title: title of the figure.
         synthetic: whether the data are generated.
     """
@@ -82,19 +82,19 @@ def landscapes(panels: Mapping[str, np.ndarray], plane: Plane, *, title: str, sy
     # Blue and orange are the classes; white means that neither is more likely.
     colours = LinearSegmentedColormap.from_list("classes", [BLUE, "white", ORANGE]) if two else "viridis"
     image = None
-    for place, (caption, found) in zip(axes.flat, panels.items(), strict=False):
-        image = place.imshow(found, origin="lower", extent=extent, interpolation="bilinear", cmap=colours)
+    for panel, (caption, values) in zip(axes.flat, panels.items(), strict=False):
+        image = panel.imshow(values, origin="lower", extent=extent, interpolation="bilinear", cmap=colours)
         image.set_clim(0.0, 1.0)
         if two:
             lines = np.linspace(-edge, edge, POINTS)
-            place.contour(lines, lines, found, levels=[0.5], colors="black", linewidths=0.8)
-        _points(place, plane)
-        place.set(xlim=(-edge, edge), ylim=(-edge, edge), aspect="equal")
-        place.set_xlabel(plane.axes[0], parse_math=False)
-        place.set_ylabel(plane.axes[1], parse_math=False)
-        place.set_title(caption, fontsize=10, parse_math=False)
-    for place in axes.flat[len(panels) :]:
-        place.set_visible(False)
+            panel.contour(lines, lines, values, levels=[0.5], colors="black", linewidths=0.8)
+        _draw_samples(panel, plane)
+        panel.set(xlim=(-edge, edge), ylim=(-edge, edge), aspect="equal")
+        panel.set_xlabel(plane.axes[0], parse_math=False)
+        panel.set_ylabel(plane.axes[1], parse_math=False)
+        panel.set_title(caption, fontsize=10, parse_math=False)
+    for panel in axes.flat[len(panels) :]:
+        panel.set_visible(False)
     assert image is not None
     label = f"p(y = {plane.names[1]} | x)" if two else "entropy / log K"
     figure.colorbar(image, ax=axes, shrink=0.8, label=label)
@@ -103,10 +103,10 @@ def landscapes(panels: Mapping[str, np.ndarray], plane: Plane, *, title: str, sy
     return figure
 
 
-def _points(place: Axes, plane: Plane) -> None:
+def _draw_samples(panel: Axes, plane: Plane) -> None:
     for label, name in enumerate(plane.names):
-        some = plane.points[plane.labels == label][:SHOWN]
+        points = plane.points[plane.labels == label][:SHOWN]
         colour = (BLUE, ORANGE)[label] if len(plane.names) == 2 else None
-        place.scatter(*some.T, s=9, color=colour, edgecolor="black", linewidth=0.35, label=name)
+        panel.scatter(*points.T, s=9, color=colour, edgecolor="black", linewidth=0.35, label=name)
     if len(plane.outliers):
-        place.scatter(*plane.outliers[:SHOWN].T, s=12, marker="^", color="black", label="outliers")
+        panel.scatter(*plane.outliers[:SHOWN].T, s=12, marker="^", color="black", label="outliers")

@@ -1,4 +1,4 @@
-"""Figures of the predictions for samples of the test split, according to the kind of data."""
+"""Figures of predictions for samples of the test split, depending on the kind of target."""
 
 import math
 from collections.abc import Iterator
@@ -16,40 +16,37 @@ from framework.distributions.circular import angular_distance, wrap
 from framework.distributions.class_probabilities import class_probabilities
 from framework.distributions.density import circular_grid
 from framework.distributions.noise import Draw
-from framework.evaluation.splits import on_device, predicted
-from framework.reports.class_picture import choose_classified, classified
-from framework.reports.landscape_picture import Plane, half_width, landscapes, probabilities
+from framework.evaluation.splits import on_device, predict
+from framework.reports.class_picture import choose_classified, draw_classified
+from framework.reports.landscape_picture import Plane, draw_landscapes, half_width, probabilities
 from framework.reports.viewing_circles import choose, viewing_circles
 from framework.runs.session import Session
 
 PICTURED = 128
-"""Number of test samples from which the samples in a figure are chosen."""
+"""Number of test samples from which the samples of a figure are chosen."""
 
 
 UNRESOLVED, DRAWS, TIMES = 0.01, 1000, 10
-"""Limit on the error of a grid's total probability, above which the grid does not resolve the density.
+"""Largest error of a grid's total probability at which the grid is considered to resolve the density.
 
-The density is then estimated from DRAWS samples, drawn TIMES times.
+Otherwise the density is estimated from DRAWS × TIMES random values.
 """
 
 
 def prediction_pictures(session: Session) -> Iterator[tuple[str, Figure]]:
-    """Yield the names and figures."""
+    """Yield the name and the figure of each plot for the kind of target."""
     kind = session.target.kind
     if kind == "angle":
-        yield "predicted_densities", _densities(session)
+        yield "predicted_densities", _densities_figure(session)
     if kind == "class" and session.data.plane:
-        yield "landscape", _landscape(session)
+        yield "landscape", _landscape_figure(session)
     elif kind == "class":
-        yield "classified", _classified(session)
+        yield "classified", _classified_figure(session)
 
 
 @torch.no_grad()
-def _densities(session: Session) -> Figure:
-    """Return the figure of the densities of the first angle on the viewing circle.
-
-    The samples are chosen from the first PICTURED samples of the test split.
-    """
+def _densities_figure(session: Session) -> Figure:
+    """Return the figure of the first angle's densities, for some of the first PICTURED test samples."""
     predictor, data = session.predictor, session.data
     inputs: list[Tensor] = []
     columns: list[tuple[Tensor, ...]] = []
@@ -59,16 +56,17 @@ def _densities(session: Session) -> Figure:
         if len(inputs) >= PICTURED:
             break
         draw = Draw(settings.seed, number)
-        prediction = predicted(predictor, batch, settings.samples, draw)
+        prediction = predict(predictor, batch, settings.samples, draw)
         first = prediction.marginal(0)
         with draw("pictures"):
-            angles, log_density = around(first)
+            angles, log_density = log_density_on_circle(first)
         entropy, truth, point = first.entropy(), batch["target"][:, 0], prediction.point[:, 0]
         symmetry = batch.get("symmetry", torch.ones_like(batch["index"]))
         columns.append((log_density, entropy, deviation(truth, point, symmetry), truth, point, symmetry))
         inputs.extend(batch["input"].cpu())
-    joined = (torch.cat(some, -1).cpu().numpy() for some in zip(*columns, strict=True))
-    log_density, entropy, error, truth, point, symmetry = joined
+    log_density, entropy, error, truth, point, symmetry = (
+        torch.cat(parts, -1).cpu().numpy() for parts in zip(*columns, strict=True)
+    )
     chosen = choose(entropy, error, log_density)
     order = [index for row in chosen.values() for index in row]
     return viewing_circles(
@@ -87,22 +85,22 @@ def _densities(session: Session) -> Figure:
 
 
 @torch.no_grad()
-def _classified(session: Session) -> Figure:
-    """Return the figure of classified samples, chosen from the whole test split."""
+def _classified_figure(session: Session) -> Figure:
+    """Return the figure of classified samples; the samples are spread over the whole test split."""
     predictor, data = session.predictor, session.data
     dataset = data.splits().test
     length: int = len(dataset)  # pyright: ignore[reportArgumentType]
-    some = Subset(dataset, np.unique(np.linspace(0, length - 1, PICTURED).round().astype(int)).tolist())
+    subset = Subset(dataset, np.unique(np.linspace(0, length - 1, PICTURED).round().astype(int)).tolist())
     inputs: list[Tensor] = []
     shares, labels = [np.zeros((0, len(data.target.names)))], [np.zeros(0, np.int64)]
-    for batch in on_device(session.blocks().of(some), session.device):
+    for batch in on_device(session.blocks().of(subset), session.device):
         shares.append(class_probabilities(predictor(batch["input"])).cpu().numpy())
         labels.append(batch["target"].cpu().numpy())
         inputs.extend(batch["input"].cpu())
     probability, label = np.concatenate(shares), np.concatenate(labels)
     chosen = choose_classified(probability, label)
     order = [index for row in chosen.values() for index in row]
-    return classified(
+    return draw_classified(
         [data.preview(inputs[index]) for index in order],
         probability[order],
         label[order],
@@ -113,16 +111,16 @@ def _classified(session: Session) -> Figure:
     )
 
 
-def _landscape(session: Session) -> Figure:
+def _landscape_figure(session: Session) -> Figure:
     """Return the figure of class probabilities over the plane of the inputs, with test samples and outliers."""
     predictor, data, outliers = session.predictor, session.data, session.outliers
     points, labels = _first(data)
-    others = _first(outliers)[0] if outliers is not None else points[:0]
-    plane = Plane(points, labels, others, data.target.names, half_width(points, others))
+    outlier_points = _first(outliers)[0] if outliers is not None else points[:0]
+    plane = Plane(points, labels, outlier_points, data.target.names, half_width(points, outlier_points))
     if len(data.columns) == 2:
-        one, two = (f"{name}, as the model reads it" for name in data.columns)
-        plane = replace(plane, axes=(one, two))
-    return landscapes(
+        first, second = (f"{name}, as the model reads it" for name in data.columns)
+        plane = replace(plane, axes=(first, second))
+    return draw_landscapes(
         {"": probabilities(predictor.cpu(), plane.half_width)},
         plane,
         title=f"{session.title}: predictions over the inputs",
@@ -130,10 +128,10 @@ def _landscape(session: Session) -> Figure:
     )
 
 
-def around(density: Distribution, points: int = 720) -> tuple[Tensor, Tensor]:
-    """Return angles (points,) and the log-density of one angle there, (points, batch), however narrow the density is.
+def log_density_on_circle(density: Distribution, points: int = 720) -> tuple[Tensor, Tensor]:
+    """Return a grid of angles (points,) and the log-density on it (points, batch), even of a very narrow density.
 
-    If the density is too narrow for the grid, it is estimated by the share of draws in each cell of the grid.
+    If a density is too narrow for the grid, it is estimated from the share of random values in each grid cell.
     """
     angles, log_density = circular_grid(density, points)
     width = 2 * math.pi / points
@@ -141,29 +139,29 @@ def around(density: Distribution, points: int = 720) -> tuple[Tensor, Tensor]:
     unresolved = (on_grid.sum(0) / (DRAWS * TIMES) - 1).abs() > UNRESOLVED
     if not bool(unresolved.any()):
         return angles, log_density
-    drawn = torch.cat([density.sample(torch.Size((DRAWS,))) for _ in range(TIMES)]).squeeze(-1)
-    place = ((wrap(drawn).double() + math.pi) / width).round().long() % points
-    found = torch.zeros_like(on_grid).scatter_add_(0, place, torch.ones_like(place, dtype=on_grid.dtype))
-    # Values on the grid are kept unless the draws contradict them, so that tails stay smooth.
-    wrong = unresolved & ((found - on_grid).abs() > 5 * (on_grid + 1).sqrt())
-    return angles, torch.where(wrong, (found / (DRAWS * TIMES * width)).log(), log_density.double())
+    values = torch.cat([density.sample(torch.Size((DRAWS,))) for _ in range(TIMES)]).squeeze(-1)
+    cell = ((wrap(values).double() + math.pi) / width).round().long() % points
+    counts = torch.zeros_like(on_grid).scatter_add_(0, cell, torch.ones_like(cell, dtype=on_grid.dtype))
+    # The grid's values are kept unless the random values contradict them, so that tails stay smooth.
+    wrong = unresolved & ((counts - on_grid).abs() > 5 * (on_grid + 1).sqrt())
+    return angles, torch.where(wrong, (counts / (DRAWS * TIMES * width)).log(), log_density.double())
 
 
 def deviation(truth: Tensor, point: Tensor, symmetry: Tensor) -> Tensor:
-    """Return the angular distance to the nearest of the equally true angles, radians; 0 if all angles are true."""
+    """Return the distance of a point prediction to the nearest true angle, radians; 0 if all angles are true."""
     folds = symmetry.clamp(min=1)
     return torch.where(symmetry == 0, 0.0, angular_distance(folds * truth, folds * point) / folds)
 
 
 def _caption(error: float, entropy: float, symmetry: int) -> str:
-    """Return the text below a panel."""
-    said = f"error {math.degrees(error):.0f}°" if symmetry else "any direction is true"
+    """Return the text below a panel: error and entropy."""
+    accuracy = f"error {math.degrees(error):.0f}°" if symmetry else "any direction is true"
     note = f", {symmetry}-fold symmetric" if symmetry > 1 else ""
-    return f"{said}, entropy {entropy:.2f} nats{note}"
+    return f"{accuracy}, entropy {entropy:.2f} nats{note}"
 
 
 def _equally_true(truth: float, symmetry: int) -> np.ndarray:
-    """Return every angle that is as true as the annotated one; none if all angles are true."""
+    """Return all angles that are true because of the symmetry, radians; none if all angles are true."""
     return truth + 2 * math.pi / symmetry * np.arange(symmetry) if symmetry else np.zeros(0)
 
 

@@ -1,4 +1,4 @@
-"""Report at the end of a run: the result table, its numbers as JSON, figures, and where to look next."""
+"""Report at the end of a run: the result table, its numbers as JSON, figures, and hints for the next steps."""
 
 import json
 import math
@@ -23,16 +23,16 @@ if TYPE_CHECKING:
 
 
 def report_test(run: Run, session: Session) -> None:
-    """Test, measure the cost, print the table, write results.json and the figures, and log the numbers.
+    """Test the model, measure its cost, print the table, write results.json and the figures, and log the numbers.
 
     Args:
         run: the run, whose folder and tracker receive the results.
-        session: the session of the run, after `tested`.
+        session: the session of the run, with the trained model.
     """
     settings, data, outliers, metrics = session.settings, session.data, session.outliers, session.metrics
     blocks = session.blocks()
     loader = blocks.test_dataloader()
-    found = evaluate(
+    evaluation = evaluate(
         session.predictor,
         track_batches(loader, "testing"),
         metrics,
@@ -45,69 +45,76 @@ def report_test(run: Run, session: Session) -> None:
         else track_batches(blocks.of(outliers.splits().test), "testing on outliers"),
     )
     batch = next(iter(session.batches().test_dataloader()))
-    spent = cost(session.predictor, batch, samples=settings.samples, device=session.device)
+    run_cost = cost(session.predictor, batch, samples=settings.samples, device=session.device)
     columns = {key: heading for metric in metrics for key, heading in metric.columns.items()}
     better: Better = {**{key: way for metric in metrics for key, way in metric.better.items()}, **COST_BETTER}
     synthetic = data.synthetic or (outliers is not None and outliers.synthetic)
-    results = _results(run, session, found, spent, columns, better)
+    results = _results(run, session, evaluation, run_cost, columns, better)
     results |= {"synthetic": synthetic, "test_samples": len(loader.dataset)}  # type: ignore[arg-type]
     path = run.folder / "results.json"
     write_whole(path, json.dumps(results, indent=1).encode())
-    numbers = {key: float(value) for key, value in asdict(spent).items() if isinstance(value, int | float)}
-    groups = {f"test/{name}": some for name, some in found.groups.items()}
-    known = _logged(run)
-    for part, values in {"test": found.total, **groups, "cost": numbers}.items():
+    numbers = {key: float(value) for key, value in asdict(run_cost).items() if isinstance(value, int | float)}
+    groups = {f"test/{name}": values for name, values in evaluation.groups.items()}
+    already_logged = _logged_names(run)
+    for part, values in {"test": evaluation.total, **groups, "cost": numbers}.items():
         named = {f"{part}/{key}": value for key, value in values.items()}
-        run.tracker.log_metrics({name: value for name, value in named.items() if name not in known}, 0, 0)
+        run.tracker.log_metrics(
+            {name: value for name, value in named.items() if name not in already_logged}, 0, 0
+        )
     run.tracker.log_artifact(path)
-    rows = [  # nothing is bold, because groups of test samples do not compete
+    rows = [  # no bold numbers, because the groups of test samples do not compete
         results,
-        *({**results, **numbers, "method": f"  {name}"} for name, numbers in found.groups.items()),
+        *({**results, **numbers, "method": f"  {name}"} for name, numbers in evaluation.groups.items()),
     ]
     title = f"{session.title}, {len(loader.dataset)} test samples"  # type: ignore[arg-type]
     session.console.print(results_table(rows, {"method": "method", **columns, **COST_COLUMNS}, title=title))
     if settings.pictures:
-        _pictures(run, session, found, synthetic)
-    _next_steps(run, spent, session.console)
+        _save_pictures(run, session, evaluation, synthetic)
+    _next_steps(run, run_cost, session.console)
 
 
-def _logged(run: Run) -> set[str]:
-    """Return the names of numbers that a resumed run logged before it was killed; computed again, they are the same."""
+def _logged_names(run: Run) -> set[str]:
+    """Return the names of numbers that a resumed run already logged; computed again, they have the same values."""
     return {name for line in run.tracker.journal.lines() for name in line.values} if run.resumed else set()
 
 
-def _pictures(run: Run, session: Session, found: Evaluation, synthetic: bool) -> None:
+def _save_pictures(run: Run, session: Session, evaluation: Evaluation, synthetic: bool) -> None:
     """Save the figures of predictions and of metrics.
 
-    If the figures of predictions need a function that the density lacks, only these figures are left out. The run does
-    not fail, because nobody requested them and its numbers exist.
+    If the density lacks a function that the figures of predictions need, a message is printed instead of these figures.
+    The run does not fail, because its results are complete without them.
     """
     from framework.reports.prediction_pictures import prediction_pictures
 
     try:
         for name, figure in prediction_pictures(session):
-            picture(run, figure, name)
+            save_picture(run, figure, name)
     except UserError as error:
-        session.console.print(f"no picture of predictions: {error}", soft_wrap=True, highlight=False)
-    for metric in found.metrics:
+        session.console.print(f"No figure of predictions was drawn: {error}", soft_wrap=True, highlight=False)
+    for metric in evaluation.metrics:
         if isinstance(metric, HasFigure):
-            picture(run, metric.figure(session.title, synthetic=synthetic), metric.figure_name)
+            save_picture(run, metric.figure(session.title, synthetic=synthetic), metric.figure_name)
 
 
 def _results(
-    run: Run, session: Session, found: Evaluation, spent: Cost, columns: dict[str, str], better: Better
+    run: Run,
+    session: Session,
+    evaluation: Evaluation,
+    run_cost: Cost,
+    columns: dict[str, str],
+    better: Better,
 ) -> dict[str, Any]:
-    """Return the numbers of a run as they are written to results.json."""
+    """Return the content of results.json."""
     return {
         "method": session.method,
         "experiment": run.settings.experiment_name,
         "data": session.data_title,
         "seed": run.settings.seed,
-        **{key: _plain(value) for key, value in found.total.items()},
+        **{key: _plain(value) for key, value in evaluation.total.items()},
         "groups": {
-            name: {k: _plain(v) for k, v in numbers.items()} for name, numbers in found.groups.items()
+            name: {k: _plain(v) for k, v in numbers.items()} for name, numbers in evaluation.groups.items()
         },
-        **{key: _plain(value) for key, value in asdict(spent).items()},
+        **{key: _plain(value) for key, value in asdict(run_cost).items()},
         "columns": columns,
         "better": better,
         "folder": str(run.folder),
@@ -115,12 +122,12 @@ def _results(
 
 
 def _plain(value: Any) -> Any:
-    """Return a value for JSON, which has no NaN: NaN becomes null, which tables print as "not available"."""
+    """Return a value for JSON, where NaN becomes null; tables print null as "not available"."""
     return None if isinstance(value, float) and math.isnan(value) else value
 
 
 def report_training(run: Run, session: Session, *, kept_epoch: int) -> None:
-    """Save the training curve from the journal, unless the settings switch figures off.
+    """Draw the training curve from the journal and save it, unless the settings switch figures off.
 
     Args:
         run: the run with the journal.
@@ -148,11 +155,11 @@ def report_training(run: Run, session: Session, *, kept_epoch: int) -> None:
         title=f"{session.title}: training",
         synthetic=session.data.synthetic,
     )
-    picture(run, figure, "training_curve")
+    save_picture(run, figure, "training_curve")
 
 
-def picture(run: Run, figure: "Figure", name: str) -> Path:
-    """Save a figure into the run folder, in the format of the settings, and send it to the store; return its path."""
+def save_picture(run: Run, figure: "Figure", name: str) -> Path:
+    """Save a figure in the run folder, in the format of the settings, log it to the store, and return its path."""
     from framework.figures.style import save_figure
 
     folder = run.folder / "figures"
@@ -162,16 +169,16 @@ def picture(run: Run, figure: "Figure", name: str) -> Path:
     return path
 
 
-def _next_steps(run: Run, spent: Cost, console: Console) -> None:
-    """Print the machine, the run folder, and how to use the model."""
-    holds = ("figures", "results.json", "citations.bib", "checkpoints/model.ckpt")
-    there = [name for name in holds if (run.folder / name).exists()]
-    # A run that tested the model of another run has no model of its own.
-    model = run.folder if holds[-1] in there else run.settings.checkpoint
+def _next_steps(run: Run, run_cost: Cost, console: Console) -> None:
+    """Print the machine, the run folder and its files, and how to use the model."""
+    files = ("figures", "results.json", "citations.bib", "checkpoints/model.ckpt")
+    existing = [name for name in files if (run.folder / name).exists()]
+    # A run that tests the model of another run has no model of its own.
+    model = run.folder if files[-1] in existing else run.settings.checkpoint
     lines = [
-        f"measured on {machine(spent.device, spent.threads)}, batches of {spent.batch_size}; "
-        f"one sample alone takes {spent.latency_milliseconds:.2f} ms",
-        f"run folder:    {run.folder}   ({', '.join(there)})",
+        f"measured on {machine(run_cost.device, run_cost.threads)}, batches of {run_cost.batch_size}; "
+        f"a single sample takes {run_cost.latency_milliseconds:.2f} ms",
+        f"run folder:    {run.folder}   ({', '.join(existing)})",
         f"all runs:      {run.tracker.url}",
         f"in a notebook: framework.load('{model}')",
         f"what to cite:  {run.folder / 'citations.bib'}",

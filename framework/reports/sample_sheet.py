@@ -1,4 +1,4 @@
-"""An empty contact sheet of samples: one row for each kind of sample; a row without samples says so."""
+"""An empty contact sheet of samples with one row for each kind of sample."""
 
 from collections.abc import Mapping, Sequence
 
@@ -21,11 +21,11 @@ def sample_sheet(
 ) -> tuple[Figure, list[np.ndarray]]:
     """Return the figure and, for each sample in the order of the rows, its panels from top to bottom.
 
-    Lengths are in inches.
+    A row without samples contains a text that says so. Lengths are in inches.
 
     Args:
-        rows: heading of each row, and its number of samples; may be 0.
-        least: smallest number of samples that a row has room for.
+        rows: heading and number of samples of each row; a number may be 0.
+        least: smallest number of columns of panels.
         width: width of a panel.
         heights: heights of the panels of a sample.
         flat: heights of the panels in a row without samples.
@@ -39,11 +39,11 @@ def sample_sheet(
     panels = figure.subplots(len(tall), across, squeeze=False, height_ratios=tall)
     for axes in panels.flat:
         axes.set(xticks=[], yticks=[], frame_on=False)
-    found: list[np.ndarray] = []
+    sample_panels: list[np.ndarray] = []
     for line, (heading, count) in zip(panels.reshape(len(rows), -1, across), rows.items(), strict=True):
         if count:
             line[0, 0].set_ylabel(heading, fontsize=11, weight="bold")
         else:  # horizontal text, because a flat row has no room for vertical text
             line[0, 0].text(0, 0.5, f"{heading}: no such sample", ha="left", va="center", color=GREY)
-        found += list(line[:, :count].T)
-    return figure, found
+        sample_panels += list(line[:, :count].T)
+    return figure, sample_panels

@@ -1,4 +1,4 @@
-"""Result tables for people and for programs: numbers with their errors, in text, Markdown and CSV."""
+"""Result tables: numbers with their errors, for the terminal, in Markdown and as CSV."""
 
 import math
 import re
@@ -21,14 +21,14 @@ Row = Mapping[str, object]
 """Names and numbers of one result.
 
 "<key>_std" (standard deviation over runs, see `aggregate`) or "<key>_sem" (standard error of the mean) is printed
-behind "<key>" as ±. "synthetic" says whether the data were generated.
+after the number "<key>" as ±. "synthetic" is true if the data were generated.
 """
 
 Better = Mapping[str, Literal["higher", "lower"]]
-"""Direction in which a column is better.
+"""Direction in which the values of a column are better.
 
-Its best value is bold if it differs significantly from every other one (`framework.evaluation.significance`), so never
-if a ± is not known.
+The best value is bold if it differs significantly from every other value (`framework.evaluation.significance`), so
+never if an error is not known.
 """
 
 COST_COLUMNS = {
@@ -36,15 +36,15 @@ COST_COLUMNS = {
     "flops_per_sample": "FLOPs / sample",
     "parameters": "parameters",
 }
-"""Costs in every result table (framework.evaluation.cost.Cost), with the headings."""
+"""Headings of the costs in every result table (framework.evaluation.cost.Cost), by key."""
 COST_BETTER: Better = dict.fromkeys(COST_COLUMNS, "lower")
 """Direction in which costs are better."""
 NOT_AVAILABLE = "not available"
 NO_BREAK = "\u00a0"
 WIDTH = 100
-"""Width of a terminal's line, in characters, that a table should fit into."""
+"""Width of a line of the terminal, in characters, into which a table should fit."""
 SPREADS = {"_std": "standard deviation over runs", "_sem": "standard error of the mean"}
-"""Suffixes of the keys of errors, and their meaning."""
+"""Meaning of the errors, by the suffix of their keys."""
 
 
 def results_table(
@@ -52,24 +52,26 @@ def results_table(
 ) -> Table:
     """Return a table for the terminal.
 
-    Each row is a line. If lines would be wider than 100 characters, each row is a column, unless that is even wider.
+    Each result is a line. If the table would be wider than 100 characters, each result is a column instead, unless
+    that is even wider.
 
     Args:
         rows: one result each.
-        columns: the keys to show with their headings, in order; the first names the row.
-        title: title above the table; it says "synthetic" if all rows are (a column says so if only some are).
-        better: directions for bold; a single row is never best.
+        columns: headings by key, in order; the first column names the result.
+        title: title above the table. "(synthetic data)" is added if all results are synthetic; a column says which are
+            if only some are.
+        better: directions for bold numbers; a single result is never bold.
     """
     synthetic = [_synthetic(row) for row in rows]
     if rows and all(synthetic) and "synthetic" not in title.lower():
         title = f"{title} (synthetic data)"
     lines = _lines(rows, columns, better or {}, origin=any(synthetic) and not all(synthetic))
-    turned = [list(line) for line in zip(*lines, strict=True)]
-    if _width(lines) > WIDTH and _width(turned) < _width(lines):
-        lines = turned
+    transposed = [list(line) for line in zip(*lines, strict=True)]
+    if _width(lines) > WIDTH and _width(transposed) < _width(lines):
+        lines = transposed
     table = Table(title=Text(title), caption=_caption(rows, columns, lines) or None, box=box.SIMPLE_HEAD)
     for index, head in enumerate(lines[0]):
-        heading = Text(_wrapped(head.plain, max((len(cell) for cell in _column(lines, index)), default=0)))
+        heading = Text(_wrap(head.plain, max((len(cell) for cell in _column(lines, index)), default=0)))
         table.add_column(heading, justify="left" if index == 0 else "right", overflow="fold")
     for line in lines[1:]:
         table.add_row(*line)
@@ -77,17 +79,17 @@ def results_table(
 
 
 def markdown(rows: Sequence[Row], columns: Mapping[str, str], *, better: Better | None = None) -> str:
-    """Return the table in Markdown; if any row is synthetic, a column says which."""
+    """Return the table in Markdown; if any result is synthetic, a column says which are."""
     lines = _lines(rows, columns, better or {}, origin=any(map(_synthetic, rows)))
-    written = [[_escaped(cell) for cell in line] for line in lines]
-    rule = ["---", *["---:"] * (len(written[0]) - 1)]
-    text = "".join(f"| {' | '.join(line)} |\n" for line in [written[0], rule, *written[1:]])
+    cells = [[_escape(cell) for cell in line] for line in lines]
+    rule = ["---", *["---:"] * (len(cells[0]) - 1)]
+    text = "".join(f"| {' | '.join(line)} |\n" for line in [cells[0], rule, *cells[1:]])
     caption = _caption(rows, columns, lines)
     return f"{text}\n{caption}\n" if caption else text
 
 
-def csv(rows: Sequence[Row], columns: Iterable[str] | None, path: Path) -> None:
-    """Write the columns under their keys, with all digits and with errors beside; missing values are left empty.
+def write_csv(rows: Sequence[Row], columns: Iterable[str] | None, path: Path) -> None:
+    """Write a CSV file with keys as headings, all digits, and errors in columns of their own; missing values are empty.
 
     Args:
         rows: one result each.
@@ -112,7 +114,7 @@ def csv(rows: Sequence[Row], columns: Iterable[str] | None, path: Path) -> None:
 
 
 def aggregate(rows: Sequence[Row], by: Sequence[str], over: str = "seed") -> list[dict[str, object]]:
-    """Return mean and standard deviation over runs that differ in `over` only.
+    """Return means and standard deviations over runs that differ in `over` only.
 
     Args:
         rows: one run each.
@@ -120,10 +122,10 @@ def aggregate(rows: Sequence[Row], by: Sequence[str], over: str = "seed") -> lis
         over: the key that distinguishes the runs of a group.
 
     Returns:
-        One row per group, in order of first appearance. It has the keys of `by`; for every number "<key>" the mean and,
-        as "<key>_std", the sample standard deviation (NaN for one run); "n", the number of runs; and every other value
-        that all runs of the group share. A number that one of the runs lacks is NaN. A single run keeps its standard
-        errors "<key>_sem"; for several runs they are left out, because their mean means nothing.
+        One row per group, in order of first appearance. It has the keys of `by`; for every number, the mean "<key>"
+        and the sample standard deviation "<key>_std" (NaN for one run); "n", the number of runs; and every other value
+        that all runs of the group share. A number that one of the runs lacks is NaN. The standard errors "<key>_sem" of
+        a single run are kept; those of several runs are left out, because their mean has no meaning.
 
     Raises:
         ConfigError: a row lacks a key, or two runs of a group have the same `over`.
@@ -132,16 +134,19 @@ def aggregate(rows: Sequence[Row], by: Sequence[str], over: str = "seed") -> lis
     for row in rows:
         missing = [key for key in (*by, over) if key not in row]
         if missing:
-            raise ConfigError(f"A result has no {missing[0]!r} to aggregate by; it has: {', '.join(row)}.")
+            raise ConfigError(
+                f"A result lacks {missing[0]!r}, by which results are aggregated. Keys of the result: "
+                f"{', '.join(row)}."
+            )
         groups.setdefault((*(row[key] for key in by), _synthetic(row)), []).append(row)
-    return [_aggregated(members, by, over) for members in groups.values()]
+    return [_aggregate_group(members, by, over) for members in groups.values()]
 
 
 def format_number(value: int | float, spread: int | float = math.nan) -> str:
-    """Return a number to three significant digits, or as its error allows: "1.23 ± 0.04", "22.8 ± 1.0".
+    """Return a number with its error, such as "1.23 ± 0.04" or "22.8 ± 1.0", or with three significant digits.
 
-    The error is given to one significant digit, to two if the first is 1. Whole numbers (`int`) are exact below 100,000
-    and "1.23 M" above. NaN is "not available".
+    The error has one significant digit, or two if the first is 1, and determines the digits of the number. Whole
+    numbers (`int`) are exact below 100,000 and abbreviated above, such as "1.23 M". NaN is "not available".
     """
     if math.isnan(value):
         return NOT_AVAILABLE
@@ -156,14 +161,16 @@ def format_number(value: int | float, spread: int | float = math.nan) -> str:
         scale, unit = _unit(size)
         return f"({format_number(value / scale, spread / scale)}) {unit}"
     decimals = -_exponent(spread) + (1 if spread < 1.95 * 10.0 ** _exponent(spread) else 0)
-    if decimals > 5 - _exponent(size):  # beyond six digits of the value, the size of the error suffices
+    if decimals > 5 - _exponent(
+        size
+    ):  # at most six digits of the value; a smaller error is given by its order of magnitude
         return f"{value:.{5 - _exponent(size)}f} ± {spread:.0e}"
-    kept = max(decimals, 0)
-    return f"{round(value, decimals):.{kept}f} ± {round(spread, decimals):.{kept}f}"
+    printed = max(decimals, 0)
+    return f"{round(value, decimals):.{printed}f} ± {round(spread, decimals):.{printed}f}"
 
 
 def machine(device: object, threads: object) -> str:
-    """Return the machine of a measurement as text: "cpu (AMD EPYC), 2 threads"."""
+    """Return a description of the machine of a measurement, such as "cpu (AMD EPYC), 2 threads"."""
     return f"{device}, {threads} thread{'' if threads == 1 else 's'}"
 
 
@@ -182,7 +189,7 @@ def _plain(value: int | float) -> str:
 
 
 def _unit(value: int | float) -> tuple[float, str]:
-    """Return the decimal prefix of a large number, with its factor: 1e3 and "k", and so on."""
+    """Return the factor and the decimal prefix for a large number, such as (1e3, "k")."""
     return next(pair for pair in ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k")) if abs(value) >= pair[0])
 
 
@@ -194,7 +201,7 @@ def _exponent(value: int | float) -> int:
 def _lines(
     rows: Sequence[Row], columns: Mapping[str, str], better: Better, *, origin: bool
 ) -> list[list[Text]]:
-    """Return headings and cells; `origin` adds a column that says which data are synthetic."""
+    """Return lines of cells, headings first; `origin` adds a column that says which data are synthetic."""
     lines = [[Text(_cell(row, key)) for key in columns] for row in rows]
     for index, key in enumerate(columns):
         values = {
@@ -231,13 +238,13 @@ def _cell(row: Row, key: str) -> str:
 
 
 def _spread(row: Row, key: str) -> float | None:
-    """Return the number behind ±; None if there is none."""
+    """Return the error that is printed after ±; None if there is none."""
     spreads = (_number(row.get(key + suffix)) for suffix in SPREADS)
     return next((spread for spread in spreads if spread is not None), None)
 
 
 def _number(value: object) -> float | None:
-    """Return a value as float; None if it is not a number, is NaN, or is a truth value."""
+    """Return a value as float; None if it is no number, NaN or a truth value."""
     if isinstance(value, bool | np.bool_ | str) or not isinstance(value, SupportsFloat):
         return None
     number = float(value)
@@ -245,7 +252,7 @@ def _number(value: object) -> float | None:
 
 
 def _raw(value: object) -> object:
-    """Return a value for a CSV file."""
+    """Return a value as it is written to a CSV file."""
     if isinstance(value, bool | np.bool_):
         return "true" if value else "false"
     if isinstance(value, str):
@@ -260,7 +267,7 @@ def _synthetic(row: Row) -> bool:
 
 
 def _caption(rows: Sequence[Row], columns: Mapping[str, str], lines: Sequence[Sequence[Text]]) -> str:
-    """Return the meaning of ± and bold, for those that the table has."""
+    """Return the caption that explains ± and bold, as far as the table contains them."""
     spreads = [
         meaning
         for suffix, meaning in SPREADS.items()
@@ -273,9 +280,9 @@ def _caption(rows: Sequence[Row], columns: Mapping[str, str], lines: Sequence[Se
 
 
 def _width(lines: Sequence[Sequence[Text]]) -> int:
-    """Return the width of a table, in characters, if cells are not broken and headings are broken between words."""
+    """Return the width of a table in characters if only headings are wrapped, at every space."""
     widths = [
-        max(map(len, [*_wrapped(head.plain, 0).splitlines(), *_column(lines, index)]), default=0)
+        max(map(len, [*_wrap(head.plain, 0).splitlines(), *_column(lines, index)]), default=0)
         for index, head in enumerate(lines[0])
     ]
     return sum(widths) + 3 * len(widths) + 1
@@ -285,48 +292,48 @@ def _column(lines: Sequence[Sequence[Text]], index: int) -> list[Text]:
     return [line[index] for line in lines[1:]]
 
 
-def _wrapped(heading: str, width: int) -> str:
-    """Return a heading broken into lines between words, at most `width` wide if the words allow it."""
+def _wrap(heading: str, width: int) -> str:
+    """Return a heading wrapped between words to lines of `width` characters; a longer word widens all lines."""
     # A single sign, such as "°" or "/", stays with the word before it.
     words = re.sub(r" (?=[^\w\s]( |$))", NO_BREAK, heading)
     width = max([1, width, *map(len, words.split(" "))])
     return textwrap.fill(words, width, break_on_hyphens=False).replace(NO_BREAK, " ")
 
 
-def _escaped(cell: Text) -> str:
+def _escape(cell: Text) -> str:
     text = cell.plain.replace("|", "\\|").replace("\n", " ")
     return f"**{text}**" if cell.spans else text
 
 
-def _aggregated(members: Sequence[Row], by: Sequence[str], over: str) -> dict[str, object]:
-    """Return the row of a group of runs."""
+def _aggregate_group(members: Sequence[Row], by: Sequence[str], over: str) -> dict[str, object]:
+    """Return the aggregated row of a group of runs."""
     first = members[0]
-    seen = [member[over] for member in members]
-    repeated = [value for index, value in enumerate(seen) if value in seen[:index]]
+    distinguishing = [member[over] for member in members]
+    repeated = [value for index, value in enumerate(distinguishing) if value in distinguishing[:index]]
     if repeated:
         group = ", ".join(f"{key}={first[key]}" for key in by) or "the sweep"
         raise ConfigError(
-            f"Two results of {group} have {over}={repeated[0]}: they are not independent runs. "
-            f"Add the key in which they differ to the grouping ({', '.join(by)}), or leave one of them out."
+            f"Two results of {group} have {over}={repeated[0]}, so they are not independent runs. "
+            f"Add the key in which they differ to the grouping ({', '.join(by)}), or leave one of the results out."
         )
-    found: dict[str, object] = {key: first[key] for key in by}
+    group_row: dict[str, object] = {key: first[key] for key in by}
     keys = dict.fromkeys(key for member in members for key in member)
     for key in keys:
         if key in (*by, over):
             continue
         if key.endswith(tuple(SPREADS)):
             if len(members) == 1:
-                found[key] = first[key]
+                group_row[key] = first[key]
             continue
         values = [member.get(key) for member in members]
         if all(value == values[0] for value in values) and not isinstance(values[0], float):
-            found[key] = values[0]
+            group_row[key] = values[0]
         elif all(value is None or _is_number(value) for value in values):
             numbers = np.array([math.nan if value is None else float(value) for value in values])  # type: ignore[arg-type]
-            with np.errstate(invalid="ignore"):  # infinite values have no spread
-                found[key] = float(numbers.mean())
-                found[f"{key}_std"] = float(numbers.std(ddof=1)) if len(numbers) > 1 else math.nan
-    return {**found, "n": len(members)}
+            with np.errstate(invalid="ignore"):  # the spread of infinite values is NaN
+                group_row[key] = float(numbers.mean())
+                group_row[f"{key}_std"] = float(numbers.std(ddof=1)) if len(numbers) > 1 else math.nan
+    return {**group_row, "n": len(members)}
 
 
 def _is_number(value: object) -> bool:

@@ -1,6 +1,6 @@
-"""Figures of error against run time: one panel per metric, one colour per method.
+"""Figures of error against run time, with one panel per metric and one colour per method.
 
-They show curves along a knob, or single results.
+Each method is a curve over the values of a knob, or a single result.
 """
 
 import math
@@ -17,28 +17,28 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
-from framework.evaluation.pareto import NOISE, TIMES_APART, front
+from framework.evaluation.pareto import NOISE, TIME_NOISE, front
 from framework.evaluation.significance import mean
 from framework.figures.style import COLOURS, GREY, MARKERS, titled_figure
 from framework.reports.table import SPREADS, Better, Row
 
-# Offsets of a text from its point, in order of preference, in typographical points.
+# Offsets of a text from its data point, in typographical points, in order of preference.
 SIDES = ((9, 6), (9, -6), (-9, 6), (-9, -6), (0, 13), (0, -13), (12, 15), (12, -15), (-12, 15))
 
 Style = dict[str, Any]
 PARETO: Style = {"ls": "", "marker": "o", "mfc": "none", "markersize": 13, "mec": "black"}
 """Style of the rings around the points of a front."""
 FRONT = "front"
-"""Mark of the lines that ring the points of a front."""
+"""Identifier (gid) of the rings around the points of a front."""
 SHADE = "0.87"
-"""Grey of the area in which errors mean nothing."""
+"""Grey level of the area in which errors are not meaningful."""
 ACROSS = 3
 """Largest number of panels side by side."""
 
 
 @dataclass(frozen=True)
 class Floor:
-    """The number below which an error means nothing, and the legend's text about it."""
+    """Level below which an error is not meaningful, and the legend's text about it."""
 
     height: float
     meaning: str
@@ -46,7 +46,7 @@ class Floor:
 
 @dataclass(frozen=True)
 class _Series:
-    """Rows that are drawn alike: those of a method, or of a method in a group."""
+    """Rows that are drawn in one style: those of a method, or of a method in a group."""
 
     method: str
     group: str
@@ -67,24 +67,24 @@ def error_against_run_time(
     floors: Mapping[str, Floor] | None = None,
     note: str = "",
 ) -> Figure:
-    """Draw numbers of each result against its run time.
+    """Draw numbers of each result against the run time.
 
     The axis of run time is logarithmic, and so is the axis of an error without negative values. Rows of a method that
-    have a "knob" are connected in their order, and the knob's "value" is written beside each point. Bars are a row's
-    "<key>_std" or "<key>_sem". Rings mark the front of each group, beyond noise (`framework.evaluation.pareto`); errors
-    on different groups do not compare. A panel without standard errors has no rings and says so. On a logarithmic axis
-    an error of 0 is drawn on the lower edge and labelled.
+    have a "knob" are connected in their order, and the knob's "value" is written beside each point. Error bars are a
+    row's "<key>_std" or "<key>_sem". Rings mark the Pareto front of each group (`framework.evaluation.pareto`); errors
+    of different groups are not compared. A panel without standard errors has no rings, but a text that says so. On a
+    logarithmic axis an error of 0 is drawn on the lower edge and labelled.
 
     Args:
         rows: as for `framework.reports.table`, each with its "method".
-        labels: key → label of its axis.
+        labels: label of the axis, by key.
         better: direction in which a key is better; "lower" is an error.
         title: title of the figure.
         synthetic: whether the data are generated.
-        machine: machine and number of threads of the measurement; it is written on every time axis.
+        machine: machine and number of threads of the measurement, which is written on every time axis.
         time: key of the run time.
-        group: key of the group; without it all rows are one group. Up to 14 methods and 12 groups look different.
-        floors: floors by key; the area below is shaded.
+        group: key of the group; None: all rows are one group. Up to 14 methods and 12 groups have different styles.
+        floors: floors by key; the area below a floor is shaded.
         note: text below the figure.
     """
     across = min(ACROSS, len(labels))
@@ -98,37 +98,41 @@ def error_against_run_time(
     x_label = "\n".join(["run time (ms per sample)", *textwrap.wrap(f"on {machine}", width)])
     series = _series([row for row in rows if any(_drawable(row, key, time) for key in labels)], group)
     floors = floors or {}
-    words = []
+    texts = []
     for axes, (key, label) in zip(panels, labels.items(), strict=False):
         axes.set(xscale="log", ylabel=label)
         axes.set_xlabel(x_label, parse_math=False)
-        words.append(_panel(axes, series, key, time, lower=better.get(key) == "lower", floor=floors.get(key)))
+        texts.append(_panel(axes, series, key, time, lower=better.get(key) == "lower", floor=floors.get(key)))
         left_out = len(rows) - sum(_drawable(row, key, time) for row in rows)
         if left_out:
-            text = f"not drawn for want of a finite error and run time: {left_out}"
+            text = f"not drawn, without finite error and run time: {left_out}"
             axes.set_title(text, loc="right", fontsize=8, color=GREY)
     _legends(figure, series, group, [floor.meaning for floor in floors.values() if floor.height > 0], note)
-    figure.draw_without_rendering()  # computes the layout, so that positions on the page are known
-    for axes, (notes, lines) in zip(panels, words, strict=False):
+    figure.draw_without_rendering()  # computes the layout, which `_annotate` needs
+    for axes, (notes, lines) in zip(panels, texts, strict=False):
         _annotate(axes, notes, lines)
     return figure
 
 
 def _series(rows: Sequence[Row], group: str | None) -> list[_Series]:
     """Return the rows by method and group, with the style of each series."""
-    found: dict[tuple[str, str], list[Row]] = {}
+    members_of: dict[tuple[str, str], list[Row]] = {}
     for row in rows:
         kind = "" if group is None else str(row.get(group))
-        found.setdefault((str(row.get("method")), kind), []).append(row)
-    methods, kinds = (list(dict.fromkeys(names)) for names in zip(*found, strict=True)) if found else ([], [])
+        members_of.setdefault((str(row.get("method")), kind), []).append(row)
+    methods, kinds = (
+        (list(dict.fromkeys(names)) for names in zip(*members_of, strict=True)) if members_of else ([], [])
+    )
     series = []
-    for (method, kind), members in found.items():
-        place = methods.index(method)
-        colour = COLOURS[place % len(COLOURS)]
+    for (method, kind), members in members_of.items():
+        position = methods.index(method)
+        colour = COLOURS[position % len(COLOURS)]
         style: Style = {
             "color": colour,
-            "marker": MARKERS[(place if group is None else kinds.index(kind)) % len(MARKERS)],
-            "markerfacecolor": "none" if place // len(COLOURS) % 2 else colour,  # first filled, then hollow
+            "marker": MARKERS[(position if group is None else kinds.index(kind)) % len(MARKERS)],
+            "markerfacecolor": "none"
+            if position // len(COLOURS) % 2
+            else colour,  # hollow when colours repeat
             "linestyle": "-" if members[0].get("knob") else "",
         }
         series.append(_Series(method, kind, members, style))
@@ -141,14 +145,15 @@ def _panel(
     """Draw the panel of one metric.
 
     Returns:
-        The texts beside points as (x, y, text, colour), and the lines that the texts must not cover.
+        The texts beside points as (x, y, text, colour), and the drawn lines, which texts should not cover.
     """
-    kept = [[row for row in one.rows if _drawable(row, key, time)] for one in series]
-    places = [
-        np.array([(_value(row, time), _value(row, key)) for row in rows]).reshape(-1, 2) for rows in kept
+    drawn_rows = [[row for row in entry.rows if _drawable(row, key, time)] for entry in series]
+    positions = [
+        np.array([(_value(row, time), _value(row, key)) for row in rows]).reshape(-1, 2)
+        for rows in drawn_rows
     ]
-    spreads = [np.array([_spread(row, key) for row in rows]) for rows in kept]
-    everything = np.concatenate([np.zeros((0, 2)), *places])
+    spreads = [np.array([_spread(row, key) for row in rows]) for rows in drawn_rows]
+    everything = np.concatenate([np.zeros((0, 2)), *positions])
     errors, bars = everything[:, 1], np.concatenate([np.zeros(0), *spreads])
     first, last = (everything[:, 0].min(), everything[:, 0].max()) if len(everything) else (1.0, 1.0)
     axes.set_xlim(first / _room(first, last), last * _room(first, last))
@@ -158,7 +163,7 @@ def _panel(
         ends = ends[ends > 0] if (ends > 0).any() else np.ones(1)
         low, high = ends.min(), ends.max()
         if floor is not None and floor.height > 0:
-            # A reference that is exact to rounding must not stretch the panel over ten decades.
+            # A reference that is exact to rounding error must not stretch the panel over ten decades.
             low, high = min(low, max(floor.height, low / 100)), max(high, floor.height)
         room = _room(low, high)
         bottom = low / room
@@ -166,30 +171,32 @@ def _panel(
         if floor is not None and floor.height > bottom:
             axes.axhspan(bottom, floor.height, color=SHADE, zorder=0)
     notes, lines = [], []
-    for one, rows, line, spread in zip(series, kept, places, spreads, strict=True):
+    for entry, rows, line, spread in zip(series, drawn_rows, positions, spreads, strict=True):
         zero = line[:, 1] < bottom
         line[:, 1] = np.maximum(line[:, 1], bottom)
         below = np.minimum(spread, line[:, 1] - bottom)
-        axes.errorbar(line[:, 0], line[:, 1], [below, spread], capsize=2.5, clip_on=False, **one.style)
-        lines += [line] if one.style["linestyle"] else []
+        axes.errorbar(line[:, 0], line[:, 1], [below, spread], capsize=2.5, clip_on=False, **entry.style)
+        lines += [line] if entry.style["linestyle"] else []
         ends = np.stack([line[:, 1] - below, line[:, 1] + spread], 1)
         lines += [np.column_stack([[x, x], end]) for x, end in zip(line[:, 0], ends, strict=True)]
-        for row, (x, y), nothing in zip(rows, line, zero, strict=True):
-            said = [f"{_value(row, 'value'):g}"] if row.get("knob") else []
-            said += ["error 0"] if nothing else []
-            notes += [(x, y, ": ".join(said), one.style["color"])] if said else []
-    for kind in dict.fromkeys(one.group for one in series):
-        some = [place for place, one in enumerate(series) if one.group == kind]
-        own = np.concatenate([places[place] for place in some])
-        means = [mean(row, key, row.get("n", row.get("repeats"))) for place in some for row in kept[place]]
-        signed = [
-            replace(one, value=height if lower else -height)
-            for one, height in zip(means, own[:, 1], strict=True)
+        for row, (x, y), is_zero in zip(rows, line, zero, strict=True):
+            parts = [f"{_value(row, 'value'):g}"] if row.get("knob") else []
+            parts += ["error 0"] if is_zero else []
+            notes += [(x, y, ": ".join(parts), entry.style["color"])] if parts else []
+    for kind in dict.fromkeys(entry.group for entry in series):
+        members = [index for index, entry in enumerate(series) if entry.group == kind]
+        points = np.concatenate([positions[index] for index in members])
+        means = [
+            mean(row, key, row.get("n", row.get("repeats"))) for index in members for row in drawn_rows[index]
         ]
-        best = front(signed, own[:, 0].tolist(), TIMES_APART)
+        signed = [
+            replace(value, value=height if lower else -height)
+            for value, height in zip(means, points[:, 1], strict=True)
+        ]
+        best = front(signed, points[:, 0].tolist(), TIME_NOISE)
         if any(best):
-            axes.plot(*own[best].T, **PARETO, clip_on=False, gid=FRONT)
-        elif len(own) > 1:
+            axes.plot(*points[best].T, **PARETO, clip_on=False, gid=FRONT)
+        elif len(points) > 1:
             axes.set_title("no front: standard errors not known", loc="left", fontsize=8, color=GREY)
     _plain_ticks(axes.xaxis)
     if axes.get_yscale() == "log":
@@ -202,13 +209,13 @@ def _panel(
 def _legends(
     figure: Figure, series: Sequence[_Series], group: str | None, shaded: Sequence[str], note: str
 ) -> None:
-    """Draw the legends of methods, marks and groups."""
+    """Draw the legends of methods, markers and groups."""
     handles: list[Line2D | Patch] = []
-    for one in {one.method: one for one in reversed(series)}.values():
-        knobs = ", ".join(dict.fromkeys(str(row["knob"]) for row in one.rows if row.get("knob")))
-        marker = one.style["marker"] if group is None else "o"
-        label = f"{one.method} ({knobs})" if knobs else one.method
-        handles.insert(0, Line2D([], [], **{**one.style, "marker": marker}, label=label))
+    for entry in {entry.method: entry for entry in reversed(series)}.values():
+        knobs = ", ".join(dict.fromkeys(str(row["knob"]) for row in entry.rows if row.get("knob")))
+        marker = entry.style["marker"] if group is None else "o"
+        label = f"{entry.method} ({knobs})" if knobs else entry.method
+        handles.insert(0, Line2D([], [], **{**entry.style, "marker": marker}, label=label))
     if ringed := any(line.get_gid() == FRONT for axes in figure.axes for line in axes.lines):
         beaten = "not beaten beyond noise" + ("" if group is None else f" in its {group}")
         handles.append(Line2D([], [], **PARETO, label=f"{beaten} (Pareto)"))
@@ -225,7 +232,7 @@ def _legends(
     )
     legend.get_title().set(fontsize=7, color=GREY, parse_math=False)
     if group is not None:
-        kinds = {one.group: one.style["marker"] for one in series}
+        kinds = {entry.group: entry.style["marker"] for entry in series}
         handles = [
             Line2D([], [], marker=marker, color=GREY, ls="", label=kind) for kind, marker in kinds.items()
         ]
@@ -233,12 +240,12 @@ def _legends(
 
 
 def _room(low: float, high: float) -> float:
-    """Return the margin of a logarithmic axis as a factor; a single number is in the middle."""
+    """Return the margin of a logarithmic axis as a factor; a single number is placed in the middle."""
     return (high / low) ** 0.1 if high > low else 2.0
 
 
 def _plain_ticks(axis: Axis) -> None:
-    """Label a logarithmic axis with plain numbers, and always with some of them."""
+    """Label a logarithmic axis with plain numbers, however short the axis is."""
     low, high = axis.get_view_interval()
     decades = math.log10(high / low)
     steps = (1.0,) if decades > 3 else (1.0, 2.0, 5.0) if decades > 1.2 else (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)
@@ -248,15 +255,15 @@ def _plain_ticks(axis: Axis) -> None:
 
 
 def _annotate(axes: Axes, notes: Sequence[tuple[Any, ...]], lines: Sequence[np.ndarray]) -> None:
-    """Write the text of each point (x, y, text, colour) on the side where nothing is written or drawn yet."""
-    pen = axes.figure.dpi / 72  # pixels a point
-    edges = [np.zeros((0, 4))]  # left, bottom, right, top of what is drawn, pixels
+    """Write the text of each point (x, y, text, colour) on the side where it covers the least."""
+    pen = axes.figure.dpi / 72  # pixels per typographical point
+    edges = [np.zeros((0, 4))]  # boxes of the drawn lines: left, bottom, right, top in pixels
     for line in lines:
         corners = axes.transData.transform(line)
         between = np.linspace(0, 1, 200)[:, None, None]
         dots = (corners[:-1] + between * (corners[1:] - corners[:-1])).reshape(-1, 2)
         edges += [np.hstack([dots - pen, dots + pen]), np.hstack([corners - 6 * pen, corners + 6 * pen])]
-    taken, frame = np.concatenate(edges), axes.bbox
+    occupied, frame = np.concatenate(edges), axes.bbox
     for x, y, text, colour in notes:
         trials = []
         for across, up in SIDES:
@@ -264,11 +271,11 @@ def _annotate(axes: Axes, notes: Sequence[tuple[Any, ...]], lines: Sequence[np.n
             note = axes.annotate(text, (x, y), (across, up), textcoords="offset points", ha=side, va="center")
             note.set(fontsize=8, color=colour, annotation_clip=False)
             box = note.get_window_extent().extents
-            met = ((taken[:, :2] <= box[2:]) & (taken[:, 2:] >= box[:2])).all(1).sum()
+            overlaps = ((occupied[:, :2] <= box[2:]) & (occupied[:, 2:] >= box[:2])).all(1).sum()
             outside = bool(np.any(box[:2] < frame.min) or np.any(box[2:] > frame.max))
-            trials.append((met + 10_000 * outside, note, box))
+            trials.append((overlaps + 10_000 * outside, note, box))
         best = min(trials, key=lambda trial: trial[0])
-        taken = np.vstack([taken, best[2]])
+        occupied = np.vstack([occupied, best[2]])
         for trial in trials:
             if trial is not best:
                 trial[1].remove()
@@ -286,6 +293,6 @@ def _value(row: Row, key: str) -> float:
 
 
 def _spread(row: Row, key: str) -> float:
-    """Return the half-length of a row's bar; 0 if it is not known."""
+    """Return the half-length of a row's error bar; 0 if it is not known."""
     spreads = (_value(row, key + suffix) for suffix in SPREADS)
     return next((spread for spread in spreads if math.isfinite(spread)), 0.0)

@@ -1,4 +1,4 @@
-"""The training curve: both losses over epochs, and the epoch whose weights were kept."""
+"""Training curve: training and validation loss over epochs, and the epoch of the kept weights."""
 
 import math
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ from matplotlib.ticker import MaxNLocator
 from framework.figures.style import BLUE, GREEN, RED, titled_figure
 
 FEW = 30
-"""Number of points below which each point is marked, because a line through a single point is invisible."""
+"""Number of points below which each point has a marker, because a line through a single point is invisible."""
 
 
 def training_curve(
@@ -38,20 +38,19 @@ def training_curve(
     axes = figure.subplots()
     few = {"marker": "o", "markersize": 3.5} if len(train) < FEW else {}
     axes.plot(epochs, train, color=BLUE, linewidth=1.2, label="training, single batches", **few)
-    seen = np.array(validation, dtype=np.float64).reshape(-1, 2)
-    axes.plot(*seen.T, color=RED, linewidth=1.5, marker="o", markersize=3.5, label="validation")
-    values = [value for value in (*train, *seen[:, 1]) if math.isfinite(value)]
+    validated = np.array(validation, dtype=np.float64).reshape(-1, 2)
+    axes.plot(*validated.T, color=RED, linewidth=1.5, marker="o", markersize=3.5, label="validation")
+    values = [value for value in (*train, *validated[:, 1]) if math.isfinite(value)]
     if values:
         low, middle, high = np.percentile(values, [5, 50, 95])
         usual = max(abs(low), abs(high), 1e-12)
-        if (
-            max(abs(value - middle) for value in values) > 30 * usual
-        ):  # an epoch with an extreme loss must not flatten all others
+        # An epoch with an extreme loss must not flatten the rest of the curve.
+        if max(abs(value - middle) for value in values) > 30 * usual:
             axes.set_yscale("symlog", linthresh=usual)
     if best_epoch is not None:
         axes.axvline(best_epoch, color=GREEN, linestyle="--", label=f"kept weights: epoch {best_epoch:g}")
     axes.set(xlabel="epoch", ylabel=y_label)
-    axes.set_xlim(0, 1.03 * max([1, *epochs, *seen[:, 0]]))
+    axes.set_xlim(0, 1.03 * max([1, *epochs, *validated[:, 0]]))
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.grid(alpha=0.3)
     axes.legend(frameon=False)

@@ -1,4 +1,4 @@
-"""Figures of predicted densities on the viewing circle around their images: certain, ambiguous and failed ones."""
+"""Figures of predicted densities on a viewing circle around each image: certain, ambiguous and failed predictions."""
 
 import math
 import textwrap
@@ -15,12 +15,12 @@ from matplotlib.patches import Circle, Patch
 from framework.figures.style import BLUE, GREEN, GREY, RED
 from framework.reports.sample_sheet import sample_sheet
 
-LARGE_ERROR = math.pi / 6  # radians; a viewpoint further off counts as wrong (Acc_{π/6} of thesis Table 3.3)
-RING = 0.5  # thickness of the ring that holds the densities, in radii of the viewing circle
+LARGE_ERROR = math.pi / 6  # radians; a larger error counts as wrong (Acc_{π/6} of thesis Table 3.3)
+RING = 0.5  # thickness of the ring in which densities are drawn, in radii of the viewing circle
 PREDICTED: dict[str, Any] = {"color": RED, "ls": ":", "linewidth": 1.2, "marker": "o", "markersize": 4}
-"""Style of a point prediction: dotted, so that a narrow density is visible below it."""
+"""Style of a point prediction; it is dotted so that a narrow density below it stays visible."""
 DEGREES = ("0°", "90°", "180°", "270°")
-"""Labels of the quarters of the circle if directions have no words."""
+"""Labels of the four directions if the data set has no words for them."""
 
 
 def choose(
@@ -29,10 +29,10 @@ def choose(
     log_density: Float[np.ndarray, "points samples"],
     count: int = 4,
 ) -> dict[str, list[int]]:
-    """Return up to `count` samples for each row of Figure 3.6; the same arguments give the same samples.
+    """Return the indices of up to `count` samples for each row of Figure 3.6; the choice is deterministic.
 
-    "certain": one peak, entropy at most the median, error at most π/6. "ambiguous": several peaks. "failed": as
-    "certain", but with a larger error, so a confident mistake. Each row holds its samples of lowest entropy.
+    "certain": one peak, entropy at most the median, error at most π/6. "ambiguous": several peaks. "failed": confident
+    mistakes, which differ from "certain" by a larger error. Each row has its samples of lowest entropy.
 
     Args:
         entropy: entropy of each density, nats.
@@ -44,10 +44,12 @@ def choose(
         ValueError: a number is NaN.
     """
     if any(np.isnan(numbers).any() for numbers in (entropy, error, log_density)):
-        raise ValueError("wanted numbers to choose samples by, got NaN among entropies, errors or densities.")
+        raise ValueError(
+            "Got NaN among the entropies, errors or densities, by which samples are chosen. Pass numbers only."
+        )
     if len(entropy) == 0:
         return {"certain": [], "ambiguous": [], "failed": []}
-    several = peaks(log_density) > 1
+    several = count_peaks(log_density) > 1
     confident = ~several & (entropy <= np.median(entropy))
     right = error <= LARGE_ERROR
     rows = {"certain": confident & right, "ambiguous": several, "failed": confident & ~right}
@@ -55,15 +57,15 @@ def choose(
     return {name: order[chosen[order]][:count].tolist() for name, chosen in rows.items()}
 
 
-def peaks(log_density: Float[np.ndarray, "points samples"]) -> np.ndarray:
-    """Return how many separate arcs of the circle have more than a quarter of the highest density, (samples,)."""
+def count_peaks(log_density: Float[np.ndarray, "points samples"]) -> np.ndarray:
+    """Return the number of separate arcs with more than a quarter of the highest density, (samples,)."""
     high = log_density > log_density.max(0) - math.log(4)
     starts = (high & ~np.roll(high, 1, axis=0)).sum(0)
-    return np.maximum(starts, 1)  # an arc that is the whole circle has no start
+    return np.maximum(starts, 1)  # an arc that covers the whole circle has no start
 
 
-def scale(peak: float) -> float:
-    """Return the density of the outer circle, per radian: the first of 1.5, 3, 6, 15, 30, ... not below the peak."""
+def outer_density(peak: float) -> float:
+    """Return the density of the outer circle, per radian: the first of 1.5, 3, 6, 15, 30, … not below `peak`."""
     steps = (step * 10.0**power for power in range(308) for step in (1.5, 3.0, 6.0))
     return next(step for step in steps if step >= peak)
 
@@ -84,8 +86,9 @@ def viewing_circles(
 ) -> Figure:
     """Draw predicted densities on the viewing circle around each image, as in Figures 3.2 and 3.6.
 
-    Angle 0 is at the bottom, and angles run counter-clockwise. A density is a band outside the circle; its thickness is
-    the density. It ends within an outer circle, which represents the density that is written beside it.
+    Angle 0 is at the bottom, and angles run counter-clockwise. A density is drawn as a band outside the circle, whose
+    thickness is proportional to the density. The band stays inside an outer circle; the density that the outer circle
+    represents is written beside it.
 
     Args:
         images: images of the samples, as `Data.preview` gives them.
@@ -94,19 +97,21 @@ def viewing_circles(
         truths: true angles, radians; NaN if there is no true direction, which is then not drawn.
         predictions: point predictions, radians.
         captions: text below each panel.
-        modes: for each sample all angles that are equally true, for a symmetric object, radians.
-        rows: heading of each row, and its number of samples in their order; may be 0.
+        modes: for each sample, all angles that are equally true because the object is symmetric, radians.
+        rows: heading and number of samples of each row, in the order of the samples; a number may be 0.
         title: title of the figure.
         synthetic: whether the data are generated.
-        directions: words for the directions 0°, 90°, 180° and 270° from which an object is seen; without them the
-            angles are written.
+        directions: words for the viewing directions 0°, 90°, 180° and 270°; without words the angles are written.
     """
     lengths = (log_density.shape[1], sum(rows.values()), len(images), len(captions))
     if len(set(lengths)) != 1:
-        raise ValueError(f"wanted as many densities as samples in rows, images and captions, got {lengths}.")
-    density = np.exp(np.minimum(log_density.astype(np.float64), 700))  # beyond, float64 overflows
+        raise ValueError(
+            f"Got {lengths[0]} densities, {lengths[1]} samples in rows, {lengths[2]} images and {lengths[3]} "
+            "captions. Pass equally many of each."
+        )
+    density = np.exp(np.minimum(log_density.astype(np.float64), 700))  # larger exponents overflow float64
     if np.isnan(density).any():
-        raise ValueError("wanted a log-density everywhere, got NaN.")
+        raise ValueError("Got NaN as a log-density. Pass a number for every sample and angle.")
     size = {"least": 3, "width": 2.5, "heights": (2.75,), "flat": (0.6875,), "margin": 1.5}
     figure, panels = sample_sheet(rows, **size, title=title, synthetic=synthetic)
     for sample, (axes,) in enumerate(panels):
@@ -139,24 +144,24 @@ def _viewing_circle(
 ) -> None:
     """Draw an image and the density around it."""
     height, width = image.shape[:2]
-    # The corners of the image stay inside the circle, and its sides leave room for the words.
+    # The corners of the image stay inside the circle, and its sides leave space for the words.
     half = min(0.96 / math.hypot(height, width), 0.72 / max(height, width))
     axes.imshow(image, extent=(-half * width, half * width, -half * height, half * height))
     limit = 1 + RING + 0.2
     axes.set(xlim=(-limit, limit), ylim=(-limit, limit))
-    outer = scale(density.max())
+    outer = outer_density(density.max())
     around, value = np.append(angles, angles[0]), np.append(density, density[0])
     band = np.append(1 + RING * value / outer, np.ones_like(value))
     axes.fill(*_position(np.append(around, around[::-1]), band), color=BLUE, alpha=0.6, linewidth=0)
-    # A density at a single angle has no area, but a line shows it.
+    # A density at a single angle has no area, but a line makes it visible.
     axes.plot(*_position(around, 1 + RING * value / outer), color=BLUE, linewidth=0.6)
     axes.text(limit, 1.3, f"{outer:g} per rad", fontsize=6.5, color=GREY, ha="right", va="bottom")
     for radius, line in ((1.0, "-"), (1 + RING, "-"), (1 + RING / (2 * math.pi * outer), ":")):
         axes.add_patch(Circle((0, 0), radius, fill=False, color=GREY, linestyle=line, zorder=3))
     for quarter, word in enumerate(words or DEGREES):
         x, y = _position(quarter * math.pi / 2, 0.86)
-        turn = 90 * (quarter % 2) if words else 0
-        style = {"fontsize": 6.5 if words else 6, "color": GREY, "rotation": turn, "parse_math": False}
+        rotation = 90 * (quarter % 2) if words else 0
+        style = {"fontsize": 6.5 if words else 6, "color": GREY, "rotation": rotation, "parse_math": False}
         axes.text(x, y, word, ha="center", va="center", **style)
 
 
@@ -165,13 +170,13 @@ def _marks(axes: Axes, truth: float, prediction: float, modes: Sequence[float] |
     for angle, face in (*((mode, "none") for mode in modes), (truth, GREEN)):
         if math.isnan(angle):
             continue
-        inwards = (3, 0, math.degrees(angle))  # a triangle outside the outer circle
+        triangle = (3, 0, math.degrees(angle))  # points inwards, from outside the outer circle
         x, y = _position(angle, 1 + RING + 0.1)
-        axes.plot(x, y, color=GREEN, marker=inwards, markerfacecolor=face, markersize=8, zorder=5)
+        axes.plot(x, y, color=GREEN, marker=triangle, markerfacecolor=face, markersize=8, zorder=5)
     x, y = _position(prediction, np.array([1.0, 1 + RING]))
     axes.plot(x, y, **PREDICTED, zorder=5)
 
 
 def _position(angle: Any, radius: Any) -> tuple[Any, Any]:
-    """Return the position of an angle (radians) on a circle: 0 at the bottom, counter-clockwise."""
+    """Return the position (x, y) of an angle in radians on a circle: 0 at the bottom, counter-clockwise."""
     return radius * np.sin(angle), -radius * np.cos(angle)

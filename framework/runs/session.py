@@ -49,7 +49,7 @@ from framework.datasets.fields import fetch
 from framework.density_head import Fitted
 from framework.distributions.noise import seed_step
 from framework.errors import CheckpointError, ConfigError, UserError
-from framework.evaluation.splits import BLOCK, numbers, on_device, require_own
+from framework.evaluation.splits import BLOCK, numbers, on_device, require_unique_name
 from framework.metric import Metric
 from framework.model import Predictor, fitted_models, learns
 from framework.objective import Objective
@@ -326,7 +326,7 @@ def tested(session: Session) -> Session:
     owners: dict[str, Metric] = {}
     for metric in metrics:
         for name in metric.columns:
-            require_own(owners, name, metric)
+            require_unique_name(owners, name, metric)
     return replace(session, parts=parts, metrics=metrics, outliers=build_outliers(parts, session.data))
 
 

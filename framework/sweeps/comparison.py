@@ -14,10 +14,10 @@ from framework.reports.table import (
     COST_COLUMNS,
     Better,
     aggregate,
-    csv,
     machine,
     markdown,
     results_table,
+    write_csv,
 )
 from framework.runs.job import read_record, recorded
 from framework.runs.run import stored_config
@@ -105,7 +105,7 @@ def summarise(folder: Path, overrides: Sequence[Sequence[str]], config: Mapping[
         compared = aggregate(rows, by=by, over="seed")
         better = rows[0]["better"]
         console.print(results_table(compared, columns, title=f"{len(rows)} runs in {folder}", better=better))
-        csv(compared, columns, folder / "comparison.csv")
+        write_csv(compared, columns, folder / "comparison.csv")
         files.append(folder / "comparison.csv")
         files.extend(_picture(compared, rows, by, folder))
         console.print(f"comparison: {', '.join(str(file) for file in files)}", soft_wrap=True)
@@ -166,7 +166,7 @@ def rank(
     console = output()
     title = f"{len(trials)} trials in {folder}, best first"
     console.print(results_table(shown, columns, title=title, better={"value": better}))
-    csv(shown, columns, folder / "ranking.csv")
+    write_csv(shown, columns, folder / "ranking.csv")
     last = [
         f"#{row['trial']} "
         + (f"(its value is {row['value']:g})" if trial.completed else "(did not complete)")

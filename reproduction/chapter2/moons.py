@@ -26,7 +26,7 @@ from framework.configuration.schema import build, resolve
 from framework.distributions.class_probabilities import class_probabilities
 from framework.evaluation.splits import cost, evaluate
 from framework.metric import HasFigure
-from framework.reports.landscape_picture import Plane, landscapes, probabilities
+from framework.reports.landscape_picture import Plane, draw_landscapes, probabilities
 from framework.reports.table import Better, aggregate, markdown
 from framework.training.batches import Batches
 
@@ -235,7 +235,9 @@ def pictures(rows: list[dict[str, Any]]) -> None:
         f"({letter}) {METHODS[key]}": probabilities(framework.load(folders[key]), plane.half_width)
         for letter, key in zip("abcdef", six, strict=True)
     }
-    figure = landscapes(panels, plane, title="Probability landscapes of Table 2.1, seed 0", synthetic=True)
+    figure = draw_landscapes(
+        panels, plane, title="Probability landscapes of Table 2.1, seed 0", synthetic=True
+    )
     figure.savefig(HERE / "moons_landscapes.png", dpi=100)
     figure = Figure(figsize=(11, 6.6), dpi=110, layout="constrained")
     FigureCanvasAgg(figure)

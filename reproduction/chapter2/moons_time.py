@@ -22,7 +22,7 @@ from framework.configuration.schema import build, resolve
 from framework.datasets.fields import as_batch
 from framework.evaluation.tradeoff import rows, tradeoff
 from framework.figures.style import save_figure
-from framework.reports.table import Row, csv
+from framework.reports.table import Row, write_csv
 from framework.reports.tradeoff_picture import error_against_run_time
 
 HERE = Path(__file__).parent
@@ -76,7 +76,7 @@ def main() -> None:
     found = [
         {**row, "machine": where} for row in rows(curves, dict.fromkeys(LABELS, "lower"), synthetic=True)
     ]
-    csv(found, None, HERE / "moons_time.csv")
+    write_csv(found, None, HERE / "moons_time.csv")
     drawn(found)
     for row in found:
         sys.stdout.write(f"{row['method']}, {row['value']}: NLL {row['nll']:.4f}, ECE {row['ece']:.4f}, ")

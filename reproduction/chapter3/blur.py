@@ -27,7 +27,7 @@ from framework.distributions.density import circular_grid
 from framework.distributions.protocol import marginal
 from framework.figures.style import COLOURS, GREY, MARKERS, save_figure, titled_figure
 from framework.model import Predictor
-from framework.reports.table import aggregate, csv, markdown
+from framework.reports.table import aggregate, markdown, write_csv
 
 HERE = Path(__file__).resolve()
 METHODS = {
@@ -193,7 +193,7 @@ def main(sweeps: list[Path], root: str | None) -> None:
         if row["seed"] == 0:
             first[method(row)] = model
     label = "synthetic IDIAP" if rows[0]["synthetic"] else "IDIAP"
-    csv(rows, {"method": "method", "seed": "seed", **COLUMNS}, HERE.with_suffix(".csv"))
+    write_csv(rows, {"method": "method", "seed": "seed", **COLUMNS}, HERE.with_suffix(".csv"))
     curves(rows, HERE.with_suffix(".png"))
     # a head in half profile, which blur makes doubtful step by step
     index = int((fields["target"][:, 0].abs() - math.radians(50)).abs().argmin())

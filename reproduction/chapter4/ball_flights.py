@@ -31,7 +31,7 @@ from framework.distributions.protocol import median
 from framework.figures.style import COLOURS, MARKERS, save_figure, titled_figure
 from framework.flights.frames import PARTS
 from framework.prediction import Prediction
-from framework.reports.table import Row, csv
+from framework.reports.table import Row, write_csv
 from plugins.metric.flight_error.figure import bundle, landing_places
 from plugins.metric.flight_error.landing import Shown
 from plugins.metric.flight_error.metric import DRAWS, FlightError
@@ -338,7 +338,7 @@ def write(
         )
         for row in curves(kind, found)
     ]
-    csv(rows, None, HERE.with_suffix(".csv"))
+    write_csv(rows, None, HERE.with_suffix(".csv"))
     drawn(rows)
     bundles({method: several[0] for method, several in simulated.items()})
 

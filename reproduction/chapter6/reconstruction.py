@@ -29,7 +29,7 @@ from benchmarks.pages import machine, read_rows, write_page
 from framework.figures.style import COLOURS, MARKERS, save_figure, titled_figure
 from framework.geometry.clouds import NormalisedClouds, sizes
 from framework.geometry.nearest import chamfer
-from framework.reports.table import csv, markdown
+from framework.reports.table import markdown, write_csv
 from plugins.encoder.bps.basis import Strategy, basis
 from plugins.encoder.bps.encoding import decode, encode, prepared
 from plugins.encoder.grids.occupancy import decode as centres
@@ -234,9 +234,9 @@ def main() -> None:
     chair, _ = shapes(CLOUD_SIZES[-1], 1, ["chair", "airplane"])
     spent = [{**row, "synthetic": synthetic} for row in times(chair[:1])]
     columns = {"method": "method", "length": "N", "chamfer": "Chamfer distance", "shapes": "shapes"}
-    csv(rows, columns, HERE.with_suffix(".csv"))
+    write_csv(rows, columns, HERE.with_suffix(".csv"))
     timed = {"method": "method", "basis": "k", "points": "n", "milliseconds": "ms"}
-    csv(spent, timed, HERE.with_name("reconstruction_time.csv"))
+    write_csv(spent, timed, HERE.with_name("reconstruction_time.csv"))
     pictured(rows, spent)
     wide = [
         {"method": f"{method}, k = {count}", "synthetic": synthetic}

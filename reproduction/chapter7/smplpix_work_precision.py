@@ -23,7 +23,7 @@ from framework.configuration.schema import build, resolve
 from framework.data import Data
 from framework.figures.style import save_figure
 from framework.model import Predictor
-from framework.reports.table import Row, csv
+from framework.reports.table import Row, write_csv
 from framework.reports.tradeoff_picture import error_against_run_time
 from framework.training.batches import Batches
 from reproduction.chapter7.smplpix_table import Judged, by_subject, described, examined
@@ -134,7 +134,7 @@ def main(runs: list[str]) -> None:
                 {"method": method, **row(examined(predictor, data, None), feature_distance(predictor, data))}
             )
             sys.stdout.write(line(method, rows[-1]) + "\n")
-    csv([{**one, "synthetic": True} for one in rows], None, HERE.with_suffix(".csv"))
+    write_csv([{**one, "synthetic": True} for one in rows], None, HERE.with_suffix(".csv"))
     drawn(rows)
     text = [
         "# Quality of an image against its run time (synthetic people)",
