@@ -31,7 +31,7 @@ def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})
 
 
-_NOW = {
+_CURRENT_NAMES = {
     f"framework.{old}": f"framework.{new}"
     for old, new in {
         "cache": "storage.cache",
@@ -63,16 +63,16 @@ _NOW = {
 """Old names of modules that plugins import, and the current names of these modules."""
 
 
-class _Moved:
+class _OldNameFinder:
     """Finder that makes the old name of a module refer to the module itself, not to a copy."""
 
     def find_spec(
         self, fullname: str, path: "Sequence[str] | None", target: "ModuleType | None" = None
     ) -> "ModuleSpec | None":
-        return ModuleSpec(fullname, self) if fullname in _NOW else None  # type: ignore[arg-type]
+        return ModuleSpec(fullname, self) if fullname in _CURRENT_NAMES else None  # type: ignore[arg-type]
 
     def create_module(self, spec: ModuleSpec) -> "ModuleType":
-        module = import_module(_NOW[spec.name])
+        module = import_module(_CURRENT_NAMES[spec.name])
         self.spec = module.__spec__
         return module
 
@@ -80,4 +80,4 @@ class _Moved:
         module.__spec__ = self.spec  # the import system has just replaced it by the spec of the old name
 
 
-sys.meta_path.append(_Moved())
+sys.meta_path.append(_OldNameFinder())

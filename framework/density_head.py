@@ -81,7 +81,7 @@ class DensityHead(nn.Module, ABC):
 
 
 class Fitted(ABC):
-    """Second base of a density head that is fitted to the whole training split at once, not by gradient.
+    """Additional base class of a density head that is fitted to the whole training split at once, not by gradient.
 
     Trees are an example. No linear layer precedes the head: it reads the features as they are, and its `size` is their
     number, 0 before the fit. The encoders before it may have no trained parameters either. Its state may have any

@@ -94,7 +94,7 @@ class Mean(Metric):
 
 
 class HasFigure(ABC):
-    """Second base of a metric that has a figure."""
+    """Additional base class of a metric that has a figure."""
 
     figure_name: ClassVar[str]
     """Name of the figure's file, without a suffix."""

@@ -65,7 +65,7 @@ class Uncertainty(Predictor):
 
 
 class SeveralModels(ABC):
-    """Second base of a wrapper that trains several models, each as it would train alone.
+    """Additional base class of a wrapper that trains several models, each as it would train alone.
 
     Attributes:
         model_count: number of models.
@@ -123,7 +123,7 @@ def own_batches(predictor: Predictor, own: bool = True) -> Iterator[None]:
 
 
 class Joining(ABC):
-    """Second base of a wrapper whose members can be models that were trained separately (mode=combine)."""
+    """Additional base class of a wrapper whose members can be models that were trained separately (mode=combine)."""
 
     @classmethod
     @abstractmethod

@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from framework.errors import DataError
 from framework.geometry.nearest import Queries, chamfer, nearest, prepare
 from framework.geometry.nearest.device import nearest_of
-from framework.geometry.nearest.streamed import Middle, Reach, Stream, normal
+from framework.geometry.nearest.streamed import Middle, Reach, Stream, normalise_chunk
 
 DTYPES = pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
 EXACT = {torch.float32: 2.5e-7, torch.float64: 1e-15}
@@ -471,7 +471,7 @@ def test_two_readings_of_the_chunks_normalise_as_the_formula():
         reach.add(chunk)
     local = (cloud - cloud[0]) - (cloud - cloud[0]).mean(0)
     assert reach.norm == pytest.approx(np.linalg.norm(local, axis=1).max(), rel=1e-9)
-    found = torch.cat([normal(chunk, middle.mean, reach.norm) for chunk in chunks])
+    found = torch.cat([normalise_chunk(chunk, middle.mean, reach.norm) for chunk in chunks])
     wanted = local / np.linalg.norm(local, axis=1).max()
     assert float((found - torch.tensor(wanted)).abs().max()) < 1e-9
 

@@ -25,7 +25,7 @@ def brain(tmp_path_factory):
 @pytest.mark.parametrize("preset", PRESETS)
 def test_derivatives_are_autograds(preset):
     wanted = Parameters.of(preset)
-    at = torch.tensor([wanted.start, wanted.elsewhere], dtype=torch.float64) * 1.05
+    at = torch.tensor([wanted.start, wanted.second_start], dtype=torch.float64) * 1.05
     at[:, 10] = 0.07
     measured = torch.rand(2, len(PLACES), dtype=torch.float64)
     misfit, rows = Misfit(measured, PLACES), torch.arange(2)
@@ -56,7 +56,7 @@ def test_derivatives_are_autograds(preset):
 @pytest.mark.parametrize("preset", PRESETS)
 def test_offsets_that_were_not_measured_are_as_if_never_asked_for(preset):
     wanted = Parameters.of(preset)
-    at = torch.tensor([wanted.start, wanted.elsewhere], dtype=torch.float64)
+    at = torch.tensor([wanted.start, wanted.second_start], dtype=torch.float64)
     noise = torch.randn(2, len(PLACES), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     measured, kept = spectrum(1.05 * at, PLACES) + 0.003 * noise, torch.arange(len(PLACES)) % 3 > 0
     holes, rows = measured.where(kept, torch.nan), torch.tensor([1, 0])

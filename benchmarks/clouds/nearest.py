@@ -31,7 +31,7 @@ from sklearn.neighbors import NearestNeighbors
 from benchmarks.pages import machine, write_page
 from benchmarks.timing import first_calls
 from framework.geometry.nearest import Queries, nearest, prepare
-from framework.geometry.nearest.streamed import Middle, Reach, Stream, normal
+from framework.geometry.nearest.streamed import Middle, Reach, Stream, normalise_chunk
 
 Array = NDArray[np.floating]
 ROWS = ((2048, 512, 24, 12), (10_000, 1000, 12, 8), (100_000, 1000, 3, 5), (1_000_000, 4096, 3, 2))
@@ -318,7 +318,7 @@ def streaming(total: int = 10**8, size: int = 10**6, basis_points: int = 1000) -
     reach = Reach(middle.mean)
     read("largest norm", reach.add)
     stream = Stream(basis)
-    read("nearest", lambda points: stream.add(normal(points, middle.mean, reach.norm)))
+    read("nearest", lambda points: stream.add(normalise_chunk(points, middle.mean, reach.norm)))
     found = stream.result()
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     times = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in spent.items())

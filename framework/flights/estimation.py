@@ -151,7 +151,7 @@ def guess_states(frames: ObservedFrames, gravity: float) -> Float[Tensor, "fligh
     return state.clamp(-0.9 * MOST.to(state), 0.9 * MOST.to(state))
 
 
-def root(covariance: Float[Tensor, "flight 9 9"]) -> Float[Tensor, "flight 9 9"]:
+def covariance_root(covariance: Float[Tensor, "flight 9 9"]) -> Float[Tensor, "flight 9 9"]:
     """Return R with R Rᵀ equal to the covariance.
 
     If rounding has made the covariance indefinite, R Rᵀ is the nearest positive semi-definite matrix.

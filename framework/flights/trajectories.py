@@ -16,7 +16,7 @@ Started at a parabola's root, the error falls below rounding in three.
 
 
 @no_type_check  # called for every step
-def free(
+def free_flight(
     state: Float[Tensor, "flight 9"], time: Float[Tensor, "flight"], constants: Constants
 ) -> Float[Tensor, "flight 9"]:
     """Return the state after `time` seconds without a table: one step of the classical Runge-Kutta method (order 4).
@@ -54,7 +54,7 @@ def step(
 
     If a second bounce follows at once, the ball is laid on the table, so that bounces cannot go on without end.
     """
-    after = free(state, time, constants)
+    after = free_flight(state, time, constants)
     touching = constants.touching
     hits = (after[:, 2] < touching) & (state[:, 2] >= touching - 1e-9)
     rows = hits.nonzero()[:, 0]
@@ -66,15 +66,15 @@ def step(
     root = (climb.square() + 2 * constants.gravity * height.clamp(min=0) + 1e-18).sqrt()
     until = torch.minimum(((climb + root) / constants.gravity).clamp(min=0), whole)
     for _ in range(NEWTON):
-        bounce_state = free(before, until, constants)
+        bounce_state = free_flight(before, until, constants)
         until = until - (bounce_state[:, 2] - touching) / bounce_state[:, 5].clamp(max=-1e-3)
         until = torch.minimum(until.clamp(min=0), whole)
-    bounce_state = free(before, until, constants)
+    bounce_state = free_flight(before, until, constants)
     u, v, w, a, b, c = bounce_state[:, 3:].unbind(-1)
     velocity, spin = bounce((u, v, w), (a, b, c), constants)
     level = torch.full_like(u, touching)
     left = torch.stack([bounce_state[:, 0], bounce_state[:, 1], level, *velocity, *spin], -1)
-    risen = free(left, whole - until, constants)
+    risen = free_flight(left, whole - until, constants)
     lies = (risen[:, 2] < touching) & (risen[:, 1] < constants.far)
     risen = torch.where(lies.unsqueeze(-1) & (torch.arange(9) == 2), risen.clamp(min=touching), risen)
     risen = torch.where(lies.unsqueeze(-1) & (torch.arange(9) == 5), risen.clamp(min=0), risen)

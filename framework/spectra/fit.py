@@ -74,7 +74,12 @@ def fit(
     offsets = offsets.to(measured)
     lower, upper, first, second = (
         measured.new_tensor(side)
-        for side in (parameter_set.lower, parameter_set.upper, parameter_set.start, parameter_set.elsewhere)
+        for side in (
+            parameter_set.lower,
+            parameter_set.upper,
+            parameter_set.start,
+            parameter_set.second_start,
+        )
     )
     begin, damping = first.expand(len(measured), -1), CAREFUL
     if start is not None:

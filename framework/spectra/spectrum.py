@@ -49,7 +49,7 @@ class Parameters(NamedTuple):
         return PRESETS[preset]
 
     @property
-    def elsewhere(self) -> tuple[float, ...]:
+    def second_start(self) -> tuple[float, ...]:
         """Second start of the search."""
         return tuple(ELSEWHERE.get(name, at) for name, at in zip(self.names, self.start, strict=True))
 

@@ -5,7 +5,7 @@
     reach = Reach(middle.mean)              # second
     for chunk in chunks(): reach.add(chunk)
     stream = Stream(queries)                # third
-    for chunk in chunks(): stream.add(normal(chunk, middle.mean, reach.norm))
+    for chunk in chunks(): stream.add(normalise_chunk(chunk, middle.mean, reach.norm))
 
 A chunk is a cloud (points, columns): x, y, z, then attributes. Memory holds one chunk and the results so far.
 """
@@ -102,7 +102,7 @@ class Middle:
 
     def add(self, chunk: Float[Tensor, "points columns"]) -> None:
         """Add the points of a chunk."""
-        points = finite(chunk)
+        points = finite_points(chunk)
         if len(points) == 0:
             return
         if self.count == 0:
@@ -128,7 +128,7 @@ class Reach:
 
     def add(self, chunk: Float[Tensor, "points columns"]) -> None:
         """Add the points of a chunk."""
-        points = finite(chunk)
+        points = finite_points(chunk)
         if len(points):
             self.largest = max(
                 self.largest, float(torch.linalg.vector_norm(points - self.centre, dim=1).max())
@@ -140,7 +140,7 @@ class Reach:
         return self.largest or 1.0
 
 
-def finite(chunk: Tensor) -> Float[Tensor, "points 3"]:
+def finite_points(chunk: Tensor) -> Float[Tensor, "points 3"]:
     """Return coordinates in float64.
 
     Raises:
@@ -156,7 +156,7 @@ def finite(chunk: Tensor) -> Float[Tensor, "points 3"]:
     return points
 
 
-def normal(
+def normalise_chunk(
     chunk: Float[Tensor, "points columns"], centre: Tensor, scale: float
 ) -> Float[Tensor, "points columns"]:
     """Return the chunk less the centre, divided by the scale (eq. 6.2); in its dtype, with attributes unchanged."""

@@ -18,9 +18,9 @@ from framework.flights.estimation import (
     Estimate,
     ObservedFrames,
     Prior,
+    covariance_root,
     estimate_states,
     observed_frames,
-    root,
 )
 from framework.flights.frames import PARTS, future_frames
 from framework.flights.physics import Constants
@@ -174,7 +174,7 @@ class BallisticHead(DensityHead, Fitted):
         places, slopes = simulate_with_jacobian(estimate.state, self._whole(seen), self.constants)
         mean = places[:, -self.future :].flatten(1)
         self._require_course(mean, estimate)
-        return mean, slopes[:, -self.future :].flatten(1, 2) @ root(estimate.covariance)
+        return mean, slopes[:, -self.future :].flatten(1, 2) @ covariance_root(estimate.covariance)
 
     def _require_course(self, places: Tensor, estimate: Estimate) -> None:
         """Require flights with a finite course; implausible physical constants lead to infinite ones.
@@ -214,7 +214,7 @@ class BallisticHead(DensityHead, Fitted):
         points = torch.quasirandom.SobolEngine(9, scramble=True, seed=0).draw(count, dtype=torch.float64)
         noise = torch.special.ndtri(points.clamp(1e-9, 1 - 1e-9))
         self._require_course(estimate.state, estimate)
-        states = estimate.state.unsqueeze(1) + noise @ root(estimate.covariance).mT
+        states = estimate.state.unsqueeze(1) + noise @ covariance_root(estimate.covariance).mT
         times = self._whole(seen).repeat_interleave(count, 0)
         places = simulate(states.reshape(-1, 9), times, self.constants)[:, -self.future :, :3]
         places = places.reshape(flights, count, 3 * self.future)

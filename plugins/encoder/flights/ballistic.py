@@ -8,7 +8,7 @@ from pydantic import Field
 from torch import Tensor
 
 from framework.encoder import Encoder
-from framework.flights.estimation import Prior, estimate_states, observed_frames, root
+from framework.flights.estimation import Prior, covariance_root, estimate_states, observed_frames
 from framework.flights.frames import PARTS
 from framework.flights.physics import Constants
 from framework.flights.trajectories import simulate_with_jacobian
@@ -74,7 +74,9 @@ class BallisticEncoder(Encoder):
         moments = self.step * torch.arange(1, self.future + 1, dtype=torch.float64)
         times = torch.cat([seen.times, moments.expand(len(frames), -1)], 1)
         places, slopes = simulate_with_jacobian(estimate.state, times, self.constants)
-        spread = (slopes[:, -self.future :].flatten(1, 2) @ root(estimate.covariance)).square().sum(-1)
+        spread = (
+            (slopes[:, -self.future :].flatten(1, 2) @ covariance_root(estimate.covariance)).square().sum(-1)
+        )
         spread = (spread + self.noise**2).log() / 2
         found = torch.cat([places[:, -self.future :].flatten(1), spread, frames], 1)
         return found.clamp(-LARGEST, LARGEST).to(inputs.device, dtype)

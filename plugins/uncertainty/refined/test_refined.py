@@ -27,7 +27,7 @@ def model(target: Target, length: int) -> Model:
 def test_a_fit_begins_where_the_model_says():
     wrapped = model(Target("real", TEN.target), len(OFFSETS))
     refined = Refined(lambda: wrapped, steps=3).eval()
-    spectra = spectrum(torch.tensor([TEN.start, TEN.elsewhere], dtype=torch.float64), PLACES).float()
+    spectra = spectrum(torch.tensor([TEN.start, TEN.second_start], dtype=torch.float64), PLACES).float()
     with torch.no_grad():
         found = refined(spectra)
         start = median(wrapped.eval()(spectra), 100)
