@@ -233,7 +233,7 @@ class Data(ABC):
 
 
 class Mapped(ABC):
-    """Additional base class of a data set whose samples are positions in one file, such that predictions can be drawn as maps.
+    """Additional base class of a data set whose samples are positions in one file, so that predictions form maps.
 
     An example is a data set whose samples are the voxels of a volume.
     """

@@ -255,7 +255,7 @@ def fitted_models(predictor: Predictor) -> list[Model]:
 
 
 def learns(predictor: Predictor) -> bool:
-    """Return whether a predictor is trained by gradient: it has such parameters, and no head that is fitted at once."""
+    """Return true if a predictor is trained by gradient: it has trained parameters, and no head that is fitted at once."""
     return not fitted_models(predictor) and any(
         parameter.requires_grad for parameter in predictor.parameters()
     )
@@ -277,7 +277,7 @@ def independent_penalty(values: Float[Tensor, "batch *member"]) -> Float[Tensor,
 
 
 def own_sample_penalty(values: Float[Tensor, "batch"], members: int) -> Float[Tensor, "batch"]:
-    """Return penalties of samples that one member each sees, with gradients multiplied by the number of members.
+    """Return penalties of samples, each seen by one member only; gradients are multiplied by the number of members.
 
     Their mean is the mean of `values`. In each member the gradient of that mean is the gradient of the mean over the
     member's own samples.

@@ -97,7 +97,7 @@ class Prediction:
             return median(self.density, self.samples)
 
     def interval(self, mass: float, draws: int = DRAWS) -> Interval:
-        """Return the middle interval of probability `mass` for each real or angle, with ends of shape (batch, number).
+        """Return the central interval of probability `mass` of each real or angle, with ends of shape (batch, number).
 
         `framework.distributions.intervals` defines it.
         """
@@ -105,9 +105,9 @@ class Prediction:
             return central_interval(self.density, mass, draws)
 
     def set_size(self, sets: ValueSet) -> Tensor:
-        """Return the size of the sets that come with the densities, (batch,).
+        """Return the sizes of the prediction sets, (batch,).
 
-        A size that is drawn always uses the same draws.
+        A size that is estimated from draws always uses the same draws.
         """
         with self._draw("set"):
             return sets.size()

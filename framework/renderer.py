@@ -83,7 +83,7 @@ class Report:
 
 
 def join_scenes(scenes: Sequence[Scene]) -> Scene:
-    """Return one scene of several scenes, seen by the camera of the first; vertices and faces keep their order.
+    """Return several scenes as one scene, seen by the camera of the first; vertices and faces keep their order.
 
     A scene without colours gets white ones if another scene has colours.
 
@@ -159,7 +159,7 @@ def _join_textures(scenes: Sequence[Scene]) -> Texture | None:
 
 
 class Renderer(ABC):
-    """Draws scenes; it draws only the requested channels and what the camera can see.
+    """Base class of renderers, which draw the requested channels of a scene, and only what the camera can see.
 
     Keyword-only constructor parameters are the config. No call changes the result of a later one (a renderer may reuse
     buffers), so calls may come in any order.

@@ -62,7 +62,7 @@ class AffineDensity(Distribution):
 
     @property
     def log_volume(self) -> Tensor:
-        """Log-determinant of the map, log |det|, (*batch,), nats; log-densities are lower by it (change of variables)."""
+        """Log-determinant of the map, log |det|, (*batch,), nats, which the change of variables subtracts."""
         return self.scale.log().sum(-1)
 
     def inner(self, value: Tensor) -> Tensor:

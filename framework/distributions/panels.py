@@ -149,7 +149,7 @@ def split(panels: Panels, step: int) -> list[Panels]:
 
 
 def integrate(density: Distribution, panels: Panels) -> tuple[Tensor, Tensor]:
-    """Return ∫ p and -∫ p log p on each panel, (2, panel), and the largest difference between the two rules, (panel,)."""
+    """Return ∫ p and -∫ p log p on each panel, (2, panel), and the larger difference of both rules, (panel,)."""
     like = panels.place
     half = (panels.high - panels.low) / 2
     v = (panels.high + panels.low) / 2 + half * NODES.to(like).unsqueeze(-1)

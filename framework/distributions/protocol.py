@@ -372,7 +372,7 @@ class ValueSet(ABC):
 
     @abstractmethod
     def contains(self, value: Tensor) -> Tensor:
-        """Return true for each value (*sample, *batch, *event) that is in the set of its item, bool (*sample, *batch)."""
+        """Return true for each value (*sample, *batch, *event) in the set of its item, bool (*sample, *batch)."""
 
     @abstractmethod
     def size(self) -> Tensor:
@@ -399,7 +399,7 @@ class ValueSet(ABC):
 def value_set(density: Distribution) -> ValueSet | None:
     """Return the prediction sets of the items of the density.
 
-    Default: None, there are no sets. Structures return None too: a guarantee for a density does not hold for a mixture, a
-    power or a marginal of it. An affine transform (`affine.AffineDensity`) has the transformed sets.
+    Default: None, there are no sets. Structures return None too: a guarantee for a density does not hold for a mixture,
+    a power or a marginal of it. An affine transform (`affine.AffineDensity`) has the transformed sets.
     """
     return None

@@ -1,1 +1,1 @@
-"""Style that all figures share, drawn by metrics, data sets or reports."""
+"""Style that the figures of metrics, data sets and reports share."""

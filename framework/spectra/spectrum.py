@@ -50,7 +50,7 @@ class Parameters(NamedTuple):
 
     @property
     def second_start(self) -> tuple[float, ...]:
-        """Second start of the search."""
+        """Second start of the search, at which the search is repeated (`fit`)."""
         return tuple(ELSEWHERE.get(name, at) for name, at in zip(self.names, self.start, strict=True))
 
     @property

@@ -44,15 +44,15 @@ ALONE_IN_LEAF = 8
 
 @inlined
 @no_type_check
-def squared(x, y, z):
+def squared_length(x, y, z):
     """Return the squared length of x, y, z."""
     return fma(z, z, fma(y, y, x * x))
 
 
 @inlined
 @no_type_check
-def beside(low, high, query_low, query_high, zero):
-    """Return the distance of two intervals, 0 if they meet."""
+def interval_distance(low, high, query_low, query_high, zero):
+    """Return the distance between two intervals, 0 if they overlap."""
     return most(zero, most(low - query_high, query_low - high))
 
 
@@ -60,10 +60,10 @@ def beside(low, high, query_low, query_high, zero):
 @no_type_check
 def to_boxes(box, nodes, start, low, high, zero):
     """Return squared distances of the boxes of 16 nodes from one box."""
-    return squared(
-        beside(load(box, start), load(box, 3 * nodes + start), low[0], high[0], zero),
-        beside(load(box, nodes + start), load(box, 4 * nodes + start), low[1], high[1], zero),
-        beside(load(box, 2 * nodes + start), load(box, 5 * nodes + start), low[2], high[2], zero),
+    return squared_length(
+        interval_distance(load(box, start), load(box, 3 * nodes + start), low[0], high[0], zero),
+        interval_distance(load(box, nodes + start), load(box, 4 * nodes + start), low[1], high[1], zero),
+        interval_distance(load(box, 2 * nodes + start), load(box, 5 * nodes + start), low[2], high[2], zero),
     )
 
 
@@ -71,10 +71,14 @@ def to_boxes(box, nodes, start, low, high, zero):
 @no_type_check
 def to_box(box, nodes, node, query, zero):
     """Return squared distances of one node's box from 16 queries."""
-    return squared(
-        beside(splat(take(box, node)), splat(take(box, 3 * nodes + node)), query[0], query[0], zero),
-        beside(splat(take(box, nodes + node)), splat(take(box, 4 * nodes + node)), query[1], query[1], zero),
-        beside(
+    return squared_length(
+        interval_distance(
+            splat(take(box, node)), splat(take(box, 3 * nodes + node)), query[0], query[0], zero
+        ),
+        interval_distance(
+            splat(take(box, nodes + node)), splat(take(box, 4 * nodes + node)), query[1], query[1], zero
+        ),
+        interval_distance(
             splat(take(box, 2 * nodes + node)), splat(take(box, 5 * nodes + node)), query[2], query[2], zero
         ),
     )
@@ -84,7 +88,7 @@ def to_box(box, nodes, node, query, zero):
 @no_type_check
 def to_point(points, at, query):
     """Return squared distances of 16 queries from the point whose x is stored at `at`."""
-    return squared(
+    return squared_length(
         splat(take(points, at)) - query[0],
         splat(take(points, at + 16)) - query[1],
         splat(take(points, at + 32)) - query[2],
@@ -96,7 +100,7 @@ def to_point(points, at, query):
 def to_leaf(points, leaf, x, y, z):
     """Return squared distances of a leaf's 16 points from one query."""
     at = 64 * leaf
-    return squared(load(points, at) - x, load(points, at + 16) - y, load(points, at + 32) - z)
+    return squared_length(load(points, at) - x, load(points, at + 16) - y, load(points, at + 32) - z)
 
 
 @inlined
@@ -117,7 +121,7 @@ def nearest_bit(open_, gaps, at):
 
 @compiled
 @no_type_check
-def alone(packed, level, node, query, best, leaf, opened, gaps):
+def search_alone(packed, level, node, query, best, leaf, opened, gaps):
     """Search for one query below a node; return best squared distance, its leaf, and whether it may occur twice.
 
     The node is of the level above `level`.
@@ -284,7 +288,7 @@ def search(packed, packets, begin, end, distance, index):
                         take(queries, packet_start + i + 16),
                         take(queries, packet_start + i + 32),
                     )
-                    bests[i], leaves[i], again = alone(
+                    bests[i], leaves[i], again = search_alone(
                         packed, level - 1, node, lane_query, bests[i], np.int64(leaves[i]), opened_alone, gaps
                     )
                     ties |= np.int64(again) << i
@@ -357,7 +361,7 @@ def search_all(cloud, size, packets, begin, end, distance, index):
             gap = best
             for i in range(16):
                 gap = least(
-                    squared(
+                    squared_length(
                         splat(take(from_, at + 3 * i)) - x,
                         splat(take(from_, at + 3 * i + 1)) - y,
                         splat(take(from_, at + 3 * i + 2)) - z,
@@ -375,7 +379,7 @@ def search_all(cloud, size, packets, begin, end, distance, index):
                 take(queries, packet_start + i + 16),
                 take(queries, packet_start + i + 32),
             )
-            gap = squared(a - splat(qx), b - splat(qy), c - splat(qz))
+            gap = squared_length(a - splat(qx), b - splat(qy), c - splat(qz))
             nearest = lowest(gap)
             place = take(packets.ids, packet_start + 48 + i)
             distance[place] = np.sqrt(nearest)

@@ -159,6 +159,6 @@ def finite_points(chunk: Tensor) -> Float[Tensor, "points 3"]:
 def normalise_chunk(
     chunk: Float[Tensor, "points columns"], centre: Tensor, scale: float
 ) -> Float[Tensor, "points columns"]:
-    """Return the chunk less the centre, divided by the scale (eq. 6.2); in its dtype, with attributes unchanged."""
+    """Return the chunk minus the centre, divided by the scale (eq. 6.2); dtype and attributes are unchanged."""
     points = (chunk[:, :3].double() - centre) / scale
     return torch.cat([points.to(chunk.dtype), chunk[:, 3:]], 1)
