@@ -13,7 +13,7 @@ from benchmarks.pages import machine, write_page
 from benchmarks.rendering.rasterizer import DISTANCE, FOCAL, HEIGHT, WIDTH, figure, scene, subdivided
 from framework.geometry.camera import look_from
 from plugins.renderer.rasterizer.renderer import Rasterizer
-from plugins.renderer.rasterizer.test_coverage import Seen, total, views
+from plugins.renderer.rasterizer.test_coverage import PixelCounts, sum_counts, views
 
 CAMERAS = 10_000
 VIEWS = 40
@@ -46,7 +46,7 @@ def report() -> str:
     rows = []
     for name in ("regular", "loose"):
         chosen = [one for one in found if one[0].startswith(name)]
-        seen: Seen = total(chosen)
+        seen: PixelCounts = sum_counts(chosen)
         cells = (len(chosen), seen.inside, seen.holes, seen.doubled, seen.strays, seen.other)
         rows.append(f"| {name} | " + " | ".join(f"{cell:,}" for cell in cells) + " |")
     covered, holes, cracks = around()

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from plugins.renderer.rasterizer.sample_scenes import described, glb, packed, quad
+from plugins.renderer.rasterizer.sample_scenes import describe, glb, pack_glb, quad
 from tests.fuzz.crafted_files import HUGE, plain_png
 from tests.fuzz.damage import EXTREME, spoilt
 
@@ -17,8 +17,8 @@ def in_glb(content: bytes, random: np.random.Generator) -> bytes:
     size = int.from_bytes(content[12:16], "little")
     text, binary = content[20 : 20 + size], content[28 + size :]
     if random.random() < 0.3:
-        return packed(text, spoilt(binary, random))
-    return packed(in_gltf(text, random), binary)
+        return pack_glb(text, spoilt(binary, random))
+    return pack_glb(in_gltf(text, random), binary)
 
 
 def in_gltf(content: bytes, random: np.random.Generator) -> bytes:
@@ -43,7 +43,7 @@ def _places(value: Any) -> Iterator[tuple[Any, Any]]:
 def crafted() -> Iterator[bytes]:
     """Of small size and large promises, with references to other files, and with circles."""
     content, parts = quad()
-    whole, binary = described(content, parts)
+    whole, binary = describe(content, parts)
 
     def changed(*path: str | int, value: Any) -> bytes:
         new = copy.deepcopy(whole)
@@ -51,7 +51,7 @@ def crafted() -> Iterator[bytes]:
         for step in path[:-1]:
             place = place[step]
         place[path[-1]] = value
-        return packed(json.dumps(new).encode(), binary)
+        return pack_glb(json.dumps(new).encode(), binary)
 
     yield changed("accessors", 0, "count", value=HUGE)
     yield changed("accessors", 0, value={"componentType": 5126, "count": HUGE, "type": "VEC3"})
@@ -79,8 +79,8 @@ def crafted() -> Iterator[bytes]:
         yield changed("buffers", 0, value={"uri": address, "byteLength": 4})
     for size in ((9_000, 9_000), (65_000, 65_000), (70_000, 2)):
         yield glb(content, [*parts[:-1], plain_png(*size, rows=1)])
-    yield packed(b"[" * 10**6, b"")
-    yield packed(b'{"asset": ' * 10**5, b"")
+    yield pack_glb(b"[" * 10**6, b"")
+    yield pack_glb(b'{"asset": ' * 10**5, b"")
     yield b"glTF" + bytes(8)
 
 

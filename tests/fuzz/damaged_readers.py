@@ -157,7 +157,7 @@ def subjects() -> Iterator[Reader]:
         [*crafted.images()],
         optional=True,
     )
-    parts, binary = scenes.described(*square)
+    parts, binary = scenes.describe(*square)
     parts["buffers"][0]["uri"] = "scene.bin"
     yield Reader(  # the scene is named where bytes say nothing by themselves
         "BIN, buffers of scenes",

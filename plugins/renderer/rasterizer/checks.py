@@ -1,4 +1,4 @@
-"""Checks that a scene can be drawn, and its data as arrays that kernels read."""
+"""Checks that a scene can be drawn, and conversion of its data to the arrays that kernels read."""
 
 import math
 from collections.abc import Collection
@@ -13,26 +13,29 @@ from framework.errors import did_you_mean
 from framework.geometry.camera import Camera
 from framework.renderer import Scene, Texture
 from plugins.renderer.rasterizer import raster
-from plugins.renderer.rasterizer.canvas import Corners, Shelf
-from plugins.renderer.rasterizer.drawing import Given, Gradient
-from plugins.renderer.rasterizer.textures import FARTHEST_UV, WRAPS, Laid
+from plugins.renderer.rasterizer.canvas import Corners, MeshCache
+from plugins.renderer.rasterizer.drawing import Gradient, SceneArrays
+from plugins.renderer.rasterizer.textures import FARTHEST_UV, WRAPS, TextureArrays
 
 CHANNELS = ("color", "depth", "face", "mask", "normal", "barycentric", "uv")
-PAINTED = ("color", "uv")
+TEXTURED = ("color", "uv")
 """Channels that read a texture."""
-WHOLE = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64)
-"""Number types that indices may have."""
+INDEX_TYPES = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64)
+"""Allowed number types of indices."""
 
 
 @dataclass(frozen=True)
-class Ready:
-    """A checked scene that can be drawn.
+class CheckedScene:
+    """A scene after all checks.
 
     Attributes:
+        scene: the scene before the checks.
+        vertices, colors, texture: inputs in number types that kernels read; None if they are not drawn.
         faces: faces of the scene.
-        corners: faces of its texture.
+        corners: faces of the texture.
         lens: fx, fy, cx, cy, pixels.
-        learning: whether a gradient may be asked for.
+        near: distance of the near plane, metres.
+        needs_gradient: whether an input requires a gradient.
     """
 
     scene: Scene
@@ -43,55 +46,57 @@ class Ready:
     corners: Corners | None
     lens: np.ndarray
     near: float
-    learning: bool
+    needs_gradient: bool
 
     @property
     def uv_and_images(self) -> tuple[Tensor | None, tuple[Tensor, ...]]:
         """The texture's uv and images; None and an empty tuple without a texture."""
         return (None, ()) if self.texture is None else (self.texture.uv, self.texture.images)
 
-    def given(self, times: int, colored: bool) -> tuple[Given, Tensor]:
-        """Return the scene as arrays, with `times` samples per pixel along each axis, and the lens as a tensor.
+    def to_arrays(self, times: int, colored: bool) -> tuple[SceneArrays, Tensor]:
+        """Return the scene as arrays, and the lens as a tensor that may require a gradient.
 
-        The lens may require a gradient.
+        Args:
+            times: samples per pixel along each axis.
+            colored: whether colours are drawn.
         """
         camera = self.scene.camera
-        numbers = self.lens
-        lens = torch.from_numpy(numbers)
-        if self.learning and any(isinstance(part, Tensor) for part in (camera.focal, camera.principal)):
+        lens_array = self.lens
+        lens = torch.from_numpy(lens_array)
+        if self.needs_gradient and any(isinstance(part, Tensor) for part in (camera.focal, camera.principal)):
             parts = [torch.as_tensor(part, dtype=torch.float64) for part in (camera.focal, camera.principal)]
             lens = torch.cat(parts)
         if times > 1:  # the centre of pixel 0 is the centre of its samples
             shift = torch.tensor([0.0, 0.0, 1.0, 1.0], dtype=torch.float64)
             lens = (lens + 0.5 * shift) * times - 0.5 * shift
-            numbers = lens.detach().numpy()
-        return Given(
-            array(self.vertices),
-            array(self.colors) if colored and self.colors is not None else None,
-            array(camera.rotation).astype(np.float64),
-            array(camera.translation).astype(np.float64),
-            numbers,
-            self.laid,
+            lens_array = lens.detach().numpy()
+        return SceneArrays(
+            to_array(self.vertices),
+            to_array(self.colors) if colored and self.colors is not None else None,
+            to_array(camera.rotation).astype(np.float64),
+            to_array(camera.translation).astype(np.float64),
+            lens_array,
+            self.texture_arrays,
         ), lens
 
     @cached_property
-    def laid(self) -> Laid | None:
+    def texture_arrays(self) -> TextureArrays | None:
         """The texture in the form that kernels read; None without a texture."""
         texture, corners = self.texture, self.corners
         if texture is None or corners is None:
             return None
-        flat = [array(image).reshape(-1, image.shape[2]) for image in texture.images]
+        flat = [to_array(image).reshape(-1, image.shape[2]) for image in texture.images]
         sides = [image.shape[:2] for image in texture.images]
         starts = np.cumsum([0, *[height * width for height, width in sides]])
         images = np.array([(start, *side) for start, side in zip(starts, sides, strict=False)], np.int64)
         shown = np.zeros(len(corners.array), np.int32)
         if texture.shown is not None:
-            shown = array(texture.shown).astype(np.int32)
+            shown = to_array(texture.shown).astype(np.int32)
         texels = flat[0] if len(flat) == 1 else np.concatenate(flat)
-        return Laid(
+        return TextureArrays(
             texels,
             images.reshape(-1, 3),
-            array(texture.uv),
+            to_array(texture.uv),
             corners.array,
             shown,
             WRAPS[texture.wrap],
@@ -99,22 +104,24 @@ class Ready:
         )
 
 
-def array(tensor: Tensor) -> np.ndarray:
+def to_array(tensor: Tensor) -> np.ndarray:
     """Return a tensor as a contiguous NumPy array, without gradient."""
     return tensor.detach().contiguous().numpy()
 
 
-def ready(scene: Scene, channels: Collection[str], shelf: Shelf, gradient: Gradient) -> Ready:
-    """Return the scene, checked for these channels.
+def check_scene(
+    scene: Scene, channels: Collection[str], mesh_cache: MeshCache, gradient: Gradient
+) -> CheckedScene:
+    """Check that these channels of a scene can be drawn, and return the checked scene.
 
     Raises:
-        ValueError: the scene cannot be drawn; the message says what came and what was wanted.
+        ValueError: the scene cannot be drawn.
     """
     check_channels(channels)
     check_device("vertices", scene.vertices)
     check_device("faces", scene.faces)
-    vertices = numbers("vertices", scene.vertices, 3)
-    faces = indices("faces", scene.faces, len(vertices), "vertices", shelf)
+    vertices = checked_rows("vertices", scene.vertices, 3)
+    faces = indices("faces", scene.faces, len(vertices), "vertices", mesh_cache)
     check_device("camera.rotation", scene.camera.rotation)
     check_device("camera.translation", scene.camera.translation)
     lens = check_camera(scene.camera)
@@ -127,31 +134,32 @@ def ready(scene: Scene, channels: Collection[str], shelf: Shelf, gradient: Gradi
             check_device("colors", scene.colors)
             colors = checked_colors(scene.colors, len(vertices))
         learned.append(colors)
-    if scene.texture is not None and not set(PAINTED).isdisjoint(channels):
+    if scene.texture is not None and not set(TEXTURED).isdisjoint(channels):
         if gradient == "soft" and "color" in channels:
             raise ValueError(
-                "gradient=soft blends colours per vertex, and the scene has a texture; choose gradient=boundary, or "
-                "give colors alone."
+                "gradient=soft draws only colours of vertices, but the scene has a texture. Choose gradient=boundary, "
+                "or "
+                "remove the texture."
             )
-        for name, part in laid_parts(scene.texture).items():
+        for name, part in texture_tensors(scene.texture).items():
             check_device(name, part)
         texture = checked_texture(
             scene.texture, len(faces.array), None if colors is None else colors.shape[1]
         )
-        corners = indices("texture.faces", texture.faces, len(texture.uv), "places", shelf)
+        corners = indices("texture.faces", texture.faces, len(texture.uv), "texture coordinates", mesh_cache)
         learned += [texture.uv, *texture.images]
-    learning = torch.is_grad_enabled() and any(
+    needs_gradient = torch.is_grad_enabled() and any(
         isinstance(part, Tensor) and part.requires_grad for part in learned
     )
     near = max(float(camera.near), raster.NEAREST)
-    return Ready(scene, vertices, colors, texture, faces, corners, lens, near, learning)
+    return CheckedScene(scene, vertices, colors, texture, faces, corners, lens, near, needs_gradient)
 
 
 def check_on_device(scene: Scene, channels: Collection[str], gradient: Gradient) -> Tensor:
-    """Check a scene for `reference.picture`, whose tensors lie on one device, and return its lens there.
+    """Check a scene for `reference.render`, and return its lens (fx, fy, cx, cy) on the device of the vertices.
 
     Raises:
-        ValueError: the scene cannot be drawn; the message says what came and what was wanted.
+        ValueError: the scene cannot be drawn, or its tensors are on different devices.
     """
     check_channels(channels)
     camera, texture = scene.camera, scene.texture
@@ -163,23 +171,23 @@ def check_on_device(scene: Scene, channels: Collection[str], gradient: Gradient)
         "camera.translation": camera.translation,
     }
     if texture is not None:
-        parts |= laid_parts(texture)
+        parts |= texture_tensors(texture)
     device = scene.vertices.device
     for name, part in parts.items():
         if part is not None and part.device != device:
             raise ValueError(
-                f"{name} came on {part.device} and vertices on {device}; wanted one device for both."
+                f"{name} is on {part.device}, but vertices are on {device}. Move both to the same device."
             )
-    numbers("vertices", scene.vertices, 3)
+    checked_rows("vertices", scene.vertices, 3)
     check_indices("faces", scene.faces, len(scene.vertices), "vertices")
     check_camera(camera)
     check_paint(scene, channels)
     colors = None
     if "color" in channels and scene.colors is not None:
         colors = checked_colors(scene.colors, len(scene.vertices))
-    if texture is not None and not set(PAINTED).isdisjoint(channels):
+    if texture is not None and not set(TEXTURED).isdisjoint(channels):
         checked_texture(texture, len(scene.faces), None if colors is None else colors.shape[1])
-        check_indices("texture.faces", texture.faces, len(texture.uv), "places")
+        check_indices("texture.faces", texture.faces, len(texture.uv), "texture coordinates")
     lens = [
         torch.as_tensor(part, dtype=torch.float64, device=device) for part in (camera.focal, camera.principal)
     ]
@@ -190,100 +198,106 @@ def check_on_device(scene: Scene, channels: Collection[str], gradient: Gradient)
         and any(part is not None and part.requires_grad for part in learned)
     ):
         raise ValueError(
-            f"gradient={gradient} was asked for on {device}, where only what faces show within has a gradient; choose "
-            "gradient=interior, or give tensors on the CPU."
+            f"gradient={gradient} is not available on {device}, where only the interior of faces has a gradient. "
+            "Choose "
+            "gradient=interior, or move the scene to the CPU."
         )
     return torch.cat(lens)
 
 
 def check_channels(channels: Collection[str]) -> None:
-    """Refuse channels that the renderer does not draw."""
+    """Check that the renderer can draw these channels."""
     if isinstance(channels, str):
         raise ValueError(
-            f"channels came as the string {channels!r}; wanted a collection, e.g. ({channels!r},)."
+            f"channels is the string {channels!r}, but a collection of names is required, e.g. ({channels!r},)."
         )
     for name in channels:
         if name not in CHANNELS:
             raise ValueError(
-                f"{name!r} is no channel of rasterizer.{did_you_mean(name, CHANNELS)} "
-                f"It draws {', '.join(CHANNELS)}."
+                f"{name!r} is not a channel of rasterizer.{did_you_mean(name, CHANNELS)} "
+                f"The channels of rasterizer are {', '.join(CHANNELS)}."
             )
 
 
 def check_paint(scene: Scene, channels: Collection[str]) -> None:
-    """Refuse to draw colours of a scene that has none."""
+    """Check that the scene has colours or a texture if colours are drawn."""
     if "color" in channels and scene.colors is None and scene.texture is None:
         raise ValueError(
-            '"color" was asked of a scene without colours; give colors or a texture, or ask other channels.'
+            'the channel "color" requires a scene with colours. Give colors or a texture, or choose other channels.'
         )
 
 
 def check_device(name: str, tensor: Tensor) -> None:
-    """Refuse a tensor that is not on the CPU."""
+    """Check that a tensor is on the CPU."""
     if tensor.device.type != "cpu":
         raise ValueError(
-            f"{name} came on {tensor.device}; rasterizer draws on the CPU, or a whole scene on cuda: give {name}.cpu()."
+            f"{name} is on {tensor.device}, but rasterizer draws on the CPU, or a whole scene on cuda. Give "
+            f"{name}.cpu()."
         )
 
 
-def numbers(name: str, tensor: Tensor, columns: int | None) -> Tensor:
-    """Return rows of `columns` coordinates, or of any number of colours, in a number type that kernels read."""
+def checked_rows(name: str, tensor: Tensor, columns: int | None) -> Tensor:
+    """Return a floating-point matrix in a number type that kernels read, after checking its shape.
+
+    `columns` is the required number of columns; None for any number from 1.
+    """
     if tensor.ndim != 2 or tensor.shape[1] < 1 or (columns is not None and tensor.shape[1] != columns):
-        wanted = "channels, 1 or more" if columns is None else columns
-        raise ValueError(f"{name} came with the shape {tuple(tensor.shape)}; wanted ({name}, {wanted}).")
-    return floating(name, tensor)
+        expected = "1 or more channels" if columns is None else columns
+        raise ValueError(f"{name}: got the shape {tuple(tensor.shape)}, expected ({name}, {expected}).")
+    return to_float(name, tensor)
 
 
-def floating(name: str, tensor: Tensor) -> Tensor:
-    """Return a floating-point tensor in a number type that kernels read, float32 or float64."""
+def to_float(name: str, tensor: Tensor) -> Tensor:
+    """Return a floating-point tensor as float32 or float64, which kernels read."""
     if not tensor.is_floating_point():
-        raise ValueError(f"{name} came as {tensor.dtype}; wanted floating point, e.g. torch.float32.")
+        raise ValueError(f"{name}: got {tensor.dtype}, expected floating point, e.g. torch.float32.")
     return tensor if tensor.dtype in (torch.float32, torch.float64) else tensor.float()
 
 
 def checked_colors(colors: Tensor, count: int) -> Tensor:
-    """Return colours of `count` vertices, in a number type that kernels read."""
-    found = numbers("colors", colors, None)
-    if len(found) != count:
-        raise ValueError(f"{len(found)} colors came for {count} vertices; wanted one each.")
-    return found
+    """Return colours in a number type that kernels read, after checking that their number is `count`."""
+    checked = checked_rows("colors", colors, None)
+    if len(checked) != count:
+        raise ValueError(f"got {len(checked)} colors for {count} vertices, expected one color per vertex.")
+    return checked
 
 
-def check_corners(name: str, given: Tensor) -> None:
-    """Refuse anything but rows of three integers."""
-    if given.ndim != 2 or given.shape[1] != 3:
-        raise ValueError(f"{name} came with the shape {tuple(given.shape)}; wanted ({name}, 3).")
-    if given.dtype not in WHOLE:
-        raise ValueError(f"{name} came as {given.dtype}; wanted whole numbers, e.g. torch.int64.")
+def check_corners(name: str, face_indices: Tensor) -> None:
+    """Check that a tensor holds three integers per face."""
+    if face_indices.ndim != 2 or face_indices.shape[1] != 3:
+        raise ValueError(f"{name}: got the shape {tuple(face_indices.shape)}, expected ({name}, 3).")
+    if face_indices.dtype not in INDEX_TYPES:
+        raise ValueError(f"{name}: got {face_indices.dtype}, expected whole numbers, e.g. torch.int64.")
 
 
-def check_indices(name: str, given: Tensor, count: int, of: str) -> None:
-    """Refuse anything but rows of three indices below `count`, on any device."""
-    check_corners(name, given)
-    if given.numel() and not (int(given.min()) >= 0 and int(given.max()) < count):
-        raise ValueError(out_of_range(name, given, count, of))
+def check_indices(name: str, face_indices: Tensor, count: int, of: str) -> None:
+    """Check that a tensor on any device holds three indices from 0 to `count` - 1 per face."""
+    check_corners(name, face_indices)
+    if face_indices.numel() and not (int(face_indices.min()) >= 0 and int(face_indices.max()) < count):
+        raise ValueError(out_of_range(name, face_indices, count, of))
 
 
-def indices(name: str, given: Tensor, count: int, of: str, shelf: Shelf) -> Corners:
-    """Return checked rows of three indices below `count` on the CPU, in the form that kernels read."""
-    check_corners(name, given)
-    kept = given.dtype in (torch.int32, torch.int64)
-    found = shelf.find(array(given if kept else given.long()))
-    if given.numel() and found.largest >= count:
-        raise ValueError(out_of_range(name, given, count, of))
-    return found
+def indices(name: str, face_indices: Tensor, count: int, of: str, mesh_cache: MeshCache) -> Corners:
+    """Return face indices on the CPU in the form that kernels read, after checking that they lie below `count`."""
+    check_corners(name, face_indices)
+    readable = face_indices.dtype in (torch.int32, torch.int64)
+    corners = mesh_cache.find(to_array(face_indices if readable else face_indices.long()))
+    if face_indices.numel() and corners.largest >= count:
+        raise ValueError(out_of_range(name, face_indices, count, of))
+    return corners
 
 
-def out_of_range(name: str, given: Tensor, count: int, of: str) -> str:
-    """Return the message about indices beyond the scene's vertices or places."""
+def out_of_range(name: str, face_indices: Tensor, count: int, of: str) -> str:
+    """Return the message about indices out of range; `of` names what they refer to."""
     return (
-        f"{name} name the {of} {int(given.min())} to {int(given.max())}; wanted 0 to {count - 1}, since the scene has "
+        f"{name} refer to the {of} {int(face_indices.min())} to {int(face_indices.max())}, expected 0 to {count - 1}, "
+        "since the scene has "
         f"{count} {of}."
     )
 
 
-def laid_parts(texture: Texture) -> dict[str, Tensor]:
-    """Return the tensors of a texture, by their names in messages."""
+def texture_tensors(texture: Texture) -> dict[str, Tensor]:
+    """Return the tensors of a texture with the names that messages use for them."""
     parts = {"uv": texture.uv, "texture.faces": texture.faces}
     if texture.shown is not None:
         parts["texture.shown"] = texture.shown
@@ -291,48 +305,49 @@ def laid_parts(texture: Texture) -> dict[str, Tensor]:
 
 
 def checked_texture(texture: Texture, count: int, channels: int | None) -> Texture:
-    """Return a texture of `count` faces, in number types that kernels read, on any device.
-
-    The indices in `texture.faces` are not yet checked.
+    """Return a texture on any device in number types that kernels read, after all checks but that of `texture.faces`.
 
     Args:
         texture: the texture.
         count: number of faces of the scene.
-        channels: number of channels of the scene's vertex colours; None if it has none.
+        channels: number of channels of the scene's vertex colours; None without vertex colours.
     """
     if not texture.images:
-        raise ValueError("a texture came without images; wanted one or more.")
+        raise ValueError("got a texture without images, expected at least one image.")
     if texture.wrap not in WRAPS:
-        raise ValueError(f"wrap came as {texture.wrap!r}; wanted one of {', '.join(WRAPS)}.")
+        raise ValueError(f"got the wrap rule {texture.wrap!r}, expected one of {', '.join(WRAPS)}.")
     images = []
-    wanted = channels if channels is not None else (3, *texture.images[0].shape)[-1]
+    expected = channels if channels is not None else (3, *texture.images[0].shape)[-1]
     for image in texture.images:
-        if image.ndim != 3 or 0 in image.shape or image.shape[2] != wanted:
+        if image.ndim != 3 or 0 in image.shape or image.shape[2] != expected:
             raise ValueError(
-                f"an image of a texture came with the shape {tuple(image.shape)}; wanted (height, width, {wanted}), as "
-                "the other images and the colors have them."
+                f"image of a texture: got the shape {tuple(image.shape)}, expected (height, width, {expected}), like "
+                "the "
+                "other images and the colors."
             )
-        images.append(floating("an image of a texture", image))
+        images.append(to_float("image of a texture", image))
     if len({image.dtype for image in images}) > 1:
         images = [image.double() for image in images]
-    uv = numbers("uv", texture.uv, 2)
+    uv = checked_rows("uv", texture.uv, 2)
     if uv.numel() and not bool((uv.detach().abs() <= FARTHEST_UV).all()):
         raise ValueError(
-            f"uv holds a number that is not finite, or beyond {FARTHEST_UV:g}; wanted places near 0 to 1."
+            f"uv has a number that is not finite or is beyond {FARTHEST_UV:g}; texture coordinates should be near 0 "
+            "to 1."
         )
     check_corners("texture.faces", texture.faces)
     shown = texture.shown
     if len(texture.faces) != count or (shown is not None and shown.shape != (count,)):
         raise ValueError(
-            f"texture.faces came for {len(texture.faces)} faces"
-            + ("" if shown is None else f" and texture.shown with the shape {tuple(shown.shape)}")
-            + f"; wanted {count}, since the scene has {count} faces."
+            f"texture.faces has {len(texture.faces)} faces"
+            + ("" if shown is None else f" and texture.shown has the shape {tuple(shown.shape)}")
+            + f", expected {count} for both, since the scene has {count} faces."
         )
-    if shown is not None and shown.dtype not in WHOLE:
-        raise ValueError(f"texture.shown came as {shown.dtype}; wanted whole numbers, e.g. torch.int64.")
+    if shown is not None and shown.dtype not in INDEX_TYPES:
+        raise ValueError(f"texture.shown: got {shown.dtype}, expected whole numbers, e.g. torch.int64.")
     if shown is not None and count and not (int(shown.min()) >= -1 and int(shown.max()) < len(images)):
         raise ValueError(
-            f"texture.shown names the images {int(shown.min())} to {int(shown.max())}; wanted -1 to {len(images) - 1}."
+            f"texture.shown refers to the images {int(shown.min())} to {int(shown.max())}, expected -1 to "
+            f"{len(images) - 1}."
         )
     return Texture(tuple(images), uv, texture.faces, shown, texture.wrap, texture.smooth)
 
@@ -341,7 +356,7 @@ def check_camera(camera: Camera) -> np.ndarray:
     """Check a camera and return its lens, (fx, fy, cx, cy), float64."""
     for name, side in (("height", camera.height), ("width", camera.width)):
         if not 1 <= side <= 2**16:
-            raise ValueError(f"camera.{name} = {side}; wanted 1 to {2**16} pixels.")
+            raise ValueError(f"camera.{name} is {side}, expected 1 to {2**16} pixels.")
     camera.check_shapes()
     for name in ("rotation", "translation", "focal", "principal"):
         part = getattr(camera, name)
@@ -355,6 +370,6 @@ def check_camera(camera: Camera) -> np.ndarray:
     everything = (*lens, *camera.rotation.reshape(-1).tolist(), *camera.translation.tolist())
     if not all(map(math.isfinite, everything)) or not 0 < camera.near < math.inf or min(lens[:2]) <= 0:
         raise ValueError(
-            f"camera holds a number that is not finite, or a focal or near that is not above 0: {camera}."
+            f"the camera has a number that is not finite, or a focal or near that is not above 0: {camera}."
         )
     return np.array(lens)

@@ -1,4 +1,4 @@
-"""One image of one scene as a differentiable operation on tensors, with compiled forward and backward kernels."""
+"""Drawing of one image as a differentiable operation on tensors, with compiled forward and backward kernels."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -12,24 +12,24 @@ from torch.autograd.function import once_differentiable
 from framework.renderer import Report
 from plugins.renderer.rasterizer import nmr, raster, shading, soft
 from plugins.renderer.rasterizer.boundary import boundary
-from plugins.renderer.rasterizer.canvas import Box, Canvas, Corners, Lease
-from plugins.renderer.rasterizer.clipping import clipped
-from plugins.renderer.rasterizer.interior import interior, of_the_world
-from plugins.renderer.rasterizer.textures import Laid
+from plugins.renderer.rasterizer.canvas import Box, Canvas, CanvasLease, Corners
+from plugins.renderer.rasterizer.clipping import clip
+from plugins.renderer.rasterizer.interior import interior, transform_to_world
+from plugins.renderer.rasterizer.textures import TextureArrays
 
 Gradient = Literal["boundary", "interior", "nmr", "soft"]
 Saving = Literal["view", "box", "hidden", "unchanged"]
-NUMBERS = {"normal": 3, "barycentric": 3, "uv": 2}
+CHANNEL_SIZES = {"normal": 3, "barycentric": 3, "uv": 2}
 STEEPEST = 1e37
-"""Largest absolute value of a gradient, such that float32 holds it and sums of a few.
+"""Largest absolute value of a gradient; float32 can hold sums of a few such values.
 
-Steeper gradients, where faces almost touch the camera, are clamped to this value.
+Larger gradients, which occur if faces almost touch the camera, are clamped to this value.
 """
 
 
 @dataclass(frozen=True)
-class View:
-    """Settings of an image apart from the inputs that have a gradient; plain numbers.
+class DrawingSettings:
+    """Settings of an image: all inputs that have no gradient.
 
     Attributes:
         faces: faces of the scene.
@@ -37,10 +37,10 @@ class View:
         size: (height, width), pixels.
         cull: leave out faces seen from behind.
         channels: channels to draw, in this order.
-        gradient: see `Rasterizer`; "soft" draws another image.
+        gradient: kind of gradient, see `Rasterizer`; "soft" also changes the image.
         softness: σ and γ of "soft".
         savings: work that may be left out, see `Rasterizer`.
-        once: whether a pixel is one sample, and not the mean of several.
+        single_sample: True if a pixel is one sample, False if it is the mean of several samples.
     """
 
     faces: Corners
@@ -51,21 +51,21 @@ class View:
     gradient: Gradient
     softness: tuple[float, float]
     savings: frozenset[Saving]
-    once: bool = True
+    single_sample: bool = True
 
     @property
-    def blended(self) -> bool:
-        """True if the colour is that of `soft`."""
+    def uses_soft(self) -> bool:
+        """True if `soft` draws the colours."""
         return "color" in self.channels and self.gradient == "soft"
 
 
 @dataclass(frozen=True)
-class Given:
-    """Inputs of an image that have a gradient, and the whole texture, as arrays.
+class SceneArrays:
+    """Inputs of an image that have a gradient, and the texture, as arrays.
 
     Attributes:
         lens: fx, fy, cx, cy, pixels.
-        laid: the texture; its texels are those of all images.
+        texture: the texture, with the texels of all its images.
     """
 
     vertices: np.ndarray
@@ -73,170 +73,194 @@ class Given:
     rotation: np.ndarray
     translation: np.ndarray
     lens: np.ndarray
-    laid: Laid | None
+    texture: TextureArrays | None
 
     @property
-    def paints(self) -> int:
-        """Number of channels of a colour."""
-        return self.colors.shape[1] if self.colors is not None else cast(Laid, self.laid).texels.shape[1]
+    def color_channels(self) -> int:
+        """Number of colour channels."""
+        return (
+            self.colors.shape[1]
+            if self.colors is not None
+            else cast(TextureArrays, self.texture).texels.shape[1]
+        )
 
 
 @dataclass
-class Drawn:
+class RenderedImage:
     """An image and the data that its gradient reads.
 
     Attributes:
-        channels: the channels that were asked for.
+        channels: the requested channels.
+        report: counts of drawn and omitted faces.
+        lease: the canvas of the image.
         box: part of the canvas that may show a face.
-        blend: unrounded colours where the gradient is "soft" and something is in view.
+        soft_image: colours before rounding to float32, if the gradient is "soft" and something is in view.
     """
 
     channels: dict[str, Tensor]
     report: Report
-    lease: Lease
+    lease: CanvasLease
     box: Box
-    blend: soft.Blend | None
+    soft_image: soft.SoftImage | None
 
 
-def draw(given: Given, view: View, pool: list[Canvas], learning: bool) -> Drawn:
-    """Return the channels of a view; `learning` keeps what the gradient needs."""
-    lease = Lease(pool)
-    canvas, (height, width), faces = lease.canvas, view.size, view.faces.array
-    numbers = outputs(given, view)
-    counts, box, blend = np.zeros(len(raster.REASONS) + 1, np.int64), (height, 0, width, 0), None
+def draw(scene: SceneArrays, settings: DrawingSettings, pool: list[Canvas], learning: bool) -> RenderedImage:
+    """Draw the channels of an image; `learning` also prepares the data that the gradient needs."""
+    lease = CanvasLease(pool)
+    canvas, (height, width), faces = lease.canvas, settings.size, settings.faces.array
+    numbers = allocate_channels(scene, settings)
+    counts, box, soft_image = np.zeros(len(raster.REASONS) + 1, np.int64), (height, 0, width, 0), None
     reused: set[str] = set()
-    if out_of_view(given, view):
+    if is_out_of_view(scene, settings):
         counts[raster.OUTSIDE] = len(faces)
     else:
-        if placed(given, view, canvas):
+        if place_vertices(scene, settings, canvas):
             reused.add("places")
-        if view.blended and given.colors is not None:
-            seen = (canvas.seen, canvas.screen, faces, given.colors, given.lens)
-            blend = soft.blend(*seen, view.cull, view.size, *view.softness, counts)
-            numbers["color"][:] = blend.color
-        exact = set(numbers) - {"color"} if view.blended else set(numbers)
+        if settings.uses_soft and scene.colors is not None:
+            surface = (canvas.camera_points, canvas.screen, faces, scene.colors, scene.lens)
+            soft_image = soft.render(*surface, settings.cull, settings.size, *settings.softness, counts)
+            numbers["color"][:] = soft_image.color
+        exact = set(numbers) - {"color"} if settings.uses_soft else set(numbers)
         if learning and "depth" in numbers:
-            exact.add("face")  # the gradient of a depth needs the visible faces
-        if exact and canvas.has(view.faces, view.cull, view.size):
+            exact.add("face")  # the gradient of depth needs the visible faces
+        if exact and canvas.shows(settings.faces, settings.cull, settings.size):
             reused.add("faces")
             box, counts = canvas.box, canvas.counts
         elif exact:
             counts.fill(0)
-            alone = numbers["mask"] if exact == {"mask"} else None
-            box = rasterised(given, view, canvas, alone, counts)
-        if "box" not in view.savings:
+            mask_only = numbers["mask"] if exact == {"mask"} else None
+            box = rasterise_faces(scene, settings, canvas, mask_only, counts)
+        if "box" not in settings.savings:
             box = (0, height, 0, width)
-        if exact and canvas.has(view.faces, view.cull, view.size):
-            fill(given, view, canvas, numbers, box)
-    left_out = {name: int(counts[place]) for place, name in raster.REASONS.items() if counts[place]}
+        if exact and canvas.shows(settings.faces, settings.cull, settings.size):
+            fill_channels(scene, settings, canvas, numbers, box)
+    left_out = {name: int(counts[reason]) for reason, name in raster.REASONS.items() if counts[reason]}
     visited = max(box[1] - box[0], 0) * max(box[3] - box[2], 0)
-    told = frozenset(reused)
-    report = Report(len(faces), int(counts[raster.DRAWN]), left_out, visited, told, frozenset(numbers))
+    reused_names = frozenset(reused)
+    report = Report(
+        len(faces), int(counts[raster.DRAWN]), left_out, visited, reused_names, frozenset(numbers)
+    )
     channels = {name: torch.from_numpy(array) for name, array in numbers.items()}
-    return Drawn(channels, report, lease, box, blend)
+    return RenderedImage(channels, report, lease, box, soft_image)
 
 
-def out_of_view(given: Given, view: View) -> bool:
-    """Return whether there is nothing to draw; false also where `savings` does not include this test."""
-    if len(view.faces.array) == 0:
+def is_out_of_view(scene: SceneArrays, settings: DrawingSettings) -> bool:
+    """Return whether all vertices are out of view; always False if `savings` does not include "view"."""
+    if len(settings.faces.array) == 0:
         return True
-    if "view" not in view.savings:
+    if "view" not in settings.savings:
         return False
-    height, width = view.size
-    margin = soft.reach(view.softness[0], view.size) if view.blended else 0.0
-    edges = (view.near, height + 2 * margin, width + 2 * margin)
-    pose = (given.rotation, given.translation, given.lens[:2], given.lens[2:] + margin)
-    return bool(raster.out_of_view(given.vertices, *pose, *edges))
+    height, width = settings.size
+    margin = soft.blur_margin(settings.softness[0], settings.size) if settings.uses_soft else 0.0
+    edges = (settings.near, height + 2 * margin, width + 2 * margin)
+    pose = (scene.rotation, scene.translation, scene.lens[:2], scene.lens[2:] + margin)
+    return bool(raster.is_out_of_view(scene.vertices, *pose, *edges))
 
 
-def placed(given: Given, view: View, canvas: Canvas) -> bool:
-    """Put the vertices on the canvas, and return whether they were there already."""
-    if "unchanged" not in view.savings:
+def place_vertices(scene: SceneArrays, settings: DrawingSettings, canvas: Canvas) -> bool:
+    """Project the vertices onto the canvas; return whether the canvas already held the same projection."""
+    if "unchanged" not in settings.savings:
         canvas.forget()
-    pose = np.concatenate([given.rotation.ravel(), given.translation, given.lens, [view.near]])
-    if canvas.placed(given.vertices, pose):
+    pose = np.concatenate([scene.rotation.ravel(), scene.translation, scene.lens, [settings.near]])
+    if canvas.update_pose(scene.vertices, pose):
         return True
-    lens = (given.lens[:2], given.lens[2:])
-    place = (given.vertices, given.rotation, given.translation, *lens, view.near)
-    canvas.cut = raster.project(*place, canvas.seen, canvas.screen)
+    lens = (scene.lens[:2], scene.lens[2:])
+    inputs = (scene.vertices, scene.rotation, scene.translation, *lens, settings.near)
+    canvas.cut = raster.project(*inputs, canvas.camera_points, canvas.screen)
     return False
 
 
-def outputs(given: Given, view: View) -> dict[str, np.ndarray]:
-    """Return arrays for the channels, filled with the background."""
-    made: dict[str, np.ndarray] = {}
-    for name in view.channels:
+def allocate_channels(scene: SceneArrays, settings: DrawingSettings) -> dict[str, np.ndarray]:
+    """Return an array for each channel, filled with the background."""
+    arrays: dict[str, np.ndarray] = {}
+    for name in settings.channels:
         if name == "face":
-            made[name] = np.full(view.size, -1, np.int32)
+            arrays[name] = np.full(settings.size, -1, np.int32)
         elif name == "depth":
-            made[name] = np.full(view.size, np.inf, np.float32)
+            arrays[name] = np.full(settings.size, np.inf, np.float32)
         elif name == "mask":
-            made[name] = np.zeros(view.size, np.bool_)
+            arrays[name] = np.zeros(settings.size, np.bool_)
         else:
-            # Fresh zeros cost nothing until they are touched, and pixels that no face covers are never touched.
-            made[name] = np.zeros((*view.size, NUMBERS.get(name) or given.paints), np.float32)
-    return made
+            # the system provides zeros at first access, and pixels without a face are never accessed
+            arrays[name] = np.zeros(
+                (*settings.size, CHANNEL_SIZES.get(name) or scene.color_channels), np.float32
+            )
+    return arrays
 
 
-def rasterised(given: Given, view: View, canvas: Canvas, alone: np.ndarray | None, counts: np.ndarray) -> Box:
-    """Draw all faces on the canvas, or into a mask alone, and count what happens to them.
+def rasterise_faces(
+    scene: SceneArrays,
+    settings: DrawingSettings,
+    canvas: Canvas,
+    mask_only: np.ndarray | None,
+    counts: np.ndarray,
+) -> Box:
+    """Draw all faces on the canvas, or only into a mask, and add to `counts` as `raster.rasterise` does.
 
-    Faces that the near plane cuts are drawn too.
+    The visible parts of faces that the near plane cuts are also drawn.
     """
-    faces, box = view.faces.array, (view.size[0], 0, view.size[1], 0)
+    faces, box = settings.faces.array, (settings.size[0], 0, settings.size[1], 0)
     tiles = None
-    if alone is None:
-        canvas.cleared(view.size)
-        tiles = canvas.empty_tiles() if "hidden" in view.savings else None
-    arrays = (canvas.depth, canvas.face, None) if alone is None else (None, None, alone)
+    if mask_only is None:
+        canvas.clear(settings.size)
+        tiles = canvas.empty_tiles() if "hidden" in settings.savings else None
+    arrays = (canvas.depth, canvas.face, None) if mask_only is None else (None, None, mask_only)
     cut = 0
-    if canvas.cut:  # faces that the near plane cuts are near and hide later faces, so they are drawn first
-        corners, parts, numbers = clipped(canvas.seen, faces, given.lens[:2], given.lens[2:], view.near)
+    if canvas.cut:  # cut faces are near and hide many others, so they are drawn first
+        corners, parts, numbers = clip(
+            canvas.camera_points, faces, scene.lens[:2], scene.lens[2:], settings.near
+        )
         if len(parts):
-            known = tiles or (None, None, None)
-            box = raster.rasterise(corners, parts, 0, numbers, view.cull, *view.size, *arrays, *known, counts)
+            tiles_or_none = tiles or (None, None, None)
+            box = raster.rasterise(
+                corners, parts, 0, numbers, settings.cull, *settings.size, *arrays, *tiles_or_none, counts
+            )
             cut = int(counts[raster.DRAWN])
             counts.fill(0)
     if tiles is not None:
-        drawn_in = (canvas.depth, canvas.face, *tiles)
-        rest = raster.front_to_back(canvas.screen, faces, view.cull, *view.size, *drawn_in, counts)
+        targets = (canvas.depth, canvas.face, *tiles)
+        rest = raster.front_to_back(canvas.screen, faces, settings.cull, *settings.size, *targets, counts)
     else:
-        nothing = (None, None, None)
+        no_tiles = (None, None, None)
         rest = raster.rasterise(
-            canvas.screen, faces, 0, None, view.cull, *view.size, *arrays, *nothing, counts
+            canvas.screen, faces, 0, None, settings.cull, *settings.size, *arrays, *no_tiles, counts
         )
     counts[raster.DRAWN] += cut
     counts[raster.BEHIND] -= cut
     box = (min(box[0], rest[0]), max(box[1], rest[1]), min(box[2], rest[2]), max(box[3], rest[3]))
-    if alone is None:
-        canvas.shows(view.faces, view.cull, box, counts)
+    if mask_only is None:
+        canvas.record_mesh(settings.faces, settings.cull, box, counts)
     return box
 
 
-def fill(given: Given, view: View, canvas: Canvas, numbers: dict[str, np.ndarray], box: Box) -> None:
-    """Fill the channels from the visible faces."""
+def fill_channels(
+    scene: SceneArrays, settings: DrawingSettings, canvas: Canvas, numbers: dict[str, np.ndarray], box: Box
+) -> None:
+    """Fill the channels, except soft colours, from the visible faces."""
     top, bottom, left, right = box
     part = (slice(top, bottom), slice(left, right))
     if "face" in numbers:
         numbers["face"][part] = canvas.face[part]
     if "mask" in numbers:
         np.greater_equal(canvas.face[part], 0, out=numbers["mask"][part])
-    places = (canvas.seen, canvas.screen)
-    faces, visible = view.faces.array, (canvas.face, box)
-    color, depth = None if view.blended else numbers.get("color"), numbers.get("depth")
+    vertices = (canvas.camera_points, canvas.screen)
+    faces, visible = settings.faces.array, (canvas.face, box)
+    color, depth = None if settings.uses_soft else numbers.get("color"), numbers.get("depth")
     if color is not None or depth is not None:
-        painted = (given.colors, given.laid) if color is not None else (None, None)
-        shading.shade(*places, faces, *painted, given.lens, view.near, *visible, color, depth)
+        paint = (scene.colors, scene.texture) if color is not None else (None, None)
+        shading.shade(*vertices, faces, *paint, scene.lens, settings.near, *visible, color, depth)
     if not {"normal", "barycentric", "uv"}.isdisjoint(numbers):
-        asked = [numbers.get(name) for name in ("normal", "barycentric", "uv")]
-        shading.inform(*places, given.vertices, faces, given.laid, given.lens, *visible, *asked)
+        channels = [numbers.get(name) for name in ("normal", "barycentric", "uv")]
+        shading.fill_surface_channels(
+            *vertices, scene.vertices, faces, scene.texture, scene.lens, *visible, *channels
+        )
 
 
-class Picture(torch.autograd.Function):
-    """The differentiable channels, in the view's order, of all inputs that have a gradient.
+class DrawImage(torch.autograd.Function):
+    """Autograd function from the inputs that have a gradient to the channels, in the order of the settings.
 
-    These are vertices, colours, rotation, translation, lens (fx, fy, cx, cy), uv and images. `made` receives the
-    report.
+    The inputs are vertices, colours, rotation, translation, lens (fx, fy, cx, cy), uv and texture images. The report is
+    appended to `reports`.
     """
 
     @staticmethod
@@ -248,145 +272,192 @@ class Picture(torch.autograd.Function):
         translation: Tensor,
         lens: Tensor,
         uv: Tensor | None,
-        given: Given,
-        view: View,
+        scene: SceneArrays,
+        settings: DrawingSettings,
         pool: list[Canvas],
-        made: list[Report],
+        reports: list[Report],
         *images: Tensor,
     ) -> tuple[Tensor, ...]:
-        drawn = draw(given, view, pool, learning=True)
-        made.append(drawn.report)
+        rendered = draw(scene, settings, pool, learning=True)
+        reports.append(rendered.report)
         ctx.set_materialize_grads(False)
-        ctx.given, ctx.view = given, view
-        ctx.drawn = replace(drawn, channels={})  # an image that refers to itself would never be freed
+        ctx.scene, ctx.settings = scene, settings
+        ctx.rendered = replace(rendered, channels={})  # an image that refers to itself would never be freed
         ctx.color = None
-        if view.gradient == "nmr" and "color" in drawn.channels:
-            ctx.color = drawn.channels["color"].numpy().copy()
+        if settings.gradient == "nmr" and "color" in rendered.channels:
+            ctx.color = rendered.channels["color"].numpy().copy()
         learned = (vertices, colors, rotation, translation, lens, uv)
-        # torch then refuses a gradient of inputs that were changed in place in the meantime
+        # torch then raises an error if inputs were changed in place before the backward pass
         ctx.save_for_backward(*[part for part in (*learned, *images) if part is not None])
         ctx.types = [None if part is None else part.dtype for part in learned]
         ctx.images = [(image.shape, image.dtype) for image in images]
         ctx.mark_non_differentiable(
-            *[part for name, part in drawn.channels.items() if name not in ("color", "depth")]
+            *[part for name, part in rendered.channels.items() if name not in ("color", "depth")]
         )
-        return tuple(drawn.channels.values())
+        return tuple(rendered.channels.values())
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *along: Tensor | None) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, *grad_channels: Tensor | None) -> tuple[Tensor | None, ...]:
         _ = ctx.saved_tensors
-        slopes = {
+        image_gradients = {
             name: slope.contiguous().numpy()
-            for name, slope in zip(ctx.view.channels, along, strict=True)
+            for name, slope in zip(ctx.settings.channels, grad_channels, strict=True)
             if slope is not None and name in ("color", "depth")
         }
-        asked = ctx.needs_input_grad
-        found = backward(ctx.given, ctx.view, ctx.drawn, ctx.color, slopes, asked[:6], any(asked[10:]))
-        *first, of_texels = found
+        needs_gradient = ctx.needs_input_grad
+        gradients = backward(
+            ctx.scene,
+            ctx.settings,
+            ctx.rendered,
+            ctx.color,
+            image_gradients,
+            needs_gradient[:6],
+            any(needs_gradient[10:]),
+        )
+        *first, grad_texels = gradients
         parts = [
-            slopes_as(part, kind) if wanted and part is not None else None
-            for part, kind, wanted in zip(first, ctx.types, asked, strict=False)
+            to_gradient_tensor(part, kind) if wanted and part is not None else None
+            for part, kind, wanted in zip(first, ctx.types, needs_gradient, strict=False)
         ]
-        return *parts, None, None, None, None, *of_images(of_texels, ctx.images)
+        return *parts, None, None, None, None, *split_by_image(grad_texels, ctx.images)
 
 
-def slopes_as(found: np.ndarray, kind: torch.dtype) -> Tensor:
-    """Return a gradient as a tensor of the input's number type, clamped to STEEPEST."""
-    return torch.from_numpy(found).clamp_(-STEEPEST, STEEPEST).to(kind)
+def to_gradient_tensor(gradient: np.ndarray, kind: torch.dtype) -> Tensor:
+    """Return a gradient as a tensor of the given number type, clamped to ±`STEEPEST`."""
+    return torch.from_numpy(gradient).clamp_(-STEEPEST, STEEPEST).to(kind)
 
 
-def of_images(
-    of_texels: np.ndarray | None, images: Sequence[tuple[torch.Size, torch.dtype]]
+def split_by_image(
+    grad_texels: np.ndarray | None, images: Sequence[tuple[torch.Size, torch.dtype]]
 ) -> list[Tensor | None]:
     """Split the gradient of all texels into one gradient per image."""
-    found, start = [], 0
+    gradients, start = [], 0
     for shape, kind in images:
         count = shape[0] * shape[1]
-        if of_texels is None:
-            found.append(None)
+        if grad_texels is None:
+            gradients.append(None)
         else:
-            found.append(slopes_as(of_texels[start : start + count], kind).reshape(shape))
+            gradients.append(to_gradient_tensor(grad_texels[start : start + count], kind).reshape(shape))
         start += count
-    return found
+    return gradients
 
 
 def backward(
-    given: Given,
-    view: View,
-    drawn: Drawn,
+    scene: SceneArrays,
+    settings: DrawingSettings,
+    rendered: RenderedImage,
     color: np.ndarray | None,
-    slopes: dict[str, np.ndarray],
-    asked: Sequence[bool],
-    of_images: bool,
+    image_gradients: dict[str, np.ndarray],
+    needs_gradient: Sequence[bool],
+    texels_need_gradient: bool,
 ) -> tuple[np.ndarray | None, ...]:
-    """Return gradients in vertices, colours, rotation, translation, lens, uv and texels, float64.
+    """Return the gradients with respect to vertices, colours, rotation, translation, lens, uv and texels, float64.
 
-    A gradient that was not asked for is None, or is returned where it was computed anyway. `color` is the image, for
-    the kinds of gradient that read it.
+    Args:
+        scene: inputs of the image.
+        settings: settings of the image.
+        rendered: the image.
+        color: colours of the image; needed only for gradient "nmr".
+        image_gradients: gradients of the loss with respect to "color" and "depth".
+        needs_gradient: whether vertices, colours, rotation, translation, lens and uv need a gradient. The gradient of
+            an input that needs none may be None.
+        texels_need_gradient: whether the texels need a gradient.
     """
-    canvas, laid, vertices = drawn.lease.canvas, given.laid, given.vertices
-    moving = any((asked[0], asked[2], asked[3], asked[4]))
-    of_colors = np.zeros(given.colors.shape) if asked[1] and given.colors is not None else None
-    of_uv = np.zeros(laid.uv.shape) if asked[5] and laid is not None else None
-    of_texels = np.zeros(laid.texels.shape) if of_images and laid is not None else None
-    of_vertices, of_rotation, of_translation = np.zeros(vertices.shape), np.zeros((3, 3)), np.zeros(3)
-    of_lens = np.zeros(4) if moving else None
-    if drawn.box[0] < drawn.box[1] or drawn.blend is not None:
-        of_seen = np.zeros(canvas.seen.shape) if moving else None
-        to_camera(given, view, drawn, color, slopes, of_seen, of_lens, of_colors, of_texels, of_uv)
-        if of_seen is not None:
-            of_the_world(vertices, given.rotation, of_seen, of_vertices, of_rotation, of_translation)
-    return of_vertices, of_colors, of_rotation, of_translation, of_lens, of_uv, of_texels
+    canvas, texture, vertices = rendered.lease.canvas, scene.texture, scene.vertices
+    moving = any((needs_gradient[0], needs_gradient[2], needs_gradient[3], needs_gradient[4]))
+    grad_colors = np.zeros(scene.colors.shape) if needs_gradient[1] and scene.colors is not None else None
+    grad_uv = np.zeros(texture.uv.shape) if needs_gradient[5] and texture is not None else None
+    grad_texels = np.zeros(texture.texels.shape) if texels_need_gradient and texture is not None else None
+    grad_vertices, grad_rotation, grad_translation = np.zeros(vertices.shape), np.zeros((3, 3)), np.zeros(3)
+    grad_lens = np.zeros(4) if moving else None
+    if rendered.box[0] < rendered.box[1] or rendered.soft_image is not None:
+        grad_points = np.zeros(canvas.camera_points.shape) if moving else None
+        add_gradients(
+            scene,
+            settings,
+            rendered,
+            color,
+            image_gradients,
+            grad_points,
+            grad_lens,
+            grad_colors,
+            grad_texels,
+            grad_uv,
+        )
+        if grad_points is not None:
+            transform_to_world(
+                vertices, scene.rotation, grad_points, grad_vertices, grad_rotation, grad_translation
+            )
+    return grad_vertices, grad_colors, grad_rotation, grad_translation, grad_lens, grad_uv, grad_texels
 
 
-def to_camera(
-    given: Given,
-    view: View,
-    drawn: Drawn,
+def add_gradients(
+    scene: SceneArrays,
+    settings: DrawingSettings,
+    rendered: RenderedImage,
     color: np.ndarray | None,
-    slopes: dict[str, np.ndarray],
-    of_seen: np.ndarray | None,
-    of_lens: np.ndarray | None,
-    of_colors: np.ndarray | None,
-    of_texels: np.ndarray | None,
-    of_uv: np.ndarray | None,
+    image_gradients: dict[str, np.ndarray],
+    grad_points: np.ndarray | None,
+    grad_lens: np.ndarray | None,
+    grad_colors: np.ndarray | None,
+    grad_texels: np.ndarray | None,
+    grad_uv: np.ndarray | None,
 ) -> None:
-    """Add the gradients in camera coordinates, lens, colours and texture, by the kind of gradient."""
-    canvas, lens, colors, laid = drawn.lease.canvas, given.lens, given.colors, given.laid
-    along_color, along_depth = slopes.get("color"), slopes.get("depth")
-    faces = view.faces.array
+    """Add the gradients to the arrays `grad_*`, by the method that `settings.gradient` names.
+
+    `grad_points` is the gradient with respect to the vertices in camera coordinates.
+    """
+    canvas, lens, colors, texture = rendered.lease.canvas, scene.lens, scene.colors, scene.texture
+    grad_image, grad_depth = image_gradients.get("color"), image_gradients.get("depth")
+    faces = settings.faces.array
     surface = (
-        canvas.seen,
+        canvas.camera_points,
         canvas.screen,
         faces,
         colors,
-        laid,
+        texture,
         lens,
         canvas.face,
-        drawn.box,
+        rendered.box,
         canvas.scratch(len(faces)),
     )
-    of_paint = (of_colors, of_texels, of_uv)
-    visible = drawn.box[0] < drawn.box[1]
-    if view.gradient in ("nmr", "soft"):
-        if visible and along_depth is not None:
-            interior(*surface, None, along_depth, of_seen, of_lens, None, None, None)
-        if along_color is not None and drawn.blend is not None and colors is not None:
+    grad_paint = (grad_colors, grad_texels, grad_uv)
+    visible = rendered.box[0] < rendered.box[1]
+    if settings.gradient in ("nmr", "soft"):
+        if visible and grad_depth is not None:
+            interior(*surface, None, grad_depth, grad_points, grad_lens, None, None, None)
+        if grad_image is not None and rendered.soft_image is not None and colors is not None:
             sums = (
-                np.zeros(shape) if of is None else of
-                for of, shape in ((of_seen, canvas.seen.shape), (of_colors, colors.shape), (of_lens, (4,)))
+                np.zeros(shape) if gradient is None else gradient
+                for gradient, shape in (
+                    (grad_points, canvas.camera_points.shape),
+                    (grad_colors, colors.shape),
+                    (grad_lens, (4,)),
+                )
             )
-            soft.slopes(canvas.seen, faces, colors, lens, drawn.blend, along_color, *sums)
-        elif along_color is not None and visible and view.gradient == "nmr":
-            # inside of faces, "nmr" has gradients in colours and textures only
-            interior(*surface, along_color, None, None, None, *of_paint)
-            if of_seen is not None and of_lens is not None and color is not None:
-                picture = (canvas.face, color, along_color)
-                nmr.sweeps(canvas.seen, canvas.screen, faces, lens, *picture, of_seen, of_lens)
+            soft.add_gradients(
+                canvas.camera_points, faces, colors, lens, rendered.soft_image, grad_image, *sums
+            )
+        elif grad_image is not None and visible and settings.gradient == "nmr":
+            # inside of faces, "nmr" has gradients with respect to colours and textures only
+            interior(*surface, grad_image, None, None, None, *grad_paint)
+            if grad_points is not None and grad_lens is not None and color is not None:
+                image = (canvas.face, color, grad_image)
+                nmr.add_edge_gradients(
+                    canvas.camera_points, canvas.screen, faces, lens, *image, grad_points, grad_lens
+                )
     elif visible:
-        interior(*surface, along_color, along_depth, of_seen, of_lens, *of_paint)
-        if view.gradient == "boundary" and along_color is not None and of_seen is not None:
-            edges = (canvas.seen, canvas.screen, faces, view.faces.beside, colors, laid, lens)
-            picture = (canvas.face, canvas.depth, drawn.box, view.once)
-            boundary(*edges, *picture, along_color, of_seen, of_lens)
+        interior(*surface, grad_image, grad_depth, grad_points, grad_lens, *grad_paint)
+        if settings.gradient == "boundary" and grad_image is not None and grad_points is not None:
+            edges = (
+                canvas.camera_points,
+                canvas.screen,
+                faces,
+                settings.faces.adjacent,
+                colors,
+                texture,
+                lens,
+            )
+            image = (canvas.face, canvas.depth, rendered.box, settings.single_sample)
+            boundary(*edges, *image, grad_image, grad_points, grad_lens)

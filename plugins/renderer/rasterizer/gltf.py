@@ -1,6 +1,6 @@
 """Reader of glTF 2.0 (Khronos, 2021) files, .gltf and .glb: surfaces, base colours and positions.
 
-Light that materials reflect, animations and cameras are not read.
+Other material properties, animations, lights and cameras are not read.
 """
 
 from collections.abc import Iterable, Iterator
@@ -17,133 +17,142 @@ from framework.errors import DataError, quote, shorten
 from framework.renderer import Wrap
 from framework.storage.limits import MOST_JOINT_SETS, MOST_PARTS
 from framework.storage.reading import translate_errors
-from plugins.renderer.rasterizer.gltf_document import WIDTHS, Document, numbers, opened, whole
-from plugins.renderer.rasterizer.parts import Part, Subject, drawn_without, subject
+from plugins.renderer.rasterizer.gltf_document import (
+    WIDTHS,
+    Document,
+    open_document,
+    to_numbers,
+    whole_number,
+)
+from plugins.renderer.rasterizer.parts import Part, Subject, find_beside, join_parts
 
 WRAPS: dict[int, Wrap] = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
 NEAREST = 9728
-UNDERSTOOD = (
+SUPPORTED = (
     "EXT_texture_webp",
     "KHR_lights_punctual",
     "KHR_materials_",  # all of them change how light is reflected
     "KHR_mesh_quantization",
     "KHR_texture_transform",
 )
-"""Extensions that a file may require, or the beginnings of their names."""
+"""Names, or beginnings of names, of the extensions that a file may require."""
 MOVES = {"matrix", "rotation", "scale", "translation"}
 POINTS_AND_LINES, TRIANGLES, STRIP, FAN = (0, 1, 2, 3), 4, 5, 6
 
 
 def read(file: Path) -> Subject:
-    """Return the surfaces of a file's scene, in base colours.
+    """Read the surfaces of a glTF file's scene with their base colours.
 
     Raises:
-        DataError: the file, or a file that it refers to, is missing, damaged or no glTF 2.0, needs an extension that is
-            not understood, or shows no surface.
+        DataError: the file or a file that it refers to is missing or damaged; or the file is not glTF 2.0, requires an
+            unsupported extension, or has no surface.
     """
-    # overflow gives numbers that are not finite, which are refused at the end
+    # overflow gives numbers that are not finite; `join_parts` raises an error for them
     with translate_errors(file, "glTF"), np.errstate(all="ignore"):
-        document = opened(file)
+        document = open_document(file)
         version = str(document.content["asset"]["version"])
         if not version.startswith("2."):
-            raise ValueError(f"it is of version {quote(version)}; wanted 2.0")
+            raise ValueError(f"the file has glTF version {quote(version)}, but only 2.0 is supported")
         missing = [
-            one for one in document.content.get("extensionsRequired", ()) if not one.startswith(UNDERSTOOD)
+            name for name in document.content.get("extensionsRequired", ()) if not name.startswith(SUPPORTED)
         ]
         if missing:
             raise DataError(
-                f"{file}: it needs {shorten(', '.join(missing))}, which is not understood; save it without, e.g. with "
-                "neither compressed geometry nor compressed textures."
+                f"{file}: the file requires {shorten(', '.join(missing))}, which is not supported. Save the file "
+                "without this "
+                "extension, e.g. with neither compressed geometry nor compressed textures."
             )
         unknown = [
-            one for one in document.content.get("extensionsUsed", ()) if not one.startswith(UNDERSTOOD)
+            name for name in document.content.get("extensionsUsed", ()) if not name.startswith(SUPPORTED)
         ]
         if unknown:
             document.notes.append(
-                f"it uses {shorten(', '.join(unknown))}, which is not understood: what that adds is left out."
+                f"the file uses {shorten(', '.join(unknown))}, which is not supported; its additions are left out."
             )
         if len(document.content.get("scenes", ())) > 1:
-            document.notes.append("its other scenes are left out.")
+            document.notes.append("the file's other scenes are left out.")
         try:
-            above = _above(document)
-            if _count(document, above) > MOST_PARTS:
+            parents = _find_parents(document)
+            if _count_parts(document, parents) > MOST_PARTS:
                 raise DataError(
-                    f"{file}: it has more than {MOST_PARTS} parts; join some of them in one mesh."
+                    f"{file}: the scene has more than {MOST_PARTS} parts. Join some of them into one mesh."
                 )
-            parts = list(_parts(document, above))
+            parts = list(_read_parts(document, parents))
         except KeyError as error:
-            raise ValueError(f"{shorten(error)} is missing, or none of what may stand there") from error
-        return subject(parts, "y", document.notes)
+            raise ValueError(
+                f"the key {shorten(error)} is missing, or its value is not one of the possible values"
+            ) from error
+        return join_parts(parts, "y", document.notes)
 
 
-def _count(document: Document, shown_nodes: Iterable[int]) -> int:
-    """Return how many parts these nodes show, before any of them is read or placed."""
+def _count_parts(document: Document, shown_nodes: Iterable[int]) -> int:
+    """Return the number of parts of these nodes, without reading any part."""
     nodes = (document.item("nodes", number) for number in shown_nodes)
     return sum(len(document.item("meshes", node["mesh"])["primitives"]) for node in nodes if "mesh" in node)
 
 
-def _parts(document: Document, above: dict[int, int | None]) -> Iterator[Part]:
-    """Yield the parts where their nodes stand; a mesh that several nodes show is yielded for each."""
-    places = _places(document, above)
+def _read_parts(document: Document, parents: dict[int, int | None]) -> Iterator[Part]:
+    """Yield the parts in the scene's axes; a mesh that several nodes refer to is yielded once for each node."""
+    matrices = _node_matrices(document, parents)
     known: dict[tuple[int, int], Part] = {}
     needed = 0
-    for number, place in places.items():
+    for number, matrix in matrices.items():
         node = document.item("nodes", number)
         if "mesh" not in node:
             continue
         mesh = document.item("meshes", node["mesh"])
         if any(mesh.get("weights", ())) or any(node.get("weights", ())):
-            document.notes.append("its blend shapes are left out.")
+            document.notes.append("the blend shapes are left out.")
         for place_in_mesh, primitive in enumerate(mesh["primitives"]):
-            if whole(primitive.get("mode", TRIANGLES)) in POINTS_AND_LINES:
-                document.notes.append("its points and lines are left out.")
+            if whole_number(primitive.get("mode", TRIANGLES)) in POINTS_AND_LINES:
+                document.notes.append("points and lines are left out.")
                 continue
             key = (node["mesh"], place_in_mesh)
-            part = known[key] = known.get(key) or _part(document, primitive)
+            part = known[key] = known.get(key) or _read_part(document, primitive)
             needed += 80 * (len(part.vertices) + len(part.faces))
-            document.bounded(needed)
+            document.check_size(needed)
             if "skin" in node:
-                yield _skinned(document, part, primitive, document.item("skins", node["skin"]), places)
+                yield _pose_part(document, part, primitive, document.item("skins", node["skin"]), matrices)
             else:
-                yield _placed(part, place)
+                yield _transform_part(part, matrix)
 
 
-def _above(document: Document) -> dict[int, int | None]:
-    """Return the nodes that the scene shows with their parent nodes; each node comes after its parent."""
+def _find_parents(document: Document) -> dict[int, int | None]:
+    """Return each node of the scene with its parent (None for a root); parents precede their children."""
     scenes = document.content.get("scenes", [])
     if scenes:
         roots = document.item("scenes", document.content.get("scene", 0)).get("nodes", [])
     else:
         children = {child for node in document.content.get("nodes", []) for child in node.get("children", [])}
         roots = [number for number in range(len(document.content.get("nodes", []))) if number not in children]
-    found: dict[int, int | None] = {}
+    parents_of: dict[int, int | None] = {}
     waiting: list[tuple[int, int | None]] = [(number, None) for number in roots]
     while waiting:
-        number, above = waiting.pop()
+        number, parents = waiting.pop()
         node = document.item("nodes", number)
-        if number in found:
-            raise ValueError(f"its node {number} stands in two places, or in itself")
-        found[number] = above
+        if number in parents_of:
+            raise ValueError(f"node {number} has two parents, or is its own ancestor")
+        parents_of[number] = parents
         waiting += [(child, number) for child in reversed(node.get("children", []))]
-    return found
+    return parents_of
 
 
-def _places(document: Document, above: dict[int, int | None]) -> dict[int, Float[np.ndarray, "4 4"]]:
-    """Return the matrices from each node's own axes to the scene's axes."""
-    found: dict[int, NDArray] = {}
-    for number, parent in above.items():
-        place = np.eye(4) if parent is None else found[parent]
+def _node_matrices(document: Document, parents: dict[int, int | None]) -> dict[int, Float[np.ndarray, "4 4"]]:
+    """Return for each node the matrix from the node's own axes to the scene's axes."""
+    matrices: dict[int, NDArray] = {}
+    for number, parent in parents.items():
+        matrix = np.eye(4) if parent is None else matrices[parent]
         node = document.item("nodes", number)
-        found[number] = place @ _transform(node) if MOVES & node.keys() else place
-    return found
+        matrices[number] = matrix @ _transform(node) if MOVES & node.keys() else matrix
+    return matrices
 
 
 def _transform(node: dict[str, Any]) -> Float[np.ndarray, "4 4"]:
-    """Return a node's matrix, or translation · rotation · scale (section 3.5.3)."""
+    """Return the matrix of a node relative to its parent: the stored one, or translation · rotation · scale (3.5.3)."""
     if "matrix" in node:
-        return numbers(node["matrix"]).reshape(4, 4).T
-    found = np.eye(4)
-    x, y, z, w = numbers(node.get("rotation", (0, 0, 0, 1)))
+        return to_numbers(node["matrix"]).reshape(4, 4).T
+    matrix = np.eye(4)
+    x, y, z, w = to_numbers(node.get("rotation", (0, 0, 0, 1)))
     turned = np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
@@ -151,56 +160,56 @@ def _transform(node: dict[str, Any]) -> Float[np.ndarray, "4 4"]:
             [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
         ]
     )
-    found[:3, :3] = turned * numbers(node.get("scale", (1, 1, 1))).reshape(3)
-    found[:3, 3] = numbers(node.get("translation", (0, 0, 0))).reshape(3)
-    return found
+    matrix[:3, :3] = turned * to_numbers(node.get("scale", (1, 1, 1))).reshape(3)
+    matrix[:3, 3] = to_numbers(node.get("translation", (0, 0, 0))).reshape(3)
+    return matrix
 
 
-def _placed(part: Part, place: Float[np.ndarray, "4 4"]) -> Part:
-    vertices = part.vertices @ place[:3, :3].T + place[:3, 3]
-    mirrored = np.linalg.det(place[:3, :3]) < 0  # section 3.7.4: the winding order is then reversed
+def _transform_part(part: Part, matrix: Float[np.ndarray, "4 4"]) -> Part:
+    vertices = part.vertices @ matrix[:3, :3].T + matrix[:3, 3]
+    mirrored = np.linalg.det(matrix[:3, :3]) < 0  # section 3.7.4: the winding order is then reversed
     return replace(part, vertices=vertices, faces=part.faces[:, ::-1] if mirrored else part.faces)
 
 
-def _skinned(
+def _pose_part(
     document: Document,
     part: Part,
     primitive: dict[str, Any],
     skin: dict[str, Any],
-    places: dict[int, NDArray],
+    matrices: dict[int, NDArray],
 ) -> Part:
-    """Return a part posed by its joints without an animation; the node's own position is ignored (section 3.7.3.3)."""
-    document.notes.append("it is shown in its rest pose.")
-    joints = np.stack([places[number] for number in skin["joints"]])
+    """Return a part in the rest pose of its joints; the node's own matrix is ignored (section 3.7.3.3)."""
+    document.notes.append("the model is drawn in its rest pose.")
+    joints = np.stack([matrices[number] for number in skin["joints"]])
     if "inverseBindMatrices" in skin:
         inverse = document.numbers(skin["inverseBindMatrices"], 16).reshape(-1, 4, 4).mT
         joints = joints @ inverse[: len(joints)]
-    moved = np.zeros_like(part.vertices)
+    moved_vertices = np.zeros_like(part.vertices)
     attributes = primitive["attributes"]
     ones = np.ones((len(part.vertices), 1))
     sets = sum(name.startswith("JOINTS_") for name in attributes)
     if sets > MOST_JOINT_SETS:
         raise ValueError(
-            f"a part follows {4 * sets} joints at each vertex; wanted at most {4 * MOST_JOINT_SETS}"
+            f"a part has {4 * sets} joints at each vertex, but at most {4 * MOST_JOINT_SETS} are supported"
         )
     for number in range(sets):
         chosen = document.numbers(attributes[f"JOINTS_{number}"], 4)
         weights = document.numbers(attributes[f"WEIGHTS_{number}"], 4, shares=True)
         for corner in range(4):
-            of_vertices = joints[chosen[:, corner], :3]
-            document.bounded(of_vertices.nbytes)
-            here = np.einsum("vij,vj->vi", of_vertices, np.concatenate([part.vertices, ones], 1))
-            moved += weights[:, corner, None] * here
-    return replace(part, vertices=moved)
+            vertex_joints = joints[chosen[:, corner], :3]
+            document.check_size(vertex_joints.nbytes)
+            transformed = np.einsum("vij,vj->vi", vertex_joints, np.concatenate([part.vertices, ones], 1))
+            moved_vertices += weights[:, corner, None] * transformed
+    return replace(part, vertices=moved_vertices)
 
 
-def _part(document: Document, primitive: dict[str, Any]) -> Part:
+def _read_part(document: Document, primitive: dict[str, Any]) -> Part:
     attributes = primitive["attributes"]
     described = document.item("accessors", attributes["POSITION"])
     if "extensions" in primitive and not {"bufferView", "sparse"} & described.keys():
         raise DataError(
-            f"its vertices are stored by {shorten(', '.join(primitive['extensions']))} alone, which is not understood; "
-            "wanted them without compression. Save it so."
+            f"the vertices are stored only by {shorten(', '.join(primitive['extensions']))}, which is not supported. "
+            "Save the file without compression."
         )
     vertices = document.numbers(attributes["POSITION"], 3).astype(np.float64)
     count = len(vertices)
@@ -208,26 +217,32 @@ def _part(document: Document, primitive: dict[str, Any]) -> Part:
     if "indices" in primitive:
         order = document.numbers(primitive["indices"], 1)[:, 0].astype(np.int64)
     if order.size and order.max() >= count:
-        raise ValueError(f"a face names vertex {order.max()}, but there are only 0 to {count - 1}")
-    faces = _triangles(order, primitive.get("mode", TRIANGLES))
-    factor, described = _material(document, primitive)
+        raise ValueError(
+            f"a face refers to vertex {order.max()}, but the vertices are numbered 0 to {count - 1}"
+        )
+    faces = _read_triangles(order, primitive.get("mode", TRIANGLES))
+    factor, described = _read_material(document, primitive)
     colors = None if factor is None else np.tile(factor, (count, 1))
     if "COLOR_0" in attributes:
         width = WIDTHS[document.item("accessors", attributes["COLOR_0"])["type"]]
-        own = _each(document.numbers(attributes["COLOR_0"], width, shares=True), count, "colour")[:, :3]
+        own = _check_count(document.numbers(attributes["COLOR_0"], width, shares=True), count, "colour")[
+            :, :3
+        ]
         colors = own if colors is None else own * colors
     part = Part(vertices, faces, colors)
-    return part if described is None else _textured(document, part, attributes, described)
+    return part if described is None else _add_texture(document, part, attributes, described)
 
 
-def _each(found: NDArray, count: int, what: str) -> NDArray:
-    if len(found) != count:
-        raise ValueError(f"{len(found)} entries of a {what} came for {count} vertices; wanted one each")
-    return found
+def _check_count(values: NDArray, count: int, quantity: str) -> NDArray:
+    if len(values) != count:
+        raise ValueError(
+            f"got {len(values)} values of {quantity} for {count} vertices, expected one per vertex"
+        )
+    return values
 
 
-def _triangles(order: Int[np.ndarray, "corners"], mode: Any) -> Int[np.ndarray, "faces 3"]:
-    """Return the triangles of a primitive of the given mode (section 3.7.2.1, equations of primitive types)."""
+def _read_triangles(order: Int[np.ndarray, "corners"], mode: Any) -> Int[np.ndarray, "faces 3"]:
+    """Return the triangles of a primitive from its vertex indices and its mode (equations of section 3.7.2.1)."""
     if mode == TRIANGLES:
         return order[: len(order) // 3 * 3].reshape(-1, 3)
     inner = np.arange(max(len(order) - 2, 0))
@@ -235,18 +250,18 @@ def _triangles(order: Int[np.ndarray, "corners"], mode: Any) -> Int[np.ndarray, 
         return order[np.stack([inner, inner + 1 + inner % 2, inner + 2 - inner % 2], 1)]
     if mode == FAN:
         return order[np.stack([inner + 1, inner + 2, np.zeros_like(inner)], 1)]
-    raise ValueError(f"its mode is {quote(mode)}; wanted 4, 5 or 6: triangles")
+    raise ValueError(f"the mode of a primitive is {quote(mode)}, expected 4, 5 or 6 (triangles, strip, fan)")
 
 
-def _material(
+def _read_material(
     document: Document, primitive: dict[str, Any]
 ) -> tuple[Float[np.ndarray, "3"] | None, dict[str, Any] | None]:
-    """Return the factor of the base colour, None where there is none, and the description of its texture."""
+    """Return the base colour factor (None for no factor) and the description of the texture (None for no texture)."""
     if "material" not in primitive:
         return None, None
     material = document.item("materials", primitive["material"])
     if material.get("alphaMode", "OPAQUE") != "OPAQUE":
-        document.notes.append("its transparency is left out.")
+        document.notes.append("transparency is left out.")
     glossy = material.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness")
     if glossy is not None:
         factor, texture = glossy.get("diffuseFactor"), glossy.get("diffuseTexture")
@@ -255,28 +270,30 @@ def _material(
         factor, texture = described.get("baseColorFactor"), described.get("baseColorTexture")
     if factor is None:
         return None, texture
-    found = numbers(factor).reshape(-1)[:3]
-    return (None if found.tolist() == [1, 1, 1] else found), texture
+    base_color = to_numbers(factor).reshape(-1)[:3]
+    return (None if base_color.tolist() == [1, 1, 1] else base_color), texture
 
 
-def _textured(document: Document, part: Part, attributes: dict[str, Any], described: dict[str, Any]) -> Part:
-    moved = described.get("extensions", {}).get("KHR_texture_transform", {})
-    name = f"TEXCOORD_{whole(moved.get('texCoord', described.get('texCoord', 0)))}"
+def _add_texture(
+    document: Document, part: Part, attributes: dict[str, Any], described: dict[str, Any]
+) -> Part:
+    moved_vertices = described.get("extensions", {}).get("KHR_texture_transform", {})
+    name = f"TEXCOORD_{whole_number(moved_vertices.get('texCoord', described.get('texCoord', 0)))}"
     if name not in attributes:
-        document.notes.append("a part with a texture says no places in it, and is drawn without.")
+        document.notes.append("a part with a texture has no texture coordinates, so the texture is left out.")
         return part
-    uv = _each(document.numbers(attributes[name], 2), len(part.vertices), "place in a texture").astype(
+    uv = _check_count(document.numbers(attributes[name], 2), len(part.vertices), "texture coordinate").astype(
         np.float64
     )
-    if moved:
-        # KHR_texture_transform: translation · rotation · scale, counter-clockwise where v runs downwards, as its text
-        # and its test model say; the GLSL beside them turns the other way (github.com/KhronosGroup/glTF/issues/1563)
-        angle = float(numbers(moved.get("rotation", 0)))
+    if moved_vertices:
+        # KHR_texture_transform: translation · rotation · scale, counter-clockwise for v downwards. The text of the
+        # extension and its test model agree; its GLSL code rotates the other way (KhronosGroup/glTF issue 1563).
+        angle = float(to_numbers(moved_vertices.get("rotation", 0)))
         turned = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
-        uv = (uv * numbers(moved.get("scale", (1, 1)))) @ turned.T
-        uv = uv + numbers(moved.get("offset", (0, 0)))
+        uv = (uv * to_numbers(moved_vertices.get("scale", (1, 1)))) @ turned.T
+        uv = uv + to_numbers(moved_vertices.get("offset", (0, 0)))
     texture = document.item("textures", described["index"])
-    image = _image(document, texture)
+    image = _read_image(document, texture)
     if image is None:
         return part
     sampler = document.item("samplers", texture["sampler"]) if "sampler" in texture else {}
@@ -290,25 +307,25 @@ def _textured(document: Document, part: Part, attributes: dict[str, Any], descri
     )
 
 
-def _image(document: Document, texture: dict[str, Any]):
+def _read_image(document: Document, texture: dict[str, Any]):
     number = texture.get("extensions", {}).get("EXT_texture_webp", {}).get("source", texture.get("source"))
     if number is None:
-        document.notes.append("a texture is stored by an extension that is not understood: drawn without.")
+        document.notes.append("a texture is stored by an unsupported extension, so the texture is left out.")
         return None
     image = document.item("images", number)
-    known = document.pictures.known(number)
+    known = document.textures.find(number)
     if known is not None:
         return known
     uri = image.get("uri")
     if uri is not None and not uri.startswith("data:"):
-        file = drawn_without(
+        file = find_beside(
             document.folder, unquote(uri, errors="surrogateescape"), "texture is", document.notes
         )
         if file is None:
             return None
-        content, name = document.of_file(file), shorten(uri, 60)
+        content, name = document.read_file(file), shorten(uri, 60)
     elif uri is not None:
-        content, name = document.referred(uri), shorten(uri, 60)
+        content, name = document.read_address(uri), shorten(uri, 60)
     else:
-        content, name = bytes(document.view(image["bufferView"])[0]), f"{number}"
-    return document.pictures.decode(number, content, name)
+        content, name = bytes(document.buffer_view(image["bufferView"])[0]), f"{number}"
+    return document.textures.decode(number, content, name)

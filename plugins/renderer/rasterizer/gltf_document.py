@@ -1,7 +1,7 @@
-"""A glTF 2.0 document (Khronos, 2021): its description, and the numbers and files that it refers to.
+"""A glTF 2.0 document (Khronos, 2021): its JSON description, and the numbers and files that the description refers to.
 
-The file may be damaged or malicious: all numbers in it are checked against bounds, and no array is made larger than
-the file's size allows.
+The file may be damaged or malicious: all its numbers are checked against bounds, and the size of every array is limited
+by the size of the file.
 """
 
 import base64
@@ -18,7 +18,7 @@ from framework.errors import quote, shorten
 from framework.storage.limits import SCENE_BYTES, UNFOLDED_TIMES
 from framework.storage.plain_values import plain_numbers
 from framework.storage.reading import read_bytes, translate_errors
-from plugins.renderer.rasterizer.parts import Pictures, beside
+from plugins.renderer.rasterizer.parts import TextureDecoder, resolve_beside
 
 NUMBERS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
@@ -26,169 +26,188 @@ WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 
 @dataclass
 class Document:
-    """A file's description and the data that it refers to."""
+    """The JSON description of a file and the data that it refers to.
+
+    Attributes:
+        content: the description.
+        folder: folder of the file.
+        binary: binary part of a .glb; None for a .gltf.
+        size: bytes read so far, of this file and of the files that it refers to.
+        buffers: buffers that were read, by number.
+        textures: decoder of the textures.
+        notes: sentences about elements of the file that are left out.
+    """
 
     content: dict[str, Any]
     folder: Path
     binary: bytes | None
     size: int
     buffers: dict[int, bytes] = field(default_factory=dict)
-    pictures: Pictures = field(default_factory=Pictures)
+    textures: TextureDecoder = field(default_factory=TextureDecoder)
     notes: list[str] = field(default_factory=list)
 
     def item(self, kind: str, number: Any) -> dict[str, Any]:
-        """Return item `number` of a kind of items, such as "meshes".
+        """Return the description of item `number` of a kind, such as "meshes".
 
         Raises:
             ValueError: there is no such item.
         """
         items = self.content.get(kind, [])
         if not isinstance(number, int) or isinstance(number, bool) or not 0 <= number < len(items):
-            raise ValueError(f"it names number {quote(number)} of its {kind}, of which it has {len(items)}")
+            raise ValueError(
+                f"the file refers to number {quote(number)} of its {kind}, but has {len(items)} of them"
+            )
         return items[number]
 
     def buffer(self, number: int) -> bytes:
         """Return the bytes of a buffer.
 
         Raises:
-            ValueError: the file and the files beside it do not hold the buffer.
+            ValueError: neither this file nor a file beside it holds the buffer.
         """
         if number not in self.buffers:
             described = self.item("buffers", number)
             if "uri" in described:
-                self.buffers[number] = self.referred(described["uri"])
+                self.buffers[number] = self.read_address(described["uri"])
             elif number == 0 and self.binary is not None:
                 self.buffers[number] = self.binary
             else:
                 extensions = ", ".join(described.get("extensions", {}))
-                why = (
-                    f", but stored by {shorten(extensions)}, which is not understood; save it without"
+                reason = (
+                    f"; it is stored by {shorten(extensions)}, which is not supported. Save the file without this "
+                    "extension"
                     if extensions
                     else ""
                 )
-                raise ValueError(f"its buffer {number} is nowhere{why}")
+                raise ValueError(f"buffer {number} is missing{reason}")
         return self.buffers[number]
 
-    def referred(self, address: str) -> bytes:
-        """Return the content of a data: address, or of a file beside this file."""
+    def read_address(self, address: str) -> bytes:
+        """Return the content of a data: URI, or of a file beside this file."""
         if address.startswith("data:"):
             head, _, body = address.partition(",")
             if not head.endswith(";base64"):
-                raise ValueError(f"it holds data as {quote(head[-20:])}; wanted base64")
+                raise ValueError(f"data is encoded as {quote(head[-20:])}, but only base64 is supported")
             return base64.b64decode(body, validate=True)
-        return self.of_file(beside(self.folder, unquote(address, errors="surrogateescape")))
+        return self.read_file(resolve_beside(self.folder, unquote(address, errors="surrogateescape")))
 
-    def of_file(self, file: Path) -> bytes:
-        """Return the content of a file beside this file."""
+    def read_file(self, file: Path) -> bytes:
+        """Return the content of a file beside this file, and add its size to `size`."""
         with translate_errors(file, "a part of a glTF file"):
-            found = read_bytes(file)
-        self.size += len(found)
-        return found
+            data = read_bytes(file)
+        self.size += len(data)
+        return data
 
-    def view(self, number: Any) -> tuple[bytes | memoryview, int]:
-        """Return the bytes of a buffer view, and the distance of its elements in bytes (0: close together)."""
+    def buffer_view(self, number: Any) -> tuple[bytes | memoryview, int]:
+        """Return the bytes of a buffer view, and the distance between its elements in bytes (0: no gaps)."""
         described = self.item("bufferViews", number)
-        buffer = self.buffer(whole(described["buffer"]))
-        first, length = whole(described.get("byteOffset", 0)), whole(described["byteLength"])
-        if first + length > len(buffer):
+        buffer = self.buffer(whole_number(described["buffer"]))
+        start, length = (
+            whole_number(described.get("byteOffset", 0)),
+            whole_number(described["byteLength"]),
+        )
+        if start + length > len(buffer):
             raise ValueError(
-                f"its buffer has {len(buffer)} bytes, of which {first + length} are asked; it is cut short"
+                f"a buffer has {len(buffer)} bytes, but {start + length} are required; the file is cut short"
             )
-        return memoryview(buffer)[first : first + length], whole(described.get("byteStride", 0))
+        return memoryview(buffer)[start : start + length], whole_number(described.get("byteStride", 0))
 
     def numbers(self, number: Any, width: int, *, shares: bool = False) -> NDArray:
-        """Return the numbers of an accessor, (count, width): integers as they are, or float64.
+        """Return the numbers of an accessor, (count, width): stored integers, or float64.
 
         Args:
             number: number of the accessor.
             width: number of columns.
-            shares: read integers as shares of the largest one, whether the accessor says so or not.
+            shares: divide integers by the largest integer of their type, even if the accessor is not "normalized".
         """
         described = self.item("accessors", number)
         if WIDTHS.get(described["type"]) != width:
-            raise ValueError(f"wanted {width} numbers each, got {quote(described['type'])}")
-        count, kind = whole(described["count"]), np.dtype(NUMBERS[described["componentType"]])
-        self.bounded(count * width * 8)
-        found = np.zeros((count, width), kind)
+            raise ValueError(f"expected {width} numbers per element, got the type {quote(described['type'])}")
+        count, kind = whole_number(described["count"]), np.dtype(NUMBERS[described["componentType"]])
+        self.check_size(count * width * 8)
+        values = np.zeros((count, width), kind)
         if "bufferView" in described:
-            found = self._elements(described["bufferView"], described, count, width, kind).copy()
+            values = self._elements(described["bufferView"], described, count, width, kind).copy()
         if "sparse" in described:
             sparse = described["sparse"]
-            changed, places = whole(sparse["count"]), sparse["indices"]
+            changed, places = whole_number(sparse["count"]), sparse["indices"]
             order = np.dtype(NUMBERS[places["componentType"]])
             rows = self._elements(places["bufferView"], places, changed, 1, order)[:, 0]
-            found[rows] = self._elements(
+            values[rows] = self._elements(
                 sparse["values"]["bufferView"], sparse["values"], changed, width, kind
             )
         if kind.kind == "f":
-            return found.astype(np.float64)
+            return values.astype(np.float64)
         if shares or described.get(
             "normalized"
         ):  # section 3.11 "Animations", equations of normalized integers
-            return np.maximum(found.astype(np.float64) / np.iinfo(kind).max, -1)
-        return found
+            return np.maximum(values.astype(np.float64) / np.iinfo(kind).max, -1)
+        return values
 
     def _elements(
-        self, view: Any, described: dict[str, Any], count: int, width: int, kind: np.dtype
+        self, buffer_view: Any, described: dict[str, Any], count: int, width: int, kind: np.dtype
     ) -> NDArray:
-        content, apart = self.view(view)
-        first, size = whole(described.get("byteOffset", 0)), width * kind.itemsize
-        apart = apart or size
-        if apart < size or (count and first + (count - 1) * apart + size > len(content)):
+        content, stride = self.buffer_view(buffer_view)
+        description, size = whole_number(described.get("byteOffset", 0)), width * kind.itemsize
+        stride = stride or size
+        if stride < size or (count and description + (count - 1) * stride + size > len(content)):
             raise ValueError(
-                f"{count} elements were announced, but there are {len(content)} bytes; it is cut short"
+                f"{count} elements are declared, but there are only {len(content)} bytes; the file is cut short"
             )
-        return np.ndarray((count, width), kind, content, first, (apart, kind.itemsize))
+        return np.ndarray((count, width), kind, content, description, (stride, kind.itemsize))
 
-    def bounded(self, needed: int) -> None:
-        """Refuse to use more bytes than a file of this size may become.
+    def check_size(self, needed: int) -> None:
+        """Check that reading a part takes no more bytes than is plausible for a file of this size.
 
         Raises:
             ValueError: `needed` bytes are too many.
         """
         if needed > max(SCENE_BYTES, UNFOLDED_TIMES * self.size):
-            raise ValueError(f"{self.size} bytes would become {needed}; it repeats itself, or is damaged")
+            raise ValueError(
+                f"{self.size} bytes of the file would become {needed} bytes; the file repeats itself, or is damaged"
+            )
 
 
-def opened(file: Path) -> Document:
-    """Return the document that a .gltf or .glb file holds."""
+def open_document(file: Path) -> Document:
+    """Read the document of a .gltf or .glb file."""
     content = read_bytes(file)
     size, binary = len(content), None
     if content[:4] == b"glTF":
-        first, binary = _chunks(content)
-        content = first
+        description, binary = _split_chunks(content)
+        content = description
     elif file.suffix.lower() == ".glb":
-        raise ValueError("wanted glTF in its first bytes")
+        raise ValueError("the file does not begin with the bytes glTF")
     described = json.loads(content)
     if not isinstance(described, dict):
-        raise ValueError(f"it holds {type(described).__name__}")
+        raise ValueError(f"the description is a {type(described).__name__}, expected an object")
     return Document(described, file.parent, binary, size)
 
 
-def _chunks(content: bytes) -> tuple[bytes, bytes | None]:
-    """Return the description and the binary part of a .glb (section 4.4)."""
+def _split_chunks(content: bytes) -> tuple[bytes, bytes | None]:
+    """Return the description and the binary part of a .glb file (section 4.4)."""
     version, length = (int.from_bytes(content[place : place + 4], "little") for place in (4, 8))
     if version != 2 or length > len(content):
         raise ValueError(
-            f"its header announces version {version} and {length} bytes, but it has {len(content)}; wanted version 2, "
-            "whole"
+            f"the header declares version {version} and {length} bytes, and the file has {len(content)} bytes; "
+            "version 2 and "
+            "the complete file are required"
         )
-    found: dict[bytes, bytes] = {}
+    chunks: dict[bytes, bytes] = {}
     place = 12
     while place + 8 <= length:
         size = int.from_bytes(content[place : place + 4], "little")
         kind = content[place + 4 : place + 8]
         if place + 8 + size > length:
-            raise ValueError("a part of it goes on beyond its end")
-        found.setdefault(kind, content[place + 8 : place + 8 + size])
+            raise ValueError("a chunk continues beyond the end of the file")
+        chunks.setdefault(kind, content[place + 8 : place + 8 + size])
         place += 8 + size
-    if b"JSON" not in found:
-        raise ValueError("it has no description")
-    return found[b"JSON"], found.get(b"BIN\0")
+    if b"JSON" not in chunks:
+        raise ValueError("the file has no JSON description")
+    return chunks[b"JSON"], chunks.get(b"BIN\0")
 
 
-def numbers(value: Any) -> NDArray:
-    """Return a value of the description, where numbers are wanted, as float64.
+def to_numbers(value: Any) -> NDArray:
+    """Return a number or nested lists of numbers of the description as a float64 array.
 
     Raises:
         ValueError: something in it is not a number.
@@ -196,8 +215,8 @@ def numbers(value: Any) -> NDArray:
     return np.array(plain_numbers(value), np.float64)
 
 
-def whole(value: Any) -> int:
-    """Return a value of the description if it is an integer from 0."""
+def whole_number(value: Any) -> int:
+    """Return a value of the description after checking that it is an integer of at least 0."""
     if not isinstance(value, int) or isinstance(value, bool) or value < 0:
-        raise ValueError(f"wanted a whole number from 0, got {quote(value)}")
+        raise ValueError(f"expected a whole number of at least 0, got {quote(value)}")
     return value

@@ -1,19 +1,19 @@
 """The approximate gradient of Kato, Ushiku & Harada, "Neural 3D Mesh Renderer" (CVPR 2018, section 3); compiled.
 
-An edge that moves along a row of pixels recolours a pixel j when it has come as far as j. The paper replaces that step
-of height δ_j^I at the distance δ_i^x by a ramp, so that j attracts the vertex i from any distance:
+When a moving edge arrives at a pixel j, the colour of j changes by the step δ_j^I. The paper replaces this step at the
+distance δ_i^x by a linear ramp, so that pixel j attracts vertex i from any distance:
 
-    ∂I_j/∂x_i = δ_j^I / δ_i^x  where δ_j^P δ_j^I < 0 (the loss falls; δ_j^P is its slope in I_j), else 0
+    ∂I_j/∂x_i = δ_j^I / δ_i^x  if δ_j^P δ_j^I < 0 (the loss falls; δ_j^P is its derivative in I_j), else 0
 
-For a pixel outside of the face, δ_j^I leads to the colour just inside of the edge. For a pixel of the face itself,
-there is one such term for the edge on either side, which leads to the colour just outside of it. An edge has no effect
-on pixels outside where its face is hidden beside it. Where the paper is silent, this code follows its published kernel:
-these colours are those of the two pixels beside the edge; faces seen from behind (clockwise) have no part; 1e-4 is
-added to every distance, in units in which the image is 2 wide. The place of a pixel inside its face has no gradient in
-positions; colours have their exact gradient.
+For a pixel outside of the face, δ_j^I is the change to the colour just inside of the edge. A pixel of the face itself
+has one term for the edge on either side, with the change to the colour just outside of that edge. An edge has no effect
+on outside pixels if its own face is hidden next to the edge. Details that the paper leaves open follow its published
+kernel: these colours are taken from the two pixels beside the edge; faces seen from behind (clockwise) are ignored;
+1e-4 is added to every distance, in units in which the image is 2 wide. Barycentric weights inside of a face contribute
+no gradient with respect to positions; colours have their exact gradient.
 
-Pixels without a gradient have no effect, so for each line only the others are kept. Arrays are those of `raster`; a
-line is a row of pixels, or a column where the arrays come transposed, and a place is a pixel's number along the line.
+Pixels without a gradient have no effect, so each line stores only the other pixels. Arrays are described in `raster`. A
+line is a row of pixels, or a column if the arrays are transposed. A position is the index of a pixel in its line.
 """
 
 from typing import no_type_check
@@ -21,47 +21,47 @@ from typing import no_type_check
 import numpy as np
 
 from framework.storage.kernels import compiler
-from plugins.renderer.rasterizer.boundary import along
+from plugins.renderer.rasterizer.boundary import add_screen_gradient
 from plugins.renderer.rasterizer.raster import KEPT_IN, SUBPIXELS, compiled
 
-LEAST_DISTANCE = 1e-4  # added to distances, in half image sides along the direction in which an edge moves
+LEAST_DISTANCE = 1e-4  # added to distances; unit: half the image's side in the direction of the edge's motion
 
-# sums may be reordered, so that a processor adds several terms at once
+# allows reordering of sums, so that the processor adds several terms at once
 reordered = compiler(KEPT_IN, fastmath={"reassoc", "contract", "nsz"})
 
 
-def sweeps(
-    seen: np.ndarray,
+def add_edge_gradients(
+    camera_points: np.ndarray,
     screen: np.ndarray,
     faces: np.ndarray,
     lens: np.ndarray,
     face: np.ndarray,
     color: np.ndarray,
-    along_color: np.ndarray,
-    of_seen: np.ndarray,
-    of_lens: np.ndarray,
+    grad_image: np.ndarray,
+    grad_points: np.ndarray,
+    grad_lens: np.ndarray,
 ) -> None:
-    """Add to `of_seen` and `of_lens` the gradient from all pixels on all edges, along rows and along columns."""
+    """Add the gradient from all pixels on all edges, along rows and along columns, to `grad_points` and `grad_lens`."""
     for axis in (0, 1):
         if axis == 1:
             face = np.ascontiguousarray(face.T)
             color = np.ascontiguousarray(color.transpose(1, 0, 2))
-            along_color = np.ascontiguousarray(along_color.transpose(1, 0, 2))
-        kept = pulling(face, color, along_color)
-        of_place = np.zeros(len(seen))
-        sweep(axis, screen, faces, face, color, *kept, of_place)
-        to_camera(seen, axis, of_place, lens, of_seen, of_lens)
+            grad_image = np.ascontiguousarray(grad_image.transpose(1, 0, 2))
+        gradient_pixels = collect_gradient_pixels(face, color, grad_image)
+        grad_position = np.zeros(len(camera_points))
+        sum_line_gradients(axis, screen, faces, face, color, *gradient_pixels, grad_position)
+        add_to_camera(camera_points, axis, grad_position, lens, grad_points, grad_lens)
 
 
 @compiled
 @no_type_check
-def pulling(face, color, along_color):
-    """Return the pixels that have a gradient g, line by line.
+def collect_gradient_pixels(face, color, grad_image):
+    """Return the pixels with a gradient g that is not 0, line by line.
 
     Returns:
-        before: (lines, length + 1), how many pixels are kept before a pixel.
-        place, owner, value: place, face and I · g of each kept pixel.
-        slopes: (channels, kept), g.
+        before: (lines, length + 1), number of stored pixels before each pixel.
+        pixel_positions, owner, value: position, face and I · g of each stored pixel.
+        slopes: (channels, stored pixels), g.
     """
     lines, length = face.shape
     channels = color.shape[2]
@@ -71,30 +71,32 @@ def pulling(face, color, along_color):
         for position in range(length):
             before[line, position] = count
             for channel in range(channels):
-                if along_color[line, position, channel] != 0:
+                if grad_image[line, position, channel] != 0:
                     count += 1
                     break
         before[line, length] = count
-    place, value = np.empty(count), np.zeros(count)
+    pixel_positions, value = np.empty(count), np.zeros(count)
     owner = np.empty(count, np.int64)
     slopes = np.empty((channels, count))
     for line in range(lines):
         for position in range(length):
-            here = before[line, position]
-            if here < before[line, position + 1]:
-                place[here] = position
-                owner[here] = face[line, position]
+            slot = before[line, position]
+            if slot < before[line, position + 1]:
+                pixel_positions[slot] = position
+                owner[slot] = face[line, position]
                 for channel in range(channels):
-                    slope = np.float64(along_color[line, position, channel])
-                    slopes[channel, here] = slope
-                    value[here] += slope * color[line, position, channel]
-    return before, place, owner, value, slopes
+                    slope = np.float64(grad_image[line, position, channel])
+                    slopes[channel, slot] = slope
+                    value[slot] += slope * color[line, position, channel]
+    return before, pixel_positions, owner, value, slopes
 
 
 @compiled
 @no_type_check
-def sweep(axis, screen, faces, face, color, before, place, owner, value, slopes, of_place):
-    """Add to `of_place`, per vertex, the gradient of the loss in the vertex's place along the lines, per pixel."""
+def sum_line_gradients(
+    axis, screen, faces, face, color, before, pixel_positions, owner, value, slopes, grad_position
+):
+    """Add the gradient with respect to each vertex's position along the lines, per pixel, to `grad_position`."""
     lines, length = face.shape
     least = LEAST_DISTANCE * length / 2
     shown = np.zeros(faces.shape[0], np.bool_)
@@ -115,29 +117,29 @@ def sweep(axis, screen, faces, face, color, before, place, owner, value, slopes,
         first_place = np.int64(max(np.ceil(low), 0.0))
         last_place = np.int64(min(np.floor(high), length - 1.0))
         for corner in range(3):
-            one, other, third = (
+            start_vertex, end_vertex, third_vertex = (
                 faces[index, corner],
                 faces[index, (corner + 1) % 3],
                 faces[index, (corner + 2) % 3],
             )
-            start, end = screen[one, 1 - axis] / SUBPIXELS, screen[other, 1 - axis] / SUBPIXELS
+            start, end = screen[start_vertex, 1 - axis] / SUBPIXELS, screen[end_vertex, 1 - axis] / SUBPIXELS
             if start == end:
-                continue  # an edge along the lines crosses none of them; the published kernel divides by 0 here
-            here = screen[one, axis] / SUBPIXELS
-            lean = (screen[other, axis] / SUBPIXELS - here) / (end - start)
-            opposite = here + lean * (screen[third, 1 - axis] / SUBPIXELS - start)
-            outwards = 1 if opposite > screen[third, axis] / SUBPIXELS else -1
-            # clamp before the casts, since an integer cannot hold an end that is 1e30 lines away
+                continue  # an edge parallel to the lines crosses no line; the published kernel divides by 0 here
+            start_position = screen[start_vertex, axis] / SUBPIXELS
+            lean = (screen[end_vertex, axis] / SUBPIXELS - start_position) / (end - start)
+            opposite = start_position + lean * (screen[third_vertex, 1 - axis] / SUBPIXELS - start)
+            outwards = 1 if opposite > screen[third_vertex, axis] / SUBPIXELS else -1
+            # clamp before the casts: an end may be 1e30 lines away, which no integer holds
             first_line = np.int64(np.ceil(min(max(min(start, end), 0.0), lines)))
             last_line = np.int64(np.floor(max(min(max(start, end), lines - 1.0), -1.0)))
             for line in range(first_line, last_line + 1):
-                crossing = here + lean * (line - start)
+                crossing = start_position + lean * (line - start)
                 inner = np.floor(crossing) if outwards > 0 else np.ceil(crossing)
                 outer = inner + outwards
                 if not (min(inner, outer) >= 0 and max(inner, outer) <= length - 1):
                     continue
                 inside, outside = np.int64(inner), np.int64(outer)
-                # A vertex moves the edge by this share of its own way: δ_i^x of the paper is distance / share.
+                # The edge moves by this share of a vertex's motion: δ_i^x of the paper is distance / share.
                 share = (end - line) / (end - start)
                 for way in (outwards, -outwards):
                     if way == outwards:
@@ -152,7 +154,7 @@ def sweep(axis, screen, faces, face, color, before, place, owner, value, slopes,
                         number, painted = index, color[line, outside]
                     if first >= last:
                         continue
-                    pulled, pulled_other = pull(
+                    gain_start, gain_end = sum_gains(
                         first,
                         last,
                         number,
@@ -160,22 +162,24 @@ def sweep(axis, screen, faces, face, color, before, place, owner, value, slopes,
                         crossing,
                         share,
                         least,
-                        place,
+                        pixel_positions,
                         owner,
                         value,
                         slopes,
                         gains,
                     )
-                    of_place[one] -= way * pulled
-                    of_place[other] -= way * pulled_other
+                    grad_position[start_vertex] -= way * gain_start
+                    grad_position[end_vertex] -= way * gain_end
 
 
 @reordered
 @no_type_check
-def pull(first, last, number, painted, crossing, share, least, place, owner, value, slopes, gains):
-    """Return the gain per pixel of motion of each end of an edge, summed over kept pixels.
+def sum_gains(
+    first, last, number, painted, crossing, share, least, pixel_positions, owner, value, slopes, gains
+):
+    """Return the decrease of the loss per pixel of motion, for each end of an edge, summed over stored pixels.
 
-    These are the pixels from `first` to before `last` that show the face `number`; -1 stands for all faces.
+    The sum runs over the stored pixels from `first` to `last` - 1 that show the face `number` (-1: any face).
     """
     count = last - first
     gains = gains[:count]
@@ -183,29 +187,31 @@ def pull(first, last, number, painted, crossing, share, least, place, owner, val
     for channel in range(slopes.shape[0]):
         paint = np.float64(painted[channel])
         slope = slopes[channel, first:last]
-        for each in range(count):
-            gains[each] -= paint * slope[each]  # -δ_j^I δ_j^P
+        for pixel in range(count):
+            gains[pixel] -= paint * slope[pixel]  # -δ_j^I δ_j^P
     if number >= 0:
         owners = owner[first:last]
-        for each in range(count):
-            gains[each] = gains[each] if owners[each] == number else 0.0
+        for pixel in range(count):
+            gains[pixel] = gains[pixel] if owners[pixel] == number else 0.0
     other_share = 1 - share
     add = share * least if share > 0 else 1.0
     other_add = other_share * least if other_share > 0 else 1.0
-    pulled = pulled_other = 0.0
-    places = place[first:last]
-    for each in range(count):
-        distance = abs(places[each] - crossing)
-        gain = max(gains[each], 0.0)  # 0 where δ_j^P δ_j^I >= 0; over δ_i^x = distance / share + least
-        pulled += gain / (distance + add)
-        pulled_other += gain / (distance + other_add)
-    return share * pulled, other_share * pulled_other
+    gain_start = gain_end = 0.0
+    positions = pixel_positions[first:last]
+    for pixel in range(count):
+        distance = abs(positions[pixel] - crossing)
+        gain = max(gains[pixel], 0.0)  # 0 where δ_j^P δ_j^I >= 0; over δ_i^x = distance / share + least
+        gain_start += gain / (distance + add)
+        gain_end += gain / (distance + other_add)
+    return share * gain_start, other_share * gain_end
 
 
 @compiled
 @no_type_check
-def to_camera(seen, axis, of_place, lens, of_seen, of_lens):
-    """Add gradients in places along one axis of the screen to those in camera coordinates and lens."""
-    for vertex in range(of_place.shape[0]):
-        if of_place[vertex] != 0:
-            along(seen, vertex, axis, of_place[vertex], lens, of_seen, of_lens)
+def add_to_camera(camera_points, axis, grad_position, lens, grad_points, grad_lens):
+    """Convert gradients with respect to positions along a screen axis; add them to `grad_points` and `grad_lens`."""
+    for vertex in range(grad_position.shape[0]):
+        if grad_position[vertex] != 0:
+            add_screen_gradient(
+                camera_points, vertex, axis, grad_position[vertex], lens, grad_points, grad_lens
+            )

@@ -1,4 +1,4 @@
-"""Parts of a scene as files store them, and functions that join them into one scene."""
+"""Parts of a scene in the form in which files store them, and functions that join parts into one scene."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,12 +21,12 @@ from framework.storage.limits import FEW_TEXELS, MOST_TEXELS, TEXELS_PER_BYTE
 
 Axis = Literal["y", "z"]
 GREY = 0.55
-"""Linear RGB value of a surface whose file gives no colour."""
+"""Linear RGB value of a surface without a colour in its file."""
 FARTHEST = 1e30
 """Largest coordinate for which float32 can hold the depth."""
-NOWHERE = look_from(0.0, 0.0, 0.0, 1.0, 1.0, (1, 1))
+PLACEHOLDER_CAMERA = look_from(0.0, 0.0, 0.0, 1.0, 1.0, (1, 1))
 EDGE = 1e-4
-"""Largest distance beyond a texture's edge that is taken as rounding, so that no wrap rule is needed there."""
+"""Largest distance of uv beyond a texture's edge that counts as rounding error and needs no wrap rule."""
 
 
 @dataclass(frozen=True)
@@ -35,13 +35,13 @@ class Part:
 
     Attributes:
         vertices: in metres, or in the file's unit.
-        faces: rows of `vertices`, counter-clockwise seen from outside.
-        colors: linear in [0, 1], multiplied with the texture's colours; None where the file gives none.
-        image: the texture, linear in [0, 1], rows from top to bottom.
-        uv: places in it, u to the right, v upwards.
-        corners: rows of `uv` per face; if None, these are the rows of `vertices`.
-        wraps: what lies beyond the image's edges along u and v.
-        smooth: interpolate between its texels.
+        faces: indices of `vertices`, counter-clockwise when seen from outside.
+        colors: linear RGB in [0, 1], multiplied by the texture's colours; None if the file gives no colours.
+        image: the texture, linear RGB in [0, 1], rows from top to bottom.
+        uv: texture coordinates, u to the right, v upwards.
+        corners: indices of `uv` for each face; None if they equal `faces`.
+        wraps: rules for texture coordinates beyond the image's edges, along u and along v.
+        smooth: whether to interpolate between texels.
     """
 
     vertices: Float[np.ndarray, "vertices 3"]
@@ -59,10 +59,10 @@ class Subject:
     """The content of a scene file.
 
     Attributes:
-        scene: in the file's own axes and unit; its camera is meaningless.
-        plain: vertices of parts with one colour and no texture, whose shape only shading shows.
+        scene: all surfaces, in the file's own axes and unit; the camera is a placeholder.
+        plain: True for vertices of parts with a single colour and no texture; only shading makes their shape visible.
         up: the axis that points upwards by the convention of the file's format.
-        notes: one sentence about each thing that the file has and the scene lacks.
+        notes: one sentence about each element of the file that the scene leaves out.
     """
 
     scene: Scene
@@ -71,8 +71,13 @@ class Subject:
     notes: tuple[str, ...] = ()
 
 
-def subject(parts: Sequence[Part], up: Axis, notes: Sequence[str] = ()) -> Subject:
-    """Join the parts of a file.
+def join_parts(parts: Sequence[Part], up: Axis, notes: Sequence[str] = ()) -> Subject:
+    """Join the parts of a file into one scene.
+
+    Args:
+        parts: surfaces of the file; parts without faces are ignored.
+        up: the axis that points upwards.
+        notes: sentences about elements of the file that are left out; repeated sentences are kept once.
 
     Raises:
         DataError: there are no faces, a coordinate is not finite or too large, or textures continue beyond their edges
@@ -80,20 +85,25 @@ def subject(parts: Sequence[Part], up: Axis, notes: Sequence[str] = ()) -> Subje
     """
     parts = [part for part in parts if len(part.faces)]
     if not parts:
-        raise DataError("it has no faces, only points or lines; wanted a surface. Make a mesh of them first.")
+        raise DataError(
+            "the file has no faces, only points or lines, but a surface is required. Create a mesh from the points "
+            "first."
+        )
     for part in parts:
-        for what, numbers in (("coordinate", part.vertices), ("place in a texture", part.uv)):
+        for quantity, numbers in (("coordinate", part.vertices), ("texture coordinate", part.uv)):
             if numbers is not None and not np.isfinite(numbers).all():
-                raise DataError(f"a {what} is not finite; restore the file from its source.")
+                raise DataError(f"a {quantity} is not finite. Copy the file again from its source.")
         if np.abs(part.vertices).max() > FARTHEST:
-            raise DataError(f"a coordinate is beyond {FARTHEST:g}; wanted metres. Scale it down.")
-    wrap, smooth = _wrap(parts), all(part.smooth for part in parts if part.image is not None)
-    scene = join_scenes([_scene(part, wrap, smooth) for part in parts])
-    plain = [torch.full((len(part.vertices),), _plain(part)) for part in parts]
+            raise DataError(
+                f"a coordinate is beyond {FARTHEST:g}; coordinates should be in metres. Scale the scene down."
+            )
+    wrap, smooth = _find_wrap(parts), all(part.smooth for part in parts if part.image is not None)
+    scene = join_scenes([_part_to_scene(part, wrap, smooth) for part in parts])
+    plain = [torch.full((len(part.vertices),), _has_one_color(part)) for part in parts]
     return Subject(scene, torch.cat(plain), up, tuple(dict.fromkeys(notes)))
 
 
-def _scene(part: Part, wrap: Wrap, smooth: bool) -> Scene:
+def _part_to_scene(part: Part, wrap: Wrap, smooth: bool) -> Scene:
     light = 1.0 if part.image is not None else GREY
     colors = np.full_like(part.vertices, light) if part.colors is None else part.colors.clip(0, 1)
     texture = None
@@ -110,50 +120,55 @@ def _scene(part: Part, wrap: Wrap, smooth: bool) -> Scene:
         torch.tensor(part.vertices),
         torch.tensor(part.faces.copy()),  # torch accepts no view with negative strides
         torch.tensor(colors).float(),
-        NOWHERE,
+        PLACEHOLDER_CAMERA,
         texture,
     )
 
 
-def _plain(part: Part) -> bool:
+def _has_one_color(part: Part) -> bool:
     return part.image is None and (part.colors is None or bool((part.colors == part.colors[0]).all()))
 
 
-def _wrap(parts: Sequence[Part]) -> Wrap:
-    """Return the one rule for what lies beyond the edges of all textures; only parts that reach beyond need it."""
-    named: set[Wrap] = set()
+def _find_wrap(parts: Sequence[Part]) -> Wrap:
+    """Return the wrap rule of all textures; only parts with uv beyond their texture's edges need a certain rule."""
+    stated: set[Wrap] = set()
     needed: set[Wrap] = set()
     for part in parts:
         if part.uv is None or part.image is None:
             continue
         places = part.uv[np.unique(part.faces if part.corners is None else part.corners)]
         beyond = np.any((places < -EDGE) | (places > 1 + EDGE), axis=0)
-        named.update(part.wraps)
+        stated.update(part.wraps)
         needed.update(wrap for wrap, reaches in zip(part.wraps, beyond, strict=True) if reaches)
     if len(needed) > 1:
         raise DataError(
-            f"its textures go on beyond their edges in different ways ({', '.join(sorted(needed))}); wanted one way "
-            "in a scene. Change the samplers, or draw the parts apart."
+            f"the textures continue beyond their edges in different ways ({', '.join(sorted(needed))}), but a scene "
+            "has a single way. Change the samplers, or draw the parts separately."
         )
-    return next(iter(needed or named)) if len(needed or named) == 1 else "clamp"
+    return next(iter(needed or stated)) if len(needed or stated) == 1 else "clamp"
 
 
-class Pictures:
-    """Decoder of the textures of one file, each once, with a limit on all of them together."""
+class TextureDecoder:
+    """Decoder of the textures of one file; each texture is decoded once, and their total size is limited."""
 
     def __init__(self) -> None:
         self._decoded: dict[object, Float[Tensor, "height width 3"]] = {}
         self._texels, self._bytes = 0, 0
 
-    def known(self, key: object) -> Float[Tensor, "height width 3"] | None:
-        """Return the texture that was decoded under this key, or None."""
+    def find(self, key: object) -> Float[Tensor, "height width 3"] | None:
+        """Return the texture that was decoded under this key; None if there is no such texture."""
         return self._decoded.get(key)
 
     def decode(self, key: object, content: bytes, name: str) -> Float[Tensor, "height width 3"]:
-        """Return the linear RGB of an image file's content, rows from top to bottom; transparency is ignored.
+        """Decode an image file to linear RGB, rows from top to bottom; transparency is ignored.
+
+        Args:
+            key: identifier under which `find` returns the texture.
+            content: bytes of the image file.
+            name: name of the texture for messages.
 
         Raises:
-            DataError: the content is no image, or too large.
+            DataError: the content is not an image, or the image is too large.
         """
         try:
             with images.open_stream(BytesIO(content)) as image:
@@ -162,75 +177,82 @@ class Pictures:
                 most = min(MOST_TEXELS, max(FEW_TEXELS, TEXELS_PER_BYTE * self._bytes))
                 if self._texels > most:
                     raise DataError(
-                        f"it has {image.width} x {image.height} pixels; wanted up to {most} of all textures together. "
-                        "Make it smaller."
+                        f"the image has {image.width} x {image.height} pixels, but all textures together may have at "
+                        f"most {most}. Make the image smaller."
                     )
                 light = np.empty((image.height, image.width, 3), np.float32)
                 for top, strip in images.decode_opaque(image):
-                    light[top : top + len(strip)] = _light(strip)
+                    light[top : top + len(strip)] = _to_linear(strip)
         except DataError as error:
             raise DataError(f"the texture {name}: {error}") from error
         except Exception as error:
             raise DataError(
-                f"the texture {name} cannot be read as an image ({shorten(error) or type(error).__name__}). Restore it."
+                f"the texture {name} cannot be read as an image ({shorten(error) or type(error).__name__}). Copy "
+                "the texture again from its source."
             ) from error
         self._decoded[key] = torch.from_numpy(light)
         return self._decoded[key]
 
 
-def _light(pixels: UInt8[np.ndarray, "*any"]) -> Float[np.ndarray, "*any"]:
+def _to_linear(pixels: UInt8[np.ndarray, "*any"]) -> Float[np.ndarray, "*any"]:
     return linear_from_bytes(torch.arange(256, dtype=torch.uint8)).numpy()[pixels]
 
 
-def beside(folder: Path, name: str) -> Path:
-    """Return the file that another file in `folder` refers to, if it lies in this folder or below it.
+def resolve_beside(folder: Path, name: str) -> Path:
+    """Return the path of a file that another file in `folder` refers to, if this path lies in or below `folder`.
 
     Raises:
-        DataError: the name is an address, or the file lies elsewhere.
+        DataError: the name is an address, or the path lies outside of the folder.
     """
     plain = name.replace("\\", "/")
     try:
-        found = (folder / plain).resolve()
-        found.exists()  # raises if the name is not possible for a file
-        inside = ":" not in plain and found.is_relative_to(folder.resolve())
+        resolved = (folder / plain).resolve()
+        resolved.exists()  # raises if the name is not possible for a file
+        inside = ":" not in plain and resolved.is_relative_to(folder.resolve())
     except (OSError, ValueError):
         inside = False
     if not plain or not inside:
         raise DataError(
-            f"it names {quote(name)}; wanted a file in its own folder, since others are not read. Copy it there."
+            f"the file refers to {quote(name)}, but only files in the same folder are read. Copy that file into the "
+            "folder."
         )
     return folder / plain
 
 
-def drawn_without(folder: Path, name: str, what: str, notes: list[str]) -> Path | None:
-    """Return the file that another file in `folder` refers to; None, with a note, if it is missing or lies elsewhere.
+def find_beside(folder: Path, name: str, content: str, notes: list[str]) -> Path | None:
+    """Find a file that another file in `folder` refers to; return None and add a note if there is no such file.
 
-    Programs write folders of their own machine. For such a place elsewhere, the file of the same name in `folder` is
-    taken.
+    Programs often write a path of their own machine. If the path lies outside of `folder`, the file of the same name in
+    `folder` is used.
 
     Args:
-        folder: folder of the file that refers to it.
-        name: the name that it is given there.
-        what: what the file holds, with a verb: "texture is".
-        notes: receives the notes.
+        folder: folder of the referring file.
+        name: path as it stands in the referring file.
+        content: content of the file and a verb for messages, such as "texture is".
+        notes: list to which the note is added.
 
     Raises:
-        DataError: a link leads elsewhere.
+        DataError: the file is a link to a file outside of the folder.
     """
     plain = name.replace("\\", "/")
     if ":" in plain or plain.startswith("/") or normpath(plain).startswith(".."):
-        last = plain.rpartition("/")[2]
-        file = beside(folder, last) if last.strip(".") else None
+        base_name = plain.rpartition("/")[2]
+        file = resolve_beside(folder, base_name) if base_name.strip(".") else None
         if file is None or not file.exists():
-            notes.append(f"its {what} in another folder, {shorten(name)}, which is not read: drawn without.")
+            notes.append(
+                f"the {content} in another folder, {shorten(name)}, which is not read; the scene is drawn without."
+            )
             return None
         notes.append(
-            f"its {what} in another folder, {shorten(name)}; {shorten(file.name)} beside it is read."
+            f"the {content} in another folder, {shorten(name)}; {shorten(file.name)} in the scene's folder is read "
+            "instead."
         )
         return file
-    file = beside(folder, name)
+    file = resolve_beside(folder, name)
     if file.exists():  # anything but a regular file is refused where it is read
         return file
-    thing, _, verb = what.rpartition(" ")
-    notes.append(f"its {thing} {shorten(name)} {verb} not beside it: drawn without.")
+    noun, _, verb = content.rpartition(" ")
+    notes.append(
+        f"the {noun} {shorten(name)} {verb} missing in the scene's folder; the scene is drawn without."
+    )
     return None

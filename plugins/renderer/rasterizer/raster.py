@@ -1,19 +1,19 @@
-"""Rasterisation: which pixels a triangle covers, on one CPU core; compiled functions on NumPy arrays.
+"""Rasterisation on one CPU core: which pixels a triangle covers, and which triangle is visible; compiled functions.
 
-Corners are rounded to 1/256 pixel, and edge functions that are exact on these integers (Pineda 1988)
-decide with the top-left rule which pixels a triangle covers: a pixel centre on the edge between two triangles
-belongs to exactly one of them. Rounded corners also decide which of several triangles is the nearest at a pixel. The
-colours of the nearest triangle are interpolated between corners that are not rounded, see `shading`.
+Corners are rounded to 1/256 pixel. Edge functions that are exact on these integers (Pineda 1988) and the top-left rule
+decide which pixels a triangle covers: a pixel centre on the edge between two triangles belongs to exactly one of them.
+Rounded corners also decide which of several triangles is the nearest at a pixel. The colours of the nearest triangle
+are interpolated between corners that are not rounded, see `shading`.
 
 Arrays:
-    seen: (vertices, 3) float64: x right, y down, z forward from the camera, metres.
-    screen: (vertices, 5) float64: column and row in 1/256 pixel, rounded to integers; 1 / depth in 1/metre, 0
-        where a vertex cannot be drawn; column and row in 1/256 pixel, not rounded.
-    depth, face, mask: (height, width) float32, int32, bool; the depths are those of rounded corners.
-    box: first row, past-the-last row, first column, past-the-last column of the pixels that may have been drawn.
+    camera_points: (vertices, 3) float64: vertices in camera coordinates, x right, y down, z forward, metres.
+    screen: (vertices, 5) float64: column and row in 1/256 pixel, rounded to integers; 1 / depth in 1/metre, or 0 for a
+        vertex that cannot be drawn; column and row in 1/256 pixel, not rounded.
+    depth, face, mask: (height, width) float32, int32, bool; depths are computed from rounded corners.
+    box: first row, last row + 1, first column, last column + 1 of the pixels that may show a face.
 
-An argument that is None is compiled away. `no_type_check` keeps the type checks that tests switch on from wrapping a
-kernel before it is compiled.
+If an argument is None, the code that uses it is not compiled. `no_type_check` prevents the type checker of the tests
+from wrapping a kernel before it is compiled.
 """
 
 from pathlib import Path
@@ -27,7 +27,7 @@ SUBPIXELS = 256.0
 EXACT = 2.0**25
 """Largest coordinate in 1/256 pixel at which edge functions are exact.
 
-Up to here they stay under 2^53, so that int64 and float64 give the same integer.
+Up to this size their values stay below 2^53, so that int64 and float64 give the same integer.
 """
 LARGEST = 1e100  # 1/256 pixel; a product of two coordinates and an inverse depth stays finite in float64
 NEAREST = 1e-100  # metres; the same holds for depths above this
@@ -35,7 +35,7 @@ FARTHEST = 3e38  # metres; the largest depth that float32 holds
 TILE = 8  # pixels
 RUN = 128  # faces
 DRAWN, BEHIND, FLAT, BACK, OUTSIDE, HIDDEN = range(6)
-"""Numbers of what can happen to a face."""
+"""Outcomes of drawing a face, as indices of `counts`."""
 REASONS = {BEHIND: "behind", FLAT: "flat", BACK: "back", OUTSIDE: "outside", HIDDEN: "hidden"}
 
 # Without fastmath: products must be rounded before they are subtracted, see `_draw_far`.
@@ -48,7 +48,7 @@ compiled = compiler(KEPT_IN)
 @compiled
 @no_type_check
 def largest_index(indices):
-    """Return the largest of integers read as unsigned: a negative integer counts as larger than any array."""
+    """Return the largest index; the integers are unsigned views, so that a negative index becomes a very large one."""
     largest = indices.dtype.type(0)
     for index in indices:
         largest = max(largest, index)
@@ -57,11 +57,11 @@ def largest_index(indices):
 
 @compiled
 @no_type_check
-def out_of_view(vertices, rotation, translation, focal, principal, near, height, width):
-    """Return whether the box around all vertices lies wholly outside one plane of the view.
+def is_out_of_view(vertices, rotation, translation, focal, principal, near, height, width):
+    """Return whether the bounding box of all vertices lies completely outside one plane of the view frustum.
 
-    The planes stand one pixel outside the image, so that rounding hides no visible pixel. NaN takes part in no
-    comparison; an infinite coordinate makes the box infinite and the answer false.
+    The planes lie one pixel outside of the image, so that rounding loses no visible pixel. Coordinates that are NaN are
+    ignored. An infinite coordinate makes the box infinite and the result False.
     """
     low = np.full(3, np.inf)
     high = np.full(3, -np.inf)
@@ -73,7 +73,8 @@ def out_of_view(vertices, rotation, translation, focal, principal, near, height,
             if value > high[axis]:
                 high[axis] = value
     for plane in range(5):
-        # Each plane as weights of the camera coordinates (x, y, z) and an offset; seen points give >= 0.
+        # a plane is given by weights of the camera coordinates (x, y, z) and an offset; the sum is >= 0 for visible
+        # points
         x = y = offset = 0.0
         if plane == 0:
             z, offset = 1.0, -near
@@ -92,15 +93,18 @@ def out_of_view(vertices, rotation, translation, focal, principal, near, height,
             slope = along_x + along_y + along_z
             most += max(slope * low[axis], slope * high[axis])
             size += (abs(along_x) + abs(along_y) + abs(along_z)) * max(abs(low[axis]), abs(high[axis]))
-        if most < -1e-12 * size:  # the rounding of the sums above is far smaller
+        if most < -1e-12 * size:  # far more than the rounding error of these sums
             return True
     return False
 
 
 @compiled
 @no_type_check
-def project(vertices, rotation, translation, focal, principal, near, seen, screen):
-    """Fill `seen` and `screen` from world coordinates; return how many finite vertices the near plane cuts off."""
+def project(vertices, rotation, translation, focal, principal, near, camera_points, screen):
+    """Fill `camera_points` and `screen` from world coordinates.
+
+    Return the number of finite vertices that the near plane cuts off.
+    """
     hidden = 0
     for vertex in range(vertices.shape[0]):
         a = np.float64(vertices[vertex, 0])
@@ -109,7 +113,7 @@ def project(vertices, rotation, translation, focal, principal, near, seen, scree
         x = rotation[0, 0] * a + rotation[0, 1] * b + rotation[0, 2] * c + translation[0]
         y = rotation[1, 0] * a + rotation[1, 1] * b + rotation[1, 2] * c + translation[1]
         z = rotation[2, 0] * a + rotation[2, 1] * b + rotation[2, 2] * c + translation[2]
-        seen[vertex, 0], seen[vertex, 1], seen[vertex, 2] = x, y, z
+        camera_points[vertex, 0], camera_points[vertex, 1], camera_points[vertex, 2] = x, y, z
         on_screen(x, y, z, focal, principal, near, screen[vertex])
         if screen[vertex, 2] == 0 and z < near and abs(x) <= LARGEST and abs(y) <= LARGEST and z >= -LARGEST:
             hidden += 1
@@ -118,30 +122,33 @@ def project(vertices, rotation, translation, focal, principal, near, seen, scree
 
 @compiled
 @no_type_check
-def on_screen(x, y, z, focal, principal, near, place):
-    """Fill `place`, a row of `screen`, from camera coordinates."""
+def on_screen(x, y, z, focal, principal, near, row_of_screen):
+    """Fill a row of `screen` from camera coordinates."""
     inverse = 1.0 / z
     column = (focal[0] * x * inverse + principal[0]) * SUBPIXELS
     row = (focal[1] * y * inverse + principal[1]) * SUBPIXELS
-    # Tested as floats and before any cast; NaN fails every comparison.
+    # compared as floats, before any cast to integers; every comparison with NaN is false
     if z >= near and z <= FARTHEST and abs(column) <= LARGEST and abs(row) <= LARGEST:
-        place[0], place[1], place[2] = np.rint(column), np.rint(row), inverse
-        place[3], place[4] = column, row
+        row_of_screen[0], row_of_screen[1], row_of_screen[2] = np.rint(column), np.rint(row), inverse
+        row_of_screen[3], row_of_screen[4] = column, row
     else:
-        place[:] = 0.0
+        row_of_screen[:] = 0.0
 
 
 @compiled
 @no_type_check
-def owned(along_column, along_row):
-    """Return whether pixels exactly on an edge belong to the triangle, by the edge function's slope (top-left rule)."""
+def owns_edge(along_column, along_row):
+    """Return whether pixel centres exactly on an edge belong to the triangle (top-left rule).
+
+    The arguments are the derivatives of the edge function along columns and rows.
+    """
     return along_column > 0 or (along_column == 0 and along_row > 0)
 
 
 @compiled
 @no_type_check
-def before(x, y, other_x, other_y):
-    """Return whether one point comes before another, row by row."""
+def comes_before(x, y, other_x, other_y):
+    """Return whether a point precedes another point in row-major order."""
     return y < other_y or (y == other_y and x < other_x)
 
 
@@ -150,21 +157,31 @@ def before(x, y, other_x, other_y):
 def rasterise(
     screen, faces, first, numbers, cull, height, width, depth, face, mask, farthest, empty, changed, counts
 ):
-    """Draw the faces into `depth` and `face`, or into `mask` alone, and return the box.
+    """Draw faces into `depth` and `face`, or only into `mask`, and return the box of the pixels.
 
-    Each pixel shows the nearest face, and among equal float32 depths the face with the lowest number. The arrays may
-    hold faces that were drawn before; arrays that are not drawn into are None.
+    Each pixel shows the nearest face; among equal float32 depths, it shows the face with the lowest number. The arrays
+    may already show other faces.
 
-    Faces are numbered from `first` on where `numbers` is None, otherwise by `numbers`; faces with the same number are
-    parts of one face. `cull` leaves out faces seen from behind. `farthest`, `empty` and `changed` are None, or arrays
-    over tiles of `TILE` × `TILE` pixels: no depth in a tile is beyond `farthest`, `empty` pixels of it show the
-    background, and `changed` pixels were written since `farthest` was computed. What happens to the faces is added to
-    `counts`, by `DRAWN` and so on.
+    Args:
+        screen: corners, see the module.
+        faces: (faces, 3), indices of rows of `screen`.
+        first: number of the first face, if `numbers` is None.
+        numbers: (faces), number of each face, or None; faces with the same number are parts of one face.
+        cull: leave out faces seen from behind.
+        height: height of the image, pixels.
+        width: width of the image, pixels.
+        depth: depths, or None.
+        face: visible faces; None if `depth` is None.
+        mask: covered pixels, or None.
+        farthest: None, or an upper bound of the depths in each tile of `TILE` × `TILE` pixels.
+        empty: None, or the number of pixels of each tile that show the background.
+        changed: None, or the number of pixels of each tile that were written since `farthest` was computed.
+        counts: (6) int64; the number of faces with each outcome (`DRAWN` etc.) is added.
     """
     last_x, last_y = (width - 1) * SUBPIXELS, (height - 1) * SUBPIXELS
     box_top, box_bottom, box_left, box_right = height, 0, width, 0
-    behind = flat = back = outside = hidden = drawn = 0
-    last_drawn = -1
+    behind = flat = back = outside = hidden = drawn_faces = 0
+    last_number = -1
     for index in range(faces.shape[0]):
         a, b, c = faces[index, 0], faces[index, 1], faces[index, 2]
         near0, near1, near2 = screen[a, 2], screen[b, 2], screen[c, 2]
@@ -175,7 +192,7 @@ def rasterise(
         bx, by = screen[b, 0], screen[b, 1]
         cx, cy = screen[c, 0], screen[c, 1]
         area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)  # exact up to EXACT
-        # Counter-clockwise from outside has negative area where rows run downwards.
+        # counter-clockwise faces have negative area, because rows run downwards
         if area < 0:
             area = -area
             bx, by, near1, cx, cy, near2 = cx, cy, near2, bx, by, near1
@@ -190,7 +207,7 @@ def rasterise(
         if right < 0 or bottom < 0 or left > last_x or top > last_y:
             outside += 1
             continue
-        # The pixel centres in the bounding box; clamped as floats, so that the casts are safe.
+        # pixel centres in the bounding box; coordinates are clamped as floats, so that the casts are safe
         first_column = (np.int64(max(left, 0.0)) + 255) >> 8
         last_column = np.int64(min(right, last_x)) >> 8
         first_row = (np.int64(max(top, 0.0)) + 255) >> 8
@@ -205,19 +222,19 @@ def rasterise(
             continue
         if numbers is None:
             number = first + index
-            drawn += 1
+            drawn_faces += 1
         else:
             number = numbers[index]
-            drawn += 1 if number != last_drawn else 0
-            last_drawn = number
+            drawn_faces += 1 if number != last_number else 0
+            last_number = number
         box_top, box_bottom = min(box_top, first_row), max(box_bottom, last_row + 1)
         box_left, box_right = min(box_left, first_column), max(box_right, last_column + 1)
         if depth is not None:
-            # The topmost, then leftmost corner first: the rounding of a depth then does not depend on the order
-            # in which a face names its corners, and two faces with the same corners are equally far.
-            if before(bx, by, ax, ay) and before(bx, by, cx, cy):
+            # start with the topmost, then leftmost corner: the rounding of a depth then does not depend on the order of
+            # the corners, and two faces with the same corners have the same depths
+            if comes_before(bx, by, ax, ay) and comes_before(bx, by, cx, cy):
                 ax, ay, near0, bx, by, near1, cx, cy, near2 = bx, by, near1, cx, cy, near2, ax, ay, near0
-            elif before(cx, cy, ax, ay):
+            elif comes_before(cx, cy, ax, ay):
                 ax, ay, near0, bx, by, near1, cx, cy, near2 = cx, cy, near2, ax, ay, near0, bx, by, near1
         if left < -EXACT or right > EXACT or top < -EXACT or bottom > EXACT:
             corners = (ax, ay, near0, bx, by, near1, cx, cy, near2)
@@ -225,13 +242,13 @@ def rasterise(
             continue
         x0, y0, x1, y1 = np.int64(ax), np.int64(ay), np.int64(bx), np.int64(by)
         x2, y2 = np.int64(cx), np.int64(cy)
-        # Edge functions, each opposite its corner and positive inside (Pineda 1988): their gradients.
+        # gradients of the edge functions (Pineda 1988), each of the edge opposite a corner, positive inside
         column0, row0 = y1 - y2, x2 - x1
         column1, row1 = y2 - y0, x0 - x2
         column2, row2 = y0 - y1, x1 - x0
-        bias0 = 0 if owned(column0, row0) else 1
-        bias1 = 0 if owned(column1, row1) else 1
-        bias2 = 0 if owned(column2, row2) else 1
+        bias0 = 0 if owns_edge(column0, row0) else 1
+        bias1 = 0 if owns_edge(column1, row1) else 1
+        bias2 = 0 if owns_edge(column2, row2) else 1
         x, y = first_column << 8, first_row << 8
         start0 = column0 * (x - x1) + row0 * (y - y1) - bias0
         start1 = column1 * (x - x2) + row1 * (y - y2) - bias1
@@ -246,16 +263,16 @@ def rasterise(
                 if mask is not None:
                     mask[row, column] |= (edge0 | edge1 | edge2) >= 0
                 if depth is not None and (edge0 | edge1 | edge2) >= 0:
-                    # 1 / depth is affine on the screen; clamped, it cannot leave the corners' range.
+                    # 1 / depth is affine on the screen; it is clamped to the range of the corners
                     inverse = (edge0 + bias0) * scale0 + (edge1 + bias1) * scale1 + (edge2 + bias2) * scale2
                     distance = np.float32(1.0 / min(max(inverse, least), most))
-                    there = depth[row, column]
-                    if distance < there or (distance == there and number < face[row, column]):
+                    shown_depth = depth[row, column]
+                    if distance < shown_depth or (distance == shown_depth and number < face[row, column]):
                         depth[row, column] = distance
                         face[row, column] = number
                         if empty is not None:
                             written += 1
-                            if there == np.inf:
+                            if shown_depth == np.inf:
                                 empty[row // TILE, column // TILE] -= 1
                 edge0 += column0
                 edge1 += column1
@@ -264,8 +281,8 @@ def rasterise(
             start1 += row1
             start2 += row2
         if farthest is not None and written > 0:
-            look_up(farthest, empty, changed, pixels, written, depth)
-    for place, count in ((DRAWN, drawn), (BEHIND, behind), (FLAT, flat), (BACK, back)):
+            update_tiles(farthest, empty, changed, pixels, written, depth)
+    for place, count in ((DRAWN, drawn_faces), (BEHIND, behind), (FLAT, flat), (BACK, back)):
         counts[place] += count
     counts[OUTSIDE] += outside
     counts[HIDDEN] += hidden
@@ -275,7 +292,7 @@ def rasterise(
 @compiled
 @no_type_check
 def is_hidden(farthest, pixels, nearest):
-    """Return whether everything in a box of pixels was drawn nearer than `nearest`, as far as the tiles tell."""
+    """Return whether the tiles show that every pixel of a box has a depth below `nearest`."""
     first_row, last_row, first_column, last_column = pixels
     for row in range(first_row // TILE, last_row // TILE + 1):
         for column in range(first_column // TILE, last_column // TILE + 1):
@@ -286,11 +303,11 @@ def is_hidden(farthest, pixels, nearest):
 
 @compiled
 @no_type_check
-def look_up(farthest, empty, changed, pixels, written, depth):
-    """Record that `written` pixels of a box were written, and compute how far its full tiles reach.
+def update_tiles(farthest, empty, changed, pixels, written, depth):
+    """Record that `written` pixels of a box were written, and update the largest depths of its tiles.
 
-    The depth of a tile is computed when the tile is first full, and again whenever as many pixels were written as a
-    tile has.
+    The largest depth of a tile is computed when all its pixels show a face for the first time, and again whenever as
+    many pixels were written as the tile has.
     """
     first_row, last_row, first_column, last_column = pixels
     for row in range(first_row // TILE, last_row // TILE + 1):
@@ -311,9 +328,9 @@ def look_up(farthest, empty, changed, pixels, written, depth):
 @compiled
 @no_type_check
 def front_to_back(screen, faces, cull, height, width, depth, face, farthest, empty, changed, counts):
-    """Draw as `rasterise` does, in runs of `RUN` faces from near to far, and return the box.
+    """Draw like `rasterise`, but in runs of `RUN` faces from near to far, and return the box.
 
-    A run that is hidden as a whole is counted as hidden.
+    All faces of a run that is completely hidden are counted as hidden.
     """
     runs = (faces.shape[0] + RUN - 1) // RUN
     last_x, last_y = (width - 1) * SUBPIXELS, (height - 1) * SUBPIXELS
@@ -329,20 +346,22 @@ def front_to_back(screen, faces, cull, height, width, depth, face, farthest, emp
                 whole &= near > 0
                 nearest[run] = max(nearest[run], near)
                 left, right, top, bottom = min(left, x), max(right, x), min(top, y), max(bottom, y)
-        # a run that is not wholly before the near plane, or is out of view, gets no pixels, so it is never hidden
+        # a run that crosses the near plane or is out of view gets an empty box, so it is never skipped as hidden
         if not whole or right < 0 or bottom < 0 or left > last_x or top > last_y:
             left, right, top, bottom = 0.0, -SUBPIXELS, 0.0, -SUBPIXELS
         bounds[run, 0], bounds[run, 1] = np.int64(max(top, 0.0)) >> 8, np.int64(min(bottom, last_y)) >> 8
         bounds[run, 2], bounds[run, 3] = np.int64(max(left, 0.0)) >> 8, np.int64(min(right, last_x)) >> 8
     top, bottom, left, right = height, 0, width, 0
     for run in np.argsort(-nearest):
-        some = faces[run * RUN : (run + 1) * RUN]
+        run_faces = faces[run * RUN : (run + 1) * RUN]
         pixels = (bounds[run, 0], bounds[run, 1], bounds[run, 2], bounds[run, 3])
         if bounds[run, 1] >= 0 and is_hidden(farthest, pixels, np.float32(1.0 / nearest[run])):
-            counts[HIDDEN] += some.shape[0]
+            counts[HIDDEN] += run_faces.shape[0]
             continue
         tiles = (farthest, empty, changed)
-        box = rasterise(screen, some, run * RUN, None, cull, height, width, depth, face, None, *tiles, counts)
+        box = rasterise(
+            screen, run_faces, run * RUN, None, cull, height, width, depth, face, None, *tiles, counts
+        )
         top, bottom = min(top, box[0]), max(bottom, box[1])
         left, right = min(left, box[2]), max(right, box[3])
     return top, bottom, left, right
@@ -351,14 +370,19 @@ def front_to_back(screen, faces, cull, height, width, depth, face, farthest, emp
 @compiled
 @no_type_check
 def _draw_far(corners, pixels, number, depth, face, mask):
-    """Draw a face that reaches beyond `EXACT`, with edge functions in float64, computed anew at each pixel.
+    """Draw a face with coordinates beyond `EXACT`, with float64 edge functions that are computed for each pixel.
 
-    Even rounded, these change exactly their sign with an edge's direction (`edges`), so that neighbouring faces share
-    no pixel and leave none out; between corners within `EXACT` they are the integers of `rasterise`.
+    Reversing an edge changes only the sign of its rounded edge function (`edges`), so that neighbouring faces cover no
+    pixel twice and leave no gap. For edges between corners within `EXACT`, the values equal the integers of
+    `rasterise`.
     """
     ax, ay, near0, bx, by, near1, cx, cy, near2 = corners
     first_row, last_row, first_column, last_column = pixels
-    owned0, owned1, owned2 = owned(by - cy, cx - bx), owned(cy - ay, ax - cx), owned(ay - by, bx - ax)
+    owned0, owned1, owned2 = (
+        owns_edge(by - cy, cx - bx),
+        owns_edge(cy - ay, ax - cx),
+        owns_edge(ay - by, bx - ax),
+    )
     least, most = min(near0, near1, near2), max(near0, near1, near2)
     for row in range(first_row, last_row + 1):
         for column in range(first_column, last_column + 1):
@@ -373,8 +397,8 @@ def _draw_far(corners, pixels, number, depth, face, mask):
             if depth is not None:
                 inverse = (edge0 * near0 + edge1 * near1 + edge2 * near2) / (edge0 + edge1 + edge2)
                 distance = np.float32(1.0 / min(max(inverse, least), most))
-                there = depth[row, column]
-                if distance < there or (distance == there and number < face[row, column]):
+                shown_depth = depth[row, column]
+                if distance < shown_depth or (distance == shown_depth and number < face[row, column]):
                     depth[row, column] = distance
                     face[row, column] = number
 
@@ -382,7 +406,7 @@ def _draw_far(corners, pixels, number, depth, face, mask):
 @compiled
 @no_type_check
 def edges(ax, ay, bx, by, cx, cy, row, column):
-    """Return a triangle's edge functions at a pixel, each opposite its corner: x1 y2 - x2 y1 relative to the pixel."""
+    """Return the edge functions x1 y2 - x2 y1 of a triangle, relative to a pixel; the i-th is opposite corner i."""
     x, y = column * SUBPIXELS, row * SUBPIXELS
     ax, ay, bx, by, cx, cy = ax - x, ay - y, bx - x, by - y, cx - x, cy - y
     return bx * cy - cx * by, cx * ay - ax * cy, ax * by - bx * ay
@@ -391,7 +415,7 @@ def edges(ax, ay, bx, by, cx, cy, row, column):
 @compiled
 @no_type_check
 def to_edge(ax, ay, bx, by, x, y):
-    """Return the squared distance from a point to an edge, and the place of the closest point on it, 0 to 1."""
+    """Return the squared distance from a point to an edge, and the position of the nearest point on it, 0 to 1."""
     ux, uy, vx, vy = bx - ax, by - ay, x - ax, y - ay
     length = ux * ux + uy * uy
     part = min(max((ux * vx + uy * vy) / length, 0.0), 1.0) if length > 0 else 0.0

@@ -1,4 +1,4 @@
-"""A differentiable rasteriser on one CPU core; it implements the contract of framework.renderer."""
+"""Differentiable rasteriser on one CPU core, or in plain torch on a GPU."""
 
 from collections.abc import Collection, Sequence
 from typing import Annotated
@@ -11,38 +11,41 @@ from torch.nn.functional import avg_pool2d
 from framework.renderer import Renderer, Report, Scene
 from framework.storage.threads import POOL
 from plugins.renderer.rasterizer import reference
-from plugins.renderer.rasterizer.canvas import Canvas, Shelf
-from plugins.renderer.rasterizer.checks import CHANNELS, PAINTED, Ready, check_on_device, ready
-from plugins.renderer.rasterizer.drawing import Gradient, Picture, Saving, View, draw
+from plugins.renderer.rasterizer.canvas import Canvas, MeshCache
+from plugins.renderer.rasterizer.checks import CHANNELS, TEXTURED, CheckedScene, check_on_device, check_scene
+from plugins.renderer.rasterizer.drawing import DrawImage, DrawingSettings, Gradient, Saving, draw
 from plugins.renderer.rasterizer.raster import NEAREST
 
-ALL: tuple[Saving, ...] = ("view", "box", "unchanged")
+DEFAULT_SAVINGS: tuple[Saving, ...] = ("view", "box", "unchanged")
 
 
 class Rasterizer(Renderer):
     """A rasteriser of coloured and textured meshes, without gaps between faces, differentiable in all scene inputs.
 
     Corners are rounded to 1/256 pixel, and integers decide which pixels a triangle covers: triangles that share an edge
-    leave out no pixel between them and share none. Faces without area after rounding are left out; faces that the near
-    plane cuts are clipped. Depth and colour are perspective-correct, between corners that are not rounded. Tensors live
-    on the CPU; a scene on a GPU is drawn there in plain torch, without faces that the near plane cuts and with gradient
-    "interior" alone.
+    leave no pixel between them uncovered and cover no pixel twice. Faces without area after rounding are left out;
+    faces that the near plane cuts are clipped. Depth and colour are perspective-correct and are interpolated between
+    corners that are not rounded.
 
-    "color" has a gradient in vertices, colours, textures' images and uv, and the camera's rotation, translation, focal
-    lengths and principal point. "depth" has one too, except for the edges of visible surfaces.
+    A scene on the CPU is drawn by compiled kernels. A scene on a GPU is drawn there in plain torch (`on_device`): faces
+    that the near plane cuts are left out, and only the gradient "interior" is available.
+
+    "color" has a gradient with respect to vertices, colours, texture images, uv and the camera's rotation, translation,
+    focal lengths and principal point. "depth" has a gradient too, but without the effect of moving edges.
 
     Args:
-        cull: leave out faces seen from behind; right for closed meshes only, and faster.
-        gradient: "boundary": gradients inside of faces and from moving edges, where one surface replaces another;
-            "interior": gradients inside of faces alone; "nmr": the approximation of Kato et al., for comparison;
-            "soft": the image itself is that of Liu et al., blurred and blended, for comparison, in "color" of vertex
-            colours alone.
-        sigma: how far coverage blurs ("soft" alone): squared distance, where the image's shorter side is 2.
-        gamma: how far depths blend ("soft" alone), as a ratio of the nearest depth to a face's depth.
-        supersampling: samples per pixel along each axis, for "color" alone, which is then their mean.
-        savings: work that may be left out; the image is the same to the last bit. "view": scenes wholly out of view;
-            "box": pixels around the drawn faces; "hidden": faces behind those drawn before, nearest first, which is
-            faster where much is hidden; "unchanged": everything that is as it was in the last image.
+        cull: leave out faces seen from behind; faster, but correct for closed meshes only.
+        gradient: "boundary": gradients inside of faces, and from moving edges at which one surface replaces another;
+            "interior": gradients inside of faces only; "nmr": the approximation of Kato et al., for comparison; "soft":
+            the blurred and blended image of Liu et al., for comparison, which changes "color" and shows vertex colours
+            only.
+        sigma: blur of coverage ("soft" only), as a squared distance in units in which the image's shorter side is 2.
+        gamma: blur of depth ("soft" only), in units of the ratio of the nearest depth to a face's depth.
+        supersampling: samples per pixel along each axis; "color" is their mean, other channels take one sample.
+        savings: work that may be skipped; the image stays the same to the last bit. "view": scenes completely out of
+            view; "box": pixels outside of the box around the drawn faces; "hidden": faces behind faces that were drawn
+            before, which sorts faces by depth and is faster if many faces are hidden; "unchanged": results that have
+            not changed since the last image.
     """
 
     channels = frozenset(CHANNELS)
@@ -84,7 +87,7 @@ class Rasterizer(Renderer):
         sigma: Annotated[float, Field(ge=1e-8, le=1)] = 1e-5,
         gamma: Annotated[float, Field(ge=1e-6, le=1)] = 1e-4,
         supersampling: Annotated[int, Field(ge=1, le=16)] = 1,
-        savings: tuple[Saving, ...] = ALL,
+        savings: tuple[Saving, ...] = DEFAULT_SAVINGS,
     ) -> None:
         self.cull = cull
         self.gradient: Gradient = gradient
@@ -97,65 +100,65 @@ class Rasterizer(Renderer):
         if gradient != "soft":
             self.differentiable |= {"texture", "uv"}
         self.report: Report | None = None
-        self._shelf, self._pool = Shelf(), list[Canvas]()
+        self._mesh_cache, self._pool = MeshCache(), list[Canvas]()
 
     def __call__(self, scene: Scene, channels: Collection[str] = ("color",)) -> dict[str, Tensor]:
-        drawn, self.report = self._picture(scene, channels)
-        return drawn
+        rendered, self.report = self._render(scene, channels)
+        return rendered
 
     def batch(
         self, scenes: Sequence[Scene], channels: Collection[str] = ("color",)
     ) -> list[dict[str, Tensor]]:
-        """Draw several scenes in parallel on as many threads as torch uses; `report` is then of the last scene."""
+        """Draw several scenes in parallel on as many threads as torch uses; `report` describes the last scene."""
         learning = torch.is_grad_enabled()
-        found: list[tuple[dict[str, Tensor], Report | None]] = [({}, None)] * len(scenes)
+        results: list[tuple[dict[str, Tensor], Report | None]] = [({}, None)] * len(scenes)
 
         def draw(number: int) -> None:
             with torch.set_grad_enabled(learning):  # each thread has its own setting
-                found[number] = self._picture(scenes[number], channels)
+                results[number] = self._render(scenes[number], channels)
 
         POOL.share(draw, len(scenes), torch.get_num_threads())
-        if found:
-            self.report = found[-1][1]
-        return [drawn for drawn, _ in found]
+        if results:
+            self.report = results[-1][1]
+        return [channels for channels, _ in results]
 
-    def _picture(self, scene: Scene, channels: Collection[str]) -> tuple[dict[str, Tensor], Report | None]:
+    def _render(self, scene: Scene, channels: Collection[str]) -> tuple[dict[str, Tensor], Report | None]:
         if scene.vertices.device.type == "cuda":
             return self.on_device(scene, channels), None
-        checked = ready(scene, channels, self._shelf, self.gradient)
-        found: dict[str, Tensor] = {}
+        checked = check_scene(scene, channels, self._mesh_cache, self.gradient)
+        rendered: dict[str, Tensor] = {}
         report = None
-        for names, times in samples(channels, self.supersampling):
-            drawn, report = self._drawn(scene, checked, names, times)
-            found |= drawn
-        return {name: found[name] for name in channels}, report
+        for names, times in group_by_samples(channels, self.supersampling):
+            group, report = self._render_samples(scene, checked, names, times)
+            rendered |= group
+        return {name: rendered[name] for name in channels}, report
 
     def on_device(self, scene: Scene, channels: Collection[str]) -> dict[str, Tensor]:
-        """Return the channels as drawn by `reference`, on the device of the scene's tensors."""
+        """Draw the channels in plain torch (`reference`) on the device of the scene's tensors."""
         lens, camera = check_on_device(scene, channels, self.gradient), scene.camera
         if self.gradient == "soft":
             raise ValueError(
-                "gradient=soft draws on the CPU; give tensors there, or choose another gradient."
+                "gradient=soft draws only on the CPU. Move the scene to the CPU, or choose another gradient."
             )
-        found: dict[str, Tensor] = {}
-        for names, times in samples(channels, self.supersampling):
+        rendered: dict[str, Tensor] = {}
+        for names, times in group_by_samples(channels, self.supersampling):
             shift = torch.tensor([0.0, 0.0, 0.5, 0.5], dtype=torch.float64, device=lens.device)
             pose = (camera.rotation, camera.translation, (lens + shift) * times - shift)
             size = (camera.height * times, camera.width * times)
             near = max(float(camera.near), NEAREST)
-            colors = scene.colors if "color" in names else None  # colours were checked only if they are read
-            texture = None if set(PAINTED).isdisjoint(names) else scene.texture
+            colors = scene.colors if "color" in names else None  # colours are checked only if they are drawn
+            texture = None if set(TEXTURED).isdisjoint(names) else scene.texture
             surface = (scene.vertices, scene.faces, colors, texture)
-            drawn = reference.picture(*surface, pose, near, size, names, self.cull)
-            found |= pooled(drawn, times)
-        return {name: found[name] for name in channels}
+            group = reference.render(*surface, pose, near, size, names, self.cull)
+            rendered |= average_samples(group, times)
+        return {name: rendered[name] for name in channels}
 
-    def _drawn(
-        self, scene: Scene, checked: Ready, channels: tuple[str, ...], times: int
+    def _render_samples(
+        self, scene: Scene, checked: CheckedScene, channels: tuple[str, ...], times: int
     ) -> tuple[dict[str, Tensor], Report]:
-        """Return the channels, with `times` samples per pixel along each axis."""
+        """Draw channels of a checked scene with `times` samples per pixel along each axis."""
         camera = scene.camera
-        view = View(
+        settings = DrawingSettings(
             checked.faces,
             checked.near,
             (camera.height * times, camera.width * times),
@@ -166,24 +169,24 @@ class Rasterizer(Renderer):
             self.savings,
             times == 1,
         )
-        given, lens = checked.given(times, "color" in channels)
-        if checked.learning and not {"color", "depth"}.isdisjoint(channels):
-            made: list[Report] = []
+        arrays, lens = checked.to_arrays(times, "color" in channels)
+        if checked.needs_gradient and not {"color", "depth"}.isdisjoint(channels):
+            reports: list[Report] = []
             colors = checked.colors if "color" in channels else None
             uv, images = checked.uv_and_images if "color" in channels else (None, ())
             learned = (checked.vertices, colors, camera.rotation, camera.translation, lens, uv)
-            tensors = Picture.apply(*learned, given, view, self._pool, made, *images)
-            found, report = dict(zip(channels, tensors, strict=True)), made[0]
+            tensors = DrawImage.apply(*learned, arrays, settings, self._pool, reports, *images)
+            rendered, report = dict(zip(channels, tensors, strict=True)), reports[0]
         else:
-            drawn = draw(given, view, self._pool, learning=False)
-            found, report = drawn.channels, drawn.report
-        return pooled(found, times), report
+            image = draw(arrays, settings, self._pool, learning=False)
+            rendered, report = image.channels, image.report
+        return average_samples(rendered, times), report
 
 
-def samples(channels: Collection[str], supersampling: int) -> list[tuple[tuple[str, ...], int]]:
-    """Return the groups of channels that are drawn together, each with its samples per pixel along each axis.
+def group_by_samples(channels: Collection[str], supersampling: int) -> list[tuple[tuple[str, ...], int]]:
+    """Return groups of channels that are drawn together, with the samples per pixel along each axis of each group.
 
-    Colours come last.
+    Colours form the last group.
     """
     names = tuple(dict.fromkeys(channels))
     rest = tuple(name for name in names if name != "color")
@@ -192,8 +195,8 @@ def samples(channels: Collection[str], supersampling: int) -> list[tuple[tuple[s
     return [*([(rest, 1)] if rest else []), (("color",), supersampling)]
 
 
-def pooled(drawn: dict[str, Tensor], times: int) -> dict[str, Tensor]:
-    """Return the mean of `times` × `times` samples for each pixel."""
+def average_samples(channels: dict[str, Tensor], times: int) -> dict[str, Tensor]:
+    """Return the mean of `times` × `times` samples for each pixel of every channel."""
     if times == 1:
-        return drawn
-    return {name: avg_pool2d(picture.movedim(-1, 0), times).movedim(0, -1) for name, picture in drawn.items()}
+        return channels
+    return {name: avg_pool2d(image.movedim(-1, 0), times).movedim(0, -1) for name, image in channels.items()}

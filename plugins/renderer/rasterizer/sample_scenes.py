@@ -1,4 +1,4 @@
-"""Scenes as bytes, for tests: glTF from a description and arrays, a complete sample of it, and a sample of OBJ."""
+"""Scene files for tests: functions that write glTF from a description and arrays, a glTF sample, an OBJ sample."""
 
 import base64
 import copy
@@ -16,10 +16,11 @@ TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 Entry = dict[str, Any]
 
 
-def described(content: Entry, parts: Sequence[NDArray | bytes]) -> tuple[Entry, bytes]:
-    """Return a complete description and the binary part, from arrays and bytes in their order.
+def describe(content: Entry, parts: Sequence[NDArray | bytes]) -> tuple[Entry, bytes]:
+    """Return the complete description of a glTF file, and its binary part.
 
-    Arrays become accessors, bytes become buffer views only.
+    The binary part holds `parts` in their order. An array becomes an accessor with a buffer view; bytes become only a
+    buffer view.
     """
     content = {"asset": {"version": "2.0"}, "accessors": [], "bufferViews": [], **copy.deepcopy(content)}
     binary = b""
@@ -42,13 +43,13 @@ def described(content: Entry, parts: Sequence[NDArray | bytes]) -> tuple[Entry, 
 
 
 def glb(content: Entry, parts: Sequence[NDArray | bytes]) -> bytes:
-    """Return the bytes of a .glb file."""
-    whole, binary = described(content, parts)
-    return packed(json.dumps(whole).encode(), binary)
+    """Return the bytes of a .glb file with the given description and binary parts."""
+    description, binary = describe(content, parts)
+    return pack_glb(json.dumps(description).encode(), binary)
 
 
-def packed(text: bytes, binary: bytes) -> bytes:
-    """Return the bytes of a .glb file from its description and its binary part."""
+def pack_glb(text: bytes, binary: bytes) -> bytes:
+    """Return the bytes of a .glb file from its description as JSON and its binary part."""
     text += b" " * (-len(text) % 4)
     size = 12 + 8 + len(text) + 8 + len(binary)
     words = [b"glTF", (2).to_bytes(4, "little"), size.to_bytes(4, "little")]
@@ -65,12 +66,14 @@ def packed(text: bytes, binary: bytes) -> bytes:
 
 def gltf(content: Entry, parts: Sequence[NDArray | bytes]) -> bytes:
     """Return the bytes of a .gltf file with its binary part in base64."""
-    whole, binary = described(content, parts)
-    whole["buffers"][0]["uri"] = "data:application/octet-stream;base64," + base64.b64encode(binary).decode()
-    return json.dumps(whole).encode()
+    description, binary = describe(content, parts)
+    description["buffers"][0]["uri"] = (
+        "data:application/octet-stream;base64," + base64.b64encode(binary).decode()
+    )
+    return json.dumps(description).encode()
 
 
-PLACES = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], "<f4")
+CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], "<f4")
 UV = np.array([[0, 1], [1, 1], [1, 0], [0, 0]], "<f4")
 ORDER = np.array([0, 1, 2, 0, 2, 3], "<u2")
 COLORS = np.array([[255, 0, 0, 255], [0, 255, 0, 255], [0, 0, 255, 255], [255, 255, 255, 255]], "u1")
@@ -119,9 +122,9 @@ QUAD: Entry = {
     "samplers": [{"wrapS": 33071, "wrapT": 33071}],
     "images": [{"bufferView": 7, "mimeType": "image/png"}],
 }
-"""Description of a textured and coloured square, shown three times, once skinned."""
+"""Description of a textured and coloured square that is shown by three nodes, one of them with a skin."""
 PARTS: list[NDArray | bytes] = [
-    PLACES,
+    CORNERS,
     UV,
     ORDER,
     COLORS,
@@ -139,7 +142,7 @@ def png(pixels: NDArray) -> bytes:
 
 
 def quad() -> tuple[Entry, list[NDArray | bytes]]:
-    """Return the description of the square and its parts."""
+    """Return the description of the square and its binary parts."""
     return QUAD, [*PARTS, png(np.zeros((4, 4, 3), np.uint8))]
 
 

@@ -1,13 +1,13 @@
-"""Colours, depths, texture places and normals of the visible face at each pixel; compiled functions.
+"""Colours, depths, texture coordinates and normals of the visible face at each pixel; compiled functions.
 
-Arrays are those of `raster`. Corners are at their projected places, not rounded. A pixel that a face covers only by the
-rounding of its corners, and which lies less than 1/256 pixel beside it, shows the nearest place of the face.
+Arrays are described in `raster`. Corners are at their projected positions, not rounded. A pixel that a face covers only
+because its corners were rounded lies less than 1/256 pixel beside the face; it shows the nearest point of the face.
 
 Args:
     colors: (vertices, channels), or None for white vertices.
-    laid: `textures.Laid`, or None.
+    texture: `textures.Laid`, or None.
     lens: fx, fy, cx, cy, pixels.
-    face: (height, width) int32, the face that each pixel of `box` shows; -1: none.
+    face: (height, width) int32, index of the face that each pixel shows, -1 for background.
 """
 
 from typing import no_type_check
@@ -15,16 +15,16 @@ from typing import no_type_check
 import numpy as np
 
 from plugins.renderer.rasterizer.raster import SUBPIXELS, compiled, edges, to_edge
-from plugins.renderer.rasterizer.textures import among_texels, mixed, uv_at
+from plugins.renderer.rasterizer.textures import find_texels, interpolate, interpolate_uv
 
 
 @compiled
 @no_type_check
-def weights(ax, ay, near0, bx, by, near1, cx, cy, near2, row, column):
+def pixel_weights(ax, ay, near0, bx, by, near1, cx, cy, near2, row, column):
     """Return perspective-correct barycentric weights of a face at a pixel that shows it: (w / z) / Σ (w / z).
 
-    `ax`, `ay` and `near0` are column and row of the first corner in 1/256 pixel, not rounded, and its 1 / depth; the
-    other corners follow in the same way.
+    `ax` and `ay` are column and row of the first corner in 1/256 pixel, not rounded, and `near0` is its 1 / depth; the
+    arguments of the other corners have the same meaning.
     """
     edge0, edge1, edge2 = edges(ax, ay, bx, by, cx, cy, row, column)
     part0, part1, part2 = edge0 * near0, edge1 * near1, edge2 * near2
@@ -38,7 +38,7 @@ def weights(ax, ay, near0, bx, by, near1, cx, cy, near2, row, column):
 @compiled
 @no_type_check
 def weights_beside(ax, ay, near0, bx, by, near1, cx, cy, near2, row, column):
-    """Return the weights of the place of a face that is nearest, on the screen, to a pixel beside it."""
+    """Return the weights of the point of a face that is nearest, on the screen, to a pixel beside the face."""
     x, y = column * SUBPIXELS, row * SUBPIXELS
     to_ab, part_ab = to_edge(ax, ay, bx, by, x, y)
     to_bc, part_bc = to_edge(bx, by, cx, cy, x, y)
@@ -55,17 +55,17 @@ def weights_beside(ax, ay, near0, bx, by, near1, cx, cy, near2, row, column):
 
 @compiled
 @no_type_check
-def weights_in_space(seen, a, b, c, ray_x, ray_y):
-    """Return barycentric weights of a face that may have corners behind the camera.
+def weights_in_space(camera_points, a, b, c, ray_x, ray_y):
+    """Return barycentric weights of a face that may have corners behind the camera, for a ray r = (ray_x, ray_y, 1).
 
-    The weights are r·(b × c) and so on over their sum (Olano & Greer 1997).
+    The weights are r·(b × c), r·(c × a), r·(a × b) over their sum (Olano & Greer 1997).
     """
-    part0 = volume(seen, b, c, ray_x, ray_y)
-    part1 = volume(seen, c, a, ray_x, ray_y)
-    part2 = volume(seen, a, b, ray_x, ray_y)
-    turn = 1.0 if part0 + part1 + part2 > 0 else -1.0
+    part0 = scalar_triple_product(camera_points, b, c, ray_x, ray_y)
+    part1 = scalar_triple_product(camera_points, c, a, ray_x, ray_y)
+    part2 = scalar_triple_product(camera_points, a, b, ray_x, ray_y)
+    sign = 1.0 if part0 + part1 + part2 > 0 else -1.0
     # rounding of corners may leave the pixel a little outside of the face
-    part0, part1, part2 = max(turn * part0, 0.0), max(turn * part1, 0.0), max(turn * part2, 0.0)
+    part0, part1, part2 = max(sign * part0, 0.0), max(sign * part1, 0.0), max(sign * part2, 0.0)
     total = part0 + part1 + part2
     if not (total > 0 and total < np.inf):  # seen edge-on
         return 1.0 / 3, 1.0 / 3, 1.0 / 3
@@ -74,60 +74,60 @@ def weights_in_space(seen, a, b, c, ray_x, ray_y):
 
 @compiled
 @no_type_check
-def volume(seen, a, b, ray_x, ray_y):
-    """Return r · (a × b) of two vertices and a ray (ray_x, ray_y, 1)."""
-    ax, ay, az = seen[a, 0], seen[a, 1], seen[a, 2]
-    bx, by, bz = seen[b, 0], seen[b, 1], seen[b, 2]
+def scalar_triple_product(camera_points, a, b, ray_x, ray_y):
+    """Return r · (a × b) for two vertices and a ray r = (ray_x, ray_y, 1)."""
+    ax, ay, az = camera_points[a, 0], camera_points[a, 1], camera_points[a, 2]
+    bx, by, bz = camera_points[b, 0], camera_points[b, 1], camera_points[b, 2]
     return ray_x * (ay * bz - az * by) + ray_y * (az * bx - ax * bz) + (ax * by - ay * bx)
 
 
 @compiled
 @no_type_check
-def weights_at(seen, screen, faces, lens, index, row, column):
+def weights_at(camera_points, screen, faces, lens, index, row, column):
     """Return barycentric weights of a face at a pixel that shows it."""
     a, b, c = faces[index, 0], faces[index, 1], faces[index, 2]
     if screen[a, 2] != 0 and screen[b, 2] != 0 and screen[c, 2] != 0:
         near0, near1, near2 = screen[a, 2], screen[b, 2], screen[c, 2]
         ax, ay, bx, by = screen[a, 3], screen[a, 4], screen[b, 3], screen[b, 4]
-        return weights(ax, ay, near0, bx, by, near1, screen[c, 3], screen[c, 4], near2, row, column)
-    return weights_in_space(seen, a, b, c, (column - lens[2]) / lens[0], (row - lens[3]) / lens[1])
+        return pixel_weights(ax, ay, near0, bx, by, near1, screen[c, 3], screen[c, 4], near2, row, column)
+    return weights_in_space(camera_points, a, b, c, (column - lens[2]) / lens[0], (row - lens[3]) / lens[1])
 
 
 @compiled
 @no_type_check
-def light(faces, colors, laid, index, w0, w1, w2, picture, row, column):
+def fill_color(faces, colors, texture, index, w0, w1, w2, image, row, column):
     """Fill a pixel of an image, (height, width, channels), with the colour of a face at barycentric weights."""
     if colors is None:
-        for channel in range(picture.shape[2]):
-            picture[row, column, channel] = 1.0
+        for channel in range(image.shape[2]):
+            image[row, column, channel] = 1.0
     else:
         a, b, c = faces[index, 0], faces[index, 1], faces[index, 2]
-        for channel in range(picture.shape[2]):
-            picture[row, column, channel] = (
+        for channel in range(image.shape[2]):
+            image[row, column, channel] = (
                 w0 * colors[a, channel] + w1 * colors[b, channel] + w2 * colors[c, channel]
             )
-    if laid is not None:
-        tint(laid, index, w0, w1, w2, picture, row, column)
+    if texture is not None:
+        multiply_by_texture(texture, index, w0, w1, w2, image, row, column)
 
 
 @compiled
 @no_type_check
-def tint(laid, index, w0, w1, w2, picture, row, column):
-    """Multiply a pixel by the colour of the face's texture there, if the face has one."""
-    if laid.shown[index] < 0:
+def multiply_by_texture(texture, index, w0, w1, w2, image, row, column):
+    """Multiply a pixel by the colour of the face's texture at barycentric weights; do nothing without a texture."""
+    if texture.shown[index] < 0:
         return
-    u, v = uv_at(laid, index, w0, w1, w2)
-    place = among_texels(laid, laid.shown[index], u, v)
-    for channel in range(picture.shape[2]):
-        picture[row, column, channel] *= mixed(laid, place, channel)
+    u, v = interpolate_uv(texture, index, w0, w1, w2)
+    texels = find_texels(texture, texture.shown[index], u, v)
+    for channel in range(image.shape[2]):
+        image[row, column, channel] *= interpolate(texture, texels, channel)
 
 
 @compiled
 @no_type_check
-def shade(seen, screen, faces, colors, laid, lens, near, face, box, color, depth):
-    """Fill `color` (height, width, channel) and `depth` (height, width), or one of them, where a face is seen.
+def shade(camera_points, screen, faces, colors, texture, lens, near, face, box, color, depth):
+    """Fill `color` (height, width, channels) and `depth` (height, width), or one of them, at pixels that show a face.
 
-    `near` is the distance of the near plane, metres; no depth is smaller.
+    Depths are clamped to at least `near`, the distance of the near plane in metres.
     """
     top, bottom, left, right = box
     for row in range(top, bottom):
@@ -135,18 +135,20 @@ def shade(seen, screen, faces, colors, laid, lens, near, face, box, color, depth
             index = face[row, column]
             if index < 0:
                 continue
-            # same as `weights_at` and `light`, but inlined: a call per pixel would count references to every array
+            # inlined copy of `weights_at` and `fill_color`: a call per pixel would count references to every array
             a, b, c = faces[index, 0], faces[index, 1], faces[index, 2]
             near0, near1, near2 = screen[a, 2], screen[b, 2], screen[c, 2]
             if near0 != 0 and near1 != 0 and near2 != 0:
                 ax, ay, bx, by = screen[a, 3], screen[a, 4], screen[b, 3], screen[b, 4]
                 cx, cy = screen[c, 3], screen[c, 4]
-                w0, w1, w2 = weights(ax, ay, near0, bx, by, near1, cx, cy, near2, row, column)
+                w0, w1, w2 = pixel_weights(ax, ay, near0, bx, by, near1, cx, cy, near2, row, column)
             else:
                 ray_x, ray_y = (column - lens[2]) / lens[0], (row - lens[3]) / lens[1]
-                w0, w1, w2 = weights_in_space(seen, a, b, c, ray_x, ray_y)
+                w0, w1, w2 = weights_in_space(camera_points, a, b, c, ray_x, ray_y)
             if depth is not None:
-                depth[row, column] = max(w0 * seen[a, 2] + w1 * seen[b, 2] + w2 * seen[c, 2], near)
+                depth[row, column] = max(
+                    w0 * camera_points[a, 2] + w1 * camera_points[b, 2] + w2 * camera_points[c, 2], near
+                )
             if color is None:
                 continue
             if colors is None:
@@ -157,14 +159,16 @@ def shade(seen, screen, faces, colors, laid, lens, near, face, box, color, depth
                     color[row, column, channel] = (
                         w0 * colors[a, channel] + w1 * colors[b, channel] + w2 * colors[c, channel]
                     )
-            if laid is not None:
-                tint(laid, index, w0, w1, w2, color, row, column)
+            if texture is not None:
+                multiply_by_texture(texture, index, w0, w1, w2, color, row, column)
 
 
 @compiled
 @no_type_check
-def inform(seen, screen, vertices, faces, laid, lens, face, box, normal, barycentric, uv):
-    """Fill `normal`, `barycentric` and `uv`, (height, width, 3 or 2), where a face is seen; None is left out."""
+def fill_surface_channels(
+    camera_points, screen, vertices, faces, texture, lens, face, box, normal, barycentric, uv
+):
+    """Fill `normal`, `barycentric` and `uv`, (height, width, 3 or 2), at pixels that show a face; any may be None."""
     top, bottom, left, right = box
     last = -1
     x = y = z = 0.0
@@ -178,19 +182,19 @@ def inform(seen, screen, vertices, faces, laid, lens, face, box, normal, barycen
                     x, y, z = normal_of(vertices, faces, index)
                     last = index
                 normal[row, column, 0], normal[row, column, 1], normal[row, column, 2] = x, y, z
-            w0, w1, w2 = weights_at(seen, screen, faces, lens, index, row, column)
+            w0, w1, w2 = weights_at(camera_points, screen, faces, lens, index, row, column)
             if barycentric is not None:
                 barycentric[row, column, 0] = w0
                 barycentric[row, column, 1] = w1
                 barycentric[row, column, 2] = w2
-            if uv is not None and laid is not None and laid.shown[index] >= 0:
-                uv[row, column, 0], uv[row, column, 1] = uv_at(laid, index, w0, w1, w2)
+            if uv is not None and texture is not None and texture.shown[index] >= 0:
+                uv[row, column, 0], uv[row, column, 1] = interpolate_uv(texture, index, w0, w1, w2)
 
 
 @compiled
 @no_type_check
 def normal_of(vertices, faces, index):
-    """Return the unit normal on the side where a face's corners run counter-clockwise; 0 for a face without area."""
+    """Return the unit normal of a face on the side from which its corners are counter-clockwise; 0 without area."""
     edge = np.empty((2, 3))
     for which in range(2):
         for axis in range(3):

@@ -1,18 +1,18 @@
-"""Aggregation of Liu, Li, Chen & Li, "Soft Rasterizer" (ICCV 2019, section 3), forward and backward; compiled.
+"""Soft image of Liu, Li, Chen & Li, "Soft Rasterizer" (ICCV 2019, section 3), and its gradient; compiled functions.
 
-A pixel's colour is A_O A_S: the colours of the faces near it, blended by nearness and coverage, over black by the soft
-silhouette (which the paper gives beside the colours):
+The colour of a pixel is A_O A_S. A_S blends the colours of the faces near the pixel by nearness and coverage. A_O is
+the soft silhouette, which the paper returns separately; here it blends A_S with a black background:
 
-    D_j = sigmoid(± d² / σ), + inside of the face
+    D_j = sigmoid(± d² / σ), with + inside of the face and - outside
     w_j = D_j exp(z_j / γ) / (Σ_k D_k exp(z_k / γ) + exp(ε / γ))
     A_S = Σ_j w_j C_j + w_b 0
     A_O = 1 - Π_j (1 - D_j)
 
-d is the distance from the pixel to the face's border, in units in which the image's shorter side is 2; z_j,
-"normalised inverse depth", is the depth of the nearest vertex in view over the face's. Outside of a face its colour
-and depth use its barycentric weights cut at 0 and scaled to the sum 1, as in the published kernel, which also
-leaves a face out where D < 1e-4. Here the colours and depths are perspective-correct. No corner is rounded. A face that
-the near plane cuts is left out.
+d is the distance from the pixel to the face's border, in units in which the image's shorter side is 2; z_j, "normalised
+inverse depth", is the depth of the nearest vertex in view over the depth of face j. Outside of a face, its colour and
+depth use its barycentric weights, clipped at 0 and scaled to the sum 1. This follows the published kernel, which also
+ignores a face at pixels with D < 1e-4. Unlike there, colours and depths are perspective-correct. Corners are not
+rounded. A face that the near plane cuts is left out.
 """
 
 import math
@@ -21,31 +21,31 @@ from typing import no_type_check
 
 import numpy as np
 
-from plugins.renderer.rasterizer.boundary import along
+from plugins.renderer.rasterizer.boundary import add_screen_gradient
 from plugins.renderer.rasterizer.raster import BACK, BEHIND, DRAWN, FLAT, OUTSIDE, compiled, to_edge
 
 BACKGROUND = 1e-3  # ε, as published
 REACH = math.log(1e4 - 1)  # -log(odds) of D = 1e-4
-HIDDEN = 40.0  # nats; e^-40 vanishes beside 1 in float64
+HIDDEN = 40.0  # nats; 1 + e^-40 is 1 in float64
 FLATTEST = 1e-12  # area over the square of the longest side
 
 
 @dataclass
-class Blend:
+class SoftImage:
     """A soft image and the data that its gradient reads.
 
     Attributes:
-        place: (vertices, 2) float64, column and row, pixels.
-        bounds: (faces, 4) int64, first and past-the-last row and column that a face may reach.
-        nearest: the vertex that depths are measured by; -1: nothing is in view.
-        scales: 1 / σ in 1/pixel², γ, and how far outside of a face it is seen, pixels.
+        positions: (vertices, 2) float64, column and row, pixels.
+        bounds: (faces, 4) int64, first row, last row + 1, first column, last column + 1 of the pixels near a face.
+        nearest: index of the nearest vertex in view, the unit of depths; -1 if nothing is in view.
+        scales: 1 / σ in 1/pixel², γ, and the distance beyond its border at which a face is still visible, pixels.
         most, total, clear: (height, width) float64: the largest z_j or ε, Σ D exp((z - most) / γ) with the background's
             part, and Π (1 - D).
         mean: (height, width, channels) float64, A_S.
         color: (height, width, channels) float64, A_O A_S.
     """
 
-    place: np.ndarray
+    positions: np.ndarray
     bounds: np.ndarray
     nearest: int
     scales: tuple[float, float, float]
@@ -56,13 +56,13 @@ class Blend:
     color: np.ndarray
 
 
-def reach(sigma: float, size: tuple[int, int]) -> float:
-    """Return how far outside of a face the face is seen, pixels."""
+def blur_margin(sigma: float, size: tuple[int, int]) -> float:
+    """Return the distance beyond its border at which a face is still visible, pixels."""
     return math.sqrt(REACH * sigma) * min(size) / 2
 
 
-def blend(
-    seen: np.ndarray,
+def render(
+    camera_points: np.ndarray,
     screen: np.ndarray,
     faces: np.ndarray,
     colors: np.ndarray,
@@ -72,54 +72,63 @@ def blend(
     sigma: float,
     gamma: float,
     counts: np.ndarray,
-) -> Blend:
+) -> SoftImage:
     """Return the soft image of the vertices from `raster.project`; `counts` is as in `raster.rasterise`."""
-    place, bounds = np.zeros((len(seen), 2)), np.zeros((len(faces), 4), np.int64)
-    margin = reach(sigma, size)
-    nearest = prepare(seen, screen, faces, lens, cull, *size, margin, place, bounds, counts)
+    positions, bounds = np.zeros((len(camera_points), 2)), np.zeros((len(faces), 4), np.int64)
+    margin = blur_margin(sigma, size)
+    nearest = prepare(camera_points, screen, faces, lens, cull, *size, margin, positions, bounds, counts)
     scales = (4 / (sigma * min(size) ** 2), gamma, margin)
     most, total, clear = np.full(size, BACKGROUND), np.ones(size), np.ones(size)
     mean = np.zeros((*size, colors.shape[1]))
     color = np.zeros(mean.shape)
     if nearest >= 0:
-        forward(seen, faces, colors, place, bounds, nearest, *scales, most, total, clear, mean, color)
-    return Blend(place, bounds, nearest, scales, most, total, clear, mean, color)
+        forward(
+            camera_points, faces, colors, positions, bounds, nearest, *scales, most, total, clear, mean, color
+        )
+    return SoftImage(positions, bounds, nearest, scales, most, total, clear, mean, color)
 
 
-def slopes(
-    seen: np.ndarray,
+def add_gradients(
+    camera_points: np.ndarray,
     faces: np.ndarray,
     colors: np.ndarray,
     lens: np.ndarray,
-    drawn: Blend,
-    along_color: np.ndarray,
-    of_seen: np.ndarray,
-    of_colors: np.ndarray,
-    of_lens: np.ndarray,
+    blend_data: SoftImage,
+    grad_image: np.ndarray,
+    grad_points: np.ndarray,
+    grad_colors: np.ndarray,
+    grad_lens: np.ndarray,
 ) -> None:
-    """Add to `of_*` the gradients of a loss whose gradient in the image is `along_color`."""
-    if drawn.nearest >= 0:
-        arrays = (drawn.place, drawn.bounds, drawn.nearest, *drawn.scales)
-        arrays += (drawn.most, drawn.total, drawn.clear, drawn.mean)
-        backward((seen, faces, colors, lens), arrays, along_color, (of_seen, of_colors, of_lens))
+    """Add the gradients of a loss to `grad_points`, `grad_colors` and `grad_lens`.
+
+    `grad_image` is the gradient of the loss with respect to the image.
+    """
+    if blend_data.nearest >= 0:
+        arrays = (blend_data.positions, blend_data.bounds, blend_data.nearest, *blend_data.scales)
+        arrays += (blend_data.most, blend_data.total, blend_data.clear, blend_data.mean)
+        backward(
+            (camera_points, faces, colors, lens), arrays, grad_image, (grad_points, grad_colors, grad_lens)
+        )
 
 
 @compiled
 @no_type_check
-def prepare(seen, screen, faces, lens, cull, height, width, margin, place, bounds, counts):
-    """Fill `place` and `bounds`, count what happens to the faces, and return the nearest vertex in view, or -1."""
-    for vertex in range(seen.shape[0]):
+def prepare(camera_points, screen, faces, lens, cull, height, width, margin, positions, bounds, counts):
+    """Fill `positions` and `bounds`, count the faces by outcome, and return the nearest vertex in view, or -1."""
+    for vertex in range(camera_points.shape[0]):
         if screen[vertex, 2] != 0:
             for axis in range(2):
-                place[vertex, axis] = lens[axis] * seen[vertex, axis] / seen[vertex, 2] + lens[2 + axis]
+                positions[vertex, axis] = (
+                    lens[axis] * camera_points[vertex, axis] / camera_points[vertex, 2] + lens[2 + axis]
+                )
     nearest = -1
     for index in range(faces.shape[0]):
         a, b, c = faces[index, 0], faces[index, 1], faces[index, 2]
         if screen[a, 2] == 0 or screen[b, 2] == 0 or screen[c, 2] == 0:
             counts[BEHIND] += 1
             continue
-        ux, uy = place[b, 0] - place[a, 0], place[b, 1] - place[a, 1]
-        vx, vy = place[c, 0] - place[a, 0], place[c, 1] - place[a, 1]
+        ux, uy = positions[b, 0] - positions[a, 0], positions[b, 1] - positions[a, 1]
+        vx, vy = positions[c, 0] - positions[a, 0], positions[c, 1] - positions[a, 1]
         area = ux * vy - vx * uy
         longest = max(ux * ux + uy * uy, vx * vx + vy * vy)
         if not abs(area) > FLATTEST * longest:
@@ -130,8 +139,8 @@ def prepare(seen, screen, faces, lens, cull, height, width, margin, place, bound
             continue
         for axis in range(2):
             last = (width if axis == 0 else height) - 1.0
-            low = min(place[a, axis], place[b, axis], place[c, axis]) - margin
-            high = max(place[a, axis], place[b, axis], place[c, axis]) + margin
+            low = min(positions[a, axis], positions[b, axis], positions[c, axis]) - margin
+            high = max(positions[a, axis], positions[b, axis], positions[c, axis]) + margin
             if high >= 0 and low <= last:
                 bounds[index, 2 - 2 * axis] = np.int64(np.ceil(max(low, 0.0)))
                 bounds[index, 3 - 2 * axis] = np.int64(np.floor(min(high, last))) + 1
@@ -142,22 +151,29 @@ def prepare(seen, screen, faces, lens, cull, height, width, margin, place, bound
         counts[DRAWN] += 1
         for corner in range(3):
             vertex = faces[index, corner]
-            if nearest < 0 or seen[vertex, 2] < seen[nearest, 2]:
+            if nearest < 0 or camera_points[vertex, 2] < camera_points[nearest, 2]:
                 nearest = vertex
     return nearest
 
 
 @compiled
 @no_type_check
-def corners_of(place, a, b, c):
+def face_corners(positions, a, b, c):
     """Return column and row of the three corners of a face, pixels."""
-    return place[a, 0], place[a, 1], place[b, 0], place[b, 1], place[c, 0], place[c, 1]
+    return (
+        positions[a, 0],
+        positions[a, 1],
+        positions[b, 0],
+        positions[b, 1],
+        positions[c, 0],
+        positions[c, 1],
+    )
 
 
 @compiled
 @no_type_check
-def parts(ax, ay, bx, by, cx, cy, x, y):
-    """Return barycentric weights on the screen; their sum is 1."""
+def screen_weights(ax, ay, bx, by, cx, cy, x, y):
+    """Return barycentric weights of the point (x, y) on the screen; their sum is 1."""
     inverse = 1.0 / ((bx - ax) * (cy - ay) - (cx - ax) * (by - ay))
     return (
         ((bx - x) * (cy - y) - (cx - x) * (by - y)) * inverse,
@@ -168,8 +184,8 @@ def parts(ax, ay, bx, by, cx, cy, x, y):
 
 @compiled
 @no_type_check
-def heights_of(ax, ay, bx, by, cx, cy):
-    """Return the heights of a triangle over its edges, each opposite its corner, pixels."""
+def triangle_heights(ax, ay, bx, by, cx, cy):
+    """Return the three heights of a triangle, pixels; the i-th runs from corner i to the opposite edge."""
     area = abs((bx - ax) * (cy - ay) - (cx - ax) * (by - ay))
     return (
         area / np.hypot(cx - bx, cy - by),
@@ -180,11 +196,11 @@ def heights_of(ax, ay, bx, by, cx, cy):
 
 @compiled
 @no_type_check
-def to_border(corners, heights, w0, w1, w2, x, y):
-    """Return the squared distance to the border of a triangle, 1 inside of it or -1 outside, and the nearest edge.
+def distance_to_border(corners, heights, w0, w1, w2, x, y):
+    """Return the squared distance to the border of a triangle, the side (1 inside, -1 outside), and the nearest edge.
 
-    The edge is named by the corner opposite. From inside, the distance is to the nearest of the edges' lines; from
-    outside, to one of the edges that face the pixel.
+    The number of an edge is that of the opposite corner. Inside, the distance is measured to the lines of all edges;
+    outside, to the edges that face the point.
     """
     ax, ay, bx, by, cx, cy = corners
     least, edge = np.inf, 0
@@ -208,25 +224,25 @@ def to_border(corners, heights, w0, w1, w2, x, y):
 
 @compiled
 @no_type_check
-def reached(corners, heights, low, sharpness, x, y):
-    """Return weights, side, nearest edge and exp(-d²/σ) of a pixel, where d is the distance to the edge.
+def weigh_pixel(corners, heights, low, sharpness, x, y):
+    """Return barycentric weights, side, nearest edge and exp(-d²/σ) of a pixel, where d is the distance to the edge.
 
-    The weights are barycentric. The side is 1 inside of the triangle, -1 outside, and 0 out of reach. A pixel with a
-    weight below its limit in `low` is out of reach.
+    The side is 1 inside of the triangle, -1 outside, and 0 if the pixel is too far away. A pixel with a weight below
+    its limit in `low` is too far away.
     """
-    w0, w1, w2 = parts(*corners, x, y)
+    w0, w1, w2 = screen_weights(*corners, x, y)
     if w0 < low[0] or w1 < low[1] or w2 < low[2]:
         return w0, w1, w2, 0.0, 0, 0.0
-    squared, turn, edge = to_border(corners, heights, w0, w1, w2, x, y)
-    if turn < 0 and squared * sharpness > REACH:
-        turn = 0.0
-    return w0, w1, w2, turn, edge, np.exp(-squared * sharpness)
+    squared, side, edge = distance_to_border(corners, heights, w0, w1, w2, x, y)
+    if side < 0 and squared * sharpness > REACH:
+        side = 0.0
+    return w0, w1, w2, side, edge, np.exp(-squared * sharpness)
 
 
 @compiled
 @no_type_check
-def cut(w0, w1, w2):
-    """Return the weights cut at 0 and scaled to the sum 1, and their sum before scaling."""
+def clip_weights(w0, w1, w2):
+    """Return the weights, clipped at 0 and scaled to the sum 1, and their sum before scaling."""
     w0, w1, w2 = max(w0, 0.0), max(w1, 0.0), max(w2, 0.0)
     scale = w0 + w1 + w2
     return w0 / scale, w1 / scale, w2 / scale, scale
@@ -235,29 +251,42 @@ def cut(w0, w1, w2):
 @compiled
 @no_type_check
 def forward(
-    seen, faces, colors, place, bounds, nearest, sharpness, gamma, margin, most, total, clear, mean, color
+    camera_points,
+    faces,
+    colors,
+    positions,
+    bounds,
+    nearest,
+    sharpness,
+    gamma,
+    margin,
+    most,
+    total,
+    clear,
+    mean,
+    color,
 ):
-    """Fill the arrays of `Blend`, face by face; the sums are rescaled when a nearer face comes (w_j)."""
+    """Fill the arrays of `SoftImage` face by face; the sums of w_j are rescaled whenever a nearer face follows."""
     channels = colors.shape[1]
     height, width = most.shape
-    unit = seen[nearest, 2]
+    unit = camera_points[nearest, 2]
     for index in range(faces.shape[0]):
         top, bottom, left, right = bounds[index]
         if top >= bottom:
             continue
         a, b, c = faces[index, 0], faces[index, 1], faces[index, 2]
-        corners = corners_of(place, a, b, c)
-        heights = heights_of(*corners)
+        corners = face_corners(positions, a, b, c)
+        heights = triangle_heights(*corners)
         low = -margin / heights[0], -margin / heights[1], -margin / heights[2]
-        near0, near1, near2 = 1.0 / seen[a, 2], 1.0 / seen[b, 2], 1.0 / seen[c, 2]
+        near0, near1, near2 = 1.0 / camera_points[a, 2], 1.0 / camera_points[b, 2], 1.0 / camera_points[c, 2]
         for row in range(top, bottom):
             for column in range(left, right):
-                w0, w1, w2, turn, _, doubt = reached(corners, heights, low, sharpness, column, row)
-                if turn == 0:
+                w0, w1, w2, side, _, doubt = weigh_pixel(corners, heights, low, sharpness, column, row)
+                if side == 0:
                     continue
-                covered = (1.0 if turn > 0 else doubt) / (1 + doubt)
-                clear[row, column] *= (doubt if turn > 0 else 1.0) / (1 + doubt)
-                q0, q1, q2, _ = cut(w0, w1, w2)
+                covered = (1.0 if side > 0 else doubt) / (1 + doubt)
+                clear[row, column] *= (doubt if side > 0 else 1.0) / (1 + doubt)
+                q0, q1, q2, _ = clip_weights(w0, w1, w2)
                 a0, a1, a2 = q0 * near0, q1 * near1, q2 * near2
                 inverse = a0 + a1 + a2
                 nearness = unit * inverse
@@ -289,48 +318,50 @@ def forward(
 
 @compiled
 @no_type_check
-def backward(scene, drawn, along_color, sums):
-    """Add to `of_*` the gradients of the loss, face by face; the terms of a face at a pixel are computed again."""
-    seen, faces, colors, lens = scene
-    place, bounds, nearest, sharpness, gamma, margin, most, total, clear, mean = drawn
-    of_seen, of_colors, of_lens = sums
+def backward(scene, blend_data, grad_image, sums):
+    """Add the gradients of the loss to `sums`, face by face; the terms of each face and pixel are recomputed."""
+    camera_points, faces, colors, lens = scene
+    positions, bounds, nearest, sharpness, gamma, margin, most, total, clear, mean = blend_data
+    grad_points, grad_colors, grad_lens = sums
     channels = colors.shape[1]
-    unit = seen[nearest, 2]
+    unit = camera_points[nearest, 2]
     height, width = most.shape
-    of_mean = np.zeros((height, width))  # g · A_S
+    grad_dot_mean = np.zeros((height, width))  # g · A_S
     live = np.zeros((height, width), np.bool_)
     for row in range(height):
         for column in range(width):
             if clear[row, column] < 1:
                 for channel in range(channels):
-                    slope = np.float64(along_color[row, column, channel])
-                    of_mean[row, column] += slope * mean[row, column, channel]
+                    slope = np.float64(grad_image[row, column, channel])
+                    grad_dot_mean[row, column] += slope * mean[row, column, channel]
                     live[row, column] |= slope != 0
-    of_corners = np.empty(6)
+    grad_corners = np.empty(6)
     for index in range(faces.shape[0]):
         top, bottom, left, right = bounds[index]
         if top >= bottom:
             continue
         a, b, c = faces[index, 0], faces[index, 1], faces[index, 2]
-        corners = corners_of(place, a, b, c)
-        heights = heights_of(*corners)
+        corners = face_corners(positions, a, b, c)
+        heights = triangle_heights(*corners)
         low = -margin / heights[0], -margin / heights[1], -margin / heights[2]
         ax, ay, bx, by, cx, cy = corners
         area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
-        near0, near1, near2 = 1.0 / seen[a, 2], 1.0 / seen[b, 2], 1.0 / seen[c, 2]
-        of_corners[:] = 0.0
-        of_near0 = of_near1 = of_near2 = of_unit = 0.0
+        near0, near1, near2 = 1.0 / camera_points[a, 2], 1.0 / camera_points[b, 2], 1.0 / camera_points[c, 2]
+        grad_corners[:] = 0.0
+        grad_near0 = grad_near1 = grad_near2 = grad_unit = 0.0
         for row in range(top, bottom):
             for column in range(left, right):
                 if not live[row, column]:
                     continue
-                w0, w1, w2, turn, edge, doubt = reached(corners, heights, low, sharpness, column, row)
-                if turn == 0:
+                w0, w1, w2, side, edge, doubt = weigh_pixel(corners, heights, low, sharpness, column, row)
+                if side == 0:
                     continue
-                covered = (1.0 if turn > 0 else doubt) / (1 + doubt)
-                left_clear = (doubt if turn > 0 else 1.0) / (1 + doubt)
-                of_odds = of_mean[row, column] * clear[row, column] * covered  # of A_O: ∂ log(1 - D) = -D
-                q0, q1, q2, scale = cut(w0, w1, w2)
+                covered = (1.0 if side > 0 else doubt) / (1 + doubt)
+                left_clear = (doubt if side > 0 else 1.0) / (1 + doubt)
+                grad_odds = (
+                    grad_dot_mean[row, column] * clear[row, column] * covered
+                )  # of A_O: ∂ log(1 - D) = -D
+                q0, q1, q2, scale = clip_weights(w0, w1, w2)
                 a0, a1, a2 = q0 * near0, q1 * near1, q2 * near2
                 inverse = a0 + a1 + a2
                 above = (unit * inverse - most[row, column]) / gamma
@@ -338,24 +369,24 @@ def backward(scene, drawn, along_color, sums):
                     weight = (1 - clear[row, column]) * covered * np.exp(above) / total[row, column]
                     d0 = d1 = d2 = 0.0
                     for channel in range(channels):
-                        slope = weight * along_color[row, column, channel]
-                        of_colors[a, channel] += slope * a0 / inverse
-                        of_colors[b, channel] += slope * a1 / inverse
-                        of_colors[c, channel] += slope * a2 / inverse
+                        slope = weight * grad_image[row, column, channel]
+                        grad_colors[a, channel] += slope * a0 / inverse
+                        grad_colors[b, channel] += slope * a1 / inverse
+                        grad_colors[c, channel] += slope * a2 / inverse
                         d0 += slope * colors[a, channel]
                         d1 += slope * colors[b, channel]
                         d2 += slope * colors[c, channel]
                     own = (a0 * d0 + a1 * d1 + a2 * d2) / inverse
-                    gained = own - weight * of_mean[row, column]  # ∂L / ∂ log(D exp(z / γ))
-                    of_odds += gained * left_clear  # ∂ log D = 1 - D
-                    of_unit += gained / gamma * inverse
+                    gained = own - weight * grad_dot_mean[row, column]  # ∂L / ∂ log(D exp(z / γ))
+                    grad_odds += gained * left_clear  # ∂ log D = 1 - D
+                    grad_unit += gained / gamma * inverse
                     # through C_j = Σ a c / Σ a and z_j = unit Σ a, with a = q / depth
                     d0 = (d0 - own) / inverse + unit * gained / gamma
                     d1 = (d1 - own) / inverse + unit * gained / gamma
                     d2 = (d2 - own) / inverse + unit * gained / gamma
-                    of_near0 += q0 * d0
-                    of_near1 += q1 * d1
-                    of_near2 += q2 * d2
+                    grad_near0 += q0 * d0
+                    grad_near1 += q1 * d1
+                    grad_near2 += q2 * d2
                     d0, d1, d2 = d0 * near0, d1 * near1, d2 * near2
                     # through q = max(w, 0) / Σ max(w, 0), and w = edge function / area
                     flat = q0 * d0 + q1 * d1 + q2 * d2
@@ -364,29 +395,29 @@ def backward(scene, drawn, along_color, sums):
                     d2 = (d2 - flat) / scale if w2 > 0 else 0.0
                     flat = w0 * d0 + w1 * d1 + w2 * d2
                     d0, d1, d2 = (d0 - flat) / area, (d1 - flat) / area, (d2 - flat) / area
-                    of_corners[0] += d2 * (by - row) - d1 * (cy - row)
-                    of_corners[1] += d1 * (cx - column) - d2 * (bx - column)
-                    of_corners[2] += d0 * (cy - row) - d2 * (ay - row)
-                    of_corners[3] += d2 * (ax - column) - d0 * (cx - column)
-                    of_corners[4] += d1 * (ay - row) - d0 * (by - row)
-                    of_corners[5] += d0 * (bx - column) - d1 * (ax - column)
+                    grad_corners[0] += d2 * (by - row) - d1 * (cy - row)
+                    grad_corners[1] += d1 * (cx - column) - d2 * (bx - column)
+                    grad_corners[2] += d0 * (cy - row) - d2 * (ay - row)
+                    grad_corners[3] += d2 * (ax - column) - d0 * (cx - column)
+                    grad_corners[4] += d1 * (ay - row) - d0 * (by - row)
+                    grad_corners[5] += d0 * (bx - column) - d1 * (ax - column)
                 # through d² = |p - (1 - t) A - t B|², at the t that makes it least
                 first, second = 2 * ((edge + 1) % 3), 2 * ((edge + 2) % 3)
                 sx, sy = corners[first], corners[first + 1]
                 ex, ey = corners[second], corners[second + 1]
                 _, part = to_edge(sx, sy, ex, ey, column, row)
-                down = -2 * of_odds * turn * sharpness
+                down = -2 * grad_odds * side * sharpness
                 down_x = down * (column - sx - part * (ex - sx))
                 down_y = down * (row - sy - part * (ey - sy))
-                of_corners[first] += (1 - part) * down_x
-                of_corners[first + 1] += (1 - part) * down_y
-                of_corners[second] += part * down_x
-                of_corners[second + 1] += part * down_y
+                grad_corners[first] += (1 - part) * down_x
+                grad_corners[first + 1] += (1 - part) * down_y
+                grad_corners[second] += part * down_x
+                grad_corners[second + 1] += part * down_y
         for axis in range(2):
-            along(seen, a, axis, of_corners[axis], lens, of_seen, of_lens)
-            along(seen, b, axis, of_corners[2 + axis], lens, of_seen, of_lens)
-            along(seen, c, axis, of_corners[4 + axis], lens, of_seen, of_lens)
-        of_seen[a, 2] -= of_near0 * near0 * near0
-        of_seen[b, 2] -= of_near1 * near1 * near1
-        of_seen[c, 2] -= of_near2 * near2 * near2
-        of_seen[nearest, 2] += of_unit
+            add_screen_gradient(camera_points, a, axis, grad_corners[axis], lens, grad_points, grad_lens)
+            add_screen_gradient(camera_points, b, axis, grad_corners[2 + axis], lens, grad_points, grad_lens)
+            add_screen_gradient(camera_points, c, axis, grad_corners[4 + axis], lens, grad_points, grad_lens)
+        grad_points[a, 2] -= grad_near0 * near0 * near0
+        grad_points[b, 2] -= grad_near1 * near1 * near1
+        grad_points[c, 2] -= grad_near2 * near2 * near2
+        grad_points[nearest, 2] += grad_unit

@@ -44,7 +44,7 @@ def cube(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return file
 
 
-def drawn(file: Path, folder: Path, *options: str, name: str = "one.png") -> Any:
+def run_command(file: Path, folder: Path, *options: str, name: str = "one.png") -> Any:
     out = folder / name
     main([str(file), "--out", str(out), "--size", "48x40", *options])
     return np.load(out) if out.suffix == ".npy" else Image.open(io.BytesIO(out.read_bytes()))
@@ -58,7 +58,7 @@ def test_a_cube_shows_the_side_that_the_camera_faces(cube: Path, tmp_path: Path,
     views = {(0, 0): front, (90, 0): right, (180, 0): opposite(front), (270, 0): opposite(right), (0, 90): top,
              (0, -90): opposite(top)}  # fmt: skip
     for (azimuth, elevation), side in views.items():
-        image = drawn(cube, tmp_path, "--azimuth", f"{azimuth}", "--elevation", f"{elevation}", "--up", up,
+        image = run_command(cube, tmp_path, "--azimuth", f"{azimuth}", "--elevation", f"{elevation}", "--up", up,
                       "--background", "#123456")  # fmt: skip
         pixels = np.asarray(image)
         assert image.mode == "RGB" and image.size == (48, 40)
@@ -97,8 +97,8 @@ def test_a_texture_is_drawn_upright_and_in_its_colours(tmp_path: Path, name: str
         [str(tmp_path / name), *view, "--size", "42x42", "--no-shade", "--out", str(out)]
     )  # an odd count a texel
     pixels = np.asarray(Image.open(io.BytesIO(out.read_bytes())), int)
-    found = pixels[[[10, 10], [31, 31]], [[10, 31], [10, 31]]]
-    assert np.abs(found - four).max() <= 1
+    texel_centres = pixels[[[10, 10], [31, 31]], [[10, 31], [10, 31]]]
+    assert np.abs(texel_centres - four).max() <= 1
 
 
 def test_edges_are_blended_in_light_and_transparent_pictures_know_their_share(
@@ -106,47 +106,49 @@ def test_edges_are_blended_in_light_and_transparent_pictures_know_their_share(
 ) -> None:
     """Compare a transparent image before any background with an image that is drawn on that background."""
     options = ("--azimuth", "40", "--elevation", "30", "--supersampling", "4")
-    clear = np.asarray(drawn(cube, tmp_path, *options, "--background", "transparent"))
+    clear = np.asarray(run_command(cube, tmp_path, *options, "--background", "transparent"))
     assert clear.shape == (40, 48, 4) and {0, 255} < set(clear[..., 3].ravel().tolist())
     share = torch.from_numpy(clear[..., 3:] / 255)
     for text in ("#000000", "#ffffff", "#40c0f0"):
         behind = linear_from_bytes(torch.tensor([*bytes.fromhex(text[1:])], dtype=torch.uint8))
         light = linear_from_bytes(torch.from_numpy(clear[..., :3].copy())) * share + behind * (1 - share)
         opaque = linear_from_bytes(
-            torch.from_numpy(np.array(drawn(cube, tmp_path, *options, "--background", text)))
+            torch.from_numpy(np.array(run_command(cube, tmp_path, *options, "--background", text)))
         )
         assert float((light - opaque).abs().max()) < 0.02
 
 
 def test_depth_mask_and_face_hold_what_the_renderer_says(cube: Path, tmp_path: Path) -> None:
     options = ("--azimuth", "0", "--elevation", "0", "--distance", "4", "--channel")
-    exact = drawn(cube, tmp_path, *options, "depth", name="one.npy")
+    exact = run_command(cube, tmp_path, *options, "depth", name="one.npy")
     assert exact.dtype == np.float32 and exact.shape == (40, 48) and abs(exact[20, 24] - 3) < 1e-6
-    millimetres = np.asarray(drawn(cube, tmp_path, *options, "depth"))
+    millimetres = np.asarray(run_command(cube, tmp_path, *options, "depth"))
     np.testing.assert_array_equal(millimetres, np.where(np.isfinite(exact), np.round(1000 * exact), 0))
-    mask = np.asarray(drawn(cube, tmp_path, *options, "mask"))
+    mask = np.asarray(run_command(cube, tmp_path, *options, "mask"))
     np.testing.assert_array_equal(mask, np.where(np.isfinite(exact), 255, 0))
-    faces = np.asarray(drawn(cube, tmp_path, *options, "face")).astype(int) - 1
-    np.testing.assert_array_equal(faces, drawn(cube, tmp_path, *options, "face", name="one.npy"))
+    faces = np.asarray(run_command(cube, tmp_path, *options, "face")).astype(int) - 1
+    np.testing.assert_array_equal(faces, run_command(cube, tmp_path, *options, "face", name="one.npy"))
     assert faces.min() == -1 and faces.max() < 12
-    with pytest.raises(DataError, match=r"a depth of \d+\.\d+ m came; 16 bits hold .* Write a \.npy"):
-        drawn(cube, tmp_path, "--distance", "200", "--channel", "depth", "--fov", "1")
+    with pytest.raises(DataError, match=r"has a depth of \d+\.\d+ m, but 16 bits hold .* Write a \.npy"):
+        run_command(cube, tmp_path, "--distance", "200", "--channel", "depth", "--fov", "1")
 
 
 def test_channels_become_whole_numbers_as_they_say() -> None:
     directions = torch.tensor([[[0.0, 0, 1], [-1, 0, 0], [0, 0, 0]]])
-    assert pictures.normal(directions).tolist() == [[[128, 128, 255], [0, 128, 128], [0, 0, 0]]]
-    assert pictures.uv(torch.tensor([[[0.2, 1.6], [-0.2, 0.0]]])).tolist() == [[[51, 153, 0], [204, 0, 0]]]
-    assert pictures.barycentric(torch.tensor([[[0.2, 0.8, 0.0]]])).tolist() == [[[51, 204, 0]]]
-    with pytest.raises(DataError, match="face 65535 came"):
-        pictures.face(torch.tensor([[65535]], dtype=torch.int32))
-    assert set(pictures.CODES) | {"color"} >= Rasterizer.channels
+    assert pictures.normal_image(directions).tolist() == [[[128, 128, 255], [0, 128, 128], [0, 0, 0]]]
+    assert pictures.uv_image(torch.tensor([[[0.2, 1.6], [-0.2, 0.0]]])).tolist() == [
+        [[51, 153, 0], [204, 0, 0]]
+    ]
+    assert pictures.barycentric_image(torch.tensor([[[0.2, 0.8, 0.0]]])).tolist() == [[[51, 204, 0]]]
+    with pytest.raises(DataError, match="shows face 65535"):
+        pictures.face_image(torch.tensor([[65535]], dtype=torch.int32))
+    assert set(pictures.INTEGER_IMAGES) | {"color"} >= Rasterizer.channels
 
 
 def test_a_sphere_of_one_colour_is_lit_from_the_camera(tmp_path: Path) -> None:
     """Check Lambert's law on normals that the sphere's facets share; an edge of a cube stays sharp."""
     trimesh.creation.icosphere(4, 1.0).export(tmp_path / "ball.stl")
-    pixels = drawn(
+    pixels = run_command(
         tmp_path / "ball.stl", tmp_path, "--distance", "50", "--fov", "2.6", "--background", "black"
     )
     shown = linear_from_bytes(torch.from_numpy(np.array(pixels))).numpy()[..., 0] / 0.55
@@ -156,7 +158,7 @@ def test_a_sphere_of_one_colour_is_lit_from_the_camera(tmp_path: Path) -> None:
     inside = square < 0.85
     wanted = pictures.AMBIENT + (1 - pictures.AMBIENT) * np.sqrt(np.clip(1 - square, 0, 1))
     assert np.abs(shown - wanted)[inside].max() < 0.03
-    flat = np.asarray(drawn(tmp_path / "ball.stl", tmp_path, "--no-shade", "--background", "black"))
+    flat = np.asarray(run_command(tmp_path / "ball.stl", tmp_path, "--no-shade", "--background", "black"))
     assert len(np.unique(flat[15:25, 20:28])) == 1
     box = trimesh.creation.box((1, 1, 1))
     normals = pictures.corner_normals(box.vertices, box.faces).reshape(12, 3, 3)
@@ -173,15 +175,18 @@ def test_the_camera_is_that_of_look_from_and_sees_all_of_the_subject() -> None:
         centre = torch.from_numpy(random.normal(size=3) * 100)
         angles = tuple(random.uniform(-3, 3, 3).tolist())
         size = (int(random.integers(9, 99)), int(random.integers(9, 99)))
-        around, fov = turntable.Ball(centre, float(random.uniform(0.01, 100))), float(random.uniform(0.2, 2))
-        found = turntable.looking_at(around, "z", angles, 7.0, fov, size)
-        wanted = look_from(*angles, 7.0, fov, size)
+        sphere, fov = (
+            turntable.BoundingSphere(centre, float(random.uniform(0.01, 100))),
+            float(random.uniform(0.2, 2)),
+        )
+        camera = turntable.look_at(sphere, "z", angles, 7.0, fov, size)
+        expected = look_from(*angles, 7.0, fov, size)
         points = torch.from_numpy(random.normal(size=(5, 3)))
-        for ours, theirs in zip(found.project(points + centre), wanted.project(points), strict=True):
+        for ours, theirs in zip(camera.project(points + centre), expected.project(points), strict=True):
             torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-4)
-        fitted = turntable.looking_at(around, "y", angles, None, fov, size)
+        fitted = turntable.look_at(sphere, "y", angles, None, fov, size)
         rim = torch.nn.functional.normalize(torch.from_numpy(random.normal(size=(5_000, 3))), dim=1)
-        places, depths = fitted.project(around.radius * rim + centre)
+        places, depths = fitted.project(sphere.radius * rim + centre)
         assert (depths > fitted.near).all()
         far = (places - torch.tensor(fitted.principal)).abs().amax(0)
         share = far / torch.tensor([size[1] / 2, size[0] / 2])
@@ -190,15 +195,15 @@ def test_the_camera_is_that_of_look_from_and_sees_all_of_the_subject() -> None:
 
 @pytest.mark.parametrize("up", ["y", "z"])
 def test_a_turntable_is_a_whole_turn_in_equal_steps(up: turntable.Axis) -> None:
-    around = turntable.Ball(torch.tensor([3.0, -2.0, 8.0], dtype=torch.float64), 2.0)
+    sphere = turntable.BoundingSphere(torch.tensor([3.0, -2.0, 8.0], dtype=torch.float64), 2.0)
     cameras = [
-        turntable.looking_at(around, up, (0.3 + 2 * math.pi * number / 7, 0.4, 0.1), 9.0, 0.7, (40, 48))
+        turntable.look_at(sphere, up, (0.3 + 2 * math.pi * number / 7, 0.4, 0.1), 9.0, 0.7, (40, 48))
         for number in range(7)
     ]
-    found = [*turntable.around(cameras[0], around.centre, up, 7)]
-    assert len(found) == 7 and found[0] is cameras[0]
-    after = turntable.turned(found[-1], around.centre, up, 2 * math.pi / 7)
-    for ours, theirs in [*zip(found, cameras, strict=True), (after, cameras[0])]:
+    circle = [*turntable.circle_cameras(cameras[0], sphere.centre, up, 7)]
+    assert len(circle) == 7 and circle[0] is cameras[0]
+    after = turntable.rotate_camera(circle[-1], sphere.centre, up, 2 * math.pi / 7)
+    for ours, theirs in [*zip(circle, cameras, strict=True), (after, cameras[0])]:
         torch.testing.assert_close(ours.rotation, theirs.rotation, rtol=0, atol=1e-12)
         torch.testing.assert_close(ours.translation, theirs.translation, rtol=0, atol=1e-11)
 
@@ -222,18 +227,18 @@ def test_an_exact_camera_sees_points_where_its_formula_says(cube: Path, tmp_path
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        ({"K": [[60, 1, 20], [0, 60, 18], [0, 0, 1]]}, "its K is"),
+        ({"K": [[60, 1, 20], [0, 60, 18], [0, 0, 1]]}, "the camera matrix K is"),
         ({"K": [[-60, 0, 20], [0, 60, 18], [0, 0, 1]]}, "fx and fy above 0"),
-        ({"R": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}, "its determinant is -1"),
-        ({"R": [[2, 0, 0], [0, 2, 0], [0, 0, 2]]}, "its R is no rotation"),
-        ({"R": "x"}, "its R is 'x'; wanted 3 x 3 finite numbers"),
-        ({"t": [0, 0, float("nan")]}, "its t is"),
-        ({"t": None}, "its t is"),
-        ({"size": [640.5, 480]}, "its size is"),
-        ({"size": [0, 480]}, "its size is"),
+        ({"R": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}, "determinant of R is -1"),
+        ({"R": [[2, 0, 0], [0, 2, 0], [0, 0, 2]]}, "the matrix R is not a rotation"),
+        ({"R": "x"}, "R is 'x', expected 3 x 3 finite numbers"),
+        ({"t": [0, 0, float("nan")]}, "the camera's t is"),
+        ({"t": None}, "the camera's t is"),
+        ({"size": [640.5, 480]}, "the camera's size is"),
+        ({"size": [0, 480]}, "the camera's size is"),
         (
             {"sise": [640, 480]},
-            "'sise' is no part of it; wanted a camera's K, R, t, size. Did you mean 'size'?",
+            "the entry 'sise' is unknown. The entries of a camera are K, R, t, size. Did you mean 'size'?",
         ),
     ],
 )
@@ -251,7 +256,7 @@ def test_a_bad_camera_gets_its_sentence(tmp_path: Path, change: dict[str, Any], 
 
 
 def test_a_gif_has_its_frames_and_begins_with_the_picture(cube: Path, tmp_path: Path) -> None:
-    film = drawn(cube, tmp_path, "--turntable", "5", "--rate", "20", name="one.gif")
+    film = run_command(cube, tmp_path, "--turntable", "5", "--rate", "20", name="one.gif")
     assert (
         film.n_frames == 5
         and film.size == (48, 40)
@@ -260,13 +265,13 @@ def test_a_gif_has_its_frames_and_begins_with_the_picture(cube: Path, tmp_path: 
     )
     for number in range(5):
         film.seek(number)
-        still = np.asarray(drawn(cube, tmp_path, "--azimuth", f"{30 + 72 * number}"), float)
+        still = np.asarray(run_command(cube, tmp_path, "--azimuth", f"{30 + 72 * number}"), float)
         assert np.abs(still - np.asarray(film.convert("RGB"))).max() <= 8  # of 256 colours a frame
-    stacked = drawn(cube, tmp_path, "--turntable", "5", "--channel", "depth", name="one.npy")
+    stacked = run_command(cube, tmp_path, "--turntable", "5", "--channel", "depth", name="one.npy")
     assert stacked.shape == (5, 40, 48)
 
 
-def program(folder: Path, text: str) -> None:
+def write_ffmpeg(folder: Path, text: str) -> None:
     file = folder / "ffmpeg"
     file.write_text(f"#!{sys.executable}\nimport sys\n{text}\n")
     file.chmod(file.stat().st_mode | stat.S_IXUSR)
@@ -279,48 +284,52 @@ def test_a_film_is_what_ffmpeg_makes_of_the_frames(
     monkeypatch.setenv("PATH", str(tmp_path))
     out = tmp_path / "films" / "one.mp4"
     options = [str(cube), "--turntable", "3", "--size", "48x40", "--out", str(out)]
-    with pytest.raises(ConfigError, match=r"an \.mp4 needs the program ffmpeg.*ask for a \.gif"):
+    with pytest.raises(ConfigError, match=r"an \.mp4 requires the program ffmpeg.*choose a \.gif"):
         main(options)
-    program(tmp_path, "content = sys.stdin.buffer.read()\nopen(sys.argv[-1], 'wb').write(content)")
+    write_ffmpeg(tmp_path, "content = sys.stdin.buffer.read()\nopen(sys.argv[-1], 'wb').write(content)")
     main(options)
     frames = np.frombuffer(out.read_bytes(), np.uint8).reshape(3, 40, 48, 3)
     for number in range(3):
-        still = np.asarray(drawn(cube, tmp_path, "--azimuth", f"{30 + 120 * number}"), int)
+        still = np.asarray(run_command(cube, tmp_path, "--azimuth", f"{30 + 120 * number}"), int)
         assert np.abs(still - frames[number]).max() <= 1
     out.unlink()
-    program(tmp_path, "sys.stderr.write('no such codec'); sys.exit(3)")
-    with pytest.raises(DataError, match=r"ffmpeg ended with 3 and said: no such codec\. Ask for a \.gif"):
+    write_ffmpeg(tmp_path, "sys.stderr.write('no such codec'); sys.exit(3)")
+    with pytest.raises(
+        DataError, match=r"ffmpeg failed with exit code 3 and the message: no such codec\. Choose a \.gif"
+    ):
         main(options)
     assert list(out.parent.iterdir()) == []
-    with pytest.raises(ConfigError, match=r"47x40 pixels came; wanted even numbers"):
+    with pytest.raises(ConfigError, match=r"got 47x40 pixels, but an .mp4 requires an even"):
         main([*options[:3], "--size", "47x40", *options[5:]])
 
 
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        (["--fov", "300"], "argument --fov: '300' came; wanted a number from 0.1 to 170 degrees."),
-        (["--azimuth", "nan"], "wanted a number from -3600 to 3600 degrees"),
-        (["--distance", "-1"], "metres, or auto"),
-        (["--size", "640"], "wanted WIDTHxHEIGHT in pixels"),
-        (["--size", "0x9"], "wanted WIDTHxHEIGHT in pixels"),
-        (["--size", "9999x9999"], "samples. Ask for a smaller --size or --supersampling"),
-        (["--turntable", "2.5"], "'2.5' came; wanted a whole number from 2 to 3600"),
-        (["--supersampling", "0"], "wanted a whole number from 1 to 16"),
-        (["--channel", "dept"], "wanted one of barycentric, color, depth, face, mask, normal, uv."),
-        (["--channel", "uv"], "has no texture"),
+        (["--fov", "300"], "argument --fov: got '300', expected a number from 0.1 to 170 degrees."),
+        (["--azimuth", "nan"], "expected a number from -3600 to 3600 degrees"),
+        (["--distance", "-1"], "(metres), or auto"),
+        (["--size", "640"], "expected WIDTHxHEIGHT in pixels"),
+        (["--size", "0x9"], "expected WIDTHxHEIGHT in pixels"),
+        (["--size", "9999x9999"], "samples are possible. Choose a smaller --size or --supersampling"),
+        (["--turntable", "2.5"], "got '2.5', expected a whole number from 2 to 3600"),
+        (["--supersampling", "0"], "expected a whole number from 1 to 16"),
+        (["--channel", "dept"], "expected one of barycentric, color, depth, face, mask, normal, uv."),
+        (["--channel", "uv"], "the scene has no texture"),
         (["--channel", "dept"], "Did you mean 'depth'? --help"),
         (["--background", "whit"], "Did you mean 'white'?"),
         (["--azimut", "3"], "Did you mean '--azimuth'?"),
         (["--up", "x"], "invalid choice: 'x'"),
-        (["--out", "one.jpeg"], "wanted a name that ends in .png, .gif, .mp4, .npy. Did you mean '.png'?"),
-        (["--out", "one.gif"], "wanted --turntable and its number of frames"),
-        (["--out", "one.png", "--turntable", "9"], "holds one picture; wanted .gif, .mp4 or .npy"),
-        (["--out", "one.gif", "--turntable", "9", "--channel", "depth"], "whose numbers films do not hold"),
-        (["--out", "one.gif", "--turntable", "9", "--background", "transparent"], "with colours and a .png alone"),
-        (["--camera", "gone.json", "--fov", "40"], "--fov came beside --camera, whose file says it"),
-        (["--camera", "gone.json"], "gone.json: no such file; wanted a camera"),
-        (["--camera", "cube.ply"], "wanted a file whose name ends in .json or .yaml"),
+        (["--out", "one.jpeg"], "expected a file name that ends in .png, .gif, .mp4, .npy. Did you mean '.png'?"),
+        (["--out", "one.gif"], "requires --turntable with a number of frames"),
+        (["--out", "one.png", "--turntable", "9"], "holds a single image. Use .gif, .mp4 or .npy"),
+        (["--out", "one.gif", "--turntable", "9", "--channel", "depth"], "an animation cannot hold the numbers of "
+            "--channel depth"),
+        (["--out", "one.gif", "--turntable", "9", "--background", "transparent"], "only for --channel color and a "
+            ".png file"),
+        (["--camera", "gone.json", "--fov", "40"], "got both --fov and --camera, whose file determines the whole view"),
+        (["--camera", "gone.json"], "gone.json: no such file; expected a camera"),
+        (["--camera", "cube.ply"], "Give a file whose name ends in .json or .yaml"),
     ],
 )  # fmt: skip
 def test_every_mistake_gets_one_sentence_and_leaves_nothing(
@@ -340,8 +349,8 @@ def test_the_command_says_where_it_wrote_and_its_report_on_request(
     main([str(cube), "--size", "9x9"])
     assert capsys.readouterr() == ("outputs/cube.png\n", "")
     main([str(cube), "--size", "9x9", "--report"])
-    said = capsys.readouterr().err
-    assert "ms a frame (median of 1)" in said and len(said.splitlines()) <= 2
+    report = capsys.readouterr().err
+    assert "ms per frame (median of 1)" in report and len(report.splitlines()) <= 2
 
 
 def test_extreme_subjects_are_drawn_or_get_a_sentence(
@@ -358,15 +367,15 @@ def test_extreme_subjects_are_drawn_or_get_a_sentence(
         (tmp_path / "ball.off").write_text("\n".join([f"OFF\n{len(vertices)} {len(ball.faces)} 0", *lines]))
         if scale == 1e40:
             with pytest.raises(DataError, match=r"ball\.off: a coordinate is beyond 1e\+30"):
-                drawn(tmp_path / "ball.off", tmp_path)
+                run_command(tmp_path / "ball.off", tmp_path)
         else:
-            shown.append(np.asarray(drawn(tmp_path / "ball.off", tmp_path), int))
+            shown.append(np.asarray(run_command(tmp_path / "ball.off", tmp_path), int))
     assert len(np.unique(shown[0])) > 20
-    assert all(np.abs(one - shown[0]).max() <= 2 for one in shown)
+    assert all(np.abs(image - shown[0]).max() <= 2 for image in shown)
     assert "no face" not in capsys.readouterr().err
     (tmp_path / "flat.off").write_text("OFF\n3 1 0\n1 1 1\n1 1 1\n1 1 1\n3 0 1 2\n")
-    assert len(np.unique(np.asarray(drawn(tmp_path / "flat.off", tmp_path)))) == 1
-    assert "flat.off: no face of it is seen in the last picture." in capsys.readouterr().err
+    assert len(np.unique(np.asarray(run_command(tmp_path / "flat.off", tmp_path)))) == 1
+    assert "flat.off: no face of the scene is visible in the last image." in capsys.readouterr().err
 
 
 def test_as_a_program_it_ends_with_a_sentence_and_no_stack_trace(cube: Path, tmp_path: Path) -> None:
@@ -374,10 +383,10 @@ def test_as_a_program_it_ends_with_a_sentence_and_no_stack_trace(cube: Path, tmp
     with pytest.raises(NotADirectoryError):
         main([str(cube), "--size", "9x9", "--out", str(tmp_path / "file" / "inner" / "one.png")])
     command = [sys.executable, "-m", "plugins.renderer.rasterizer", str(cube), "--size", "9x9", "--out"]
-    done = subprocess.run([*command, "/proc/none/one.png"], capture_output=True, text=True, timeout=60)
-    assert done.returncode == 1 and done.stdout == ""
+    process = subprocess.run([*command, "/proc/none/one.png"], capture_output=True, text=True, timeout=60)
+    assert process.returncode == 1 and process.stdout == ""
     assert (
-        done.stderr
+        process.stderr
         == "error: /proc/none cannot be written (No such file or directory). Choose another path.\n"
     )
 
@@ -391,6 +400,6 @@ def test_the_same_mesh_as_obj_and_glb_is_the_same_picture(tmp_path: Path) -> Non
     shown = []
     for name in ("one.glb", "one.obj"):
         mesh.export(tmp_path / name)
-        shown.append(np.asarray(drawn(tmp_path / name, tmp_path, "--shade"), int))
+        shown.append(np.asarray(run_command(tmp_path / name, tmp_path, "--shade"), int))
         assert not read(tmp_path / name).notes
     assert np.abs(shown[0] - shown[1]).max() <= 1 and len(np.unique(shown[0])) > 3

@@ -12,7 +12,7 @@ from scipy.spatial import Delaunay
 
 from framework.geometry.camera import Camera, look_from
 from plugins.renderer.rasterizer import raster
-from plugins.renderer.rasterizer.clipping import clipped
+from plugins.renderer.rasterizer.clipping import clip
 
 MARGIN = 2 / 256  # pixels; a corner is rounded by up to 1/512 along either axis
 FAR = 4.0  # metres, half a side of the plane
@@ -20,7 +20,7 @@ FAR = 4.0  # metres, half a side of the plane
 
 @njit(error_model="numpy")  # not kept on disk, where nothing would see that a kernel it calls has changed
 @no_type_check
-def added(screen, faces, height, width, alone, number):
+def count_faces(screen, faces, height, width, alone, number):
     """Add to `number`, (height, width), how many faces cover each pixel, each drawn alone; `alone` is all false."""
     counts = np.zeros(6, np.int64)
     for index in range(faces.shape[0]):
@@ -34,7 +34,7 @@ def added(screen, faces, height, width, alone, number):
                 alone[row, column] = False
 
 
-def covered(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+def count_coverage(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """Return how many faces cover each pixel, each drawn alone, and which pixels they cover when drawn together.
 
     The kernels are those that `Rasterizer` calls. Each part of a face that the near plane cuts counts as a face.
@@ -42,18 +42,18 @@ def covered(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> tuple[np
     rotation, translation = camera.rotation.double().numpy(), camera.translation.double().numpy()
     lens = np.array(camera.focal), np.array(camera.principal)
     size = camera.height, camera.width
-    seen, screen = np.empty((len(vertices), 3)), np.empty((len(vertices), 5))
+    camera_points, screen = np.empty((len(vertices), 3)), np.empty((len(vertices), 5))
     number, alone, mask = np.zeros(size, np.int64), np.zeros(size, np.bool_), np.zeros(size, np.bool_)
     counts = np.zeros(6, np.int64)
-    raster.project(vertices, rotation, translation, *lens, camera.near, seen, screen)
-    corners, parts, numbers = clipped(seen, faces, *lens, camera.near)
+    raster.project(vertices, rotation, translation, *lens, camera.near, camera_points, screen)
+    corners, parts, numbers = clip(camera_points, faces, *lens, camera.near)
     for places, indices, names in ((screen, faces, None), (corners, parts, numbers)):
         raster.rasterise(places, indices, 0, names, False, *size, None, None, mask, None, None, None, counts)
-        added(places, indices, *size, alone, number)
+        count_faces(places, indices, *size, alone, number)
     return number, mask
 
 
-def on_the_plane(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+def intersect_plane(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """Return whether each pixel's ray hits the plane, and how far the pixel is from the plane's border, pixels.
 
     The plane is the square |x|, |y| <= FAR of z = 0 beyond the near plane. The computation uses rays in the world.
@@ -83,7 +83,7 @@ def on_the_plane(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     return inside, distance
 
 
-def loose(random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def random_plane(random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Return the square, cut along a Delaunay triangulation of random points.
 
     It is flat, and the corners of a face have any order.
@@ -96,18 +96,18 @@ def loose(random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     return np.pad(points, ((0, 0), (0, 1))), Delaunay(points).simplices
 
 
-def regular() -> tuple[np.ndarray, np.ndarray]:
+def regular_plane() -> tuple[np.ndarray, np.ndarray]:
     """Return the square cut into 8 × 8 squares, which are cut along either diagonal in turn."""
     row, column = np.meshgrid(np.arange(8), np.arange(8), indexing="ij")
     a, b, c, d = (9 * (row + down) + column + right for down, right in ((0, 0), (0, 1), (1, 0), (1, 1)))
     odd = (row + column) % 2 == 1
-    one = np.where(odd[..., None], np.stack([a, b, c], -1), np.stack([a, b, d], -1))
+    first_half = np.where(odd[..., None], np.stack([a, b, c], -1), np.stack([a, b, d], -1))
     other = np.where(odd[..., None], np.stack([b, d, c], -1), np.stack([a, d, c], -1))
     points = np.stack(np.meshgrid(*[np.linspace(-FAR, FAR, 9)] * 2, indexing="xy"), -1).reshape(-1, 2)
-    return np.pad(points, ((0, 0), (0, 1))), np.concatenate([one.reshape(-1, 3), other.reshape(-1, 3)])
+    return np.pad(points, ((0, 0), (0, 1))), np.concatenate([first_half.reshape(-1, 3), other.reshape(-1, 3)])
 
 
-def somewhere(random: np.random.Generator) -> Camera:
+def random_camera(random: np.random.Generator) -> Camera:
     """Return a camera above or below the plane, near or far, with any lens and principal point."""
     height, width = (int(side) for side in random.integers(1, 65, 2))
     distance = float(10.0 ** random.uniform(math.log10(0.05), 4))
@@ -130,7 +130,7 @@ def somewhere(random: np.random.Generator) -> Camera:
     )
 
 
-def square_on(random: np.random.Generator) -> Camera:
+def aligned_camera(random: np.random.Generator) -> Camera:
     """Return a camera for which all numbers are exact, and edges of the regular plane run through pixel centres."""
     height, width = (int(side) for side in random.integers(1, 65, 2))
     depth, pixels = 2.0 ** random.integers(-4, 14), 2.0 ** random.integers(0, 6)  # metres; pixels a metre
@@ -150,7 +150,7 @@ def square_on(random: np.random.Generator) -> Camera:
     )
 
 
-class Seen(NamedTuple):
+class PixelCounts(NamedTuple):
     """Numbers of pixels of a view.
 
     Attributes:
@@ -167,32 +167,37 @@ class Seen(NamedTuple):
     other: int
 
 
-def looked_at(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> Seen:
-    number, mask = covered(vertices, faces, camera)
-    inside, distance = on_the_plane(camera)
+def count_pixels(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> PixelCounts:
+    number, mask = count_coverage(vertices, faces, camera)
+    inside, distance = intersect_plane(camera)
     clear = distance > MARGIN
     must, never = inside & clear, ~inside & clear
     wrong = must, must & (number == 0), must & (number > 1), never & (number > 0), mask != (number > 0)
-    return Seen(*(int(pixels.sum()) for pixels in wrong))
+    return PixelCounts(*(int(pixels.sum()) for pixels in wrong))
 
 
-def views(number: int, seed: int = 0) -> Iterator[tuple[str, Seen]]:
+def views(number: int, seed: int = 0) -> Iterator[tuple[str, PixelCounts]]:
     """Yield the views of `number` cameras, a third of them square on, with the name of the plane that each sees."""
     random = np.random.default_rng(seed)
-    planes = {"regular": regular()} | {f"loose {index}": loose(random) for index in range(5)}
+    planes = {"regular": regular_plane()} | {f"loose {index}": random_plane(random) for index in range(5)}
     names = list(planes)
     for index in range(number):
         name = names[0] if index % 2 else names[1 + index // 2 % 5]
-        camera = square_on(random) if index % 6 < 2 else somewhere(random)
-        yield name, looked_at(*planes[name], camera)
+        camera = aligned_camera(random) if index % 6 < 2 else random_camera(random)
+        yield name, count_pixels(*planes[name], camera)
 
 
-def total(found: Iterable[tuple[str, Seen]]) -> Seen:
-    return Seen(*np.sum([seen for _, seen in found], 0).tolist())
+def sum_counts(counts: Iterable[tuple[str, PixelCounts]]) -> PixelCounts:
+    return PixelCounts(*np.sum([camera_points for _, camera_points in counts], 0).tolist())
 
 
 def test_every_pixel_of_a_tessellated_plane_is_covered_once_whatever_the_camera() -> None:
     """Check 2,000 cameras; benchmarks/rendering/rasterizer_coverage.py has 10,000."""
-    seen = total(views(2000))
-    assert seen.inside > 600_000
-    assert (seen.holes, seen.doubled, seen.strays, seen.other) == (0, 0, 0, 0)
+    camera_points = sum_counts(views(2000))
+    assert camera_points.inside > 600_000
+    assert (camera_points.holes, camera_points.doubled, camera_points.strays, camera_points.other) == (
+        0,
+        0,
+        0,
+        0,
+    )

@@ -30,7 +30,7 @@ def ahead(height: int = 9, width: int = 11, near: float = 1e-3, focal: float = 8
     return Camera(torch.eye(3), torch.zeros(3), (focal, focal), middle, height, width, near)
 
 
-def meshed(corners: np.ndarray | list, camera: Camera, faces: np.ndarray | list | None = None) -> Scene:
+def make_scene(corners: np.ndarray | list, camera: Camera, faces: np.ndarray | list | None = None) -> Scene:
     """Return a scene of vertices (n, 3), in which colours and texture places differ everywhere.
 
     Without `faces`, every three vertices are a face.
@@ -51,13 +51,13 @@ WALL = [[-9, -9, 3.0], [9, -9, 3], [0, 12, 3]]
 
 def slivers() -> np.ndarray:
     """Return triangles as thin as 1e-12 to 1e-2 of their length, in all directions."""
-    found = []
+    triangles = []
     for turn, width in enumerate(10.0 ** np.arange(-12, -1)):
         along = np.array([math.cos(turn), math.sin(turn), 0.1])
         across = np.array([-math.sin(turn), math.cos(turn), -0.2])
         middle = np.array([0.1 * turn - 0.5, 0.07 * turn - 0.4, 1.5])
-        found.append([middle - along, middle + along, middle + along / 3 + width * across])
-    return np.array(found).reshape(-1, 3)
+        triangles.append([middle - along, middle + along, middle + along / 3 + width * across])
+    return np.array(triangles).reshape(-1, 3)
 
 
 def crossing() -> np.ndarray:
@@ -67,59 +67,59 @@ def crossing() -> np.ndarray:
 
 
 SCENES: dict[str, Callable[[], Scene]] = {
-    "edge-on": lambda: meshed(
+    "edge-on": lambda: make_scene(
         [[0, 0, 1.0], [0, 1, 2], [0, -1, 2], [-0.3, 0, 1], [0.3, 0, 2], [0.6, 0, 3], *WALL], ahead()
     ),
-    "nearly edge-on": lambda: meshed(
+    "nearly edge-on": lambda: make_scene(
         [[1e-9, -1, 1.0], [1e-7, 1, 1], [-1e-9, 0, 3], [-1, 1e-3, 1], [1, 1e-3, 1], [0, 2e-3, 5], *WALL], ahead()
     ),
-    "degenerate": lambda: meshed(
+    "degenerate": lambda: make_scene(
         [[0, 0, 1.0], [0.5, 0, 1], [0, 0.5, 1]], ahead(), [[0, 0, 1], [1, 1, 1], [0, 1, 2], [0, 1, 0]]
     ),
-    "all in one point": lambda: meshed(np.tile([0.0, 0, 1], (6, 1)), ahead()),
-    "slivers": lambda: meshed([*slivers(), *WALL], ahead()),
-    "slivers alone": lambda: meshed(slivers(), ahead(40, 50)),
-    "intersecting": lambda: meshed([*crossing(), *WALL], ahead()),
-    "coplanar": lambda: meshed([*WALL, *WALL, *np.array(WALL)[::-1], [-1, -1, 3], [1, -1, 3], [0, 1, 3]], ahead()),
-    "a vertex on the camera plane": lambda: meshed([[0, 0.2, 0.0], [-1, 0.3, 2], [1, 0.3, 2], *WALL], ahead()),
-    "a vertex at the eye": lambda: meshed([[0, 0, 0.0], [-1, 0.3, 2], [1, 0.3, 2], *WALL], ahead()),
-    "on the near plane": lambda: meshed([[-1, 0.2, 0.5], [1, 0.3, 0.5], [0, 0.9, 0.5], *WALL], ahead(near=0.5)),
-    "through the eye": lambda: meshed([[-1, -1, -1.0], [1, 1, 1], [1, 0, 1.5], *WALL], ahead()),
-    "behind": lambda: meshed([[-1, -1, -1.0], [1, 1, -1], [1, 0, -1.5]], ahead()),
-    "a face over all": lambda: meshed(np.array([[-1, -1, 0], [1, -1, 0], [0, 1, 0]]) * 1e30 + [0, 0, 2], ahead()),
-    "a face over all, far": lambda: meshed(
+    "all in one point": lambda: make_scene(np.tile([0.0, 0, 1], (6, 1)), ahead()),
+    "slivers": lambda: make_scene([*slivers(), *WALL], ahead()),
+    "slivers alone": lambda: make_scene(slivers(), ahead(40, 50)),
+    "intersecting": lambda: make_scene([*crossing(), *WALL], ahead()),
+    "coplanar": lambda: make_scene([*WALL, *WALL, *np.array(WALL)[::-1], [-1, -1, 3], [1, -1, 3], [0, 1, 3]], ahead()),
+    "a vertex on the camera plane": lambda: make_scene([[0, 0.2, 0.0], [-1, 0.3, 2], [1, 0.3, 2], *WALL], ahead()),
+    "a vertex at the eye": lambda: make_scene([[0, 0, 0.0], [-1, 0.3, 2], [1, 0.3, 2], *WALL], ahead()),
+    "on the near plane": lambda: make_scene([[-1, 0.2, 0.5], [1, 0.3, 0.5], [0, 0.9, 0.5], *WALL], ahead(near=0.5)),
+    "through the eye": lambda: make_scene([[-1, -1, -1.0], [1, 1, 1], [1, 0, 1.5], *WALL], ahead()),
+    "behind": lambda: make_scene([[-1, -1, -1.0], [1, 1, -1], [1, 0, -1.5]], ahead()),
+    "a face over all": lambda: make_scene(np.array([[-1, -1, 0], [1, -1, 0], [0, 1, 0]]) * 1e30 + [0, 0, 2], ahead()),
+    "a face over all, far": lambda: make_scene(
         [[-1e30, -1e30, 1e30], [1e30, -1e30, 1e29], [0, 1e30, 2e30], [0, 0, 1], [1e-20, 0, 1], [0, 1e30, 1]], ahead()
     ),
-    "up to where float32 ends": lambda: meshed(np.array(WALL) * [3e37, 2e37, 1e38], ahead()),
-    "nearer than float32 goes": lambda: meshed(np.array(WALL) * 1e-46, ahead(near=1e-90)),
-    "very near": lambda: meshed(np.array(WALL) * 1e-30, ahead(near=1e-35)),
-    "floor from under the feet": lambda: meshed(
+    "up to where float32 ends": lambda: make_scene(np.array(WALL) * [3e37, 2e37, 1e38], ahead()),
+    "nearer than float32 goes": lambda: make_scene(np.array(WALL) * 1e-46, ahead(near=1e-90)),
+    "very near": lambda: make_scene(np.array(WALL) * 1e-30, ahead(near=1e-35)),
+    "floor from under the feet": lambda: make_scene(
         [[-1.0, 0.5, 3e-9], [1.0, 0.5, 3e-9], [0.0, 0.5, 50.0], *WALL], ahead(near=1e-9)
     ),
-    "short lens": lambda: meshed([*crossing(), *WALL], ahead(focal=1e-3)),
-    "long lens": lambda: meshed([*crossing(), *WALL], ahead(focal=1e6)),
-    "far from the origin": lambda: meshed(
+    "short lens": lambda: make_scene([*crossing(), *WALL], ahead(focal=1e-3)),
+    "long lens": lambda: make_scene([*crossing(), *WALL], ahead(focal=1e6)),
+    "far from the origin": lambda: make_scene(
         crossing() + 1e6, replace(ahead(), translation=torch.tensor([-1e6] * 3))
     ),
-    "many in one pixel": lambda: meshed(
+    "many in one pixel": lambda: make_scene(
         crossing()[np.arange(600) % 60] * 1e-2 + np.array([0, 0, 1]), ahead()
     ),
-    "one pixel": lambda: meshed([*crossing(), *WALL], ahead(1, 1)),
-    "one row": lambda: meshed([*crossing(), *WALL], ahead(1, 30)),
-    "tiny": lambda: meshed(crossing() * 1e-4 + [0, 0, 1.0], ahead()),
-    "no faces": lambda: meshed(WALL, ahead(), []),
+    "one pixel": lambda: make_scene([*crossing(), *WALL], ahead(1, 1)),
+    "one row": lambda: make_scene([*crossing(), *WALL], ahead(1, 30)),
+    "tiny": lambda: make_scene(crossing() * 1e-4 + [0, 0, 1.0], ahead()),
+    "no faces": lambda: make_scene(WALL, ahead(), []),
 }  # fmt: skip
 
 
-def learned(scene: Scene, kind: torch.dtype, textured: bool) -> tuple[Scene, dict[str, Tensor]]:
+def require_gradients(scene: Scene, kind: torch.dtype, textured: bool) -> tuple[Scene, dict[str, Tensor]]:
     """Return the scene in one number type, and its parts that require a gradient."""
-    seen = scene.camera
+    original = scene.camera
     parts: dict[str, Tensor] = {
         "vertices": scene.vertices,
-        "rotation": seen.rotation,
-        "translation": seen.translation,
-        "focal": torch.as_tensor(seen.focal, dtype=torch.float64),
-        "principal": torch.as_tensor(seen.principal, dtype=torch.float64),
+        "rotation": original.rotation,
+        "translation": original.translation,
+        "focal": torch.as_tensor(original.focal, dtype=torch.float64),
+        "principal": torch.as_tensor(original.principal, dtype=torch.float64),
     }
     if scene.colors is not None:
         parts["colors"] = scene.colors
@@ -128,22 +128,26 @@ def learned(scene: Scene, kind: torch.dtype, textured: bool) -> tuple[Scene, dic
         parts |= {"texture": texture.images[0], "uv": texture.uv}
     parts = {name: part.detach().to(kind).clone().requires_grad_() for name, part in parts.items()}
     camera = replace(
-        seen, **{name: parts[name] for name in ("rotation", "translation", "focal", "principal")}
+        original, **{name: parts[name] for name in ("rotation", "translation", "focal", "principal")}
     )
     if texture is not None:
         texture = replace(texture, images=(parts["texture"],), uv=parts["uv"])
     return Scene(parts["vertices"], scene.faces, parts.get("colors"), camera, texture), parts
 
 
-def bad_slopes(scene: Scene, renderer: Rasterizer, kind: torch.dtype, scale: float = 1.0) -> list[str]:
+def find_bad_gradients(
+    scene: Scene, renderer: Rasterizer, kind: torch.dtype, scale: float = 1.0
+) -> list[str]:
     """Return parameters whose gradients are not finite, and channels that are not finite where they must be."""
-    given, parts = learned(scene, kind, renderer.gradient != "soft")
-    found = renderer(given, ("color", "depth", "mask", "normal", "barycentric", "uv"))
-    bad = [name for name in ("color", "normal", "barycentric", "uv") if not found[name].isfinite().all()]
-    bad += ["depth"] * (not torch.equal(found["depth"].isfinite(), found["mask"]))
-    weight = torch.linspace(-1, 2, found["color"].numel()).reshape(found["color"].shape)
-    depth = found["depth"].masked_select(found["mask"])
-    loss = scale * ((found["color"] * weight).sum() + (depth.clamp(max=1e20).sum() if depth.numel() else 0))
+    differentiable, parts = require_gradients(scene, kind, renderer.gradient != "soft")
+    channels = renderer(differentiable, ("color", "depth", "mask", "normal", "barycentric", "uv"))
+    bad = [name for name in ("color", "normal", "barycentric", "uv") if not channels[name].isfinite().all()]
+    bad += ["depth"] * (not torch.equal(channels["depth"].isfinite(), channels["mask"]))
+    weight = torch.linspace(-1, 2, channels["color"].numel()).reshape(channels["color"].shape)
+    depth = channels["depth"].masked_select(channels["mask"])
+    loss = scale * (
+        (channels["color"] * weight).sum() + (depth.clamp(max=1e20).sum() if depth.numel() else 0)
+    )
     slopes = torch.autograd.grad(loss, list(parts.values()), allow_unused=True)
     return bad + [
         name
@@ -162,11 +166,13 @@ def bad_slopes(scene: Scene, renderer: Rasterizer, kind: torch.dtype, scale: flo
 )
 def test_no_gradient_is_NaN_or_infinite(name: str, gradient: Gradient) -> None:
     for kind, supersampling in itertools.product(TYPES, (1, 2)):
-        bad = bad_slopes(SCENES[name](), Rasterizer(gradient=gradient, supersampling=supersampling), kind)
+        bad = find_bad_gradients(
+            SCENES[name](), Rasterizer(gradient=gradient, supersampling=supersampling), kind
+        )
         assert not bad, (kind, supersampling)
 
 
-def wild(seed: int) -> Scene:
+def random_scene(seed: int) -> Scene:
     """Return a scene with coordinates of any size that float32 holds, mostly in front of a camera with any lens.
 
     In some scenes, all coordinates lie on a grid with edges through the camera's centre and through pixel centres.
@@ -188,14 +194,14 @@ def wild(seed: int) -> Scene:
     near, focal = random.choice([1e-37, 1e-20, 1e-3, 1.0]), random.choice([1e-3, 0.3, 8.0, 1e3, 1e6])
     camera = ahead(*(int(side) for side in random.integers(1, 13, 2)), float(near), float(focal))
     away = torch.tensor([0.0, 0, random.choice([0.0, 2.0])])
-    return meshed(vertices, replace(camera, translation=away.float()), faces)
+    return make_scene(vertices, replace(camera, translation=away.float()), faces)
 
 
 @settings(deadline=None, max_examples=150, derandomize=True)
 @given(st.integers(0, 2**32 - 1), st.sampled_from(KINDS), st.sampled_from([1.0, 1e-30, 1e20]))
 def test_wild_scenes_have_finite_pictures_and_gradients(seed: int, gradient: Gradient, scale: float) -> None:
     for kind in TYPES:
-        assert not bad_slopes(wild(seed), Rasterizer(gradient=gradient), kind, scale), kind
+        assert not find_bad_gradients(random_scene(seed), Rasterizer(gradient=gradient), kind, scale), kind
 
 
 @pytest.mark.parametrize(
@@ -213,8 +219,8 @@ def test_a_face_whose_corners_are_1e30_away_fills_the_image_whatever_is_asked(
     turn = np.linalg.matrix_power(np.array([[0, -1.0, 0], [1, 0, 0], [0, 0, 1]]), quarter)
     corners = np.array([[-1, -1, 0], [1, -1.5, 0], [0, 1, 0]]) * 1e30 @ turn.T + [0, 0, 2]
     for faces in ([0, 1, 2], [0, 2, 1]):
-        scene = meshed(corners, ahead(), faces)
-        found = Rasterizer(gradient=gradient)(replace(scene, texture=None), EVERY)
-        assert found["mask"].all() and (found["depth"] == 2).all() and (found["face"] == 0).all()
+        scene = make_scene(corners, ahead(), faces)
+        channels = Rasterizer(gradient=gradient)(replace(scene, texture=None), EVERY)
+        assert channels["mask"].all() and (channels["depth"] == 2).all() and (channels["face"] == 0).all()
         for kind in TYPES:
-            assert not bad_slopes(scene, Rasterizer(gradient=gradient), kind)
+            assert not find_bad_gradients(scene, Rasterizer(gradient=gradient), kind)

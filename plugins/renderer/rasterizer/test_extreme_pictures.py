@@ -18,11 +18,11 @@ from plugins.renderer.rasterizer.test_extreme import (
     KINDS,
     SCENES,
     ahead,
-    bad_slopes,
     crossing,
-    learned,
-    meshed,
-    wild,
+    find_bad_gradients,
+    make_scene,
+    random_scene,
+    require_gradients,
 )
 
 SAVINGS = get_args(Saving)
@@ -40,17 +40,17 @@ def test_each_face_is_counted_once_and_savings_change_no_bit_however_wild_the_sc
     seed: int, cull: bool, savings: set[Saving], channels: set[str]
 ) -> None:
     """Check that a second image, which reuses what has not changed, has the same report."""
-    scene = wild(seed)
+    scene = random_scene(seed)
     renderer = Rasterizer(cull=cull, savings=tuple(savings))
     plain = Rasterizer(cull=cull, savings=())(scene, channels)
     for _ in range(2):
-        found, report = renderer(scene, channels), renderer.report
+        image, report = renderer(scene, channels), renderer.report
         assert report is not None
         assert report.faces == len(scene.faces) == report.drawn_faces + sum(report.left_out.values())
         assert report.drawn_faces >= 0 and all(count > 0 for count in report.left_out.values())
-        assert all(torch.equal(found[name], plain[name]) for name in channels)
+        assert all(torch.equal(image[name], plain[name]) for name in channels)
         if "face" in channels:
-            shown = found["face"].unique()
+            shown = image["face"].unique()
             assert len(shown[shown >= 0]) <= report.drawn_faces
 
 
@@ -85,27 +85,27 @@ def test_what_is_not_finite_is_refused_or_disturbs_only_the_faces_that_have_it(
     where: str, number: float
 ) -> None:
     first = [[-0.4, -0.3, 1.0], [0.3, -0.35, 1], [0, 0.3, 1]]
-    scene = meshed([*first, *crossing()[:27] + np.array([0, 0, 0.5])], ahead(24, 32, focal=20.0))
+    scene = make_scene([*first, *crossing()[:27] + np.array([0, 0, 0.5])], ahead(24, 32, focal=20.0))
     bad = with_number(scene, where, number)
     if where not in ("vertices", "colors", "texels"):
         with pytest.raises(ValueError, match="not finite"):
             Rasterizer()(bad, EVERY)
         return
-    plain, found = Rasterizer()(scene, EVERY), Rasterizer()(bad, EVERY)
+    plain, channels = Rasterizer()(scene, EVERY), Rasterizer()(bad, EVERY)
     untouched = plain["face"] != 0
     assert untouched.any() and (~untouched).any()
     if where == "vertices":
         rest = Rasterizer()(
             replace(scene, faces=torch.cat([torch.zeros_like(scene.faces[:1]), scene.faces[1:]])), EVERY
         )
-        assert all(torch.equal(rest[name], found[name]) for name in EVERY)
-        assert all(found[name].isfinite().all() for name in ("color", "normal", "barycentric", "uv"))
+        assert all(torch.equal(rest[name], channels[name]) for name in EVERY)
+        assert all(channels[name].isfinite().all() for name in ("color", "normal", "barycentric", "uv"))
         return
-    assert all(torch.equal(found[name], plain[name]) for name in EVERY if name != "color")
+    assert all(torch.equal(channels[name], plain[name]) for name in EVERY if name != "color")
     if where == "colors":
-        assert torch.equal(found["color"][untouched], plain["color"][untouched])
+        assert torch.equal(channels["color"][untouched], plain["color"][untouched])
     else:
-        same = (found["color"] == plain["color"]).all(-1)
+        same = (channels["color"] == plain["color"]).all(-1)
         assert same[~plain["mask"]].all() and 0.3 < same.float().mean() < 1
     # out of view the number has no effect
     away = replace(bad, camera=replace(bad.camera, translation=torch.tensor([0.0, 0, -50])))
@@ -114,12 +114,12 @@ def test_what_is_not_finite_is_refused_or_disturbs_only_the_faces_that_have_it(
 
 def test_a_face_seen_edge_on_shows_nothing_and_one_nearly_so_no_hole() -> None:
     vertices = [[0, -1, 1.0], [0, 1, 1], [0, 0, 3], [-1, 0, 1], [1, 0, 1], [0, 0, 4]]
-    assert not Rasterizer()(meshed(vertices, ahead()), ("mask",))["mask"].any()
+    assert not Rasterizer()(make_scene(vertices, ahead()), ("mask",))["mask"].any()
     for lift in 10.0 ** np.arange(-12, 0):
-        roof = meshed([[-9, -9, 3.0], [9, -9, 3], [9, lift, 3], [-9, lift, 3], [9, 9, 3], [-9, 9, 3], [0, lift, 1]],
+        roof = make_scene([[-9, -9, 3.0], [9, -9, 3], [9, lift, 3], [-9, lift, 3], [9, 9, 3], [-9, 9, 3], [0, lift, 1]],
                       ahead(), [[0, 1, 2], [0, 2, 3], [3, 2, 4], [3, 4, 5], [3, 6, 2], [2, 6, 3]])  # fmt: skip
-        found = Rasterizer()(roof, ("mask", "face"))
-        assert found["mask"].all()
+        channels = Rasterizer()(roof, ("mask", "face"))
+        assert channels["mask"].all()
 
 
 def test_planes_that_pass_through_one_another_show_the_nearer() -> None:
@@ -134,25 +134,25 @@ def test_planes_that_pass_through_one_another_show_the_nearer() -> None:
         [9, 9, 5],
         [-9, 9, 5],
     ]
-    scene = meshed(corners, camera, [[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]])
-    found = Rasterizer()(scene, ("depth", "face"))
+    scene = make_scene(corners, camera, [[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]])
+    channels = Rasterizer()(scene, ("depth", "face"))
     down = (torch.arange(40).double() - camera.principal[1]) / 32.0
     depths = torch.stack([3 / (1 + 2 / 9 * down), 3 / (1 - 2 / 9 * down)])
-    assert torch.allclose(found["depth"].double(), depths.amin(0)[:, None].expand(40, 50), rtol=1e-3)
-    assert torch.equal(found["face"] // 2, depths.argmin(0)[:, None].expand(40, 50).int())
+    assert torch.allclose(channels["depth"].double(), depths.amin(0)[:, None].expand(40, 50), rtol=1e-3)
+    assert torch.equal(channels["face"] // 2, depths.argmin(0)[:, None].expand(40, 50).int())
 
 
 @pytest.mark.parametrize("depth", [0.0, -1e-300, 1e-300, 1e-3, -1.0])
 def test_a_vertex_on_the_plane_of_the_camera_hides_no_part_of_its_face(depth: float) -> None:
     """Check that a floor that begins beside the camera has the depth of each ray, however far it begins behind."""
     camera = ahead(30, 40, focal=16.0)
-    scene = meshed(
+    scene = make_scene(
         [[-50, 1, depth], [50, 1, depth], [50, 1, 50], [-50, 1, 50]], camera, [[0, 1, 2], [0, 2, 3]]
     )
-    found = Rasterizer()(scene, ("depth",))["depth"].double()
+    channels = Rasterizer()(scene, ("depth",))["depth"].double()
     down = (torch.arange(30).double() - camera.principal[1]) / 16.0
     true = (1 / down).where((down > 0) & (1 / down < 50), math.inf)[:, None].expand(30, 40)
-    assert torch.allclose(found, true, rtol=1e-3)
+    assert torch.allclose(channels, true, rtol=1e-3)
 
 
 def test_of_a_million_faces_in_one_pixel_the_nearest_is_seen() -> None:
@@ -162,12 +162,12 @@ def test_of_a_million_faces_in_one_pixel_the_nearest_is_seen() -> None:
     corners = np.concatenate(
         [shape * depth[:, None, None], np.broadcast_to(depth[:, None, None], (len(depth), 3, 1))], 2
     )
-    scene = meshed(corners, ahead())
+    scene = make_scene(corners, ahead())
     for savings in (("box",), SAVINGS):
         renderer = Rasterizer(savings=savings)
-        found = renderer(scene, ("face", "depth"))
-        assert found["face"][4, 5] == depth.argmin() and found["depth"][4, 5] == 1
-        assert (found["face"] >= 0).sum() == 1 and renderer.report is not None
+        channels = renderer(scene, ("face", "depth"))
+        assert channels["face"][4, 5] == depth.argmin() and channels["depth"][4, 5] == 1
+        assert (channels["face"] >= 0).sum() == 1 and renderer.report is not None
         assert renderer.report.drawn_faces + renderer.report.left_out.get("hidden", 0) == len(depth)
 
 
@@ -175,7 +175,9 @@ def test_of_a_million_faces_in_one_pixel_the_nearest_is_seen() -> None:
 def test_gradients_of_a_hundred_thousand_faces_in_one_pixel_are_finite(gradient: Gradient) -> None:
     shape = np.array([[-0.04, -0.04, 0], [0.04, -0.04, 0], [0, 0.06, 0]])
     corners = shape + np.array([0, 0, 1]) * np.linspace(2, 1, 100_000)[:, None, None]
-    assert not bad_slopes(meshed(corners, ahead(1, 1)), Rasterizer(gradient=gradient), torch.float32)
+    assert not find_bad_gradients(
+        make_scene(corners, ahead(1, 1)), Rasterizer(gradient=gradient), torch.float32
+    )
 
 
 def test_a_picture_does_not_depend_on_the_unit_of_length_or_on_how_long_the_lens_is() -> None:
@@ -186,12 +188,12 @@ def test_a_picture_does_not_depend_on_the_unit_of_length_or_on_how_long_the_lens
         focal = 2.0**power
         camera = ahead(20, 24, near=focal * 2.0**-10, focal=focal)
         corners = np.concatenate([8 * pixels[:, :2] * pixels[:, 2:], focal * pixels[:, 2:]], 1)
-        found = Rasterizer()(meshed(corners, camera), ("face", "mask", "color", "depth"))
-        found["depth"] /= focal
-        pictures.append(found)
+        channels = Rasterizer()(make_scene(corners, camera), ("face", "mask", "color", "depth"))
+        channels["depth"] /= focal
+        pictures.append(channels)
     assert pictures[0]["mask"].float().mean() > 0.2
-    for found in pictures[1:]:
-        assert all(torch.equal(found[name], pictures[0][name]) for name in found)
+    for channels in pictures[1:]:
+        assert all(torch.equal(channels[name], pictures[0][name]) for name in channels)
 
 
 def test_millimetres_are_seen_a_million_metres_from_the_origin() -> None:
@@ -205,28 +207,30 @@ def test_millimetres_are_seen_a_million_metres_from_the_origin() -> None:
     camera = replace(
         ahead(40, 50, focal=900.0), rotation=torch.eye(3).double(), translation=torch.zeros(3).double()
     )
-    near = meshed(shape, camera)
-    there = replace(
+    near = make_scene(shape, camera)
+    distant = replace(
         near,
         vertices=near.vertices @ turn + far,
         camera=replace(camera, rotation=turn, translation=-turn @ far),
     )
-    one, other = (Rasterizer()(scene, EVERY) for scene in (near, there))
-    assert one["mask"].float().mean() > 0.2
-    assert (one["face"] != other["face"]).float().mean() < 2e-3  # corners that lie between two grid points
-    same = (one["face"] == other["face"]) & one["mask"]
-    assert (one["depth"] - other["depth"])[same].abs().max() < 1e-6
+    near_image, distant_image = (Rasterizer()(scene, EVERY) for scene in (near, distant))
+    assert near_image["mask"].float().mean() > 0.2
+    assert (
+        near_image["face"] != distant_image["face"]
+    ).float().mean() < 2e-3  # corners that lie between two grid points
+    same = (near_image["face"] == distant_image["face"]) & near_image["mask"]
+    assert (near_image["depth"] - distant_image["depth"])[same].abs().max() < 1e-6
 
 
 def test_the_largest_images() -> None:
     """Draw 4096 × 4096 pixels, with a face over all of it and one in a corner."""
     camera = ahead(4096, 4096, focal=2048.0)
     corners = [[-3, -3, 1.0], [9, -3, 1], [-3, 9, 1], [0.9, 0.9, 0.9], [0.9, 0.8, 0.9], [0.8, 0.9, 0.9]]
-    scene = replace(meshed(corners, camera), texture=None)
-    found = Rasterizer()(scene, ("color", "face"))
-    assert (found["face"] >= 0).all() and found["color"].shape == (4096, 4096, 3)
-    assert abs(int(found["face"].sum()) - (0.1 / 0.9 * 2048) ** 2 / 2) < 300  # pixels of the small one
-    assert found["color"].isfinite().all() and found["color"].min() > 0
+    scene = replace(make_scene(corners, camera), texture=None)
+    channels = Rasterizer()(scene, ("color", "face"))
+    assert (channels["face"] >= 0).all() and channels["color"].shape == (4096, 4096, 3)
+    assert abs(int(channels["face"].sum()) - (0.1 / 0.9 * 2048) ** 2 / 2) < 300  # pixels of the small one
+    assert channels["color"].isfinite().all() and channels["color"].min() > 0
 
 
 @pytest.mark.parametrize("gradient", KINDS)
@@ -234,13 +238,15 @@ def test_of_nothing_at_all_comes_the_background_and_no_slope(gradient: Gradient)
     for name in ("no faces", "behind", "degenerate", "all in one point"):
         scene = SCENES[name]()
         if name == "degenerate":
-            scene = meshed(scene.vertices.numpy(), ahead(), [[0, 0, 1], [1, 1, 1]])
-        given, parts = learned(scene, torch.float32, gradient != "soft")
-        found = Rasterizer(gradient=gradient)(
-            given, EVERY if gradient != "soft" else ("color", "depth", "face", "mask")
+            scene = make_scene(scene.vertices.numpy(), ahead(), [[0, 0, 1], [1, 1, 1]])
+        differentiable, parts = require_gradients(scene, torch.float32, gradient != "soft")
+        channels = Rasterizer(gradient=gradient)(
+            differentiable, EVERY if gradient != "soft" else ("color", "depth", "face", "mask")
         )
-        assert not found["mask"].any() and (found["face"] == -1).all() and (found["color"] == 0).all()
-        slopes = torch.autograd.grad(found["color"].sum(), list(parts.values()), allow_unused=True)
+        assert (
+            not channels["mask"].any() and (channels["face"] == -1).all() and (channels["color"] == 0).all()
+        )
+        slopes = torch.autograd.grad(channels["color"].sum(), list(parts.values()), allow_unused=True)
         assert all(slope is None or (slope == 0).all() for slope in slopes)
     empty = Scene(torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.int64), torch.zeros(0, 3), ahead(1, 1))
     assert (Rasterizer(gradient=gradient)(empty)["color"] == 0).all()
@@ -259,12 +265,12 @@ def test_slopes_do_not_depend_on_how_long_the_lens_is(gradient: Gradient) -> Non
         focal = 2.0**power
         corners = np.concatenate([8 * crossing()[:, :2] * crossing()[:, 2:], focal * crossing()[:, 2:]], 1)
         camera = ahead(20, 24, near=focal * 2.0**-10, focal=focal)
-        scene, parts = learned(meshed(corners, camera), torch.float64, gradient != "soft")
+        scene, parts = require_gradients(make_scene(corners, camera), torch.float64, gradient != "soft")
         color = Rasterizer(gradient=gradient)(scene)["color"]
         weight = torch.linspace(-1, 2, color.numel()).reshape(color.shape)
         names = [name for name in parts if name != "rotation"]  # it mixes axes of different units
-        found = torch.autograd.grad((color * weight).sum(), [parts[name] for name in names])
-        slopes = dict(zip(names, found, strict=True))
+        channels = torch.autograd.grad((color * weight).sum(), [parts[name] for name in names])
+        slopes = dict(zip(names, channels, strict=True))
         slopes["focal"] = slopes["focal"] * focal
         for name in ("vertices", "translation"):
             slopes[name] = slopes[name] * torch.tensor([1, 1, focal])

@@ -36,18 +36,18 @@ def blob(rings: int = 40) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
 
 
 def camera(azimuth: float = 0.5, size: tuple[int, int] = (72, 88)) -> Camera:
-    seen = look_from(azimuth, 0.3, 0.1, 3.2, 0.6, size)
-    lens = [torch.tensor(part, dtype=torch_float) for part in (seen.focal, seen.principal)]
+    pose = look_from(azimuth, 0.3, 0.1, 3.2, 0.6, size)
+    lens = [torch.tensor(part, dtype=torch_float) for part in (pose.focal, pose.principal)]
     return replace(
-        seen,
-        rotation=seen.rotation.double(),
-        translation=seen.translation.double(),
+        pose,
+        rotation=pose.rotation.double(),
+        translation=pose.translation.double(),
         focal=lens[0],
         principal=lens[1],
     )
 
 
-def turned(rotation: torch.Tensor, by: torch.Tensor) -> torch.Tensor:
+def rotate_by(rotation: torch.Tensor, by: torch.Tensor) -> torch.Tensor:
     """Return exp([by]×) R."""
     zero = torch.zeros_like(by[0])
     cross = torch.stack(
@@ -99,21 +99,21 @@ def scene(
         amount * move(vertices).double()
         for amount, move in zip(by["vertices"], DEFORMATIONS.values(), strict=True)
     )
-    seen = camera(azimuth)
-    seen = replace(
-        seen,
-        rotation=turned(seen.rotation, by["rotation"]),
-        translation=seen.translation + by["translation"],
-        focal=seen.focal * (1 + by["focal"]),
+    pose = camera(azimuth)
+    pose = replace(
+        pose,
+        rotation=rotate_by(pose.rotation, by["rotation"]),
+        translation=pose.translation + by["translation"],
+        focal=pose.focal * (1 + by["focal"]),
     )
     if not textured:
-        return Scene(moved, faces, colors + torch.sin(3 * vertices) * by["colors"], seen)
+        return Scene(moved, faces, colors + torch.sin(3 * vertices) * by["colors"], pose)
     row, column = torch.meshgrid(torch.arange(48.0), torch.arange(64.0), indexing="ij")
     stripes = [(row / 5 + column / (7 + channel) + channel).sin() for channel in range(3)]
     image = 0.5 + 0.4 * torch.stack(stripes, -1).double()
     image = image + torch.sin(3 * image) * by["texture"]
     uv = 0.5 + 0.35 * vertices[:, :2] + 0.2 * vertices[:, 2:]
-    return Scene(moved, faces, None, seen, Texture((image,), uv, faces))
+    return Scene(moved, faces, None, pose, Texture((image,), uv, faces))
 
 
 @pytest.mark.slow
@@ -131,8 +131,8 @@ def test_gradients_are_those_of_differences_of_supersampled_pictures() -> None:
         "1 sample": Rasterizer(),
         "interior": Rasterizer(supersampling=4, gradient="interior"),
     }
-    found: dict[tuple[str, str], list[float]] = {}
-    wanted: dict[str, list[float]] = {}
+    gradients: dict[tuple[str, str], list[float]] = {}
+    differences: dict[str, list[float]] = {}
     for view, azimuth in enumerate(VIEWS):
         torch.manual_seed(view)
         off = {name: 0.05 * torch.randn_like(value.detach()) for name, value in parameters().items()}
@@ -147,27 +147,27 @@ def test_gradients_are_those_of_differences_of_supersampled_pictures() -> None:
             for textured in (False, True):
                 by = parameters()
                 loss(renderer, by, textured).backward()
-                for kind, (name, laid) in KINDS.items():
-                    if laid == textured:
-                        found.setdefault((how, kind), []).extend(by[name].grad.tolist())
+                for kind, (name, is_textured) in KINDS.items():
+                    if is_textured == textured:
+                        gradients.setdefault((how, kind), []).extend(by[name].grad.tolist())
         step = 2e-3
         for kind, (name, textured) in KINDS.items():
             for index in range(len(parameters()[name])):
                 ends = []
                 for sign in (1, -1):
-                    there = {key: part.detach().clone() for key, part in parameters().items()}
-                    there[name][index] += sign * step
+                    moved = {key: part.detach().clone() for key, part in parameters().items()}
+                    moved[name][index] += sign * step
                     with torch.no_grad():
-                        ends.append(loss(hard, there, textured).item())
-                wanted.setdefault(kind, []).append((ends[0] - ends[1]) / (2 * step))
+                        ends.append(loss(hard, moved, textured).item())
+                differences.setdefault(kind, []).append((ends[0] - ends[1]) / (2 * step))
 
     def cosine(how: str, kind: str) -> float:
-        one, other = np.array(found[how, kind]), np.array(wanted[kind])
-        return one @ other / np.linalg.norm(one) / np.linalg.norm(other)
+        gradient, expected = np.array(gradients[how, kind]), np.array(differences[kind])
+        return gradient @ expected / np.linalg.norm(gradient) / np.linalg.norm(expected)
 
-    for kind, other in wanted.items():
+    for kind, expected in differences.items():
         assert cosine("16 samples", kind) > 0.99, kind
-        assert abs(np.linalg.norm(found["16 samples", kind]) / np.linalg.norm(other) - 1) < 0.05, kind
+        assert abs(np.linalg.norm(gradients["16 samples", kind]) / np.linalg.norm(expected) - 1) < 0.05, kind
         assert cosine("1 sample", kind) > 0.99, kind
     assert cosine("interior", "vertices") < 0.9  # the gradient of moving edges is needed
 
@@ -183,34 +183,36 @@ def test_inside_a_face_slopes_are_those_of_the_plane(behind: bool) -> None:
         [[-2.0, -2, 4], [3, -1, 5], [-1, 0.3, -1.0] if behind else [-1, 3, 3]], dtype=torch_float
     )
     colors = torch.rand(3, 4, dtype=torch_float)
-    rotation = turned(torch.eye(3, dtype=torch_float), torch.tensor([0.1, -0.05, 0.2]).double())
+    rotation = rotate_by(torch.eye(3, dtype=torch_float), torch.tensor([0.1, -0.05, 0.2]).double())
     translation = torch.tensor([0.02, 0.03, 0.1], dtype=torch_float)
     focal, principal = torch.tensor([40.0, 45.0]).double(), torch.tensor([12.2, 9.7]).double()
-    given = [
+    inputs = [
         part.clone().requires_grad_() for part in (vertices, colors, rotation, translation, focal, principal)
     ]
-    seen = Camera(given[2], given[3], given[4], given[5], 20, 24, 0.5)
+    pose = Camera(inputs[2], inputs[3], inputs[4], inputs[5], 20, 24, 0.5)
     faces = torch.tensor([[0, 2, 1]])
-    drawn = Rasterizer()(Scene(given[0], faces, given[1], seen), ("color", "depth", "mask"))
-    covered = drawn["mask"]
+    channels = Rasterizer()(Scene(inputs[0], faces, inputs[1], pose), ("color", "depth", "mask"))
+    covered = channels["mask"]
     assert 20 < covered.sum() < 480
     slope, down = torch.rand(20, 24, 4), torch.rand(20, 24)
     inside = covered & (torch.nn.functional.avg_pool2d(covered.float()[None], 3, 1, 1)[0] == 1)
     slope, down = slope * inside[..., None], down * inside
-    ((slope * drawn["color"]).sum() + (down * drawn["depth"].where(inside, 0)).sum()).backward()
+    ((slope * channels["color"]).sum() + (down * channels["depth"].where(inside, 0)).sum()).backward()
 
-    again = [part.detach().clone().requires_grad_() for part in given]
-    x = again[0] @ again[2].T + again[3]
+    copies = [part.detach().clone().requires_grad_() for part in inputs]
+    x = copies[0] @ copies[2].T + copies[3]
     row, column = torch.meshgrid(torch.arange(20.0).double(), torch.arange(24.0).double(), indexing="ij")
     place = torch.stack([column, row], -1)
-    ray = torch.cat([(place - again[5]) / again[4], torch.ones(20, 24, 1).double()], -1)
+    ray = torch.cat([(place - copies[5]) / copies[4], torch.ones(20, 24, 1).double()], -1)
     a, b, c = x
     parts = torch.stack([ray @ torch.linalg.cross(*pair) for pair in ((b, c), (c, a), (a, b))], -1)
-    color = parts / parts.sum(-1, keepdim=True) @ again[1]
+    color = parts / parts.sum(-1, keepdim=True) @ copies[1]
     depth = (a @ torch.linalg.cross(b, c)) / parts.sum(-1)
     ((slope * color)[inside].sum() + (down * depth)[inside].sum()).backward()
-    for one, other in zip(given, again, strict=True):
-        torch.testing.assert_close(one.grad, other.grad, rtol=2e-3, atol=2e-3 * float(other.grad.abs().max()))
+    for actual, expected in zip(inputs, copies, strict=True):
+        torch.testing.assert_close(
+            actual.grad, expected.grad, rtol=2e-3, atol=2e-3 * float(expected.grad.abs().max())
+        )
 
 
 def test_inside_a_face_slopes_are_those_of_differences() -> None:
@@ -220,25 +222,27 @@ def test_inside_a_face_slopes_are_those_of_differences() -> None:
     """
     torch.manual_seed(0)
     slope, down = torch.rand(20, 24, 4), torch.rand(20, 24)
-    given = {
+    inputs = {
         "vertices": torch.tensor([[-8.0, -8, 4], [9, -6, 5], [-1, 9, 3]], dtype=torch_float),
         "colors": torch.rand(3, 4, dtype=torch_float),
         "translation": torch.tensor([0.02, 0.03, 0.1], dtype=torch_float),
         "focal": torch.tensor([40.0, 45.0]).double(),
         "principal": torch.tensor([12.2, 9.7]).double(),
     }
-    rotation = turned(torch.eye(3, dtype=torch_float), torch.tensor([0.1, -0.05, 0.2]).double())
+    rotation = rotate_by(torch.eye(3, dtype=torch_float), torch.tensor([0.1, -0.05, 0.2]).double())
 
     def loss(vertices: torch.Tensor, colors: torch.Tensor, *pose: torch.Tensor) -> torch.Tensor:
         translation, focal, principal = pose
-        seen = Camera(rotation, translation, focal, principal, 20, 24, 0.5)
-        drawn = Rasterizer()(Scene(vertices, torch.tensor([[0, 2, 1]]), colors, seen), ("color", "depth"))
-        assert bool(drawn["depth"].isfinite().all())
-        return (slope * drawn["color"]).double().sum() + (down * drawn["depth"]).double().sum()
+        viewpoint = Camera(rotation, translation, focal, principal, 20, 24, 0.5)
+        channels = Rasterizer()(
+            Scene(vertices, torch.tensor([[0, 2, 1]]), colors, viewpoint), ("color", "depth")
+        )
+        assert bool(channels["depth"].isfinite().all())
+        return (slope * channels["color"]).double().sum() + (down * channels["depth"]).double().sum()
 
-    learned = [part.clone().requires_grad_() for part in given.values()]
-    found = torch.autograd.grad(loss(*learned), learned)
-    for number, (name, part) in enumerate(given.items()):
+    learned = [part.clone().requires_grad_() for part in inputs.values()]
+    gradients = torch.autograd.grad(loss(*learned), learned)
+    for number, (name, part) in enumerate(inputs.items()):
         differences = torch.zeros_like(part)
         step = (
             0.3 if name in ("focal", "principal") else 1e-3
@@ -246,18 +250,18 @@ def test_inside_a_face_slopes_are_those_of_differences() -> None:
         for index in range(part.numel()):
             ends = []
             for sign in (1, -1):
-                parts = [other.clone() for other in given.values()]
+                parts = [other.clone() for other in inputs.values()]
                 parts[number].view(-1)[index] += sign * step
                 with torch.no_grad():
                     ends.append(loss(*parts).item())
             differences.view(-1)[index] = (ends[0] - ends[1]) / (2 * step)
         largest = float(differences.abs().max())
         torch.testing.assert_close(
-            found[number],
+            gradients[number],
             differences,
             rtol=0,
             atol=1e-3 * largest,
-            msg=lambda told, name=name: f"{name}: {told}",
+            msg=lambda message, name=name: f"{name}: {message}",
         )
 
 
@@ -272,41 +276,45 @@ def test_gradients_of_extreme_scenes_are_finite(gradient: Gradient) -> None:
     for corners in (edge_on, sliver, everywhere, crossing, plane, bad):
         for focal in (1e-3, 30.0, 1e6):
             vertices = torch.cat([corners, torch.tensor([[-0.3, -0.3, 4.0], [0.3, -0.3, 4], [0, 0.3, 4]])])
-            given = vertices.clone().requires_grad_()
+            differentiable = vertices.clone().requires_grad_()
             lens = torch.tensor([focal, focal]).double().requires_grad_()
-            seen = Camera(torch.eye(3), torch.zeros(3), lens, (8.0, 8.0), 17, 17)
+            pose = Camera(torch.eye(3), torch.zeros(3), lens, (8.0, 8.0), 17, 17)
             faces = torch.tensor([[0, 1, 2], [0, 2, 1], [3, 4, 5]])
             colors = torch.rand(6, 3).requires_grad_()
-            drawn = Rasterizer(gradient=gradient)(Scene(given, faces, colors, seen), ("color", "depth"))
+            channels = Rasterizer(gradient=gradient)(
+                Scene(differentiable, faces, colors, pose), ("color", "depth")
+            )
             # terms of both signs, since nmr drops changes that do not lower the loss
-            (drawn["color"].square().sum() - drawn["color"].sum()).backward(retain_graph=True)
-            drawn["depth"].where(drawn["depth"] < math.inf, 0).sum().backward()
-            assert drawn["color"].isfinite().all()
-            assert all(part.grad.isfinite().all() for part in (given, colors, lens))
+            (channels["color"].square().sum() - channels["color"].sum()).backward(retain_graph=True)
+            channels["depth"].where(channels["depth"] < math.inf, 0).sum().backward()
+            assert channels["color"].isfinite().all()
+            assert all(part.grad.isfinite().all() for part in (differentiable, colors, lens))
 
 
 @pytest.mark.parametrize("gradient", ["boundary", "nmr", "soft"])
 def test_a_depths_gradient_does_not_depend_on_what_else_is_asked(gradient: Gradient) -> None:
     vertices, faces, colors = blob(12)
-    found = []
+    gradients = []
     for channels in (("depth",), ("depth", "mask"), ("color", "depth"), ("face", "depth")):
         for supersampling in (1, 2):
-            given = vertices.clone().requires_grad_()
+            differentiable = vertices.clone().requires_grad_()
             renderer = Rasterizer(gradient=gradient, supersampling=supersampling)
-            depth = renderer(Scene(given, faces, colors, camera()), channels)["depth"]
+            depth = renderer(Scene(differentiable, faces, colors, camera()), channels)["depth"]
             depth.where(depth < math.inf, 0).sum().backward()
-            found.append(given.grad)
-    assert found[0].abs().max() > 0
-    for other in found[1:]:
-        torch.testing.assert_close(other, found[0], rtol=1e-9, atol=1e-9)
+            gradients.append(differentiable.grad)
+    assert gradients[0].abs().max() > 0
+    for other in gradients[1:]:
+        torch.testing.assert_close(other, gradients[0], rtol=1e-9, atol=1e-9)
 
 
 def test_what_nobody_differentiates_costs_nothing() -> None:
     vertices, faces, colors = blob(8)
-    drawn = Rasterizer()(Scene(vertices, faces, colors, camera()), ("color", "depth", "face", "mask"))
-    assert not any(value.requires_grad for value in drawn.values())
+    channels = Rasterizer()(Scene(vertices, faces, colors, camera()), ("color", "depth", "face", "mask"))
+    assert not any(value.requires_grad for value in channels.values())
     learned = Scene(vertices, faces, colors.clone().requires_grad_(), camera())
-    drawn = Rasterizer()(learned, ("color", "face", "mask"))
+    channels = Rasterizer()(learned, ("color", "face", "mask"))
     assert (
-        drawn["color"].requires_grad and not drawn["face"].requires_grad and not drawn["mask"].requires_grad
+        channels["color"].requires_grad
+        and not channels["face"].requires_grad
+        and not channels["mask"].requires_grad
     )

@@ -15,20 +15,20 @@ HEIGHT, WIDTH = 9, 12
 DISTANCE_ADDED = 1e-4  # as published, where the image is 2 wide
 
 
-def at(places: np.ndarray, depths: np.ndarray, lens: torch.Tensor) -> torch.Tensor:
+def unproject(places: np.ndarray, depths: np.ndarray, lens: torch.Tensor) -> torch.Tensor:
     """Return vertices that are seen at the given places."""
     rays = (torch.as_tensor(places) - lens[2:]) / lens[:2]
     z = torch.as_tensor(depths)[:, None]
     return torch.cat([rays * z, z], 1)
 
 
-def literal(places, faces, face, color, slopes) -> np.ndarray:
+def definition_gradient(places, faces, face, color, slopes) -> np.ndarray:
     """Return ∂L/∂(column, row) of every vertex, by the paper's definition.
 
     For each pixel, face, edge and end i of that edge, it computes how far i alone must move along the axis until the
     edge meets the pixel, and what the pixel would then show.
     """
-    found = np.zeros_like(places)
+    gradient = np.zeros_like(places)
     for axis, number, corner in np.ndindex(2, len(faces), 3):
         corners = places[faces[number]]
         (ax, ay), (bx, by), (cx, cy) = corners
@@ -39,49 +39,49 @@ def literal(places, faces, face, color, slopes) -> np.ndarray:
         for row, column in np.ndindex(HEIGHT, WIDTH):
             pixel = np.array([column, row])
             line, place = pixel[1 - axis], pixel[axis]
-            one, other = places[ends[0]], places[ends[1]]
-            low, high = sorted([one[1 - axis], other[1 - axis]])
+            start, end_point = places[ends[0]], places[ends[1]]
+            low, high = sorted([start[1 - axis], end_point[1 - axis]])
             if low == high or not low <= line <= high:
                 continue
             crossing = np.interp(
                 line,
                 [low, high],
-                [e[axis] for e in sorted([one, other], key=lambda end, axis=axis: end[1 - axis])],
+                [e[axis] for e in sorted([start, end_point], key=lambda end, axis=axis: end[1 - axis])],
             )
             # on which side of the edge the face is
-            normal = np.array([other[1] - one[1], one[0] - other[0]])
-            outwards = -int(np.sign(normal @ (third - one)) * np.sign(normal[axis]))
+            normal = np.array([end_point[1] - start[1], start[0] - end_point[0]])
+            outwards = -int(np.sign(normal @ (third - start)) * np.sign(normal[axis]))
             inner = math.floor(crossing) if outwards > 0 else math.ceil(crossing)
             outer = inner + outwards
             size = (WIDTH, HEIGHT)[axis]
             if not (0 <= inner < size and 0 <= outer < size):
                 continue
 
-            def there(position, line=line, axis=axis):
+            def pixel_index(position, line=line, axis=axis):
                 return (line, position) if axis == 0 else (position, line)
 
             if (place - crossing) * outwards > 0:
-                if face[there(inner)] != number:
+                if face[pixel_index(inner)] != number:
                     continue
-                change = color[there(inner)] - color[row, column]
+                change = color[pixel_index(inner)] - color[row, column]
             else:
                 if face[row, column] != number:
                     continue
-                change = color[there(outer)] - color[row, column]
+                change = color[pixel_index(outer)] - color[row, column]
             falls = float(slopes[row, column] @ change)
             if falls >= 0:
                 continue
             beyond = (place - crossing) * outwards > 0
             for end, fixed in (ends, ends[::-1]):
-                here, pivot = places[end], places[fixed]
+                moving, pivot = places[end], places[fixed]
                 if line == pivot[1 - axis]:
                     continue  # however far it moves, the edge stays where it is on this line
-                needed = pivot[axis] + (place - pivot[axis]) * (here[1 - axis] - pivot[1 - axis]) / (
+                needed = pivot[axis] + (place - pivot[axis]) * (moving[1 - axis] - pivot[1 - axis]) / (
                     line - pivot[1 - axis]
                 )
-                distance = abs(needed - here[axis]) + DISTANCE_ADDED * size / 2
-                found[end, axis] += falls / distance * (outwards if beyond else -outwards)
-    return found
+                distance = abs(needed - moving[axis]) + DISTANCE_ADDED * size / 2
+                gradient[end, axis] += falls / distance * (outwards if beyond else -outwards)
+    return gradient
 
 
 @pytest.mark.parametrize("whole", [False, True])
@@ -103,16 +103,18 @@ def test_it_is_the_papers_sum_over_pixels_and_edges(seed: int, whole: bool) -> N
             faces[number] = faces[number, ::-1]
     depths = random.uniform(1, 3, 9)
     lens = torch.tensor([10.0, 11, 5.5, 4], dtype=torch.float64).requires_grad_()
-    vertices = at(places, depths, lens.detach()).requires_grad_()
+    vertices = unproject(places, depths, lens.detach()).requires_grad_()
     colors = torch.tensor(random.uniform(0, 1, (9, 2))).requires_grad_()
     eye = torch.eye(3, dtype=torch.float64)
-    seen = Camera(eye, torch.zeros(3).double(), lens[:2], lens[2:], HEIGHT, WIDTH)
-    scene = Scene(vertices, torch.tensor(faces), colors, seen)
-    drawn = Rasterizer(gradient="nmr")(scene, ("color", "face"))
+    pose = Camera(eye, torch.zeros(3).double(), lens[:2], lens[2:], HEIGHT, WIDTH)
+    scene = Scene(vertices, torch.tensor(faces), colors, pose)
+    channels = Rasterizer(gradient="nmr")(scene, ("color", "face"))
     slopes = torch.tensor(random.normal(0, 1, (HEIGHT, WIDTH, 2)) * random.integers(0, 2, (HEIGHT, WIDTH, 1)))
-    (drawn["color"] * slopes).sum().backward()
-    picture = drawn["color"].detach().double().numpy()
-    wanted = literal(places, faces, drawn["face"].numpy(), picture, slopes.float().double().numpy())
+    (channels["color"] * slopes).sum().backward()
+    picture = channels["color"].detach().double().numpy()
+    wanted = definition_gradient(
+        places, faces, channels["face"].numpy(), picture, slopes.float().double().numpy()
+    )
     assert np.abs(wanted).max() > 0.1
 
     again, lens_again = vertices.detach().requires_grad_(), lens.detach().clone().requires_grad_()
@@ -125,28 +127,28 @@ def test_it_is_the_papers_sum_over_pixels_and_edges(seed: int, whole: bool) -> N
 def test_colors_and_depths_are_led_back_as_within_faces() -> None:
     vertices, faces, colors = blob(12)
     slopes, down = torch.rand(72, 88, 3), torch.rand(72, 88)
-    found = {}
+    gradients = {}
     for gradient in ("interior", "nmr"):
         tinted, moved = colors.clone().requires_grad_(), vertices.clone().requires_grad_()
-        drawn = Rasterizer(gradient=gradient)(Scene(moved, faces, tinted, camera()), ("color", "depth"))
-        (drawn["depth"].where(drawn["depth"] < math.inf, 0) * down).sum().backward(retain_graph=True)
+        channels = Rasterizer(gradient=gradient)(Scene(moved, faces, tinted, camera()), ("color", "depth"))
+        (channels["depth"].where(channels["depth"] < math.inf, 0) * down).sum().backward(retain_graph=True)
         of_depth, moved.grad = moved.grad, None
-        (drawn["color"] * slopes).sum().backward()
-        found[gradient] = (tinted.grad, of_depth)
-    assert all(torch.equal(*pair) for pair in zip(found["interior"], found["nmr"], strict=True))
+        (channels["color"] * slopes).sum().backward()
+        gradients[gradient] = (tinted.grad, of_depth)
+    assert all(torch.equal(*pair) for pair in zip(gradients["interior"], gradients["nmr"], strict=True))
 
 
 def test_it_reaches_a_target_that_the_face_does_not_touch() -> None:
     """Check that descent leads to the target on the right, where a gradient of the edges alone is nearly 0."""
     eye = torch.eye(3)
-    seen = Camera(eye, torch.zeros(3), (20.0, 20.0), (19.5, 9.5), 20, 40)
+    pose = Camera(eye, torch.zeros(3), (20.0, 20.0), (19.5, 9.5), 20, 40)
     corners = torch.tensor([[-0.8, -0.2, 1.0], [-0.5, 0.2, 1], [-0.3, -0.2, 1]])
     faces, colors = torch.tensor([[0, 1, 2]]), torch.ones(3, 1)
-    target = Rasterizer()(Scene(corners + torch.tensor([1.0, 0, 0]), faces, colors, seen))["color"]
+    target = Rasterizer()(Scene(corners + torch.tensor([1.0, 0, 0]), faces, colors, pose))["color"]
     way = {}
     for gradient in ("boundary", "nmr"):
         shift = torch.zeros(3, requires_grad=True)
-        picture = Rasterizer(gradient=gradient)(Scene(corners + shift, faces, colors, seen))["color"]
+        picture = Rasterizer(gradient=gradient)(Scene(corners + shift, faces, colors, pose))["color"]
         assert 10 < picture.sum() < 200 and (picture * target).sum() == 0
         (picture - target).square().sum().backward()
         way[gradient] = -float(shift.grad[0])

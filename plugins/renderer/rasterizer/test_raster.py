@@ -20,7 +20,7 @@ from plugins.renderer.rasterizer.renderer import Rasterizer
 
 ALL = ("color", "depth", "face", "mask")
 FOCAL = 64.0
-wild = settings(deadline=None, max_examples=60, derandomize=True)
+hypothesis_settings = settings(deadline=None, max_examples=60, derandomize=True)
 
 
 def ahead(height, width, near=1e-3):
@@ -29,14 +29,14 @@ def ahead(height, width, near=1e-3):
     return Camera(torch.eye(3), torch.zeros(3), (FOCAL, FOCAL), middle, height, width, near)
 
 
-def seen_at(pixels, depths, camera):
+def unproject(pixels, depths, camera):
     """Return world points that the camera of `ahead` sees at pixels (column, row) and depths, float64."""
     pixels, depths = np.asarray(pixels, dtype=np.float64), np.asarray(depths, dtype=np.float64)
     sideways = (pixels - np.array(camera.principal)) / FOCAL * depths[..., None]
     return torch.tensor(np.concatenate([sideways, depths[..., None]], -1))
 
 
-def scene_of(vertices, faces, camera, colors=None):
+def make_scene(vertices, faces, camera, colors=None):
     faces = torch.as_tensor(np.asarray(faces, dtype=np.int64).reshape(-1, 3))
     return Scene(vertices, faces, colors, camera)
 
@@ -45,19 +45,19 @@ def draw(scene, channels=("depth", "face", "mask"), cull=False):
     return {name: value.numpy() for name, value in Rasterizer(cull=cull)(scene, channels).items()}
 
 
-def same(first, second):
+def are_equal(first, second):
     return first.keys() == second.keys() and all(np.array_equal(first[name], second[name]) for name in first)
 
 
-def by_rays(scene):
+def trace_rays(scene):
     """Return what pixels show by brute force, with rays and planes in space, independent of the kernels.
 
     A pixel's ray hits a triangle where it is on the same side of all three planes through the camera's centre and an
     edge.
 
     Returns:
-        hits, distances to the nearest edge line (pixels) and depths, each (faces, height, width); barycentric
-        weights (faces, height, width, 3).
+        hits, distances to the nearest edge line (pixels) and depths, each (faces, height, width); barycentric weights
+        (faces, height, width, 3).
     """
     camera = scene.camera
     columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
@@ -90,15 +90,15 @@ def soups(draw, subpixels):
     count = draw(st.integers(1, 8))
     pixels = rng.uniform(-0.7, 1.7, (3 * count, 2)) * [width, height]
     pixels = np.round(pixels * subpixels) / subpixels
-    vertices = seen_at(pixels, rng.uniform(0.5, 4, 3 * count), camera)
+    vertices = unproject(pixels, rng.uniform(0.5, 4, 3 * count), camera)
     colors = torch.tensor(rng.uniform(0, 1, (3 * count, 3)))
-    return scene_of(vertices, np.arange(3 * count), camera, colors)
+    return make_scene(vertices, np.arange(3 * count), camera, colors)
 
 
-@wild
+@hypothesis_settings
 @given(soups(subpixels=256))
 def test_every_channel_agrees_with_rays_through_pixel_centres(scene):
-    hits, margins, depths, weights = by_rays(scene)
+    hits, margins, depths, weights = trace_rays(scene)
     got = draw(scene, ALL)
     depths = np.where(hits, depths, np.inf)
     order = np.sort(depths, 0)
@@ -128,19 +128,19 @@ def slivers(draw):
     width = 10.0 ** rng.uniform(-5, 0, (300, 1)) * rng.integers(0, 2, (300, 1))
     between = start + rng.uniform(-0.2, 1.2, (300, 1)) * (end - start) + width * rng.normal(0, 1, (300, 2))
     pixels = np.stack([start, end, between], 1).reshape(-1, 2)
-    vertices = seen_at(pixels, rng.uniform(0.5, 4, 900), camera)
+    vertices = unproject(pixels, rng.uniform(0.5, 4, 900), camera)
     colors = torch.tensor(rng.uniform(0, 1, (900, 3)))
-    return scene_of(vertices, np.arange(900), camera, colors)
+    return make_scene(vertices, np.arange(900), camera, colors)
 
 
-@wild
+@hypothesis_settings
 @given(st.one_of(soups(subpixels=1e6), slivers()))
 def test_what_a_face_shows_is_interpolated_between_corners_that_are_not_rounded(scene):
     """Check that weights lead to the place of the face under the pixel, with the place's colour and depth.
 
     Where only rounding covers the pixel, they lead to the nearest place of the face.
     """
-    hits, margins, _, _ = by_rays(scene)
+    hits, margins, _, _ = trace_rays(scene)
     got = draw(scene, ("face", "barycentric", "color", "depth"))
     row, column = np.nonzero(got["face"] >= 0)
     face = got["face"][row, column]
@@ -157,10 +157,10 @@ def test_what_a_face_shows_is_interpolated_between_corners_that_are_not_rounded(
     assert (distance[hits[face, row, column] & (margins[face, row, column] > 1e-9)] < 2e-5).all()
 
 
-@wild
+@hypothesis_settings
 @given(soups(subpixels=1e6))
 def test_off_the_grid_coverage_is_that_of_the_triangle_up_to_half_a_subpixel(scene):
-    hits, margins, _, _ = by_rays(scene)
+    hits, margins, _, _ = trace_rays(scene)
     for index in range(len(scene.faces)):
         alone = draw(replace(scene, faces=scene.faces[index : index + 1]), ("mask",))["mask"]
         clear = (
@@ -173,13 +173,13 @@ def test_off_the_grid_coverage_is_that_of_the_triangle_up_to_half_a_subpixel(sce
 def coverage(vertices, faces, camera):
     """Return how many faces, each drawn alone, cover each pixel; check that the whole mesh covers the same pixels."""
     counts = sum(
-        draw(scene_of(vertices, face, camera), ("mask",))["mask"].astype(int) for face in np.asarray(faces)
+        draw(make_scene(vertices, face, camera), ("mask",))["mask"].astype(int) for face in np.asarray(faces)
     )
-    assert np.array_equal(draw(scene_of(vertices, faces, camera), ("mask",))["mask"], counts > 0)
+    assert np.array_equal(draw(make_scene(vertices, faces, camera), ("mask",))["mask"], counts > 0)
     return counts
 
 
-@wild
+@hypothesis_settings
 @given(st.integers(0, 2**32 - 1), st.sampled_from([1, 2, 16, 1000]))
 def test_neighbours_share_no_pixel_and_leave_none_out(seed, subpixels):
     rng = np.random.default_rng(seed)
@@ -190,11 +190,11 @@ def test_neighbours_share_no_pixel_and_leave_none_out(seed, subpixels):
     faces = Delaunay(points).simplices
     flip = rng.random(len(faces)) < 0.5
     faces[flip] = faces[flip][:, ::-1]
-    vertices = seen_at(points, rng.uniform(0.5, 4, len(points)), camera)
+    vertices = unproject(points, rng.uniform(0.5, 4, len(points)), camera)
     assert (coverage(vertices, faces, camera) == 1).all()
 
 
-@wild
+@hypothesis_settings
 @given(st.integers(0, 2**32 - 1), st.integers(5, 12))
 def test_fans_are_watertight_however_far_their_rims_reach(seed, spokes):
     rng = np.random.default_rng(seed)
@@ -203,12 +203,12 @@ def test_fans_are_watertight_however_far_their_rims_reach(seed, spokes):
     radii = rng.choice([1e2, 1e4, 131072.0, 3e5, 1e9, 1e30], spokes)
     rim = np.array(camera.principal) + radii[:, None] * np.stack([np.cos(angles), np.sin(angles)], 1)
     hub = rng.integers(0, 9, 2).astype(float)
-    vertices = seen_at(np.concatenate([[hub], rim]), rng.uniform(0.5, 4, spokes + 1), camera)
+    vertices = unproject(np.concatenate([[hub], rim]), rng.uniform(0.5, 4, spokes + 1), camera)
     faces = [(0, 1 + i, 1 + (i + 1) % spokes) for i in range(spokes)]
     assert (coverage(vertices, faces, camera) == 1).all()
 
 
-@wild
+@hypothesis_settings
 @given(st.integers(0, 2**32 - 1))
 def test_far_edges_through_pixel_centres_are_decided_once(seed):
     rng = np.random.default_rng(seed)
@@ -216,14 +216,14 @@ def test_far_edges_through_pixel_centres_are_decided_once(seed):
     compass = np.array([(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)])
     hub = rng.integers(0, 9, 2)
     rim = hub + compass * 2.0 ** rng.integers(5, 45, (8, 1))  # whole 1/256 pixels that float64 holds exactly
-    vertices = seen_at(np.concatenate([[hub], rim]), 2.0 ** rng.integers(-2, 3, 9), camera)
+    vertices = unproject(np.concatenate([[hub], rim]), 2.0 ** rng.integers(-2, 3, 9), camera)
     assert (coverage(vertices, [(0, 1 + i, 1 + (i + 1) % 8) for i in range(8)], camera) == 1).all()
 
 
 def test_an_edge_on_a_pixel_row_or_column_belongs_to_the_triangle_below_or_right_of_it():
     camera = ahead(5, 5)
-    vertices = seen_at([(1, 1), (3, 1), (3, 3), (1, 3)], np.ones(4), camera)
-    mask = draw(scene_of(vertices, [(0, 1, 2), (0, 2, 3)], camera))["mask"]
+    vertices = unproject([(1, 1), (3, 1), (3, 3), (1, 3)], np.ones(4), camera)
+    mask = draw(make_scene(vertices, [(0, 1, 2), (0, 2, 3)], camera))["mask"]
     assert np.argwhere(mask).tolist() == [[1, 1], [1, 2], [2, 1], [2, 2]]
 
 
@@ -235,7 +235,7 @@ def test_depth_and_colour_are_those_of_a_plane_in_perspective(kind):
     direction = np.concatenate([(corners - camera.principal) / FOCAL, np.ones((4, 1))], 1)
     world = direction * (offset / (direction @ normal))[:, None]
     slope, base = np.array([[0.05, 0.1, 0.02], [0.04, -0.02, 0.1], [-0.03, 0.03, 0.05]]), 0.4
-    scene = scene_of(
+    scene = make_scene(
         torch.tensor(world, dtype=kind),
         [(0, 1, 2), (0, 2, 3)],
         camera,
@@ -257,7 +257,7 @@ def test_a_triangle_that_reaches_far_out_of_the_image_keeps_its_plane():
     # Two corners a little before the eye and far aside, as of a floor one stands on: about 2e7 pixels away.
     camera = ahead(30, 40, near=1e-6)
     world = torch.tensor([[-1.0, 0.5, 3e-6], [1.0, 0.5, 3e-6], [0.0, 0.5, 50.0]], dtype=torch.float64)
-    got = draw(scene_of(world, [(0, 1, 2)], camera))
+    got = draw(make_scene(world, [(0, 1, 2)], camera))
     rows = np.arange(30) - camera.principal[1]
     with np.errstate(divide="ignore"):
         depth = np.where(rows > 0, 0.5 * FOCAL / rows, np.inf)
@@ -288,14 +288,14 @@ def test_of_equal_surfaces_the_lower_face_index_wins_whatever_the_order_of_its_c
     inverse[:, 2] = (1 / halfway - (weights * inverse)[:, :2].sum(1)) / weights[:, 2]
     depths = 1 / inverse
     assert (depths > 0).all()
-    once = seen_at(corners, depths, camera).reshape(-1, 3)
-    again = seen_at(corners[:, order], depths[:, order], camera).reshape(-1, 3)
+    once = unproject(corners, depths, camera).reshape(-1, 3)
+    again = unproject(corners[:, order], depths[:, order], camera).reshape(-1, 3)
     first = np.arange(3 * count).reshape(-1, 3)
     second = first + 3 * count
-    alone = draw(scene_of(once, first, camera))
+    alone = draw(make_scene(once, first, camera))
     assert np.isin(np.arange(count), alone["face"]).all()
     for faces in (np.concatenate([first, second]), np.concatenate([second, first])):
-        both = draw(scene_of(torch.cat([once, again]), faces, camera))
+        both = draw(make_scene(torch.cat([once, again]), faces, camera))
         assert np.array_equal(both["face"], alone["face"])
         assert np.allclose(both["depth"], alone["depth"], rtol=2.0**-23, atol=0)
 
@@ -304,30 +304,30 @@ def test_of_equal_surfaces_the_lower_face_index_wins_whatever_the_order_of_its_c
 def test_ties_and_culling_hold_however_far_a_triangle_reaches(reach):
     camera = ahead(9, 9)
     rng = np.random.default_rng(7)
-    vertices = seen_at(
+    vertices = unproject(
         [(-reach, -reach), (-reach, 1.5 * reach), (2 * reach, -reach)], rng.uniform(1, 2, 3), camera
     )
     for front in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         back = front[::-1]
-        pair = scene_of(vertices, [back, front], camera)
+        pair = make_scene(vertices, [back, front], camera)
         assert (draw(pair)["face"] == 0).all()
         assert (draw(pair, cull=True)["face"] == 1).all()
-        assert same(draw(pair, ("depth",)), draw(pair, ("depth",), cull=True))
+        assert are_equal(draw(pair, ("depth",)), draw(pair, ("depth",), cull=True))
 
 
-@wild
+@hypothesis_settings
 @given(st.integers(0, 2**32 - 1), st.integers(0, 2**23 - 1), st.sampled_from([1, 1e8]))
 def test_of_overlapping_surfaces_at_one_depth_the_lower_index_wins(seed, step, reach):
     rng = np.random.default_rng(seed)
     camera = ahead(12, 12)
     depth = 1 + step / 2**23 + 2.0**-24  # halfway between two float32
     pixels = camera.principal + reach * rng.uniform(-11, 11, (18, 2))
-    vertices = seen_at(pixels, np.full(18, depth), camera)
+    vertices = unproject(pixels, np.full(18, depth), camera)
     faces = np.arange(18).reshape(-1, 3)
     expected = np.full((12, 12), -1)
     for index in reversed(range(6)):
-        expected[draw(scene_of(vertices, faces[index], camera), ("mask",))["mask"]] = index
-    got = draw(scene_of(vertices, faces, camera))
+        expected[draw(make_scene(vertices, faces[index], camera), ("mask",))["mask"]] = index
+    got = draw(make_scene(vertices, faces, camera))
     assert np.array_equal(got["face"], expected)
 
 
@@ -338,7 +338,7 @@ numbers = st.one_of(
 )
 
 
-@settings(wild, max_examples=150)
+@settings(hypothesis_settings, max_examples=150)
 @given(
     arrays.arrays(np.float32, st.tuples(st.integers(3, 9), st.just(3)), elements=numbers),
     st.integers(0, 2**32 - 1),
@@ -359,11 +359,11 @@ def test_wild_coordinates_draw_only_what_may_be_drawn_and_disturb_nothing_else(
     allowed &= (np.diff(np.sort(faces, 1), axis=1) > 0).all(1)
     vertices = torch.tensor(world)
     colors = torch.tensor(rng.uniform(0, 1, world.shape), dtype=torch.float32)
-    got = draw(scene_of(vertices, faces, camera, colors), ALL, cull)
-    kept = np.flatnonzero(allowed)
-    pruned = draw(scene_of(vertices, faces[allowed], camera, colors), ALL, cull)
-    pruned["face"] = np.append(kept, -1)[pruned["face"]]
-    assert same(got, pruned)
+    got = draw(make_scene(vertices, faces, camera, colors), ALL, cull)
+    allowed_faces = np.flatnonzero(allowed)
+    pruned = draw(make_scene(vertices, faces[allowed], camera, colors), ALL, cull)
+    pruned["face"] = np.append(allowed_faces, -1)[pruned["face"]]
+    assert are_equal(got, pruned)
     assert np.array_equal(got["mask"], np.isfinite(got["depth"]))
     assert np.array_equal(got["mask"], got["face"] >= 0)
     assert (got["depth"][got["mask"]] >= np.float32(camera.near)).all()
@@ -372,7 +372,7 @@ def test_wild_coordinates_draw_only_what_may_be_drawn_and_disturb_nothing_else(
 
 
 def triangle(camera, z=1.0):
-    return scene_of(torch.tensor([[-0.1, -0.1, z], [0.1, -0.1, z], [0.0, 0.1, z]]), [(0, 1, 2)], camera)
+    return make_scene(torch.tensor([[-0.1, -0.1, z], [0.1, -0.1, z], [0.0, 0.1, z]]), [(0, 1, 2)], camera)
 
 
 @pytest.mark.parametrize(
@@ -398,20 +398,20 @@ def cut_soups(draw):
     count = draw(st.integers(1, 8))
     vertices = rng.uniform(-1, 1, (3 * count, 3)) * [0.3, 0.3, 2] + [0, 0, 0.6]
     colors = torch.tensor(rng.uniform(0, 1, (3 * count, 3)))
-    return scene_of(torch.tensor(vertices), np.arange(3 * count), camera, colors)
+    return make_scene(torch.tensor(vertices), np.arange(3 * count), camera, colors)
 
 
-@wild
+@hypothesis_settings
 @given(cut_soups())
 def test_what_the_near_plane_cuts_is_drawn_as_far_as_it_is_in_front(scene):
     """Compare triangles that have corners behind the camera with rays through pixel centres."""
-    hits, margins, depths, weights = by_rays(scene)
+    hits, margins, depths, weights = trace_rays(scene)
     near = scene.camera.near
     got = draw(scene, ALL)
     with np.errstate(invalid="ignore"):
-        seen = hits & (depths >= near)
+        visible = hits & (depths >= near)
         clear = (margins > 0.02).all(0) & ~(abs(depths - near) < 0.02).any(0)
-        depths = np.where(seen, depths, np.inf)
+        depths = np.where(visible, depths, np.inf)
         order = np.sort(depths, 0)
         if len(order) > 1:
             clear &= ~(order[1] - order[0] < 1e-2 * order[0])
@@ -440,17 +440,17 @@ def test_the_near_plane_itself_is_seen():
 @pytest.mark.parametrize("faces", [[(0, 0, 1)], [(0, 1, 0)], [(2, 2, 2)], [(0, 1, 3)]])
 def test_a_triangle_without_an_area_is_left_out(faces):
     camera = ahead(9, 9)
-    vertices = seen_at([(0, 0), (4, 4), (8, 0), (8, 8)], [1.0, 2.0, 3.0, 1.0], camera)
-    assert not draw(scene_of(vertices, faces, camera))["mask"].any()
+    vertices = unproject([(0, 0), (4, 4), (8, 0), (8, 8)], [1.0, 2.0, 3.0, 1.0], camera)
+    assert not draw(make_scene(vertices, faces, camera))["mask"].any()
     huge = torch.tensor([[-1e30, -1e30, 1.0], [1e30, 1e30, 1.0]], dtype=torch.float64)
-    assert not draw(scene_of(torch.cat([vertices, huge]), [(0, 4, 5), (4, 5, 4)], camera))["mask"].any()
+    assert not draw(make_scene(torch.cat([vertices, huge]), [(0, 4, 5), (4, 5, 4)], camera))["mask"].any()
 
 
 @pytest.mark.parametrize(("height", "width"), [(1, 1), (1, 7), (7, 1), (2, 3)])
 def test_the_smallest_images(height, width):
     camera = ahead(height, width)
-    reach = seen_at([(-40, -40), (80, -40), (-40, 80)], [2.0, 2.0, 2.0], camera)
-    got = draw(scene_of(reach, [(0, 1, 2)], camera, torch.full((3, 3), 0.25)), ALL)
+    reach = unproject([(-40, -40), (80, -40), (-40, 80)], [2.0, 2.0, 2.0], camera)
+    got = draw(make_scene(reach, [(0, 1, 2)], camera, torch.full((3, 3), 0.25)), ALL)
     assert got["color"].shape == (height, width, 3) and (got["color"] == 0.25).all()
     assert (got["depth"] == 2).all() and (got["face"] == 0).all() and got["mask"].all()
 
@@ -467,24 +467,24 @@ def portrait(subdivisions=3, **changes):
 
 
 @pytest.mark.parametrize(
-    "asked", [(name,) for name in ALL] + [("depth", "mask"), {"color", "mask"}, ("face",) * 2, ()]
+    "requested", [(name,) for name in ALL] + [("depth", "mask"), {"color", "mask"}, ("face",) * 2, ()]
 )
 @pytest.mark.parametrize("cull", [False, True])
-def test_each_channel_is_the_same_alone_and_only_what_is_asked_is_drawn(asked, cull):
-    together, alone = draw(portrait(), ALL, cull), draw(portrait(), asked, cull)
-    assert set(alone) == set(asked)
-    assert same(alone, {name: together[name] for name in alone})
+def test_each_channel_is_the_same_alone_and_only_what_is_asked_is_drawn(requested, cull):
+    together, alone = draw(portrait(), ALL, cull), draw(portrait(), requested, cull)
+    assert set(alone) == set(requested)
+    assert are_equal(alone, {name: together[name] for name in alone})
     kinds = {"color": np.float32, "depth": np.float32, "face": np.int32, "mask": np.bool_}
     assert all(value.dtype == kinds[name] for name, value in alone.items())
 
 
 def test_colours_are_shaded_only_when_asked(monkeypatch):
-    asked = []
-    monkeypatch.setattr(shading, "shade", lambda *given: asked.append(given[-2:]))
+    shaded = []
+    monkeypatch.setattr(shading, "shade", lambda *arguments: shaded.append(arguments[-2:]))
     draw(portrait(), ("depth", "face", "mask"))
-    assert [(color is None, depth is None) for color, depth in asked] == [(True, False)]
+    assert [(color is None, depth is None) for color, depth in shaded] == [(True, False)]
     assert draw(replace(portrait(), colors=None), ("mask", "face"))["mask"].any()
-    assert len(asked) == 1
+    assert len(shaded) == 1
 
 
 @pytest.mark.parametrize("angle", np.linspace(0, 6, 7))
@@ -500,8 +500,8 @@ def test_of_a_closed_mesh_culling_changes_no_silhouette_and_hardly_a_pixel(angle
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     eye = -scene.camera.rotation.double().numpy().T @ scene.camera.translation.double().numpy()
     facing = ((eye - corners[:, 0]) * normals).sum(1)
-    drawn = np.unique(culled["face"][culled["face"] >= 0])
-    assert (facing[drawn] > -1e-4 * np.linalg.norm(normals[drawn], axis=1)).all()
+    visible_faces = np.unique(culled["face"][culled["face"] >= 0])
+    assert (facing[visible_faces] > -1e-4 * np.linalg.norm(normals[visible_faces], axis=1)).all()
 
 
 def test_from_inside_a_closed_mesh_fills_the_image():
@@ -525,17 +525,17 @@ def test_a_scene_out_of_view_costs_no_projection_and_gives_the_background(where,
     assert np.isinf(got["depth"]).all() and (got["color"] == 0).all()
 
 
-@wild
+@hypothesis_settings
 @given(st.integers(0, 2**32 - 1), st.sampled_from([1e-3, 1.0, 1e20]))
 def test_the_test_of_the_whole_scene_hides_nothing(seed, size):
     rng = np.random.default_rng(seed)
     vertices = torch.tensor(rng.normal(0, size, (12, 3)) + rng.normal(0, 2, 3))
     camera = replace(ahead(8, 8), translation=torch.tensor(rng.normal(0, 2, 3)))
-    everything = scene_of(vertices, rng.permuted(np.tile(np.arange(12), (8, 1)), axis=1)[:, :3], camera)
+    everything = make_scene(vertices, rng.permuted(np.tile(np.arange(12), (8, 1)), axis=1)[:, :3], camera)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(raster, "out_of_view", lambda *_: False)
+        patch.setattr(raster, "is_out_of_view", lambda *_: False)
         expected = draw(everything)
-    assert same(draw(everything), expected)
+    assert are_equal(draw(everything), expected)
 
 
 def test_empty_scenes_give_the_background():
@@ -551,12 +551,12 @@ def test_calls_leave_nothing_behind_and_repeat_to_the_bit():
     scenes = [portrait(), triangle(ahead(9, 9)), portrait(translation=torch.tensor([3.0, 0, 2])), portrait(2)]
     fresh = [draw(scene) for scene in scenes]
     first = renderer(scenes[0], ("depth", "face", "mask"))
-    kept = {name: value.clone() for name, value in first.items()}
+    copies = {name: value.clone() for name, value in first.items()}
     for scene, expected in [*zip(scenes, fresh, strict=True)] * 2:
         got = renderer(scene, ("depth", "face", "mask"))
-        assert same({name: value.numpy() for name, value in got.items()}, expected)
+        assert are_equal({name: value.numpy() for name, value in got.items()}, expected)
     assert all(
-        torch.equal(first[name], kept[name]) for name in first
+        torch.equal(first[name], copies[name]) for name in first
     )  # no call writes into an earlier answer
 
 
@@ -567,71 +567,71 @@ def test_layouts_and_types_of_the_input_do_not_matter():
     columns = Scene(
         scene.vertices.T.contiguous().T, faces.T.contiguous().T, scene.colors.double(), scene.camera
     )
-    assert same(draw(columns, ALL), expected)
-    assert same(
+    assert are_equal(draw(columns, ALL), expected)
+    assert are_equal(
         draw(replace(scene, vertices=scene.vertices.double(), faces=scene.faces.short()), ALL), expected
     )
     learned = replace(scene, vertices=scene.vertices.clone().requires_grad_())
     with torch.no_grad():
-        assert same(draw(learned, ALL), expected)
+        assert are_equal(draw(learned, ALL), expected)
     assert Rasterizer()(learned)["color"].requires_grad
 
 
-ROADS = pytest.mark.parametrize("road", [Rasterizer.__call__, Rasterizer.on_device])
-"""Names of the two implementations: compiled on the CPU, and plain torch on any device."""
+IMPLEMENTATIONS = pytest.mark.parametrize("implementation", [Rasterizer.__call__, Rasterizer.on_device])
+"""The two implementations: compiled on the CPU, and plain torch on any device."""
 
 
-@ROADS
+@IMPLEMENTATIONS
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        ({"vertices": torch.zeros(5, 2)}, "vertices came with the shape (5, 2)"),
-        ({"vertices": torch.zeros(642, 4)}, "vertices came with the shape (642, 4)"),
-        ({"vertices": torch.zeros(642)}, "vertices came with the shape (642,)"),
-        ({"vertices": torch.tensor(0.0)}, "vertices came with the shape ()"),
-        ({"vertices": torch.zeros(3, 5, 3)}, "vertices came with the shape (3, 5, 3)"),
+        ({"vertices": torch.zeros(5, 2)}, "vertices: got the shape (5, 2)"),
+        ({"vertices": torch.zeros(642, 4)}, "vertices: got the shape (642, 4)"),
+        ({"vertices": torch.zeros(642)}, "vertices: got the shape (642,)"),
+        ({"vertices": torch.tensor(0.0)}, "vertices: got the shape ()"),
+        ({"vertices": torch.zeros(3, 5, 3)}, "vertices: got the shape (3, 5, 3)"),
         (
             {"vertices": torch.zeros(642, 3, dtype=torch.int64)},
-            "vertices came as torch.int64; wanted floating",
+            "vertices: got torch.int64, expected floating",
         ),
-        ({"faces": torch.zeros(4, 4, dtype=torch.int64)}, "faces came with the shape (4, 4)"),
-        ({"faces": torch.zeros(12, dtype=torch.int64)}, "faces came with the shape (12,)"),
-        ({"faces": torch.tensor(1)}, "faces came with the shape ()"),
-        ({"faces": torch.zeros(2, 2, 3, dtype=torch.int64)}, "faces came with the shape (2, 2, 3)"),
-        ({"faces": torch.zeros(4, 3)}, "faces came as torch.float32; wanted whole numbers"),
-        ({"faces": torch.zeros(4, 3, dtype=torch.bool)}, "faces came as torch.bool; wanted whole numbers"),
-        ({"faces": torch.tensor([[0, 1, 642]])}, "0 to 642; wanted 0 to 641"),
-        ({"faces": torch.tensor([[0, -1, 2]], dtype=torch.int32)}, "-1 to 2; wanted 0 to 641"),
-        ({"colors": torch.zeros(5, 3)}, "5 colors came for 642 vertices"),
-        ({"colors": torch.zeros(700, 3)}, "700 colors came for 642 vertices"),
-        ({"colors": torch.zeros(642)}, "colors came with the shape (642,)"),
-        ({"colors": torch.zeros(642, 3, dtype=torch.uint8)}, "colors came as torch.uint8; wanted floating"),
-        ({"colors": torch.zeros(642, 0)}, "colors came with the shape (642, 0)"),
-        ({"colors": None}, '"color" was asked of a scene without colours'),
+        ({"faces": torch.zeros(4, 4, dtype=torch.int64)}, "faces: got the shape (4, 4)"),
+        ({"faces": torch.zeros(12, dtype=torch.int64)}, "faces: got the shape (12,)"),
+        ({"faces": torch.tensor(1)}, "faces: got the shape ()"),
+        ({"faces": torch.zeros(2, 2, 3, dtype=torch.int64)}, "faces: got the shape (2, 2, 3)"),
+        ({"faces": torch.zeros(4, 3)}, "faces: got torch.float32, expected whole numbers"),
+        ({"faces": torch.zeros(4, 3, dtype=torch.bool)}, "faces: got torch.bool, expected whole numbers"),
+        ({"faces": torch.tensor([[0, 1, 642]])}, "0 to 642, expected 0 to 641"),
+        ({"faces": torch.tensor([[0, -1, 2]], dtype=torch.int32)}, "-1 to 2, expected 0 to 641"),
+        ({"colors": torch.zeros(5, 3)}, "5 colors for 642 vertices"),
+        ({"colors": torch.zeros(700, 3)}, "700 colors for 642 vertices"),
+        ({"colors": torch.zeros(642)}, "colors: got the shape (642,)"),
+        ({"colors": torch.zeros(642, 3, dtype=torch.uint8)}, "colors: got torch.uint8, expected floating"),
+        ({"colors": torch.zeros(642, 0)}, "colors: got the shape (642, 0)"),
+        ({"colors": None}, '"color" requires a scene with colours'),
     ],
 )
-def test_what_does_not_fit_is_refused_with_a_sentence(change, sentence, road):
+def test_what_does_not_fit_is_refused_with_a_sentence(change, sentence, implementation):
     scene = portrait()
     for name, value in change.items():
         object.__setattr__(scene, name, value)  # past the type checks that only tests have
     for channels in (ALL, ("color",), ("depth",), ("normal", "barycentric")):
         if "colors" in change and "color" not in channels:  # which nobody reads then
-            assert set(road(Rasterizer(), scene, channels)) == set(channels)
+            assert set(implementation(Rasterizer(), scene, channels)) == set(channels)
             continue
         with pytest.raises(ValueError, match=re.escape(sentence)):
-            road(Rasterizer(), scene, channels)
+            implementation(Rasterizer(), scene, channels)
 
 
 def test_what_lies_elsewhere_is_refused():
-    with pytest.raises(ValueError, match="vertices came on meta; rasterizer draws on the CPU"):
+    with pytest.raises(ValueError, match="vertices is on meta, but rasterizer draws on the CPU"):
         Rasterizer()(replace(portrait(), vertices=torch.zeros(642, 3, device="meta")), ALL)
 
 
-@ROADS
-def test_wrong_indices_are_refused_out_of_view_too(road):
+@IMPLEMENTATIONS
+def test_wrong_indices_are_refused_out_of_view_too(implementation):
     scene = portrait(translation=torch.tensor([0.0, 0, -5]))
-    with pytest.raises(ValueError, match="wanted 0 to 641"):
-        road(Rasterizer(), replace(scene, faces=scene.faces + 1), ("mask",))
+    with pytest.raises(ValueError, match="expected 0 to 641"):
+        implementation(Rasterizer(), replace(scene, faces=scene.faces + 1), ("mask",))
 
 
 LENSES = {
@@ -644,30 +644,30 @@ LENSES = {
 LENSES |= {f"a tensor of {shape}": torch.full(shape, 8.0) for shape in ((), (0,), (1,), (3,), (1, 2), (2, 1))}
 
 
-@ROADS
+@IMPLEMENTATIONS
 @pytest.mark.parametrize("learned", [False, True])
 @pytest.mark.parametrize("name", ["focal", "principal"])
 @pytest.mark.parametrize("lens", LENSES)
-def test_a_lens_that_is_not_two_numbers_is_refused(lens, name, learned, road):
+def test_a_lens_that_is_not_two_numbers_is_refused(lens, name, learned, implementation):
     scene = portrait()
     if learned:
         scene = replace(scene, vertices=scene.vertices.clone().requires_grad_())
     object.__setattr__(scene.camera, name, LENSES[lens])  # past the type checks that only tests have
     with pytest.raises(ValueError, match=rf"camera\.{name} has .*; expected the shape \(2,\)"):
-        road(Rasterizer(gradient="interior", supersampling=2), scene, ("color", "mask"))
+        implementation(Rasterizer(gradient="interior", supersampling=2), scene, ("color", "mask"))
 
 
-@ROADS
+@IMPLEMENTATIONS
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        ({"height": 0}, "camera.height = 0; wanted 1 to"),
-        ({"width": 2**20}, "camera.width = 1048576; wanted 1 to"),
+        ({"height": 0}, "camera.height is 0, expected 1 to"),
+        ({"width": 2**20}, "camera.width is 1048576, expected 1 to"),
         ({"near": 0.0}, "near that is not above 0"),
         ({"focal": (1.0, math.nan)}, "not finite"),
         ({"translation": torch.tensor([0.0, math.inf, 0.0])}, "not finite"),
-        ({"rotation": torch.eye(3, device="meta")}, "camera.rotation came on meta"),
-        ({"focal": torch.ones(2, device="meta")}, "camera.focal came on meta"),
+        ({"rotation": torch.eye(3, device="meta")}, "camera.rotation is on meta"),
+        ({"focal": torch.ones(2, device="meta")}, "camera.focal is on meta"),
         ({"rotation": torch.eye(4)}, "camera.rotation has the shape (4, 4); expected the shape (3, 3)"),
         (
             {"translation": torch.ones(1)},
@@ -675,20 +675,20 @@ def test_a_lens_that_is_not_two_numbers_is_refused(lens, name, learned, road):
         ),
     ],
 )
-def test_a_camera_that_cannot_be_is_refused(change, sentence, road):
+def test_a_camera_that_cannot_be_is_refused(change, sentence, implementation):
     scene = portrait()
     for name, value in change.items():
         object.__setattr__(scene.camera, name, value)  # past the type checks that only tests have
     with pytest.raises(ValueError, match=re.escape(sentence)):
-        road(Rasterizer(), scene, ("color",))
+        implementation(Rasterizer(), scene, ("color",))
 
 
 @pytest.mark.parametrize(
     ("channels", "sentence"),
     [
         (("depht",), "Did you mean 'depth'?"),
-        (("mask", "normals"), "'normals' is no channel"),
-        ("mask", "wanted a coll"),
+        (("mask", "normals"), "'normals' is not a channel"),
+        ("mask", "a collection of names is required"),
     ],
 )
 def test_unknown_channels_are_refused(channels, sentence):

@@ -25,11 +25,11 @@ SAVINGS = get_args(Saving)
 EVERY = ("color", "depth", "face", "mask", "normal", "barycentric", "uv")
 
 
-def seen(distance: float = 4.0, size: tuple[int, int] = (60, 70), azimuth: float = 0.4) -> Camera:
+def distant_camera(distance: float = 4.0, size: tuple[int, int] = (60, 70), azimuth: float = 0.4) -> Camera:
     return look_from(azimuth, 0.2, 0.1, distance, 0.6, size)
 
 
-def crowd(camera: Camera, random: np.random.Generator, count: int = 3) -> Scene:
+def random_bodies(camera: Camera, random: np.random.Generator, count: int = 3) -> Scene:
     """Return a scene of bodies that hide one another, some out of view or cut by the near plane; one has a texture."""
     vertices, faces, colors = blob(8)
     subjects = []
@@ -44,21 +44,21 @@ def crowd(camera: Camera, random: np.random.Generator, count: int = 3) -> Scene:
     return join_scenes(subjects)
 
 
-def alike(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> bool:
-    return one.keys() == other.keys() and all(torch.equal(one[name], other[name]) for name in one)
+def are_equal(first: dict[str, torch.Tensor], second: dict[str, torch.Tensor]) -> bool:
+    return first.keys() == second.keys() and all(torch.equal(first[name], second[name]) for name in first)
 
 
 @settings(deadline=None, max_examples=15, derandomize=True)
 @given(st.integers(0, 2**32 - 1), st.booleans())
 def test_savings_change_no_bit(seed: int, cull: bool) -> None:
     random = np.random.default_rng(seed)
-    scene = crowd(seen(float(random.uniform(0.3, 6))), random)
+    scene = random_bodies(distant_camera(float(random.uniform(0.3, 6))), random)
     plain = Rasterizer(cull=cull, savings=())(scene, EVERY)
     for count in range(1, len(SAVINGS) + 1):
         for chosen in itertools.combinations(SAVINGS, count):
             renderer = Rasterizer(cull=cull, savings=chosen)
-            assert alike(plain, renderer(scene, EVERY)), chosen
-            assert alike(plain, renderer(scene, EVERY)), (chosen, "again")
+            assert are_equal(plain, renderer(scene, EVERY)), chosen
+            assert are_equal(plain, renderer(scene, EVERY)), (chosen, "again")
             mask = renderer(scene, ("mask",))["mask"]
             assert torch.equal(mask, plain["mask"]), chosen
 
@@ -69,11 +69,11 @@ def test_one_renderer_draws_what_a_new_one_draws_whatever_came_before(seed: int)
     """Draw scenes that change in one part at a time, also in place and unseen by torch's own count of changes."""
     random = np.random.default_rng(seed)
     renderer = Rasterizer(savings=SAVINGS)
-    scene = crowd(seen(), random)
+    scene = random_bodies(distant_camera(), random)
     for _ in range(12):
         change = random.integers(8)
         if change == 0:
-            scene = crowd(seen(), random, int(random.integers(1, 4)))
+            scene = random_bodies(distant_camera(), random, int(random.integers(1, 4)))
         elif change == 1:
             scene.vertices.numpy()[random.integers(len(scene.vertices))] += 0.3
         elif change == 2:
@@ -81,7 +81,7 @@ def test_one_renderer_draws_what_a_new_one_draws_whatever_came_before(seed: int)
         elif change == 3:
             scene.colors.data.mul_(0.9)  # type: ignore[union-attr]
         elif change == 4:
-            scene = replace(scene, camera=seen(azimuth=float(random.uniform(0, 6))))
+            scene = replace(scene, camera=distant_camera(azimuth=float(random.uniform(0, 6))))
         elif change == 5:
             scene = replace(scene, camera=replace(scene.camera, height=int(random.integers(1, 90))))
         elif change == 6:
@@ -91,13 +91,13 @@ def test_one_renderer_draws_what_a_new_one_draws_whatever_came_before(seed: int)
         channels = [name for name in EVERY if random.random() < 0.4]
         new = Rasterizer(cull=renderer.cull, savings=())
         got = renderer(scene, channels)
-        assert alike(got, new(scene, channels)), (change, channels)
+        assert are_equal(got, new(scene, channels)), (change, channels)
         for picture in got.values():
             picture.numpy()[...] = 7  # they are the caller's
 
 
 def test_what_did_not_change_is_not_computed_again() -> None:
-    scene = crowd(seen(), np.random.default_rng(0))
+    scene = random_bodies(distant_camera(), np.random.default_rng(0))
     renderer = Rasterizer()
     renderer(scene, ("color",))
     assert renderer.report is not None and renderer.report.reused == frozenset()
@@ -115,7 +115,7 @@ def test_what_did_not_change_is_not_computed_again() -> None:
         assert again.report is not None and again.report.reused == frozenset()
 
 
-def by_hand(scene: Scene, cull: bool) -> dict[str, int]:
+def count_outcomes(scene: Scene, cull: bool) -> dict[str, int]:
     """Count what happens to the faces of a scene in front of the near plane, one by one."""
     camera = scene.camera
     pixels, depth = camera.project(scene.vertices.double())
@@ -142,14 +142,18 @@ def by_hand(scene: Scene, cull: bool) -> dict[str, int]:
 def test_the_report_is_what_brute_force_counts(cull: bool, shift: float) -> None:
     vertices, faces, colors = blob(12)
     degenerate = torch.cat([faces, faces[:5, [0, 0, 1]]])
-    camera = replace(seen(), rotation=seen().rotation.double(), translation=seen().translation.double())
+    camera = replace(
+        distant_camera(),
+        rotation=distant_camera().rotation.double(),
+        translation=distant_camera().translation.double(),
+    )
     scene = Scene(vertices + torch.tensor([shift, 0, 0]), degenerate, colors, camera)
     renderer = Rasterizer(cull=cull, savings=("box",))
     for channels in (("color",), ("mask",), ("color", "depth", "face")):
         picture = renderer(scene, channels)
         report = renderer.report
         assert report is not None
-        wanted = by_hand(scene, cull)
+        wanted = count_outcomes(scene, cull)
         assert report.faces == len(degenerate) == sum(wanted.values())
         assert report.drawn_faces == wanted.pop("drawn")
         assert dict(report.left_out) == {name: count for name, count in wanted.items() if count}
@@ -161,7 +165,7 @@ def test_the_report_is_what_brute_force_counts(cull: bool, shift: float) -> None
 
 def test_faces_out_of_view_behind_and_hidden_are_counted() -> None:
     vertices, faces, colors = blob(12)
-    scene = Scene(vertices, faces, colors, seen())
+    scene = Scene(vertices, faces, colors, distant_camera())
     renderer = Rasterizer(savings=SAVINGS)
     renderer(replace(scene, vertices=vertices + 50))
     report = renderer.report
@@ -180,28 +184,28 @@ def test_faces_out_of_view_behind_and_hidden_are_counted() -> None:
     both = join_scenes([scene, before])
     close = Rasterizer(savings=SAVINGS)
     picture = close(both, ("color", "face"))
-    assert alike(picture, Rasterizer(savings=())(both, ("color", "face")))
+    assert are_equal(picture, Rasterizer(savings=())(both, ("color", "face")))
     assert (picture["face"] >= len(faces)).all()
     assert close.report is not None and close.report.left_out["hidden"] > 0.8 * len(faces)
     floor = torch.tensor([[-90.0, -90, -1.5], [90, -90, -1.5], [90, 90, -1.5], [-90, 90, -1.5]]).double()
     under = join_scenes([scene, replace(before, vertices=floor), replace(before, vertices=floor + 0.01)])
-    assert alike(
+    assert are_equal(
         close(under, ("face",)), Rasterizer(savings=())(under, ("face",))
     )  # what the near plane cuts
 
 
 def test_blended_pictures_report_what_became_of_every_face() -> None:
     vertices, faces, colors = blob(12)
-    scene = Scene(vertices, torch.cat([faces, faces[:5, [0, 0, 1]]]), colors, seen())
+    scene = Scene(vertices, torch.cat([faces, faces[:5, [0, 0, 1]]]), colors, distant_camera())
     for cull in (False, True):
         renderer, hard = Rasterizer(gradient="soft", sigma=1e-8, cull=cull), Rasterizer(cull=cull)
         renderer(scene)
         hard(scene)
-        one, other = renderer.report, hard.report
-        assert one is not None and other is not None
-        assert one.drawn_faces + sum(one.left_out.values()) == one.faces == other.faces
-        assert one.left_out.get("back", 0) == pytest.approx(other.left_out.get("back", 0), abs=20)
-        assert one.left_out["flat"] >= 5 and one.drawn_faces > 100
+        soft, hard_report = renderer.report, hard.report
+        assert soft is not None and hard_report is not None
+        assert soft.drawn_faces + sum(soft.left_out.values()) == soft.faces == hard_report.faces
+        assert soft.left_out.get("back", 0) == pytest.approx(hard_report.left_out.get("back", 0), abs=20)
+        assert soft.left_out["flat"] >= 5 and soft.drawn_faces > 100
     renderer(replace(scene, camera=replace(scene.camera, near=4.0)))
     assert renderer.report is not None and 0 < renderer.report.left_out["behind"] < len(scene.faces)
 
@@ -214,12 +218,14 @@ def test_a_gradient_of_what_was_changed_since_is_refused(name: str) -> None:
     """
     vertices, faces, colors = blob(6)
     learned = {"vertices": vertices.clone().requires_grad_(), "colors": colors.clone().requires_grad_()}
-    loss = Rasterizer()(Scene(learned["vertices"], faces, learned["colors"], seen()))["color"].sum()
+    loss = Rasterizer()(Scene(learned["vertices"], faces, learned["colors"], distant_camera()))["color"].sum()
     with torch.no_grad():
         learned[name] += 1
     with pytest.raises(RuntimeError, match="modified by an inplace operation"):
         loss.backward()
-    again = Rasterizer()(Scene(learned["vertices"], faces, learned["colors"], seen()))["color"].sum()
+    again = Rasterizer()(Scene(learned["vertices"], faces, learned["colors"], distant_camera()))[
+        "color"
+    ].sum()
     again.backward()
     with pytest.raises(RuntimeError, match="second time"):
         again.backward()
@@ -228,7 +234,7 @@ def test_a_gradient_of_what_was_changed_since_is_refused(name: str) -> None:
 def test_pictures_in_one_graph_keep_what_their_gradients_read() -> None:
     """Check that several views before one backward pass, as in a fit to many cameras, give the sum of gradients."""
     vertices, faces, colors = blob(8)
-    views = [seen(azimuth=azimuth) for azimuth in (0.1, 1.7, 3.1, 4.4)]
+    views = [distant_camera(azimuth=azimuth) for azimuth in (0.1, 1.7, 3.1, 4.4)]
 
     def slope(renderer: Rasterizer, cameras: list[Camera]) -> torch.Tensor:
         learned = vertices.clone().requires_grad_()
@@ -239,12 +245,12 @@ def test_pictures_in_one_graph_keep_what_their_gradients_read() -> None:
 
     renderer = Rasterizer()
     together = slope(renderer, views)
-    apart = torch.stack([slope(Rasterizer(), [camera]) for camera in views]).sum(0)
-    assert torch.allclose(together, apart, rtol=1e-12)
+    separate_sum = torch.stack([slope(Rasterizer(), [camera]) for camera in views]).sum(0)
+    assert torch.allclose(together, separate_sum, rtol=1e-12)
     sides = renderer.batch([Scene(vertices, faces, colors, camera) for camera in views], ("color",))
     assert all(
-        alike(one, renderer(Scene(vertices, faces, colors, camera)))
-        for one, camera in zip(sides, views, strict=True)
+        are_equal(side, renderer(Scene(vertices, faces, colors, camera)))
+        for side, camera in zip(sides, views, strict=True)
     )
 
 
@@ -255,33 +261,38 @@ def test_a_batch_is_its_scenes_side_by_side(threads: int) -> None:
     """Check scenes of different sizes and meshes, with gradients, and without where none are wanted."""
     random = np.random.default_rng(1)
     scenes = [
-        crowd(seen(size=(int(random.integers(1, 80)), int(random.integers(1, 80)))), random, 2)
+        random_bodies(
+            distant_camera(size=(int(random.integers(1, 80)), int(random.integers(1, 80)))), random, 2
+        )
         for _ in range(9)
     ]
     learned = [scene.vertices.clone().requires_grad_() for scene in scenes]
-    given = [replace(scene, vertices=vertices) for scene, vertices in zip(scenes, learned, strict=True)]
+    differentiable = [
+        replace(scene, vertices=vertices) for scene, vertices in zip(scenes, learned, strict=True)
+    ]
     renderer, before = Rasterizer(), torch.get_num_threads()
     torch.set_num_threads(threads)
     try:
-        found = renderer.batch(given, ("color", "depth"))
+        batch = renderer.batch(differentiable, ("color", "depth"))
         with torch.no_grad():
-            assert not any(picture["color"].requires_grad for picture in renderer.batch(given))
+            assert not any(picture["color"].requires_grad for picture in renderer.batch(differentiable))
         assert renderer.batch([]) == []
     finally:
         torch.set_num_threads(before)
-    for picture, scene, vertices in zip(found, given, learned, strict=True):
+    for picture, scene, vertices in zip(batch, differentiable, learned, strict=True):
         alone = Rasterizer()(scene, ("color", "depth"))
-        assert alike(picture, alone)
-        one, other = (
-            torch.autograd.grad(drawn["color"].square().sum(), vertices)[0] for drawn in (picture, alone)
+        assert are_equal(picture, alone)
+        batch_gradient, single_gradient = (
+            torch.autograd.grad(channels["color"].square().sum(), vertices)[0]
+            for channels in (picture, alone)
         )
-        assert torch.equal(one, other)
+        assert torch.equal(batch_gradient, single_gradient)
 
 
 def test_after_the_first_picture_nothing_is_allocated_but_pictures() -> None:
     """Check this with and without gradients; and that nothing is kept when the images are gone."""
     vertices, faces, colors = blob(40)
-    scene = Scene(vertices, faces, colors, seen(size=(300, 300)))
+    scene = Scene(vertices, faces, colors, distant_camera(size=(300, 300)))
     renderer = Rasterizer(cull=True)
     own = 300 * 300 * 3 * 4
     for number in range(3):
@@ -299,7 +310,9 @@ def test_after_the_first_picture_nothing_is_allocated_but_pictures() -> None:
         renderer(replace(scene, vertices=learned))["color"].sum().backward()
     gc.collect()
     assert len(renderer._pool) <= 2
-    assert not [thing for thing in gc.get_objects() if type(thing).__name__ == "PictureBackward"]
+    assert not [
+        candidate for candidate in gc.get_objects() if type(candidate).__name__ == "DrawImageBackward"
+    ]
 
 
 @pytest.mark.parametrize("gradient", get_args(Gradient))
@@ -308,7 +321,7 @@ def test_a_picture_of_27_thousand_vertices_and_its_gradient_take_less_than_64_mi
     vertices, faces, colors = blob(117)
     assert len(vertices) > 27_554
     learned, painted = vertices.float().requires_grad_(), colors.float().requires_grad_()
-    scene = Scene(learned, faces, painted, seen(size=(410, 308)))
+    scene = Scene(learned, faces, painted, distant_camera(size=(410, 308)))
     tracemalloc.start()
     before = tracemalloc.get_traced_memory()[0]
     Rasterizer(gradient=gradient)(scene)["color"].sum().backward()
@@ -319,7 +332,7 @@ def test_a_picture_of_27_thousand_vertices_and_its_gradient_take_less_than_64_mi
 
 def test_what_waits_for_the_next_picture_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     vertices, faces, colors = blob(8)
-    scene = Scene(vertices, faces, colors, seen(size=(200, 200)))
+    scene = Scene(vertices, faces, colors, distant_camera(size=(200, 200)))
     renderer = Rasterizer()
     pictures = [
         renderer(replace(scene, vertices=vertices.clone().requires_grad_()))["color"] for _ in range(12)
@@ -327,15 +340,15 @@ def test_what_waits_for_the_next_picture_is_bounded(monkeypatch: pytest.MonkeyPa
     assert len(renderer._pool) == 0
     monkeypatch.setattr(canvas, "MOST_BYTES", 10**6)
     del pictures
-    assert 1 <= len(renderer._pool) < 12 and sum(kept.bytes for kept in renderer._pool) <= 10**6
-    renderer(replace(scene, camera=seen(size=(2000, 2000))))
-    assert sum(kept.bytes for kept in renderer._pool) <= 10**6
-    assert alike(renderer(scene, EVERY), Rasterizer()(scene, EVERY))
+    assert 1 <= len(renderer._pool) < 12 and sum(unused.bytes for unused in renderer._pool) <= 10**6
+    renderer(replace(scene, camera=distant_camera(size=(2000, 2000))))
+    assert sum(unused.bytes for unused in renderer._pool) <= 10**6
+    assert are_equal(renderer(scene, EVERY), Rasterizer()(scene, EVERY))
 
 
 def test_a_renderer_can_be_copied_and_sent_to_another_process() -> None:
-    scene = crowd(seen(), np.random.default_rng(0))
+    scene = random_bodies(distant_camera(), np.random.default_rng(0))
     renderer = Rasterizer()
     picture = renderer(scene, EVERY)
     for other in (copy.deepcopy(renderer), pickle.loads(pickle.dumps(renderer))):
-        assert alike(other(scene, EVERY), picture)
+        assert are_equal(other(scene, EVERY), picture)

@@ -18,14 +18,14 @@ from framework.errors import DataError
 from framework.renderer import Scene
 from plugins.renderer.rasterizer import parts
 from plugins.renderer.rasterizer.sample_scenes import (
+    CORNERS,
     MTL,
     OBJ,
     ORDER,
-    PLACES,
     UV,
-    described,
+    describe,
     glb,
-    packed,
+    pack_glb,
     png,
     quad,
 )
@@ -36,13 +36,15 @@ FOUR = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 255]]], np
 REAL = os.environ.get("REAL_DATA_ROOT")
 
 
-def light(stored: NDArray) -> NDArray:
+def to_linear(stored: NDArray) -> NDArray:
     """Return linear RGB of 8-bit sRGB, by the formula of IEC 61966-2-1."""
     share = stored / 255
     return np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
 
 
-def part(image: bytes | None = None, **changes: Any) -> tuple[dict[str, Any], list[NDArray | bytes]]:
+def textured_square(
+    image: bytes | None = None, **changes: Any
+) -> tuple[dict[str, Any], list[NDArray | bytes]]:
     """Return a square of one node and one material, from (0, 0) to (1, 1), with its texture upright.
 
     `changes` go to its material.
@@ -57,10 +59,10 @@ def part(image: bytes | None = None, **changes: Any) -> tuple[dict[str, Any], li
         "textures": [{"source": 0}],
         "images": [{"bufferView": 3}],
     }
-    return content, [PLACES, UV, ORDER, image or png(FOUR)]
+    return content, [CORNERS, UV, ORDER, image or png(FOUR)]
 
 
-def written(
+def write_scene(
     folder: Path,
     content: dict[str, Any],
     arrays: list[NDArray | bytes],
@@ -68,18 +70,18 @@ def written(
     change: Callable[[dict[str, Any]], object] = lambda _: None,
 ) -> Path:
     """Write a .glb, or a .gltf with one file beside it; `change` is applied to the whole description."""
-    whole, binary = described(content, arrays)
+    whole, binary = describe(content, arrays)
     file = folder / name
     if name.endswith(".gltf"):
         whole["buffers"][0]["uri"] = "one%20part.bin"
         (folder / "one part.bin").write_bytes(binary)
     change(whole)
     text = json.dumps(whole).encode()
-    file.write_bytes(packed(text, binary) if name.endswith(".glb") else text)
+    file.write_bytes(pack_glb(text, binary) if name.endswith(".glb") else text)
     return file
 
 
-def texel(scene: Scene, face: int, corner: int, inwards: float = 0.1) -> NDArray:
+def texel_at_corner(scene: Scene, face: int, corner: int, inwards: float = 0.1) -> NDArray:
     """Return the texture's nearest texel a little inside of a face's corner, by the contract: u right, v upwards."""
     texture = scene.texture
     assert texture is not None
@@ -92,13 +94,15 @@ def texel(scene: Scene, face: int, corner: int, inwards: float = 0.1) -> NDArray
 
 @pytest.mark.parametrize("name", ["one.glb", "one.gltf"])
 def test_a_texture_stands_upright(tmp_path: Path, name: str) -> None:
-    scene = read(written(tmp_path, *part(), name=name)).scene
+    scene = read(write_scene(tmp_path, *textured_square(), name=name)).scene
     wanted = {(0, 0): FOUR[1, 0], (1, 0): FOUR[1, 1], (1, 1): FOUR[0, 1], (0, 1): FOUR[0, 0]}
     for face, corner in product(range(2), range(3)):
         x, y, _ = scene.vertices[scene.faces[face, corner]].int().tolist()
-        np.testing.assert_allclose(texel(scene, face, corner), light(wanted[x, y]), atol=1e-6)
+        np.testing.assert_allclose(texel_at_corner(scene, face, corner), to_linear(wanted[x, y]), atol=1e-6)
     assert scene.texture is not None
-    reference = trimesh.load(written(tmp_path, *part(), name="two.glb"), force="mesh", process=False)
+    reference = trimesh.load(
+        write_scene(tmp_path, *textured_square(), name="two.glb"), force="mesh", process=False
+    )
     np.testing.assert_allclose(scene.texture.uv, reference.visual.uv, atol=1e-6)
 
 
@@ -107,24 +111,24 @@ def test_colours_are_multiplied_in_linear_light(tmp_path: Path, width: int, kind
     shares = np.array([[0.1, 0.5, 1, 1], [1, 0, 0.25, 0], [0.6, 0.7, 0.8, 1], [0, 0, 0, 1]])[:, :width]
     full = 1 if kind == "<f4" else np.iinfo(kind).max
     stored = (shares * full).astype(kind)
-    content, arrays = part(baseColorFactor=[0.5, 0.25, 1, 1])
+    content, arrays = textured_square(baseColorFactor=[0.5, 0.25, 1, 1])
     content["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"] = 3
     content["images"] = [{"bufferView": 4}]
-    found = read(written(tmp_path, content, [*arrays[:3], stored, arrays[3]]))
-    assert found.scene.colors is not None and found.scene.texture is not None and not found.plain.any()
-    np.testing.assert_allclose(found.scene.colors, stored[:, :3] / full * [0.5, 0.25, 1], atol=1e-6)
-    np.testing.assert_allclose(found.scene.texture.images[0], light(FOUR), atol=1e-6)
+    subject = read(write_scene(tmp_path, content, [*arrays[:3], stored, arrays[3]]))
+    assert subject.scene.colors is not None and subject.scene.texture is not None and not subject.plain.any()
+    np.testing.assert_allclose(subject.scene.colors, stored[:, :3] / full * [0.5, 0.25, 1], atol=1e-6)
+    np.testing.assert_allclose(subject.scene.texture.images[0], to_linear(FOUR), atol=1e-6)
 
 
 def test_what_has_no_colour_is_grey_and_what_has_one_is_lit_alike(tmp_path: Path) -> None:
-    content, arrays = part()
+    content, arrays = textured_square()
     del content["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"]
     for factor, wanted in ((None, [parts.GREY] * 3), ([0.1, 0.2, 0.3, 0.5], [0.1, 0.2, 0.3])):
         if factor:
             content["materials"][0]["pbrMetallicRoughness"]["baseColorFactor"] = factor
-        found = read(written(tmp_path, content, arrays))
-        assert found.plain.all() and found.scene.texture is None and found.scene.colors is not None
-        np.testing.assert_allclose(found.scene.colors, np.tile(wanted, (4, 1)), atol=1e-6)
+        subject = read(write_scene(tmp_path, content, arrays))
+        assert subject.plain.all() and subject.scene.texture is None and subject.scene.colors is not None
+        np.testing.assert_allclose(subject.scene.colors, np.tile(wanted, (4, 1)), atol=1e-6)
 
 
 def test_nodes_stand_where_trimesh_puts_them(tmp_path: Path) -> None:
@@ -143,8 +147,8 @@ def test_nodes_stand_where_trimesh_puts_them(tmp_path: Path) -> None:
             nodes.append({"mesh": 0, **(moves if number % 2 else {"matrix": matrix.T.ravel().tolist()})})
             if number:
                 nodes[int(random.integers(number))].setdefault("children", []).append(number)
-        content, arrays = part()
-        file = written(tmp_path, {**content, "nodes": nodes}, arrays)
+        content, arrays = textured_square()
+        file = write_scene(tmp_path, {**content, "nodes": nodes}, arrays)
         scene, reference = read(file).scene, trimesh.load(file, force="mesh", process=False)
         ours = scene.vertices[scene.faces].numpy()
         theirs = reference.vertices[reference.faces]
@@ -152,12 +156,12 @@ def test_nodes_stand_where_trimesh_puts_them(tmp_path: Path) -> None:
             np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
             for corners in (ours, theirs)
         ]
-        found, wanted = (
+        actual, expected = (
             np.concatenate([corners.mean(1), area], 1)
             for corners, area in zip((ours, theirs), areas, strict=True)
         )
-        np.testing.assert_allclose(np.sort(found, 0), np.sort(wanted, 0), atol=1e-5)
-        distance = np.linalg.norm(found[:, None] - wanted, axis=2)
+        np.testing.assert_allclose(np.sort(actual, 0), np.sort(expected, 0), atol=1e-5)
+        distance = np.linalg.norm(actual[:, None] - expected, axis=2)
         assert (distance.min(0) < 1e-5).all() and (distance.min(1) < 1e-5).all()
 
 
@@ -166,7 +170,7 @@ def test_strips_and_fans_are_the_triangles_that_they_stand_for(
     tmp_path: Path, mode: int, order: list[int]
 ) -> None:
     """Check that all faces face z; vertices are interleaved with texture places, and one is replaced (sparse)."""
-    content, arrays = part()
+    content, arrays = textured_square()
     content["meshes"][0]["primitives"][0]["mode"] = mode
     content["images"] = [{"bufferView": 2}]
     rows, values = {"bufferView": 3, "componentType": 5121}, {"bufferView": 4}
@@ -175,11 +179,16 @@ def test_strips_and_fans_are_the_triangles_that_they_stand_for(
         {**numbers, "type": "VEC3", "sparse": {"count": 1, "indices": rows, "values": values}},
         {**numbers, "type": "VEC2", "byteOffset": 12},
     ]
-    mixed = np.concatenate([PLACES, UV], 1).tobytes()
+    mixed = np.concatenate([CORNERS, UV], 1).tobytes()
     moved = np.array([5, 5, 0], "<f4").tobytes()
-    given = [mixed, np.array(order, "<u2"), arrays[3], b"\2", moved]
+    binary_parts = [mixed, np.array(order, "<u2"), arrays[3], b"\2", moved]
     scene = read(
-        written(tmp_path, content, given, change=lambda whole: whole["bufferViews"][0].update(byteStride=20))
+        write_scene(
+            tmp_path,
+            content,
+            binary_parts,
+            change=lambda whole: whole["bufferViews"][0].update(byteStride=20),
+        )
     ).scene
     corners = scene.vertices[scene.faces]
     area = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, 2] / 2
@@ -196,7 +205,7 @@ def test_a_skin_is_shown_as_its_joints_stand(tmp_path: Path) -> None:
     weights[:, 2:] = 0
     weights /= weights.sum(1, keepdims=True)
     joints = np.array([[0, 1, 0, 0], [1, 0, 0, 0], [0, 1, 0, 0], [1, 1, 0, 0]], "u1")
-    content, arrays = part()
+    content, arrays = textured_square()
     content["meshes"][0]["primitives"][0]["attributes"] |= {"JOINTS_0": 3, "WEIGHTS_0": 4}
     content["nodes"] = [
         {"mesh": 0, "skin": 0, "translation": [9, 9, 9]},
@@ -207,30 +216,32 @@ def test_a_skin_is_shown_as_its_joints_stand(tmp_path: Path) -> None:
     content["skins"] = [{"joints": [2, 1], "inverseBindMatrices": 5}]
     content["images"] = [{"bufferView": 6}]
     stored = inverse.transpose(0, 2, 1).reshape(2, 16).astype("<f4")
-    found = read(written(tmp_path, content, [*arrays[:3], joints, weights.astype("<f4"), stored, arrays[3]]))
-    assert found.notes == ("it is shown in its rest pose.",)
+    subject = read(
+        write_scene(tmp_path, content, [*arrays[:3], joints, weights.astype("<f4"), stored, arrays[3]])
+    )
+    assert subject.notes == ("the model is drawn in its rest pose.",)
     first, second = np.eye(4), np.eye(4)
     first[:3, 3] = [1, 2, 3]
     cos, sin = 0.8**2 - 0.6**2, 2 * 0.6 * 0.8  # half the angle stands in the file
     second[:3, :3] = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]]) @ np.diag([1, 2, 1])
     places = [first @ second, first]
     for vertex in range(4):
-        point = np.append(PLACES[vertex], 1)
+        point = np.append(CORNERS[vertex], 1)
         wanted = sum(
             weights[vertex, k] * (places[joints[vertex, k]] @ inverse[joints[vertex, k]] @ point)
             for k in range(4)
         )
-        np.testing.assert_allclose(found.scene.vertices[vertex], wanted[:3], atol=1e-5)
+        np.testing.assert_allclose(subject.scene.vertices[vertex], wanted[:3], atol=1e-5)
 
 
 def test_a_texture_may_be_moved_turned_and_scaled(tmp_path: Path) -> None:
     """Check that the turn is counter-clockwise on the image, whose v runs downwards: from right to up, which is -v."""
-    content, arrays = part()
+    content, arrays = textured_square()
     moved = {"offset": [0.25, 0.5], "rotation": np.pi / 2, "scale": [2, 3]}
     content["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"]["extensions"] = {
         "KHR_texture_transform": moved
     }
-    texture = read(written(tmp_path, content, arrays)).scene.texture
+    texture = read(write_scene(tmp_path, content, arrays)).scene.texture
     assert texture is not None
     u, v = UV.T
     downwards = np.stack([0.25 + 3 * v, 0.5 - 2 * u], 1)  # (2u, 0) becomes (0, -2u), (0, 3v) becomes (3v, 0)
@@ -256,7 +267,7 @@ def test_what_lies_beyond_a_texture_is_told(
     tmp_path: Path, samplers: list[str | None], reach: int, wanted: str | None
 ) -> None:
     """Check that a scene has one wrap rule, and that textures need none where faces stay inside."""
-    content, arrays = part()
+    content, arrays = textured_square()
     content["textures"], content["samplers"], content["materials"], content["meshes"] = [], [], [], []
     content["nodes"] = [{"mesh": number, "translation": [number, 0, 0]} for number in range(len(samplers))]
     content["scenes"] = [{"nodes": [*range(len(samplers))]}]
@@ -271,10 +282,10 @@ def test_what_lies_beyond_a_texture_is_told(
         )
         if name is not None:
             content["samplers"].append({"wrapS": NUMBERS[name], "wrapT": NUMBERS[name], "magFilter": 9728})
-    file = written(tmp_path, content, [PLACES, (reach * UV).astype("<f4"), ORDER, arrays[3]])
+    file = write_scene(tmp_path, content, [CORNERS, (reach * UV).astype("<f4"), ORDER, arrays[3]])
     if wanted is None:
         with pytest.raises(
-            DataError, match=r"one\.glb: its textures go on .*\(clamp, mirror\); wanted one way"
+            DataError, match=r"one\.glb: the textures continue .*\(clamp, mirror\), but a scene"
         ):
             read(file)
         return
@@ -297,7 +308,7 @@ def test_the_same_mesh_as_obj_and_glb_is_the_same_scene(tmp_path: Path) -> None:
     for name in ("one.glb", "one.obj"):
         scene = read(tmp_path / name).scene
         assert scene.texture is not None and scene.colors is not None
-        np.testing.assert_allclose(scene.texture.images[0], light(FOUR), atol=1e-6)
+        np.testing.assert_allclose(scene.texture.images[0], to_linear(FOUR), atol=1e-6)
         corners = [scene.vertices[scene.faces], scene.texture.uv[scene.texture.faces]]
         shapes.append(torch.cat([*(values.flatten(1).double() for values in corners)], 1))
     np.testing.assert_allclose(shapes[0].sort(0).values, shapes[1].sort(0).values, atol=1e-5)
@@ -311,10 +322,10 @@ def test_an_obj_has_the_colours_of_its_materials(tmp_path: Path) -> None:
     (tmp_path / "one.mtl").write_bytes(MTL.replace(b"-clamp on ", b""))
     assert "one.png" in read(tmp_path / "one.obj").notes[0]
     (tmp_path / "one.png").write_bytes(png(FOUR))
-    found = read(tmp_path / "one.obj")
-    scene = found.scene
-    assert not found.notes and scene.texture is not None and scene.colors is not None
-    stored = light(np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255], [255, 255, 255]]))
+    subject = read(tmp_path / "one.obj")
+    scene = subject.scene
+    assert not subject.notes and scene.texture is not None and scene.colors is not None
+    stored = to_linear(np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255], [255, 255, 255]]))
     for face, factor in ((0, [1, 0, 0]), (1, [0, 0, 1])):
         for corner in range(3):
             place = scene.vertices[scene.faces[face, corner]][:2].int().tolist()
@@ -323,7 +334,7 @@ def test_an_obj_has_the_colours_of_its_materials(tmp_path: Path) -> None:
                 scene.colors[scene.faces[face, corner]], stored[vertex] * factor, atol=1e-6
             )
             np.testing.assert_allclose(
-                texel(scene, face, corner), light(FOUR[1 - place[1], place[0]]), atol=1e-6
+                texel_at_corner(scene, face, corner), to_linear(FOUR[1 - place[1], place[0]]), atol=1e-6
             )
 
 
@@ -356,9 +367,9 @@ def test_names_may_hold_what_begins_a_comment_elsewhere(
     file = tmp_path / "one.obj"
     for place, lines in ((file, surface), (tmp_path / library, materials)):
         place.write_bytes(end.join(before + line for line in [*lines, ""]).encode())
-    found = read(file)
-    scene = found.scene
-    assert not found.notes and scene.colors is not None and scene.texture is not None
+    subject = read(file)
+    scene = subject.scene
+    assert not subject.notes and scene.colors is not None and scene.texture is not None
     assert len(scene.texture.images) == len(PICTURES) and scene.texture.shown is not None
     for number, color in enumerate(colors):
         (face,) = (scene.vertices[scene.faces][:, 0, 0] == number).nonzero()[:, 0].tolist()
@@ -366,7 +377,7 @@ def test_names_may_hold_what_begins_a_comment_elsewhere(
         shown = int(scene.texture.shown[face])
         assert (shown >= 0) == (number < len(PICTURES))
         if shown >= 0:
-            np.testing.assert_allclose(scene.texture.images[shown], light(images[number]), atol=1e-6)
+            np.testing.assert_allclose(scene.texture.images[shown], to_linear(images[number]), atol=1e-6)
     if before:
         return
     reference = trimesh.load(file, process=False, group_material=True)
@@ -380,26 +391,26 @@ def test_names_may_hold_what_begins_a_comment_elsewhere(
 @pytest.mark.parametrize("binary", [False, True])
 def test_ply_colours_are_light_and_its_texture_is_found(tmp_path: Path, binary: bool) -> None:
     colors = np.array([[255, 128, 0, 255], [12, 55, 99, 255], [1, 2, 3, 255], [200, 100, 50, 255]], np.uint8)
-    mesh = trimesh.Trimesh(PLACES, ORDER.reshape(2, 3), vertex_colors=colors, process=False)
+    mesh = trimesh.Trimesh(CORNERS, ORDER.reshape(2, 3), vertex_colors=colors, process=False)
     mesh.export(tmp_path / "one.ply", encoding="binary" if binary else "ascii")
-    found = read(tmp_path / "one.ply")
-    assert found.scene.colors is not None and not found.plain.any() and found.up == "y"
-    np.testing.assert_allclose(found.scene.colors, light(colors[:, :3]), atol=1e-6)
+    subject = read(tmp_path / "one.ply")
+    assert subject.scene.colors is not None and not subject.plain.any() and subject.up == "y"
+    np.testing.assert_allclose(subject.scene.colors, to_linear(colors[:, :3]), atol=1e-6)
     head = "ply\nformat ascii 1.0\ncomment TextureFile one.png\nelement vertex 4\n"
     head += "".join(f"property float {name}\n" for name in "xyzst") + "element face 2\n"
     head += "property list uchar int vertex_indices\nend_header\n"
-    rows = "".join(f"{x} {y} {z} {x} {y}\n" for x, y, z in PLACES.tolist()) + "3 0 1 2\n3 0 2 3\n"
+    rows = "".join(f"{x} {y} {z} {x} {y}\n" for x, y, z in CORNERS.tolist()) + "3 0 1 2\n3 0 2 3\n"
     (tmp_path / "two.ply").write_text(head + rows)
-    assert "one.png is not beside it" in read(tmp_path / "two.ply").notes[0]
+    assert "one.png is missing in the scene's folder" in read(tmp_path / "two.ply").notes[0]
     (tmp_path / "one.png").write_bytes(png(FOUR))
     scene = read(tmp_path / "two.ply").scene
-    np.testing.assert_allclose(texel(scene, 0, 0), light(FOUR[1, 0]), atol=1e-6)
-    np.testing.assert_allclose(texel(scene, 1, 2), light(FOUR[0, 0]), atol=1e-6)
+    np.testing.assert_allclose(texel_at_corner(scene, 0, 0), to_linear(FOUR[1, 0]), atol=1e-6)
+    np.testing.assert_allclose(texel_at_corner(scene, 1, 2), to_linear(FOUR[0, 0]), atol=1e-6)
 
 
-def naming(folder: Path, name: str) -> list[Path]:
+def write_formats(folder: Path, name: str) -> list[Path]:
     """Return a scene of each format whose texture has this name."""
-    content, arrays = part()
+    content, arrays = textured_square()
     content["images"] = [{"uri": name}]
     (folder / "one.obj").write_bytes(OBJ)
     (folder / "one.mtl").write_bytes(b"newmtl red\nmap_Kd " + name.encode())
@@ -409,18 +420,18 @@ def naming(folder: Path, name: str) -> list[Path]:
         "property list uchar int vertex_indices\nend_header\n" + "0 0 0 0 0\n1 0 0 1 0\n1 1 0 1 1\n3 0 1 2\n"
     )
     (folder / "one.ply").write_text(head)
-    made = [written(folder, content, arrays, end) for end in ("one.glb", "one.gltf")]
-    return [*made, folder / "one.obj", folder / "one.ply"]
+    files = [write_scene(folder, content, arrays, end) for end in ("one.glb", "one.gltf")]
+    return [*files, folder / "one.obj", folder / "one.ply"]
 
 
 def test_names_that_are_not_utf8_lead_to_their_files(tmp_path: Path) -> None:
     (tmp_path / os.fsdecode(b"caf\xe9.png")).write_bytes(png(FOUR))
-    for file in naming(tmp_path, "caf%E9.png"):
+    for file in write_formats(tmp_path, "caf%E9.png"):
         if file.suffix in (".obj", ".ply"):
             named = (tmp_path / "one.mtl") if file.suffix == ".obj" else file
             named.write_bytes(named.read_bytes().replace(b"caf%E9", b"caf\xe9"))
-        found = read(file)
-        assert found.scene.texture is not None and not found.notes
+        subject = read(file)
+        assert subject.scene.texture is not None and not subject.notes
 
 
 @pytest.mark.parametrize(
@@ -432,18 +443,22 @@ def test_no_file_outside_of_the_folder_is_read(tmp_path: Path, name: str) -> Non
     (folder / "sub").mkdir(parents=True)
     (tmp_path / "one.png").write_bytes(png(FOUR))
     (folder / "link").symlink_to(tmp_path / "one.png")
-    for file in naming(folder, name):
-        found = read(file)
-        assert found.scene.texture is None
-        assert found.notes == (
-            f"its texture is in another folder, {name}, which is not read: drawn without.",
+    for file in write_formats(folder, name):
+        subject = read(file)
+        assert subject.scene.texture is None
+        assert subject.notes == (
+            f"the texture is in another folder, {name}, which is not read; the scene is drawn without.",
         )
-    for file in naming(folder, "link"):
-        with pytest.raises(DataError, match=r"inner.*it names 'link'; wanted a file in its own folder"):
+    for file in write_formats(folder, "link"):
+        with pytest.raises(
+            DataError, match=r"inner.*the file refers to 'link', but only files in the same folder"
+        ):
             read(file)
-    buffers, arrays = part()
-    file = written(folder, buffers, arrays, "one.gltf", lambda whole: whole["buffers"][0].update(uri=name))
-    with pytest.raises(DataError, match=r"inner.*it names .*; wanted a file in its own folder"):
+    buffers, arrays = textured_square()
+    file = write_scene(
+        folder, buffers, arrays, "one.gltf", lambda whole: whole["buffers"][0].update(uri=name)
+    )
+    with pytest.raises(DataError, match=r"inner.*the file refers to .*, but only files in the same folder"):
         read(file)
 
 
@@ -463,66 +478,71 @@ def test_no_file_outside_of_the_folder_is_read(tmp_path: Path, name: str) -> Non
 def test_of_a_place_elsewhere_the_file_beside_is_taken(tmp_path: Path, name: str) -> None:
     (tmp_path / "t.png").write_bytes(png(FOUR))
     (tmp_path / "one.mtl").write_bytes(b"newmtl red\nmap_Kd t.png")
-    for file in naming(tmp_path, name):
-        found = read(file)
-        assert found.scene.texture is not None
-        assert found.notes == (f"its texture is in another folder, {name}; t.png beside it is read.",)
+    for file in write_formats(tmp_path, name):
+        subject = read(file)
+        assert subject.scene.texture is not None
+        assert subject.notes == (
+            f"the texture is in another folder, {name}; t.png in the scene's folder is read instead.",
+        )
     (tmp_path / "t.png").rename(tmp_path / "lib.mtl")
     library = f"mtllib {name.replace('t.png', 'lib.mtl')}\n".encode()
     (tmp_path / "one.obj").write_bytes(library + OBJ.partition(b"\n")[2])
     (tmp_path / "lib.mtl").write_bytes(b"newmtl red\nKd 1 0 0\n")
-    found = read(tmp_path / "one.obj")
-    assert found.notes == (
-        f"its materials are in another folder, {name.replace('t.png', 'lib.mtl')}; lib.mtl beside it is read.",
+    subject = read(tmp_path / "one.obj")
+    assert subject.notes == (
+        f"the materials are in another folder, {name.replace('t.png', 'lib.mtl')}; lib.mtl in the scene's folder is "
+        "read instead.",
     )
 
 
 def test_a_missing_texture_is_noted_alike_by_every_format(tmp_path: Path) -> None:
-    for file in naming(tmp_path, "sub/gone.png"):
-        found = read(file)
-        assert found.scene.texture is None
-        assert found.notes == ("its texture sub/gone.png is not beside it: drawn without.",)
+    for file in write_formats(tmp_path, "sub/gone.png"):
+        subject = read(file)
+        assert subject.scene.texture is None
+        assert subject.notes == (
+            "the texture sub/gone.png is missing in the scene's folder; the scene is drawn without.",
+        )
     (tmp_path / "sub").mkdir()
     (tmp_path / "sub" / "gone.png").write_bytes(png(FOUR))
-    for file in naming(tmp_path, "sub/gone.png"):
-        found = read(file)
-        assert found.scene.texture is not None and not found.notes
+    for file in write_formats(tmp_path, "sub/gone.png"):
+        subject = read(file)
+        assert subject.scene.texture is not None and not subject.notes
 
 
 LEFT_OUT: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     "instances": (
         lambda whole: whole.update(extensionsUsed=["EXT_mesh_gpu_instancing", "KHR_materials_ior"]),
-        "it uses EXT_mesh_gpu_instancing, which is not understood: what that adds is left out.",
+        "the file uses EXT_mesh_gpu_instancing, which is not supported; its additions are left out.",
     ),
     "a texture of an extension": (
         lambda whole: whole.update(textures=[{"extensions": {"KHR_texture_basisu": {"source": 0}}}]),
-        "a texture is stored by an extension that is not understood: drawn without.",
+        "a texture is stored by an unsupported extension, so the texture is left out.",
     ),
     "scenes": (
         lambda whole: whole.update(scenes=[{"nodes": [0]}, {"nodes": []}]),
-        "its other scenes are left out.",
+        "the file's other scenes are left out.",
     ),
     "alpha": (
         lambda whole: whole["materials"][0].update(alphaMode="BLEND"),
-        "its transparency is left out.",
+        "transparency is left out.",
     ),
-    "blend shapes": (lambda whole: whole["meshes"][0].update(weights=[1]), "its blend shapes are left out."),
+    "blend shapes": (lambda whole: whole["meshes"][0].update(weights=[1]), "the blend shapes are left out."),
 }
 
 
-@pytest.mark.parametrize("what", LEFT_OUT)
-def test_what_a_scene_leaves_out_is_said(tmp_path: Path, what: str) -> None:
-    change, note = LEFT_OUT[what]
-    assert not read(written(tmp_path, *part())).notes
-    assert read(written(tmp_path, *part(), change=change)).notes == (note,)
+@pytest.mark.parametrize("kind", LEFT_OUT)
+def test_what_a_scene_leaves_out_is_said(tmp_path: Path, kind: str) -> None:
+    change, note = LEFT_OUT[kind]
+    assert not read(write_scene(tmp_path, *textured_square())).notes
+    assert read(write_scene(tmp_path, *textured_square(), change=change)).notes == (note,)
 
 
 def test_textures_have_a_bound_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    content, arrays = part()
-    file = written(tmp_path, content, arrays)
+    content, arrays = textured_square()
+    file = write_scene(tmp_path, content, arrays)
     monkeypatch.setattr(parts, "MOST_TEXELS", 3)
     with pytest.raises(
-        DataError, match=r"one\.glb: the texture 0: it has 2 x 2 pixels; wanted .* Make it smaller"
+        DataError, match=r"one\.glb: the texture 0: the image has 2 x 2 pixels, but .* Make the image smaller"
     ):
         read(file)
 
@@ -530,33 +550,42 @@ def test_textures_have_a_bound_together(tmp_path: Path, monkeypatch: pytest.Monk
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        (lambda whole: whole.update(extensionsRequired=["KHR_draco_mesh_compression"]), "it needs KHR_draco"),
-        (lambda whole: whole["asset"].update(version="1.0"), "it is of version '1.0'; wanted 2.0"),
-        (lambda whole: whole["meshes"][0]["primitives"][0].update(mode=0), "it has no faces, only points"),
-        (lambda whole: whole["nodes"][0].update(children=[0]), "its node 0 stands in two places"),
+        (
+            lambda whole: whole.update(extensionsRequired=["KHR_draco_mesh_compression"]),
+            "the file requires KHR_draco",
+        ),
+        (lambda whole: whole["asset"].update(version="1.0"), "the file has glTF version '1.0'"),
+        (
+            lambda whole: whole["meshes"][0]["primitives"][0].update(mode=0),
+            "the file has no faces, only points",
+        ),
+        (lambda whole: whole["nodes"][0].update(children=[0]), "node 0 has two parents"),
         (
             lambda whole: whole["nodes"][0].update(mesh=7),
-            "it names number 7 of its meshes, of which it has 1",
+            "the file refers to number 7 of its meshes, but has 1",
         ),
         (lambda whole: whole["nodes"][0].update(translation=[1e400, 0, 0]), "a coordinate is not finite"),
-        (lambda whole: whole["accessors"][0].update(count=10**9), "it repeats itself, or is damaged"),
-        (lambda whole: whole["accessors"][0].update(count=3), "names vertex 3, but there are only 0 to 2"),
-        (lambda whole: whole["accessors"][0].pop("count"), "'count' is missing"),
-        (lambda whole: whole["bufferViews"][0].update(byteLength=10**9), "it is cut short"),
-        (lambda whole: whole["textures"][0].update(source=-1), "it names number -1 of its images"),
+        (lambda whole: whole["accessors"][0].update(count=10**9), "the file repeats itself, or is damaged"),
+        (
+            lambda whole: whole["accessors"][0].update(count=3),
+            "refers to vertex 3, but the vertices are numbered 0 to 2",
+        ),
+        (lambda whole: whole["accessors"][0].pop("count"), "the key 'count' is missing"),
+        (lambda whole: whole["bufferViews"][0].update(byteLength=10**9), "the file is cut short"),
+        (lambda whole: whole["textures"][0].update(source=-1), "the file refers to number -1 of its images"),
         (
             lambda whole: (
                 whole["accessors"][0].pop("bufferView"),
                 whole["meshes"][0]["primitives"][0].update(extensions={"KHR_draco_mesh_compression": {}}),
             ),
-            "its vertices are stored by KHR_draco_mesh_compression alone",
+            "the vertices are stored only by KHR_draco_mesh_compression",
         ),
         (
             lambda whole: (
                 whole["buffers"].append({"byteLength": 48, "extensions": {"EXT_meshopt_compression": {}}}),
                 whole["bufferViews"][0].update(buffer=1),
             ),
-            "its buffer 1 is nowhere, but stored by EXT_meshopt_compression",
+            "buffer 1 is missing; it is stored by EXT_meshopt_compression",
         ),
     ],
 )
@@ -564,7 +593,7 @@ def test_a_bad_gltf_gets_its_sentence(
     tmp_path: Path, change: Callable[[dict[str, Any]], object], sentence: str
 ) -> None:
     for name in ("one.glb", "one.gltf"):
-        file = written(tmp_path, *part(), name=name, change=change)
+        file = write_scene(tmp_path, *textured_square(), name=name, change=change)
         with pytest.raises(DataError) as caught:
             read(file)
         assert str(caught.value).startswith(f"{file}: ") and sentence in str(caught.value)
@@ -582,15 +611,18 @@ def test_every_damage_of_length_is_refused(tmp_path: Path) -> None:
 
 def test_what_cannot_be_a_scene_gets_its_sentence(tmp_path: Path) -> None:
     (tmp_path / "chair.glb").mkdir()
-    (tmp_path / "points.ply").write_bytes(trimesh.PointCloud(PLACES).export(file_type="ply"))
+    (tmp_path / "points.ply").write_bytes(trimesh.PointCloud(CORNERS).export(file_type="ply"))
     for name, sentence in (
-        ("chiar.glb", "no such file; wanted a scene. Mend the path. Did you mean 'chair.glb'?"),
-        ("chair.glb", "is a folder; wanted a file whose name ends in .glb, .gltf"),
+        (
+            "chiar.glb",
+            "the file does not exist. Correct the path of the scene file. Did you mean 'chair.glb'?",
+        ),
+        ("chair.glb", "is a folder. Give a file whose name ends in .glb, .gltf"),
         (
             "chair.gbl",
-            "wanted a file whose name ends in .glb, .gltf, .obj, .off, .ply, .stl. Did you mean '.glb'?",
+            "Give a file whose name ends in .glb, .gltf, .obj, .off, .ply, .stl. Did you mean '.glb'?",
         ),
-        ("points.ply", "it has no faces, only points or lines; wanted a surface"),
+        ("points.ply", "the file has no faces, only points or lines, but a surface is required"),
     ):
         with pytest.raises(DataError) as caught:
             read(tmp_path / name)

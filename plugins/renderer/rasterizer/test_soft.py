@@ -10,28 +10,29 @@ from torch import Tensor
 from framework.geometry.camera import Camera
 from framework.renderer import Scene
 from plugins.renderer.rasterizer.canvas import Corners
-from plugins.renderer.rasterizer.drawing import Given, View, backward, draw
+from plugins.renderer.rasterizer.drawing import DrawingSettings, SceneArrays, backward, draw
 from plugins.renderer.rasterizer.renderer import Rasterizer
-from plugins.renderer.rasterizer.test_gradient import blob, camera, turned
+from plugins.renderer.rasterizer.test_gradient import blob, camera, rotate_by
 
 SIZE = (11, 14)
 KNOBS = ((1e-2, 0.05), (1e-3, 0.3), (0.2, 1e-3), (1e-5, 1e-4))
 
 
-def reference(vertices: Tensor, colors: Tensor, rotation: Tensor, translation: Tensor, lens: Tensor, faces: Tensor,
+def autograd_image(vertices: Tensor, colors: Tensor, rotation: Tensor, translation: Tensor, lens: Tensor, faces:
+Tensor,
               cull: bool, sigma: float, gamma: float) -> Tensor:  # fmt: skip
     """Return the image by autograd, every pixel with every face; all faces are in front of the camera and in view."""
-    seen = vertices @ rotation.T + translation
-    place = seen[:, :2] / seen[:, 2:] * lens[:2] + lens[2:]
+    camera_points = vertices @ rotation.T + translation
+    place = camera_points[:, :2] / camera_points[:, 2:] * lens[:2] + lens[2:]
     if cull:
         sides = place[faces][:, 1:] - place[faces][:, :1]
         faces = faces[torch.linalg.det(sides) < 0]
-    corners, inverse = place[faces], 1 / seen[faces][..., 2]  # (faces, 3, 2), (faces, 3)
+    corners, inverse = place[faces], 1 / camera_points[faces][..., 2]  # (faces, 3, 2), (faces, 3)
     row, column = torch.meshgrid(*(torch.arange(side).double() for side in SIZE), indexing="ij")
     pixel = torch.stack([column, row], -1)[:, :, None]  # (row, column, face, 2)
-    one, other = corners, corners.roll(-1, 1)
-    way = other - one
-    from_one = pixel[..., None, :] - one
+    start, end = corners, corners.roll(-1, 1)
+    way = end - start
+    from_one = pixel[..., None, :] - start
     part = ((from_one * way).sum(-1) / way.square().sum(-1)).clamp(0, 1)
     squared = (from_one - part[..., None] * way).square().sum(-1).amin(-1)
     homogeneous = torch.cat([corners, torch.ones_like(corners[..., :1])], -1)
@@ -46,7 +47,7 @@ def reference(vertices: Tensor, colors: Tensor, rotation: Tensor, translation: T
     clipped = weights.clamp(min=0)
     clipped = clipped / clipped.sum(-1, keepdim=True)
     shares = clipped * inverse
-    nearness = seen[faces][..., 2].min() * shares.sum(-1)
+    nearness = camera_points[faces][..., 2].min() * shares.sum(-1)
     shade = torch.einsum("rcfj,fjk->rcfk", shares / shares.sum(-1, keepdim=True), colors[faces])
     most = nearness.detach().where(coverage > 0, 1e-3).amax(2).clamp(min=1e-3)
     weight = coverage * ((nearness - most[..., None]).where(coverage > 0, 0) / gamma).exp()
@@ -56,7 +57,7 @@ def reference(vertices: Tensor, colors: Tensor, rotation: Tensor, translation: T
     return (1 - (1 - coverage).prod(2))[..., None] * mean
 
 
-def given(seed: int) -> tuple[list[Tensor], Tensor]:
+def random_inputs(seed: int) -> tuple[list[Tensor], Tensor]:
     """Return vertices, colours, rotation, translation, lens, float64, and faces.
 
     The faces overlap, share vertices and extend beyond the image.
@@ -64,7 +65,7 @@ def given(seed: int) -> tuple[list[Tensor], Tensor]:
     torch.manual_seed(seed)
     vertices = torch.rand(9, 3).double() * torch.tensor([2.0, 1.6, 1]) - torch.tensor([1.0, 0.8, 0])
     faces = torch.cat([torch.arange(9).reshape(3, 3), torch.tensor([[2, 3, 7], [0, 4, 8], [1, 8, 5]])])
-    rotation = turned(torch.eye(3).double(), torch.tensor([0.1, -0.05, 0.2]).double())
+    rotation = rotate_by(torch.eye(3).double(), torch.tensor([0.1, -0.05, 0.2]).double())
     lens = torch.tensor([13.0, 12.5, 6.4, 5.1], dtype=torch.float64)
     return [
         vertices,
@@ -75,8 +76,8 @@ def given(seed: int) -> tuple[list[Tensor], Tensor]:
     ], faces
 
 
-def view(faces: Tensor, cull: bool, sigma: float, gamma: float) -> View:
-    return View(
+def soft_settings(faces: Tensor, cull: bool, sigma: float, gamma: float) -> DrawingSettings:
+    return DrawingSettings(
         Corners(faces.numpy()),
         1e-3,
         SIZE,
@@ -88,44 +89,48 @@ def view(faces: Tensor, cull: bool, sigma: float, gamma: float) -> View:
     )
 
 
-def picture(parts: list[np.ndarray], seen: View) -> np.ndarray:
+def draw_soft(parts: list[np.ndarray], settings: DrawingSettings) -> np.ndarray:
     """Return the image in float64, before it is rounded."""
-    drawn = draw(Given(*parts, None), seen, [], learning=True)
-    assert drawn.blend is not None
-    return drawn.blend.color
+    rendered = draw(SceneArrays(*parts, None), settings, [], learning=True)
+    assert rendered.soft_image is not None
+    return rendered.soft_image.color
 
 
 @pytest.mark.parametrize("knobs", KNOBS)
 @pytest.mark.parametrize("cull", [False, True])
 def test_picture_and_slopes_are_the_formulas(knobs: tuple[float, float], cull: bool) -> None:
     for seed in range(3):
-        parts, faces = given(seed)
-        again = [part.clone().requires_grad_() for part in parts]
-        wanted = reference(*again, faces, cull, *knobs)
+        parts, faces = random_inputs(seed)
+        copies = [part.clone().requires_grad_() for part in parts]
+        wanted = autograd_image(*copies, faces, cull, *knobs)
         arrays = [part.numpy() for part in parts]
-        seen = view(faces, cull, *knobs)
-        drawn = draw(Given(*arrays, None), seen, [], learning=True)
-        assert drawn.blend is not None
-        np.testing.assert_allclose(drawn.blend.color, wanted.detach(), rtol=1e-9, atol=1e-12)
+        settings = soft_settings(faces, cull, *knobs)
+        rendered = draw(SceneArrays(*arrays, None), settings, [], learning=True)
+        assert rendered.soft_image is not None
+        np.testing.assert_allclose(rendered.soft_image.color, wanted.detach(), rtol=1e-9, atol=1e-12)
         slope = torch.randn(*SIZE, 2)
         (wanted * slope).sum().backward()
-        found = backward(Given(*arrays, None), seen, drawn, None, {"color": slope.numpy()}, [True] * 6, False)
-        for one, other in zip(found[:5], again, strict=True):
-            assert other.grad is not None and other.grad.abs().max() > 0
-            np.testing.assert_allclose(one, other.grad, rtol=1e-7, atol=1e-8 * float(other.grad.abs().max()))
+        gradients = backward(
+            SceneArrays(*arrays, None), settings, rendered, None, {"color": slope.numpy()}, [True] * 6, False
+        )
+        for gradient, copy in zip(gradients[:5], copies, strict=True):
+            assert copy.grad is not None and copy.grad.abs().max() > 0
+            np.testing.assert_allclose(
+                gradient, copy.grad, rtol=1e-7, atol=1e-8 * float(copy.grad.abs().max())
+            )
 
 
 @pytest.mark.parametrize("knobs", KNOBS)
 def test_slopes_are_differences_of_the_picture(knobs: tuple[float, float]) -> None:
     """Compare gradients in every number of the scene with central differences, to 1e-4 of the largest of a kind."""
-    parts, faces = given(5)
-    arrays, seen = [part.numpy() for part in parts], view(faces, False, *knobs)
+    parts, faces = random_inputs(5)
+    arrays, settings = [part.numpy() for part in parts], soft_settings(faces, False, *knobs)
     slope = np.random.default_rng(0).normal(size=(*SIZE, 2)).astype(np.float32)
-    scene = Given(*arrays, None)
-    drawn = draw(scene, seen, [], learning=True)
-    found = backward(scene, seen, drawn, None, {"color": slope}, [True] * 6, False)[:5]
+    scene = SceneArrays(*arrays, None)
+    rendered = draw(scene, settings, [], learning=True)
+    gradients = backward(scene, settings, rendered, None, {"color": slope}, [True] * 6, False)[:5]
     step = 1e-6 if knobs[1] > 1e-4 else 1e-8
-    for number, got in enumerate(found):
+    for number, got in enumerate(gradients):
         assert got is not None
         wanted = np.zeros_like(got)
         for place in np.ndindex(got.shape):
@@ -133,7 +138,7 @@ def test_slopes_are_differences_of_the_picture(knobs: tuple[float, float]) -> No
             for sign in (1, -1):
                 moved = [array.copy() for array in arrays]
                 moved[number][place] += sign * step
-                ends.append(float((picture(moved, seen) * slope).sum()))
+                ends.append(float((draw_soft(moved, settings) * slope).sum()))
             wanted[place] = (ends[0] - ends[1]) / (2 * step)
         np.testing.assert_allclose(got, wanted, rtol=0, atol=1e-4 * np.abs(wanted).max())
 
@@ -156,8 +161,8 @@ def test_without_blur_it_is_the_hard_picture_and_says_so_at_any_size() -> None:
 
 def test_what_is_out_of_view_by_less_than_the_blur_is_seen() -> None:
     corners = torch.tensor([[-0.3, -0.3, 1.0], [-0.3, 0.3, 1], [-0.51, 0, 1]]) - torch.tensor([0.25, 0, 0])
-    seen = Camera(torch.eye(3), torch.zeros(3), (20.0, 20.0), (9.5, 9.5), 20, 20)
-    scene = Scene(corners, torch.tensor([[0, 1, 2]]), torch.ones(3, 1), seen)
+    pose = Camera(torch.eye(3), torch.zeros(3), (20.0, 20.0), (9.5, 9.5), 20, 20)
+    scene = Scene(corners, torch.tensor([[0, 1, 2]]), torch.ones(3, 1), pose)
     assert Rasterizer()(scene)["color"].sum() == 0
     blurred = Rasterizer(gradient="soft", sigma=1e-2)(scene)["color"]
     assert 0 < blurred.sum() < 20 and blurred[:, 10:].sum() == 0 and math.isfinite(blurred.sum())

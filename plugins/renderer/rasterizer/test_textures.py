@@ -15,7 +15,7 @@ from plugins.renderer.rasterizer.renderer import Rasterizer
 from plugins.renderer.rasterizer.test_gradient import blob, camera
 
 
-def covered(kind: torch.dtype = torch.float64, wrap: Wrap = "repeat", smooth: bool = True) -> Scene:
+def textured_body(kind: torch.dtype = torch.float64, wrap: Wrap = "repeat", smooth: bool = True) -> Scene:
     """Return a round body with a small, repeated image on it; corners share vertices, but not texture places."""
     vertices, faces, colors = blob(10)
     generator = torch.Generator().manual_seed(1)
@@ -27,14 +27,14 @@ def covered(kind: torch.dtype = torch.float64, wrap: Wrap = "repeat", smooth: bo
     return Scene(vertices, faces, None, camera(), texture)
 
 
-def sampled(image: Tensor, uv: Tensor, wrap: Wrap) -> Tensor:
+def sample_by_torch(image: Tensor, uv: Tensor, wrap: Wrap) -> Tensor:
     """Return bilinear samples at places (row, column, 2) in [-1, 2] by torch."""
     if wrap == "repeat":  # five copies each way, the middle one from 0 to 1
         image, uv, wrap = image.repeat(5, 5, 1), (uv + 2) / 5, "clamp"
     grid = torch.stack([2 * uv[..., 0] - 1, 1 - 2 * uv[..., 1]], -1)
     mode = {"clamp": "border", "mirror": "reflection"}[wrap]
-    found = grid_sample(image.movedim(-1, 0)[None], grid[None], padding_mode=mode, align_corners=False)
-    return found[0].movedim(0, -1)
+    samples = grid_sample(image.movedim(-1, 0)[None], grid[None], padding_mode=mode, align_corners=False)
+    return samples[0].movedim(0, -1)
 
 
 @pytest.mark.parametrize("kind", [torch.float32, torch.float64])
@@ -42,44 +42,44 @@ def sampled(image: Tensor, uv: Tensor, wrap: Wrap) -> Tensor:
 def test_colours_and_slopes_are_those_of_sampling_at_the_places_that_faces_show(
     wrap: Wrap, kind: torch.dtype
 ) -> None:
-    scene = covered(kind, wrap)
+    scene = textured_body(kind, wrap)
     assert scene.texture is not None
     image, uv = scene.texture.images[0].clone().requires_grad_(), scene.texture.uv.clone().requires_grad_()
     learned = replace(scene, texture=replace(scene.texture, images=(image,), uv=uv))
-    found = Rasterizer(gradient="interior")(learned, ("color", "barycentric", "face", "uv", "mask"))
-    face, mask = found["face"].long(), found["mask"]
-    weights = found["barycentric"].double()
+    channels = Rasterizer(gradient="interior")(learned, ("color", "barycentric", "face", "uv", "mask"))
+    face, mask = channels["face"].long(), channels["mask"]
+    weights = channels["barycentric"].double()
     again, places = image.detach().clone().requires_grad_(), uv.detach().clone().requires_grad_()
     place = (weights[..., None] * places[scene.texture.faces[face.clamp(min=0)]]).sum(-2)
-    assert (place.detach() - found["uv"])[mask].abs().max() < 1e-6
-    wanted = sampled(again.double(), place.double(), wrap) * mask[..., None]
-    assert (found["color"] - wanted).abs().max() < 3e-6
-    slope = torch.randn(found["color"].shape, generator=torch.Generator().manual_seed(2))
-    got = torch.autograd.grad((found["color"] * slope).sum(), (image, uv))
+    assert (place.detach() - channels["uv"])[mask].abs().max() < 1e-6
+    wanted = sample_by_torch(again.double(), place.double(), wrap) * mask[..., None]
+    assert (channels["color"] - wanted).abs().max() < 3e-6
+    slope = torch.randn(channels["color"].shape, generator=torch.Generator().manual_seed(2))
+    got = torch.autograd.grad((channels["color"] * slope).sum(), (image, uv))
     expected = torch.autograd.grad((wanted * slope).sum(), (again, places))
     # slopes are those of corners that are not rounded to 1/256 pixel: a place may then lie beyond a texel's middle,
     # where the slope in it jumps
-    for one, other, limit in zip(got, expected, (1e-3, 0.03), strict=True):
-        assert one.dtype == kind
-        assert (one - other).norm() < limit * other.norm()
+    for gradient, expected_gradient, limit in zip(got, expected, (1e-3, 0.03), strict=True):
+        assert gradient.dtype == kind
+        assert (gradient - expected_gradient).norm() < limit * expected_gradient.norm()
 
 
 def test_the_texel_that_a_place_lies_in_is_shown_where_it_is_not_smooth() -> None:
-    scene = covered(smooth=False)
+    scene = textured_body(smooth=False)
     assert scene.texture is not None
-    found = Rasterizer()(scene, ("color", "uv", "mask"))
+    channels = Rasterizer()(scene, ("color", "uv", "mask"))
     image = scene.texture.images[0]
-    place = found["uv"].double()
+    place = channels["uv"].double()
     column, row = (place[..., 0] * 7).floor() % 7, ((1 - place[..., 1]) * 5).floor() % 5
-    wanted = image[row.long(), column.long()] * found["mask"][..., None]
+    wanted = image[row.long(), column.long()] * channels["mask"][..., None]
     near = ((place * torch.tensor([7, 5]) - (place * torch.tensor([7, 5])).round()).abs() < 1e-4).any(-1)
-    assert torch.equal(found["color"][~near], wanted[~near].float())
-    assert near[found["mask"]].float().mean() < 0.01
+    assert torch.equal(channels["color"][~near], wanted[~near].float())
+    assert near[channels["mask"]].float().mean() < 0.01
 
 
 def test_joined_subjects_show_what_each_shows_alone() -> None:
     """Check subjects with textures, colours, both or neither; each keeps its own image, whatever stands before it."""
-    textured = covered()
+    textured = textured_body()
     assert textured.texture is not None
     vertices, faces, colors = blob(10)
     right, down = torch.tensor([0.9, 0.0, 0.0]), torch.tensor([0.0, 0.0, -0.9])
@@ -92,23 +92,23 @@ def test_joined_subjects_show_what_each_shows_alone() -> None:
     subjects = [replace(subject, camera=wide) for subject in subjects]
     renderer = Rasterizer()
     whole = renderer(join_scenes(subjects), ("color", "face", "uv"))
-    seen = 0
+    pixel_count = 0
     for number, subject in enumerate(subjects):
         alone = renderer(subject, ("color", "face", "uv"))
         low, high = number * len(faces), (number + 1) * len(faces)
-        here = (whole["face"] >= low) & (whole["face"] < high)
-        seen += int(here.sum())
-        assert here.sum() > 100
+        shows_subject = (whole["face"] >= low) & (whole["face"] < high)
+        pixel_count += int(shows_subject.sum())
+        assert shows_subject.sum() > 100
         for name in ("color", "uv"):
-            assert torch.equal(whole[name][here], alone[name][here])
-    assert seen == (whole["face"] >= 0).sum()
+            assert torch.equal(whole[name][shows_subject], alone[name][shows_subject])
+    assert pixel_count == (whole["face"] >= 0).sum()
 
 
 @pytest.mark.parametrize(("colored", "textured"), list(itertools.product([False, True], repeat=2))[1:])
 def test_joining_keeps_what_subjects_have(colored: bool, textured: bool) -> None:
     vertices, faces, colors = blob(4)
     plain = Scene(vertices, faces, colors if colored else None, camera())
-    scene = join_scenes([plain, replace(plain, texture=covered().texture if textured else None), plain])
+    scene = join_scenes([plain, replace(plain, texture=textured_body().texture if textured else None), plain])
     assert len(scene.vertices) == 3 * len(vertices) and scene.faces.max() == 3 * len(vertices) - 1
     assert (scene.colors is not None) == colored and (scene.texture is not None) == textured
     if scene.texture is not None:
@@ -144,37 +144,37 @@ def test_joined_indices_are_those_of_int64_whatever_types_came(
             object.__setattr__(part, name, value)
         return scene
 
-    found = join_scenes([subject(count, kind, textured[0]), subject(100, other, textured[1])])
+    merged = join_scenes([subject(count, kind, textured[0]), subject(100, other, textured[1])])
     # the same small numbers as int64, moved by hand
     first, last = subject(count, kind, True), subject(100, other, True)
     assert first.texture is not None and first.texture.shown is not None
     assert last.texture is not None and last.texture.shown is not None
-    assert found.faces.tolist() == [*first.faces.tolist(), *(last.faces.long() + count).tolist()]
-    if found.texture is None:
+    assert merged.faces.tolist() == [*first.faces.tolist(), *(last.faces.long() + count).tolist()]
+    if merged.texture is None:
         assert not any(textured)
         return
     places, images = (count, len(first.texture.images)) if textured[0] else (0, 0)
     nothing = torch.zeros(2, 3, dtype=torch.int64)
     parts = [first.texture.faces if textured[0] else nothing]
     parts += [last.texture.faces.long() + places if textured[1] else nothing]
-    assert found.texture.faces.tolist() == torch.cat(parts).tolist()
+    assert merged.texture.faces.tolist() == torch.cat(parts).tolist()
     shown = first.texture.shown.tolist() if textured[0] else [-1, -1]
     shown += (last.texture.shown.long() + images).tolist() if textured[1] else [-1, -1]
-    assert found.texture.shown is not None and found.texture.shown.tolist() == shown
+    assert merged.texture.shown is not None and merged.texture.shown.tolist() == shown
 
 
 def test_subjects_of_other_channels_are_not_joined() -> None:
     vertices, faces, colors = blob(4)
     with pytest.raises(ValueError, match="1 and 3 channels; expected the same number"):
-        join_scenes([Scene(vertices, faces, colors[:, :1], camera()), covered()])
+        join_scenes([Scene(vertices, faces, colors[:, :1], camera()), textured_body()])
     with pytest.raises(ValueError, match="Got no scene to join"):
         join_scenes([])
-    other = covered(wrap="clamp")
+    other = textured_body(wrap="clamp")
     with pytest.raises(ValueError, match="different wrap or smooth"):
-        join_scenes([covered(), other])
+        join_scenes([textured_body(), other])
 
 
-@pytest.mark.parametrize("road", [Rasterizer.__call__, Rasterizer.on_device])
+@pytest.mark.parametrize("implementation", [Rasterizer.__call__, Rasterizer.on_device])
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
@@ -183,28 +183,28 @@ def test_subjects_of_other_channels_are_not_joined() -> None:
         ({"images": (torch.zeros(4, 3),)}, "shape (4, 3)"),
         ({"images": (torch.zeros(0, 4, 3),)}, "shape (0, 4, 3)"),
         ({"images": (torch.zeros(2, 2, 3), torch.zeros(2, 2, 1))}, "shape (2, 2, 1)"),
-        ({"images": (torch.zeros(2, 2, 3, dtype=torch.uint8),)}, "torch.uint8; wanted floating point"),
+        ({"images": (torch.zeros(2, 2, 3, dtype=torch.uint8),)}, "torch.uint8, expected floating point"),
         ({"uv": torch.full((30, 2), torch.nan)}, "not finite"),
         ({"uv": torch.full((30, 2), 1e9)}, "beyond 1e+06"),
         ({"uv": torch.zeros(30, 3)}, "shape (30, 3)"),
         ({"uv": torch.zeros(30)}, "shape (30,)"),
-        ({"uv": torch.zeros(30, 2, dtype=torch.int64)}, "uv came as torch.int64"),
-        ({"faces": torch.zeros(4, 3)}, "texture.faces came as torch.float32; wanted whole numbers"),
-        ({"faces": torch.zeros(12, dtype=torch.int64)}, "texture.faces came with the shape (12,)"),
-        ({"faces": torch.zeros(4, 4, dtype=torch.int64)}, "texture.faces came with the shape (4, 4)"),
-        ({"faces": torch.full((4, 3), -1)}, "-1 to -1; wanted 0 to 29"),
-        ({"shown": torch.zeros(4)}, "texture.shown came as torch.float32; wanted whole numbers"),
-        ({"faces": torch.full((4, 3), 99)}, "99 to 99; wanted 0 to 29"),
-        ({"faces": torch.zeros(5, 3, dtype=torch.int64)}, "came for 5 faces"),
-        ({"shown": torch.zeros(3, dtype=torch.int64)}, "shown with the shape (3,)"),
-        ({"shown": torch.full((4,), 1)}, "images 1 to 1; wanted -1 to 0"),
-        ({"wrap": "around"}, "'around'; wanted one of repeat"),
+        ({"uv": torch.zeros(30, 2, dtype=torch.int64)}, "uv: got torch.int64"),
+        ({"faces": torch.zeros(4, 3)}, "texture.faces: got torch.float32, expected whole numbers"),
+        ({"faces": torch.zeros(12, dtype=torch.int64)}, "texture.faces: got the shape (12,)"),
+        ({"faces": torch.zeros(4, 4, dtype=torch.int64)}, "texture.faces: got the shape (4, 4)"),
+        ({"faces": torch.full((4, 3), -1)}, "-1 to -1, expected 0 to 29"),
+        ({"shown": torch.zeros(4)}, "texture.shown: got torch.float32, expected whole numbers"),
+        ({"faces": torch.full((4, 3), 99)}, "99 to 99, expected 0 to 29"),
+        ({"faces": torch.zeros(5, 3, dtype=torch.int64)}, "has 5 faces"),
+        ({"shown": torch.zeros(3, dtype=torch.int64)}, "shown has the shape (3,)"),
+        ({"shown": torch.full((4,), 1)}, "images 1 to 1, expected -1 to 0"),
+        ({"wrap": "around"}, "'around', expected one of repeat"),
     ],
 )
 def test_a_texture_that_does_not_fit_is_refused_with_a_sentence(
     change: dict[str, object],
     sentence: str,
-    road: Callable[[Rasterizer, Scene, Sequence[str]], dict[str, Tensor]],
+    implementation: Callable[[Rasterizer, Scene, Sequence[str]], dict[str, Tensor]],
 ) -> None:
     corners = torch.rand(12, 3, generator=torch.Generator().manual_seed(0))
     faces = torch.arange(12).reshape(4, 3)
@@ -214,13 +214,16 @@ def test_a_texture_that_does_not_fit_is_refused_with_a_sentence(
     scene = Scene(corners, faces, None, camera(), texture)
     for channels in (("color",), ("uv",), ("mask", "color")):
         with pytest.raises(ValueError) as caught:
-            road(Rasterizer(), scene, channels)
+            implementation(Rasterizer(), scene, channels)
         assert sentence in str(caught.value)
-    assert set(road(Rasterizer(), scene, ("mask", "depth"))) == {"mask", "depth"}  # which read none of it
+    assert set(implementation(Rasterizer(), scene, ("mask", "depth"))) == {
+        "mask",
+        "depth",
+    }  # which read none of it
 
 
 def test_the_blended_picture_refuses_textures() -> None:
-    with pytest.raises(ValueError, match="gradient=soft blends colours per vertex"):
-        Rasterizer(gradient="soft")(covered())
-    assert Rasterizer(gradient="soft")(covered(), ("mask", "uv"))["mask"].any()
+    with pytest.raises(ValueError, match="gradient=soft draws only colours of vertices"):
+        Rasterizer(gradient="soft")(textured_body())
+    assert Rasterizer(gradient="soft")(textured_body(), ("mask", "uv"))["mask"].any()
     assert "texture" not in Rasterizer(gradient="soft").differentiable

@@ -1,6 +1,6 @@
-"""Textures on faces: texels around a place, and the interpolated colour; compiled functions on arrays.
+"""Textures on faces: texels around a point of a texture, and interpolation between them; compiled functions.
 
-Texel centres lie at whole numbers: u W - 1/2 from the left and (1 - v) H - 1/2 from the top.
+In texel coordinates, u W - 1/2 from the left and (1 - v) H - 1/2 from the top, texel centres lie at whole numbers.
 """
 
 from typing import NamedTuple, no_type_check
@@ -12,18 +12,18 @@ from plugins.renderer.rasterizer.raster import compiled
 REPEAT, CLAMP, MIRROR = range(3)
 WRAPS = {"repeat": REPEAT, "clamp": CLAMP, "mirror": MIRROR}
 FARTHEST_UV = 1e6
-"""Largest uv for which float32 still resolves a place within an image."""
+"""Largest uv for which float32 still resolves positions within an image."""
 
 
-class Laid(NamedTuple):
+class TextureArrays(NamedTuple):
     """A texture in the form that kernels read.
 
     Attributes:
-        texels: (texels, channels), the texels of all images one after the other, each image row by row from the top.
-        images: (images, 3) int64, the first texel, height and width of each image.
-        uv: (places, 2).
-        corners: (faces, 3) int32, rows of `uv`.
-        shown: (faces) int32, the image of each face, or -1.
+        texels: (texels, channels), the texels of all images in sequence, each image row by row from the top.
+        images: (images, 3) int64, index of the first texel, height and width of each image.
+        uv: (coordinates, 2), texture coordinates.
+        corners: (faces, 3) int32, indices of `uv`.
+        shown: (faces) int32, index of the image on each face, -1 for none.
         wrap: `REPEAT`, `CLAMP` or `MIRROR`.
         smooth: whether to interpolate between texels.
     """
@@ -39,10 +39,10 @@ class Laid(NamedTuple):
 
 @compiled
 @no_type_check
-def uv_at(laid, index, w0, w1, w2):
-    """Return the place in its texture that a face shows at barycentric weights."""
-    a, b, c = laid.corners[index, 0], laid.corners[index, 1], laid.corners[index, 2]
-    uv = laid.uv
+def interpolate_uv(texture, index, w0, w1, w2):
+    """Return the texture coordinates (u, v) of a face at barycentric weights."""
+    a, b, c = texture.corners[index, 0], texture.corners[index, 1], texture.corners[index, 2]
+    uv = texture.uv
     return (
         w0 * uv[a, 0] + w1 * uv[b, 0] + w2 * uv[c, 0],
         w0 * uv[a, 1] + w1 * uv[b, 1] + w2 * uv[c, 1],
@@ -51,36 +51,36 @@ def uv_at(laid, index, w0, w1, w2):
 
 @compiled
 @no_type_check
-def wrapped(place, count, wrap):
-    """Return the texel of a row of `count` texels that stands at an integer place, also beyond the row's ends."""
+def wrap_index(index, count, wrap):
+    """Return the index from 0 to `count` - 1 that the wrap rule gives for any integer index."""
     if wrap == CLAMP:
-        return min(max(place, 0), count - 1)
+        return min(max(index, 0), count - 1)
     if wrap == REPEAT:
-        return place % count
-    place %= 2 * count
-    return min(place, 2 * count - 1 - place)
+        return index % count
+    index %= 2 * count
+    return min(index, 2 * count - 1 - index)
 
 
 @compiled
 @no_type_check
-def among_texels(laid, image, u, v):
-    """Return the four texels around a place, and its distance to the right and down between them, 0 to 1.
+def find_texels(texture, image, u, v):
+    """Return the indices of the four texels around (u, v), and the position between them to the right and down, 0 to 1.
 
-    The texels start at the top left and run row by row. In a texture that is not smooth, all four are the same texel.
+    The texels are ordered from the top left, row by row. If the texture is not smooth, all four are the same texel.
     """
-    start, height, width = laid.images[image, 0], laid.images[image, 1], laid.images[image, 2]
+    start, height, width = texture.images[image, 0], texture.images[image, 1], texture.images[image, 2]
     x, y = u * width - 0.5, (1 - v) * height - 0.5
-    if not laid.smooth:
+    if not texture.smooth:
         x, y = np.floor(x + 0.5), np.floor(y + 0.5)
     left, top = np.floor(x), np.floor(y)
     right, down = x - left, y - top
-    first_column = wrapped(np.int64(left), width, laid.wrap)
-    first_row = start + wrapped(np.int64(top), height, laid.wrap) * width
-    if not laid.smooth:
+    first_column = wrap_index(np.int64(left), width, texture.wrap)
+    first_row = start + wrap_index(np.int64(top), height, texture.wrap) * width
+    if not texture.smooth:
         texel = first_row + first_column
         return texel, texel, texel, texel, 0.0, 0.0
-    last_column = wrapped(np.int64(left) + 1, width, laid.wrap)
-    last_row = start + wrapped(np.int64(top) + 1, height, laid.wrap) * width
+    last_column = wrap_index(np.int64(left) + 1, width, texture.wrap)
+    last_row = start + wrap_index(np.int64(top) + 1, height, texture.wrap) * width
     return (
         first_row + first_column,
         first_row + last_column,
@@ -93,10 +93,10 @@ def among_texels(laid, image, u, v):
 
 @compiled
 @no_type_check
-def mixed(laid, place, channel):
-    """Return the colour of a texture at a place from `among_texels`."""
-    a, b, c, d, right, down = place
-    texels = laid.texels
+def interpolate(texture, texels_around, channel):
+    """Return one colour channel, interpolated between the texels from `find_texels`."""
+    a, b, c, d, right, down = texels_around
+    texels = texture.texels
     above = texels[a, channel] + right * (texels[b, channel] - texels[a, channel])
     below = texels[c, channel] + right * (texels[d, channel] - texels[c, channel])
     return above + down * (below - above)
@@ -104,15 +104,15 @@ def mixed(laid, place, channel):
 
 @compiled
 @no_type_check
-def mixed_slopes(laid, image, place, channel):
-    """Return the derivatives of `mixed` in u and v."""
-    a, b, c, d, right, down = place
-    texels = laid.texels
+def interpolation_derivatives(texture, image, texels_around, channel):
+    """Return the derivatives of `interpolate` with respect to u and v."""
+    a, b, c, d, right, down = texels_around
+    texels = texture.texels
     above = texels[b, channel] - texels[a, channel]
     below = texels[d, channel] - texels[c, channel]
     before = texels[c, channel] - texels[a, channel]
     after = texels[d, channel] - texels[b, channel]
     return (
-        laid.images[image, 2] * (above + down * (below - above)),
-        -laid.images[image, 1] * (before + right * (after - before)),
+        texture.images[image, 2] * (above + down * (below - above)),
+        -texture.images[image, 1] * (before + right * (after - before)),
     )

@@ -1,1 +1,1 @@
-"""Renderer that paints people with a trained network from the points of a body (SMPLpix)."""
+"""Renderer that draws people with a trained network from the points of a body (SMPLpix)."""

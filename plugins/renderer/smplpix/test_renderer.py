@@ -11,14 +11,17 @@ from framework.geometry.camera import canonical_camera, look_from
 from framework.geometry.srgb import linear_from_srgb, srgb_from_linear
 from framework.renderer import Scene
 from framework.testing.scenes import sphere
-from plugins.renderer.smplpix.rows import NEAR, SLIM, UNET, checkpoint, seeing
+from plugins.renderer.smplpix.rows import NEAR, SLIM, UNET, projection_settings, write_checkpoint
 
 SIZE, OTHER = (40, 32), (27, 50)
 MESH = sphere(rings=12)
 ENCODERS = {
-    "projection, slim": [seeing(SIZE, **NEAR), {"name": "slim", **SLIM}],
-    "projection, unet": [seeing(SIZE, levels=2, **NEAR), {"name": "unet", **UNET}],
-    "rasterised, slim": [seeing(SIZE, "rasterised", depth=True), {"name": "slim", **SLIM, "residual": True}],
+    "projection, slim": [projection_settings(SIZE, **NEAR), {"name": "slim", **SLIM}],
+    "projection, unet": [projection_settings(SIZE, levels=2, **NEAR), {"name": "unet", **UNET}],
+    "rasterised, slim": [
+        projection_settings(SIZE, "rasterised", depth=True),
+        {"name": "slim", **SLIM, "residual": True},
+    ],
 }
 
 
@@ -31,7 +34,7 @@ def own_paths(encoders):
     return {"encoder.rasterised.root": encoders[0]["root"]} if "root" in encoders[0] else {}
 
 
-def seen_from(size, azimuth=0.4):
+def distant_camera(size, azimuth=0.4):
     """Return a camera of unequal focal lengths, off the middle, far from any canonical one."""
     camera = look_from(azimuth, 0.3, -0.2, distance=3.5, field_of_view=0.8, size=size)
     return replace(camera, focal=(camera.focal[0], 1.1 * camera.focal[1]), principal=(17.0, 15.5))
@@ -39,13 +42,13 @@ def seen_from(size, azimuth=0.4):
 
 @pytest.fixture(scope="module", params=ENCODERS)
 def encoders(request, tmp_path_factory):
-    found = [dict(part) for part in ENCODERS[request.param]]
-    if found[0]["name"] == "rasterised":
-        found[0]["root"] = str(root(tmp_path_factory.mktemp("root")))
-    return found
+    settings = [dict(part) for part in ENCODERS[request.param]]
+    if settings[0]["name"] == "rasterised":
+        settings[0]["root"] = str(write_registration(tmp_path_factory.mktemp("root")))
+    return settings
 
 
-def root(folder):
+def write_registration(folder):
     """Return the sphere as everybody's registration, in the layout from which `rasterised` reads its triangles."""
     for split in ("train", "validation", "test"):
         (folder / f"{split}.txt").write_text(f"{split}\n")
@@ -60,7 +63,7 @@ def root(folder):
     return folder
 
 
-def given(scene):
+def network_input(scene):
     """Return the input that a user of the loaded run passes."""
     assert scene.colors is not None
     return torch.cat([scene.camera.to_canonical(scene.vertices), srgb_from_linear(scene.colors)], 1)[None]
@@ -72,39 +75,43 @@ def test_it_draws_what_the_loaded_run_predicts(encoders, size, members, tmp_path
     wrapped = {"uncertainty": [{"name": "ensemble", "members": members}]} if members > 1 else {}
     points = len(MESH.vertices)
     paths = own_paths(encoders)
-    drawn = renderer(checkpoint(tmp_path / "run.ckpt", encoders, SIZE, points, **wrapped), paths=paths)
+    smplpix = renderer(
+        write_checkpoint(tmp_path / "run.ckpt", encoders, SIZE, points, **wrapped), paths=paths
+    )
     sized = [{**encoders[0], "height": size[0], "width": size[1]}, encoders[1]]
-    loaded = framework.load(checkpoint(tmp_path / "sized.ckpt", sized, size, points, **wrapped), paths=paths)
+    loaded = framework.load(
+        write_checkpoint(tmp_path / "sized.ckpt", sized, size, points, **wrapped), paths=paths
+    )
     for azimuth in (0.4, 2.0):
-        scene = replace(MESH, camera=seen_from(size, azimuth))
+        scene = replace(MESH, camera=distant_camera(size, azimuth))
         before = torch.random.get_rng_state()
-        found = drawn(scene)["color"]
+        image = smplpix(scene)["color"]
         assert torch.equal(torch.random.get_rng_state(), before)
         with torch.no_grad():
-            density = loaded(given(scene))
-        assert torch.equal(found, images(density, ("color",))["color"][0])
+            density = loaded(network_input(scene))
+        assert torch.equal(image, images(density, ("color",))["color"][0])
         if members == 1:
-            assert torch.equal(found, linear_from_srgb(density.mean[0]))  # the numbers of the file, as light
-        assert found.max() - found.min() > 0.01 and found.shape == (*size, 3)
+            assert torch.equal(image, linear_from_srgb(density.mean[0]))  # the numbers of the file, as light
+        assert image.max() - image.min() > 0.01 and image.shape == (*size, 3)
 
 
 def test_a_camera_anywhere_sees_what_the_canonical_one_sees(tmp_path):
-    drawn = renderer(checkpoint(tmp_path / "run.ckpt", ENCODERS["projection, slim"], SIZE))
-    scene = replace(MESH, vertices=MESH.vertices.double(), camera=seen_from(SIZE))
+    smplpix = renderer(write_checkpoint(tmp_path / "run.ckpt", ENCODERS["projection, slim"], SIZE))
+    scene = replace(MESH, vertices=MESH.vertices.double(), camera=distant_camera(SIZE))
     pixels, depth = scene.camera.project(scene.vertices)
     clear = ((pixels + 0.5) - (pixels + 0.5).round()).abs().amin(1) > 1e-3  # rounding decides no pixel
     plain = canonical_camera(*SIZE)
     across = (pixels - torch.tensor(plain.principal)) / torch.tensor(plain.focal)
     moved = torch.cat([across, torch.ones(len(pixels), 1)], 1) * depth[:, None]
     some = {"faces": MESH.faces[:0], "colors": MESH.colors[clear]}
-    one = drawn(replace(scene, vertices=scene.vertices[clear], **some))["color"]
-    other = drawn(replace(scene, vertices=moved[clear], camera=plain, **some))["color"]
-    torch.testing.assert_close(one, other, rtol=0, atol=1e-5)
+    image = smplpix(replace(scene, vertices=scene.vertices[clear], **some))["color"]
+    canonical_image = smplpix(replace(scene, vertices=moved[clear], camera=plain, **some))["color"]
+    torch.testing.assert_close(image, canonical_image, rtol=0, atol=1e-5)
 
 
 def test_what_must_not_be_seen_is_not(tmp_path):
-    drawn = renderer(checkpoint(tmp_path / "run.ckpt", ENCODERS["projection, slim"], SIZE))
-    scene = replace(MESH, camera=replace(seen_from(SIZE), near=3.0))
+    smplpix = renderer(write_checkpoint(tmp_path / "run.ckpt", ENCODERS["projection, slim"], SIZE))
+    scene = replace(MESH, camera=replace(distant_camera(SIZE), near=3.0))
     assert scene.colors is not None
     _, depth = scene.camera.project(scene.vertices)
     vertices, bad = scene.vertices.clone(), torch.arange(len(depth)) % 7 == 0
@@ -112,14 +119,14 @@ def test_what_must_not_be_seen_is_not(tmp_path):
     good = (depth >= 3.0) & ~bad
     assert 0 < good.sum() < len(depth)
     alone = Scene(vertices[good], MESH.faces[:0], scene.colors[good], scene.camera)
-    assert torch.equal(drawn(replace(scene, vertices=vertices))["color"], drawn(alone)["color"])
+    assert torch.equal(smplpix(replace(scene, vertices=vertices))["color"], smplpix(alone)["color"])
 
 
 def test_the_box_and_the_precision_can_be_chosen(tmp_path):
-    run = checkpoint(
+    run = write_checkpoint(
         tmp_path / "run.ckpt", [ENCODERS["projection, slim"][0], {"name": "slim", **SLIM, "crop": 0}], SIZE
     )
-    scene = replace(MESH, camera=seen_from(SIZE))
+    scene = replace(MESH, camera=distant_camera(SIZE))
     pictures = [
         renderer(run, **config)(scene)["color"]
         for config in ({}, {"crop": 0}, {"crop": "whole"}, {"precision": "bfloat16"})
@@ -139,7 +146,7 @@ def test_without_a_run_it_says_what_to_do(run, kind, message):
 
 
 def test_a_path_of_its_checkpoint_is_said_again_or_refused(encoders, tmp_path):
-    run = checkpoint(tmp_path / "run.ckpt", encoders, SIZE, len(MESH.vertices))
+    run = write_checkpoint(tmp_path / "run.ckpt", encoders, SIZE, len(MESH.vertices))
     for key, path in own_paths(encoders).items():
         with pytest.raises(ConfigError, match=r"encoder\.rasterised\.root="):
             renderer(run)
@@ -148,27 +155,27 @@ def test_a_path_of_its_checkpoint_is_said_again_or_refused(encoders, tmp_path):
 
 
 def test_what_it_cannot_draw_is_refused(encoders, tmp_path):
-    run = checkpoint(tmp_path / "run.ckpt", encoders, SIZE, len(MESH.vertices))
-    drawn = renderer(run, paths=own_paths(encoders))
-    scene = replace(MESH, camera=seen_from(SIZE))
+    run = write_checkpoint(tmp_path / "run.ckpt", encoders, SIZE, len(MESH.vertices))
+    smplpix = renderer(run, paths=own_paths(encoders))
+    scene = replace(MESH, camera=distant_camera(SIZE))
     assert scene.colors is not None
     with pytest.raises(ValueError, match="red, green and blue"):
-        drawn(replace(scene, colors=scene.colors[:, :1]))
+        smplpix(replace(scene, colors=scene.colors[:, :1]))
     for name in ("focal", "principal"):
         for lens in (8.0, (8.0,), (8.0, 8.0, 8.0), torch.tensor([8.0]), torch.tensor(8.0), torch.ones(2, 1)):
-            camera = seen_from(SIZE)
+            camera = distant_camera(SIZE)
             object.__setattr__(camera, name, lens)  # past the type checks that only tests have
             with pytest.raises(ValueError, match=rf"camera\.{name} has .*; expected the shape \(2,\)"):
-                drawn(replace(scene, camera=camera))
+                smplpix(replace(scene, camera=camera))
     if encoders[0]["name"] == "rasterised":
         with pytest.raises(ValueError, match="topology"):
-            drawn(replace(scene, vertices=MESH.vertices[:9], colors=scene.colors[:9], faces=MESH.faces[:0]))
+            smplpix(replace(scene, vertices=MESH.vertices[:9], colors=scene.colors[:9], faces=MESH.faces[:0]))
 
 
 def test_a_run_that_paints_no_people_is_refused(tmp_path):
-    grey = checkpoint(
+    grey = write_checkpoint(
         tmp_path / "grey.ckpt",
-        [seeing(SIZE, **NEAR), {"name": "slim", **SLIM, "colors": 1}],
+        [projection_settings(SIZE, **NEAR), {"name": "slim", **SLIM, "colors": 1}],
         SIZE,
         names=("grey",),
     )
