@@ -255,7 +255,7 @@ def fitted_models(predictor: Predictor) -> list[Model]:
 
 
 def learns(predictor: Predictor) -> bool:
-    """Return true if a predictor is trained by gradient: it has trained parameters, and no head that is fitted at once."""
+    """Return true if a predictor is trained by gradient: it has such parameters and no head that is fitted at once."""
     return not fitted_models(predictor) and any(
         parameter.requires_grad for parameter in predictor.parameters()
     )
