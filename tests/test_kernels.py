@@ -40,7 +40,7 @@ def test_every_file_that_compiles_is_among_the_sources(names: tuple[str, ...], h
 
 
 FILES = [file for root in ("framework", "plugins") for file in (TOP / root).rglob("*.py")]
-ALONE = re.compile(r"kept_in\([^,]+, \[Path\(__file__\)\]\)")
+ALONE = re.compile(r"kernel_cache\([^,]+, \[Path\(__file__\)\]\)")
 
 
 def test_kernels_that_call_other_files_are_kept_by_their_sources() -> None:
