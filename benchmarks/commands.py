@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from types import FrameType
 
-from framework.tracking.signals import SIGNALS, ending_with_parent
+from framework.tracking.signals import SIGNALS, end_with_parent
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -37,7 +37,7 @@ def carry_out(command: Sequence[str]) -> None:
 
     before = {number: signal.signal(number, passed_on) for number in numbers}
     try:
-        started.append(subprocess.Popen(command, cwd=ROOT, process_group=0, preexec_fn=ending_with_parent()))
+        started.append(subprocess.Popen(command, cwd=ROOT, process_group=0, preexec_fn=end_with_parent()))
         for number in early:
             started[0].send_signal(number)
         code = started[0].wait()

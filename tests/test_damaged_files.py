@@ -76,7 +76,7 @@ def test_every_reader_of_the_project_is_among_them() -> None:
             for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
             if isinstance(node, ast.Call)
         }
-        if {"guarded", "reading.guarded"} & called:
+        if {"translate_errors", "reading.translate_errors"} & called:
             guarding.add(name)
         if any(one in ("open", "np.load", "torch.load") or one.endswith(READING) for one in called):
             opening.add(name)
@@ -90,7 +90,7 @@ OWN_CACHE = {
     "framework/bodies/topologies.py",
     "plugins/data/labelled_clouds/reading.py",
 }
-"""They guard what the project keeps in its own cache, where `archive` reads it, which is among the readers."""
+"""They guard what the project keeps in its own cache, where `read_npz` reads it, which is among the readers."""
 OWN_FILES = {
     "framework/configuration/composition.py": "the package's config.yaml",
     "framework/datasets/images.py": "within a guard",
@@ -106,9 +106,9 @@ import sys
 from tests.fuzz.damage import scratch
 from tests.fuzz.damaged_readers import readers
 from tests.fuzz.fuzz import whole
-from framework.storage.reading import guarded
+from framework.storage.reading import translate_errors
 
-code, found = guarded.__wrapped__.__code__, set()
+code, found = translate_errors.__wrapped__.__code__, set()
 
 def called(frame, event, argument):
     if event == "call" and frame.f_code is code:  # by contextlib, by whoever guards

@@ -117,7 +117,7 @@ def test_a_journal_is_bounded_in_size_and_in_lines(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(journals, "LONGEST", 1000)
     path = tmp_path / "journal.jsonl"
     path.write_bytes(b'{"n":7,"time":1}\n' + b"x" * 5000)
-    with pytest.raises(DataError, match="no line that can be read in its last 2,000 bytes"):
+    with pytest.raises(DataError, match="no readable line in its last 2,000 bytes"):
         Journal(path).open()
     assert path.stat().st_size == 5017
     assert Journal(path).read() == [{"n": 7, "time": 1}]

@@ -145,8 +145,8 @@ def test_a_folder_may_hold_other_files_and_a_failure_leaves_nothing(
     assert not [*(tmp_path / "features").iterdir()], "what failed says nothing of a later attempt"
     done = framework(*common, *places, "data.unreadable=skip", folder=None)
     assert done.code == 0, done.out
-    assert "2 files ignored, being of another kind: README, angles.csv" in done.out
-    assert "1 files left out, since they cannot be read: 00.npy" in done.out
+    assert "2 files ignored, because they are of another kind: README, angles.csv" in done.out
+    assert "1 files left out, because they cannot be read: 00.npy" in done.out
     features = tmp_path / "features"
     assert (features / "unreadable.txt").read_text() == "a/00.npy\n"
     names = (features / "files.txt").read_text().splitlines()

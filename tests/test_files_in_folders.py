@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 
 from framework.errors import DataError
-from framework.runs.user_files import files_in, say_left_out
+from framework.runs.user_files import list_files, print_left_out
 
 HELD = {"files": ("one.png", "two.PNG"), "folders": ("sub", "more"), "hidden": (".DS_Store", ".git")}
 
@@ -32,13 +32,17 @@ def test_files_are_those_of_the_folder_itself(
     kinds = [kind for kind, held in (("files", files), ("folders", folders), ("hidden", hidden)) if held]
     folder = made(tmp_path / "given", *kinds)
     if files:
-        found, left_out = files_in(folder)
+        found, left_out = list_files(folder)
         assert [file.name for file in found] == ["one.png", "two.PNG"]
         said = io.StringIO()
-        say_left_out(Console(file=said, width=200), "folders", "not looked into", left_out)
+        print_left_out(Console(file=said, width=200), "folders", "not looked into", left_out)
         assert said.getvalue() == ("2 folders not looked into: more, sub\n" if folders else "")
-        assert files_in(folder / "one.png") == ([folder / "one.png"], [])
+        assert list_files(folder / "one.png") == ([folder / "one.png"], [])
     else:
-        why = r"holds folders alone \(more, sub\), which are not looked into" if folders else "holds no file"
-        with pytest.raises(DataError, match=rf"given {why}\. Give a folder that itself holds the files"):
-            files_in(folder)
+        why = (
+            r"contains only folders \(more, sub\), which are not searched" if folders else "contains no file"
+        )
+        with pytest.raises(
+            DataError, match=rf"given {why}\. Give the folder that directly contains the files"
+        ):
+            list_files(folder)

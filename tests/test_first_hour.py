@@ -13,7 +13,7 @@ import sys
 from hydra.core.global_hydra import GlobalHydra
 from framework.app import main
 from framework.storage import progress
-progress.SHORT = progress.APART = 0.0
+progress.QUIET_TIME = progress.REPORT_INTERVAL = 0.0
 for command in sys.argv[1:]:
     sys.argv = ["framework", *command.split()]
     main()

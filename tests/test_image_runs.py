@@ -153,7 +153,7 @@ def test_images_are_predicted_loaded_frozen_served_and_trained_further(
         *people(tmp_path), f"checkpoint={done.folder}", "optimizer.learning_rate=1e-9", folder="further"
     )
     assert again.code == 0, again.out
-    assert "starting anew from the weights of" in again.out
+    assert "starting a new training from the weights of" in again.out
     # the same parameters but for the rate; moments of batches go on
     first, further = (
         torch.load(one.folder / "checkpoints" / "model.ckpt", weights_only=True)["state_dict"]
@@ -187,10 +187,10 @@ def test_what_learns_nothing_is_tested_as_it_is(framework: Framework, tmp_path: 
     tested = framework(*test, *paths_again([f"resume={done.folder}"]), folder="tested")
     assert tested.code == 0, tested.out
     for further, sentence in (
-        ("objective=[random_features]", "Nothing in this model learns by gradient"),
+        ("objective=[random_features]", "No part of this model learns by gradient"),
         (
             "trainer.max_epochs=2",
-            "trainer.max_epochs=2 has no effect: nothing in this model learns by gradient",
+            "trainer.max_epochs=2 has no effect: no part of this model learns by gradient",
         ),
     ):
         refused = framework("experiment=smplpix/rasterised", *run, further, folder="no")

@@ -270,7 +270,7 @@ def test_a_full_disk_stops_nobody_and_loses_nothing(
     for step in range(1, 50):
         journal.write({"a": float(step)}, step, 0)
     assert len(caplog.records) == 1
-    assert "numbers wait in memory" in caplog.text
+    assert "keeps its numbers in memory" in caplog.text
     disk.room = 1 << 30
     journal.write({"a": 50.0}, 50, 0)
     assert steps(journal) == list(range(51))

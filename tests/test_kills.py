@@ -25,11 +25,11 @@ RUN = """
 import json, os, signal, sys, threading, time
 from pathlib import Path
 from framework.tracking.tracker import NoTracker
-from framework.tracking.watch import watched
+from framework.tracking.watch import start_watcher
 
 folder, how = Path(sys.argv[1]), sys.argv[2]
 tracker = NoTracker(folder)
-with watched(folder):
+with start_watcher(folder):
     tracker.open()
     tracker.log_metrics({"train/loss": 1.0}, 1, 0)
     if how == "closes":
@@ -40,10 +40,10 @@ with watched(folder):
 """
 PARENT = """
 import subprocess, sys, time
-from framework.tracking.signals import ending_with_parent
+from framework.tracking.signals import end_with_parent
 jobs = [
     subprocess.Popen([sys.executable, "-c", *sys.argv[1:3], how], preexec_fn=ends, start_new_session=True)
-    for how, ends in zip(sys.argv[3:], (ending_with_parent(), None))
+    for how, ends in zip(sys.argv[3:], (end_with_parent(), None))
 ]
 time.sleep(100)
 """

@@ -174,7 +174,7 @@ trainer.log_every_steps=0 | trainer.log_every_steps = 0
 trainer.checkpoint_every_steps=-1 | trainer.checkpoint_every_steps = -1
 +trainer.profiler=fast | trainer.profiler = 'fast'
 +trainer.logger=true | trainer.logger: unknown key
-logger.uri=http://me:secret@127.0.0.1 | came with a password
+logger.uri=http://me:secret@127.0.0.1 | was given with a password
 mode=tests | Did you mean 'test'?
 mode=predict checkpoint=nowhere | Give the folder that a run printed at its start
 mode=work_precision | needs checkpoint=
@@ -203,8 +203,8 @@ experiment=moons/vanilla_128 optimizer.patience=3 | only the schedule plateau re
 experiment=moons/vanilla_128 +trainer.limit_test_batches=3 | the test always covers its whole split
 experiment=moons/vanilla_128 logger=none +logger.uri=x | logger=none has no store
 experiment=moons/vanilla_128 metric=[accuracy] outliers.test=9 | no metric of this run reads outliers
-data=moons density_head=extra_trees metric=[accuracy] trainer.max_epochs=3 | is fitted at once, without gradient
-data=moons density_head=extra_trees metric=[accuracy] optimizer=sgd | is fitted at once, without gradient
+data=moons density_head=extra_trees metric=[accuracy] trainer.max_epochs=3 | is fitted in one step, without gradient
+data=moons density_head=extra_trees metric=[accuracy] optimizer=sgd | is fitted in one step, without gradient
 experiment=moons/vanilla_128 encoder.mlp.width=3 | Did you mean 'widths'?
 """
 

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from framework.errors import ConfigError
-from framework.runs.job import leave_value
+from framework.runs.job import write_value
 from framework.sweeps import jobs as sweep
 
 LINUX = pytest.mark.skipif(
@@ -29,7 +29,7 @@ APP = """
 import json, os, sys, time, types
 from pathlib import Path
 import hydra
-from framework.runs.job import leave_value
+from framework.runs.job import write_value
 from framework.sweeps import jobs as sweep
 
 HERE = Path(__file__).parent
@@ -565,11 +565,11 @@ def test_free_number() -> None:
 
 def test_what_a_job_leaves_for_an_optimising_sweeper(tmp_path: Path) -> None:
     job = sweep.Job(0, [], [], tmp_path, "key", "config")
-    leave_value(tmp_path, 0.25)
+    write_value(tmp_path, 0.25)
     assert job.value() is None, "a run of no sweep leaves nothing"
     assert not list(tmp_path.iterdir())
     (tmp_path / "job.json").touch()
-    leave_value(tmp_path, 0.25)
+    write_value(tmp_path, 0.25)
     assert job.value() == 0.25
     assert {path.name for path in tmp_path.iterdir()} == {"job.json", "value.json"}
 

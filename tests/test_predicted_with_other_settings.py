@@ -26,7 +26,7 @@ def table(folder: Path) -> tuple[list[str], Path, dict[str, str | None]]:
     file = folder / "people.csv"
     file.write_text("\n".join(["width,height,age,label", *rows]))
     data = f"data=tabular data.path={file} data.target=age data.kind=real data.columns=[width,height]"
-    same = "the same without it"
+    same = "in the same way without it"
     return (
         [*data.split(), "density_head=gaussian", "metric=[rmse]"],
         file,
@@ -56,8 +56,8 @@ def images(folder: Path) -> tuple[list[str], Path, dict[str, str | None]]:
         [*data, "density_head=von_mises", "metric=[angular_deviation]"],
         folder / "40.png",
         {
-            f"data.root={root}": "the same without it",
-            "data.image_size=16": "the same without it",
+            f"data.root={root}": "in the same way without it",
+            "data.image_size=16": "in the same way without it",
             "data.image_size=32": "reads inputs of shape",
         },
     )

@@ -22,7 +22,7 @@ from omegaconf import DictConfig, OmegaConf
 from framework.configuration.composition import folder, register
 from framework.errors import ConfigError
 from framework.modes.combine import found
-from framework.runs.job import recorded
+from framework.runs.job import find_job_folders
 from framework.sweeps import comparison
 from hydra_plugins.framework_random_search import _best, _draws
 from tests.conftest import TINY, Framework
@@ -544,8 +544,8 @@ def test_jobs_are_found_however_deep_they_lie_and_those_of_a_sweep_below_are_not
     (tmp_path / "another" / "multirun.yaml").touch()
     rows = table(tmp_path)
     assert sorted(row["x"] for row in rows) == ["1", "10", "9"]
-    assert [path.name for path in recorded(tmp_path)[:2]] == ["x=9", "x=10"]
-    assert {path.relative_to(tmp_path).parts[0] for path in recorded(tmp_path)} == {
+    assert [path.name for path in find_job_folders(tmp_path)[:2]] == ["x=9", "x=10"]
+    assert {path.relative_to(tmp_path).parts[0] for path in find_job_folders(tmp_path)} == {
         "x=9",
         "x=10",
         "experiment=a",

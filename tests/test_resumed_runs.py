@@ -18,7 +18,7 @@ from framework.modes import calibrate, train
 from framework.modes import test as testing
 from framework.runs import run as runs
 from framework.runs import session
-from framework.runs.run import TRACEBACK, opened
+from framework.runs.run import TRACEBACK, open_run
 from framework.tracking.run_info import read_run_info
 from framework.tracking.signals import Stopped
 from plugins.data.moons.data import Moons
@@ -54,11 +54,11 @@ def test_a_run_that_has_finished_says_no_error_any_more(
 ) -> None:
     config = composed(folder, *SMALL[:-3])
     monkeypatch.setattr(runs, "_tracker", lambda config, run_id, resumed: build(folder, run_id=run_id))
-    with pytest.raises(type(error)), opened(config):
+    with pytest.raises(type(error)), open_run(config):
         raise error
     tags = client(folder).get_run(identity(folder)).data.tags
     assert "error" in tags and (folder / TRACEBACK).is_file()
-    with opened(config) as run:
+    with open_run(config) as run:
         assert run.resumed
     found = client(folder).get_run(identity(folder))
     assert found.info.status == "FINISHED" and "error" not in found.data.tags

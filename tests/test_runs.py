@@ -521,7 +521,7 @@ def test_predictions_of_a_folder_leave_out_what_is_no_input(framework: Framework
     skip = ("data=caviar", "data.image_size=32", "data.skip_unreadable=true")
     done = framework(*predict, *skip, folder="predicted")
     assert done.code == 0, done.out
-    assert "2 files ignored, being of another kind: README, angles.csv" in done.out
+    assert "2 files ignored, because they are of another kind: README, angles.csv" in done.out
     assert (done.folder / "unreadable.txt").read_text() == f"{folder / 'broken.png'}\n"
     rows = (done.folder / "predictions.csv").read_text().splitlines()[1:]
     assert [row.partition(",")[0] for row in rows] == [str(folder / "one.png"), str(folder / "two.png")]
@@ -588,7 +588,7 @@ def test_a_strangers_run_is_not_resumed_into_the_store_that_it_names(framework: 
     (killed.folder / "config.yaml").write_text(yaml.safe_dump(config), encoding="utf-8")
     resumed = framework(f"resume={killed.folder}")
     assert resumed.code == 2, resumed.out
-    assert "If that is where you keep runs, say so: add logger.uri=https://attacker.example" in resumed.out
+    assert "If this is your store, add logger.uri=https://attacker.example" in resumed.out
 
 
 def test_answers_that_are_not_finite_get_a_sentence(framework: Framework) -> None:
@@ -641,5 +641,5 @@ def test_a_run_that_started_from_weights_goes_on_without_them(
         return
     assert resumed.code == 0, resumed.out
     assert "resuming from" in resumed.out
-    assert "starting anew" not in resumed.out
+    assert "starting a new training" not in resumed.out
     assert killed.losses() == without.losses()

@@ -158,7 +158,7 @@ def test_a_mode_reads_what_it_says_it_reads(
     config = composed(mode)
     require_read(mode, config.overrides)
     seen: set[str] = set()
-    get, inherited = Settings.__getattribute__, session.inherited
+    get, inherited = Settings.__getattribute__, session.inherit_settings
 
     def noting(self: Settings, key: str) -> Any:
         if key in Settings.model_fields:
@@ -170,7 +170,7 @@ def test_a_mode_reads_what_it_says_it_reads(
         values.seen = seen
         return replace(config, values=values)
 
-    monkeypatch.setattr(session, "inherited", lambda *given: recorded(inherited(*given)))
+    monkeypatch.setattr(session, "inherit_settings", lambda *given: recorded(inherited(*given)))
     monkeypatch.setattr(Settings, "__getattribute__", noting)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

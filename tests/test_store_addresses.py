@@ -16,7 +16,7 @@ from framework.tracking.stores import (
     Address,
     address,
     artifact_folder,
-    confirmed,
+    confirm_address,
     default_uri,
     require_own_files,
     sqlite_path,
@@ -45,10 +45,10 @@ def require_in(name: str, base: Path) -> None:
     # MLflow makes the folder above what stands in the address
     assert Path(uri.removeprefix("sqlite:///")).parent in (file.parent, Path())
     require_own_files(uri, (f"{files}/1/artifacts",))
-    assert confirmed(uri, None, folder, folder / "run.json") == Address(uri, False)
+    assert confirm_address(uri, None, folder, folder / "run.json") == Address(uri, False)
     literal = f"sqlite:///{file}"  # as earlier versions recorded it
     if sqlite_path(literal) == file:
-        assert confirmed(literal, None, folder, folder / "run.json") == Address(uri, False)
+        assert confirm_address(literal, None, folder, folder / "run.json") == Address(uri, False)
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -46,7 +46,7 @@ from framework.configuration.config import Config
 from framework.configuration.registry import load
 from framework.deployment.served import _load_pyfunc
 from framework.errors import UserError
-from framework.runs.session import for_trained, tested
+from framework.runs.session import add_test_parts, for_trained
 from framework.storage.checkpoints import read, write
 
 base, source = map(Path, sys.argv[1:3])
@@ -67,7 +67,7 @@ uses = {
     "load": lambda: framework.load(checkpoint),
     "freeze": lambda: framework.freeze(checkpoint),
     "serve": lambda: _load_pyfunc(str(checkpoint)),
-    "test": lambda: tested(for_trained(Config.of(settings, base / "test", []))),
+    "test": lambda: add_test_parts(for_trained(Config.of(settings, base / "test", []))),
     "resume": resumed,
 }
 for line in sys.stdin.read().splitlines():

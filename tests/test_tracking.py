@@ -42,7 +42,7 @@ from framework.tracking.run_info import (
 from framework.tracking.sender import Record, Sender, Store, batches
 from framework.tracking.stores import (
     Address,
-    confirmed,
+    confirm_address,
     default_uri,
     require_no_password,
     store_uri,
@@ -335,7 +335,7 @@ def test_names_the_store_does_not_take(folder: Path, caplog: pytest.LogCaptureFi
     }
     assert run.data.params == {"x_y": "1"}
     assert run.data.tags["x_y"] == "1"
-    assert caplog.text.count("MLflow takes no name like") == 5  # each name once
+    assert caplog.text.count("MLflow does not accept the name") == 5  # each name once
 
 
 def test_an_entry_the_store_refuses_holds_up_nothing(
@@ -361,7 +361,7 @@ def test_a_file_that_is_gone_holds_up_nothing(folder: Path, caplog: pytest.LogCa
     log(tracker, [1])
     tracker.close("FINISHED")
     assert status(folder) == "FINISHED"
-    assert "missing.png is gone" in caplog.text
+    assert "missing.png was removed" in caplog.text
 
 
 @pytest.mark.parametrize("path", ["/etc/hostname", "../secret.txt", "a/../../secret.txt", ".."])
@@ -423,7 +423,7 @@ def test_a_store_that_only_a_file_names_is_not_contacted(
         if setting:
             monkeypatch.setenv("MLFLOW_TRACKING_URI", setting)
         with pytest.raises(ConfigError, match=r"say so: add logger\.uri=") as caught:
-            confirmed(recorded, named, tmp_path / "run", Path("run.json"))
+            confirm_address(recorded, named, tmp_path / "run", Path("run.json"))
         assert "a:b" not in str(caught.value)
         assert str(caught.value).isprintable()
 
@@ -440,11 +440,11 @@ def test_a_store_that_only_a_file_names_is_not_contacted(
 def test_what_is_contacted_is_the_users_own_text(
     recorded: str, own: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert confirmed(recorded, own, tmp_path, Path("run.json")) == Address(own, True)
+    assert confirm_address(recorded, own, tmp_path, Path("run.json")) == Address(own, True)
     monkeypatch.setenv("MLFLOW_TRACKING_URI", own)
-    assert confirmed(recorded, None, tmp_path, Path("run.json")) == Address(own, True)
+    assert confirm_address(recorded, None, tmp_path, Path("run.json")) == Address(own, True)
     default = default_uri(tmp_path / "run")
-    assert confirmed(default, None, tmp_path / "run", Path("run.json")) == Address(default, False)
+    assert confirm_address(default, None, tmp_path / "run", Path("run.json")) == Address(default, False)
 
 
 @pytest.mark.parametrize(
@@ -605,7 +605,7 @@ def test_a_store_that_fails_again_and_again_gets_everything_once_and_in_order(
     assert carrier.finish(60.0)
     assert [record["step"] for record in store.got] == list(range(500))
     assert caplog.text.count("cannot be reached or written (away)") == 1
-    assert caplog.text.count("is back after") == 1
+    assert caplog.text.count("can be reached again after") == 1
     journal.close()
 
 
@@ -641,7 +641,7 @@ def test_a_store_locked_for_longer_than_mlflow_waits(folder: Path, caplog: pytes
     assert history(folder) == losses(range(400))
     assert status(folder) == "FINISHED"
     assert caplog.text.count("cannot be reached or written") == 1
-    assert "is back after" in caplog.text
+    assert "can be reached again after" in caplog.text
 
 
 @pytest.mark.usefixtures("short_locks")
@@ -651,7 +651,7 @@ def test_a_store_locked_at_the_start(folder: Path, caplog: pytest.LogCaptureFixt
     with locked(folder):
         tracker.open()
         assert tracker.run_id is None
-        assert "The run goes on" in caplog.text
+        assert "The run continues" in caplog.text
         log(tracker, range(10))
     until(lambda: tracker.run_id is not None)
     tracker.close("FINISHED")
@@ -668,7 +668,7 @@ def test_a_store_locked_until_after_the_end(folder: Path, caplog: pytest.LogCapt
         command = f"`python -m framework mode=sync mode.run='{folder}'`"
         assert command in caplog.text  # quoted: the path has a space
         assert str(folder / "journal.jsonl") in caplog.text
-        with pytest.raises(UserError, match=r"database is locked.*try again"):
+        with pytest.raises(UserError, match=r"database is locked.*Try again"):
             sync(folder)
     assert sync(folder) > 10
     assert history(folder) == losses(range(10))
@@ -752,7 +752,10 @@ def test_a_deleted_experiment_is_said(folder: Path, caplog: pytest.LogCaptureFix
     tracker.open()
     log(tracker, [1])
     tracker.close("FINISHED")
-    assert "'some/experiment' was deleted there; restore it, or choose another name" in caplog.text
+    assert (
+        "'some/experiment' was deleted in the store; restore the experiment, or choose another name"
+        in caplog.text
+    )
     client(folder).restore_experiment(experiment)
     sync(folder)
     assert history(folder) == losses([1])
@@ -776,7 +779,7 @@ def test_a_server_away_from_start_to_end_and_then_back(
     tracker.close("FINISHED")
     assert tracker.run_id is None
     assert tracker.url == f"http://127.0.0.1:{port}"
-    with pytest.raises(UserError, match="did not take everything"):
+    with pytest.raises(UserError, match="did not accept everything"):
         sync(folder, uri)
     assert "secret" not in caplog.text
 
@@ -808,16 +811,16 @@ def test_a_store_that_does_not_answer_does_not_hold_up_the_start(
     folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     answer = threading.Event()
-    opened = mlflow_store._opened
+    opened = mlflow_store._open_client
 
     def hangs(info: RunInfo) -> tuple[MlflowClient, str]:
         assert answer.wait(60)
         return opened(info)
 
-    monkeypatch.setattr(mlflow_store, "_opened", hangs)
+    monkeypatch.setattr(mlflow_store, "_open_client", hangs)
     tracker = build(folder, opening_patience=0.01)
     tracker.open()
-    assert "no answer yet" in caplog.text
+    assert "the store has not responded yet" in caplog.text
     log(tracker, range(5))
     answer.set()
     tracker.close("FINISHED")
@@ -840,11 +843,11 @@ def test_what_sends_dies_and_another_goes_on(folder: Path, caplog: pytest.LogCap
     assert tracker.run_id is None, "nobody waits for the store"
     first = sending_process(tracker)
     tracker.log_metrics({"a name [°]": 1.0}, 0, 0)
-    until(lambda: "MLflow takes no name like 'a name [°]'" in caplog.text)
+    until(lambda: "MLflow does not accept the name 'a name [°]'" in caplog.text)
     log(tracker, range(10))
     first.kill()
     log(tracker, range(10, 20))
-    until(lambda: "the sending process has ended" in caplog.text)
+    until(lambda: "the process that sends to the store has ended" in caplog.text)
     until(lambda: sending_process(tracker) is not first)
     second = sending_process(tracker)
     tracker.close("FINISHED")
@@ -859,7 +862,7 @@ def test_what_sends_and_hangs_is_ended_with_the_run(
     monkeypatch.setattr(store_process, "_COMMAND", ("sleep", "100"))
     tracker = build(folder, open_store=None, opening_patience=0.01, patience=0.1)
     tracker.open()
-    assert "no answer yet" in caplog.text
+    assert "the store has not responded yet" in caplog.text
     log(tracker, range(5))
     process = sending_process(tracker)
     tracker.close("FAILED")
@@ -954,7 +957,7 @@ def test_a_killed_run_whose_store_is_away_is_closed_later(
 ) -> None:
     with locked(killed):
         assert mark_dead(killed, "FAILED")
-    assert "did not take everything" in caplog.text
+    assert "did not accept everything" in caplog.text
     sync(killed)
     assert status(killed) == "FAILED"
 
@@ -1032,7 +1035,7 @@ def test_changed_parameters_of_a_resumed_run_become_tags(folder: Path) -> None:
 
 
 def test_a_creation_that_was_cut_short_is_found_again(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    created = mlflow_store.MlflowStore._created
+    created = mlflow_store.MlflowStore._create_run
     calls = 0
 
     def cut_short(self, info, experiment_id):
@@ -1041,7 +1044,7 @@ def test_a_creation_that_was_cut_short_is_found_again(folder: Path, monkeypatch:
         created(self, info, experiment_id)
         raise ConnectionError("the answer was lost")
 
-    monkeypatch.setattr(mlflow_store.MlflowStore, "_created", cut_short)
+    monkeypatch.setattr(mlflow_store.MlflowStore, "_create_run", cut_short)
     tracker = build(folder)
     tracker.open()
     log(tracker, [1])
@@ -1069,7 +1072,7 @@ def test_a_store_that_lost_the_run_gets_it_anew(
     assert again.run_id != tracker.run_id
     points = MlflowClient(moved).get_metric_history(str(again.run_id), "loss")
     assert [(point.step, point.value) for point in points] == losses(range(8))
-    assert "the run is stored there anew" in caplog.text
+    assert "the whole run is sent again" in caplog.text
 
 
 def test_a_store_deleted_while_the_run_goes_on_is_made_again_with_everything(
@@ -1121,7 +1124,7 @@ def test_a_run_that_never_reached_its_store_goes_on_as_one(
         def away(info: RunInfo) -> None:
             raise ConnectionError("away")
 
-        patched.setattr(mlflow_store, "_opened", away)
+        patched.setattr(mlflow_store, "_open_client", away)
         tracker = build(folder, patience=0.0)
         tracker.open()
         log(tracker, range(10))
@@ -1192,7 +1195,7 @@ def test_a_store_whose_making_was_cut_short_is_made_again(
 
     monkeypatch.setattr(mlflow_store, "SqlAlchemyStore", CutShort)
     with pytest.raises(Killed):
-        mlflow_store._opened(info)
+        mlflow_store._open_client(info)
     assert not path.exists()
     with subprocess.Popen([sys.executable, "-S", "-c", ""]) as dead:
         pass
@@ -1201,7 +1204,7 @@ def test_a_store_whose_making_was_cut_short_is_made_again(
     )  # by a process that was killed
     left.write_bytes(b"half a store")
     monkeypatch.setattr(mlflow_store, "SqlAlchemyStore", make_quickly)
-    _, experiment = mlflow_store._opened(info)
+    _, experiment = mlflow_store._open_client(info)
     assert MlflowClient(info.uri).get_experiment(experiment).name == "e"
     assert not list(tmp_path.glob(".*partial"))
 
@@ -1388,7 +1391,7 @@ def test_the_folder_of_a_run_or_a_copy_of_its_checkpoints(
         found = run_folder(run_id)
         assert found != folder
         assert (found / "checkpoints" / "model.ckpt").read_text() == "weights"
-    with pytest.raises(CheckpointError, match="cannot be had from"):
+    with pytest.raises(CheckpointError, match="cannot be read from"):
         run_folder("0" * 32)
     with pytest.raises(CheckpointError, match="There is no tracking store"):
         run_folder(run_id, "sqlite:///missing.db")

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from framework.configuration.schema import build, resolve
 from framework.errors import DataError
-from framework.runs.user_files import to_read
+from framework.runs.user_files import select_files
 
 SHAPES = {"moons": (3, 2), "tabular": (3, 2), "table_tennis": (30, 4)}
 END = [
@@ -33,12 +33,12 @@ def test_what_belongs_to_others_is_no_file_to_predict_for(
         (tmp_path / f"{name}.offsets.txt").write_text("\n".join(map(str, range(-6, 7))))
     config = resolve("data", {"name": "cest", "unreadable": unreadable, "offsets": list(range(-6, 7))})
     said = io.StringIO()
-    files, bad = to_read(
+    files, bad = select_files(
         build("data", config), sorted(tmp_path.iterdir()), config, Console(file=said, width=500)
     )
     assert [file.name for file in files] == [f"one.{main}", f"two.{main}"]
     assert not bad
-    assert said.getvalue().startswith("4 files belong to others and are read with them: one.")
+    assert said.getvalue().startswith("4 files belong to other files and are read with them: one.")
     assert len(said.getvalue().splitlines()) == 1
 
 

@@ -71,7 +71,7 @@ def _stored(
     from framework.runs.run import HOW
     from framework.storage.plain_values import read_yaml
     from framework.tracking.run_info import read_run_info
-    from framework.tracking.stores import confirmed
+    from framework.tracking.stores import confirm_address
 
     keys = {item: item.lstrip("+~").partition("=")[0] for item in overrides}
     again = ("resume", "checkpoint", *HOW)  # and keys `stored.…`, which repeat stored paths
@@ -99,7 +99,7 @@ def _stored(
     logger = values.get("logger")
     recorded = logger.get("uri") if isinstance(logger, dict) else None
     if recorded is not None and "logger.uri" not in keys.values():
-        store = confirmed(str(recorded), None, folder, folder / "config.yaml")
+        store = confirm_address(str(recorded), None, folder, folder / "config.yaml")
         values["logger"]["uri"] = store.uri if store.named else None
     said = flatten(given.get("stored") or {})
     said |= {"checkpoint": given["checkpoint"]} if "checkpoint" in keys.values() else {}

@@ -15,8 +15,8 @@ from framework.distributions.protocol import value_set
 from framework.errors import ConfigError
 from framework.model import FrozenFrontEnd, Predictor
 from framework.reports.report import report_test
-from framework.runs.run import opened
-from framework.runs.session import calibrate, for_trained, tested
+from framework.runs.run import open_run
+from framework.runs.session import add_test_parts, calibrate, for_trained
 from framework.target import Target
 from framework.uncertainty import SeveralModels
 
@@ -50,8 +50,8 @@ def run(config: Config) -> None:
     splits = session.data.splits()
     inputs = fetch(splits.validation, range(min(FEW, len(splits.validation))))["input"]  # type: ignore[arg-type]
     predictor = around_trained(session.predictor, wrappers, session.target, inputs)
-    session = tested(replace(session, parts=parts, method=method, predictor=predictor))
-    with opened(session.config) as run:
+    session = add_test_parts(replace(session, parts=parts, method=method, predictor=predictor))
+    with open_run(session.config) as run:
         session.record(run)
         calibrate(session)
         session.save_model(run)

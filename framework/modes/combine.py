@@ -18,9 +18,9 @@ from framework.data import Data
 from framework.errors import CheckpointError, ConfigError
 from framework.model import FrozenFrontEnd, Predictor
 from framework.reports.report import report_test
-from framework.runs.job import by_number, recorded
-from framework.runs.run import opened
-from framework.runs.session import around, begin, calibrate, tested
+from framework.runs.job import find_job_folders, natural_order_key
+from framework.runs.run import open_run
+from framework.runs.session import add_test_parts, calibrate, for_predictor, set_up_process
 from framework.storage.enclosed import require_enclosed
 from framework.uncertainty import Joining
 
@@ -37,7 +37,7 @@ class CombineOptions(Options):
 def run(config: Config) -> None:
     """Join the members, write checkpoints/model.ckpt for the other modes, and print the table row of its test."""
     options = config.options(CombineOptions)
-    console = begin(config.settings)
+    console = set_up_process(config.settings)
     sources = found(options.members)
     again = flatten(config.settings.stored)
     members = [
@@ -53,9 +53,11 @@ def run(config: Config) -> None:
     ]
     parts = {**described.config, "uncertainty": [*described.config["uncertainty"], *wrappers]}
     method = " + ".join([described.method, *(part["name"] for part in wrappers)]) if described.method else ""
-    session = tested(around(config, members[0][0], replace(described, config=parts, method=method), console))
+    session = add_test_parts(
+        for_predictor(config, members[0][0], replace(described, config=parts, method=method), console)
+    )
     session.predictor = joined(parts, session.data, [member for member, _ in members])
-    with opened(session.config) as run:
+    with open_run(session.config) as run:
         session.record(run)
         calibrate(session)
         session.save_model(run)
@@ -77,8 +79,8 @@ def found(members: str | Sequence[str]) -> list[str | Path]:
     else:
         folder = Path(members).expanduser()
         require_enclosed(folder, ConfigError)
-        runs = sorted((path.parent.parent for path in folder.glob(f"*/{_MODEL}")), key=by_number)
-        listed = [*(runs or (job for job in recorded(folder) if (job / _MODEL).is_file()))]
+        runs = sorted((path.parent.parent for path in folder.glob(f"*/{_MODEL}")), key=natural_order_key)
+        listed = [*(runs or (job for job in find_job_folders(folder) if (job / _MODEL).is_file()))]
     if len(listed) < 2:
         raise ConfigError(
             f"mode.members = {members!r} gives {len(listed)} trained models; wanted at least two: the folder of "

@@ -19,9 +19,9 @@ from framework.configuration.settings import Settings
 from framework.data import Data
 from framework.encoder import Encoder
 from framework.errors import ConfigError, DataError
-from framework.runs.run import opened
-from framework.runs.session import begin, record_citations
-from framework.runs.user_files import UNREADABLE, to_read
+from framework.runs.run import open_run
+from framework.runs.session import record_citations, set_up_process
+from framework.runs.user_files import UNREADABLE, select_files
 from framework.storage.enclosed import require_enclosed
 from framework.storage.files import write_whole
 from framework.storage.names import spell_name
@@ -79,7 +79,7 @@ class Collection:
 def run(config: Config) -> None:
     """Write this job's share of the parts; parts that exist already are left unchanged."""
     options = config.options(EncodeOptions)
-    console = begin(config.settings)
+    console = set_up_process(config.settings)
     chosen = config.values
     parts = {
         "data": resolve("data", chosen.get("data") or {}),
@@ -92,10 +92,10 @@ def run(config: Config) -> None:
     collection = collected(Path(options.files).expanduser(), Path(options.into).expanduser(), options.part)
     require_enclosed(collection.into, ConfigError)
     files = [collection.root / name for name in collection.names]
-    kept, bad = to_read(build("data", parts["data"]), files, parts["data"], console)
+    kept, bad = select_files(build("data", parts["data"]), files, parts["data"], console)
     collection = replace(collection, names=[file.relative_to(collection.root).as_posix() for file in kept])
     mine = share(collection.parts, options.share)
-    with opened(config) as run:
+    with open_run(config) as run:
         record_citations(run, parts)
         describe(collection, parts)
         try:

@@ -29,9 +29,9 @@ from framework.evaluation.prediction_sets import (
 from framework.evaluation.splits import BLOCK, predict
 from framework.model import Predictor
 from framework.prediction import Prediction, table_columns
-from framework.runs.run import opened
+from framework.runs.run import open_run
 from framework.runs.session import for_trained
-from framework.runs.user_files import UNREADABLE, files_in, say_left_out, to_read
+from framework.runs.user_files import UNREADABLE, list_files, print_left_out, select_files
 from framework.storage.names import spell_name
 from framework.target import Target
 from framework.training.batches import Batches, track_batches
@@ -55,15 +55,15 @@ class PredictOptions(Options):
 def run(config: Config) -> None:
     """Predict, and write predictions.csv into the run folder."""
     options = config.options(PredictOptions)
-    files, folders = files_in(Path(options.files).expanduser()) if options.files else ([], [])
+    files, folders = list_files(Path(options.files).expanduser()) if options.files else ([], [])
     session = for_trained(config, prepare=not files)
-    say_left_out(session.console, "folders", "not looked into", folders)
+    print_left_out(session.console, "folders", "not looked into", folders)
     if options.interval:
         require_interval(session.target, options.interval, by="mode.interval")
     bad: list[Path] = []
     if len(files) > 1:
-        files, bad = to_read(session.data, files, session.parts["data"], session.console)
-    with opened(session.config) as run:
+        files, bad = select_files(session.data, files, session.parts["data"], session.console)
+    with open_run(session.config) as run:
         if bad:
             (run.folder / UNREADABLE).write_text(
                 "".join(f"{spell_name(file)}\n" for file in bad), encoding="utf-8"

@@ -2,14 +2,14 @@
 
 from framework.configuration.config import Config, Options
 from framework.reports.report import report_test
-from framework.runs.run import opened
-from framework.runs.session import for_trained, tested
+from framework.runs.run import open_run
+from framework.runs.session import add_test_parts, for_trained
 
 
 def run(config: Config) -> None:
     """Test the model of `checkpoint`, and print its table row."""
     config.options(Options)
-    session = tested(for_trained(config))
-    with opened(session.config) as run:
+    session = add_test_parts(for_trained(config))
+    with open_run(session.config) as run:
         session.record(run)
         report_test(run, session)

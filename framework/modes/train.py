@@ -2,9 +2,9 @@
 
 from framework.configuration.config import Config, Options
 from framework.reports.report import report_test, report_training
-from framework.runs.fit import fit, keep_model_alone
-from framework.runs.job import leave_value
-from framework.runs.run import opened
+from framework.runs.fit import fit, remove_resume_files
+from framework.runs.job import write_value
+from framework.runs.run import open_run
 from framework.runs.session import calibrate, for_training
 from framework.storage.first_rank import first_rank
 
@@ -13,7 +13,7 @@ def run(config: Config) -> float:
     """Train and test a model, and return the validation loss of the kept weights (nats), which a sweeper minimises."""
     config.options(Options)
     session = for_training(config)
-    with opened(config) as run:
+    with open_run(config) as run:
         session.console.print(f"run folder: {run.folder}")
         session.record(run)
         loss, epoch = fit(session, run)
@@ -24,6 +24,6 @@ def run(config: Config) -> float:
         calibrate(session)
         session.save_model(run)
         report_test(run, session)
-        keep_model_alone(run)
-    leave_value(config.folder, loss)
+        remove_resume_files(run)
+    write_value(config.folder, loss)
     return loss

@@ -18,7 +18,7 @@ from framework.metric import Metric
 from framework.reports.report import save_picture
 from framework.reports.table import Better, machine, results_table, write_csv
 from framework.runs.job import refuse_idle
-from framework.runs.run import Run, opened
+from framework.runs.run import Run, open_run
 from framework.runs.session import Session, for_trained
 
 ERROR, AXIS = "error_nats", "error of the mean log-likelihood (nats, RMS)"
@@ -40,7 +40,7 @@ def run(config: Config) -> None:
     """Write work_precision.csv and a figure, and print the table with the points of the Pareto front marked."""
     options = config.options(WorkPrecisionOptions)
     session = for_trained(config)
-    with opened(session.config) as run:
+    with open_run(session.config) as run:
         session.record(run)
         _run(run, session, options)
 

@@ -1,1 +1,1 @@
-"""The run: its folder, its session, its provenance, and the files that it reads."""
+"""Runs: their folder, session and provenance, and the files that they read."""

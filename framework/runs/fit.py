@@ -13,7 +13,7 @@ from framework.configuration.loading import fill, predictor_weights
 from framework.configuration.settings import TRAINER_OURS
 from framework.data import Data
 from framework.model import FrozenFrontEnd, fitted_models, learns
-from framework.runs.run import Run, going_on
+from framework.runs.run import Run, resume_arguments
 from framework.runs.session import Session
 from framework.storage.checkpoints import read
 from framework.storage.first_rank import first_rank
@@ -28,20 +28,20 @@ from framework.uncertainty import outermost
 
 
 def fit(session: Session, run: Run) -> tuple[float, int | None]:
-    """Fit the predictor, leave the kept weights in it, and return their validation loss (nats) and epoch (from 0).
+    """Fit the predictor, and return the validation loss (nats) and epoch (from 0) of the weights that it has then.
 
     The epoch is None if the head was fitted in one step, or if nothing learns (a renderer, for example). Ranks other
     than the first return when training has ended.
     """
     if not learns(session.predictor):
-        return _at_once(session, run), None
-    return _by_gradient(session, run)
+        return _fit_at_once(session, run), None
+    return _fit_by_gradient(session, run)
 
 
-def _at_once(session: Session, run: Run) -> float:
+def _fit_at_once(session: Session, run: Run) -> float:
     if run.resumed:
         run.tracker.drop_after(-1)  # a killed run may have logged its loss, which has step 0
-    fed = _cached(session) if fitted_models(session.predictor) else session.data
+    fed = _cache_features(session) if fitted_models(session.predictor) else session.data
     inner = session.predictor
     if fed is not session.data and isinstance(inner, FrozenFrontEnd):
         inner = inner.predictor
@@ -54,9 +54,11 @@ def _at_once(session: Session, run: Run) -> float:
     return loss
 
 
-def _by_gradient(session: Session, run: Run) -> tuple[float, int]:
+def _fit_by_gradient(session: Session, run: Run) -> tuple[float, int]:
     settings = session.settings
-    fed = session.data if session.objectives else _cached(session)  # objectives may change or add inputs
+    fed = (
+        session.data if session.objectives else _cache_features(session)
+    )  # objectives may change or add inputs
     training = Training(
         session.predictor,
         session.objectives,
@@ -76,11 +78,11 @@ def _by_gradient(session: Session, run: Run) -> tuple[float, int]:
     several = outermost(session.predictor)
     batches.orders = several.model_count if several else 1
     batches.attach(trainer)
-    resume = _resumed_from(session, run)
+    resume = _resume_checkpoint(session, run)
     with end_together(trainer, run.stopper, partial(_give_up, run)):
         trainer.fit(training, datamodule=batches, ckpt_path=resume, weights_only=True)
-        _part()
-    early = any(isinstance(one, StopEarly) and one.stopped for one in trainer.callbacks)  # type: ignore[attr-defined]
+        _leave_process_group()
+    early = any(isinstance(callback, StopEarly) and callback.stopped for callback in trainer.callbacks)  # type: ignore[attr-defined]
     session.console.print(
         f"{'stopped early at' if early else 'ended at'} epoch {trainer.current_epoch}, kept {keep.kept_epoch + 1}"
     )
@@ -90,8 +92,8 @@ def _by_gradient(session: Session, run: Run) -> tuple[float, int]:
     return keep.kept_loss, keep.kept_epoch
 
 
-def _resumed_from(session: Session, run: Run) -> Path | None:
-    """Return the checkpoint from which training continues, or None; every rank looks before rank 0 writes another."""
+def _resume_checkpoint(session: Session, run: Run) -> Path | None:
+    """Return the checkpoint from which training continues, or None; every rank calls this before rank 0 writes one."""
     resume = find_resumable(run.checkpoints) if run.resumed else None
     if run.resumed and first_rank():
         step = 0 if resume is None else int(read(resume)["global_step"])
@@ -104,30 +106,30 @@ def _resumed_from(session: Session, run: Run) -> Path | None:
     return resume
 
 
-def keep_model_alone(run: Run) -> None:
-    """Delete the files that only resuming needs, because the run is about to finish and model.ckpt is written."""
+def remove_resume_files(run: Run) -> None:
+    """Delete the checkpoints that only a resumed run needs, after model.ckpt was written."""
     for name in (*TRAINED, BEST):
         (run.checkpoints / name).unlink(missing_ok=True)
 
 
 def _give_up(run: Run, error: BaseException) -> None:
-    """Close the run of a process that cannot continue and will end without returning to the caller."""
+    """Close the run of a process that cannot continue; the process will end without returning to the caller."""
     stopped = isinstance(error, Stopped)
     sentence = f"stopped by {error.signal}" if isinstance(error, Stopped) else str(error)
-    sys.stderr.write(f"{sentence}; go on with: python -m framework {going_on(run)}\n")
+    sys.stderr.write(f"{sentence}; continue with: python -m framework {resume_arguments(run)}\n")
     run.tracker.set_tags({"error": sentence})
     run.tracker.close("KILLED" if stopped else "FAILED")
 
 
-def _part() -> None:
-    """Leave the process group, because only rank 0 does the rest and no collective may wait for the others."""
+def _leave_process_group() -> None:
+    """Leave the process group, so that the rest, which only rank 0 does, does not wait for other ranks."""
     if dist.is_available() and dist.is_initialized():
         dist.barrier()
         dist.destroy_process_group()
 
 
-def _cached(session: Session) -> Data:
-    """Return the data with precomputed features if those equal the features of each step, else the data unchanged."""
+def _cache_features(session: Session) -> Data:
+    """Return the data with precomputed features if the features do not change from step to step, else the data."""
     predictor, data = session.predictor, session.data
     if not isinstance(predictor, FrozenFrontEnd) or data.varies or not fits(data, predictor.features):
         return data

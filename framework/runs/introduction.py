@@ -15,16 +15,16 @@ from framework.target import Target
 MOST = 12
 """Largest number of names that a line lists."""
 BUSY = 1.0
-"""Load of the machine from which on the output mentions it."""
+"""Smallest load of the machine that the output mentions."""
 
 
 def introduce(data: Data, console: Console) -> None:
     """Print what prepared data contain."""
-    _say(lines(data), console)
+    _print_lines(lines(data), console)
 
 
 def introduce_threads(chosen: int | None, console: Console) -> None:
-    """Print how many threads compute, and the reason for that number.
+    """Print the number of threads that compute, and the reason for the number.
 
     Args:
         chosen: Value of the setting `threads`.
@@ -33,7 +33,7 @@ def introduce_threads(chosen: int | None, console: Console) -> None:
     allowed = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
     cores = Cores(allowed, os.cpu_count() or allowed, load)
-    _say([threads_line(torch.get_num_threads(), chosen, cores, os.environ)], console)
+    _print_lines([threads_line(torch.get_num_threads(), chosen, cores, os.environ)], console)
 
 
 def introduce_model(description: Description, method: str, data: Data | None, console: Console) -> None:
@@ -46,16 +46,21 @@ def introduce_model(description: Description, method: str, data: Data | None, co
         console: Console to print on.
     """
     trained_on = shorten(description.config["data"]["name"]) + " (synthetic)" * description.synthetic
-    said = [f"model: {shorten(method)}, trained on {trained_on}", f"predicts {predicted(description.target)}"]
-    _say([*said, *([] if data is None else _samples(data)), *description.remarks], console)
+    heading = [
+        f"model: {shorten(method)}, trained on {trained_on}",
+        f"predicts {describe_target(description.target)}",
+    ]
+    _print_lines([*heading, *([] if data is None else _samples(data)), *description.remarks], console)
 
 
 def lines(data: Data) -> list[str]:
-    """Return the first lines of a run's output: inputs, target and number of samples."""
+    """Return the first lines of a run's output: inputs, target, numbers of samples, and remarks on the data."""
     read = (
-        _listed(data.columns) if data.columns else f"inputs of shape {'×'.join(map(str, data.input_shape))}"
+        _list_names(data.columns)
+        if data.columns
+        else f"inputs of shape {'×'.join(map(str, data.input_shape))}"
     )
-    return [f"reads {read}", f"predicts {predicted(data.target)}", *_samples(data)]
+    return [f"reads {read}", f"predicts {describe_target(data.target)}", *_samples(data)]
 
 
 class Cores(NamedTuple):
@@ -73,7 +78,7 @@ class Cores(NamedTuple):
 
 
 def threads_line(threads: int, chosen: int | None, cores: Cores, environment: Mapping[str, str]) -> str:
-    """Return a line that says how many threads compute, and the reason for that number.
+    """Return a line with the number of threads that compute, and the reason for the number.
 
     Args:
         threads: Number of threads that PyTorch uses.
@@ -81,30 +86,30 @@ def threads_line(threads: int, chosen: int | None, cores: Cores, environment: Ma
         cores: Processor cores of this machine.
         environment: Environment variables of this process.
     """
-    of = "1 core" if cores.allowed == 1 else f"{cores.allowed} cores"
+    cores_text = "1 core" if cores.allowed == 1 else f"{cores.allowed} cores"
     limited = f" that this process may use of the machine's {cores.all}" * (cores.allowed < cores.all)
     names = [name for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS") if environment.get(name)]
     if chosen is not None:
-        why = f"as threads={chosen} says"
+        reason = f"as threads={chosen} says"
     elif names:
-        why = f"as {names[0]}={shorten(environment[names[0]], 20)} says, which a sweep sets for each of its jobs"
+        reason = f"as {names[0]}={shorten(environment[names[0]], 20)} says, which a sweep sets for each of its jobs"
     else:
-        why = "one for each core; threads=1 sets another number"
+        reason = "one for each core; threads=1 sets another number"
     busy = f"; the machine's load was {cores.load:.1f} in the last minute" * (cores.load >= BUSY)
-    return f"threads: {threads} on {of}{limited}, {why}{busy}"
+    return f"threads: {threads} on {cores_text}{limited}, {reason}{busy}"
 
 
-def predicted(target: Target) -> str:
+def describe_target(target: Target) -> str:
     """Return a description of a target in words."""
     if target.kind == "class":
-        return f"one of {len(target.names)} classes: {_listed(target.names)}"
+        return f"one of {len(target.names)} classes: {_list_names(target.names)}"
     if target.kind == "image":
         return f"images of {'×'.join(map(str, target.size))} pixels"
-    return f"{'angles' if target.kind == 'angle' else 'numbers'}: {_listed(target.names)}"
+    return f"{'angles' if target.kind == 'angle' else 'numbers'}: {_list_names(target.names)}"
 
 
 def _samples(data: Data) -> list[str]:
-    """Return lines with the number of samples of each split, and remarks on peculiarities of the user's files."""
+    """Return a line with the number of samples of each split, and the data set's remarks on the user's files."""
     sizes = [
         f"{name} {len(part)}"
         for name, part in zip(Splits._fields, data.splits(), strict=True)
@@ -114,11 +119,11 @@ def _samples(data: Data) -> list[str]:
     return [f"samples: {', '.join(sizes)}{skipped}", *(shorten(remark, 1000) for remark in data.remarks)]
 
 
-def _say(said: Sequence[str], console: Console) -> None:
-    for line in said:
+def _print_lines(texts: Sequence[str], console: Console) -> None:
+    for line in texts:
         console.print(line, soft_wrap=True, highlight=False, markup=False)
 
 
-def _listed(names: Sequence[str]) -> str:
+def _list_names(names: Sequence[str]) -> str:
     rest = f" and {len(names) - MOST} more" if len(names) > MOST else ""
     return shorten(", ".join(names[:MOST]), 400) + rest

@@ -12,9 +12,9 @@ from framework.storage.first_rank import first_rank
 from framework.storage.plain_values import read_json
 
 PARENT = "FRAMEWORK_SWEEP_PARENT"
-"""Environment variable that gives a job the id of the tracking run under which its sweep is recorded."""
+"""Environment variable with the id of the sweep's run in the tracking store, which becomes the parent of the job."""
 SYNCED_WITHIN = 60.0
-"""Seconds; for a job shorter than this, the sweep sends its journal to the tracking store after it has ended."""
+"""Duration in seconds of a job up to which the sweep sends the job's journal to the tracking store afterwards."""
 RECORD = "job.json"
 VALUE = "value.json"
 _COMMAND = "multirun.yaml"
@@ -35,9 +35,9 @@ def read_record(folder: Path) -> dict[str, Any]:
     """Return the record of the job in a folder (`framework.sweeps.jobs.Job`), which may come from an untrusted source.
 
     Raises:
-        DataError: There is no record, or a sweep would not write such a record.
+        DataError: The record is missing, damaged, or different from what a sweep writes.
     """
-    path, remedy = folder / RECORD, "Delete it, and the job runs anew."
+    path, remedy = folder / RECORD, "Delete the file; the job then runs again."
     record = read_json(path, "the record of a job", remedy)
     wrong = [
         key
@@ -45,44 +45,44 @@ def read_record(folder: Path) -> dict[str, Any]:
         if key in record and (not isinstance(record[key], kinds) or isinstance(record[key], bool))
     ]
     if "overrides" not in record or (
-        not wrong and not all(isinstance(one, str) for one in record["overrides"])
+        not wrong and not all(isinstance(item, str) for item in record["overrides"])
     ):
         wrong.append("overrides")
     if "key" in record and "number" not in record:
         wrong.append("number")
     if wrong:
-        found = quote(record.get(wrong[0]))
-        raise DataError(f"{path} says {wrong[0]} = {found}; wanted what a sweep writes. {remedy}")
+        value = quote(record.get(wrong[0]))
+        raise DataError(f"{path} contains {wrong[0]} = {value}, which no sweep writes. {remedy}")
     return record
 
 
-def by_number(folder: Path) -> list[tuple[int, str]]:
-    """Return a key that sorts folders by name, with 2 before 10."""
+def natural_order_key(folder: Path) -> list[tuple[int, str]]:
+    """Return a sort key for folders that puts the name 2 before the name 10."""
     return [(len(part), part) for part in folder.parts]
 
 
-def recorded(folder: Path) -> list[Path]:
-    """Return the folders of a sweep's jobs at any depth, sorted `by_number`, without those of a sweep inside it."""
-    found = []
+def find_job_folders(folder: Path) -> list[Path]:
+    """Return the folders of a sweep's jobs at any depth, sorted by `natural_order_key`, without inner sweeps' jobs."""
+    job_folders = []
     for name, below, files in os.walk(folder):
-        here = Path(name)
-        # A damaged record may be a folder; the function that reads it raises the error.
+        path = Path(name)
+        # a record may be damaged and be a folder; the function that reads the record raises the error
         is_job = RECORD in files or RECORD in below
         if is_job:
-            found.append(here)
-        if is_job or (here != folder and _COMMAND in files):
+            job_folders.append(path)
+        if is_job or (path != folder and _COMMAND in files):
             below.clear()
-    return sorted(found, key=by_number)
+    return sorted(job_folders, key=natural_order_key)
 
 
-def leave_value(folder: Path, value: float) -> None:
-    """Write the number that an optimising sweeper reads; do nothing if `folder` does not belong to a sweep."""
+def write_value(folder: Path, value: float) -> None:
+    """Write the number that an optimising sweeper reads; do nothing if the run in `folder` is not a job of a sweep."""
     if (folder / RECORD).is_file():
         write_whole(folder / VALUE, json.dumps(value).encode())
 
 
 def refuse_idle(folder: Path, sentence: str) -> None:
-    """Refuse a setting that has no effect; in a job of a sweep, only print a note, since other jobs may read it.
+    """Refuse a setting that has no effect; in a job of a sweep, print a note, because other jobs may read the setting.
 
     Args:
         folder: Folder of the run.

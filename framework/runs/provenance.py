@@ -12,24 +12,24 @@ _PACKAGES = ("torch", "pytorch-lightning", "hydra-core", "omegaconf", "numpy", "
 def package_versions() -> dict[str, str]:
     """Return the versions of Python, of the packages that every run uses, and of all packages that provide plugins.
 
-    The versions are read from package metadata; nothing is imported.
+    The versions are read from package metadata, and no package is imported.
     """
     names = set(_PACKAGES)
     for group in GROUPS:
         names |= {entry.dist.name for entry in installed(group).values() if entry.dist and entry.dist.name}
-    found = {"python": platform.python_version()}
+    versions = {"python": platform.python_version()}
     for name in sorted(names):
         try:
-            found[name] = version(name)
+            versions[name] = version(name)
         except PackageNotFoundError:
             continue  # the package is not installed, so it is not in use
-    return found
+    return versions
 
 
 def flatten(config: Mapping[str, object]) -> dict[str, object]:
     """Return a nested config with dotted keys: {"a": {"b": [1, {"c": 2}]}} becomes {"a.b.0": 1, "a.b.1.c": 2}.
 
-    A list of plain values stays one value. An empty mapping or list is also kept as a value, so that nothing is lost.
+    A list of plain values stays one value, and so does an empty mapping or list.
     """
     flat: dict[str, object] = {}
     for key, value in config.items():

@@ -1,4 +1,4 @@
-"""One run with its folder, tracking and signals; it is closed as FINISHED, FAILED or KILLED whatever happens."""
+"""Run with its folder, tracking and signals, which is always closed with the status FINISHED, FAILED or KILLED."""
 
 import itertools
 import os
@@ -27,7 +27,7 @@ from framework.tracking.run_info import Destination, read_run_info
 from framework.tracking.signals import Stopped, Stopper
 from framework.tracking.silent import SilentTracker
 from framework.tracking.tracker import MlflowTracker, NoTracker, Tracker
-from framework.tracking.watch import watched
+from framework.tracking.watch import start_watcher
 
 TRACEBACK = "traceback.txt"
 """File with the traceback of a run that failed or was stopped; it is removed when the resumed run finishes."""
@@ -44,9 +44,9 @@ LEFT_BY_RUNS = (
     TRACEBACK,
     "unreadable.txt",
 )
-"""Files and folders that modes write into a run folder, except the journal, which the tracker keeps."""
+"""Files and folders that modes write into a run folder; the tracker writes the journal in addition."""
 HOW = ("threads", "workers", "logger.uri")
-"""Keys that do not affect what a run computes, so a resumed run may have other values of them."""
+"""Keys that do not affect the result of a run, so that their values may differ in the resumed run."""
 
 
 @dataclass(frozen=True)
@@ -82,38 +82,38 @@ class Run:
 
 
 def stored_config(folder: Path) -> dict[str, Any] | None:
-    """Return the config with which a run folder was made; None if it holds none yet."""
+    """Return the config in a run folder; None if the folder contains no config yet."""
     path = folder / "config.yaml"
     return read_yaml(path, "the config of a run") if path.is_file() else None
 
 
-def goes_on(config: Config) -> bool:
-    """Return whether the run in the folder has the same config, did not finish, and may be resumed (`resume`)."""
+def may_resume(config: Config) -> bool:
+    """Return whether the folder contains an unfinished run with this config, and `resume` allows to continue it."""
     earlier = read_run_info(config.folder)
     return (
         earlier is not None
         and earlier.status != "FINISHED"
         and config.settings.resume != "never"
-        and _same(stored_config(config.folder), config.values)
+        and _same_settings(stored_config(config.folder), config.values)
     )
 
 
 @contextmanager
-def opened(config: Config) -> Iterator[Run]:
+def open_run(config: Config) -> Iterator[Run]:
     """Open the run for the block, and close it with the right status at the end.
 
-    The run in the folder is continued if `goes_on` returns True; otherwise the files of that run are set aside. A rank
-    other than the first writes nothing and gets a silent tracker.
+    The run in the folder is continued if `may_resume` returns True; otherwise the files of that run are moved to a
+    subfolder. A rank other than the first writes nothing and gets a silent tracker.
     """
     stopper = Stopper()
-    earlier, resumed = read_run_info(config.folder), goes_on(config)
+    earlier, resumed = read_run_info(config.folder), may_resume(config)
     if not first_rank():
         with stopper.installed():
             yield Run(config, SilentTracker(config.folder), stopper, resumed)
         return
     config.folder.mkdir(parents=True, exist_ok=True)
     tracker = _tracker(config, earlier.run_id if resumed and earlier else None, resumed)
-    with stopper.installed(), watched(config.folder):
+    with stopper.installed(), start_watcher(config.folder):
         tracker.open()  # from here on, only this process writes to the folder
         run = Run(config, tracker, stopper, resumed)
         try:
@@ -124,22 +124,25 @@ def opened(config: Config) -> Iterator[Run]:
                 tracker.set_tags({"error": None})
             yield run
         except BaseException as error:
-            _record(run, error)
+            _record_error(run, error)
             killed = isinstance(error, KeyboardInterrupt | Stopped)
             tracker.close("KILLED" if killed else "FAILED")
             if killed:
-                sys.stderr.write(f"stopped; go on with: python -m framework {going_on(run)}\n")
+                sys.stderr.write(f"stopped; continue with: python -m framework {resume_arguments(run)}\n")
             if refused := describe_unwritable(error):
-                raise DataError(f"{refused} What was written is whole: {going_on(run)} goes on.") from error
+                raise DataError(
+                    f"{refused} All files of the run are undamaged; {resume_arguments(run)} continues it."
+                ) from error
             raise
         if resumed:
             (config.folder / TRACEBACK).unlink(missing_ok=True)
         tracker.close("FINISHED")
 
 
-def going_on(run: Run) -> str:
-    """Return the arguments of the command that continues a run, as typed into a shell."""
-    store = run.settings.logger.uri  # a stored address or path is used only if the user repeats it
+def resume_arguments(run: Run) -> str:
+    """Return the arguments of the command that continues a run, quoted for a shell."""
+    # the address of a store and paths are included, because stored ones are used only if the user repeats them
+    store = run.settings.logger.uri
     own = [f"resume={run.folder}", *([f"logger.uri={store}"] if store else [])]
     return " ".join([*map(shlex.quote, own), *shell_arguments(paths_of(run.config.values))])
 
@@ -147,41 +150,41 @@ def going_on(run: Run) -> str:
 def _begin_folder(config: Config) -> None:
     """Write the config into the folder, after moving the files of an earlier run to `earlier.<n>`.
 
-    They are moved so that none of them is resumed from, loaded or compared as a file of this run.
+    The files are moved, so that no command resumes, loads or compares them as files of the new run.
     """
     folder = config.folder
-    left = [folder / name for name in LEFT_BY_RUNS if (folder / name).exists()]
-    if left:
+    earlier_files = [folder / name for name in LEFT_BY_RUNS if (folder / name).exists()]
+    if earlier_files:
         aside = next(path for n in itertools.count(1) if not (path := folder / f"earlier.{n}").exists())
         aside.mkdir()
-        for path in left:
+        for path in earlier_files:
             path.replace(aside / path.name)
     (folder / "checkpoints").mkdir()
     write_whole(folder / "overrides.yaml", yaml.safe_dump(list(config.overrides)).encode())
     write_whole(folder / "config.yaml", yaml.safe_dump(dict(config.values), sort_keys=False).encode())
 
 
-def _same(stored: Mapping[str, Any] | None, values: Mapping[str, Any]) -> bool:
+def _same_settings(stored: Mapping[str, Any] | None, values: Mapping[str, Any]) -> bool:
     if stored is None:
         return False
-    one, two = (
+    stored_settings, new_settings = (
         {key: value for key, value in flatten(config).items() if key not in ("resume", *HOW)}
         for config in (stored, values)
     )
-    return one == two
+    return stored_settings == new_settings
 
 
 def _tracker(config: Config, run_id: str | None, resumed: bool) -> Tracker:
     if config.settings.logger.name == "none":
         return NoTracker(config.folder, resumed=resumed)
     parent = os.environ.get(PARENT)
-    named = run_name(config.settings, _method(config) or config.mode, config.overrides)
+    name = run_name(config.settings, _method(config) or config.mode, config.overrides)
     return MlflowTracker(
         config.folder,
         Destination(
             config.settings.logger.uri,
             store_experiment(config.values, config.trained_on),
-            named,
+            name,
             parent,
             run_id,
         ),
@@ -191,7 +194,7 @@ def _tracker(config: Config, run_id: str | None, resumed: bool) -> Tracker:
 
 
 def _method(config: Config) -> str | None:
-    """Return the density head, which names a training without an experiment; None for other runs."""
+    """Return the name of the density head, as the method of a training without an experiment; None for other modes."""
     head = config.values.get("density_head") if config.mode == "train" else None
     return str(head.get("name")) if isinstance(head, Mapping) else None
 
@@ -199,8 +202,8 @@ def _method(config: Config) -> str | None:
 def run_name(settings: Settings, method: str, overrides: Sequence[str]) -> str:
     """Return a name that distinguishes a run from similar ones.
 
-    It consists of the method, the changes on the command line, and the seed. The part before the first comma is also
-    the name of the run's model in the store.
+    The name consists of the method, the changes on the command line, and the seed. The part before the first comma is
+    also the name of the run's model in the store.
 
     Args:
         settings: Settings of the run.
@@ -234,10 +237,10 @@ def _describe(run: Run) -> None:
     run.tracker.log_artifact(run.folder / "overrides.yaml")
 
 
-def _record(run: Run, error: BaseException) -> None:
+def _record_error(run: Run, error: BaseException) -> None:
     """Store the traceback in the run folder, and the error message as a tag of the run."""
     path = run.folder / TRACEBACK
-    with suppress(OSError):  # on a full disk, the error itself is all that can be reported
+    with suppress(OSError):  # on a full disk, only the error itself can be reported
         write_whole(path, escape_undecodable("".join(traceback.format_exception(error))).encode())
         run.tracker.log_artifact(path)
     sentence = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"

@@ -1,4 +1,4 @@
-"""Session of a command: threads, device and all parts, built and checked against each other before training."""
+"""Session of a command: device, data, model and metrics, built and checked against each other before training."""
 
 import ctypes
 import logging
@@ -56,7 +56,7 @@ from framework.objective import Objective
 from framework.prediction import Prediction, true_image
 from framework.runs.introduction import introduce, introduce_model, introduce_threads
 from framework.runs.job import refuse_idle
-from framework.runs.run import Run, goes_on
+from framework.runs.run import Run, may_resume
 from framework.storage.checkpoints import read
 from framework.storage.first_rank import first_rank
 from framework.storage.progress import output
@@ -67,7 +67,7 @@ from framework.training.checkpoint import WholeCheckpoints, find_resumable
 from framework.uncertainty import remarks
 
 FEW = 8
-"""Number of validation samples with which wrappers are tried before training, since some need more than one."""
+"""Number of validation samples on which wrappers are tried before training; some wrappers need more than one."""
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # constants of malloc.h
 
 
@@ -76,17 +76,17 @@ class Session:
     """Objects with which a mode works.
 
     Attributes:
-        config: Config of the command; in a test, settings that affect its numbers come from the model's own run.
-        parts: Every plugin with every parameter, as they were built.
+        config: Config of the command; for a stored model, settings that affect its numbers come from the model's run.
+        parts: Resolved configs of all plugins, with every parameter.
         method: Name of the model in tables.
         target: Target that is predicted.
-        data: Data set, prepared unless only a user's own files are read.
+        data: Data set; it is prepared, unless only the user's own files are read.
         predictor: Predictor, untrained or as loaded.
         device: Device on which the predictor is evaluated.
-        console: Console for people; it prints nothing in ranks other than the first.
+        console: Console for the user; it prints nothing in ranks other than the first.
         objectives: Objectives of the training loss.
-        metrics: New metrics without any state, in the order of the config; empty before `tested`.
-        outliers: Prepared outliers, if a metric reads them; None before `tested`.
+        metrics: New metrics without any state, in the order of the config; empty before `add_test_parts`.
+        outliers: Prepared outliers, if a metric reads them; None before `add_test_parts`.
     """
 
     config: Config
@@ -118,23 +118,23 @@ class Session:
         return f"{self.data_title} · {self.method}"
 
     def batches(self, data: Data | None = None) -> Batches:
-        """Return the training batches of the session's data, or of `data`, which replaces them."""
+        """Return the training batches of the session's data or, if given, of `data`."""
         chosen = self.settings
         return Batches(
             data or self.data, batch_size=chosen.batch_size, workers=chosen.workers, seed=chosen.seed
         )
 
     def blocks(self) -> Batches:
-        """Return the session's data for evaluation, in blocks of one size whatever the batch size is."""
+        """Return the session's data for evaluation, in blocks of `BLOCK` samples, independent of the batch size."""
         return Batches(self.data, batch_size=BLOCK, workers=self.settings.workers, seed=self.settings.seed)
 
     def description(self) -> dict[str, Any]:
-        """Return the description that a checkpoint holds beside the weights."""
+        """Return the description that a checkpoint contains in addition to the weights."""
         remarks_now = remarks(self.predictor)
         return Description.of(self.parts, self.data, self.method, self.settings, remarks_now).stored()
 
     def record(self, run: Run) -> None:
-        """Record the data sets that the run reads, and write the references to cite."""
+        """Record the data sets that the run reads, and write the file of references to cite."""
         for role, data in (("data", self.data), ("outliers", self.outliers)):
             if data is not None:
                 about = {"synthetic": str(data.synthetic).lower(), "skipped": str(data.skipped)}
@@ -146,7 +146,7 @@ class Session:
         record_citations(run, self.parts)
 
     def save_model(self, run: Run) -> None:
-        """Write weights and description for `framework.load`; the file is also the run's model in the store."""
+        """Write weights and description to model.ckpt for `framework.load`; the file is also the model in the store."""
         path = run.checkpoints / "model.ckpt"
         state = {f"{PREFIX}{key}": value.cpu() for key, value in self.predictor.state_dict().items()}
         WholeCheckpoints().save_checkpoint({"framework": self.description(), "state_dict": state}, path)
@@ -161,36 +161,37 @@ def record_citations(run: Run, parts: Resolved) -> None:
     run.tracker.log_artifact(path)
 
 
-def begin(settings: Settings) -> Console:
+def set_up_process(settings: Settings) -> Console:
     """Set up threads, memory and Lightning's messages in this process, and return the console to print on."""
     if settings.threads:
         torch.set_num_threads(settings.threads)
     keep_memory()
-    quiet()
+    silence_lightning()
     return output()
 
 
 def for_training(config: Config) -> Session:
-    """Build everything from the config, prepare the data, try the metrics on a prediction, and return the session.
+    """Build all parts from the config, prepare the data, and return the session after `rehearse`.
 
     Raises:
         ConfigError: A part is missing or does not fit another.
         DataError: `Data.prepare` fails.
     """
-    console = begin(config.settings)
+    console = set_up_process(config.settings)
     parts = config.parts
-    resumed = goes_on(config)
+    resumed = may_resume(config)
     if not resumed:
         refuse_unread_outliers(config, parts)
         if issubclass(load("density_head", parts["density_head"]["name"]), Fitted):
             _refuse_training(
-                config, f"density_head={parts['density_head']['name']} is fitted at once, without gradient"
+                config,
+                f"density_head={parts['density_head']['name']} is fitted in one step, without gradient",
             )
     data = build_data(parts)
-    started = config.settings.checkpoint is not None and not (
+    starts_from_weights = config.settings.checkpoint is not None and not (
         resumed and find_resumable(config.folder / "checkpoints")
     )
-    start = Start.of(parts, data, config.settings) if started else None
+    start = Start.of(parts, data, config.settings) if starts_from_weights else None
     introduce_threads(config.settings.threads, console)
     data.prepare()
     introduce(data, console)
@@ -200,35 +201,36 @@ def for_training(config: Config) -> Session:
         predictor = build_predictor(parts, data.target, data.input_shape, seed, columns=data.columns)
     else:
         predictor = start.predictor_for(data, parts, seed)
-        said = "a run that was stopped goes on with resume=<its folder>"
-        console.print(f"starting anew from the weights of {start.path} ({said})", soft_wrap=True)
+        hint = "to continue a run that was stopped, use resume=<folder of the run>"
+        console.print(f"starting a new training from the weights of {start.path} ({hint})", soft_wrap=True)
     if not learns(predictor) and not resumed:
-        _refuse_training(config, "nothing in this model learns by gradient")
+        _refuse_training(config, "no part of this model learns by gradient")
     if objectives and not learns(predictor):
         raise ConfigError(
-            f"density_head={parts['density_head']['name']} is fitted at once and has no gradient, which objectives "
-            "work by. Leave objective out."
+            f"density_head={parts['density_head']['name']} is fitted in one step without a gradient, but an objective "
+            "acts through the gradient. Leave objective out."
             if fitted_models(predictor)
-            else "Nothing in this model learns by gradient, which objectives work by. Leave objective out."
+            else "No part of this model learns by gradient, but an objective acts through the gradient. Leave "
+            "objective out."
         )
     device = torch.device("cpu")
     method = method_of(config, parts)
     session = Session(config, parts, method, data.target, data, predictor, device, console, objectives)
-    session = tested(session)
+    session = add_test_parts(session)
     if first_rank():
         rehearse(session)
     return session
 
 
 def refuse_unread_outliers(config: Config, parts: Resolved) -> None:
-    """Refuse outliers that the command chooses although no metric reads them.
+    """Refuse settings of outliers if no metric reads outliers.
 
     Raises:
-        ConfigError: The command chooses outliers, and no metric reads them.
+        ConfigError: The command chooses or changes outliers, but no metric reads them.
     """
-    given = config.first_override("outliers")
-    if given and not metrics_reading_outliers(parts):
-        refuse_idle(config.folder, idle_sentence(given, "no metric of this run reads outliers"))
+    override = config.first_override("outliers")
+    if override and not metrics_reading_outliers(parts):
+        refuse_idle(config.folder, idle_sentence(override, "no metric of this run reads outliers"))
 
 
 def _refuse_training(config: Config, why: str) -> None:
@@ -238,9 +240,9 @@ def _refuse_training(config: Config, why: str) -> None:
         ConfigError: The command contains such a setting.
     """
     for group in ("optimizer", "trainer"):
-        given = config.first_override(group)
-        if given:
-            refuse_idle(config.folder, idle_sentence(given, why))
+        override = config.first_override(group)
+        if override:
+            refuse_idle(config.folder, idle_sentence(override, why))
 
 
 @dataclass(frozen=True)
@@ -261,13 +263,13 @@ class Start:
 
     @classmethod
     def of(cls, parts: Resolved, data: Data, settings: Settings) -> "Start":
-        """Read the weights from which the model starts, and check that they fit it before data is read or generated.
+        """Read the weights from which the model starts, and check that they fit before data are read or generated.
 
-        The model is built for the target and the inputs that the checkpoint describes; if the data set already knows
-        its target, that target is used. `predictor_for` compares the model with the prepared data.
+        The model is built for the inputs and the target that the checkpoint describes. A target that the data set knows
+        before it is prepared takes precedence. `predictor_for` compares the model with the prepared data.
 
         Raises:
-            CheckpointError: There is no checkpoint, or it belongs to another model.
+            CheckpointError: There is no checkpoint, or the checkpoint belongs to another model.
         """
         path = find_checkpoint(str(settings.checkpoint), uri=settings.logger.uri)
         content = read(path)
@@ -280,13 +282,13 @@ class Start:
             predictor = build_predictor(parts, target, shape, settings.seed, columns)
         except ConfigError as error:
             raise CheckpointError(
-                f"{path} belongs to another model: {error} Use the config it was trained with, or another checkpoint."
+                f"{path} belongs to another model: {error} Use the config of its training, or give another checkpoint."
             ) from error
         fill(predictor, state, str(path))
         return cls(path, state, predictor, (target, shape, columns))
 
     def predictor_for(self, data: Data, parts: Resolved, seed: int) -> Predictor:
-        """Return a predictor with the weights; it is built again if the prepared data differ from the description.
+        """Return a predictor with the weights; build it again if the prepared data differ from the description.
 
         Raises:
             CheckpointError: The weights belong to another model.
@@ -301,8 +303,8 @@ class Start:
 def method_of(config: Config, parts: Resolved) -> str:
     """Return the name of a model in tables.
 
-    It is the experiment, or the density head if there is none, followed by the uncertainty wrappers. The wrappers that
-    belong to an experiment are not listed.
+    The name is that of the experiment, or of the density head if there is no experiment, followed by the uncertainty
+    wrappers. Wrappers that are part of the experiment are not listed.
     """
     name = config.settings.experiment_name
     method = name.rpartition("/")[2] if name else str(parts["density_head"]["name"])
@@ -311,15 +313,15 @@ def method_of(config: Config, parts: Resolved) -> str:
     return " + ".join([method, *wrappers])
 
 
-def tested(session: Session) -> Session:
+def add_test_parts(session: Session) -> Session:
     """Return the session with the parts of a test added: new metrics, and outliers if a metric reads them.
 
     Raises:
-        ConfigError: A metric does not fit the target, or needs outliers and there are none.
+        ConfigError: A metric does not fit the target, or needs outliers although none are configured.
         DataError: `Data.prepare` fails.
     """
     parts = session.parts
-    # metrics of a checkpoint are checked here, where they are used, since a model predicts without them
+    # metrics of a checkpoint are checked only here, because a model predicts without them
     parts = {**parts, "metric": [resolve("metric", part) for part in parts["metric"]]}
     require_outliers(parts)
     metrics = build_metrics(parts, session.target)
@@ -334,34 +336,34 @@ def tested(session: Session) -> Session:
 def rehearse(session: Session) -> None:
     """Try the steps after training on a few samples, so that their errors appear before training.
 
-    The function checks a few targets, gives every metric predictions of two samples by the untrained model, and
-    calibrates a copy of the model. If the model predicts nothing before it is fitted, the function only checks that the
-    true images exist.
+    The function checks a few targets, lets the untrained model predict two samples, updates every metric with these
+    predictions, and calibrates a copy of the model. If the model cannot predict before it is fitted, the function only
+    checks that the true images exist.
 
     Raises:
-        UserError: The data, a metric or a wrapper raises it.
+        UserError: The data, a metric or a wrapper raises the error.
     """
     fitted, reads = (
         bool(fitted_models(session.predictor)),
-        {name for each in session.metrics for name in each.reads},
+        {name for metric in session.metrics for name in metric.reads},
     )
     splits = session.data.splits()
-    some = _few(splits.validation, 2)
-    for batch in (_few(splits.train, 2), some, _few(splits.test, 2)):
+    validation_batch = _first_samples(splits.validation, 2)
+    for batch in (_first_samples(splits.train, 2), validation_batch, _first_samples(splits.test, 2)):
         require_targets(batch, session.target)
     if fitted:
         for channel in sorted(reads):
-            true_image(some, channel)
+            true_image(validation_batch, channel)
         return
     seed_step(session.settings.seed, 0, "rehearsal")
     training = session.predictor.training
-    density = session.predictor.eval()(some["input"])
+    density = session.predictor.eval()(validation_batch["input"])
     session.predictor.train(training)
     samples = session.settings.samples
-    predictions = [Prediction(density, some, samples)]
+    predictions = [Prediction(density, validation_batch, samples)]
     if session.outliers is not None:  # test samples serve as outliers here
-        predictions.append(Prediction(density, some, samples, "outliers"))
-    # warnings about so few samples mean nothing
+        predictions.append(Prediction(density, validation_batch, samples, "outliers"))
+    # with so few samples, warnings have no meaning
     with _silence():
         for metric in session.metrics:
             trial = metric.clone()
@@ -369,19 +371,19 @@ def rehearse(session: Session) -> None:
                 if prediction.split in metric.splits:
                     trial.update(prediction)  # type: ignore[operator]  # torchmetrics types what it wraps as a module
             numbers([cast(Metric, trial)])
-        few = some if not session.parts["uncertainty"] else _few(splits.validation, FEW)
+        few = validation_batch if not session.parts["uncertainty"] else _first_samples(splits.validation, FEW)
         with torch.enable_grad():
             deepcopy(session.predictor).eval().calibrate([few])
 
 
-def _few(dataset: Dataset[Batch], most: int) -> Batch:
+def _first_samples(dataset: Dataset[Batch], most: int) -> Batch:
     """Return a batch of the first samples, at most `most`."""
     return fetch(dataset, range(min(most, len(dataset))))  # type: ignore[arg-type]
 
 
 @contextmanager
 def _silence() -> Iterator[None]:
-    """Suppress warnings and log messages below the level of an error during the block."""
+    """Suppress warnings, and log messages below the level ERROR, during the block."""
     before = logging.root.manager.disable
     logging.disable(logging.WARNING)
     try:
@@ -393,16 +395,16 @@ def _silence() -> Iterator[None]:
 
 
 def for_trained(config: Config, *, prepare: bool = True) -> Session:
-    """Return the session of a trained model: the one that `checkpoint` names.
+    """Return the session of the trained model that `checkpoint` names.
 
-    Data, outliers and metrics are those that the command line names, or else the model's own. Without `prepare`, the
-    data can only read a user's own files, and nothing is generated or loaded for them.
+    Data, outliers and metrics are those of the command line, or else those of the model. Without `prepare`, the data
+    set can only read the user's own files, and it generates and loads no data.
 
     Raises:
-        ConfigError: No checkpoint is named.
-        CheckpointError: There is no such checkpoint, or the data does not fit the model.
+        ConfigError: The command names no checkpoint.
+        CheckpointError: The checkpoint does not exist, or the data do not fit the model.
     """
-    console = begin(config.settings)
+    console = set_up_process(config.settings)
     if config.settings.checkpoint is None:
         raise ConfigError(
             f"mode={config.mode} needs checkpoint=<run folder, checkpoint file or MLflow run id>."
@@ -410,10 +412,10 @@ def for_trained(config: Config, *, prepare: bool = True) -> Session:
     predictor, description = load_with_description(
         config.settings.checkpoint, uri=config.settings.logger.uri, paths=flatten(config.settings.stored)
     )
-    return around(config, predictor, description, console, prepare=prepare)
+    return for_predictor(config, predictor, description, console, prepare=prepare)
 
 
-def around(
+def for_predictor(
     config: Config, predictor: Predictor, description: Description, console: Console, *, prepare: bool = True
 ) -> Session:
     """Return the session of a loaded predictor that a checkpoint describes; see `for_trained`.
@@ -428,22 +430,24 @@ def around(
     chosen = {
         group for group in ("data", "outliers", "metric") if group in reads and config.values.get(group)
     }
-    used = {group: parts.get(group) for group in ("outliers", "metric") if group not in chosen}
-    again = {
-        key: value for key, value in flatten(config.settings.stored).items() if key.partition(".")[0] in used
+    stored_parts = {group: parts.get(group) for group in ("outliers", "metric") if group not in chosen}
+    repeated = {
+        key: value
+        for key, value in flatten(config.settings.stored).items()
+        if key.partition(".")[0] in stored_parts
     }
-    used, dropped = remove_paths(used, again)
-    parts |= used
+    stored_parts, dropped = remove_paths(stored_parts, repeated)
+    parts |= stored_parts
     dropped |= {
         key: value for key, value in description.dropped.items() if key.partition(".")[0] not in chosen
     }
-    config = replace(inherited(config, description), trained_on=str(parts["data"]["name"]))
+    config = replace(inherit_settings(config, description), trained_on=str(parts["data"]["name"]))
     for group in chosen - {"metric"}:
         parts[group] = resolve("data", config.values[group], group)
     if "metric" in chosen:
         metrics = config.values["metric"]
         parts["metric"] = [resolve("metric", part, f"metric.{key}") for key, part in metrics.items()]
-    if "outliers" in reads and not goes_on(config):
+    if "outliers" in reads and not may_resume(config):
         refuse_unread_outliers(config, parts)
     if prepare:
         outliers = "outliers" in {*reads} - chosen and bool(metrics_reading_outliers(parts))
@@ -456,21 +460,21 @@ def around(
         data.prepare()
         require_fit(data, description)
     elif "data" in chosen or "data" in config.settings.stored:
-        begun = None if goes_on(config) else config
-        data.read = partial(_reading, data.read, data, description, begun)  # type: ignore[method-assign]
+        begun = None if may_resume(config) else config
+        data.read = partial(_read_files, data.read, data, description, begun)  # type: ignore[method-assign]
     method = description.method or method_of(config, parts)
     introduce_model(description, method, data if prepare else None, console)
     return Session(config, parts, method, description.target, data, predictor, device, console)
 
 
-def _reading(
+def _read_files(
     read: Callable[[Sequence[Path]], Dataset[Batch]],
     data: Data,
     description: Description,
     config: Config | None,
     files: Sequence[Path],
 ) -> Dataset[Batch]:
-    """Read a user's own files with a data set that the command chose or changed.
+    """Read the user's own files with a data set that the command chooses or changes.
 
     Args:
         read: Method `read` of the data set.
@@ -480,54 +484,62 @@ def _reading(
         files: Files of the user.
 
     Raises:
-        CheckpointError: The first sample has another shape than the model reads.
-        ConfigError: The choice has no effect, since the model alone reads the first files in the same way.
+        CheckpointError: The first sample has another shape than the inputs of the model.
+        ConfigError: The choice has no effect, because the model's own data set reads the first files in the same way.
     """
     samples = read(files)
-    found, wanted = tuple(fetch(samples, range(1))["input"].shape[1:]), description.input_shape
-    free = len(wanted) == 2  # a point cloud has any number of points
-    if found[free:] != wanted[free:] or len(found) != len(wanted):
+    first_shape, model_shape = tuple(fetch(samples, range(1))["input"].shape[1:]), description.input_shape
+    free = len(model_shape) == 2  # a point cloud has any number of points
+    if first_shape[free:] != model_shape[free:] or len(first_shape) != len(model_shape):
         raise CheckpointError(
-            f"{description.path} reads inputs of shape {wanted}, but with data={description.config['data']['name']} as "
-            f"this command sets it {files[0]} is one of shape {found}. Leave data out: the model knows its own."
+            f"{description.path} reads inputs of shape {model_shape}, but "
+            f"data={description.config['data']['name']} with the settings of this command reads {files[0]} as an input "
+            f"of shape {first_shape}. Leave data out; the model's own data set is then used."
         )
-    given = None if config is None else config.first_override("data")
-    if config is not None and given is not None and not isinstance(data, Mapped):
+    override = None if config is None else config.first_override("data")
+    if config is not None and override is not None and not isinstance(data, Mapped):
         skips = any(
             "unreadable=" in item for item in config.overrides
         )  # the mode reads this key, not the data set
-        some = list(files[:FEW])
-        if not skips and _same_samples(_by_itself(description, some), read(some)):
+        first_files = list(files[:FEW])
+        if not skips and _same_samples(_read_as_trained(description, first_files), read(first_files)):
             refuse_idle(
-                config.folder, idle_sentence(given, f"the model reads {files[0]} the same without it")
+                config.folder,
+                idle_sentence(override, f"the model reads {files[0]} in the same way without it"),
             )
     return samples
 
 
-def _by_itself(description: Description, files: Sequence[Path]) -> Dataset[Batch] | None:
-    """Return the samples of files as the model reads them without the command's data settings; None if it cannot."""
+def _read_as_trained(description: Description, files: Sequence[Path]) -> Dataset[Batch] | None:
+    """Return the samples of files as the model's own data set reads them, or None if it cannot read them."""
     stored = read(Path(description.path))["framework"]["config"]["data"]
     try:
         config, _ = remove_paths({"data": stored}, {})
         return reader(replace(description, config={**description.config, **config}, dropped={})).read(files)
-    except UserError:  # for example, the data need a path that only the command gives
+    except UserError:  # for example, the data set needs a path that only the command gives
         return None
 
 
-def _same_samples(one: Dataset[Batch] | None, other: Dataset[Batch]) -> bool:
-    if one is None or len(one) != len(other):  # type: ignore[arg-type]
+def _same_samples(stored_samples: Dataset[Batch] | None, samples: Dataset[Batch]) -> bool:
+    if stored_samples is None or len(stored_samples) != len(samples):  # type: ignore[arg-type]
         return False
-    first, second = (fetch(each, range(min(BLOCK, len(each)))) for each in (one, other))  # type: ignore[arg-type]
+    first, second = (fetch(dataset, range(min(BLOCK, len(dataset)))) for dataset in (stored_samples, samples))  # type: ignore[arg-type]
     return first.keys() == second.keys() and all(torch.equal(first[key], second[key]) for key in first)
 
 
-def inherited(config: Config, description: Description) -> Config:
+def inherit_settings(config: Config, description: Description) -> Config:
     """Return the config with the settings of the model's own run, except those that the command line sets."""
-    given = {item.lstrip("+~").partition("=")[0] for item in config.overrides}
-    kept = {
-        key: value for key, value in description.settings.items() if key.removesuffix("_name") not in given
+    overridden = {item.lstrip("+~").partition("=")[0] for item in config.overrides}
+    inherited_values = {
+        key: value
+        for key, value in description.settings.items()
+        if key.removesuffix("_name") not in overridden
     }
-    return replace(config, values={**config.values, **kept}, settings=config.settings.model_copy(update=kept))
+    return replace(
+        config,
+        values={**config.values, **inherited_values},
+        settings=config.settings.model_copy(update=inherited_values),
+    )
 
 
 def require_fit(data: Data, description: Description) -> None:
@@ -537,31 +549,31 @@ def require_fit(data: Data, description: Description) -> None:
         CheckpointError: The inputs have another shape, or the targets differ.
     """
     target = description.target
-    wanted = description.input_shape, target.kind, target.names, target.size
-    found = data.input_shape, data.target.kind, data.target.names, data.target.size
-    if wanted != found:
+    expected = description.input_shape, target.kind, target.names, target.size
+    actual = data.input_shape, data.target.kind, data.target.names, data.target.size
+    if expected != actual:
         raise CheckpointError(
-            f"{description.path} reads inputs of shape {wanted[0]} and predicts {wanted[1]} ({target.listed_names}), "
-            f"but the data has inputs of shape {found[0]} and targets {found[1]} ({data.target.listed_names}). Give "
-            "the data it was trained on."
+            f"{description.path} reads inputs of shape {expected[0]} and predicts {expected[1]} "
+            f"({target.listed_names}), but the data have inputs of shape {actual[0]} and targets {actual[1]} "
+            f"({data.target.listed_names}). Give data like those of the training."
         )
 
 
 def require_target(target: Target | None, description: Description) -> None:
-    """Refuse data whose targets are known before it is read or generated, and differ from the model's.
+    """Refuse data whose targets differ from the model's and are known before the data are read or generated.
 
     Raises:
         CheckpointError: The targets differ.
     """
-    wanted = description.target
+    expected = description.target
     if target is not None and (target.kind, target.names, target.size) != (
-        wanted.kind,
-        wanted.names,
-        wanted.size,
+        expected.kind,
+        expected.names,
+        expected.size,
     ):
         raise CheckpointError(
-            f"{description.path} predicts {wanted.kind} ({wanted.listed_names}), but the data has targets "
-            f"{target.kind} ({target.listed_names}). Give the data it was trained on."
+            f"{description.path} predicts {expected.kind} ({expected.listed_names}), but the data have targets "
+            f"{target.kind} ({target.listed_names}). Give data like those of the training."
         )
 
 
@@ -576,10 +588,10 @@ def calibrate(session: Session) -> None:
 
 
 def keep_memory() -> None:
-    """Make glibc keep freed memory, since every training step frees and requests the same megabytes.
+    """Make glibc keep freed memory for this process, because every training step frees and requests the same megabytes.
 
-    Otherwise each step causes thousands of page faults, which take a quarter of a small network's time. Without glibc
-    the function does nothing.
+    Otherwise each step causes thousands of page faults, which take a quarter of the training time of a small network.
+    Without glibc, the function does nothing.
     """
     if platform.libc_ver()[0] == "glibc":
         library = ctypes.CDLL(None)
@@ -587,8 +599,8 @@ def keep_memory() -> None:
         library.mallopt(M_TRIM_THRESHOLD, 2**31 - 1)
 
 
-def quiet() -> None:
-    """Silence messages of Lightning that do not help the user: missing hardware, and its own deprecations."""
+def silence_lightning() -> None:
+    """Silence messages of Lightning that do not help the user, on missing hardware and on Lightning's deprecations."""
     for name in ("pytorch_lightning", "lightning_fabric"):
         logging.getLogger(name).setLevel(logging.ERROR)
     warnings.filterwarnings("ignore", message=".*LeafSpec", module="pytorch_lightning")

@@ -1,4 +1,4 @@
-"""Choice of the files that a data set reads from a user's folder, which may hold other files too."""
+"""Selection of the files that a data set reads from a user's folder, which may contain other files too."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,13 +15,13 @@ UNREADABLE = "unreadable.txt"
 """Name of the file that lists the files left out, one per line."""
 
 
-def files_in(path: Path) -> tuple[list[Path], list[Path]]:
-    """Return the files to read, and the folders inside `path`, which are not searched.
+def list_files(path: Path) -> tuple[list[Path], list[Path]]:
+    """Return the files in a folder, or the file `path` itself, and the folders in it, which are not searched.
 
-    The files are `path` itself, or the files in it. Hidden files and folders are left out of both lists.
+    Hidden files and folders are left out of both lists.
 
     Raises:
-        DataError: There is no file.
+        DataError: The path does not exist, or the folder contains no file.
     """
     if not path.exists():
         raise DataError(f"mode.files={path} does not exist. Give a file, or a folder of files.")
@@ -31,14 +31,12 @@ def files_in(path: Path) -> tuple[list[Path], list[Path]]:
     files = [item for item in items if item.is_file()]
     folders = [item for item in items if item.is_dir()]
     if not files:
-        held = (
-            f"holds folders alone ({_listed(folders)}), which are not looked into"
+        content = (
+            f"contains only folders ({_list_paths(folders)}), which are not searched"
             if folders
-            else "holds no file"
+            else "contains no file"
         )
-        raise DataError(
-            f"mode.files={path} {held}. Give a folder that itself holds the files to predict for."
-        )
+        raise DataError(f"mode.files={path} {content}. Give the folder that directly contains the files.")
     return files, folders
 
 
@@ -53,58 +51,65 @@ def readable(data: Data, file: Path) -> bool:
     return True
 
 
-def to_read(
+def select_files(
     data: Data, files: Sequence[Path], config: Mapping[str, Any], console: Console
 ) -> tuple[list[Path], list[Path]]:
-    """Return the files to read, and the files left out because they cannot be read; print which files are not read.
+    """Return the files to read, and the files left out because they are damaged; print which files are not read.
 
-    Three kinds of files are ignored: hidden files, files that belong to others (`Data.companions`), and files with a
-    suffix that is not one of the data set's if the data set can read none of them (a README, a table). A remaining file
-    that cannot be read stays in the list and causes an error later, unless `config` says to skip such files.
+    Three kinds of files are ignored: hidden files, files that are read together with another file (`Data.companions`),
+    and files with a suffix that the data set does not list, if it can read no file with this suffix (a README, a
+    table). A remaining file that cannot be read stays in the list and causes an error later, unless `config` contains
+    `unreadable=skip` or `skip_unreadable`.
 
     Raises:
         DataError: No file remains.
     """
-    beside = {file for file in files if data.companions and file.name.lower().endswith(data.companions)}
-    say_left_out(console, "files", "belong to others and are read with them", sorted(beside))
-    files = [file for file in files if file not in beside]
+    companions = {file for file in files if data.companions and file.name.lower().endswith(data.companions)}
+    print_left_out(console, "files", "belong to other files and are read with them", sorted(companions))
+    files = [file for file in files if file not in companions]
     kinds: dict[str, list[Path]] = {}
     for file in files:
         if not file.name.startswith("."):
             kinds.setdefault(file.suffix.lower(), []).append(file)
     read = {
         kind
-        for kind, some in kinds.items()
-        if kind in data.suffixes or any(readable(data, file) for file in some)
+        for kind, files_of_kind in kinds.items()
+        if kind in data.suffixes or any(readable(data, file) for file in files_of_kind)
     }
-    kept = [
+    to_predict = [
         file for file in files if not file.name.startswith(".") and (not read or file.suffix.lower() in read)
     ]
-    say_left_out(
-        console, "files", "ignored, being of another kind", [file for file in files if file not in set(kept)]
+    print_left_out(
+        console,
+        "files",
+        "ignored, because they are of another kind",
+        [file for file in files if file not in set(to_predict)],
     )
-    if not kept:
+    if not to_predict:
         raise DataError(
-            f"None of {len(files) + len(beside)} files is one to predict for. Give files that the data set reads."
+            f"None of the {len(files) + len(companions)} files is of a kind that the data set reads. Give files of "
+            "such a kind."
         )
     if config.get("unreadable") != "skip" and not config.get("skip_unreadable"):
-        return kept, []
-    bad = [
+        return to_predict, []
+    unreadable = [
         file
-        for file in track_progress(kept, "looking for damage", len(kept), "files")
+        for file in track_progress(to_predict, "looking for damage", len(to_predict), "files")
         if not readable(data, file)
     ]
-    say_left_out(console, "files", "left out, since they cannot be read", bad)
-    if len(bad) == len(kept):
-        raise DataError(f"None of {len(kept)} files can be read. Give files that the data set reads.")
-    return [file for file in kept if file not in set(bad)], bad
+    print_left_out(console, "files", "left out, because they cannot be read", unreadable)
+    if len(unreadable) == len(to_predict):
+        raise DataError(
+            f"None of the {len(to_predict)} files can be read. Give files that the data set reads."
+        )
+    return [file for file in to_predict if file not in set(unreadable)], unreadable
 
 
-def say_left_out(console: Console, kind: str, why: str, paths: Sequence[Path]) -> None:
-    """Print the names of files or folders that are not read, if there are any."""
+def print_left_out(console: Console, kind: str, why: str, paths: Sequence[Path]) -> None:
+    """Print the names of files or folders that are not read, with their kind and the reason, if there are any."""
     if paths:
-        console.print(f"{len(paths)} {kind} {why}: {_listed(paths)}", soft_wrap=True, highlight=False)
+        console.print(f"{len(paths)} {kind} {why}: {_list_paths(paths)}", soft_wrap=True, highlight=False)
 
 
-def _listed(paths: Sequence[Path]) -> str:
+def _list_paths(paths: Sequence[Path]) -> str:
     return ", ".join(spell_name(path.name) for path in paths[:10]) + (", …" if len(paths) > 10 else "")

@@ -19,7 +19,7 @@ from framework.reports.table import (
     results_table,
     write_csv,
 )
-from framework.runs.job import read_record, recorded
+from framework.runs.job import find_job_folders, read_record
 from framework.runs.run import stored_config
 from framework.storage.plain_values import is_number, read_json
 from framework.storage.progress import output
@@ -81,7 +81,7 @@ def summarise(folder: Path, overrides: Sequence[Sequence[str]], config: Mapping[
         config: Config of the first job, as for `begin`; the store that it names is the only one that is contacted.
     """
     console = output()
-    jobs = recorded(folder)
+    jobs = find_job_folders(folder)
     for job in jobs:
         if _status(job) == "died" and (job / "run.json").is_file():
             close_and_send(job, store_of(config))  # a killed process could not close its run
@@ -376,5 +376,5 @@ def _close_parent(folder: Path, files: Sequence[Path], said: str, config: Mappin
         tracker.set_tags({DESCRIPTION: f"A sweep in `{folder}`: {said}"[:LONGEST_DESCRIPTION]})
     for file in files:
         tracker.log_artifact(file)
-    failed = [job for job in recorded(folder) if _status(job) != "completed"]
+    failed = [job for job in find_job_folders(folder) if _status(job) != "completed"]
     tracker.close("FAILED" if failed else "FINISHED")

@@ -22,7 +22,7 @@ from importlib import import_module
 from typing import Any
 
 from framework.sweeps.processes import LARGEST
-from framework.tracking.signals import ending_with_parent
+from framework.tracking.signals import end_with_parent
 
 PATIENCE = 0.02
 """Seconds between two checks whether a job has ended."""
@@ -48,7 +48,7 @@ def serve(channel: socket.socket) -> Given | None:
                 return None
             asked: dict[str, Any] = json.loads(packet)
             job = Given(asked["arguments"], asked["environment"], *descriptors)
-            end_with_server = ending_with_parent()
+            end_with_server = end_with_parent()
             pid = os.fork()
             if pid == 0:
                 os.setsid()

@@ -17,14 +17,14 @@ from pathlib import Path
 from typing import Any
 
 from framework.errors import ConfigError, UserError
-from framework.runs.job import PARENT, RECORD, VALUE, read_record, recorded
+from framework.runs.job import PARENT, RECORD, VALUE, find_job_folders, read_record
 from framework.storage.enclosed import read_plain, read_stream
 from framework.storage.files import lacks_locks, warn_unlocked, write_whole
 from framework.storage.names import as_bytes
 from framework.storage.plain_values import plain_numbers
 from framework.storage.reading import translate_errors
 from framework.sweeps.processes import Fresh, Process, Starter
-from framework.tracking.signals import ENDING, SIGNALS, Stopped, ends_with_parent, handled
+from framework.tracking.signals import ENDING, SIGNALS, Stopped, ends_with_parent, handled_signals
 
 COMMAND: Sequence[str] = (sys.executable, "-P", "-m", "framework")
 """Command of one job, to which its overrides are added. No config can set it, because a config must not run code."""
@@ -112,7 +112,7 @@ def hashed(*parts: str) -> str:
 def records(folder: Path) -> dict[str, list[tuple[Path, dict[str, Any]]]]:
     """Return folder and record of every job of earlier sweeps in `folder`, by key; a key may have several jobs."""
     found: dict[str, list[tuple[Path, dict[str, Any]]]] = {}
-    for path in recorded(folder):
+    for path in find_job_folders(folder):
         record = read_record(path)
         found.setdefault(str(record.get("key")), []).append((path, record))
     return found
@@ -356,7 +356,7 @@ def _pass_on(number: int, before: int, running: Sequence[_Running]) -> None:
 def _signals() -> Iterator[list[int]]:
     """Handle signals during the block, and yield the growing list of the received signal numbers."""
     received: list[int] = []
-    numbers = handled()
+    numbers = handled_signals()
     before = [signal.signal(number, lambda number, frame: received.append(number)) for number in numbers]
     try:
         yield received

@@ -13,7 +13,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
-from framework.tracking.signals import ending_with_parent
+from framework.tracking.signals import end_with_parent
 
 LARGEST = 2**17
 """Largest size, in bytes, of a packet that describes a job."""
@@ -76,7 +76,7 @@ class Fresh:
             env=environment,
             pass_fds=(lock,),
             start_new_session=True,  # Ctrl-C reaches the sweep only, which passes it on once to each job
-            preexec_fn=ending_with_parent(),
+            preexec_fn=end_with_parent(),
         )
         self.pid = self._process.pid
         self.seconds: float | None = None
@@ -155,7 +155,7 @@ class _Server:
                 env=environment,
                 pass_fds=(theirs.fileno(),),
                 start_new_session=True,
-                preexec_fn=ending_with_parent(),
+                preexec_fn=end_with_parent(),
             )
         self._channel.settimeout(PATIENCE)
         try:

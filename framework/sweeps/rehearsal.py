@@ -12,7 +12,7 @@ from framework.configuration.assembly import build_data
 from framework.configuration.config import Config
 from framework.configuration.modes import require_read
 from framework.errors import ConfigError, UserError
-from framework.tracking.signals import ending_with_parent
+from framework.tracking.signals import end_with_parent
 
 COMMAND: Sequence[str] = (sys.executable, "-P", "-m", "framework.sweeps.rehearsal")
 
@@ -43,7 +43,7 @@ def refuse_mistakes(jobs: Sequence[tuple[Sequence[str], Mapping[str, Any]]]) -> 
         capture_output=True,
         text=True,
         check=False,
-        preexec_fn=ending_with_parent(signal.SIGKILL),
+        preexec_fn=end_with_parent(signal.SIGKILL),
     )
     if done.returncode == 2:
         raise ConfigError(done.stdout)

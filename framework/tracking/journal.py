@@ -1,4 +1,4 @@
-"""The local journal of a run, to which every number is written before anything else receives it."""
+"""Journal of a run: the local file to which every number is written first."""
 
 import json
 import logging
@@ -40,14 +40,14 @@ class Line:
 class Journal:
     """An append-only file of JSON lines that survives a crash of its process.
 
-    Every line has a number `n`, which grows by one and is never used twice, not even after `drop_after`. The
-    statement "everything up to n is stored elsewhere" therefore stays true whatever happens to the file. Lines of
-    metrics hold `time`, `step`, `epoch` and `values`; a value that is not finite is the string "nan", "inf" or "-inf".
-    Other lines hold the arguments of `append`.
+    Every line has a number `n`, which grows by one and is never used twice, not even after `drop_after`. It is
+    therefore enough to remember up to which number the lines are stored elsewhere. Lines of metrics contain `time`,
+    `step`, `epoch` and `values`; a value that is not finite is the string "nan", "inf" or "-inf". Other lines contain
+    the arguments of `append`.
 
-    A line is with the operating system when `write` returns, so it survives SIGKILL. A thread syncs it to the disk
-    within about a second, and from then on it survives a power cut. A full disk does not stop the run: lines wait in
-    memory until there is room again.
+    When `write` returns, the operating system has received the line, so the line survives SIGKILL. A thread syncs it to
+    the disk within about a second, and from then on the line survives a power cut. A full disk does not stop the run:
+    lines wait in memory until there is free space again.
 
     The first `write`, `append` or `drop_after` makes this process the only writer until `close`, and removes an
     incomplete last line that a crash has left. Reading changes nothing and is possible at any time, from any process.
@@ -76,15 +76,17 @@ class Journal:
         with self._lock:
             self.open()
             self.last += 1
-            # Formatted here because the training loop calls it: this takes half the time of the JSON encoder.
-            pairs = ",".join([f"{_quoted(name)}:{_number_or_name(value)}" for name, value in values.items()])
-            self._put(
+            # The training loop calls this method, and this formatting takes half the time of the JSON encoder.
+            pairs = ",".join(
+                [f"{_json_name(name)}:{_number_or_name(value)}" for name, value in values.items()]
+            )
+            self._write_line(
                 f'{{"n":{self.last},"time":{time.time():.3f},"step":{int(step)},"epoch":{int(epoch)},'
                 f'"values":{{{pairs}}}}}'
             )
 
     def append(self, **record: Any) -> None:
-        """Append a line that holds plain JSON values other than metrics.
+        """Append a line of plain JSON values other than metrics.
 
         Raises:
             DataError: The file cannot be opened, or another process writes it; only the first call raises this.
@@ -92,23 +94,23 @@ class Journal:
         with self._lock:
             self.open()
             self.last += 1
-            self._put(_encode({"n": self.last, "time": round(time.time(), 3), **record}))
+            self._write_line(_encode({"n": self.last, "time": round(time.time(), 3), **record}))
 
     def read(self, after: int = 0) -> list[dict[str, Any]]:
-        """Return the next lines with a number greater than `after`, at most about a mebibyte; empty at the end.
+        """Return the next lines with a number greater than `after`, about a mebibyte at most; empty at the end.
 
-        An incomplete last line is left out. A damaged line before it is skipped with a warning. A call with the last
-        number returned reads only the new lines.
+        An incomplete last line is left out, and damaged lines are skipped with a warning. If `after` is the last number
+        that the previous call returned, only new lines are read from the file.
         """
         with self._lock:
-            found, offset = self._place
-            if found != after:
+            position, offset = self._place
+            if position != after:
                 offset = 0
             rewritten = self._rewritten
             if not os.path.lexists(self.path):
                 return []
             with translate_errors(self.path, "a journal"):
-                # stays open on the old file if drop_after replaces it meanwhile
+                # the descriptor still leads to the old file if drop_after replaces the file in the meantime
                 file = read_stream(self.path)
         records: list[dict[str, Any]] = []
         with file:
@@ -132,9 +134,10 @@ class Journal:
             after = records[-1]["n"]
 
     def drop_after(self, step: int) -> int:
-        """Remove the metrics of later steps, which a run resumed from `step` will repeat; return the number of lines.
+        """Remove the metrics of steps after `step`, and return the number of removed lines.
 
-        The file is replaced atomically, and a line `{"resumed_after": step}` records the removal.
+        A run that is resumed from `step` repeats these steps. The file is replaced atomically, and a line
+        `{"resumed_after": step}` records the removal.
 
         Raises:
             DataError: The file cannot be opened, or another process writes it; only the first call raises this.
@@ -145,15 +148,19 @@ class Journal:
             self._flush()
             dropped = 0
             marker = {"n": self.last + 1, "time": round(time.time(), 3), "resumed_after": int(step)}
-            with replacing(self.path) as partial, partial.open("xb") as kept, read_stream(self.path) as file:
+            with (
+                replacing(self.path) as partial,
+                partial.open("xb") as shortened,
+                read_stream(self.path) as file,
+            ):
                 while line := file.readline(LONGEST):
                     record = _record(line)
                     if record is not None and record.get("step", step) > step:
                         dropped += 1
                     else:
-                        # damaged lines are kept too: only lines that were understood are removed
-                        kept.write(line)
-                kept.write(_encode(marker).encode() + b"\n")
+                        # only lines that were parsed are removed, so damaged lines are copied too
+                        shortened.write(line)
+                shortened.write(_encode(marker).encode() + b"\n")
             self.last += 1
             self._reopen()
             return dropped
@@ -175,7 +182,7 @@ class Journal:
         """Make this process the only writer; do nothing if it already is.
 
         Args:
-            after: Line number known to be used. A power cut can remove lines from the file that are stored elsewhere.
+            after: Number of the last line that is stored elsewhere; a power cut may have removed it from the file.
 
         Raises:
             DataError: The file cannot be opened, or another process writes it.
@@ -185,16 +192,16 @@ class Journal:
         with self._lock:
             try:
                 self.path.parent.mkdir(parents=True, exist_ok=True)
-                self._owner = _claim(self.path)
-                self.last = max(self._mend(), after)
+                self._owner = _lock_for_writing(self.path)
+                self.last = max(self._remove_incomplete_line(), after)
                 self._file = _append_to(self.path)
             except OSError as error:
                 if self._owner >= 0:
                     os.close(self._owner)
                     self._owner = -1
                 raise DataError(
-                    f"The journal {self.path} cannot be written ({error.strerror}). "
-                    "Choose a run folder that can, or free some space."
+                    f"The journal {self.path} cannot be written ({error.strerror}). Choose a run folder that can be "
+                    "written, or free some space."
                 ) from error
             self._closing.clear()
             self._syncer = threading.Thread(target=self._sync_every_second, name="journal", daemon=True)
@@ -213,27 +220,27 @@ class Journal:
             self._flush()
             if self._waiting:
                 lost = self._waiting.count(b"\n")
-                _log.error("The last %d lines of %s are lost: its disk is full.", lost, self.path)
+                _log.error("The last %d lines of %s are lost, because the disk is full.", lost, self.path)
                 self._waiting.clear()
             self._sync(self._file)
             os.close(self._file)
             os.close(self._owner)
             self._file = self._owner = -1
 
-    def _put(self, text: str) -> None:
+    def _write_line(self, text: str) -> None:
         data = text.encode() + b"\n"
         if self._waiting:
             self._waiting += data
             self._flush()
             return
-        fault = "it is full"
+        fault = "the disk is full"
         try:
             written = os.write(self._file, data)
         except OSError as error:
             written, fault = 0, str(error.strerror)
         if written < len(data):
             _log.warning(
-                "The disk of %s takes no more (%s). The run goes on; its numbers wait in memory for room.",
+                "%s cannot be written (%s). The run continues and keeps its numbers in memory until there is space.",
                 self.path,
                 fault,
             )
@@ -260,7 +267,9 @@ class Journal:
         while not self._closing.is_set():
             self._unsynced.wait()
             self._unsynced.clear()
-            with self._lock:  # a separate descriptor, since replacing the file closes the first
+            with (
+                self._lock
+            ):  # a descriptor of its own is needed, because `drop_after` may close the first one
                 descriptor = os.dup(self._file)
             self._sync(descriptor)
             os.close(descriptor)
@@ -272,7 +281,7 @@ class Journal:
         except OSError as error:
             _log.warning("%s could not be synced to its disk: %s.", self.path, error.strerror)
 
-    def _mend(self) -> int:
+    def _remove_incomplete_line(self) -> int:
         """Remove an incomplete last line, and return the number of the last complete line."""
         if not os.path.lexists(self.path):
             return 0
@@ -280,17 +289,19 @@ class Journal:
             size = os.fstat(file.fileno()).st_size
             if size > LARGEST:
                 raise DataError(
-                    f"The journal {self.path} has {size:,} bytes; wanted {LARGEST:,} at most. Rename it, and the run "
-                    "begins a new one."
+                    f"The journal {self.path} has {size:,} bytes, but at most {LARGEST:,} are read. Rename the file; "
+                    "the run then begins a new journal."
                 )
             start = max(0, size - 2 * LONGEST)
             file.seek(start)
             content = file.read()
             end = content.rfind(b"\n") + 1
             if end < len(content) and (end or not start):
-                torn = len(content) - end
+                incomplete_bytes = len(content) - end
                 _log.warning(
-                    "Cut off an unfinished last line (%d bytes) of %s, left by a crash.", torn, self.path
+                    "Cut off an unfinished last line (%d bytes) of %s, left by a crash.",
+                    incomplete_bytes,
+                    self.path,
                 )
                 file.truncate(start + end)
         while end > 0:
@@ -301,8 +312,8 @@ class Journal:
             end = line
         if start:
             raise DataError(
-                f"The journal {self.path} has no line that can be read in its last {size - start:,} bytes. Rename it, "
-                "and the run begins a new one."
+                f"The journal {self.path} has no readable line in its last {size - start:,} bytes. Rename the file; "
+                "the run then begins a new journal."
             )
         return 0
 
@@ -317,7 +328,12 @@ class Journal:
             elif record["n"] > after:
                 records.append(record)
         if damaged:
-            _log.warning("Skipped damaged lines of %s, %d: %r.", self.path, len(damaged), damaged[0][:80])
+            _log.warning(
+                "%s has %d damaged lines, which are skipped; the first begins with %r.",
+                self.path,
+                len(damaged),
+                damaged[0][:80],
+            )
         return records
 
 
@@ -325,11 +341,12 @@ def _append_to(path: Path) -> int:
     return open_plain(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
 
 
-def _claim(path: Path) -> int:
+def _lock_for_writing(path: Path) -> int:
     """Return a descriptor that makes this process the only writer of `path` until it is closed or the process dies.
 
-    The lock is a POSIX record lock. Unlike flock, data-loading processes do not inherit it, and these outlive a killed
-    parent by seconds. It is held on a separate file, since closing any descriptor of a file releases its record lock.
+    The lock is a POSIX record lock. Data-loading processes, which outlive a killed parent by seconds, do not inherit it
+    (they would inherit flock). A separate file carries the lock, because closing any descriptor of a file releases the
+    record lock of that file.
     """
     owner = open_plain(path.with_name(f".{path.name}.lock"), os.O_RDWR | os.O_CREAT)
     try:
@@ -338,18 +355,22 @@ def _claim(path: Path) -> int:
         holder = os.pread(owner, 32, 0).decode(errors="replace").strip() or "unknown"
         os.close(owner)
         raise DataError(
-            f"{path} is being written by another process (number {holder}). Wait until it ends, stop it, or "
+            f"{path} is being written by another process (number {holder}). Wait until that process ends, stop it, or "
             "choose another run folder."
         ) from None
     except OSError as error:
-        _log.warning("%s: no locks on this file system (%s); let one process use it.", path, error.strerror)
+        _log.warning(
+            "The file system of %s does not support locks (%s). Let only one process write this run folder.",
+            path,
+            error.strerror,
+        )
     os.ftruncate(owner, 0)
     os.pwrite(owner, str(os.getpid()).encode(), 0)
     return owner
 
 
 def _whole_lines(file: BinaryIO) -> bytes:
-    """Return the next block of complete lines, about a mebibyte; empty where there is no complete line."""
+    """Return the next block of complete lines, about a mebibyte; empty if there is no complete line."""
     block = file.read(_BLOCK)
     if not block.endswith(b"\n"):
         block += file.readline(LONGEST)
@@ -357,7 +378,7 @@ def _whole_lines(file: BinaryIO) -> bytes:
 
 
 def _number(line: bytes) -> int:
-    """Return a line's number without parsing the rest; a number above all others where it has none."""
+    """Return the number of a line without parsing the rest; for a line without a number, 2**62."""
     digits = line[5 : line.find(b",", 5)] if line.startswith(b'{"n":') else b""
     return int(digits) if digits.isdigit() and len(digits) < 19 else 1 << 62
 
@@ -372,15 +393,15 @@ def _record(line: bytes) -> dict[str, Any] | None:
     if not isinstance(record, dict) or type(record.get("n")) is not int:
         return None
     values = record.get("values", {})
-    whole = isinstance(values, dict) and all(
+    values_valid = isinstance(values, dict) and all(
         value in _NO_NUMBERS if isinstance(value, str) else is_number(value) for value in values.values()
     )
-    placed = [is_number(record[key]) for key in ("time", "step", "epoch") if key in record]
-    return record if whole and all(placed) and (len(placed) == 3 or not values) else None
+    numbers_valid = [is_number(record[key]) for key in ("time", "step", "epoch") if key in record]
+    return record if values_valid and all(numbers_valid) and (len(numbers_valid) == 3 or not values) else None
 
 
 @cache
-def _quoted(name: str) -> str:
+def _json_name(name: str) -> str:
     return json.dumps(name)
 
 

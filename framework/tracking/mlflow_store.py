@@ -1,4 +1,4 @@
-"""Run in an MLflow store; this module imports MLflow, so it is imported only when a store is opened."""
+"""Access to a run in an MLflow store; this module imports MLflow, so it is imported only when a store is opened."""
 
 import getpass
 import hashlib
@@ -23,7 +23,7 @@ from framework.tracking.sender import Record, Store, reason
 from framework.tracking.stores import address, require_own_files, sqlite_path, sqlite_uri, without_password
 
 os.environ["MLFLOW_DISABLE_TELEMETRY"] = "true"
-# One retry instead of minutes of retries: the caller tries again itself, and must notice when it is told to end.
+# One retry instead of minutes of retries: the caller tries again, and must notice in between that it has to end.
 os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "1")
 with warnings.catch_warnings():
     warnings.simplefilter("ignore", DeprecationWarning)  # MLflow warns about its own dependencies
@@ -44,34 +44,34 @@ _KEY, _FOLDER = "framework.key", "framework.folder"  # tags
 _LONGEST_NAME = 250  # characters
 _DIGEST = 16  # characters of a digest that MLflow shows
 _LOADER = "framework.deployment.served"
-"""Module by which MLflow loads a model; it is a constant because a run folder may come from an untrusted source."""
+"""Module with which MLflow loads a model; a constant, because a run folder may come from an untrusted source."""
 
 
 @final
 class MlflowStore(Store):
-    """Run in an MLflow store; it is created there if it does not exist.
+    """Run in an MLflow store; the run is created if the store does not contain it.
 
     Args:
         folder: Folder of the run.
         info: Description of the run. The run is searched by its id first, then by its key. If the status is RUNNING,
-            it is set in MLflow too.
+            the status in MLflow is set too.
 
     Raises:
-        Exception: MLflow, SQLAlchemy and the network raise various kinds when the store is locked, full or cannot be
-            reached.
+        Exception: MLflow, SQLAlchemy and the network raise errors of many classes when the store is locked, full or
+            cannot be reached.
     """
 
     def __init__(self, folder: Path, info: RunInfo) -> None:
         self._folder, self._info = folder, info
-        self._client, experiment_id = _opened(info)
-        run = self._found(info, experiment_id)
+        self._client, experiment_id = _open_client(info)
+        run = self._find_run(info, experiment_id)
         self.replay = {"replay_after": info.replay_after, "replay_until": info.replay_until}
         sent, owed = info.sent, info.owed
         if run is None:
-            run = self._created(info, experiment_id)
+            run = self._create_run(info, experiment_id)
             sent, owed, self.replay = 0, (), {"replay_after": None, "replay_until": {}}
         elif run.info.lifecycle_stage == "deleted":
-            raise RuntimeError(f"run {run.info.run_id} was deleted there; restore it in MLflow")
+            raise RuntimeError(f"run {run.info.run_id} was deleted in the store; restore the run in MLflow")
         elif info.status == "RUNNING":
             self._client.update_run(run.info.run_id, status="RUNNING")
             self._client.set_tag(
@@ -99,7 +99,7 @@ class MlflowStore(Store):
             require_own_files(self._info.uri, (location or "",))
 
     def send(self, batch: Sequence[Record]) -> None:
-        """Store a batch; SQL stores identify a metric by key, time, step and value, so a repeated one is kept once."""
+        """Store a batch; a store ignores a metric that it has already, with the same key, time, step and value."""
         if "status" in batch[0]:
             status, end = batch[0]["status"], round(batch[0]["time"] * 1000)
             if status == "RUNNING":
@@ -121,18 +121,21 @@ class MlflowStore(Store):
             self._params |= {param.key: param.value for param in params}
 
     def send_file(self, path: str, place: str) -> None:
-        """Store a file or directory; one that is missing or leads out of the run folder is skipped with a warning."""
+        """Store a file or directory; skip it with a warning if it is missing or leads out of the run folder."""
         file = self._folder / path
         # a journal may come from an untrusted source, so files outside the run folder must not be sent
         try:
             if not file.is_relative_to(self._folder) or ".." in file.parts:
-                raise DataError("it names a file elsewhere")
+                raise DataError("the path names a file in another folder")
             require_plain_within(file, self._folder)
             if file.is_dir():
                 require_enclosed(file)
         except DataError as error:
             _log.warning(
-                "%s leads out of the run folder %s (%s): it is not sent.", shorten(file), self._folder, error
+                "%s leads out of the run folder %s (%s), so the file is not sent.",
+                shorten(file),
+                self._folder,
+                error,
             )
             return
         self._require_own_files(self._files)
@@ -145,30 +148,30 @@ class MlflowStore(Store):
         elif file.exists():
             self._client.log_artifact(self._run_id, str(file), place or None)
         else:
-            _log.warning("%s is gone before it could be stored.", shorten(file))
+            _log.warning("%s was removed before it could be sent to the store.", shorten(file))
 
     def _send_model(self, file: Path) -> None:
-        """Store the checkpoint as a model that MLflow can serve; it replaces a model sent before."""
-        found = self._client.search_logged_models(
+        """Store the checkpoint as a model that MLflow can serve, in place of a model that was sent before."""
+        models = self._client.search_logged_models(
             [self._experiment_id], f"source_run_id = '{self._run_id}'", max_results=1
         )
-        model = found[0] if found else None
+        model = models[0] if models else None
         if model is None:
             model = self._client.create_logged_model(self._experiment_id, self._model_name, self._run_id)
         self._require_own_files(model.artifact_location)
-        described = Model(run_id=self._run_id, model_id=model.model_id)
-        described.add_flavor(
+        description = Model(run_id=self._run_id, model_id=model.model_id)
+        description.add_flavor(
             "python_function", loader_module=_LOADER, data=file.name, python_version=platform.python_version()
         )
         with TemporaryDirectory() as folder:
-            described.save(str(Path(folder) / "MLmodel"))
+            description.save(str(Path(folder) / "MLmodel"))
             self._client.log_model_artifact(model.model_id, str(Path(folder) / "MLmodel"))
         self._client.log_model_artifact(model.model_id, str(file))
         self._client.finalize_logged_model(model.model_id, "READY")
         if model.model_id not in _models(self._client.get_run(self._run_id)):
             self._client.log_outputs(self._run_id, [LoggedModelOutput(model.model_id, 0)])
 
-    def _found(self, info: RunInfo, experiment_id: str) -> Run | None:
+    def _find_run(self, info: RunInfo, experiment_id: str) -> Run | None:
         if info.run_id is not None:
             try:
                 run = self._client.get_run(info.run_id)
@@ -180,12 +183,14 @@ class MlflowStore(Store):
                     raise
             uri = without_password(info.uri)
             _log.warning(
-                "%s knows no run %s: the run is stored there anew.", shorten(uri), shorten(info.run_id)
+                "The store %s contains no run %s, so the whole run is sent again.",
+                shorten(uri),
+                shorten(info.run_id),
             )
-        found = self._client.search_runs([experiment_id], f"tags.`{_KEY}` = '{info.key}'", max_results=1)
-        return found[0] if found else None
+        runs = self._client.search_runs([experiment_id], f"tags.`{_KEY}` = '{info.key}'", max_results=1)
+        return runs[0] if runs else None
 
-    def _created(self, info: RunInfo, experiment_id: str) -> Run:
+    def _create_run(self, info: RunInfo, experiment_id: str) -> Run:
         tags = {_KEY: info.key, _FOLDER: spell_name(self._folder), "mlflow.user": _user()}
         tags |= {"mlflow.source.name": "python -m framework", "mlflow.source.type": "LOCAL"}
         if info.parent:
@@ -202,7 +207,7 @@ class MlflowStore(Store):
                 yield Metric(key, float(value), round(record["time"] * 1000), step)
 
     def _params_and_tags(self, batch: Sequence[Record]) -> tuple[list[Param], list[RunTag], list[str]]:
-        """Return parameters, tags, and the keys of tags that were removed."""
+        """Return the parameters, the tags, and the keys of removed tags in a batch."""
         params: dict[str, str] = {}
         tags: dict[str, str | None] = {}
         for record in batch:
@@ -215,7 +220,7 @@ class MlflowStore(Store):
                 before = self._params.get(key, params.get(key))
                 if before is None:
                     params[key] = value
-                elif before != value:  # MLflow lets no parameter change, so the new value becomes a tag
+                elif before != value:  # MLflow refuses to change a parameter, so the new value becomes a tag
                     tags[f"changed.{key}"[:_LONGEST_NAME]] = value
         texts = [RunTag(key, value) for key, value in tags.items() if value is not None]
         removed = [key for key, value in tags.items() if value is None]
@@ -225,7 +230,7 @@ class MlflowStore(Store):
         try:
             self._client.delete_tag(self._run_id, key)
         except MlflowException as error:
-            if error.error_code != "RESOURCE_DOES_NOT_EXIST":  # it was never sent
+            if error.error_code != "RESOURCE_DOES_NOT_EXIST":  # the tag was never sent
                 raise
 
     def _log(self, metrics: Sequence[Metric], params: Sequence[Param], tags: Sequence[RunTag]) -> None:
@@ -237,7 +242,7 @@ class MlflowStore(Store):
             deleted = self._client.get_run(self._run_id).info.lifecycle_stage == "deleted"
             if error.error_code != "INVALID_PARAMETER_VALUE" or deleted:
                 raise
-            # One entry is refused permanently. Find it, so that the entries behind it do not wait for ever.
+            # MLflow always refuses one of the entries. Send the entries one by one, so that the others arrive.
             singles = [([entry], [], []) for entry in metrics]
             singles += [([], [entry], []) for entry in params] + [([], [], [entry]) for entry in tags]
             for single in singles:
@@ -246,19 +251,21 @@ class MlflowStore(Store):
                 except MlflowException as fault:
                     if fault.error_code != "INVALID_PARAMETER_VALUE":
                         raise
-                    _log.warning("MLflow refuses an entry; the journal keeps it: %s", reason(fault))
+                    _log.warning(
+                        "MLflow refuses an entry, which only the journal contains now: %s", reason(fault)
+                    )
 
     def _name(self, name: str) -> str:
         parts = re.sub(r"[^/\w.\- :]", "_", name)[:_LONGEST_NAME].split("/")
         key = "/".join(part for part in parts if part not in ("", ".", "..")) or "_"
         if key != name and name not in self._renamed:
             self._renamed.add(name)
-            _log.warning("MLflow takes no name like %r; there it is %r.", name, key)
+            _log.warning("MLflow does not accept the name %r, so the store uses %r.", name, key)
         return key
 
 
 def _dataset(record: Record) -> DatasetInput:
-    """Return the content of MLflow's column `Dataset`: name, digest, and all facts about the data as the profile."""
+    """Return a data set for MLflow's column `Dataset`: name, digest, and all facts about the data as the profile."""
     facts: dict[str, str] = {key: escape_undecodable(fact) for key, fact in record["facts"].items()}
     digest = facts.get("sha256") or hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
     dataset = Dataset(
@@ -276,7 +283,7 @@ def _models(run: Run) -> list[str]:
 
 
 def run_folder(run_id: str, uri: str | None = None) -> Path:
-    """Return the folder in which a run was made, or else a copy of its stored checkpoints in the cache.
+    """Return the folder of a run or, if the folder no longer exists, a folder in the cache with its checkpoints.
 
     Args:
         run_id: Id of the run in MLflow.
@@ -286,31 +293,36 @@ def run_folder(run_id: str, uri: str | None = None) -> Path:
         CheckpointError: The store has no such run, or the run has no checkpoints.
     """
     store = address(uri, Path.cwd() / "outputs" / "any")
-    told = without_password(store.uri)
+    store_name = without_password(store.uri)
     path = sqlite_path(store.uri)
     if path is not None and not path.is_file():  # MLflow would create the file
-        raise CheckpointError(f"There is no tracking store {path}. Give its address (logger.uri=...).")
+        raise CheckpointError(
+            f"There is no tracking store {path}. Give the address of the store with logger.uri=..."
+        )
     if not store.named:
         require_own_files(store.uri)
     client = MlflowClient(tracking_uri=store.uri)
     try:
         run = client.get_run(run_id)
-        made = path_of(run.data.tags.get(_FOLDER, ""))
+        original_folder = path_of(run.data.tags.get(_FOLDER, ""))
         # a store that the user did not name may have come with a run folder, so it is trusted for its own folder only
-        trusted = store.named or (path is not None and made.resolve().is_relative_to(path.parent.resolve()))
-        if _FOLDER in run.data.tags and trusted and _holds(made, run_id):
-            return made
+        trusted = store.named or (
+            path is not None and original_folder.resolve().is_relative_to(path.parent.resolve())
+        )
+        if _FOLDER in run.data.tags and trusted and _contains_run(original_folder, run_id):
+            return original_folder
         if not store.named:
             require_own_files(store.uri, (run.info.artifact_uri or "",))
         models = _models(run)
         if not models and not client.list_artifacts(run_id, "checkpoints"):
             raise CheckpointError(
-                f"Run {run_id} of {told} has no checkpoints, and its folder {made} is gone."
+                f"Run {run_id} of {store_name} has no checkpoints, and its folder {original_folder} does not exist. "
+                "Give another run, or the folder to which this run was moved."
             )
         copy = cache_folder("runs") / run_id
         copy.mkdir(exist_ok=True)
         if models:
-            # an address "models:/" would ask another store
+            # the artifact location is used, because an address "models:/" would contact another store
             place = client.get_logged_model(models[0]).artifact_location
             if not store.named:
                 require_own_files(store.uri, (place or "",))
@@ -318,12 +330,15 @@ def run_folder(run_id: str, uri: str | None = None) -> Path:
         # runs of version 0.1 keep checkpoints as files
         client.download_artifacts(run_id, "checkpoints", str(copy))
     except MlflowException as error:
-        raise CheckpointError(f"Run {run_id} cannot be had from {told}: {reason(error)}.") from error
+        raise CheckpointError(
+            f"Run {run_id} cannot be read from {store_name}: {reason(error)}. Check the id and the address of the "
+            "store (logger.uri=...)."
+        ) from error
     return copy
 
 
-def _holds(folder: Path, run_id: str) -> bool:
-    """Return whether a folder still holds the run with this id; another run may have been made there since."""
+def _contains_run(folder: Path, run_id: str) -> bool:
+    """Return whether a folder contains the run with this id; another run may have replaced it."""
     try:
         info = read_run_info(folder)
     except DataError:
@@ -331,7 +346,7 @@ def _holds(folder: Path, run_id: str) -> bool:
     return info is not None and info.run_id == run_id
 
 
-def _opened(info: RunInfo) -> tuple[MlflowClient, str]:
+def _open_client(info: RunInfo) -> tuple[MlflowClient, str]:
     """Return a client of the run's store and the id of the run's experiment; both are created if missing."""
     path = sqlite_path(info.uri)
     if path is None:
@@ -340,7 +355,7 @@ def _opened(info: RunInfo) -> tuple[MlflowClient, str]:
     path.parent.mkdir(parents=True, exist_ok=True)
     if not info.named:
         require_own_files(info.uri)
-    # MLflow's own migrations and get-or-create fail when several processes begin at the same time.
+    # MLflow fails to create a database or an experiment when several processes do so at the same time.
     with hold_lock(path.with_name(f".{path.name}.lock")):
         if not path.exists() or path.stat().st_size == 0:
             _make_database(path, info)
@@ -358,28 +373,28 @@ def _make_database(path: Path, info: RunInfo) -> None:
 
 
 def _experiment(client: MlflowClient, info: RunInfo) -> str:
-    found = client.get_experiment_by_name(info.experiment)
-    if found is None:
+    experiment = client.get_experiment_by_name(info.experiment)
+    if experiment is None:
         try:
-            made = client.create_experiment(info.experiment, artifact_location=info.artifacts)
-            for key, value in _view(made).items():
-                client.set_experiment_tag(made, key, value)
-            return made
+            experiment_id = client.create_experiment(info.experiment, artifact_location=info.artifacts)
+            for key, value in _chart_tags(experiment_id).items():
+                client.set_experiment_tag(experiment_id, key, value)
+            return experiment_id
         except MlflowException as error:
             if error.error_code != "RESOURCE_ALREADY_EXISTS":
                 raise
-        found = client.get_experiment_by_name(info.experiment)  # another process created it first
-    if found is None or found.lifecycle_stage == "deleted":
+        experiment = client.get_experiment_by_name(info.experiment)  # another process created it first
+    if experiment is None or experiment.lifecycle_stage == "deleted":
         raise RuntimeError(
-            f"experiment {info.experiment!r} was deleted there; restore it, or choose another name"
+            f"experiment {info.experiment!r} was deleted in the store; restore the experiment, or choose another name"
         )
-    return found.experiment_id
+    return experiment.experiment_id
 
 
-def _view(experiment_id: str) -> dict[str, str]:
-    """Return tags of an experiment: a view that shows both losses in one chart, and a link to it as the description.
+def _chart_tags(experiment_id: str) -> dict[str, str]:
+    """Return tags of an experiment: a view that shows both losses in one chart, and a description that links to it.
 
-    MLflow itself draws each metric in a separate chart. A view is the object that its button `Share` creates.
+    By default, MLflow draws each metric in a separate chart. A view is the object that MLflow's button `Share` creates.
     """
     losses = ["train/loss", "validation/loss"]
     chart = {"uuid": "losses", "metricSectionId": "losses", "type": "LINE", "metricKey": losses[0]}

@@ -22,19 +22,19 @@ _log = logging.getLogger(__name__)
 
 SIDECAR = "run.json"
 MODEL = "model:"
-"""Place of a checkpoint that the store keeps as the run's model instead of in a folder of files."""
+"""Folder name that marks a checkpoint which the store keeps as the run's model, not as a file."""
 
 
 @dataclass(frozen=True)
 class Destination:
-    """Place of a run in a store.
+    """Store of a run, and the names under which the store keeps the run.
 
     Attributes:
         uri: MLflow tracking URI that the user names; None means the default of `stores.address`.
         experiment: Name of the experiment in MLflow, which is created if it is new.
         run_name: Name of the run in MLflow.
         parent: Id of the run under which MLflow shows this one.
-        run_id: Id of the run to continue; None means a new run, or the run in the folder if that has no id yet.
+        run_id: Id of the run to continue; None means a new run, or the run in the folder if that run has no id yet.
     """
 
     uri: str | None
@@ -51,15 +51,15 @@ class RunInfo:
     run_id: str | None
     """Id of the run in the store; None while the store has not been reached."""
     uri: str
-    """Address of the store, written to the file without a password; empty where only the journal is kept."""
+    """Address of the store, written to the file without a password; empty if the run has no store."""
     experiment: str
     run_name: str
     parent: str | None
-    """Id, in the store, of the run to which this one belongs, such as a sweep."""
+    """Id of the run, such as a sweep, to which this run belongs in the store."""
     artifacts: str | None
-    """Folder in which a new experiment keeps its files; None lets the store decide."""
+    """Folder for the files of a new experiment; None lets the store decide."""
     key: str
-    """The framework's own id, by which a run whose creation was interrupted is found again in the store."""
+    """Id that the framework creates, which finds a run in the store even if its creation was interrupted."""
     started: float
     """Start of the run, in seconds since 1970."""
     status: str
@@ -70,7 +70,7 @@ class RunInfo:
     replay_after: int | None = None
     """Step from which the run was last resumed; the run repeats the steps after it."""
     replay_until: dict[str, int] = field(default_factory=dict)
-    """Step up to which each metric was in the store when the run was resumed, and need not be sent again."""
+    """Last step of each metric in the store when the run was resumed; up to it, the metric is not sent again."""
     owed: tuple[tuple[str, str], ...] = ()
     """Files (path, folder in the store) that must still be sent to the store."""
     named: bool = False
@@ -78,11 +78,11 @@ class RunInfo:
 
     @classmethod
     def at(cls, place: Destination, folder: Path) -> "RunInfo":
-        """Return the record of a run in `folder` that begins now.
+        """Return the record of a new run in `folder`.
 
         Raises:
-            ConfigError: MLflow cannot keep runs in that store.
-            DataError: The default store leads out of its folder.
+            ConfigError: MLflow cannot keep runs in the store `place.uri`.
+            DataError: A file of the default store is a link that leads out of its folder.
         """
         store = address(place.uri, folder)
         if not store.named:
@@ -106,7 +106,7 @@ class RunInfo:
 
 
 def read_run_info(folder: Path) -> RunInfo | None:
-    """Return the content of `run.json` in a run folder, or None where there is no such file.
+    """Return the content of `run.json` in a run folder, or None if there is no such file.
 
     Raises:
         DataError: The content was not written by a tracker.
@@ -114,13 +114,13 @@ def read_run_info(folder: Path) -> RunInfo | None:
     path = folder / SIDECAR
     if not os.path.lexists(path):
         return None
-    with translate_errors(path, "what a tracker wrote", "Remove it, and the run begins anew."):
-        found = TypeAdapter(RunInfo).validate_json(read_plain(path, LARGEST_JSON), strict=True)
-    return replace(found, named=False)
+    with translate_errors(path, "the record of a run", "Remove the file; the run then begins again."):
+        info = TypeAdapter(RunInfo).validate_json(read_plain(path, LARGEST_JSON), strict=True)
+    return replace(info, named=False)
 
 
 class Sidecar:
-    """The file `run.json`, in memory and on disk."""
+    """Record of a run in memory, and in the file `run.json`."""
 
     def __init__(self, folder: Path, info: RunInfo) -> None:
         self.info = info
@@ -128,7 +128,7 @@ class Sidecar:
         self._lock = threading.Lock()
 
     def update(self, **changes: Any) -> None:
-        """Change fields of `info`; the file is on disk when this returns, if the disk has room."""
+        """Change fields of `info`, and write the file; if that fails, log a warning."""
         with self._lock:
             self.info = replace(self.info, **changes)
             stored = asdict(self.info)
@@ -136,5 +136,7 @@ class Sidecar:
             del stored["named"]
             try:
                 write_whole(self._path, json.dumps(stored, indent=1).encode())
-            except OSError as error:  # with an old file, lines are sent again, which the store ignores
+            except (
+                OSError
+            ) as error:  # lines that an old file does not count are sent again, which the store ignores
                 _log.warning("%s could not be written: %s.", self._path, error.strerror)

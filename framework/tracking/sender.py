@@ -26,12 +26,12 @@ Record = dict[str, Any]
 
 
 class Store(ABC):
-    """Contract of one run in a store; if a method raises any exception, the store counts as away and is retried."""
+    """Contract of one run in a store; after any exception of a method, the sender tries again later."""
 
     identity: Mapping[str, Any]
     """Fields of `RunInfo` with their values after the store was opened."""
     replay: Mapping[str, Any]
-    """Fields `replay_...` of `RunInfo` with their values after the batches sent so far."""
+    """Fields `replay_after` and `replay_until` of `RunInfo` with their values after the batches sent so far."""
 
     @abstractmethod
     def send(self, batch: Sequence[Record]) -> None:
@@ -42,7 +42,7 @@ class Store(ABC):
         """Store a file or a directory under the folder `place`; `path` is absolute or relative to the run folder.
 
         Raises:
-            DataError: This store may not accept files; another call would not help.
+            DataError: Files may not be sent to this store; a further attempt would fail too.
         """
 
 
@@ -76,7 +76,7 @@ def batches(records: Sequence[Record]) -> Iterator[list[Record]]:
 def send_new(journal: Journal, sidecar: Sidecar, store: Store, stop: Callable[[], bool]) -> int:
     """Send the journal lines that the store lacks until `stop()` returns True, and return the number of lines sent.
 
-    Lines that are logged meanwhile wait for the next call; otherwise each line of a training would be sent on its own.
+    Lines that are logged during this call wait for the next one. Otherwise each line of a training would be sent alone.
     """
     count, last_line = 0, journal.last
     while sidecar.info.sent < last_line and (records := journal.read(sidecar.info.sent)):
@@ -85,7 +85,7 @@ def send_new(journal: Journal, sidecar: Sidecar, store: Store, stop: Callable[[]
                 return count
             last = batch[-1]["n"]
             if "artifact" in batch[0]:
-                # Files are only noted here and sent afterwards, so that a file that fails does not delay the numbers.
+                # Files are listed here and sent later, so that a file that cannot be sent does not delay the numbers.
                 owed = (*sidecar.info.owed, (batch[0]["artifact"], batch[0]["folder"]))
                 sidecar.update(sent=last, owed=owed)
             else:
@@ -133,14 +133,14 @@ def send_all(folder: Path, journal: Journal, sidecar: Sidecar, open_store: OpenS
         send_owed(sidecar, store, lambda: False)
     except Exception as error:
         raise UserError(
-            f"The tracking store {without_password(sidecar.info.uri)} did not take everything "
-            f"({reason(error)}). What it lacks is kept in {journal.path}; try again when the store is back."
+            f"The tracking store {without_password(sidecar.info.uri)} did not accept everything ({reason(error)}). "
+            f"{journal.path} contains the rest. Try again when the store can be reached."
         ) from error
     return count
 
 
 class Sender(threading.Thread):
-    """Thread that sends a growing journal until it is told to finish; no failure of the store ends it."""
+    """Thread that sends a growing journal until `finish` is called, and tries again after failures of the store."""
 
     def __init__(self, folder: Path, journal: Journal, sidecar: Sidecar, open_store: OpenStore) -> None:
         super().__init__(name="tracking", daemon=True)  # a store that hangs does not keep the process alive
@@ -156,21 +156,21 @@ class Sender(threading.Thread):
         self._finishing = threading.Event()
         self._abandoned = False
         self._away_since: float | None = None
-        self._told_refusal = False
+        self._refusal_logged = False
 
     def notice(self) -> None:
-        """Note that one more line waits."""
+        """Count one more waiting line, and start sending if there are many."""
         self._waiting_lines += 1
         if self._waiting_lines >= _LINES:
             self._wake.set()
 
     def warn(self, why: str) -> None:
-        """Log a warning that the store is away, unless it was logged before."""
+        """Log a warning that the store cannot be reached, unless the warning was logged before."""
         if self._away_since is None:
             self._away_since = time.monotonic()
             _log.warning(
-                "The tracking store %s cannot be reached or written (%s). The run goes on; everything is "
-                "kept in %s and sent when the store is back.",
+                "The tracking store %s cannot be reached or written (%s). The run continues; %s contains everything, "
+                "which is sent when the store can be reached again.",
                 without_password(self._sidecar.info.uri),
                 why,
                 self._journal.path,
@@ -194,10 +194,10 @@ class Sender(threading.Thread):
             try:
                 self._send()
             except Exception as error:
-                self._store = None  # opened again, as it may be another store by then
+                self._store = None  # the store is opened again, because it may have been replaced
                 self.warn(reason(error))
                 self.tried.set()
-                # Little time is left after `finish`, so attempts follow each other quickly.
+                # After `finish`, little time is left, so the next attempt follows soon.
                 if finishing:
                     time.sleep(_FIRST_RETRY)
                 else:
@@ -209,7 +209,11 @@ class Sender(threading.Thread):
             if self._away_since is not None:
                 seconds, self._away_since = time.monotonic() - self._away_since, None
                 uri = without_password(self._sidecar.info.uri)
-                _log.warning("The tracking store %s is back after %.0f s and has everything.", uri, seconds)
+                _log.warning(
+                    "The tracking store %s can be reached again after %.0f s and has received everything.",
+                    uri,
+                    seconds,
+                )
             if finishing:
                 return
             if not self._finishing.wait(_PAUSE):
@@ -220,12 +224,12 @@ class Sender(threading.Thread):
             self._store = self._open_store(self._folder, self._sidecar.info)
             self._sidecar.update(**self._store.identity)
         send_new(self._journal, self._sidecar, self._store, lambda: self._abandoned)
-        send_owed(self._sidecar, self._store, lambda: self._abandoned, self._refused)
+        send_owed(self._sidecar, self._store, lambda: self._abandoned, self._log_refusal)
 
-    def _refused(self, error: DataError) -> None:
-        if not self._told_refusal:
-            self._told_refusal = True
-            _log.warning("The files of this run are not stored, its numbers are: %s", error)
+    def _log_refusal(self, error: DataError) -> None:
+        if not self._refusal_logged:
+            self._refusal_logged = True
+            _log.warning("The store receives the numbers of this run, but not its files: %s", error)
 
 
 def reason(error: BaseException) -> str:

@@ -18,13 +18,15 @@ _LIBRARY = ctypes.CDLL(None) if sys.platform == "linux" else None  # not loaded 
 _SET_PARENT_DEATH, _GET_PARENT_DEATH = 1, 2  # constants of prctl.h
 
 
-def handled() -> tuple[signal.Signals, ...]:
-    """Return the signals to handle: all of `SIGNALS`, except the closed terminal if it is ignored, as under nohup."""
-    return tuple(one for one in SIGNALS if one != CLOSED or signal.getsignal(one) is not signal.SIG_IGN)
+def handled_signals() -> tuple[signal.Signals, ...]:
+    """Return the signals to handle: all of `SIGNALS`, without SIGHUP if it is ignored, as under nohup."""
+    return tuple(
+        number for number in SIGNALS if number != CLOSED or signal.getsignal(number) is not signal.SIG_IGN
+    )
 
 
 class Stopped(SystemExit):
-    """Exception for a run that was told to stop; the process exits with 128 + the signal's number, as in shells."""
+    """Exception for a run that a signal stops; the process exits with 128 + the signal's number, as in shells."""
 
     def __init__(self, number: int) -> None:
         super().__init__(128 + number)
@@ -32,7 +34,7 @@ class Stopped(SystemExit):
 
 
 class Stopper:
-    """Handler that turns SIGINT, SIGTERM and SIGHUP into `Stopped`.
+    """Handler that raises `Stopped` for SIGINT, SIGTERM and SIGHUP.
 
     The exception is raised immediately or, while `wait` is set, when the code calls `stop`. A second signal raises it
     immediately in any case.
@@ -44,7 +46,7 @@ class Stopper:
 
     @contextmanager
     def installed(self) -> Iterator[None]:
-        """Handle the signals inside the block; the handlers before are restored after it."""
+        """Handle the signals inside the block, and restore the earlier handlers after it."""
         before = {number: signal.getsignal(number) for number in SIGNALS}
         self.install()
         try:
@@ -54,12 +56,12 @@ class Stopper:
                 signal.signal(number, handler)
 
     def install(self) -> None:
-        """Install the handlers, also where other code has replaced them since."""
-        for number in handled():
+        """Install the handlers, or install them again after other code has replaced them."""
+        for number in handled_signals():
             signal.signal(number, self._handle)
 
     def stop(self) -> NoReturn:
-        """Raise `Stopped` for the received signal; SIGTERM where only another rank has received one."""
+        """Raise `Stopped` for the received signal, or for SIGTERM if only another rank has received a signal."""
         raise Stopped(self.received or signal.SIGTERM)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
@@ -69,8 +71,8 @@ class Stopper:
             raise Stopped(number)
 
 
-def ending_with_parent(number: int = signal.SIGTERM) -> Callable[[], None]:
-    """Return a function that a new child process calls first, so that it gets a signal when this process dies.
+def end_with_parent(number: int = signal.SIGTERM) -> Callable[[], None]:
+    """Return a function for a new child process to call first; the child then gets a signal when this process dies.
 
     This works on Linux only; elsewhere the child continues to run. Start the child in the main thread, because the
     signal is sent when the starting thread ends.

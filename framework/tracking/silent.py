@@ -1,4 +1,4 @@
-"""Tracker for processes whose run is recorded by another process."""
+"""Tracker for processes of a distributed training whose run another process records."""
 
 from collections.abc import Mapping
 from pathlib import Path

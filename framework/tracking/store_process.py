@@ -1,6 +1,6 @@
-"""Store in a separate process, so that the process that trains never imports MLflow.
+"""Access to the store from a separate process, so that the process that trains never imports MLflow.
 
-Requests and answers are lines of JSON. The process ends when its input ends, that is, when the input is closed or the
+Requests and responses are lines of JSON. The process ends when its input ends, that is, when the input is closed or the
 requesting process has died.
 """
 
@@ -27,12 +27,12 @@ _ENDING = 5.0  # seconds in which the process must end by itself
 
 
 class StoreAway(Exception):
-    """Error for a store that is locked, full or away, or for a store process that has ended."""
+    """Error for a store that is locked, full or cannot be reached, or for a store process that has ended."""
 
 
 @final
 class StoreProcess:
-    """Function object (`sender.OpenStore`) that opens runs in MLflow in one process, started at the first call."""
+    """Function object (`sender.OpenStore`) that opens runs in MLflow in a process that the first call starts."""
 
     def __init__(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None
@@ -41,36 +41,36 @@ class StoreProcess:
         if self._process is not None and self._process.poll() is not None:
             self.end()
         if self._process is None:
-            # a session of its own, because Ctrl-C is meant for the training, which then tells this process to end
+            # a separate session, because Ctrl-C is meant for the training, which then ends this process
             self._process = subprocess.Popen(
                 _COMMAND, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True
             )
         return _DistantStore(self, folder, info)
 
-    def ask(self, **question: Any) -> Mapping[str, Any]:
-        """Send a request to the process and return its answer; its log messages are logged here.
+    def ask(self, **request: Any) -> Mapping[str, Any]:
+        """Send a request to the process, log the log messages of the process, and return its response.
 
         Raises:
-            DataError: The store may not accept a file.
+            DataError: A file may not be sent to the store.
             StoreAway: The store failed, or the process has ended.
         """
         process = self._process
         assert process is not None and process.stdin is not None and process.stdout is not None
         line = b""
         with suppress(BrokenPipeError):
-            process.stdin.write(json.dumps(question).encode() + b"\n")
+            process.stdin.write(json.dumps(request).encode() + b"\n")
             process.stdin.flush()
             line = process.stdout.readline()
-        gone = {"error": "the sending process has ended", "refused": False}
-        answer: dict[str, Any] = json.loads(line) if line else gone
-        for level, text in answer.get("said", ()):
+        no_response = {"error": "the process that sends to the store has ended", "refused": False}
+        response: dict[str, Any] = json.loads(line) if line else no_response
+        for level, text in response.get("said", ()):
             _log.log(level, "%s", text)
-        if "error" in answer:
-            raise DataError(answer["error"]) if answer["refused"] else StoreAway(answer["error"])
-        return answer
+        if "error" in response:
+            raise DataError(response["error"]) if response["refused"] else StoreAway(response["error"])
+        return response
 
     def end(self, *, at_once: bool = False) -> None:
-        """End the process; with `at_once`, even while it handles a request."""
+        """End the process after its current request or, with `at_once`, immediately."""
         process, self._process = self._process, None
         if process is None:
             return
@@ -91,10 +91,10 @@ class StoreProcess:
 class _DistantStore(Store):
     def __init__(self, process: StoreProcess, folder: Path, info: RunInfo) -> None:
         self._process = process
-        answer = process.ask(open=str(folder), info=asdict(info))
+        response = process.ask(open=str(folder), info=asdict(info))
         # JSON turns tuples into lists
-        owed = tuple((path, place) for path, place in answer["identity"]["owed"])
-        self.identity, self.replay = {**answer["identity"], "owed": owed}, answer["replay"]
+        owed = tuple((path, place) for path, place in response["identity"]["owed"])
+        self.identity, self.replay = {**response["identity"], "owed": owed}, response["replay"]
 
     def send(self, batch: Sequence[Record]) -> None:
         self.replay = self._process.ask(send=batch)["replay"]
@@ -103,8 +103,8 @@ class _DistantStore(Store):
         self._process.ask(send_file=path, place=place)
 
 
-class _Said(logging.Handler):
-    """Log handler that keeps the messages for the next answer."""
+class _CollectingHandler(logging.Handler):
+    """Log handler that collects the messages for the next response."""
 
     def __init__(self) -> None:
         logging.Handler.__init__(self, logging.WARNING)
@@ -114,42 +114,42 @@ class _Said(logging.Handler):
         self.lines.append((record.levelno, record.getMessage()))
 
 
-def serve(questions: BinaryIO, answers: BinaryIO) -> None:
-    """Read requests and write answers until the requests end."""
-    said = _Said()
-    logging.getLogger().addHandler(said)
+def serve(requests: BinaryIO, responses: BinaryIO) -> None:
+    """Read requests and write responses until the input ends."""
+    log_handler = _CollectingHandler()
+    logging.getLogger().addHandler(log_handler)
     store: Store | None = None
-    for line in questions:
-        question = json.loads(line)
+    for line in requests:
+        request = json.loads(line)
         try:
-            if "open" in question:
+            if "open" in request:
                 # the import takes seconds, for which the requesting process waits
                 from framework.tracking.mlflow_store import MlflowStore
 
-                info = TypeAdapter(RunInfo).validate_python(question["info"])
-                store = MlflowStore(Path(question["open"]), info)
-            assert store is not None, "a run is opened first"
-            if "send" in question:
-                store.send(question["send"])
-            elif "send_file" in question:
-                store.send_file(question["send_file"], question["place"])
-            answer: dict[str, Any] = {"identity": dict(store.identity), "replay": dict(store.replay)}
+                info = TypeAdapter(RunInfo).validate_python(request["info"])
+                store = MlflowStore(Path(request["open"]), info)
+            assert store is not None, "the first request must open a run"
+            if "send" in request:
+                store.send(request["send"])
+            elif "send_file" in request:
+                store.send_file(request["send_file"], request["place"])
+            response: dict[str, Any] = {"identity": dict(store.identity), "replay": dict(store.replay)}
         except Exception as error:
             refused = isinstance(error, DataError)
-            answer = {"error": str(error) if refused else reason(error), "refused": refused}
-        answer["said"], said.lines = said.lines, []
+            response = {"error": str(error) if refused else reason(error), "refused": refused}
+        response["said"], log_handler.lines = log_handler.lines, []
         try:
-            answers.write(json.dumps(answer).encode() + b"\n")
-            answers.flush()
+            responses.write(json.dumps(response).encode() + b"\n")
+            responses.flush()
         except BrokenPipeError:  # the requesting process has died
             return
 
 
 def main() -> None:
-    """Answer requests from standard input; redirect what MLflow prints to standard error, away from the answers."""
-    answers = os.fdopen(os.dup(1), "wb")
+    """Handle requests from standard input; redirect the output of MLflow to standard error, away from the responses."""
+    responses = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
-    serve(sys.stdin.buffer, answers)
+    serve(sys.stdin.buffer, responses)
 
 
 if __name__ == "__main__":

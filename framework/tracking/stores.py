@@ -1,9 +1,9 @@
 """Choice of the tracking store that a command may contact, and the form of its address in files.
 
-A run folder may come from an untrusted source, so an address in one of its files is never contacted. The user names a
-store in the command (`logger.uri=`) or in the environment (MLFLOW_TRACKING_URI). If neither is set, the store is the
-SQLite file `mlflow.db` in the `outputs` folder. An address that a file records is only compared with these addresses,
-and the program contacts the address that the user gave.
+A run folder may come from an untrusted source, so the program never contacts an address that it reads in such a folder.
+The user names a store in the command (`logger.uri=`) or in the environment (MLFLOW_TRACKING_URI). If neither is set,
+the store is the SQLite file `mlflow.db` in the `outputs` folder. An address in a file is only compared with these
+addresses, and the program contacts the address that the user gave.
 """
 
 import os
@@ -32,9 +32,9 @@ class Address:
     """Address of a store.
 
     Attributes:
-        uri: MLflow tracking URI; it may contain a password and is kept in memory only.
-        named: Whether the user named it. The default store may have come with a folder from an untrusted source, so
-            its files must stay in its own folder.
+        uri: MLflow tracking URI; it may contain a password and is never written to a file.
+        named: Whether the user named the store. The default store may have come with a folder from an untrusted source,
+            so all its files must lie in its own folder.
     """
 
     uri: str
@@ -42,28 +42,28 @@ class Address:
 
 
 def address(named: str | None, folder: Path) -> Address:
-    """Return the address of the store for a run that this command begins in `folder`.
+    """Return the address of the store for a new run in `folder`.
 
     Args:
         named: `logger.uri` of this command.
         folder: Folder of the run.
 
     Raises:
-        ConfigError: MLflow cannot keep runs there, or cannot use a folder of such a name.
+        ConfigError: MLflow cannot keep runs at the address, or cannot use a folder of such a name.
     """
-    given = named or os.environ.get(SETTING)
-    uri = store_uri(given) if given else default_uri(folder)
+    user_uri = named or os.environ.get(SETTING)
+    uri = store_uri(user_uri) if user_uri else default_uri(folder)
     path = sqlite_path(uri)
     if path is not None and re.search(r"[\ud800-\udfff]", str(path)):
         raise ConfigError(
-            f"{shorten(path)} lies in a folder whose name is not UTF-8, where MLflow keeps no run. Rename the folder, or "
+            f"{shorten(path)} lies in a folder whose name is not UTF-8, which MLflow cannot use. Rename the folder, or "
             "choose another store: add logger.uri=sqlite:///<file>, or logger=none."
         )
-    return Address(uri, bool(given))
+    return Address(uri, bool(user_uri))
 
 
-def confirmed(recorded: str, named: str | None, folder: Path, source: Path) -> Address:
-    """Return the user's own address of the store that a file records for the run in `folder`.
+def confirm_address(recorded: str, named: str | None, folder: Path, source: Path) -> Address:
+    """Return the address at which the user names the store that a file records for the run in `folder`.
 
     Args:
         recorded: Address in the file.
@@ -74,20 +74,20 @@ def confirmed(recorded: str, named: str | None, folder: Path, source: Path) -> A
     Raises:
         ConfigError: The user does not name the recorded store.
     """
-    own = [Address(store_uri(uri), True) for uri in (named, os.environ.get(SETTING)) if uri]
-    own += [Address(default_uri(place), False) for place in (folder, Path.cwd() / "outputs" / "run")]
-    for one in own:
-        if _same(one.uri, recorded):
-            return one
-    told = shorten(without_password(recorded))
+    candidates = [Address(store_uri(uri), True) for uri in (named, os.environ.get(SETTING)) if uri]
+    candidates += [Address(default_uri(place), False) for place in (folder, Path.cwd() / "outputs" / "run")]
+    for candidate in candidates:
+        if _is_same_store(candidate.uri, recorded):
+            return candidate
+    store_name = shorten(without_password(recorded))
     raise ConfigError(
-        f"{source} says that the run goes to {told}. A run folder may be a stranger's, so no store that only the "
-        f"folder names is contacted. If that is where you keep runs, say so: add logger.uri={told}"
+        f"{source} names the store {store_name} for the run. A run folder may come from an untrusted source, so a "
+        f"store that only the folder names is not contacted. If this is your store, add logger.uri={store_name}"
     )
 
 
 def default_uri(folder: Path) -> str:
-    """Return the address of the default store: mlflow.db in the enclosing `outputs` folder, else beside the folder."""
+    """Return the address of the default store: mlflow.db in the enclosing folder `outputs`, or else beside `folder`."""
     return sqlite_uri(_outputs(folder) / "mlflow.db")
 
 
@@ -95,25 +95,25 @@ def store_uri(uri: str) -> str:
     """Return a tracking URI in a form that does not depend on the working directory.
 
     Raises:
-        ConfigError: MLflow keeps no runs there.
+        ConfigError: MLflow cannot keep runs at the address.
     """
     if uri.startswith(_SQLITE):
         path, question, query = uri.removeprefix(_SQLITE).partition("?")
         if path in ("", ":memory:"):
-            raise ConfigError(f"logger.uri={uri} keeps nothing. Give a file: sqlite:///outputs/mlflow.db.")
+            raise ConfigError(f"logger.uri={uri} stores nothing. Give a file: sqlite:///outputs/mlflow.db.")
         return f"{sqlite_uri(Path(unquote(path)).expanduser().absolute())}{question}{query}"
     if not re.match(r"(https?|(postgresql|mysql|mssql)(\+\w+)?)://.|databricks", uri):
         raise ConfigError(
-            f"logger.uri={shorten(without_password(uri))}: wanted sqlite:///<file>, the http(s)://<host>:<port> of a "
+            f"logger.uri={shorten(without_password(uri))}: expected sqlite:///<file>, http(s)://<host>:<port> of a "
             "server, or a postgresql, mysql or mssql address. MLflow no longer keeps runs in plain folders."
         )
     return uri
 
 
 def sqlite_uri(path: Path) -> str:
-    """Return the address of an SQLite store, escaped if its path contains a character with a special meaning there.
+    """Return the address of an SQLite store, escaped if its path contains a character with a special meaning.
 
-    Slashes are then escaped too, because MLflow creates the folder that it reads in the address before decoding it.
+    Slashes are then escaped too, because MLflow creates the folder in the address before it decodes the address.
     """
     return _SQLITE + (quote(os.fsencode(path), safe="") if re.search(_MEANING, str(path)) else str(path))
 
@@ -124,7 +124,7 @@ def sqlite_path(uri: str) -> Path | None:
 
 
 def artifact_folder(uri: str, folder: Path) -> str | None:
-    """Return the folder in which a new experiment keeps its files; None for servers, which choose it themselves.
+    """Return the folder for the files of a new experiment; None for servers, which choose the folder themselves.
 
     The path is absolute, since MLflow's own default depends on the working directory.
     """
@@ -156,23 +156,24 @@ def require_own_files(uri: str, locations: tuple[str, ...] = ()) -> None:
         place = Path(unquote(parts.path) if parts.scheme == "file" and not parts.netloc else location)
         if not place.is_relative_to(home) or ".." in place.parts:
             raise DataError(
-                f"The store {path}, which nobody named, keeps files in {shorten(without_password(location))}; wanted a "
-                f"folder in {home}. If the store is yours, name it: add logger.uri={sqlite_uri(path)}"
+                f"The store {path}, which the command does not name, keeps files in "
+                f"{shorten(without_password(location))}, outside the folder {home}. If this is your store, add "
+                f"logger.uri={sqlite_uri(path)}"
             )
         require_plain_within(place, path.parent)
-        if place != home:  # `home` itself holds the files of every run
+        if place != home:  # `home` itself contains the files of every run
             require_enclosed(place)
 
 
 def without_password(text: str) -> str:
     """Return a text with the user names, passwords and tokens of all addresses in it removed."""
     text = re.sub(r"(?<!sqlite)(://)[^\s/]*@", r"\1", text)
-    text = re.sub(r"(?<!sqlite)(://)[^\s/@:]*:[^\s@]*@", r"\1", text)  # a password that holds a slash
+    text = re.sub(r"(?<!sqlite)(://)[^\s/@:]*:[^\s@]*@", r"\1", text)  # a password that contains a slash
     return re.sub(_SECRET, r"\1", text)
 
 
 def require_no_password(uri: str) -> None:
-    """Refuse an address that contains a password in a place where it would be stored or seen by others.
+    """Refuse an address with a password in a command or config, which is stored and which other users can see.
 
     Raises:
         ConfigError: The address contains a password.
@@ -180,17 +181,18 @@ def require_no_password(uri: str) -> None:
     # the user name of an http address may be a token
     if re.search(r"^https?://[^\s/]*@|^\w[\w+]*://[^\s/@]*:[^\s@]*@", uri) or re.search(_SECRET, uri):
         raise ConfigError(
-            f"logger.uri={shorten(without_password(uri))} came with a password; wanted none, since commands and configs "
-            f"are stored and other users see them. Put the whole address into the environment variable {SETTING} and "
-            "leave logger.uri out; MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD serve for http, too."
+            f"logger.uri={shorten(without_password(uri))} was given with a password, which is refused, because "
+            "commands and configs are stored and other users can see them. Put the whole address into the environment "
+            f"variable {SETTING} and leave logger.uri out. For http, MLFLOW_TRACKING_USERNAME and "
+            "MLFLOW_TRACKING_PASSWORD work too."
         )
 
 
-def _same(one: str, other: str) -> bool:
-    """Return whether two addresses name the same store, whatever passwords and escaped characters they contain."""
-    one, other = without_password(one), without_password(other)
-    same_file = sqlite_path(one) == sqlite_path(other) is not None
-    return one == other or (same_file and one.partition("?")[2] == other.partition("?")[2])
+def _is_same_store(first: str, second: str) -> bool:
+    """Return whether two addresses name the same store, ignoring passwords and the escaping of characters."""
+    first, second = without_password(first), without_password(second)
+    same_file = sqlite_path(first) == sqlite_path(second) is not None
+    return first == second or (same_file and first.partition("?")[2] == second.partition("?")[2])
 
 
 def _outputs(folder: Path) -> Path:

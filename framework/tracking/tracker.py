@@ -1,4 +1,4 @@
-"""Recording of a run: it logs to the local journal immediately, and to a store as soon as the store accepts it."""
+"""Recording of a run, to the local journal immediately and to a store as soon as the store accepts the entries."""
 
 import importlib
 import json
@@ -35,10 +35,10 @@ LONGEST_PARAMETER = 250  # characters; some servers cut off the rest silently
 class Tracker(ABC):
     """Contract of the object that records one run.
 
-    Only one process records a run folder; the other processes of a distributed training record nothing. `open` is
-    called first and `close` last. Between them, no method raises an error or waits because of a store: an entry is in
-    the journal when the call returns, within a tenth of a millisecond for metrics, and reaches the store later. Steps
-    are optimiser steps; names have the form "validation/loss".
+    Only one process records a run; the other processes of a distributed training record nothing. `open` is called first
+    and `close` last. Between them, no method raises an error or waits because of a store: when the call returns, the
+    entry is in the journal (metrics take at most a tenth of a millisecond), and it reaches the store later. Steps are
+    optimiser steps; names have the form "validation/loss".
     """
 
     journal: Journal
@@ -48,12 +48,12 @@ class Tracker(ABC):
         """Begin or continue the run, and set its status to RUNNING.
 
         Raises:
-            DataError: The run folder cannot be written, or another process writes there.
+            DataError: The run folder cannot be written, or another process writes to it.
         """
 
     @abstractmethod
     def log_params(self, flat: Mapping[str, object]) -> None:
-        """Record the config by dotted keys; a different value given later is recorded as the tag `changed.<key>`."""
+        """Record the config by dotted keys; a later change of a value is recorded as the tag `changed.<key>`."""
 
     @abstractmethod
     def set_tags(self, tags: Mapping[str, str | None]) -> None:
@@ -69,7 +69,7 @@ class Tracker(ABC):
 
     @abstractmethod
     def log_artifact(self, path: Path, folder: str = "") -> None:
-        """Record a file or a directory under `folder` in the store; it is read later, so it must stay in place.
+        """Record a file or a directory under `folder` in the store; it must not be moved, because it is read later.
 
         A checkpoint under `MODEL` (`run_info`) becomes the model of the run, which the store can serve.
         """
@@ -80,11 +80,11 @@ class Tracker(ABC):
 
     @abstractmethod
     def close(self, status: Status) -> None:
-        """End the run, after waiting a limited time for the store to accept the remaining entries."""
+        """Wait a limited time until the store has accepted the remaining entries, and end the run."""
 
     @abstractmethod
     def leave_open(self) -> None:
-        """Release the run as `close` does without ending it, because another tracker will open it again."""
+        """Release the run like `close`, but do not end it, because another tracker will open it again."""
 
     @property
     @abstractmethod
@@ -103,7 +103,7 @@ class NoTracker(Tracker):
 
     Args:
         folder: Folder of the run.
-        resumed: Whether to continue the journal in the folder instead of setting it aside; None continues it if its
+        resumed: Whether to continue the journal in the folder instead of renaming it; None continues the journal if its
             run has not finished.
     """
 
@@ -115,22 +115,22 @@ class NoTracker(Tracker):
 
     def open(self) -> None:
         wanted = RunInfo(None, "", "", "", None, None, uuid.uuid4().hex, time.time(), "RUNNING")
-        self._sidecar = _begin(self.folder, self.journal, wanted, self._resumed)
+        self._sidecar = _begin_run(self.folder, self.journal, wanted, self._resumed)
 
     def log_params(self, flat: Mapping[str, object]) -> None:
         """Do nothing, because the config is in the run folder."""
 
     def set_tags(self, tags: Mapping[str, str | None]) -> None:
-        """Do nothing, because tags serve for searching in a store."""
+        """Do nothing, because tags are only used to search in a store."""
 
     def log_metrics(self, values: Mapping[str, float], step: int, epoch: int) -> None:
         self.journal.write(values, step, epoch)
 
     def log_dataset(self, name: str, context: str, facts: Mapping[str, str]) -> None:
-        """Do nothing, because data sets serve for searching in a store."""
+        """Do nothing, because data sets are only recorded to search in a store."""
 
     def log_artifact(self, path: Path, folder: str = "") -> None:
-        """Do nothing, because the file stays in its place."""
+        """Do nothing, because the file stays in the run folder."""
 
     def drop_after(self, step: int) -> None:
         self.journal.drop_after(step)
@@ -156,19 +156,20 @@ class NoTracker(Tracker):
 class MlflowTracker(Tracker):
     """Tracker that sends a run to an MLflow store in batches, from a separate process.
 
-    Every entry is a line of the journal, and the store holds a copy of the journal. A thread sends new lines when 50 of
-    them wait or two seconds have passed. When the store is locked, full or away, the thread tries again at growing
-    intervals (up to 30 s) without limit. `sync` sends the lines that the process could not send before it ended. Lines
-    that the store has are not sent again: a resumed run repeats the steps after its checkpoint, and the store keeps
-    the first values of these steps.
+    Every entry is a line of the journal, and the store receives a copy of the journal. A thread sends new lines when 50
+    of them wait or two seconds have passed. If the store is locked, full or cannot be reached, the thread tries again
+    without end, at growing intervals (up to 30 s). `sync` sends the lines that the process could not send before it
+    ended. Lines that the store has received are not sent again: a resumed run repeats the steps after its checkpoint,
+    and the store keeps the first values of these steps.
 
-    The import of MLflow takes several seconds. A short run can avoid it if another process will `sync` it afterwards,
-    such as a sweep, which has imported MLflow already: with `wait`, nothing is sent before that time is over.
+    The import of MLflow takes several seconds. A short run can avoid this import if another process, such as a sweep,
+    calls `sync` afterwards: with `wait`, nothing is sent before that time is over.
 
     Args:
         folder: Folder of the run.
         destination: Run and store to send to.
-        resumed: Whether to continue the run in the folder or to set it aside; None follows the destination.
+        resumed: Whether to continue the run in the folder instead of renaming its files; None continues the run if it
+            is the run of the destination.
         wait: Seconds after opening before the first line is sent; a run that ends sooner sends nothing.
         opening_patience: Seconds that `open` waits for the store, for a caller that needs the run's id immediately.
         patience: Seconds that `close` waits for the store.
@@ -204,7 +205,7 @@ class MlflowTracker(Tracker):
 
     def open(self) -> None:
         self._closed = False
-        self._sidecar = _begin(self.folder, self.journal, self._wanted, self._resumed)
+        self._sidecar = _begin_run(self.folder, self.journal, self._wanted, self._resumed)
         self.journal.append(status="RUNNING")
         self._notice()
 
@@ -213,14 +214,14 @@ class MlflowTracker(Tracker):
         self._sender = Sender(self.folder, self.journal, sidecar, self._open_store)
         self._sender.start()
         if self._opening_patience and not self._sender.tried.wait(self._opening_patience):
-            self._sender.warn("no answer yet")
+            self._sender.warn("the store has not responded yet")
 
     def log_params(self, flat: Mapping[str, object]) -> None:
         shown = {key: str(value) for key, value in flat.items()}
         long = {key: value for key, value in shown.items() if len(value) > LONGEST_PARAMETER}
         if long:
             shown |= {key: value[: LONGEST_PARAMETER - 1] + "…" for key, value in long.items()}
-            self._keep_whole(long)
+            self._save_long_parameters(long)
         self._log(params=shown)
 
     def set_tags(self, tags: Mapping[str, str | None]) -> None:
@@ -259,8 +260,8 @@ class MlflowTracker(Tracker):
         self._closed = True
         if self._sender is not None and not self._sender.finish(self._patience):
             _log.warning(
-                "Part of this run has not reached the tracking store %s; it is kept in %s, and "
-                "`python -m framework mode=sync mode.run=%s` will send it.",
+                "Part of this run has not reached the tracking store %s. The missing entries are in %s; "
+                "`python -m framework mode=sync mode.run=%s` sends them.",
                 without_password(self._sidecar.info.uri),
                 self.journal.path,
                 shlex.quote(str(self.folder)),
@@ -270,14 +271,16 @@ class MlflowTracker(Tracker):
         self._sender = None
         self.journal.close()
 
-    def _keep_whole(self, params: dict[str, str]) -> None:
+    def _save_long_parameters(self, params: dict[str, str]) -> None:
         path = self.folder / "params.json"
         try:
             earlier = read_json(path, "parameters") if os.path.lexists(path) else {}
             write_whole(path, json.dumps({**earlier, **params}, indent=1).encode())
         except (OSError, DataError) as error:
             why = error.strerror if isinstance(error, OSError) else error
-            _log.warning("Parameters too long for the store are not in %s either: %s", path, why)
+            _log.warning(
+                "Parameters that are too long for the store could not be written to %s: %s", path, why
+            )
         else:
             self.log_artifact(path)
 
@@ -286,7 +289,7 @@ class MlflowTracker(Tracker):
         self._notice()
 
     def _notice(self) -> None:
-        """Note that one more line waits, and start sending when it is time."""
+        """Tell the sender that one more line waits; start the sender if the waiting time is over."""
         if self._sender is None and self._sidecar is not None and not self._closed:
             if time.monotonic() >= self._sends_from:
                 self._start_sending(self._sidecar)
@@ -306,35 +309,36 @@ class MlflowTracker(Tracker):
         return f"{base}/#/experiments/{info.experiment_id}/runs/{info.run_id}" if info.run_id else base
 
 
-def _begin(folder: Path, journal: Journal, wanted: RunInfo, resumed: bool | None) -> Sidecar:
-    """Open a run folder for writing: continue the run in it or set that run aside; return its `run.json`."""
+def _begin_run(folder: Path, journal: Journal, wanted: RunInfo, resumed: bool | None) -> Sidecar:
+    """Open a run folder for writing, continue the run in it or rename the files of that run, and return its record."""
     earlier = read_run_info(folder)
     journal.open(after=earlier.sent if earlier else 0)
     if earlier is not None and _continues(earlier, wanted, resumed):
-        known = replace(
+        info = replace(
             wanted,
             run_id=wanted.run_id or earlier.run_id,
             key=earlier.key,
             started=earlier.started,
             experiment_id=earlier.experiment_id,
         )
-        here = (without_password(known.uri), known.run_id)
-        if (without_password(earlier.uri), earlier.run_id) == here:  # a different store would get all lines
-            known = replace(
-                known,
+        store_and_run = (without_password(info.uri), info.run_id)
+        # another store has no lines of this run yet, so it must get all of them
+        if (without_password(earlier.uri), earlier.run_id) == store_and_run:
+            info = replace(
+                info,
                 sent=earlier.sent,
                 owed=earlier.owed,
                 replay_after=earlier.replay_after,
                 replay_until=earlier.replay_until,
             )
     else:
-        known = wanted
+        info = wanted
         if earlier is not None or journal.last:
             number = next(k for k in range(1, 1 << 30) if not (folder / f"journal.{k}.jsonl").exists())
             if earlier is not None:
                 (folder / SIDECAR).replace(folder / f"run.{number}.json")
             journal.set_aside(folder / f"journal.{number}.jsonl")
-    sidecar = Sidecar(folder, known)
+    sidecar = Sidecar(folder, info)
     sidecar.update()
     return sidecar
 
@@ -348,5 +352,5 @@ def _continues(earlier: RunInfo, wanted: RunInfo, resumed: bool | None) -> bool:
 
 
 def mlflow_store() -> OpenStore:
-    """Return the class that opens a run in MLflow, importing MLflow, which happens nowhere else."""
+    """Import MLflow, and return the class that opens a run in an MLflow store."""
     return importlib.import_module("framework.tracking.mlflow_store").MlflowStore

@@ -1,7 +1,7 @@
-"""Small process beside a run that closes the run when the run's own process was killed and cannot do so.
+"""Small process that closes a run after the run's own process was killed.
 
-Its arguments are the run folder, the id of the run's process, and the id of the parent process with which the run must
-end (for a job, its sweep) or 0. It ends with the run.
+The arguments of this program are the run folder, the id of the run's process, and the id of the parent process with
+which the run must end (for a job, the process of its sweep) or 0. The program ends with the run.
 """
 
 import os
@@ -21,12 +21,12 @@ _PAUSE = 0.25
 
 
 @contextmanager
-def watched(folder: Path) -> Iterator[None]:
-    """Watch this process, whose run is in `folder`, from a separate process during the block.
+def start_watcher(folder: Path) -> Iterator[None]:
+    """Start a process that watches this process, whose run is in `folder`, during the block.
 
-    If this process dies, the run is closed as KILLED in its folder only; a later `sync` sends the status to the store.
-    If this process must end with its parent and the parent dies, it has `ENDING` seconds to close the run. After that
-    it is killed together with all processes of its group.
+    If this process dies, the watcher records the status KILLED in the folder; a later `sync` sends the status to the
+    store. If this process must end with its parent and the parent dies, this process has `ENDING` seconds to close the
+    run. Then the watcher kills it together with all processes of its group.
     """
     parent = os.getppid() if ends_with_parent() else 0
     watcher = subprocess.Popen(
@@ -34,7 +34,7 @@ def watched(folder: Path) -> Iterator[None]:
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
-        start_new_session=True,  # signals to the process group of the run must not reach the watcher
+        start_new_session=True,  # so that signals to the process group of the run do not reach the watcher
     )
     try:
         yield
@@ -61,7 +61,7 @@ def watch(folder: Path, run: int, parent: int) -> None:
 
 
 def _parent_of(process: int) -> int | None:
-    """Return the id of the parent of a process; None where it cannot be found out."""
+    """Return the id of the parent of a process, or None if the system does not provide it."""
     try:
         state = Path(f"/proc/{process}/stat").read_text(encoding="utf-8", errors="replace")
     except OSError:
@@ -70,9 +70,9 @@ def _parent_of(process: int) -> int | None:
 
 
 def _kill(run: int) -> None:
-    """Kill the process, and its group if it leads one.
+    """Kill the process of a run, and its process group if it leads one.
 
-    The watcher is a child of that process, so no other process can have taken over its id.
+    The watcher is a child of that process, so no other process can have the same id.
     """
     with suppress(ProcessLookupError):
         if os.getpgid(run) == run:

@@ -22,7 +22,7 @@ from lightning_fabric.utilities.distributed import _set_num_threads_if_needed
 from pytorch_lightning.strategies.launchers import _SubprocessScriptLauncher
 
 from framework.errors import UserError
-from framework.tracking.signals import ENDING, SIGNALS, Stopped, Stopper, ending_with_parent
+from framework.tracking.signals import ENDING, SIGNALS, Stopped, Stopper, end_with_parent
 
 _GRACE = 4.0
 """Seconds that this rank has to leave the training by itself after another rank has died."""
@@ -81,7 +81,7 @@ class RankLauncher(_SubprocessScriptLauncher):
                 command,
                 env={**os.environ, "LOCAL_RANK": str(rank)},
                 cwd=folder,
-                preexec_fn=ending_with_parent(signal.SIGKILL),
+                preexec_fn=end_with_parent(signal.SIGKILL),
             )
             self.procs.append(process)
 
