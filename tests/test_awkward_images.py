@@ -25,7 +25,7 @@ from framework.configuration import registry
 from framework.configuration.schema import build, resolve
 from framework.data import Data
 from framework.datasets import images, scan_layout
-from framework.deployment.served import Served
+from framework.deployment.served import ServedModel
 from framework.errors import DataError
 from framework.geometry.srgb import bytes_from_linear
 from plugins.data.human_scans import skins
@@ -332,7 +332,7 @@ def upright(data: Data) -> dict[str, Reader]:
 
     def of_request(case: Case, folder: Path) -> np.ndarray:
         sent = {"base64": [base64.b64encode(case.content).decode()], "name": [f"image{case.suffix}"]}
-        served = object.__new__(Served)  # as far as requests are read: that needs no trained model
+        served = object.__new__(ServedModel)  # as far as requests are read: that needs no trained model
         vars(served).update(predictor=torch.nn.Identity(), data=data)
         return pixels(served._asked(pd.DataFrame(sent))["input"][0])
 

@@ -14,8 +14,8 @@ import framework
 from framework.configuration.assembly import build_predictor
 from framework.configuration.loading import PREFIX
 from framework.configuration.schema import build, resolve
-from framework.deployment.frozen import frozen
-from framework.deployment.frozen_network import affine_logits, connected, read, softmax
+from framework.deployment.frozen import freeze_predictor
+from framework.deployment.frozen_network import affine_logits, compute_layer, read_network, softmax
 from framework.encoder import Encoder
 from framework.errors import CheckpointError
 from framework.geometry.clouds import pad
@@ -69,7 +69,7 @@ def same(form, predictor, inputs, limit=1e-6):
 def test_probabilities_are_the_predictors(shape, widths, batch_norm, dtype):
     encoder = mlp(shape, widths=widths, batch_norm=batch_norm, dropout=0.5)
     model = trained([encoder], head("categorical", SEVEN), shape, dtype)
-    form = frozen(model, shape)
+    form = freeze_predictor(model, shape)
     assert (
         form.form
         == f"{len(widths) + 1} fully connected layers with batch norm folded, compiled, then softmax"
@@ -87,7 +87,7 @@ def test_probabilities_are_the_predictors(shape, widths, batch_norm, dtype):
 def test_two_classes_by_a_logistic_are_folded_too():
     target = Target("class", ("off", "on"))
     model = trained([mlp((6,), widths=[8])], head("bernoulli", target), (6,))
-    form = frozen(model, (6,))
+    form = freeze_predictor(model, (6,))
     assert form.form.endswith("softmax")
     same(form, model, torch.randn(5, 6))
 
@@ -123,7 +123,7 @@ class Blocks(Encoder):
 
 def test_layers_in_another_order_and_side_by_side():
     model = trained([Blocks(10)], head("categorical", SEVEN), (10,))
-    form = frozen(model, (10,))
+    form = freeze_predictor(model, (10,))
     assert form.form.startswith("4 fully connected layers")
     for count in (1, 6):
         same(form, model, torch.randn(count, 10))
@@ -161,9 +161,9 @@ class Squared(Encoder):
 @pytest.mark.parametrize("kind", [Twice, Squared])
 def test_what_is_no_chain_of_layers_is_left_to_torch(kind):
     model = trained([kind(4)], head("categorical", SEVEN), (4,))
-    form = frozen(model, (4,))
+    form = freeze_predictor(model, (4,))
     assert "in torch, without gradient" in form.form
-    assert read(model, (4,)) is None
+    assert read_network(model, (4,)) is None
     same(form, model, torch.randn(5, 4))
     assert not form.density(torch.randn(5, 4)).logits.requires_grad
 
@@ -173,7 +173,7 @@ def test_clouds_of_different_sizes_go_through_torch(name):
     shape = (30, 3)
     encoder = build("encoder", resolve("encoder", name), input_shape=shape)
     model = trained([encoder], head("categorical", SEVEN), shape)
-    form = frozen(model, shape)
+    form = freeze_predictor(model, shape)
     assert "in torch, without gradient" in form.form
     same(form, model, pad([torch.randn(count, 3) for count in (30, 11, 1)]))
 
@@ -182,7 +182,7 @@ def test_clouds_of_different_sizes_go_through_torch(name):
 def test_densities_over_reals_come_from_the_head(scale):
     made = head("gaussian", Target("real", ("x", "y")), scale=scale)
     model = trained([mlp((6,), widths=[16])], made, (6,))
-    form = frozen(model, (6,))
+    form = freeze_predictor(model, (6,))
     assert form.form.endswith("GaussianHead in torch")
     inputs, value = torch.randn(4, 6), torch.randn(4, 2)
     np.testing.assert_allclose(form(inputs), model(inputs).mode.detach().numpy(), rtol=1e-5, atol=1e-6)
@@ -193,7 +193,7 @@ def test_densities_over_reals_come_from_the_head(scale):
 
 def test_images_of_bytes_go_through_torch():
     model = trained([mlp((1, 4, 4), widths=[8])], head("categorical", SEVEN), (1, 4, 4))
-    form = frozen(model, (1, 4, 4))
+    form = freeze_predictor(model, (1, 4, 4))
     same(form, model, torch.randint(0, 256, (3, 1, 4, 4), dtype=torch.uint8))
 
 
@@ -216,7 +216,7 @@ class Lengths(Encoder):
 def test_fixed_encoders_in_front_are_kept(given):
     inner = trained([mlp((12,), widths=[16], batch_norm=True)], head("categorical", SEVEN), (12,))
     predictor = FrozenFrontEnd([Lengths(12)], inner).eval()
-    form = frozen(predictor, given)
+    form = freeze_predictor(predictor, given)
     assert form.form.endswith("then softmax")
     for points in (30, 8):
         same(form, predictor, torch.randn(3, points, 3))
@@ -229,7 +229,7 @@ def test_wrappers_are_run_as_they_are():
     torch.manual_seed(0)
     resolved = resolve("uncertainty", {"name": "ensemble", "members": 3})
     predictor = build("uncertainty", resolved, model=one, target=SEVEN).eval()
-    form = frozen(predictor, (6,))
+    form = freeze_predictor(predictor, (6,))
     assert form.form == "Ensemble in torch, without gradient"
     same(form, predictor, torch.randn(4, 6))
 
@@ -238,12 +238,12 @@ def test_heads_fitted_at_once_are_run_as_they_are():
     made = head("extra_trees", SEVEN, trees=5)
     made.fit(torch.randn(70, 6), torch.arange(70) % 7, 0)
     predictor = FrozenFrontEnd([Lengths(6)], Model([], made, (6,))).eval()
-    same(frozen(predictor), predictor, torch.randn(4, 9, 3))
+    same(freeze_predictor(predictor), predictor, torch.randn(4, 9, 3))
 
 
 def test_training_on_does_not_change_what_was_frozen():
     model = trained([mlp((6,), widths=[8])], head("categorical", SEVEN), (6,))
-    form, inputs = frozen(model, (6,)), torch.randn(3, 6)
+    form, inputs = freeze_predictor(model, (6,)), torch.randn(3, 6)
     before = form(inputs)
     with torch.no_grad():
         for parameter in model.parameters():
@@ -254,11 +254,11 @@ def test_training_on_does_not_change_what_was_frozen():
 
 def test_without_a_shape_the_first_call_tells():
     model = trained([mlp((6,), widths=[8])], head("categorical", SEVEN), (6,))
-    form = frozen(model)
+    form = freeze_predictor(model)
     assert form.form == "not known before the first call"
     same(form, model, torch.randn(3, 6))
     assert form.form.endswith("softmax")
-    with pytest.raises(ValueError, match=r"inputs of shape \(3, 7\); wanted \(batch, 6\)"):
+    with pytest.raises(ValueError, match=r"Got inputs of shape \(3, 7\), but shape \(batch, 6\)"):
         form(torch.randn(3, 7))
 
 
@@ -268,7 +268,7 @@ def test_inputs_that_are_not_finite_are_refused_with_their_row(bad, count):
     model = trained([mlp((6,), widths=[8])], head("categorical", SEVEN), (6,))
     inputs = torch.randn(count, 6)
     inputs[-1, 2] = bad
-    for predict in (frozen(model, (6,)), model):
+    for predict in (freeze_predictor(model, (6,)), model):
         with pytest.raises(ValueError, match=f"raw parameters are not finite in batch row {count - 1}"):
             predict(inputs)
 
@@ -287,7 +287,7 @@ def test_a_layer_is_a_product_whatever_is_zero(length, width, share, rectified, 
     numbers = generator.normal(size=length) * (generator.random(length) < share)
     weight, bias = generator.normal(size=(length, width)), generator.normal(size=width)
     found = np.full(width, np.nan, dtype)
-    connected(numbers.astype(dtype), weight.astype(dtype), bias.astype(dtype), rectified, found)
+    compute_layer(numbers.astype(dtype), weight.astype(dtype), bias.astype(dtype), rectified, found)
     wanted = numbers.astype(dtype).astype(float) @ weight.astype(dtype) + bias.astype(dtype)
     wanted = np.maximum(wanted, 0) if rectified else wanted
     np.testing.assert_allclose(found, wanted, rtol=0, atol=100 * np.finfo(dtype).eps)

@@ -138,7 +138,7 @@ def test_images_are_predicted_loaded_frozen_served_and_trained_further(
 
     model, frozen = package.load(done.folder), package.freeze(done.folder)
     assert "predicts images: red, green, blue" in repr(model)
-    served = _load_pyfunc(str(done.folder / "checkpoints" / "model.ckpt")).answer(files)
+    served = _load_pyfunc(str(done.folder / "checkpoints" / "model.ckpt")).predict_table(files)
     with torch.no_grad():
         for number, file in enumerate(files):
             density = model(file)

@@ -112,7 +112,7 @@ def test_a_model_takes_files_when_its_training_data_are_gone(
     contents = [base64.b64encode(file.read_bytes()).decode() for file in files]
     named = pd.DataFrame({"base64": contents, "name": [file.name for file in files]})
     for given in (files, named, *([contents] if kind == "images_with_angles" else [])):
-        answer = served.answer(given)
+        answer = served.predict_table(given)
         assert set(answer) - set(told) == {
             f"{name.removesuffix('_deg')}_mode{'_deg' * name.endswith('_deg')}"
             for name in told
@@ -121,7 +121,7 @@ def test_a_model_takes_files_when_its_training_data_are_gone(
         pd.testing.assert_frame_equal(answer[list(told)], told, rtol=1e-6, check_dtype=False)
     for wrong in ([str(file) for file in files], ["etc"], named.assign(base64="/etc/hostname"), object()):
         with pytest.raises(DataError):
-            served.answer(wrong)
+            served.predict_table(wrong)
     for wrong in (object(), tmp_path / "gone.csv", np.zeros((2, 77, 5, 3))):
         for form in (model, frozen):
             with pytest.raises(DataError):

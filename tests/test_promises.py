@@ -13,7 +13,7 @@ from framework.configuration.loading import load_with_description, reader
 from framework.configuration.registry import installed
 from framework.configuration.settings import Settings
 from framework.deployment.frozen import freeze
-from framework.deployment.served import Served
+from framework.deployment.served import ServedModel
 from framework.distributions.protocol import value_set
 from framework.errors import ConfigError
 from framework.modes.predict import predictions
@@ -125,7 +125,7 @@ def test_a_set_is_the_same_wherever_it_is_said(
     inputs = pd.read_csv(table)[["a", "b"]]
     inputs.to_csv(tmp_path / "inputs.csv", index=False)
     predicted = rows([tmp_path / "inputs.csv"])
-    answer = Served(predictor, description, data).answer(inputs)
+    answer = ServedModel(predictor, description, data).predict_table(inputs)
     assert set(predicted) <= set(answer)
     for column in predicted:
         told = [value if isinstance(value, str) else f"{value:.10g}" for value in answer[column]]

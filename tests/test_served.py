@@ -24,7 +24,7 @@ import pytest
 from PIL import Image
 
 from framework.deployment import request_bodies as bounds
-from framework.deployment.request_bounds import Bounded
+from framework.deployment.request_bounds import BoundedApp
 from framework.deployment.served import _load_pyfunc
 from tests.conftest import Forks, command, importing_mlflow
 from tests.test_loaded import KINDS, QUICK
@@ -198,10 +198,10 @@ def test_made_up_samples_are_answered_before_the_server_listens(servers: dict[st
     """So the first request waits for no import and no compilation: each kind has a sample, and takes it."""
     for server in servers.values():
         served = _load_pyfunc(str(server.model / "model.ckpt"))
-        samples = list(served.made_up())
+        samples = list(served.sample_requests())
         assert samples
         for sample in samples:
-            assert len(served.answer(sample)) == len(served.answer(sample)) > 0
+            assert len(served.predict_table(sample)) == len(served.predict_table(sample)) > 0
     calls: list[tuple[str, bytes]] = []
 
     async def app(scope: Any, receive: Any, send: Any) -> None:
@@ -215,7 +215,7 @@ def test_made_up_samples_are_answered_before_the_server_listens(servers: dict[st
         pass
 
     sample = b'{"inputs": [1]}'
-    asyncio.run(Bounded(app, 5.0, [sample])({"type": "lifespan"}, nothing, nothing))
+    asyncio.run(BoundedApp(app, 5.0, [sample])({"type": "lifespan"}, nothing, nothing))
     assert calls == [("http", sample), ("lifespan", b"")]
 
 

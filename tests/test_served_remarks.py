@@ -10,7 +10,7 @@ import torch
 from torch.distributions import Categorical, kl_divergence
 
 from framework.configuration.schema import build, resolve
-from framework.deployment.request_bounds import INVOCATIONS, REMARK, TICKET, Bounded
+from framework.deployment.request_bounds import INVOCATIONS, REMARK, TICKET, BoundedApp
 from framework.distributions.description import LONGEST
 from framework.distributions.protocol import pick
 from framework.target import Target
@@ -36,7 +36,7 @@ def test_an_answer_carries_the_remarks_of_its_model(remarks: tuple[str, ...]) ->
 
     headers = [(b"content-type", b"application/json")]
     scope = {"type": "http", "path": INVOCATIONS, "method": "POST", "headers": headers}
-    asyncio.run(Bounded(model, 10)(scope, receive, send))
+    asyncio.run(BoundedApp(model, 10)(scope, receive, send))
     assert sent[0]["status"] == 200
     found = [value for name, value in sent[0]["headers"] if name == REMARK]
     assert len(found) == len(remarks)

@@ -25,7 +25,7 @@ import torch
 from benchmarks.pages import machine, write_page
 from framework.configuration.assembly import build_predictor
 from framework.configuration.schema import resolve
-from framework.deployment.frozen import frozen
+from framework.deployment.frozen import freeze_predictor
 from framework.model import FrozenFrontEnd, Model, Predictor
 from framework.target import Target
 
@@ -80,7 +80,7 @@ def rows(title: str, calls: Calls, count: int) -> list[str]:
 
 def classifier(count: int) -> list[str]:
     made = predictor([MLP], (512,))
-    form = frozen(made, (512,))
+    form = freeze_predictor(made, (512,))
     assert isinstance(made, Model)
     network = torch.nn.Sequential(made.encoders, made.projection, torch.nn.Softmax(-1)).eval()
     inputs = torch.rand(count, 512)
@@ -102,7 +102,7 @@ def classifier(count: int) -> list[str]:
 def clouds(count: int) -> list[str]:
     made = predictor([BPS, MLP], (2048, 3))
     assert isinstance(made, FrozenFrontEnd)
-    form = frozen(made)
+    form = freeze_predictor(made)
     inputs = torch.randn(count, 2048, 3)
     inputs = inputs / inputs.norm(dim=-1, keepdim=True)
     check(form(inputs), made, inputs)
@@ -124,7 +124,7 @@ def check(found: np.ndarray, made: Predictor, inputs: torch.Tensor) -> None:
 def main() -> None:
     torch.set_num_threads(1)
     start = time.perf_counter()
-    frozen(predictor([MLP], (512,)), (512,))
+    freeze_predictor(predictor([MLP], (512,)), (512,))
     freezing = time.perf_counter() - start
     lines = [line for count in (1, 2, 4, 8, 32, 256) for line in classifier(count)]
     lines += [line for count in (1, 256) for line in clouds(count)]

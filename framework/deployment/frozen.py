@@ -1,9 +1,9 @@
-"""The deployable form of a trained model: one CPU core, no gradient, and no parts that only training needs.
+"""The deployable form of a trained model, without gradients and without the parts that only training needs.
 
-The computation from features to raw parameters is read from the model's own graph (torch.export), so that no encoder
-has to declare its layers. If the graph holds fully connected layers only, batch norm is folded into the neighbouring
-weights, dropout is removed, and NumPy and one compiled function compute the result. Torch runs any other model as it
-is, without gradient.
+The computation from features to raw parameters is read from the model's graph (torch.export), so no encoder has to
+declare its layers. If the graph has fully connected layers only, batch norm is folded into the neighbouring weights,
+dropout is removed, and NumPy and one compiled function compute the result, on one CPU core. Any other model is run by
+torch unchanged, without gradients.
 """
 
 import copy
@@ -19,7 +19,7 @@ from torch.distributions import Distribution
 
 from framework.configuration.loading import load_with_description, reader
 from framework.data import Data, Frame
-from framework.deployment.frozen_network import Layer, Network, read, softmax
+from framework.deployment.frozen_network import Layer, Network, read_network, softmax
 from framework.distributions.affine import AffineDensity
 from framework.distributions.class_probabilities import class_probabilities
 from framework.distributions.description import CategoricalDensity
@@ -36,7 +36,7 @@ def freeze(
     Args:
         run_or_checkpoint: run or checkpoint, as in `framework.load`.
         uri: store, as in `framework.load`.
-        paths: paths, as in `framework.load`.
+        paths: values for the checkpoint's paths, as in `framework.load`.
 
     Raises:
         CheckpointError, ConfigError: as in `framework.load`.
@@ -45,8 +45,8 @@ def freeze(
     return Frozen(predictor, description.input_shape, reader(description))
 
 
-def frozen(predictor: Predictor, input_shape: Sequence[int] | None = None) -> "Frozen":
-    """Return the deployable form of a predictor. It is a copy, so later training does not change it.
+def freeze_predictor(predictor: Predictor, input_shape: Sequence[int] | None = None) -> "Frozen":
+    """Return the deployable form of a copy of a predictor, which later training does not change.
 
     Args:
         predictor: a predictor that was not loaded from a run.
@@ -54,19 +54,23 @@ def frozen(predictor: Predictor, input_shape: Sequence[int] | None = None) -> "F
             call determines it and takes seconds.
 
     Raises:
-        ConfigError: the predictor was loaded, so it takes raw input; `freeze` handles raw input.
+        ConfigError: the predictor was loaded from a run and reads raw input; use `freeze` instead.
     """
     if predictor.description is not None:
-        raise ConfigError("This model was loaded from a run or checkpoint. Give that to framework.freeze.")
+        raise ConfigError(
+            "This model was loaded from a run or checkpoint. Pass the run or checkpoint to framework.freeze instead."
+        )
     return Frozen(predictor, input_shape)
 
 
 @final
 class Frozen:
-    """Function from inputs to numbers that equal the predictor's own to 1e-6, in the type of its parameters.
+    """Deployable model: a function from inputs to predictions.
+
+    Its results have the type of the predictor's parameters and agree with the predictor's to 1e-6.
 
     Attributes:
-        form: description of what computes the numbers.
+        form: description of how the results are computed.
     """
 
     def __init__(
@@ -74,14 +78,14 @@ class Frozen:
     ) -> None:
         self.data = data
         self.predictor = copy.deepcopy(predictor).cpu().eval().requires_grad_(False)
-        self.preceded = self.predictor if isinstance(self.predictor, FrozenFrontEnd) else None
-        self.inner = self.predictor if self.preceded is None else self.preceded.predictor
+        self.front_end = self.predictor if isinstance(self.predictor, FrozenFrontEnd) else None
+        self.inner = self.predictor if self.front_end is None else self.front_end.predictor
         floats = (tensor.dtype for tensor in self.predictor.parameters())
         self.dtype = next(floats, torch.get_default_dtype())
         self.network: Network | None = None
         self.form = "not known before the first call"
-        if self.preceded is not None:
-            input_shape = list(self.preceded.encoders)[-1].output_shape  # pyright: ignore
+        if self.front_end is not None:
+            input_shape = list(self.front_end.encoders)[-1].output_shape  # pyright: ignore
         self.shape = None if input_shape is None else tuple(input_shape)
         if self.shape is not None:
             self._read(self.shape)
@@ -89,17 +93,17 @@ class Frozen:
     def __call__(self, inputs: Any) -> np.ndarray:
         """Return the prediction for inputs.
 
-        It is the probabilities, (batch, class), of a model of classes, and the mean, (batch, height, width, number), of
-        a model of images, because draws of a mixture of images show no image. Otherwise it is the point prediction,
-        (batch, number).
+        For class targets, this is the probability of each class, (batch, class). For image targets, it is the mean,
+        (batch, height, width, number), because the median of a mixture of images is no plausible image. Otherwise, it
+        is the point prediction, (batch, number).
 
         Args:
-            inputs: inputs as the model of `framework.load` takes them. A predictor that was frozen by `frozen` takes
-                its own inputs, with the batch dimension first, in NumPy or in torch on the CPU.
+            inputs: inputs that the model of `framework.load` accepts. After `freeze_predictor`, the inputs of the
+                predictor, batch dimension first, as NumPy array or torch tensor on the CPU.
 
         Raises:
-            DataError: it is no input of this model.
-            ValueError: a computed number is not finite; the message names the first such batch row.
+            DataError: `inputs` is no input of this model.
+            ValueError: a raw parameter is not finite; the message names the first such batch row.
         """
         features, network, frame = self._features(inputs)
         if network is not None and network.classes:
@@ -107,50 +111,55 @@ class Frozen:
             softmax(probability)
             if np.isnan(probability[:, 0]).any():
                 row = int(np.isnan(probability[:, 0]).argmax())
-                raise ValueError(f"The raw parameters are not finite in batch row {row}.")
+                raise ValueError(
+                    f"The raw parameters are not finite in batch row {row}. Check the inputs of this row."
+                )
             return probability
         with torch.inference_mode():
             density = self._density(features, network)
             if density.has_enumerate_support and not density.event_shape:
                 return class_probabilities(density).to(self.dtype).numpy()
-            found = density.mean if len(density.event_shape) == 3 else median(density, 1000)
-            return (found if frame is None else frame.location + frame.scale * found).numpy()
+            value = density.mean if len(density.event_shape) == 3 else median(density, 1000)
+            return (value if frame is None else frame.location + frame.scale * value).numpy()
 
-    @torch.no_grad()  # not in inference mode, because the density is used outside of it later
+    @torch.no_grad()  # not inference mode, because the density is used outside of it
     def density(self, inputs: Any) -> Distribution:
-        """Return the density over the target, with batch_shape (batch,); inputs are the same as for a call."""
+        """Return the density of the target, batch_shape (batch,); see `__call__` for the inputs."""
         features, network, frame = self._features(inputs)
         density = self._density(features, network)
         return density if frame is None else AffineDensity(density, *frame)
 
     def _features(self, inputs: Any) -> tuple[Any, Network | None, Frame | None]:
-        """Return the features that the inner predictor reads, its network, and the frame of the predictions.
+        """Return the features for the inner predictor, its network, and the coordinate frame of the predictions.
 
-        The features are in the form that the network reads. The network is None if torch computes the prediction.
+        The network is None if torch computes the prediction. The features have the type and shape that the network
+        (an array) or torch (a tensor) requires.
         """
         frame = None
         if self.data is not None:
             batch = self.data.user_batch(inputs)
             inputs, frame = batch["input"], self.data.frame(batch)
-        if self.preceded is not None:
+        if self.front_end is not None:
             with torch.no_grad():
-                inputs = self.preceded.features(_tensor(inputs))
+                inputs = self.front_end.features(_to_tensor(inputs))
         if self.shape is None:
             self.shape = tuple(inputs.shape[1:])
             self._read(self.shape)
         network = self.network
-        if network is None or not _floating(inputs):
-            return _tensor(inputs), None, frame
-        found = inputs.detach().numpy() if isinstance(inputs, Tensor) else inputs
-        if found.shape[1:] != self.shape:
+        if network is None or not _is_floating(inputs):
+            return _to_tensor(inputs), None, frame
+        array = inputs.detach().numpy() if isinstance(inputs, Tensor) else inputs
+        if array.shape[1:] != self.shape:
             raise ValueError(
-                f"inputs of shape {tuple(found.shape)}; wanted (batch, {', '.join(map(str, self.shape))})."
+                f"Got inputs of shape {tuple(array.shape)}, but shape (batch, {', '.join(map(str, self.shape))}) "
+                "is required."
+                "required."
             )
-        flat = found.reshape(len(found), math.prod(self.shape))
+        flat = array.reshape(len(array), math.prod(self.shape))
         return np.ascontiguousarray(flat, dtype=network.dtype), network, frame
 
     def _density(self, features: Any, network: Network | None) -> Distribution:
-        """Return the density for features."""
+        """Return the density for features, computed by the network or by torch."""
         if network is None:
             return self.inner(features)
         raw = torch.from_numpy(network(features))
@@ -160,13 +169,15 @@ class Frozen:
         return self.inner.head(raw)
 
     def _read(self, shape: tuple[int, ...]) -> None:
-        """Read the network of the model for features of this shape, if it has one."""
+        """Read the model's network for features of this shape, if all its layers are fully connected."""
         if not isinstance(self.inner, Model):
             self.form = f"{type(self.inner).__name__} in torch, without gradient"
             return
-        network = read(self.inner, shape)
+        network = read_network(self.inner, shape)
         if network is None:
-            self.form = "the model in torch, without gradient: it is not of fully connected layers alone"
+            self.form = (
+                "the model in torch, without gradient, because it has other layers than fully connected ones"
+            )
             return
         self.network = network
         layers = sum(isinstance(step, Layer) for step in network.steps)
@@ -174,8 +185,8 @@ class Frozen:
         self.form = f"{layers} fully connected layers with batch norm folded, compiled, then {after}"
 
 
-def _tensor(inputs: np.ndarray | Tensor) -> Tensor:
-    # torch accepts only memory that it may write to
+def _to_tensor(inputs: np.ndarray | Tensor) -> Tensor:
+    # torch requires writable memory.
     return (
         inputs
         if isinstance(inputs, Tensor)
@@ -183,5 +194,5 @@ def _tensor(inputs: np.ndarray | Tensor) -> Tensor:
     )
 
 
-def _floating(inputs: np.ndarray | Tensor) -> bool:
+def _is_floating(inputs: np.ndarray | Tensor) -> bool:
     return inputs.is_floating_point() if isinstance(inputs, Tensor) else inputs.dtype.kind == "f"

@@ -1,6 +1,6 @@
-"""Reads the fully connected layers of a model from its graph, and computes them in NumPy and compiled functions.
+"""Fully connected layers, read from the graph of a model and computed by NumPy and compiled functions.
 
-`no_type_check` prevents the type checks that tests switch on from wrapping a kernel before it is compiled.
+The tests enable type checks that wrap every function; `no_type_check` excludes functions that must be compiled.
 """
 
 import copy
@@ -22,15 +22,15 @@ from framework.model import Model
 from framework.storage.kernels import compiler, kernel_cache
 
 LEAVES = (nn.Linear, nn.BatchNorm1d, nn.ReLU, nn.Dropout, nn.Flatten, nn.Identity, nn.Sequential)
-"""Kinds of layers that a network may hold; the export of another one takes long and cannot succeed."""
+"""Layers that a network may have; models with other layers are not exported, which would take long and fail."""
 MOST_RAW = 2048  # largest number of raw parameters of a head that is tested for a softmax
 
 
 @dataclass
 class Layer:
-    """Step of a fully connected layer: register `source` times `weight` (inputs, outputs) plus `bias`.
+    """Step of a fully connected layer: register `source` @ `weight` + `bias`.
 
-    `rectified` sets negative results to 0.
+    `weight` has the shape (inputs, outputs). If `rectified` is True, negative results are set to 0.
     """
 
     source: int
@@ -42,43 +42,48 @@ class Layer:
         """Return the result of the layer, (batch, outputs)."""
         numbers = registers[self.source]
         if len(numbers) == 1:
-            found = np.empty((1, len(self.bias)), self.bias.dtype)
-            connected(numbers[0], self.weight, self.bias, self.rectified, found[0])
-            return found
-        # Two or more samples share the reading of the weights (benchmarks/framework/frozen.md).
-        with np.errstate(invalid="ignore", over="ignore"):  # the caller refuses numbers that are not finite
-            found = numbers @ self.weight
-            found += self.bias
-        return np.maximum(found, 0, out=found) if self.rectified else found
+            result = np.empty((1, len(self.bias)), self.bias.dtype)
+            compute_layer(numbers[0], self.weight, self.bias, self.rectified, result[0])
+            return result
+        # For two or more samples NumPy is faster, because it reads the weights once (benchmarks/framework/frozen.md).
+        with np.errstate(
+            invalid="ignore", over="ignore"
+        ):  # the caller checks for numbers that are not finite
+            result = numbers @ self.weight
+            result += self.bias
+        return np.maximum(result, 0, out=result) if self.rectified else result
 
 
-class Joined(NamedTuple):
-    """Step that concatenates registers."""
+class Concatenation(NamedTuple):
+    """Step that concatenates registers along the second dimension."""
 
     sources: tuple[int, ...]
 
     def __call__(self, registers: Sequence[np.ndarray]) -> np.ndarray:
-        """Return the registers side by side, (batch, sum of lengths)."""
+        """Return the concatenated registers, (batch, sum of lengths)."""
         return np.concatenate([registers[source] for source in self.sources], 1)
 
 
 @dataclass
 class Network:
-    """Steps from features (batch, length), register 0, to raw parameters; the result of each step is the next register.
+    """Steps from features (batch, length), which are register 0, to raw parameters.
+
+    Each step reads earlier registers, and its result is the next register.
 
     Attributes:
-        result: register of the raw parameters.
+        steps: the steps, in order.
+        result: number of the register with the raw parameters.
         dtype: type of all numbers.
-        classes: True if the result is logits of classes instead of the head's raw parameters.
+        classes: True if the result is class logits instead of the head's raw parameters.
     """
 
-    steps: list[Layer | Joined]
+    steps: list[Layer | Concatenation]
     result: int
     dtype: np.dtype
     classes: bool = False
 
     def __call__(self, features: np.ndarray) -> np.ndarray:
-        """Return the raw parameters or logits for features."""
+        """Return the raw parameters, or the class logits, for features."""
         registers = [features]
         for step in self.steps:
             registers.append(step(registers))
@@ -93,10 +98,10 @@ class Network:
                 step.bias = step.bias.astype(dtype)
 
 
-def read(model: Model, shape: tuple[int, ...]) -> Network | None:
-    """Return the network of a model's encoders and linear layer; None if the model is of another kind.
+def read_network(model: Model, shape: tuple[int, ...]) -> Network | None:
+    """Read a model's encoders and linear layer as a network; return None if they contain other layers.
 
-    The network includes the head if the head is a softmax.
+    If the head is a softmax of an affine function, the network includes this function.
     """
     leaves = [part for part in model.encoders.modules() if not list(part.children())]
     first = next(model.parameters(), None)
@@ -106,18 +111,20 @@ def read(model: Model, shape: tuple[int, ...]) -> Network | None:
         or isinstance(model.head, Fitted)
     ):
         return None
-    whole = nn.Sequential(model.encoders, model.projection)
+    module = nn.Sequential(model.encoders, model.projection)
     generator = torch.Generator().manual_seed(0)
     probe = torch.randn(3, *shape, generator=generator, dtype=torch.float64).to(first)
     disabled = logging.root.manager.disable
     logging.disable(logging.CRITICAL)
     try:
-        with redirect_stderr(StringIO()):  # the exporter prints and logs pages about what it cannot do
-            exported = torch.export.export(whole, (probe,), dynamic_shapes=({0: torch.export.Dim("batch")},))
+        with redirect_stderr(
+            StringIO()
+        ):  # the exporter prints and logs many messages about unsupported operations
+            exported = torch.export.export(module, (probe,), dynamic_shapes=({0: torch.export.Dim("batch")},))
         network = _Reader(exported).network()
-        if not all(agree(network, whole, probe[:count]) for count in (1, 3)):
+        if not all(agrees(network, module, probe[:count]) for count in (1, 3)):
             return None
-    except Exception:  # an encoder may hold anything, and the exporter raises a dozen kinds
+    except Exception:  # the exporter raises many kinds of errors, depending on the encoder
         return None
     finally:
         logging.disable(disabled)
@@ -132,19 +139,19 @@ def read(model: Model, shape: tuple[int, ...]) -> Network | None:
 
 
 @torch.no_grad()
-def agree(network: "Network", whole: nn.Module, inputs: Tensor) -> bool:
-    """Return whether network and module give the same raw parameters, up to rounding, which batch norm may amplify."""
-    found, wanted = network(inputs.flatten(1).double().numpy()), whole(inputs).numpy()
-    allowed = 1e4 * np.finfo(wanted.dtype).eps * max(1.0, float(np.abs(wanted).max()))
-    return bool(np.abs(found - wanted).max() <= allowed)
+def agrees(network: "Network", module: nn.Module, inputs: Tensor) -> bool:
+    """Return whether network and module give the same raw parameters, up to rounding that batch norm may amplify."""
+    actual, expected = network(inputs.flatten(1).double().numpy()), module(inputs).numpy()
+    allowed = 1e4 * np.finfo(expected.dtype).eps * max(1.0, float(np.abs(expected).max()))
+    return bool(np.abs(actual - expected).max() <= allowed)
 
 
-class Unread(Exception):
-    """Error for a graph that holds other parts than fully connected layers."""
+class UnreadableGraph(Exception):
+    """Error for a graph with operations other than fully connected layers."""
 
 
 class Signal(NamedTuple):
-    """A node of the graph as scale * register + shift, element by element; both are None if they are 1 and 0."""
+    """Value of a graph node as scale * register + shift, element by element; None stands for scale 1 and shift 0."""
 
     register: int
     scale: np.ndarray | None = None
@@ -157,19 +164,19 @@ class _Reader:
     def __init__(self, exported: torch.export.ExportedProgram) -> None:
         self.graph = exported.graph
         signature = exported.graph_signature
-        held: Mapping[str, Any] = {**signature.inputs_to_parameters, **signature.inputs_to_buffers}
+        keys_by_name: Mapping[str, Any] = {**signature.inputs_to_parameters, **signature.inputs_to_buffers}
         self.numbers = {
-            name: exported.state_dict[key].detach().double().numpy() for name, key in held.items()
+            name: exported.state_dict[key].detach().double().numpy() for name, key in keys_by_name.items()
         }
         self.inputs = signature.user_inputs
-        self.steps: list[Layer | Joined] = []
+        self.steps: list[Layer | Concatenation] = []
         self.signals: dict[Node, Signal] = {}
 
     def network(self) -> Network:
-        """Return the network.
+        """Return the network of the graph.
 
         Raises:
-            Unread: the graph holds other parts.
+            UnreadableGraph: the graph has operations other than those of fully connected layers.
         """
         result = None
         for node in self.graph.nodes:
@@ -181,14 +188,14 @@ class _Reader:
             elif str(node.target) != "aten._assert_tensor_metadata.default":
                 self.signals[node] = self._signal(node, str(node.target).removeprefix("aten.").split(".")[0])
         if result is None or result.scale is not None:
-            raise Unread
+            raise UnreadableGraph
         return Network(self.steps, result.register, np.dtype(np.float64))
 
     def _signal(self, node: Node, name: str) -> Signal:
-        """Return the signal of a node, and add the step that computes it if there is one."""
+        """Return the signal of a node; add a step if the node needs one."""
         arguments: Any = node.args
         if name == "cat":
-            return self._joined(arguments[0], arguments[1:])
+            return self._concatenate(arguments[0], arguments[1:])
         source = self.signals[arguments[0]]
         flat = node.meta["val"].dim() == 2
         if name in ("flatten", "view", "reshape", "contiguous", "clone", "detach", "alias") and flat:
@@ -199,45 +206,49 @@ class _Reader:
             return source
         if arguments[0].meta["val"].dim() == 2:
             if name == "linear":
-                return self._connected(source, arguments)
+                return self._add_layer(source, arguments)
             if name == "batch_norm" and not arguments[5]:
-                return self._normalised(source, arguments)
-            if name in ("relu", "relu_") and (layer := self._open(arguments[0])) and source.scale is None:
+                return self._fold_batch_norm(source, arguments)
+            if (
+                name in ("relu", "relu_")
+                and (layer := self._exclusive_layer(arguments[0]))
+                and source.scale is None
+            ):
                 layer.rectified = True
                 return source
-        raise Unread
+        raise UnreadableGraph
 
-    def _connected(self, source: Signal, arguments: Any) -> Signal:
-        """Add a fully connected layer."""
+    def _add_layer(self, source: Signal, arguments: Any) -> Signal:
+        """Add a fully connected layer, and return its signal."""
         weight = self.numbers[arguments[1].name].T
-        bias = self._number(arguments, 2, np.zeros(weight.shape[1]))
+        bias = self._parameter(arguments, 2, np.zeros(weight.shape[1]))
         if source.scale is not None:
             # (s x + t) W + b = x (s W) + (t W + b)
             weight, bias = source.scale[:, None] * weight, source.shift @ weight + bias
         self.steps.append(Layer(source.register, weight, bias))
         return Signal(len(self.steps))
 
-    def _normalised(self, source: Signal, arguments: Any) -> Signal:
+    def _fold_batch_norm(self, source: Signal, arguments: Any) -> Signal:
         """Fold batch norm, (x - mean) / √(variance + ε) * weight + bias, into a neighbouring layer.
 
-        It is the layer before it if possible, or else the layer after it.
+        This is the layer before it if possible, and otherwise the layer after it.
         """
         mean, variance = (self.numbers[arguments[index].name] for index in (3, 4))
-        scale = self._number(arguments, 1, np.ones_like(mean)) / np.sqrt(variance + arguments[7])
-        shift = self._number(arguments, 2, np.zeros_like(mean)) - mean * scale
-        if source.scale is None and (layer := self._open(arguments[0])):
+        scale = self._parameter(arguments, 1, np.ones_like(mean)) / np.sqrt(variance + arguments[7])
+        shift = self._parameter(arguments, 2, np.zeros_like(mean)) - mean * scale
+        if source.scale is None and (layer := self._exclusive_layer(arguments[0])):
             layer.weight, layer.bias = layer.weight * scale, layer.bias * scale + shift
             return source
         if source.scale is None:
             return Signal(source.register, scale, shift)
         return Signal(source.register, source.scale * scale, source.shift * scale + shift)
 
-    def _joined(self, nodes: Sequence[Node], axis: Sequence[int]) -> Signal:
-        """Add a concatenation."""
+    def _concatenate(self, nodes: Sequence[Node], axis: Sequence[int]) -> Signal:
+        """Add a concatenation, and return its signal."""
         if any(node.meta["val"].dim() != 2 for node in nodes) or list(axis) not in ([1], [-1]):
-            raise Unread
+            raise UnreadableGraph
         signals = [self.signals[node] for node in nodes]
-        self.steps.append(Joined(tuple(signal.register for signal in signals)))
+        self.steps.append(Concatenation(tuple(signal.register for signal in signals)))
         if all(signal.scale is None for signal in signals):
             return Signal(len(self.steps))
         widths = [int(node.meta["val"].shape[1]) for node in nodes]
@@ -246,37 +257,37 @@ class _Reader:
         shift = [np.zeros(width) if signal.shift is None else signal.shift for signal, width in pairs]
         return Signal(len(self.steps), np.concatenate(scale), np.concatenate(shift))
 
-    def _open(self, node: Node) -> Layer | None:
-        """Return the layer whose result a node is, if no other node reads this result; else None."""
+    def _exclusive_layer(self, node: Node) -> Layer | None:
+        """Return the layer that computes a node, if no other node reads the layer's result; otherwise None."""
         register = self.signals[node].register
         step = self.steps[register - 1] if register else None
-        readers = [other for other, signal in self.signals.items() if signal.register == register]
-        alone = all(len(other.users) == 1 for other in readers)
-        return step if isinstance(step, Layer) and not step.rectified and alone else None
+        nodes = [other for other, signal in self.signals.items() if signal.register == register]
+        exclusive = all(len(other.users) == 1 for other in nodes)
+        return step if isinstance(step, Layer) and not step.rectified and exclusive else None
 
-    def _number(self, arguments: Any, index: int, otherwise: np.ndarray) -> np.ndarray:
+    def _parameter(self, arguments: Any, index: int, otherwise: np.ndarray) -> np.ndarray:
         """Return the parameter at `index` of a node's arguments, or `otherwise` if it is missing."""
-        given = len(arguments) > index and arguments[index] is not None
-        return self.numbers[arguments[index].name] if given else otherwise
+        present = len(arguments) > index and arguments[index] is not None
+        return self.numbers[arguments[index].name] if present else otherwise
 
 
 @torch.no_grad()
 def affine_logits(head: DensityHead) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return a matrix (size, class) and a constant (class,) of a head whose density is a softmax; None for other heads.
+    """Return matrix (size, class) and constant (class,) of a head whose density is softmax(raw @ matrix + constant).
 
-    The density is the softmax of raw @ matrix + constant. They are found from the head's density at 0, at each unit
-    vector and at random raw parameters of several sizes, in float64. So no head has to declare them, and torch handles
-    every head that is not affine at these points.
+    They are computed in float64 from the head's densities at 0 and at each unit vector, and checked at random raw
+    parameters of several magnitudes. So no head has to declare them. For a head that is not affine at these points the
+    result is None, and torch computes its density.
     """
     if head.size > MOST_RAW:
         return None
-    asked = copy.deepcopy(head).double()
+    double_head = copy.deepcopy(head).double()
     generator = torch.Generator().manual_seed(0)
-    drawn = torch.randn(96, head.size, generator=generator, dtype=torch.float64)
-    drawn *= torch.tensor([0.01, 1.0, 30.0], dtype=torch.float64).repeat(32).unsqueeze(1)
-    raw = torch.cat([torch.zeros(1, head.size), torch.eye(head.size), drawn])
+    probes = torch.randn(96, head.size, generator=generator, dtype=torch.float64)
+    probes *= torch.tensor([0.01, 1.0, 30.0], dtype=torch.float64).repeat(32).unsqueeze(1)
+    raw = torch.cat([torch.zeros(1, head.size), torch.eye(head.size), probes])
     with torch.random.fork_rng([]):
-        density = asked(raw)
+        density = double_head(raw)
         if not density.has_enumerate_support or tuple(density.event_shape):
             return None
         log_prob = density.log_prob(density.enumerate_support()).T
@@ -291,33 +302,33 @@ compiled = compiler(kernel_cache("frozen_network", [Path(__file__)]))
 
 @compiled
 @no_type_check
-def connected(numbers, weight, bias, rectified, outputs):
-    """Compute outputs = numbers @ weight + bias of one sample; the weights of inputs that are 0 are not read.
+def compute_layer(numbers, weight, bias, rectified, outputs):
+    """Compute outputs = numbers @ weight + bias for one sample, without reading the weights of inputs that are 0.
 
-    After a ReLU about half of the inputs are 0, and reading the weights is the cost of a batch of one. Eight inputs are
-    added at a time, so that the outputs are read and written an eighth as often.
+    For one sample, most of the time is spent on reading weights, and after a ReLU about half of the inputs are 0. Eight
+    inputs are added at a time, so that the outputs are read and written an eighth as often.
     """
     length, width = weight.shape
-    alive = np.empty(length, np.int64)
+    nonzero = np.empty(length, np.int64)
     count = 0
     for i in range(length):
         if numbers[i] != 0:  # NaN is not 0
-            alive[count] = i
+            nonzero[count] = i
             count += 1
     for j in range(width):
         outputs[j] = bias[j]
-    whole = count - count % 8
-    for start in range(0, whole, 8):
-        a, b, c, d = alive[start], alive[start + 1], alive[start + 2], alive[start + 3]
-        e, f, g, h = alive[start + 4], alive[start + 5], alive[start + 6], alive[start + 7]
+    full = count - count % 8
+    for start in range(0, full, 8):
+        a, b, c, d = nonzero[start], nonzero[start + 1], nonzero[start + 2], nonzero[start + 3]
+        e, f, g, h = nonzero[start + 4], nonzero[start + 5], nonzero[start + 6], nonzero[start + 7]
         p, q, r, s = numbers[a], numbers[b], numbers[c], numbers[d]
         t, u, v, w = numbers[e], numbers[f], numbers[g], numbers[h]
         for j in range(width):
             near = (p * weight[a, j] + q * weight[b, j]) + (r * weight[c, j] + s * weight[d, j])
             far = (t * weight[e, j] + u * weight[f, j]) + (v * weight[g, j] + w * weight[h, j])
             outputs[j] += near + far
-    for start in range(whole, count):
-        a = alive[start]
+    for start in range(full, count):
+        a = nonzero[start]
         p = numbers[a]
         for j in range(width):
             outputs[j] += p * weight[a, j]

@@ -1,6 +1,6 @@
-"""Requests that MLflow can parse in bounded memory: content types, and bodies of JSON or CSV, checked without parsing.
+"""Checks of requests, so that MLflow parses them in bounded memory: content types, and bodies of JSON or CSV.
 
-Parquet is not read. A file of a few kilobytes can expand to any size, and only the library that expands it can tell.
+Parquet is not accepted, because a file of a few kilobytes can expand to any size, which is known only after expansion.
 """
 
 import json
@@ -20,23 +20,23 @@ MOST_FILES = 64
 MOST_ROWS = 2**17
 """Largest number of rows of a request, and of samples in its files."""
 MOST_VALUES = 2**20
-"""Largest number of values in a body, JSON or CSV; a list, a dictionary and an empty cell count as one value."""
+"""Largest number of values in a body of JSON or CSV; lists, dictionaries and empty cells count as one value each."""
 MOST_DEPTH = 32
 """Largest depth of nested lists and dictionaries in JSON."""
 MOST_INPUTS = 2**25
-"""Largest number of numbers in all inputs that a request becomes."""
+"""Largest number of numbers in all model inputs of a request."""
 AT_ONCE = 2**28
-"""Largest size, in bytes, of the bodies that the server holds at a time; one request at least is always answered."""
+"""Largest total size of the bodies that the server keeps at a time, bytes; a single body is always accepted."""
 
 FORMS = ("dataframe_split", "dataframe_records", "instances", "inputs")
-"""Keys of JSON under which MLflow takes rows."""
+"""Keys of JSON under which MLflow accepts rows."""
 
 
-class Refused(Exception):
-    """Refusal of a request: the HTTP status, and the sentence for the client."""
+class Refusal(Exception):
+    """Exception that refuses a request, with the HTTP status and the message for the client."""
 
-    def __init__(self, status: int, sentence: str) -> None:
-        super().__init__(sentence)
+    def __init__(self, status: int, message: str) -> None:
+        super().__init__(message)
         self.status = status
 
 
@@ -44,178 +44,184 @@ def content_type(headers: Mapping[bytes, bytes]) -> str:
     """Return the media type of a body, "application/json" or "text/csv".
 
     Raises:
-        Refused: the media type is another one, or the encoding is not UTF-8.
+        Refusal: the media type is another one, the encoding is not UTF-8, or the body is compressed.
     """
-    said = headers.get(b"content-type", b"").decode("latin-1")
-    kind, *parameters = (part.strip() for part in said.split(";"))
+    value = headers.get(b"content-type", b"").decode("latin-1")
+    kind, *parameters = (part.strip() for part in value.split(";"))
     if kind.lower() not in ("application/json", "text/csv"):
-        raise Refused(415, f"Content-Type: {quote(said)} came; wanted application/json or text/csv.")
+        raise Refusal(415, f"Got Content-Type: {quote(value)}, but application/json or text/csv is required.")
     for parameter in filter(None, parameters):
-        name, _, value = parameter.partition("=")
-        if name.strip().lower() != "charset" or value.strip(" \"'").lower() not in ("utf-8", "utf8"):
-            raise Refused(415, f"Content-Type: {quote(said)} came; wanted {kind.lower()}; charset=utf-8.")
+        name, _, charset = parameter.partition("=")
+        if name.strip().lower() != "charset" or charset.strip(" \"'").lower() not in ("utf-8", "utf8"):
+            raise Refusal(415, f"Got Content-Type: {quote(value)}. Use {kind.lower()}; charset=utf-8.")
     if headers.get(b"content-encoding", b"identity") != b"identity":
-        raise Refused(415, "A compressed body came; wanted one without Content-Encoding.")
+        raise Refusal(415, "The body is compressed. Send it uncompressed, without Content-Encoding.")
     return kind.lower()
 
 
 def require_bounded(body: bytes, kind: str) -> None:
-    """Refuse a body that is too large, deep or malformed for MLflow to parse.
+    """Raise a Refusal if a body is too large, too deeply nested or malformed.
 
     Raises:
-        Refused: the message says what came, what was wanted and what to do.
+        Refusal: the message names the fault and the remedy.
     """
     try:
         text = body.decode("utf-8")
     except UnicodeDecodeError as error:
-        raise Refused(400, f"Byte {error.start} of the body is no UTF-8. Send the body in UTF-8.") from None
+        raise Refusal(
+            400, f"Byte {error.start} of the body is not UTF-8. Encode the body in UTF-8."
+        ) from None
     if not text.strip():
-        raise Refused(400, f"An empty body came; wanted {wanted_of(kind)}.")
+        raise Refusal(400, f"The body is empty. Send {expected_body(kind)}.")
     if kind == "text/csv":
         _require_table(text)
         return
-    _require_few(body)
+    _require_few_values(body)
     try:
-        found = json.loads(text, object_pairs_hook=_unique, parse_constant=_no_constant)
+        content = json.loads(text, object_pairs_hook=_unique_keys, parse_constant=_no_constant)
     except (ValueError, RecursionError) as error:  # JSONDecodeError, or an integer of too many digits
-        raise Refused(400, f"The body cannot be read as JSON ({shorten(error)}). Mend it.") from None
-    _require_form(found)
+        raise Refusal(400, f"The body cannot be read as JSON ({shorten(error)}). Correct the body.") from None
+    _require_form(content)
 
 
-def _require_few(body: bytes) -> None:
-    """Check the number of values and the depth of JSON, which may be damaged, in bounded memory and without parsing."""
-    # Escaped backslashes and quotation marks are removed; a remaining backslash precedes a letter that ends no text.
-    plain = body.replace(b"\\\\", b"").replace(b'\\"', b"").translate(None, _OTHERS)
+def _require_few_values(body: bytes) -> None:
+    """Check number of values and depth of possibly malformed JSON, in bounded memory and without parsing it."""
+    # Remove escaped backslashes and quotation marks, so that every remaining quotation mark begins or ends a text.
+    plain = body.replace(b"\\\\", b"").replace(b'\\"', b"").translate(None, _WITHOUT_MEANING)
     if plain.count(b'"') > 4 * MOST_VALUES:
-        raise Refused(413, _too_many(f"more than {2 * MOST_VALUES} texts"))
+        raise Refusal(413, _too_many_message(f"more than {2 * MOST_VALUES} texts"))
     marks = b"".join(plain.split(b'"')[::2])
     values = len(marks) - marks.count(b"]") - marks.count(b"}")
     if values > MOST_VALUES or len(marks) > 2 * MOST_VALUES:
-        raise Refused(413, _too_many(f"{values} values"))
+        raise Refusal(413, _too_many_message(f"{values} values"))
     codes = np.frombuffer(marks, np.uint8)
     steps = np.isin(codes, (ord("["), ord("{"))).astype(np.int64) - np.isin(codes, (ord("]"), ord("}")))
     depth = int(steps.cumsum().max(initial=0))
     if depth > MOST_DEPTH:
-        raise Refused(
+        raise Refusal(
             400,
-            f"Lists and dictionaries {depth} deep within each other came; at most {MOST_DEPTH} are read. Send "
+            f"Lists and dictionaries are nested {depth} levels deep, but at most {MOST_DEPTH} levels are read. Send "
             "rows, or an array of inputs.",
         )
 
 
-_OTHERS = bytes(set(range(256)) - set(b'"[]{},'))
+_WITHOUT_MEANING = bytes(set(range(256)) - set(b'"[]{},'))
 
 
 def _require_table(text: str) -> None:
     lines = text.splitlines()
     if len(lines) > MOST_ROWS:
-        raise Refused(413, _too_many(f"{len(lines)} lines"))
+        raise Refusal(413, _too_many_message(f"{len(lines)} lines"))
     # pandas pads short lines to the length of the longest one.
     columns = 1 + max(line.count(",") for line in lines)
     if columns * len(lines) > MOST_VALUES:
-        raise Refused(413, _too_many(f"{len(lines)} lines of up to {columns} cells"))
+        raise Refusal(413, _too_many_message(f"{len(lines)} lines of up to {columns} cells"))
     if "\0" in text:
-        raise Refused(400, "The body holds a NUL character, which no CSV has. Send text.")
+        raise Refusal(
+            400, "The body contains a NUL character, which is not allowed in CSV. Send text without it."
+        )
     if len(lines) < 2:
-        raise Refused(400, f"{len(lines)} line of CSV came; wanted {wanted_of('text/csv')}.")
+        raise Refusal(400, f"Got {len(lines)} line of CSV. Send {expected_body('text/csv')}.")
 
 
-def _require_form(found: object) -> None:
-    if not isinstance(found, dict) or len(set(FORMS) & set(found)) != 1:
-        came = f"a dictionary with the keys {quote(list(found))}" if isinstance(found, dict) else _name(found)
-        raise Refused(400, f"{_capital(came)} came; wanted {wanted_of('application/json')}.")
-    form = next(name for name in FORMS if name in found)
-    for key, value in found.items():
+def _require_form(content: object) -> None:
+    if not isinstance(content, dict) or len(set(FORMS) & set(content)) != 1:
+        description = (
+            f"a dictionary with the keys {quote(list(content))}"
+            if isinstance(content, dict)
+            else _describe(content)
+        )
+        raise Refusal(400, f"Got {description}. Send {expected_body('application/json')}.")
+    form = next(name for name in FORMS if name in content)
+    for key, value in content.items():
         if key == "params" and value:
-            raise Refused(400, "The model has no parameters. Leave 'params' out.")
+            raise Refusal(400, "The model has no parameters. Leave 'params' out.")
         if key not in (form, "params"):
-            raise Refused(400, f"Beside {form!r} a key {quote(key)} came, which is not read. Leave it out.")
-    given = found[form]
+            raise Refusal(400, f"The key {quote(key)} beside {form!r} is not read. Leave the key out.")
+    rows = content[form]
     if form == "dataframe_split":
-        _require_split(given)
+        _require_split(rows)
     elif form == "dataframe_records" or (
-        form == "instances" and isinstance(given, list) and any(isinstance(row, dict) for row in given)
+        form == "instances" and isinstance(rows, list) and any(isinstance(row, dict) for row in rows)
     ):
-        _require_records(given, form)
-    elif given is None or given in ([], {}, ""):
-        raise Refused(400, f"{form!r} is empty; wanted a row at least.")
-    if isinstance(given, list) and len(given) > MOST_ROWS:
-        raise Refused(413, _too_many(f"{len(given)} rows"))
+        _require_records(rows, form)
+    elif rows is None or rows in ([], {}, ""):
+        raise Refusal(400, f"{form!r} is empty. Send at least one row.")
+    if isinstance(rows, list) and len(rows) > MOST_ROWS:
+        raise Refusal(413, _too_many_message(f"{len(rows)} rows"))
 
 
-def _require_split(given: object) -> None:
-    wanted = "wanted {'columns': [names], 'data': [rows, each a list with a value for each column]}"
-    if not isinstance(given, dict):
-        raise Refused(400, f"'dataframe_split' is {_name(given)}; {wanted}.")
-    columns, rows, index = given.get("columns"), given.get("data"), given.get("index")
-    if not set(given) <= {"columns", "data", "index"} or not isinstance(columns, list):
-        raise Refused(400, f"'dataframe_split' has the keys {quote(list(given))}; {wanted}.")
+def _require_split(table: object) -> None:
+    expected = "Expected {'columns': [names], 'data': [rows, each a list with a value for each column]}"
+    if not isinstance(table, dict):
+        raise Refusal(400, f"'dataframe_split' is {_describe(table)}. {expected}.")
+    columns, rows, index = table.get("columns"), table.get("data"), table.get("index")
+    if not set(table) <= {"columns", "data", "index"} or not isinstance(columns, list):
+        raise Refusal(400, f"'dataframe_split' has the keys {quote(list(table))}. {expected}.")
     if not all(isinstance(name, str) for name in columns) or len(set(columns)) < len(columns):
-        raise Refused(400, f"'columns' is {quote(columns)}; wanted names, each once.")
+        raise Refusal(400, f"'columns' is {quote(columns)}, but must be a list of distinct names.")
     if not isinstance(rows, list) or not rows:
-        raise Refused(400, f"'data' is {_name(rows)}; wanted a row at least.")
+        raise Refusal(400, f"'data' is {_describe(rows)}. Send a list with at least one row.")
     if len(rows) > MOST_ROWS:
-        raise Refused(413, _too_many(f"{len(rows)} rows"))
+        raise Refusal(413, _too_many_message(f"{len(rows)} rows"))
     for number, row in enumerate(rows):
         if not isinstance(row, list) or len(row) != len(columns):
-            came = f"a list of {len(row)}" if isinstance(row, list) else _name(row)
-            raise Refused(400, f"row {number} is {came}; wanted a list of {len(columns)} values.")
+            description = f"a list of {len(row)}" if isinstance(row, list) else _describe(row)
+            raise Refusal(400, f"row {number} is {description}, but must be a list of {len(columns)} values.")
     if index is not None and (not isinstance(index, list) or len(index) != len(rows)):
-        raise Refused(400, f"'index' does not have a value for each of {len(rows)} rows. Leave it out.")
+        raise Refusal(400, f"'index' does not have a value for each of {len(rows)} rows. Leave 'index' out.")
 
 
-def _require_records(given: object, form: str) -> None:
-    """Refuse records with different keys: 1000 records of 1000 keys each would make a table of 10⁹ cells."""
-    if not isinstance(given, list) or not given:
-        raise Refused(400, f"{form!r} is {_name(given)}; wanted a list of rows, {{column: value}}.")
-    if len(given) > MOST_ROWS:
-        raise Refused(413, _too_many(f"{len(given)} rows"))
-    for number, row in enumerate(given):
-        if not isinstance(row, dict) or (number and row.keys() != given[0].keys()):
-            came = f"has the keys {quote(list(row))}" if isinstance(row, dict) else f"is {_name(row)}"
-            raise Refused(
-                400, f"row {number} {came}; wanted {{column: value}}, with the same columns in each row."
+def _require_records(records: object, form: str) -> None:
+    """Raise a Refusal if records have different keys: 1000 records of 1000 keys could make a table of 10⁹ cells."""
+    if not isinstance(records, list) or not records:
+        raise Refusal(400, f"{form!r} is {_describe(records)}. Send a list of rows, {{column: value}}.")
+    if len(records) > MOST_ROWS:
+        raise Refusal(413, _too_many_message(f"{len(records)} rows"))
+    for number, row in enumerate(records):
+        if not isinstance(row, dict) or (number and row.keys() != records[0].keys()):
+            description = (
+                f"has the keys {quote(list(row))}" if isinstance(row, dict) else f"is {_describe(row)}"
+            )
+            raise Refusal(
+                400, f"row {number} {description}. Send {{column: value}}, with the same columns in each row."
             )
 
 
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) < len(pairs):
-        seen: set[str] = set()
-        twice = next(key for key, _ in pairs if key in seen or seen.add(key))  # type: ignore[func-returns-value]
-        raise ValueError(f"the key {quote(twice)} comes twice in one dictionary")
-    return found
+def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    dictionary = dict(pairs)
+    if len(dictionary) < len(pairs):
+        earlier: set[str] = set()
+        twice = next(key for key, _ in pairs if key in earlier or earlier.add(key))  # type: ignore[func-returns-value]
+        raise ValueError(f"the key {quote(twice)} occurs twice in one dictionary")
+    return dictionary
 
 
 def _no_constant(name: str) -> None:
-    raise ValueError(f"{name} is no number of JSON")
+    raise ValueError(f"{name} is not a number in JSON")
 
 
-def _name(value: object) -> str:
+def _describe(value: object) -> str:
     if isinstance(value, list):
         return f"a list of {len(value)}"
     kinds = {dict: "a dictionary", str: "a text", bool: "true or false", type(None): "nothing"}
     return kinds.get(type(value), "a number")
 
 
-def _capital(text: str) -> str:
-    return text[:1].upper() + text[1:]
-
-
-def wanted_of(kind: str) -> str:
-    """Return what a body of a media type should hold."""
+def expected_body(kind: str) -> str:
+    """Return a description of the expected body, for a media type."""
     if kind == "text/csv":
         return "a line with the names of the columns, and a line for each row"
     return f"a dictionary with one of the keys {', '.join(FORMS)}"
 
 
-def too_large(came: str) -> str:
-    """Return the sentence for a body of too many bytes."""
-    return f"A body of {came} came; at most {MOST_BODY} are read. Send fewer rows in one request, or smaller files."
+def too_large_message(size: str) -> str:
+    """Return the message about a body of too many bytes, such as "5 bytes"."""
+    return f"The body has {size}, but at most {MOST_BODY} are read. Send fewer rows in one request, or smaller files."
 
 
-def _too_many(came: str) -> str:
+def _too_many_message(amount: str) -> str:
     return (
-        f"{_capital(came)} came; at most {MOST_ROWS} rows and {MOST_VALUES} values are read. Send them in several "
+        f"Got {amount}, but at most {MOST_ROWS} rows and {MOST_VALUES} values are read. Send them in several "
         "requests, or as files in base64."
     )

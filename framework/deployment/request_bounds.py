@@ -1,8 +1,7 @@
 """Limits on the requests that `mlflow models serve` answers; they apply before MLflow parses a body.
 
-The project has its own code for this because MLflow's server reads bodies of any size, parses JSON of any depth, and
-answers errors with stack traces. It has no setting for any of these, and calls the model only after it has parsed the
-request.
+MLflow's server reads bodies of any size, parses JSON of any depth, and answers errors with stack traces. It has no
+setting that changes this, and calls the model only after it has parsed the request.
 """
 
 import asyncio
@@ -20,17 +19,17 @@ from typing import Any, final
 from framework.deployment.request_bodies import (
     AT_ONCE,
     MOST_BODY,
-    Refused,
+    Refusal,
     content_type,
+    expected_body,
     require_bounded,
-    too_large,
-    wanted_of,
+    too_large_message,
 )
 from framework.errors import DataError, escape_unprintable, shorten
 
 INVOCATIONS = "/invocations"
-MOST_PASSED_OVER = 2**28
-"""Number of bytes of a refused body that are received and discarded."""
+MOST_DISCARDED = 2**28
+"""Largest number of bytes of a refused body that are received and discarded."""
 
 Message = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[Message]]
@@ -42,13 +41,13 @@ _log = logging.getLogger(__name__)
 
 @dataclass
 class Ticket:
-    """Data that the server and the model exchange about one request.
+    """Data that server and model exchange about one request.
 
     Attributes:
         seconds: time limit of the request.
-        deadline: end of that time, by `time.monotonic`.
-        sentence: why the model refused the request.
-        remarks: remarks of the model, sent beside the answer's table.
+        deadline: end of the time limit, as a value of `time.monotonic`.
+        sentence: message that says why the model refused the request.
+        remarks: remarks of the model, which are sent along with the table of predictions.
     """
 
     seconds: float
@@ -57,23 +56,23 @@ class Ticket:
     remarks: Sequence[str] = ()
 
     def require_time(self) -> None:
-        """Refuse to go on after the deadline.
+        """Raise an error if the deadline has passed.
 
         Raises:
-            DataError: the request has taken too long.
+            DataError: the deadline has passed.
         """
         if time.monotonic() > self.deadline:
-            self.sentence = too_long(self.seconds)
+            self.sentence = too_long_message(self.seconds)
             raise DataError(self.sentence)
 
 
 REMARK = b"x-model-remark"
-"""Header of an answer with a remark that a wrapper of the model made when it was calibrated."""
+"""Header of a response with a remark that a wrapper of the model made when it was calibrated."""
 
 
 @dataclass
-class Received:
-    """State of a body that is being received: its bytes so far, and whether it is complete."""
+class ReceivedBody:
+    """State of a body that is being received: the number of bytes so far, and whether the body is complete."""
 
     size: int = 0
     complete: bool = False
@@ -83,51 +82,51 @@ TICKET: ContextVar[Ticket | None] = ContextVar("ticket", default=None)
 """Ticket of the request that is being answered; None in a process that is not a server."""
 
 
-def too_long(seconds: float) -> str:
-    """Return the sentence for a request that takes longer than it may."""
+def too_long_message(seconds: float) -> str:
+    """Return the message about a request that exceeds the time limit."""
     return (
-        f"The request was not answered within {seconds:g} s, which is the most. Send fewer rows, or smaller files; "
-        "who starts the server sets the time: mlflow models serve --timeout."
+        f"The request was not answered within the time limit of {seconds:g} s. Send fewer rows, or smaller files; or "
+        "start the server with a longer limit: mlflow models serve --timeout."
     )
 
 
 @final
-class Bounded:
-    """ASGI application that answers requests with another application, MLflow's, within limits.
+class BoundedApp:
+    """ASGI application that passes requests to MLflow's application within limits of size and time.
 
     Args:
         app: MLflow's application.
-        seconds: time limit of a request, from its first byte to its answer.
-        samples: bodies of JSON that are answered once before the server listens, so that no client waits for imports
-            and compilation.
+        seconds: time limit of a request, from its first byte to the response.
+        samples: bodies of JSON that are answered before the server listens, so that no client waits for imports and
+            compilation.
     """
 
     def __init__(self, app: App, seconds: float, samples: Iterable[bytes] = ()) -> None:
         self.app, self.seconds, self.samples = app, seconds, samples
-        self.held = 0  # bytes of all bodies that are held now
+        self.stored_bytes = 0  # size of all bodies that are in memory now
 
     async def __call__(self, scope: MutableMapping[str, Any], receive: Receive, send: Send) -> None:
-        """Answer a request, or pass on a request that is not for the model."""
+        """Answer a request to the model within the limits; pass any other request on unchanged."""
         if scope["type"] == "lifespan":
             await self._warm_up()
         if scope["type"] != "http" or scope["path"] != INVOCATIONS or scope["method"] != "POST":
             await self.app(scope, receive, send)
             return
-        received = Received()
+        received = ReceivedBody()
         try:
-            await self._answer(scope, receive, send, received)
-        except Refused as refusal:
+            await self._respond(scope, receive, send, received)
+        except Refusal as refusal:
             await _refuse(None if received.complete else receive, send, refusal)
         finally:
-            self.held -= received.size
+            self.stored_bytes -= received.size
 
-    async def _answer(
-        self, scope: MutableMapping[str, Any], receive: Receive, send: Send, received: Received
+    async def _respond(
+        self, scope: MutableMapping[str, Any], receive: Receive, send: Send, received: ReceivedBody
     ) -> None:
         """Answer a request to the model.
 
         Raises:
-            Refused: the request exceeds a limit, or the model refuses it.
+            Refusal: the request exceeds a limit, or the model refuses it.
         """
         ticket = Ticket(self.seconds, time.monotonic() + self.seconds)
         headers = dict(scope["headers"])
@@ -138,20 +137,20 @@ class Bounded:
                 if body is None:
                     return
                 await asyncio.to_thread(require_bounded, body, kind)
-                status, content, media = await self._called(scope, receive, body, kind, ticket)
+                status, content, media = await self._call_app(scope, receive, body, kind, ticket)
         except TimeoutError:
-            raise Refused(408 if body is None else 413, too_long(self.seconds)) from None
+            raise Refusal(408 if body is None else 413, too_long_message(self.seconds)) from None
         if status >= 400:
-            raise Refused(_status(status), ticket.sentence or _sentence(content, kind))
+            raise Refusal(_client_status(status), ticket.sentence or _parse_message(content, kind))
         await _send(send, status, content, media, remarks=ticket.remarks)
 
     async def _body(
-        self, headers: Mapping[bytes, bytes], receive: Receive, received: Received
+        self, headers: Mapping[bytes, bytes], receive: Receive, received: ReceivedBody
     ) -> bytes | None:
-        """Return the body; None if the client has disconnected."""
-        said = headers.get(b"content-length", b"")
-        if said.isdigit() and int(said[:20]) > MOST_BODY:
-            raise Refused(413, too_large(f"{int(said[:20])} bytes"))
+        """Receive and return the body; None if the client has disconnected."""
+        length = headers.get(b"content-length", b"")
+        if length.isdigit() and int(length[:20]) > MOST_BODY:
+            raise Refusal(413, too_large_message(f"{int(length[:20])} bytes"))
         parts: list[bytes] = []
         while True:
             message = await receive()
@@ -160,29 +159,31 @@ class Bounded:
             part = message.get("body", b"")
             parts.append(part)
             received.size += len(part)
-            self.held += len(part)
+            self.stored_bytes += len(part)
             if received.size > MOST_BODY:
-                raise Refused(413, too_large(f"more than {MOST_BODY} bytes"))
-            if self.held > AT_ONCE and self.held > received.size:
-                raise Refused(503, "The server is busy with other large requests. Send this one again later.")
+                raise Refusal(413, too_large_message(f"more than {MOST_BODY} bytes"))
+            if self.stored_bytes > AT_ONCE and self.stored_bytes > received.size:
+                raise Refusal(
+                    503, "The server is busy with other large requests. Send this request again later."
+                )
             if not message.get("more_body", False):
                 received.complete = True
                 return b"".join(parts)
 
-    async def _called(
+    async def _call_app(
         self, scope: MutableMapping[str, Any], receive: Receive, body: bytes, kind: str, ticket: Ticket
     ) -> tuple[int, bytes, bytes]:
-        """Return status, content and media type of MLflow's answer."""
-        # The content type is rewritten without what MLflow does not know (an upper-case name, a charset in quotes).
-        kept = [pair for pair in scope["headers"] if pair[0] not in (b"content-type", b"content-length")]
-        kept += [(b"content-type", kind.encode()), (b"content-length", str(len(body)).encode())]
+        """Return status, content and media type of MLflow's response."""
+        # The content type is rewritten in the form that MLflow accepts (lower case, no quoted charset).
+        headers = [pair for pair in scope["headers"] if pair[0] not in (b"content-type", b"content-length")]
+        headers += [(b"content-type", kind.encode()), (b"content-length", str(len(body)).encode())]
         waiting = [{"type": "http.request", "body": body, "more_body": False}]
         status, media, content = 500, b"application/json", []
 
         async def read() -> Message:
             return waiting.pop() if waiting else await receive()
 
-        async def keep(message: Message) -> None:
+        async def store(message: Message) -> None:
             nonlocal status, media
             if message["type"] == "http.response.start":
                 status = message["status"]
@@ -192,17 +193,17 @@ class Bounded:
 
         token = TICKET.set(ticket)
         try:
-            await self.app({**scope, "headers": kept}, read, keep)
+            await self.app({**scope, "headers": headers}, read, store)
         except TimeoutError:
             raise
-        except Exception:  # Starlette answers 500, and raises the error for the log
+        except Exception:  # Starlette has answered with status 500, and raises the error for the log
             _log.exception("MLflow could not answer a request.")
         finally:
             TICKET.reset(token)
         return status, b"".join(content), media
 
     async def _warm_up(self) -> None:
-        """Answer the sample requests and discard the answers."""
+        """Answer the sample requests and discard the responses."""
         headers = [(b"host", b"localhost"), (b"content-type", b"application/json")]
         scope = {"type": "http", "asgi": {"version": "3.0"}, "http_version": "1.1", "method": "POST"}
         scope |= {
@@ -228,11 +229,11 @@ class Bounded:
 
 
 def bound_server(samples: Iterable[bytes]) -> None:
-    """Put limits on the MLflow server that is being started in this process; otherwise do nothing.
+    """Limit the requests of the MLflow server that is starting in this process, if there is one.
 
     `mlflow models serve` runs uvicorn with `mlflow.pyfunc.scoring_server.app`. That module loads the model and then
-    makes its application, a FastAPI. The model can reach the application at this point only. The class is restored when
-    the application has been made.
+    creates its application, an instance of FastAPI. Only between these two steps can the model change the application,
+    so it replaces the class FastAPI. The class is restored when the application has been created.
     """
     module = sys.modules.get("mlflow.pyfunc.scoring_server.app")
     if module is None or hasattr(module, "app"):
@@ -246,8 +247,8 @@ def bound_server(samples: Iterable[bytes]) -> None:
     class BoundedFastAPI(original):
         def __init__(self) -> None:
             fastapi.FastAPI = original
-            super().__init__(docs_url=None, redoc_url=None)  # pages that load scripts of other servers
-            self.bounded = Bounded(super().__call__, seconds, samples)
+            super().__init__(docs_url=None, redoc_url=None)  # these pages load scripts from other servers
+            self.bounded = BoundedApp(super().__call__, seconds, samples)
 
         async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
             await self.bounded(scope, receive, send)
@@ -255,35 +256,36 @@ def bound_server(samples: Iterable[bytes]) -> None:
     fastapi.FastAPI = BoundedFastAPI
 
 
-def _status(status: int) -> int:
+def _client_status(status: int) -> int:
     """Return the status for the client.
 
-    A body that makes MLflow fail is an error of the client, whatever status MLflow gives; 504 is MLflow's time limit.
+    A body that MLflow cannot process is a client error (4xx), whatever status MLflow returns; 504 is MLflow's time
+    limit.
     """
     return {504: 413}.get(status, status if status < 500 else 400)
 
 
-def _sentence(content: bytes, kind: str) -> str:
-    """Return MLflow's message about a request that it cannot parse, without its stack trace."""
+def _parse_message(content: bytes, kind: str) -> str:
+    """Return a message about a request that MLflow cannot parse, with MLflow's message but no stack trace."""
     try:
-        said = str(json.loads(content)["message"])
+        reason = str(json.loads(content)["message"])
     except (ValueError, KeyError, TypeError):
-        said = ""
-    said = shorten(re.split(r"\bError: ", said)[-1], 300)
-    return f"The request cannot be read{f' ({said})' if said else ''}; wanted {wanted_of(kind)}."
+        reason = ""
+    reason = shorten(re.split(r"\bError: ", reason)[-1], 300)
+    return f"The request cannot be read{f' ({reason})' if reason else ''}. Send {expected_body(kind)}."
 
 
-async def _refuse(receive: Receive | None, send: Send, refusal: Refused) -> None:
+async def _refuse(receive: Receive | None, send: Send, refusal: Refusal) -> None:
     """Send the refusal, and discard the rest of the body.
 
-    Many clients read nothing before they have sent everything.
+    Many clients read only after they have sent everything.
     """
     name = "TEMPORARILY_UNAVAILABLE" if refusal.status == 503 else "INVALID_PARAMETER_VALUE"
     content = json.dumps({"error_code": name, "message": str(refusal)}).encode()
     await _send(send, refusal.status, content, b"application/json", close=receive is not None)
     if receive is None:  # the body is complete
         return
-    left, end = MOST_PASSED_OVER, time.monotonic() + 10
+    left, end = MOST_DISCARDED, time.monotonic() + 10
     with contextlib.suppress(TimeoutError):
         while left > 0 and time.monotonic() < end:
             message = await asyncio.wait_for(receive(), 1)
@@ -302,9 +304,9 @@ async def _send(
     remarks: Iterable[str] = (),
     close: bool = False,
 ) -> None:
-    """Send an answer; with `close` the caller ends the connection.
+    """Send a response; with `close` the caller ends the connection.
 
-    Each of `remarks` is a header of its own, because a table of predictions has no place for them.
+    Each remark is sent as a header, because a table of predictions has no field for remarks.
     """
     headers = [(b"content-type", media), (b"content-length", str(len(content)).encode())]
     headers += [
