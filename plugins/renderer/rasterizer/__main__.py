@@ -235,9 +235,8 @@ def main(arguments: list[str]) -> None:
             scene = stage.lit_scene(camera_at_frame)
             start = time.perf_counter()
             try:
-                if (
-                    options.report and not seconds
-                ):  # the first drawing compiles the kernels, so it is not timed
+                # the first drawing compiles the kernels, so it is not timed
+                if options.report and not seconds:
                     Rasterizer(supersampling=renderer.supersampling)(scene, (options.channel,))
                     start = time.perf_counter()
                 rendered = renderer(scene, (options.channel,))[options.channel]

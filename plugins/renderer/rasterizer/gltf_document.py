@@ -138,9 +138,8 @@ class Document:
             )
         if kind.kind == "f":
             return values.astype(np.float64)
-        if shares or described.get(
-            "normalized"
-        ):  # section 3.11 "Animations", equations of normalized integers
+        # section 3.11 "Animations", equations of normalized integers
+        if shares or described.get("normalized"):
             return np.maximum(values.astype(np.float64) / np.iinfo(kind).max, -1)
         return values
 

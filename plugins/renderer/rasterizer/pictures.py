@@ -99,20 +99,19 @@ def corner_normals(vertices: NDArray, faces: NDArray) -> Float[np.ndarray, "corn
         areas = np.nan_to_num(np.cross(b - a, c - a), posinf=0, neginf=0)
     unit = areas / np.maximum(np.linalg.norm(areas, axis=1, keepdims=True), 1e-300)
     areas = areas / max(float(np.abs(areas).max()), 1e-300)
-    places = np.unique(vertices, axis=0, return_inverse=True)[1].reshape(
-        -1
-    )  # equal positions, also where a seam splits a vertex
-    corners = places[faces.reshape(-1)]
+    # equal positions, also where a seam splits a vertex
+    positions = np.unique(vertices, axis=0, return_inverse=True)[1].reshape(-1)
+    corners = positions[faces.reshape(-1)]
     order = np.argsort(corners, kind="stable")
-    corners, face_image = corners[order], order // 3
-    total = areas[face_image]
+    corners, face = corners[order], order // 3
+    total = areas[face]
     for step in range(1, MOST_AROUND):
         same = np.flatnonzero(corners[step:] == corners[:-step])
         if not len(same):
             break
-        smooth = same[(unit[face_image[same]] * unit[face_image[same + step]]).sum(1) > CREASE]
-        total[smooth] += areas[face_image[smooth + step]]
-        total[smooth + step] += areas[face_image[smooth]]
+        smooth = same[(unit[face[same]] * unit[face[same + step]]).sum(1) > CREASE]
+        total[smooth] += areas[face[smooth + step]]
+        total[smooth + step] += areas[face[smooth]]
     normals = np.empty_like(total)
     normals[order] = total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)
     return normals

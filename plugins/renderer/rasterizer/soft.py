@@ -358,9 +358,8 @@ def backward(scene, blend_data, grad_image, sums):
                     continue
                 covered = (1.0 if side > 0 else doubt) / (1 + doubt)
                 left_clear = (doubt if side > 0 else 1.0) / (1 + doubt)
-                grad_odds = (
-                    grad_dot_mean[row, column] * clear[row, column] * covered
-                )  # of A_O: ∂ log(1 - D) = -D
+                # of A_O: ∂ log(1 - D) = -D
+                grad_odds = grad_dot_mean[row, column] * clear[row, column] * covered
                 q0, q1, q2, scale = clip_weights(w0, w1, w2)
                 a0, a1, a2 = q0 * near0, q1 * near1, q2 * near2
                 inverse = a0 + a1 + a2

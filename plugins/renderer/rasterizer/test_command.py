@@ -1,4 +1,4 @@
-"""Tests of the command: content of its images, cameras against formulas, films, and a message for every mistake."""
+"""Tests of the command: content of images, cameras compared with formulas, videos, and messages for mistakes."""
 
 import io
 import json
@@ -70,7 +70,7 @@ def test_a_cube_shows_the_side_that_the_camera_faces(cube: Path, tmp_path: Path,
 
 @pytest.mark.parametrize("name", ["one.glb", "one.obj"])
 def test_a_texture_is_drawn_upright_and_in_its_colours(tmp_path: Path, name: str) -> None:
-    """Check red and green above, blue and white below, seen from the front; at the centres of texels they are exact."""
+    """Check red and green above, blue and white below, seen from the front. The colours are exact at texel centres."""
     four = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 255]]], np.uint8)
     square = trimesh.Trimesh(
         [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], [[0, 1, 2], [0, 2, 3]], process=False
@@ -93,9 +93,8 @@ def test_a_texture_is_drawn_upright_and_in_its_colours(tmp_path: Path, name: str
         "--supersampling",
         "1",
     ]
-    main(
-        [str(tmp_path / name), *view, "--size", "42x42", "--no-shade", "--out", str(out)]
-    )  # an odd count a texel
+    # an odd number of pixels per texel
+    main([str(tmp_path / name), *view, "--size", "42x42", "--no-shade", "--out", str(out)])
     pixels = np.asarray(Image.open(io.BytesIO(out.read_bytes())), int)
     texel_centres = pixels[[[10, 10], [31, 31]], [[10, 31], [10, 31]]]
     assert np.abs(texel_centres - four).max() <= 1
@@ -104,7 +103,7 @@ def test_a_texture_is_drawn_upright_and_in_its_colours(tmp_path: Path, name: str
 def test_edges_are_blended_in_light_and_transparent_pictures_know_their_share(
     cube: Path, tmp_path: Path
 ) -> None:
-    """Compare a transparent image before any background with an image that is drawn on that background."""
+    """Compare a transparent image, composited over a background, with an image that is drawn with this background."""
     options = ("--azimuth", "40", "--elevation", "30", "--supersampling", "4")
     clear = np.asarray(run_command(cube, tmp_path, *options, "--background", "transparent"))
     assert clear.shape == (40, 48, 4) and {0, 255} < set(clear[..., 3].ravel().tolist())
@@ -146,7 +145,7 @@ def test_channels_become_whole_numbers_as_they_say() -> None:
 
 
 def test_a_sphere_of_one_colour_is_lit_from_the_camera(tmp_path: Path) -> None:
-    """Check Lambert's law on normals that the sphere's facets share; an edge of a cube stays sharp."""
+    """Check Lambert's law with smooth normals on a sphere, and flat normals at the edges of a cube."""
     trimesh.creation.icosphere(4, 1.0).export(tmp_path / "ball.stl")
     pixels = run_command(
         tmp_path / "ball.stl", tmp_path, "--distance", "50", "--fov", "2.6", "--background", "black"
@@ -169,7 +168,7 @@ def test_a_sphere_of_one_colour_is_lit_from_the_camera(tmp_path: Path) -> None:
 
 
 def test_the_camera_is_that_of_look_from_and_sees_all_of_the_subject() -> None:
-    """Check cameras about any centre, and that the image contains a sphere but only just, for any image shape."""
+    """Check cameras around any centre, and that the sphere just fits into images of any shape."""
     random = np.random.default_rng(0)
     for _ in range(10):
         centre = torch.from_numpy(random.normal(size=3) * 100)
@@ -217,7 +216,7 @@ def test_an_exact_camera_sees_points_where_its_formula_says(cube: Path, tmp_path
     main([str(cube), "--camera", str(file), "--channel", "depth", "--out", str(tmp_path / "one.npy")])
     depth = np.load(tmp_path / "one.npy")
     assert depth.shape == (40, 44)
-    # the front side, z = 8, is 6 metres away: its pixel centres between the corners' pixels
+    # the front side, z = 8, is 6 metres away; it covers the pixel centres between its projected corners
     low, high = 60 * np.array([-1.2, 0.8]) / 6 + 20.5, 55 * np.array([-0.9, 1.1]) / 6 + 18
     inside = np.argwhere(np.abs(depth - 6) < 1e-5)
     assert inside.min(0).tolist() == [math.ceil(high[0]), math.ceil(low[0])]
@@ -266,7 +265,7 @@ def test_a_gif_has_its_frames_and_begins_with_the_picture(cube: Path, tmp_path: 
     for number in range(5):
         film.seek(number)
         still = np.asarray(run_command(cube, tmp_path, "--azimuth", f"{30 + 72 * number}"), float)
-        assert np.abs(still - np.asarray(film.convert("RGB"))).max() <= 8  # of 256 colours a frame
+        assert np.abs(still - np.asarray(film.convert("RGB"))).max() <= 8  # a frame has 256 colours
     stacked = run_command(cube, tmp_path, "--turntable", "5", "--channel", "depth", name="one.npy")
     assert stacked.shape == (5, 40, 48)
 
@@ -280,7 +279,7 @@ def write_ffmpeg(folder: Path, text: str) -> None:
 def test_a_film_is_what_ffmpeg_makes_of_the_frames(
     cube: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Replace ffmpeg by a program that keeps the bytes and its arguments, by one that fails, and by none."""
+    """Replace ffmpeg by a program that stores its input, by a program that fails, and by no program."""
     monkeypatch.setenv("PATH", str(tmp_path))
     out = tmp_path / "films" / "one.mp4"
     options = [str(cube), "--turntable", "3", "--size", "48x40", "--out", str(out)]
@@ -356,7 +355,7 @@ def test_the_command_says_where_it_wrote_and_its_report_on_request(
 def test_extreme_subjects_are_drawn_or_get_a_sentence(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Check that the image is the same for every size and place of the subject; too large coordinates are refused."""
+    """Check that the image does not depend on the size and position of the subject, up to a limit."""
     ball = trimesh.creation.icosphere(2)
     shown = []
     for scale, move in ((1.0, 0.0), (1e-20, 0.0), (1e29, 0.0), (1e-3, 1e6), (1e40, 0.0)):

@@ -1,4 +1,4 @@
-"""Test that every pixel of a tessellated plane is covered once, counted face by face with the kernel itself."""
+"""Test that every pixel of a tessellated plane is covered once; the kernel itself counts face by face."""
 
 import math
 from collections.abc import Iterable, Iterator
@@ -18,10 +18,15 @@ MARGIN = 2 / 256  # pixels; a corner is rounded by up to 1/512 along either axis
 FAR = 4.0  # metres, half a side of the plane
 
 
-@njit(error_model="numpy")  # not kept on disk, where nothing would see that a kernel it calls has changed
+@njit(
+    error_model="numpy"
+)  # not cached on disk, because the cache would not notice a change of a called kernel
 @no_type_check
 def count_faces(screen, faces, height, width, alone, number):
-    """Add to `number`, (height, width), how many faces cover each pixel, each drawn alone; `alone` is all false."""
+    """Add the number of faces that cover each pixel to `number`, (height, width).
+
+    Each face is drawn alone into `alone`, which is all false before and after.
+    """
     counts = np.zeros(6, np.int64)
     for index in range(faces.shape[0]):
         face = faces[index : index + 1]
@@ -35,7 +40,7 @@ def count_faces(screen, faces, height, width, alone, number):
 
 
 def count_coverage(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Return how many faces cover each pixel, each drawn alone, and which pixels they cover when drawn together.
+    """Return how many faces, drawn one by one, cover each pixel, and which pixels all faces together cover.
 
     The kernels are those that `Rasterizer` calls. Each part of a face that the near plane cuts counts as a face.
     """
@@ -56,7 +61,8 @@ def count_coverage(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> t
 def intersect_plane(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """Return whether each pixel's ray hits the plane, and how far the pixel is from the plane's border, pixels.
 
-    The plane is the square |x|, |y| <= FAR of z = 0 beyond the near plane. The computation uses rays in the world.
+    The plane is the square |x|, |y| <= FAR of z = 0 beyond the near plane. The computation uses rays in world
+    coordinates.
     """
     back_to_world = np.linalg.inv(camera.rotation.double().numpy())
     eye = -back_to_world @ camera.translation.double().numpy()
@@ -67,8 +73,8 @@ def intersect_plane(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     )
     ray = np.stack([right, down, np.ones(rows.shape)], -1) @ back_to_world.T
     steps = back_to_world[:, :2] / camera.focal  # change of the ray per pixel to the right, and downwards
-    # The plane's depth under the ray is d = -eye_z / ray_z, and the place is eye + d ray. Each number that must be
-    # positive is linear in the pixel when multiplied by |eye_z| / d; divided by its slope it is a distance in pixels.
+    # The depth of the plane along the ray is d = -eye_z / ray_z, at the point eye + d ray. Each limit, multiplied by
+    # |eye_z| / d, is linear in the pixel position; divided by its slope, it is a distance in pixels.
     away = abs(eye[2])
     inverse, inverse_step = -np.sign(eye[2]) * ray[..., 2], -np.sign(eye[2]) * steps[2]
     limits = [(inverse, inverse_step), (away - camera.near * inverse, -camera.near * inverse_step)]
@@ -84,9 +90,9 @@ def intersect_plane(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
 
 
 def random_plane(random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Return the square, cut along a Delaunay triangulation of random points.
+    """Return vertices and faces of a Delaunay triangulation of the square with random points.
 
-    It is flat, and the corners of a face have any order.
+    All vertices have z = 0, and the corners of a face have any order.
     """
     inner, along = random.uniform(-FAR, FAR, (40, 2)), random.uniform(-FAR, FAR, (4, 5))
     ends = np.full((4, 5), FAR) * np.array([[1], [-1], [1], [-1]])
@@ -97,7 +103,7 @@ def random_plane(random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
 
 
 def regular_plane() -> tuple[np.ndarray, np.ndarray]:
-    """Return the square cut into 8 × 8 squares, which are cut along either diagonal in turn."""
+    """Return vertices and faces of 8 × 8 squares, which are divided along alternating diagonals."""
     row, column = np.meshgrid(np.arange(8), np.arange(8), indexing="ij")
     a, b, c, d = (9 * (row + down) + column + right for down, right in ((0, 0), (0, 1), (1, 0), (1, 1)))
     odd = (row + column) % 2 == 1
@@ -112,11 +118,11 @@ def random_camera(random: np.random.Generator) -> Camera:
     height, width = (int(side) for side in random.integers(1, 65, 2))
     distance = float(10.0 ** random.uniform(math.log10(0.05), 4))
     pose = random.uniform([-7, -1.57, -7], [7, 1.57, 7])
-    if random.random() < 0.2:  # along the plane
+    if random.random() < 0.2:  # look along the plane
         pose[1] = random.choice([-1, 1]) * 10.0 ** random.uniform(-6, -1)
     camera = look_from(*pose.tolist(), distance, 1.0, (height, width))
     focal = 10.0 ** random.uniform(-3, 6)
-    if random.random() < 0.7:  # so that the plane is about as large as the image
+    if random.random() < 0.7:  # choose the plane about as large as the image
         focal = 10.0 ** random.uniform(-1, 1.5) * height * distance / FAR
     focal = np.clip(focal * random.uniform(0.7, 1.4, 2), 1e-3, 1e6).tolist()
     principal = [width, height] * random.normal(0.5, random.choice([0, 0.5, 5]), 2)
@@ -131,9 +137,9 @@ def random_camera(random: np.random.Generator) -> Camera:
 
 
 def aligned_camera(random: np.random.Generator) -> Camera:
-    """Return a camera for which all numbers are exact, and edges of the regular plane run through pixel centres."""
+    """Return a camera with exact numbers for which edges of the regular plane run through pixel centres."""
     height, width = (int(side) for side in random.integers(1, 65, 2))
-    depth, pixels = 2.0 ** random.integers(-4, 14), 2.0 ** random.integers(0, 6)  # metres; pixels a metre
+    depth, pixels = 2.0 ** random.integers(-4, 14), 2.0 ** random.integers(0, 6)  # metres; pixels per metre
     turn = np.linalg.matrix_power([[0, -1, 0], [1, 0, 0], [0, 0, 1]], int(random.integers(4))) @ np.diag(
         [1, -1, -1]
     )
@@ -151,13 +157,14 @@ def aligned_camera(random: np.random.Generator) -> Camera:
 
 
 class PixelCounts(NamedTuple):
-    """Numbers of pixels of a view.
+    """Pixel counts of one view.
 
     Attributes:
-        inside: pixels that must show the plane.
-        holes, doubled: pixels of these that no face covers, and that more than one face covers.
-        strays: pixels off the plane that faces cover.
-        other: pixels in which the whole image disagrees with its faces.
+        inside: number of pixels that must show the plane.
+        holes: number of these pixels that no face covers.
+        doubled: number of these pixels that more than one face covers.
+        strays: number of covered pixels outside of the plane.
+        other: number of pixels whose coverage differs between drawing all faces at once and one by one.
     """
 
     inside: int
@@ -177,7 +184,7 @@ def count_pixels(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> Pix
 
 
 def views(number: int, seed: int = 0) -> Iterator[tuple[str, PixelCounts]]:
-    """Yield the views of `number` cameras, a third of them square on, with the name of the plane that each sees."""
+    """Yield the pixel counts of `number` cameras, a third of them aligned, with the name of the plane in view."""
     random = np.random.default_rng(seed)
     planes = {"regular": regular_plane()} | {f"loose {index}": random_plane(random) for index in range(5)}
     names = list(planes)

@@ -1,4 +1,4 @@
-"""Tests of extreme scenes: images are right or refused with a message, and gradients of finite numbers are finite."""
+"""Tests of extreme scenes: images are right or raise an error, and gradients at finite inputs are finite."""
 
 import itertools
 import math
@@ -31,7 +31,7 @@ def ahead(height: int = 9, width: int = 11, near: float = 1e-3, focal: float = 8
 
 
 def make_scene(corners: np.ndarray | list, camera: Camera, faces: np.ndarray | list | None = None) -> Scene:
-    """Return a scene of vertices (n, 3), in which colours and texture places differ everywhere.
+    """Return a scene of vertices (n, 3), with different colours and texture coordinates at all vertices.
 
     Without `faces`, every three vertices are a face.
     """
@@ -50,7 +50,7 @@ WALL = [[-9, -9, 3.0], [9, -9, 3], [0, 12, 3]]
 
 
 def slivers() -> np.ndarray:
-    """Return triangles as thin as 1e-12 to 1e-2 of their length, in all directions."""
+    """Return triangles in all directions whose width is 1e-12 to 1e-2 of their length."""
     triangles = []
     for turn, width in enumerate(10.0 ** np.arange(-12, -1)):
         along = np.array([math.cos(turn), math.sin(turn), 0.1])
@@ -112,7 +112,7 @@ SCENES: dict[str, Callable[[], Scene]] = {
 
 
 def require_gradients(scene: Scene, kind: torch.dtype, textured: bool) -> tuple[Scene, dict[str, Tensor]]:
-    """Return the scene in one number type, and its parts that require a gradient."""
+    """Return the scene in the given number type, and its tensors that require a gradient."""
     original = scene.camera
     parts: dict[str, Tensor] = {
         "vertices": scene.vertices,
@@ -138,7 +138,7 @@ def require_gradients(scene: Scene, kind: torch.dtype, textured: bool) -> tuple[
 def find_bad_gradients(
     scene: Scene, renderer: Rasterizer, kind: torch.dtype, scale: float = 1.0
 ) -> list[str]:
-    """Return parameters whose gradients are not finite, and channels that are not finite where they must be."""
+    """Return names of parameters whose gradient is not finite, and of channels with wrong infinite or NaN values."""
     differentiable, parts = require_gradients(scene, kind, renderer.gradient != "soft")
     channels = renderer(differentiable, ("color", "depth", "mask", "normal", "barycentric", "uv"))
     bad = [name for name in ("color", "normal", "barycentric", "uv") if not channels[name].isfinite().all()]
@@ -173,7 +173,7 @@ def test_no_gradient_is_NaN_or_infinite(name: str, gradient: Gradient) -> None:
 
 
 def random_scene(seed: int) -> Scene:
-    """Return a scene with coordinates of any size that float32 holds, mostly in front of a camera with any lens.
+    """Return a scene with coordinates of any magnitude that float32 holds, mostly in front of a camera with any lens.
 
     In some scenes, all coordinates lie on a grid with edges through the camera's centre and through pixel centres.
     """
@@ -184,7 +184,7 @@ def random_scene(seed: int) -> Scene:
     vertices = sizes * random.choice([-1.0, 1.0], (count, 3)) * (random.random((count, 3)) < 0.9)
     before = random.random(count) < random.choice([0.6, 1.0])
     vertices[before, 2] = np.abs(vertices[before, 2])
-    if random.random() < 0.5:  # as far aside as away
+    if random.random() < 0.5:  # sideways distances of the same magnitude as depths
         vertices[:, :2] *= np.abs(vertices[:, 2:]) / sizes[:, :2]
     if random.random() < 0.3:
         vertices = np.concatenate(
@@ -215,7 +215,7 @@ def test_wild_scenes_have_finite_pictures_and_gradients(seed: int, gradient: Gra
 def test_a_face_whose_corners_are_1e30_away_fills_the_image_whatever_is_asked(
     quarter: int, gradient: Gradient
 ) -> None:
-    """Check faces with two corners far below or far right of the image too, where no integer holds the row."""
+    """Check also faces with two corners so far below or right of the image that no integer holds their row."""
     turn = np.linalg.matrix_power(np.array([[0, -1.0, 0], [1, 0, 0], [0, 0, 1]]), quarter)
     corners = np.array([[-1, -1, 0], [1, -1.5, 0], [0, 1, 0]]) * 1e30 @ turn.T + [0, 0, 2]
     for faces in ([0, 1, 2], [0, 2, 1]):

@@ -1,4 +1,4 @@
-"""Tests of images and reports of extreme scenes: they are right, or refused with a message."""
+"""Tests of images and reports of extreme scenes: they are right, or an error is raised."""
 
 import math
 from dataclasses import replace
@@ -55,7 +55,7 @@ def test_each_face_is_counted_once_and_savings_change_no_bit_however_wild_the_sc
 
 
 def with_number(scene: Scene, where: str, number: float) -> Scene:
-    """Return the scene with a number that is not finite in one input, at vertex 0 for inputs per vertex."""
+    """Return the scene with a non-finite number in one input; inputs per vertex get it at vertex 0."""
     camera, texture = scene.camera, scene.texture
     assert scene.colors is not None and texture is not None
     first = torch.zeros(len(scene.vertices), dtype=torch.bool)
@@ -107,7 +107,7 @@ def test_what_is_not_finite_is_refused_or_disturbs_only_the_faces_that_have_it(
     else:
         same = (channels["color"] == plain["color"]).all(-1)
         assert same[~plain["mask"]].all() and 0.3 < same.float().mean() < 1
-    # out of view the number has no effect
+    # the number has no effect out of view
     away = replace(bad, camera=replace(bad.camera, translation=torch.tensor([0.0, 0, -50])))
     assert not Rasterizer()(away)["color"].any()
 
@@ -144,7 +144,7 @@ def test_planes_that_pass_through_one_another_show_the_nearer() -> None:
 
 @pytest.mark.parametrize("depth", [0.0, -1e-300, 1e-300, 1e-3, -1.0])
 def test_a_vertex_on_the_plane_of_the_camera_hides_no_part_of_its_face(depth: float) -> None:
-    """Check that a floor that begins beside the camera has the depth of each ray, however far it begins behind."""
+    """Check the depth along each ray of a floor that begins beside, before or behind the camera."""
     camera = ahead(30, 40, focal=16.0)
     scene = make_scene(
         [[-50, 1, depth], [50, 1, depth], [50, 1, 50], [-50, 1, 50]], camera, [[0, 1, 2], [0, 2, 3]]
@@ -197,7 +197,7 @@ def test_a_picture_does_not_depend_on_the_unit_of_length_or_on_how_long_the_lens
 
 
 def test_millimetres_are_seen_a_million_metres_from_the_origin() -> None:
-    """Check vertices and camera in float64; float32 resolves 6 cm there, which is left to the user."""
+    """Check vertices and camera in float64; float32 would only resolve 6 cm at this distance."""
     far = torch.tensor([1e6, -1e6, 1e6], dtype=torch.float64)
     turn = torch.linalg.qr(
         torch.randn(3, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -217,19 +217,21 @@ def test_millimetres_are_seen_a_million_metres_from_the_origin() -> None:
     assert near_image["mask"].float().mean() > 0.2
     assert (
         near_image["face"] != distant_image["face"]
-    ).float().mean() < 2e-3  # corners that lie between two grid points
+    ).float().mean() < 2e-3  # because of corners halfway between two grid points
     same = (near_image["face"] == distant_image["face"]) & near_image["mask"]
     assert (near_image["depth"] - distant_image["depth"])[same].abs().max() < 1e-6
 
 
 def test_the_largest_images() -> None:
-    """Draw 4096 × 4096 pixels, with a face over all of it and one in a corner."""
+    """Draw 4096 × 4096 pixels, with one face over the whole image and one in a corner."""
     camera = ahead(4096, 4096, focal=2048.0)
     corners = [[-3, -3, 1.0], [9, -3, 1], [-3, 9, 1], [0.9, 0.9, 0.9], [0.9, 0.8, 0.9], [0.8, 0.9, 0.9]]
     scene = replace(make_scene(corners, camera), texture=None)
     channels = Rasterizer()(scene, ("color", "face"))
     assert (channels["face"] >= 0).all() and channels["color"].shape == (4096, 4096, 3)
-    assert abs(int(channels["face"].sum()) - (0.1 / 0.9 * 2048) ** 2 / 2) < 300  # pixels of the small one
+    assert (
+        abs(int(channels["face"].sum()) - (0.1 / 0.9 * 2048) ** 2 / 2) < 300
+    )  # area of the small face in pixels
     assert channels["color"].isfinite().all() and channels["color"].min() > 0
 
 
@@ -255,10 +257,10 @@ def test_of_nothing_at_all_comes_the_background_and_no_slope(gradient: Gradient)
 
 @pytest.mark.parametrize("gradient", KINDS)
 def test_slopes_do_not_depend_on_how_long_the_lens_is(gradient: Gradient) -> None:
-    """Check that gradients are the same to the last bit where depths grow with the focal length.
+    """Check that gradients do not change by a bit if depths grow with the focal length.
 
-    With `boundary` this holds from lenses on for which surfaces are seen apart when they are a pixel's width apart, in
-    this scene 512 pixels.
+    With `boundary`, this holds for focal lengths from 512 pixels, at which all surfaces of this scene count as
+    separate.
     """
     first: dict[str, torch.Tensor] = {}
     for power in range(9 if gradient == "boundary" else -10, 21):
@@ -268,7 +270,7 @@ def test_slopes_do_not_depend_on_how_long_the_lens_is(gradient: Gradient) -> Non
         scene, parts = require_gradients(make_scene(corners, camera), torch.float64, gradient != "soft")
         color = Rasterizer(gradient=gradient)(scene)["color"]
         weight = torch.linspace(-1, 2, color.numel()).reshape(color.shape)
-        names = [name for name in parts if name != "rotation"]  # it mixes axes of different units
+        names = [name for name in parts if name != "rotation"]  # because it mixes axes with different units
         channels = torch.autograd.grad((color * weight).sum(), [parts[name] for name in names])
         slopes = dict(zip(names, channels, strict=True))
         slopes["focal"] = slopes["focal"] * focal

@@ -1,4 +1,4 @@
-"""Tests of gradients of images, against autograd through a plain formula and differences of supersampled images."""
+"""Tests of gradients of images, compared with autograd of plain formulas and with differences of sharp images."""
 
 import math
 from dataclasses import replace
@@ -16,7 +16,7 @@ torch_float = torch.float64
 
 
 def blob(rings: int = 40) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Return a closed body that hides parts of itself, a sphere with two bumps and a dent, with smooth colours."""
+    """Return a closed body that occludes parts of itself (a sphere with two bumps and a dent), with smooth colours."""
     theta = torch.linspace(0, math.pi, rings + 1, dtype=torch_float)
     phi = torch.arange(2 * rings, dtype=torch_float) * (math.pi / rings)
     x, y = torch.outer(theta.sin(), phi.cos()), torch.outer(theta.sin(), phi.sin())
@@ -86,7 +86,7 @@ KINDS = {
 
 
 def parameters() -> dict[str, torch.Tensor]:
-    """Return parameters that are all 0 at the scene itself."""
+    """Return parameters of the scene; the unchanged scene has the value 0 for all of them."""
     sizes = {"vertices": 8, "colors": 3, "rotation": 3, "translation": 3, "focal": 1, "texture": 3}
     return {name: torch.zeros(size, dtype=torch_float, requires_grad=True) for name, size in sizes.items()}
 
@@ -121,8 +121,8 @@ def test_gradients_are_those_of_differences_of_supersampled_pictures() -> None:
     """Compare gradients with differences of supersampled images, by cosine and length over all parameters of a kind.
 
     The loss is the squared error against another pose, over four views. The parameters are 8 deformations, colours, the
-    camera's rotation, translation and focal length, and a texture. With one sample per pixel the error is another, so
-    only the cosine is compared.
+    camera's rotation, translation and focal length, and a texture. With one sample per pixel, the loss
+    differs, so only the cosine is compared.
     """
     body = blob()
     hard = Rasterizer(supersampling=16)
@@ -169,14 +169,14 @@ def test_gradients_are_those_of_differences_of_supersampled_pictures() -> None:
         assert cosine("16 samples", kind) > 0.99, kind
         assert abs(np.linalg.norm(gradients["16 samples", kind]) / np.linalg.norm(expected) - 1) < 0.05, kind
         assert cosine("1 sample", kind) > 0.99, kind
-    assert cosine("interior", "vertices") < 0.9  # the gradient of moving edges is needed
+    assert cosine("interior", "vertices") < 0.9  # without the gradient of moving edges, the result is wrong
 
 
 @pytest.mark.parametrize("behind", [False, True])
 def test_inside_a_face_slopes_are_those_of_the_plane(behind: bool) -> None:
-    """Compare gradients of colour and depth in every parameter with autograd through rays and planes.
+    """Compare gradients of colour and depth with respect to every parameter with autograd through rays and planes.
 
-    Only pixels that one face covers are compared, also where the near plane cuts the face.
+    Only pixels inside of the face are compared, also for a face that the near plane cuts.
     """
     torch.manual_seed(0)
     vertices = torch.tensor(
@@ -218,7 +218,7 @@ def test_inside_a_face_slopes_are_those_of_the_plane(behind: bool) -> None:
 def test_inside_a_face_slopes_are_those_of_differences() -> None:
     """Compare gradients of colour and depth with central differences of the image itself.
 
-    They are compared in every number of a scene whose one face covers all pixels.
+    All numbers of a scene are varied whose single face covers all pixels.
     """
     torch.manual_seed(0)
     slope, down = torch.rand(20, 24, 4), torch.rand(20, 24)
@@ -244,9 +244,8 @@ def test_inside_a_face_slopes_are_those_of_differences() -> None:
     gradients = torch.autograd.grad(loss(*learned), learned)
     for number, (name, part) in enumerate(inputs.items()):
         differences = torch.zeros_like(part)
-        step = (
-            0.3 if name in ("focal", "principal") else 1e-3
-        )  # pixels, or metres: pictures are rounded to float32
+        # pixels or metres; large, because images are rounded to float32
+        step = 0.3 if name in ("focal", "principal") else 1e-3
         for index in range(part.numel()):
             ends = []
             for sign in (1, -1):
@@ -284,7 +283,7 @@ def test_gradients_of_extreme_scenes_are_finite(gradient: Gradient) -> None:
             channels = Rasterizer(gradient=gradient)(
                 Scene(differentiable, faces, colors, pose), ("color", "depth")
             )
-            # terms of both signs, since nmr drops changes that do not lower the loss
+            # terms of both signs, because nmr ignores changes that do not lower the loss
             (channels["color"].square().sum() - channels["color"].sum()).backward(retain_graph=True)
             channels["depth"].where(channels["depth"] < math.inf, 0).sum().backward()
             assert channels["color"].isfinite().all()

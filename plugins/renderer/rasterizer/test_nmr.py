@@ -1,4 +1,4 @@
-"""Tests of the gradient of Kato et al. against the paper's definition, pixel by pixel, and of its effect."""
+"""Tests of the gradient of Kato et al., compared pixel by pixel with the paper's definition, and of its effect."""
 
 import math
 
@@ -16,7 +16,7 @@ DISTANCE_ADDED = 1e-4  # as published, where the image is 2 wide
 
 
 def unproject(places: np.ndarray, depths: np.ndarray, lens: torch.Tensor) -> torch.Tensor:
-    """Return vertices that are seen at the given places."""
+    """Return vertices that project to the given positions in pixels."""
     rays = (torch.as_tensor(places) - lens[2:]) / lens[:2]
     z = torch.as_tensor(depths)[:, None]
     return torch.cat([rays * z, z], 1)
@@ -25,8 +25,8 @@ def unproject(places: np.ndarray, depths: np.ndarray, lens: torch.Tensor) -> tor
 def definition_gradient(places, faces, face, color, slopes) -> np.ndarray:
     """Return ∂L/∂(column, row) of every vertex, by the paper's definition.
 
-    For each pixel, face, edge and end i of that edge, it computes how far i alone must move along the axis until the
-    edge meets the pixel, and what the pixel would then show.
+    For each pixel, face, edge and end i of this edge, it computes how far i must move along the axis, with the other
+    end fixed, until the edge meets the pixel, and which colour the pixel would then show.
     """
     gradient = np.zeros_like(places)
     for axis, number, corner in np.ndindex(2, len(faces), 3):
@@ -75,7 +75,7 @@ def definition_gradient(places, faces, face, color, slopes) -> np.ndarray:
             for end, fixed in (ends, ends[::-1]):
                 moving, pivot = places[end], places[fixed]
                 if line == pivot[1 - axis]:
-                    continue  # however far it moves, the edge stays where it is on this line
+                    continue  # moving this end does not change where the edge crosses this line
                 needed = pivot[axis] + (place - pivot[axis]) * (moving[1 - axis] - pivot[1 - axis]) / (
                     line - pivot[1 - axis]
                 )
@@ -87,7 +87,7 @@ def definition_gradient(places, faces, face, color, slopes) -> np.ndarray:
 @pytest.mark.parametrize("whole", [False, True])
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 4))])
 def test_it_is_the_papers_sum_over_pixels_and_edges(seed: int, whole: bool) -> None:
-    """Check overlapping faces, also from behind and beyond the image.
+    """Check overlapping faces, including faces seen from behind and faces beyond the image.
 
     With `whole`, corners lie on pixels and edges lie along lines of pixels.
     """
@@ -97,7 +97,7 @@ def test_it_is_the_papers_sum_over_pixels_and_edges(seed: int, whole: bool) -> N
     if whole:
         places[1, 1], places[4, 0] = places[0, 1], places[3, 0]
     faces = np.concatenate([np.arange(9).reshape(3, 3), random.integers(0, 9, (2, 3))])
-    for number in range(2):  # turn these two to the front
+    for number in range(2):  # these two faces must face the camera
         ways = places[faces[number, 1:]] - places[faces[number, 0]]
         if np.linalg.det(ways) > 0:
             faces[number] = faces[number, ::-1]
@@ -139,7 +139,7 @@ def test_colors_and_depths_are_led_back_as_within_faces() -> None:
 
 
 def test_it_reaches_a_target_that_the_face_does_not_touch() -> None:
-    """Check that descent leads to the target on the right, where a gradient of the edges alone is nearly 0."""
+    """Check that descent leads to the target on the right, at which the gradient of moving edges is nearly 0."""
     eye = torch.eye(3)
     pose = Camera(eye, torch.zeros(3), (20.0, 20.0), (19.5, 9.5), 20, 40)
     corners = torch.tensor([[-0.8, -0.2, 1.0], [-0.5, 0.2, 1], [-0.3, -0.2, 1]])

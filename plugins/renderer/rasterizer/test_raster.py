@@ -24,7 +24,7 @@ hypothesis_settings = settings(deadline=None, max_examples=60, derandomize=True)
 
 
 def ahead(height, width, near=1e-3):
-    """Return a camera at the origin, looking along z; its focal length, a power of two, keeps grid points exact."""
+    """Return a camera at the origin, looking along z; the focal length is a power of two to keep grid points exact."""
     middle = ((width - 1) / 2, (height - 1) / 2)
     return Camera(torch.eye(3), torch.zeros(3), (FOCAL, FOCAL), middle, height, width, near)
 
@@ -50,9 +50,9 @@ def are_equal(first, second):
 
 
 def trace_rays(scene):
-    """Return what pixels show by brute force, with rays and planes in space, independent of the kernels.
+    """Return the visible faces by brute force, with rays and planes in space, independent of the kernels.
 
-    A pixel's ray hits a triangle where it is on the same side of all three planes through the camera's centre and an
+    A pixel's ray hits a triangle if it is on the same side of all three planes through the camera's centre and an
     edge.
 
     Returns:
@@ -71,7 +71,7 @@ def trace_rays(scene):
         side = np.stack([np.cross(b, c) @ ray[..., None], np.cross(c, a) @ ray[..., None],
                          np.cross(a, b) @ ray[..., None]], -1)[..., 0, :]  # fmt: skip
         with np.errstate(divide="ignore", invalid="ignore"):
-            # The gradient of a side along the image turns it into a distance in pixels.
+            # the gradient of `side` along the image converts it to a distance in pixels
             slope = np.array([np.hypot(*np.cross(p, q)[:2]) / FOCAL for p, q in ((b, c), (c, a), (a, b))])
             margins.append(np.abs(side / slope).min(-1))
             normal = np.cross(b - a, c - a)
@@ -118,9 +118,9 @@ def test_every_channel_agrees_with_rays_through_pixel_centres(scene):
 
 @st.composite
 def slivers(draw):
-    """Return long triangles of any width down to a hundredth of the rounding of corners.
+    """Return long triangles with widths down to 1/100 of the rounding of corners.
 
-    Some triangles have all corners in a line, except for rounding.
+    Some triangles have all corners on a line, except for rounding.
     """
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     camera = ahead(20, 20)
@@ -136,9 +136,9 @@ def slivers(draw):
 @hypothesis_settings
 @given(st.one_of(soups(subpixels=1e6), slivers()))
 def test_what_a_face_shows_is_interpolated_between_corners_that_are_not_rounded(scene):
-    """Check that weights lead to the place of the face under the pixel, with the place's colour and depth.
+    """Check that the weights give the point of the face at the pixel centre, with its colour and depth.
 
-    Where only rounding covers the pixel, they lead to the nearest place of the face.
+    For pixels that are covered only because of rounding, they give the nearest point of the face.
     """
     hits, margins, _, _ = trace_rays(scene)
     got = draw(scene, ("face", "barycentric", "color", "depth"))
@@ -163,15 +163,14 @@ def test_off_the_grid_coverage_is_that_of_the_triangle_up_to_half_a_subpixel(sce
     hits, margins, _, _ = trace_rays(scene)
     for index in range(len(scene.faces)):
         alone = draw(replace(scene, faces=scene.faces[index : index + 1]), ("mask",))["mask"]
-        clear = (
-            margins[index] > 2 / 256
-        )  # a corner moves by 1/512 pixel a side; a thin corner's edge line by more
+        # rounding moves a corner by up to 1/512 pixel, and the edge lines at a thin corner by more
+        clear = margins[index] > 2 / 256
         wrong = clear & (alone != hits[index])
         assert not wrong.any()
 
 
 def coverage(vertices, faces, camera):
-    """Return how many faces, each drawn alone, cover each pixel; check that the whole mesh covers the same pixels."""
+    """Return how many faces, drawn one by one, cover each pixel; check that the whole mesh covers the same pixels."""
     counts = sum(
         draw(make_scene(vertices, face, camera), ("mask",))["mask"].astype(int) for face in np.asarray(faces)
     )
@@ -248,13 +247,13 @@ def test_depth_and_colour_are_those_of_a_plane_in_perspective(kind):
     )
     depth = offset / (ray @ normal)
     assert got["mask"].all()
-    assert np.ptp(depth) > 1  # steep enough that interpolating depth itself would fail by far
+    assert np.ptp(depth) > 1  # so steep that linear interpolation of depth would fail
     assert np.abs(got["depth"] / depth - 1).max() < 1e-6
     assert np.abs(got["color"] - ((ray * depth[..., None]) @ slope + base)).max() < 1e-6
 
 
 def test_a_triangle_that_reaches_far_out_of_the_image_keeps_its_plane():
-    # Two corners a little before the eye and far aside, as of a floor one stands on: about 2e7 pixels away.
+    # a floor below the camera: two corners are barely in front of the camera and project 2e7 pixels away
     camera = ahead(30, 40, near=1e-6)
     world = torch.tensor([[-1.0, 0.5, 3e-6], [1.0, 0.5, 3e-6], [0.0, 0.5, 50.0]], dtype=torch.float64)
     got = draw(make_scene(world, [(0, 1, 2)], camera))
@@ -262,7 +261,7 @@ def test_a_triangle_that_reaches_far_out_of_the_image_keeps_its_plane():
     with np.errstate(divide="ignore"):
         depth = np.where(rows > 0, 0.5 * FOCAL / rows, np.inf)
     for column in range(40):
-        # Straight ahead the floor is as wide as 1 - z / 50 of two metres.
+        # at depth z, the floor is 2 (1 - z / 50) metres wide
         expected = np.where(
             np.abs((column - camera.principal[0]) / FOCAL) * depth < 1 - depth / 50, depth, np.inf
         )
@@ -275,7 +274,7 @@ def test_of_equal_surfaces_the_lower_face_index_wins_whatever_the_order_of_its_c
     rng = np.random.default_rng(5)
     camera = ahead(40, 40)
     count = 400
-    # Each triangle has its own pixel, at a depth halfway between two float32: float64's last bit decides.
+    # each triangle has its own pixel, at a depth halfway between two float32 numbers, so that the last bit decides
     pixel = np.stack(np.divmod(np.arange(count), 20), 1) * 2.0
     shapes = np.array(
         [[(-0.5, -0.75), (0.75, -0.5), (-0.25, 0.75)], [(-0.5, -0.75), (0.5, -0.75), (0.25, 0.75)]]
@@ -320,7 +319,7 @@ def test_ties_and_culling_hold_however_far_a_triangle_reaches(reach):
 def test_of_overlapping_surfaces_at_one_depth_the_lower_index_wins(seed, step, reach):
     rng = np.random.default_rng(seed)
     camera = ahead(12, 12)
-    depth = 1 + step / 2**23 + 2.0**-24  # halfway between two float32
+    depth = 1 + step / 2**23 + 2.0**-24  # halfway between two float32 numbers
     pixels = camera.principal + reach * rng.uniform(-11, 11, (18, 2))
     vertices = unproject(pixels, np.full(18, depth), camera)
     faces = np.arange(18).reshape(-1, 3)
@@ -355,7 +354,9 @@ def test_wild_coordinates_draw_only_what_may_be_drawn_and_disturb_nothing_else(
     world = np.concatenate([world, [[-0.2, -0.2, 2.0], [0.3, -0.2, 2.0], [0.0, 0.3, 2.0]]]).astype(np.float32)
     faces = np.concatenate([rng.integers(0, len(world), (6, 3)), [np.arange(3) + len(world) - 3]])
     allowed = np.isfinite(world).all(1)[faces].all(1)
-    allowed &= (world[:, 2] >= np.float32(camera.near))[faces].any(1)  # what is cut is drawn in part
+    allowed &= (world[:, 2] >= np.float32(camera.near))[faces].any(
+        1
+    )  # faces that the near plane cuts are drawn in part
     allowed &= (np.diff(np.sort(faces, 1), axis=1) > 0).all(1)
     vertices = torch.tensor(world)
     colors = torch.tensor(rng.uniform(0, 1, world.shape), dtype=torch.float32)
@@ -391,7 +392,7 @@ def test_a_triangle_with_one_corner_that_cannot_be_drawn_is_left_out(vertex, val
 def cut_soups(draw):
     """Return triangles with corners that may be nearer than the near plane, or behind the camera.
 
-    Every corner is far from the plane through the camera's centre, so that rounding alone decides nothing.
+    Every corner is far from the plane through the camera's centre, so that rounding does not decide the result.
     """
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     camera = ahead(draw(st.integers(1, 20)), draw(st.integers(1, 20)), near=0.5)
@@ -419,7 +420,7 @@ def test_what_the_near_plane_cuts_is_drawn_as_far_as_it_is_in_front(scene):
     assert np.array_equal(got["mask"][clear], ~background[clear])
     assert np.array_equal(got["face"][clear], np.where(background, -1, nearest)[clear])
     shown = clear & ~background
-    # corners are rounded to 1/512 pixel; a plane's depth d = n·a / r·n changes by d² |(n_x, n_y)| / (f |n·a|) a pixel
+    # rounding moves corners by 1/512 pixel; a depth d = n·a / r·n changes by d² |(n_x, n_y)| / (f |n·a|) per pixel
     a, b, c = np.moveaxis(scene.vertices.numpy()[scene.faces.numpy()], 1, 0)
     normal = np.cross(b - a, c - a)
     slope = np.hypot(normal[:, 0], normal[:, 1]) / (FOCAL * np.abs((normal * a).sum(-1)))
@@ -489,7 +490,7 @@ def test_colours_are_shaded_only_when_asked(monkeypatch):
 
 @pytest.mark.parametrize("angle", np.linspace(0, 6, 7))
 def test_of_a_closed_mesh_culling_changes_no_silhouette_and_hardly_a_pixel(angle):
-    # A closed mesh is still closed on the grid: as many front as back faces cover each pixel, exactly.
+    # a closed mesh stays closed after rounding: equally many front and back faces cover each pixel
     scene = portrait()
     scene = replace(scene, camera=look_from(angle, angle / 4 - 0.7, angle, 1.5, 0.8, (120, 110)))
     whole, culled = draw(scene, ALL), draw(scene, ALL, cull=True)
@@ -555,9 +556,8 @@ def test_calls_leave_nothing_behind_and_repeat_to_the_bit():
     for scene, expected in [*zip(scenes, fresh, strict=True)] * 2:
         got = renderer(scene, ("depth", "face", "mask"))
         assert are_equal({name: value.numpy() for name, value in got.items()}, expected)
-    assert all(
-        torch.equal(first[name], copies[name]) for name in first
-    )  # no call writes into an earlier answer
+    # no call changes an earlier result
+    assert all(torch.equal(first[name], copies[name]) for name in first)
 
 
 def test_layouts_and_types_of_the_input_do_not_matter():
@@ -613,9 +613,9 @@ IMPLEMENTATIONS = pytest.mark.parametrize("implementation", [Rasterizer.__call__
 def test_what_does_not_fit_is_refused_with_a_sentence(change, sentence, implementation):
     scene = portrait()
     for name, value in change.items():
-        object.__setattr__(scene, name, value)  # past the type checks that only tests have
+        object.__setattr__(scene, name, value)  # bypasses the type checks of the tests
     for channels in (ALL, ("color",), ("depth",), ("normal", "barycentric")):
-        if "colors" in change and "color" not in channels:  # which nobody reads then
+        if "colors" in change and "color" not in channels:  # colours are not used then
             assert set(implementation(Rasterizer(), scene, channels)) == set(channels)
             continue
         with pytest.raises(ValueError, match=re.escape(sentence)):
@@ -652,7 +652,7 @@ def test_a_lens_that_is_not_two_numbers_is_refused(lens, name, learned, implemen
     scene = portrait()
     if learned:
         scene = replace(scene, vertices=scene.vertices.clone().requires_grad_())
-    object.__setattr__(scene.camera, name, LENSES[lens])  # past the type checks that only tests have
+    object.__setattr__(scene.camera, name, LENSES[lens])  # bypasses the type checks of the tests
     with pytest.raises(ValueError, match=rf"camera\.{name} has .*; expected the shape \(2,\)"):
         implementation(Rasterizer(gradient="interior", supersampling=2), scene, ("color", "mask"))
 
@@ -678,7 +678,7 @@ def test_a_lens_that_is_not_two_numbers_is_refused(lens, name, learned, implemen
 def test_a_camera_that_cannot_be_is_refused(change, sentence, implementation):
     scene = portrait()
     for name, value in change.items():
-        object.__setattr__(scene.camera, name, value)  # past the type checks that only tests have
+        object.__setattr__(scene.camera, name, value)  # bypasses the type checks of the tests
     with pytest.raises(ValueError, match=re.escape(sentence)):
         implementation(Rasterizer(), scene, ("color",))
 
@@ -697,7 +697,7 @@ def test_unknown_channels_are_refused(channels, sentence):
 
 
 def test_it_is_built_by_name():
-    for name in ("rasterizer", "zbuffer"):  # the latter is its earlier name, which checkpoints hold
+    for name in ("rasterizer", "zbuffer"):  # old checkpoints contain the earlier name zbuffer
         renderer = build("renderer", resolve("renderer", {"name": name, "cull": True}))
         assert isinstance(renderer, Rasterizer) and renderer.cull
     assert renderer.channels > set(ALL)

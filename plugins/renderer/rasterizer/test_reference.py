@@ -1,4 +1,4 @@
-"""Tests of the compiled kernels against plain torch, which draws on a GPU."""
+"""Tests that compare the compiled kernels with the implementation in plain torch, which draws on a GPU."""
 
 from dataclasses import replace
 
@@ -21,7 +21,7 @@ EXACT = ("face", "mask", "normal")
 @settings(deadline=None, max_examples=25, derandomize=True)
 @given(st.integers(0, 2**32 - 1), st.booleans(), st.sampled_from([1, 3]))
 def test_pictures_are_those_of_plain_torch(seed: int, cull: bool, supersampling: int) -> None:
-    """Compare scenes without faces that the near plane cuts, since plain torch leaves these out."""
+    """Compare scenes without faces that the near plane cuts, because plain torch leaves these out."""
     random = np.random.default_rng(seed)
     scene = random_bodies(distant_camera(float(random.uniform(5, 9)), (40, 50)), random)
     _, depth = scene.camera.project(scene.vertices)

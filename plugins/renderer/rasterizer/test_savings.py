@@ -1,4 +1,4 @@
-"""Tests that savings change no bit of an image, and that its report is true, against brute force."""
+"""Tests that savings change no bit of an image, and comparison of the report with brute force."""
 
 import copy
 import gc
@@ -30,7 +30,7 @@ def distant_camera(distance: float = 4.0, size: tuple[int, int] = (60, 70), azim
 
 
 def random_bodies(camera: Camera, random: np.random.Generator, count: int = 3) -> Scene:
-    """Return a scene of bodies that hide one another, some out of view or cut by the near plane; one has a texture."""
+    """Return a scene of bodies that occlude one another, some out of view or cut by the near plane, one textured."""
     vertices, faces, colors = blob(8)
     subjects = []
     for number in range(count):
@@ -66,7 +66,7 @@ def test_savings_change_no_bit(seed: int, cull: bool) -> None:
 @settings(deadline=None, max_examples=15, derandomize=True)
 @given(st.integers(0, 2**32 - 1))
 def test_one_renderer_draws_what_a_new_one_draws_whatever_came_before(seed: int) -> None:
-    """Draw scenes that change in one part at a time, also in place and unseen by torch's own count of changes."""
+    """Draw scenes that change in one part at a time, also in place and without torch's version counter noticing."""
     random = np.random.default_rng(seed)
     renderer = Rasterizer(savings=SAVINGS)
     scene = random_bodies(distant_camera(), random)
@@ -93,7 +93,7 @@ def test_one_renderer_draws_what_a_new_one_draws_whatever_came_before(seed: int)
         got = renderer(scene, channels)
         assert are_equal(got, new(scene, channels)), (change, channels)
         for picture in got.values():
-            picture.numpy()[...] = 7  # they are the caller's
+            picture.numpy()[...] = 7  # the caller may change the results
 
 
 def test_what_did_not_change_is_not_computed_again() -> None:
@@ -116,7 +116,7 @@ def test_what_did_not_change_is_not_computed_again() -> None:
 
 
 def count_outcomes(scene: Scene, cull: bool) -> dict[str, int]:
-    """Count what happens to the faces of a scene in front of the near plane, one by one."""
+    """Count the faces of a scene in front of the near plane by their outcome, one by one."""
     camera = scene.camera
     pixels, depth = camera.project(scene.vertices.double())
     assert (depth >= camera.near).all()
@@ -189,9 +189,8 @@ def test_faces_out_of_view_behind_and_hidden_are_counted() -> None:
     assert close.report is not None and close.report.left_out["hidden"] > 0.8 * len(faces)
     floor = torch.tensor([[-90.0, -90, -1.5], [90, -90, -1.5], [90, 90, -1.5], [-90, 90, -1.5]]).double()
     under = join_scenes([scene, replace(before, vertices=floor), replace(before, vertices=floor + 0.01)])
-    assert are_equal(
-        close(under, ("face",)), Rasterizer(savings=())(under, ("face",))
-    )  # what the near plane cuts
+    # these faces are cut by the near plane
+    assert are_equal(close(under, ("face",)), Rasterizer(savings=())(under, ("face",)))
 
 
 def test_blended_pictures_report_what_became_of_every_face() -> None:
@@ -212,9 +211,9 @@ def test_blended_pictures_report_what_became_of_every_face() -> None:
 
 @pytest.mark.parametrize("name", ["vertices", "colors"])
 def test_a_gradient_of_what_was_changed_since_is_refused(name: str) -> None:
-    """Check that torch refuses such a gradient, as for its own functions.
+    """Check that torch raises an error for such a gradient, as for its own functions.
 
-    It also refuses a second gradient after the first has freed its data.
+    Torch also raises an error for a second backward pass after the first has freed its data.
     """
     vertices, faces, colors = blob(6)
     learned = {"vertices": vertices.clone().requires_grad_(), "colors": colors.clone().requires_grad_()}
@@ -232,7 +231,7 @@ def test_a_gradient_of_what_was_changed_since_is_refused(name: str) -> None:
 
 
 def test_pictures_in_one_graph_keep_what_their_gradients_read() -> None:
-    """Check that several views before one backward pass, as in a fit to many cameras, give the sum of gradients."""
+    """Check that one backward pass over several views gives the sum of their gradients."""
     vertices, faces, colors = blob(8)
     views = [distant_camera(azimuth=azimuth) for azimuth in (0.1, 1.7, 3.1, 4.4)]
 
@@ -258,7 +257,7 @@ def test_pictures_in_one_graph_keep_what_their_gradients_read() -> None:
     "threads", [pytest.param(1, marks=pytest.mark.slow), 2, pytest.param(3, marks=pytest.mark.slow)]
 )
 def test_a_batch_is_its_scenes_side_by_side(threads: int) -> None:
-    """Check scenes of different sizes and meshes, with gradients, and without where none are wanted."""
+    """Check scenes of different sizes and meshes, with and without gradients."""
     random = np.random.default_rng(1)
     scenes = [
         random_bodies(
@@ -290,7 +289,7 @@ def test_a_batch_is_its_scenes_side_by_side(threads: int) -> None:
 
 
 def test_after_the_first_picture_nothing_is_allocated_but_pictures() -> None:
-    """Check this with and without gradients; and that nothing is kept when the images are gone."""
+    """Check this with and without gradients, and that deleted images leave no memory behind."""
     vertices, faces, colors = blob(40)
     scene = Scene(vertices, faces, colors, distant_camera(size=(300, 300)))
     renderer = Rasterizer(cull=True)
@@ -317,7 +316,7 @@ def test_after_the_first_picture_nothing_is_allocated_but_pictures() -> None:
 
 @pytest.mark.parametrize("gradient", get_args(Gradient))
 def test_a_picture_of_27_thousand_vertices_and_its_gradient_take_less_than_64_mib(gradient: Gradient) -> None:
-    """Measure NumPy's memory with outputs; benchmarks/rendering/rasterizer_memory.md has the growth of a process."""
+    """Measure the memory of NumPy arrays; benchmarks/rendering/rasterizer_memory.md measures that of a process."""
     vertices, faces, colors = blob(117)
     assert len(vertices) > 27_554
     learned, painted = vertices.float().requires_grad_(), colors.float().requires_grad_()

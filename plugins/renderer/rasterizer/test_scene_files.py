@@ -1,4 +1,4 @@
-"""Tests of scenes from files against trimesh, against formulas, and against each other."""
+"""Tests of scenes from files, compared with trimesh, with formulas, and between formats."""
 
 import json
 import os
@@ -45,9 +45,9 @@ def to_linear(stored: NDArray) -> NDArray:
 def textured_square(
     image: bytes | None = None, **changes: Any
 ) -> tuple[dict[str, Any], list[NDArray | bytes]]:
-    """Return a square of one node and one material, from (0, 0) to (1, 1), with its texture upright.
+    """Return description and binary parts of a square from (0, 0) to (1, 1) with an upright texture.
 
-    `changes` go to its material.
+    `changes` are added to its material.
     """
     content: dict[str, Any] = {
         "scenes": [{"nodes": [0]}],
@@ -69,7 +69,7 @@ def write_scene(
     name: str = "one.glb",
     change: Callable[[dict[str, Any]], object] = lambda _: None,
 ) -> Path:
-    """Write a .glb, or a .gltf with one file beside it; `change` is applied to the whole description."""
+    """Write a .glb, or a .gltf with one file beside it; `change` modifies the complete description."""
     whole, binary = describe(content, arrays)
     file = folder / name
     if name.endswith(".gltf"):
@@ -82,7 +82,7 @@ def write_scene(
 
 
 def texel_at_corner(scene: Scene, face: int, corner: int, inwards: float = 0.1) -> NDArray:
-    """Return the texture's nearest texel a little inside of a face's corner, by the contract: u right, v upwards."""
+    """Return the texel at a point a little inside of a face's corner, with u to the right and v upwards."""
     texture = scene.texture
     assert texture is not None
     places = texture.uv[texture.faces[face]].numpy()
@@ -132,7 +132,7 @@ def test_what_has_no_colour_is_grey_and_what_has_one_is_lit_alike(tmp_path: Path
 
 
 def test_nodes_stand_where_trimesh_puts_them(tmp_path: Path) -> None:
-    """Compare trees of turned, stretched and mirrored nodes: corners, and on which side faces are visible."""
+    """Compare trees of rotated, scaled and mirrored nodes: corners and orientation of faces."""
     random = np.random.default_rng(0)
     for _ in range(5):
         nodes: list[dict[str, Any]] = []
@@ -169,7 +169,7 @@ def test_nodes_stand_where_trimesh_puts_them(tmp_path: Path) -> None:
 def test_strips_and_fans_are_the_triangles_that_they_stand_for(
     tmp_path: Path, mode: int, order: list[int]
 ) -> None:
-    """Check that all faces face z; vertices are interleaved with texture places, and one is replaced (sparse)."""
+    """Check that all faces face z; vertices and texture coordinates are interleaved, and one vertex is sparse."""
     content, arrays = textured_square()
     content["meshes"][0]["primitives"][0]["mode"] = mode
     content["images"] = [{"bufferView": 2}]
@@ -222,7 +222,7 @@ def test_a_skin_is_shown_as_its_joints_stand(tmp_path: Path) -> None:
     assert subject.notes == ("the model is drawn in its rest pose.",)
     first, second = np.eye(4), np.eye(4)
     first[:3, 3] = [1, 2, 3]
-    cos, sin = 0.8**2 - 0.6**2, 2 * 0.6 * 0.8  # half the angle stands in the file
+    cos, sin = 0.8**2 - 0.6**2, 2 * 0.6 * 0.8  # the file contains half the angle
     second[:3, :3] = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]]) @ np.diag([1, 2, 1])
     places = [first @ second, first]
     for vertex in range(4):
@@ -235,7 +235,7 @@ def test_a_skin_is_shown_as_its_joints_stand(tmp_path: Path) -> None:
 
 
 def test_a_texture_may_be_moved_turned_and_scaled(tmp_path: Path) -> None:
-    """Check that the turn is counter-clockwise on the image, whose v runs downwards: from right to up, which is -v."""
+    """Check that the rotation is counter-clockwise on the image, with v downwards: from right to up, which is -v."""
     content, arrays = textured_square()
     moved = {"offset": [0.25, 0.5], "rotation": np.pi / 2, "scale": [2, 3]}
     content["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"]["extensions"] = {
@@ -266,7 +266,7 @@ NUMBERS = {"repeat": 10497, "clamp": 33071, "mirror": 33648}
 def test_what_lies_beyond_a_texture_is_told(
     tmp_path: Path, samplers: list[str | None], reach: int, wanted: str | None
 ) -> None:
-    """Check that a scene has one wrap rule, and that textures need none where faces stay inside."""
+    """Check that a scene has one wrap rule, and that textures need none if all uv lie inside."""
     content, arrays = textured_square()
     content["textures"], content["samplers"], content["materials"], content["meshes"] = [], [], [], []
     content["nodes"] = [{"mesh": number, "translation": [number, 0, 0]} for number in range(len(samplers))]
@@ -297,7 +297,7 @@ def test_what_lies_beyond_a_texture_is_told(
 
 
 def test_the_same_mesh_as_obj_and_glb_is_the_same_scene(tmp_path: Path) -> None:
-    """Compare both files as trimesh writes them: corners, texture places, linear RGB."""
+    """Compare files that trimesh writes in both formats: corners, texture coordinates, linear RGB."""
     mesh = trimesh.creation.box((1, 2, 3))
     mesh.unmerge_vertices()
     uv = np.random.default_rng(2).uniform(0, 1, (len(mesh.vertices), 2))
@@ -315,7 +315,7 @@ def test_the_same_mesh_as_obj_and_glb_is_the_same_scene(tmp_path: Path) -> None:
 
 
 def test_an_obj_has_the_colours_of_its_materials(tmp_path: Path) -> None:
-    """Check splitting by material, relative indices and a texture place per corner; a missing file is only noted."""
+    """Check splitting by material, relative indices and uv per corner; a missing file only adds a note."""
     (tmp_path / "one.obj").write_bytes(OBJ)
     without = read(tmp_path / "one.obj")
     assert without.scene.texture is None and len(without.notes) == 1 and "one.mtl" in without.notes[0]
@@ -349,9 +349,9 @@ PICTURES = ("a#b.png", "#c.png", "d #2.png")
 def test_names_may_hold_what_begins_a_comment_elsewhere(
     tmp_path: Path, library: str, before: str, end: str
 ) -> None:
-    """Check a triangle of each material, beside comments: colours as trimesh reads them, textures as written."""
+    """Check a triangle of each material in files with comments: colours as trimesh reads them, textures as written."""
     random = np.random.default_rng(0)
-    behind = "# a comment" if before else ""  # trimesh reads neither these nor lines that begin with blanks
+    behind = "# a comment" if before else ""  # trimesh supports neither such comments nor leading blanks
     colors = random.uniform(0, 1, (len(NAMES), 3)).round(3)
     images = random.integers(0, 256, (len(PICTURES), 2, 2, 3)).astype(np.uint8)
     surface, materials = ["#comment", "# usemtl wall", f"mtllib {library}"], ["# newmtl wall"]
@@ -384,7 +384,7 @@ def test_names_may_hold_what_begins_a_comment_elsewhere(
     assert isinstance(reference, trimesh.Scene)
     for mesh in reference.geometry.values():
         number = round(float(mesh.vertices[0, 0]))
-        if "  " not in NAMES[number]:  # which trimesh takes for one blank in one of the two files
+        if "  " not in NAMES[number]:  # trimesh reads two blanks as one in one of the two files
             np.testing.assert_allclose(mesh.visual.material.diffuse[:3] / 255, colors[number], atol=1 / 255)
 
 
@@ -409,7 +409,7 @@ def test_ply_colours_are_light_and_its_texture_is_found(tmp_path: Path, binary: 
 
 
 def write_formats(folder: Path, name: str) -> list[Path]:
-    """Return a scene of each format whose texture has this name."""
+    """Write a scene in each format whose texture has this name, and return the paths."""
     content, arrays = textured_square()
     content["images"] = [{"uri": name}]
     (folder / "one.obj").write_bytes(OBJ)
@@ -600,7 +600,7 @@ def test_a_bad_gltf_gets_its_sentence(
 
 
 def test_every_damage_of_length_is_refused(tmp_path: Path) -> None:
-    """Check that a .glb cut anywhere is refused; `tests/fuzz/fuzz.py` damages files in other ways."""
+    """Check that a .glb cut anywhere is refused; `tests/fuzz/fuzz.py` tests other damage."""
     whole = glb(*quad())
     file = tmp_path / "one.glb"
     for end in range(0, len(whole), 29):

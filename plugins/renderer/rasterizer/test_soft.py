@@ -1,4 +1,4 @@
-"""Tests of soft images and their gradients, against the paper's formulas in plain torch and against differences."""
+"""Tests of soft images and their gradients, compared with the paper's formulas in torch and with differences."""
 
 import math
 
@@ -21,7 +21,7 @@ KNOBS = ((1e-2, 0.05), (1e-3, 0.3), (0.2, 1e-3), (1e-5, 1e-4))
 def autograd_image(vertices: Tensor, colors: Tensor, rotation: Tensor, translation: Tensor, lens: Tensor, faces:
 Tensor,
               cull: bool, sigma: float, gamma: float) -> Tensor:  # fmt: skip
-    """Return the image by autograd, every pixel with every face; all faces are in front of the camera and in view."""
+    """Return the image by the formulas in torch, for every pixel and face; all faces must be in view."""
     camera_points = vertices @ rotation.T + translation
     place = camera_points[:, :2] / camera_points[:, 2:] * lens[:2] + lens[2:]
     if cull:
@@ -122,7 +122,7 @@ def test_picture_and_slopes_are_the_formulas(knobs: tuple[float, float], cull: b
 
 @pytest.mark.parametrize("knobs", KNOBS)
 def test_slopes_are_differences_of_the_picture(knobs: tuple[float, float]) -> None:
-    """Compare gradients in every number of the scene with central differences, to 1e-4 of the largest of a kind."""
+    """Compare gradients in every number of the scene with central differences, to 1e-4 of the largest gradient."""
     parts, faces = random_inputs(5)
     arrays, settings = [part.numpy() for part in parts], soft_settings(faces, False, *knobs)
     slope = np.random.default_rng(0).normal(size=(*SIZE, 2)).astype(np.float32)
@@ -144,7 +144,7 @@ def test_slopes_are_differences_of_the_picture(knobs: tuple[float, float]) -> No
 
 
 def test_without_blur_it_is_the_hard_picture_and_says_so_at_any_size() -> None:
-    """Check pixels away from edges, however σ is given; settings are in units of the image, whatever its pixels."""
+    """Check pixels away from edges for small σ, and that the meaning of σ does not depend on the number of pixels."""
     vertices, faces, colors = blob(16)
     scene = Scene(vertices, faces, colors, camera())
     hard = Rasterizer()(scene, ("color", "depth", "face", "mask"))

@@ -1,4 +1,4 @@
-"""Tests of textures against torch's own sampling, and of the channels of faces against one another."""
+"""Tests of textures, compared with torch's own sampling, and of the consistency of channels."""
 
 import itertools
 from collections.abc import Callable, Sequence
@@ -16,7 +16,7 @@ from plugins.renderer.rasterizer.test_gradient import blob, camera
 
 
 def textured_body(kind: torch.dtype = torch.float64, wrap: Wrap = "repeat", smooth: bool = True) -> Scene:
-    """Return a round body with a small, repeated image on it; corners share vertices, but not texture places."""
+    """Return a body with a small, repeated texture; corners share vertices, but not texture coordinates."""
     vertices, faces, colors = blob(10)
     generator = torch.Generator().manual_seed(1)
     image = torch.rand(5, 7, colors.shape[1], generator=generator, dtype=torch.float64).to(kind)
@@ -28,7 +28,7 @@ def textured_body(kind: torch.dtype = torch.float64, wrap: Wrap = "repeat", smoo
 
 
 def sample_by_torch(image: Tensor, uv: Tensor, wrap: Wrap) -> Tensor:
-    """Return bilinear samples at places (row, column, 2) in [-1, 2] by torch."""
+    """Return bilinear samples by torch at texture coordinates (row, column, 2) in [-1, 2]."""
     if wrap == "repeat":  # five copies each way, the middle one from 0 to 1
         image, uv, wrap = image.repeat(5, 5, 1), (uv + 2) / 5, "clamp"
     grid = torch.stack([2 * uv[..., 0] - 1, 1 - 2 * uv[..., 1]], -1)
@@ -57,8 +57,7 @@ def test_colours_and_slopes_are_those_of_sampling_at_the_places_that_faces_show(
     slope = torch.randn(channels["color"].shape, generator=torch.Generator().manual_seed(2))
     got = torch.autograd.grad((channels["color"] * slope).sum(), (image, uv))
     expected = torch.autograd.grad((wanted * slope).sum(), (again, places))
-    # slopes are those of corners that are not rounded to 1/256 pixel: a place may then lie beyond a texel's middle,
-    # where the slope in it jumps
+    # gradients use corners that are not rounded, so a point may lie beyond a texel centre, at which the gradient jumps
     for gradient, expected_gradient, limit in zip(got, expected, (1e-3, 0.03), strict=True):
         assert gradient.dtype == kind
         assert (gradient - expected_gradient).norm() < limit * expected_gradient.norm()
@@ -78,7 +77,7 @@ def test_the_texel_that_a_place_lies_in_is_shown_where_it_is_not_smooth() -> Non
 
 
 def test_joined_subjects_show_what_each_shows_alone() -> None:
-    """Check subjects with textures, colours, both or neither; each keeps its own image, whatever stands before it."""
+    """Check subjects with textures, colours, both or neither; each keeps its own image, whatever the order."""
     textured = textured_body()
     assert textured.texture is not None
     vertices, faces, colors = blob(10)
@@ -124,7 +123,7 @@ WHOLE = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64)
 def test_joined_indices_are_those_of_int64_whatever_types_came(
     kind: torch.dtype, other: torch.dtype, textured: tuple[bool, bool], count: int
 ) -> None:
-    """Join many vertices, places and images before few, with sums that no smaller type holds."""
+    """Join many vertices, texture coordinates and images with few, so that indices exceed the smaller types."""
 
     def subject(count: int, kind: torch.dtype, cover: bool) -> Scene:
         most = min(count, torch.iinfo(kind).max)
@@ -135,7 +134,7 @@ def test_joined_indices_are_those_of_int64_whatever_types_came(
         scene = Scene(
             torch.zeros(count, 3), faces.long(), torch.zeros(count, 3), camera(), texture if cover else None
         )
-        # past the type checks that only tests have, which know no uint8
+        # bypasses the type checks of the tests, which do not allow uint8
         for part, name, value in (
             (scene, "faces", faces),
             (texture, "faces", faces),
@@ -145,7 +144,7 @@ def test_joined_indices_are_those_of_int64_whatever_types_came(
         return scene
 
     merged = join_scenes([subject(count, kind, textured[0]), subject(100, other, textured[1])])
-    # the same small numbers as int64, moved by hand
+    # expected result: the same small numbers as int64, shifted by hand
     first, last = subject(count, kind, True), subject(100, other, True)
     assert first.texture is not None and first.texture.shown is not None
     assert last.texture is not None and last.texture.shown is not None
@@ -210,7 +209,7 @@ def test_a_texture_that_does_not_fit_is_refused_with_a_sentence(
     faces = torch.arange(12).reshape(4, 3)
     texture = Texture((torch.rand(2, 2, 3),), torch.rand(30, 2), faces)
     for name, value in change.items():
-        object.__setattr__(texture, name, value)  # past the type checks that only tests have
+        object.__setattr__(texture, name, value)  # bypasses the type checks of the tests
     scene = Scene(corners, faces, None, camera(), texture)
     for channels in (("color",), ("uv",), ("mask", "color")):
         with pytest.raises(ValueError) as caught:
@@ -219,7 +218,7 @@ def test_a_texture_that_does_not_fit_is_refused_with_a_sentence(
     assert set(implementation(Rasterizer(), scene, ("mask", "depth"))) == {
         "mask",
         "depth",
-    }  # which read none of it
+    }  # these channels do not read the texture
 
 
 def test_the_blended_picture_refuses_textures() -> None:

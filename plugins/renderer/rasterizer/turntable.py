@@ -64,7 +64,7 @@ def bounding_sphere(scene: Scene) -> BoundingSphere:
 
 
 def look_at(
-    circle_cameras: BoundingSphere,
+    sphere: BoundingSphere,
     up: Axis,
     angles: tuple[float, float, float],
     distance: float | None,
@@ -74,7 +74,7 @@ def look_at(
     """Return a camera that sees the subject's centre in the middle of the image.
 
     Args:
-        circle_cameras: sphere around the subject.
+        sphere: sphere around the subject.
         up: the scene's vertical axis.
         angles: azimuth, elevation, tilt in radians, as in `framework.geometry.camera.look_from`.
         distance: distance from the subject's centre, metres; None for the smallest distance from which the whole sphere
@@ -85,12 +85,12 @@ def look_at(
     height, width = size
     focal = focal_length(height, field_of_view)
     if distance is None:
-        distance = MARGIN * circle_cameras.radius / math.sin(math.atan(0.5 * min(size) / focal))
+        distance = MARGIN * sphere.radius / math.sin(math.atan(0.5 * min(size) / focal))
     rotation = IMAGE @ viewpoint_rotation(torch.tensor(angles, dtype=torch.float64)) @ UPRIGHT[up]
     forward = torch.tensor([0.0, 0.0, distance], dtype=torch.float64)
     return Camera(
         rotation,
-        forward - rotation @ circle_cameras.centre,
+        forward - rotation @ sphere.centre,
         (focal, focal),
         ((width - 1) / 2, (height - 1) / 2),
         height,

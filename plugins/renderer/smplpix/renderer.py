@@ -115,9 +115,8 @@ class SMPLpix(Renderer):
                 config={**self.description.config, "encoder": encoders},
                 target=replace(self.description.target, size=size),
             )
-            with torch.random.fork_rng(
-                devices=[]
-            ):  # building initialises random weights, which are then overwritten
+            # building initialises random weights, which are then overwritten
+            with torch.random.fork_rng(devices=[]):
                 try:
                     predictor = rebuild(changed, self._weights)
                 except CheckpointError as error:

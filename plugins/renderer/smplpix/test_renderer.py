@@ -30,12 +30,12 @@ def renderer(run, **config):
 
 
 def own_paths(encoders):
-    """Return the paths that the user of a run gives again; no path is used only because the checkpoint has it."""
+    """Return the paths that the user must repeat, because stored paths of a checkpoint are not used otherwise."""
     return {"encoder.rasterised.root": encoders[0]["root"]} if "root" in encoders[0] else {}
 
 
 def distant_camera(size, azimuth=0.4):
-    """Return a camera of unequal focal lengths, off the middle, far from any canonical one."""
+    """Return a camera with unequal focal lengths and an off-centre principal point, unlike a canonical camera."""
     camera = look_from(azimuth, 0.3, -0.2, distance=3.5, field_of_view=0.8, size=size)
     return replace(camera, focal=(camera.focal[0], 1.1 * camera.focal[1]), principal=(17.0, 15.5))
 
@@ -49,7 +49,7 @@ def encoders(request, tmp_path_factory):
 
 
 def write_registration(folder):
-    """Return the sphere as everybody's registration, in the layout from which `rasterised` reads its triangles."""
+    """Write a sphere as registration in the folder layout that the encoder `rasterised` reads."""
     for split in ("train", "validation", "test"):
         (folder / f"{split}.txt").write_text(f"{split}\n")
     file = folder / "subjects/train/registration_7k.ply"
@@ -64,7 +64,7 @@ def write_registration(folder):
 
 
 def network_input(scene):
-    """Return the input that a user of the loaded run passes."""
+    """Return the input of the network for a scene."""
     assert scene.colors is not None
     return torch.cat([scene.camera.to_canonical(scene.vertices), srgb_from_linear(scene.colors)], 1)[None]
 
@@ -91,7 +91,7 @@ def test_it_draws_what_the_loaded_run_predicts(encoders, size, members, tmp_path
             density = loaded(network_input(scene))
         assert torch.equal(image, images(density, ("color",))["color"][0])
         if members == 1:
-            assert torch.equal(image, linear_from_srgb(density.mean[0]))  # the numbers of the file, as light
+            assert torch.equal(image, linear_from_srgb(density.mean[0]))  # the predicted sRGB as linear RGB
         assert image.max() - image.min() > 0.01 and image.shape == (*size, 3)
 
 
@@ -99,7 +99,9 @@ def test_a_camera_anywhere_sees_what_the_canonical_one_sees(tmp_path):
     smplpix = renderer(write_checkpoint(tmp_path / "run.ckpt", ENCODERS["projection, slim"], SIZE))
     scene = replace(MESH, vertices=MESH.vertices.double(), camera=distant_camera(SIZE))
     pixels, depth = scene.camera.project(scene.vertices)
-    clear = ((pixels + 0.5) - (pixels + 0.5).round()).abs().amin(1) > 1e-3  # rounding decides no pixel
+    clear = ((pixels + 0.5) - (pixels + 0.5).round()).abs().amin(
+        1
+    ) > 1e-3  # so that rounding does not change a pixel
     plain = canonical_camera(*SIZE)
     across = (pixels - torch.tensor(plain.principal)) / torch.tensor(plain.focal)
     moved = torch.cat([across, torch.ones(len(pixels), 1)], 1) * depth[:, None]
@@ -151,7 +153,7 @@ def test_a_path_of_its_checkpoint_is_said_again_or_refused(encoders, tmp_path):
         with pytest.raises(ConfigError, match=r"encoder\.rasterised\.root="):
             renderer(run)
         assert key == "encoder.rasterised.root"
-        renderer(run, paths={"encoder": {"rasterised": {"root": path}}})  # as a command line has it
+        renderer(run, paths={"encoder": {"rasterised": {"root": path}}})  # nested, as on a command line
 
 
 def test_what_it_cannot_draw_is_refused(encoders, tmp_path):
@@ -164,7 +166,7 @@ def test_what_it_cannot_draw_is_refused(encoders, tmp_path):
     for name in ("focal", "principal"):
         for lens in (8.0, (8.0,), (8.0, 8.0, 8.0), torch.tensor([8.0]), torch.tensor(8.0), torch.ones(2, 1)):
             camera = distant_camera(SIZE)
-            object.__setattr__(camera, name, lens)  # past the type checks that only tests have
+            object.__setattr__(camera, name, lens)  # bypasses the type checks of the tests
             with pytest.raises(ValueError, match=rf"camera\.{name} has .*; expected the shape \(2,\)"):
                 smplpix(replace(scene, camera=camera))
     if encoders[0]["name"] == "rasterised":
