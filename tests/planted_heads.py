@@ -39,7 +39,7 @@ from plugins.density_head.categorical.head import CategoricalHead
 from plugins.density_head.gaussian.head import GaussianHead
 from plugins.density_head.laplace_image.head import LaplaceImageHead
 from plugins.density_head.von_mises.head import VonMisesHead
-from plugins.density_head.von_mises.rows import predicted
+from plugins.density_head.von_mises.rows import predicted_cases
 
 OF_DENSITIES = {check.name for check in CHECKS}
 Parts = Mapping[str, Callable[..., Any]]
@@ -247,7 +247,7 @@ class Fault:
                 return self.head(target)
             return Faulty(kinds[target.kind](target, **self.config), self.parts)
 
-        cases = predicted if self.target.kind == "angle" and not self.config and self.head is None else None
+        cases = predicted_cases if self.target.kind == "angle" and not self.config and self.head is None else None
         row = HeadRow(self.name, self.target, cases=cases)
         subject = HeadSubject(row, lambda: of(self.target), build_for=of, only=only)
         groups = [examine_head(subject), examine_densities(subject)]

@@ -303,7 +303,7 @@ def test_a_pattern_that_no_file_has_is_the_rows_fault() -> None:
         for finding in findings(DataRow("rows", fragile={"*.csv": ("missing",)}))
         if finding.name == "damaged files are named"
     )
-    assert "'*.csv' fits no file" in found.worst
+    assert "'*.csv' of `fragile` matches no file" in found.worst
 
 
 def test_the_users_cache_is_left_alone(tmp_path, monkeypatch) -> None:

@@ -51,7 +51,7 @@ def test_densities_of_heads_are_those_of_full_precision(name: str, row: HeadRow)
     subject = HeadSubject(
         row, lambda: fit_if_needed(build("density_head", config, target=row.target), row.target)
     )
-    head, raw, value = subject.make(), row.scale * subject.raws(4), subject.values(4)
+    head, raw, value = subject.make(), row.scale * subject.raw_parameters(4), subject.values(4)
 
     def make() -> Distribution:
         seed(SEED)

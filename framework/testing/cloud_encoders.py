@@ -74,7 +74,7 @@ def bad_clouds(make: Make, clouds: list[Tensor], worst: Worst) -> None:
         for number in (math.inf, -math.inf, math.nan):
             bad = torch.stack([largest, largest])
             bad[1, last, column] = number
-            _check_refused(encoder, bad, ("Cloud 1", f"column {column} of its point {last}"), worst)
+            _check_refused(encoder, bad, ("Cloud 1", f"column {column}", f"point {last}"), worst)
     _check_refused(encoder, torch.stack([largest, largest * math.nan]), ("Cloud 1", "no point"), worst)
 
 

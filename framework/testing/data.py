@@ -31,13 +31,13 @@ from framework.testing.data_samples import (
     check_equal_fields,
     check_equal_hashes,
     check_equal_splits,
-    fits,
     hash_samples,
     indices_to_check,
-    parts,
+    remove_padding,
     samples,
+    shape_fits,
     spaced_indices,
-    trimmed,
+    splits_by_name,
 )
 from framework.testing.data_targets import check_targets_belong
 from framework.testing.devices import Calls, OneDevice, check_devices
@@ -59,14 +59,14 @@ def examine_data(row: DataRow, build: Build) -> Iterator[Finding]:
             "attributes": (0.0, _attributes),
             "constructor reads nothing": (0.0, _constructor),
             "samples": (0.0, _samples),
-            "samples differ": (0.5, _differ),
-            "images are 0 to 1": (1e-6, _images),
-            "angles are radians": (2 * math.pi, _radians),
+            "samples differ": (0.5, _samples_differ),
+            "images are 0 to 1": (1e-6, _image_range),
+            "angles are radians": (2 * math.pi, _angle_size),
             "no sample in two splits": (0.0, _disjoint),
             "targets go with inputs": (0.0, lambda bench, worst: check_targets_belong(bench.data, worst)),
             "same data, same bits": (0.0, _repeatable),
             "batches equal single samples": (0.0, _fetching),
-            "batches share no memory": (0.0, _owned),
+            "batches share no memory": (0.0, _own_memory),
             "fingerprint": (0.0, _fingerprint),
             "synthetic is stated": (0.0, _synthetic),
             "pictures": (0.0, _pictures),
@@ -143,7 +143,7 @@ def _attributes(bench: Workbench, worst: Worst) -> None:
     if bench.row.synthetic is not None:  # the files of a row are undamaged
         worst.same("skipped", data.skipped, 0)
     worst.same("type of bibtex", type(data.bibtex), str)
-    for name, split in parts(data).items():
+    for name, split in splits_by_name(data).items():
         worst.count(not len(split), f"the {name} split is empty")
 
 
@@ -172,12 +172,12 @@ def _constructor(bench: Workbench, worst: Worst) -> None:
 
 def _samples(bench: Workbench, worst: Worst) -> None:
     data = bench.data
-    for name, split in parts(data).items():
+    for name, split in splits_by_name(data).items():
         fields: list[str] = []
         for number, sample in samples(split):
             fields = fields or sorted(sample)
-            worst.same(f"{name} {number}: fields", sorted(sample), fields)
-            _sample(data, sample, number, f"{name} {number}", worst)
+            worst.same(f"{name} sample {number}: fields", sorted(sample), fields)
+            _sample(data, sample, number, f"{name} sample {number}", worst)
         if len(split) <= FEW:
             continue
         for indices in batches(indices_to_check(split), [256]):
@@ -189,7 +189,7 @@ def _samples(bench: Workbench, worst: Worst) -> None:
 def _sample_batch(data: Data, batch: Batch, indices: Sequence[int], where: str, worst: Worst) -> None:
     """Check a batch of many samples, as `_sample` checks a single one."""
     missing = [key for key in NEEDED if key not in batch]
-    worst.same(f"{where}: fields missing", missing, [])
+    worst.same(f"{where}: missing fields", missing, [])
     if missing:
         return
     target = batch["target"]
@@ -211,15 +211,15 @@ def _sample_batch(data: Data, batch: Batch, indices: Sequence[int], where: str, 
         worst.finite(f"{where}: input", inputs)
         return
     for number, cloud in zip(indices, inputs, strict=True):
-        worst.finite(f"{where}: input of sample {number}", trimmed(cloud))
+        worst.finite(f"{where}: input of sample {number}", remove_padding(cloud))
 
 
-def _differ(bench: Workbench, worst: Worst) -> None:
+def _samples_differ(bench: Workbench, worst: Worst) -> None:
     """Check that at most half of the samples of a split, if their inputs are measured, repeat others.
 
     In the training split, neither all inputs nor all targets may be equal.
     """
-    for name, split in parts(bench.data).items():
+    for name, split in splits_by_name(bench.data).items():
         hashes_by_sample = bench.contents[name].hashes
         if len(hashes_by_sample) < 2:
             worst.count(False, f"{name} has fewer than two samples")
@@ -240,42 +240,49 @@ def _differ(bench: Workbench, worst: Worst) -> None:
 
 def _measured(inputs: Tensor) -> bool:
     """Return whether inputs are measured, rather than a few integers that may be equal in two samples by chance."""
-    trimmed_inputs = trimmed(inputs)
+    trimmed_inputs = remove_padding(inputs)
     return trimmed_inputs.numel() >= 16 or (
         trimmed_inputs.is_floating_point() and bool((trimmed_inputs != trimmed_inputs.round()).any())
     )
 
 
-def _images(bench: Workbench, worst: Worst) -> None:
+def _image_range(bench: Workbench, worst: Worst) -> None:
     """Check that images of floats are in [0, 1], since encoders scale bytes to [0, 1] but do not scale floats."""
-    for name, split in parts(bench.data).items():
+    for name, split in splits_by_name(bench.data).items():
         for number, sample in samples(split):
             inputs = sample["input"]
             if not inputs.is_floating_point():
                 worst.count(False, "the images are bytes")
                 continue
-            worst.record((-inputs).amax(), f"{name} {number}: lowest value {inputs.amin().item():.4g}")
-            worst.record(inputs.amax() - 1, f"{name} {number}: highest value {inputs.amax().item():.4g}")
+            worst.record((-inputs).amax(), f"{name} sample {number}: lowest value {inputs.amin().item():.4g}")
+            worst.record(
+                inputs.amax() - 1, f"{name} sample {number}: highest value {inputs.amax().item():.4g}"
+            )
 
 
 def _sample(data: Data, sample: Any, number: int, where: str, worst: Worst) -> None:
     strange = {key: type(value) for key, value in sample.items() if not isinstance(value, Tensor)}
     missing = [key for key in NEEDED if key not in sample]
     worst.same(f"{where}: fields that are not tensors", strange, {})
-    worst.same(f"{where}: fields missing", missing, [])
+    worst.same(f"{where}: missing fields", missing, [])
     if strange or missing:
         return
     inputs, target = sample["input"], sample["target"]
     shape = tuple(inputs.shape)
     worst.count(
-        not fits(shape, data.input_shape), f"{where}: input of shape {shape}, expected {data.input_shape}"
+        not shape_fits(shape, data.input_shape),
+        f"{where}: input of shape {shape}, expected {data.input_shape}",
     )
     known = inputs.is_floating_point() or inputs.dtype == torch.uint8
     worst.count(not known, f"{where}: input of {inputs.dtype}, expected a float or torch.uint8")
-    worst.finite(f"{where}: input", trimmed(inputs))
+    worst.finite(f"{where}: input", remove_padding(inputs))
     _target(data, target, where, worst)
     for key in ("index", "group"):
-        worst.same(f"{where}: {key}", (sample[key].dtype, tuple(sample[key].shape)), (torch.int64, ()))
+        worst.same(
+            f"{where}: type and shape of {key}",
+            (sample[key].dtype, tuple(sample[key].shape)),
+            (torch.int64, ()),
+        )
     worst.same(f"{where}: index", int(sample["index"]), number)
     group = int(sample["group"])
     worst.count(not 0 <= group < len(data.groups), f"{where}: group {group} of {len(data.groups)}")
@@ -284,28 +291,30 @@ def _sample(data: Data, sample: Any, number: int, where: str, worst: Worst) -> N
 def _target(data: Data, target: Tensor, where: str, worst: Worst) -> None:
     kind, names = data.target.kind, data.target.names
     if kind == "class":
-        worst.same(f"{where}: target", (target.dtype, tuple(target.shape)), (torch.int64, ()))
+        worst.same(
+            f"{where}: type and shape of the target", (target.dtype, tuple(target.shape)), (torch.int64, ())
+        )
         worst.count(
             (target < 0) | (target >= len(names)), f"{where}: class {target.tolist()} of {len(names)}"
         )
         return
-    worst.same(f"{where}: target", tuple(target.shape), data.target.event_shape)
+    worst.same(f"{where}: shape of the target", tuple(target.shape), data.target.event_shape)
     worst.count(not target.is_floating_point(), f"{where}: target of {target.dtype}, expected a float")
     worst.finite(f"{where}: target", target)
 
 
-def _radians(bench: Workbench, worst: Worst) -> None:
+def _angle_size(bench: Workbench, worst: Worst) -> None:
     """Check that no angle exceeds 2π, since a larger one is most likely in degrees."""
-    for name, split in parts(bench.data).items():
+    for name, split in splits_by_name(bench.data).items():
         for indices in batches(indices_to_check(split), [64]):
             largest = fetch(split, indices)["target"].abs().flatten(1).amax(-1)
-            worst.record(largest, lambda at, name=name, indices=indices: f"{name} {indices[at[0]]}")
+            worst.record(largest, lambda at, name=name, indices=indices: f"{name} sample {indices[at[0]]}")
 
 
 def _disjoint(bench: Workbench, worst: Worst) -> None:
     """Check that no sample, that is, pair of input and target, occurs in two splits."""
     earlier: dict[tuple[int, int], str] = {}
-    for name, split in parts(bench.data).items():
+    for name, split in splits_by_name(bench.data).items():
         own: dict[tuple[int, int], str] = {}
         for number in indices_to_check(split):
             sample = split[number]
@@ -313,7 +322,7 @@ def _disjoint(bench: Workbench, worst: Worst) -> None:
             # training targets may be stored in half precision
             rounded = target.half() if target.is_floating_point() else target
             hashes = hash_samples({"input": sample["input"][None], "target": rounded[None]})[0]
-            own[hashes["input"], hashes["target"]] = f"{name} {number}"
+            own[hashes["input"], hashes["target"]] = f"{name} sample {number}"
         worst.count(not own, f"{name} is empty")
         for content, where in own.items():
             worst.count(content in earlier, f"{where} is equal to {earlier.get(content)}")
@@ -345,7 +354,7 @@ SIZES = (1, 300, 37, 64, 129)
 
 def _fetching(bench: Workbench, worst: Worst) -> None:
     """Check that a batch holds the same samples as indexing returns one by one, for any order and batch size."""
-    for name, split in parts(bench.data).items():
+    for name, split in splits_by_name(bench.data).items():
         expected = bench.contents[name].hashes
         order = list(expected)
         random = np.random.default_rng(SEED)
@@ -359,27 +368,36 @@ def _fetching(bench: Workbench, worst: Worst) -> None:
             for indices in index_batches:
                 actual = hash_samples(fetch(split, indices))
                 worst.same(
-                    f"{name}, {order_name}: samples of a batch of {len(indices)}", len(actual), len(indices)
+                    f"{name}, {order_name}: number of samples of a batch of {len(indices)}",
+                    len(actual),
+                    len(indices),
                 )
                 for number, hashes in zip(indices, actual, strict=False):
                     check_equal_hashes(
-                        hashes, expected[number], f"{name} {number} of {len(indices)}, {order_name}", worst
+                        hashes,
+                        expected[number],
+                        f"{name} sample {number} of {len(indices)}, {order_name}",
+                        worst,
                     )
 
 
-def _owned(bench: Workbench, worst: Worst) -> None:
+def _own_memory(bench: Workbench, worst: Worst) -> None:
     """Check that each batch and sample has its own memory, so that it is not changed with another one."""
-    for name, split in parts(bench.data).items():
+    for name, split in splits_by_name(bench.data).items():
         order = list(bench.contents[name].hashes)
         expected = [bench.contents[name].hashes[number] for number in order[:16]]
         single = split[order[0]]
         fetched_batch = fetch(split, order[:16])
         _ = fetch(split, order[-16:])
         for number, actual, hashes in zip(order, hash_samples(fetched_batch), expected, strict=False):
-            check_equal_hashes(actual, hashes, f"{name} {number} after another batch was fetched", worst)
+            check_equal_hashes(
+                actual, hashes, f"{name} sample {number} after another batch was fetched", worst
+            )
         _ = split[order[-1]]
         actual = hash_samples({key: value[None] for key, value in single.items()})[0]
-        check_equal_hashes(actual, expected[0], f"{name} {order[0]} after another sample was fetched", worst)
+        check_equal_hashes(
+            actual, expected[0], f"{name} sample {order[0]} after another sample was fetched", worst
+        )
         again = fetch(split, order[:16])
         for key in ("input", "target"):
             shared = (
@@ -416,12 +434,12 @@ def _synthetic(bench: Workbench, worst: Worst) -> None:
 
 
 def _pictures(bench: Workbench, worst: Worst) -> None:
-    for name, split in parts(bench.data).items():
+    for name, split in splits_by_name(bench.data).items():
         for number in spaced_indices(len(split), 3):
             inputs = split[number]["input"]
             before = inputs.clone()
             rendered = bench.data.preview(inputs)
-            shape, where = np.shape(rendered), f"picture of {name} {number}"
+            shape, where = np.shape(rendered), f"picture of {name} sample {number}"
             worst.same(f"{where}: dtype", getattr(rendered, "dtype", type(rendered)), np.dtype(np.uint8))
             worst.count(
                 len(shape) != 3 or shape[2] != 3 or 0 in shape,
@@ -432,7 +450,7 @@ def _pictures(bench: Workbench, worst: Worst) -> None:
 
 def _on_one_device(bench: Workbench, worst: Worst) -> None:
     """Check that `augment` mixes no devices: batches are on the model's device, attributes of the data on the CPU."""
-    data, train = bench.data, parts(bench.data)["train"]
+    data, train = bench.data, splits_by_name(bench.data)["train"]
     batch = fetch(train, list(range(min(8, len(train)))))
 
     def calls(mode: OneDevice) -> Calls:
@@ -445,7 +463,7 @@ def _on_one_device(bench: Workbench, worst: Worst) -> None:
 
 def _augment(bench: Workbench, worst: Worst) -> None:
     """Check that an augmented batch is valid and depends on torch's seed alone, also for models in float64."""
-    data, train = bench.data, parts(bench.data)["train"]
+    data, train = bench.data, splits_by_name(bench.data)["train"]
     default = torch.get_default_dtype()
     sizes = [(1, default), (min(16, len(train)), default), (min(16, len(train)), torch.float64)]
     if len(train) > 16:
@@ -500,12 +518,12 @@ def _check_augmented(data: Data, batch: Batch, where: str, worst: Worst) -> None
 
 def _workers(bench: Workbench, worst: Worst) -> None:
     """Check that a pickled copy of a split, as a worker process receives it, has the same samples."""
-    for name, split in parts(bench.data).items():
+    for name, split in splits_by_name(bench.data).items():
         copy = pickle.loads(pickle.dumps(split))
         worst.same(f"length of a copy of {name}", len(copy), len(split))
         for number in spaced_indices(len(split), 3):
-            check_equal_fields(copy[number], split[number], f"{name} {number} of a copy", worst)
+            check_equal_fields(copy[number], split[number], f"{name} sample {number} of a copy", worst)
         expected = bench.contents[name].hashes
         indices = list(expected)[-300:]
         for number, hashes in zip(indices, hash_samples(fetch(copy, indices)), strict=True):
-            check_equal_hashes(hashes, expected[number], f"{name} {number} of a copy", worst)
+            check_equal_hashes(hashes, expected[number], f"{name} sample {number} of a copy", worst)

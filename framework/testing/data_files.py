@@ -15,7 +15,14 @@ from framework.data import Data
 from framework.errors import DataError
 from framework.storage.generated import MARK
 from framework.testing.data_folders import Workbench, cache_in, damage, first_match
-from framework.testing.data_samples import FEW, check_equal_splits, parts, samples, total, trimmed
+from framework.testing.data_samples import (
+    FEW,
+    check_equal_splits,
+    remove_padding,
+    samples,
+    splits_by_name,
+    total_samples,
+)
 from framework.testing.finding import TooSlow, Worst
 from framework.testing.rows import DAMAGES, Damage
 
@@ -88,7 +95,7 @@ def left_out(bench: Workbench, worst: Worst) -> None:
     pattern = next(iter(bench.row.fragile))
     place, source = bench.copy_files(lambda root: damage(first_match(root, pattern), "garbage"))
     remaining = bench.prepare_at(place, **source, **bench.row.skip)
-    missing_count = total(bench.data) - total(remaining)
+    missing_count = total_samples(bench.data) - total_samples(remaining)
     worst.count(remaining.skipped < 1, f"skipped {remaining.skipped} after damage to {pattern}")
     worst.same("samples left out", missing_count, remaining.skipped - bench.data.skipped)
 
@@ -153,7 +160,9 @@ def raw_input(bench: Workbench, worst: Worst) -> None:
             )
         worst.same(f"{file.name}: samples", len(actual), len(expected))
         for number, (input_read, input_expected) in enumerate(zip(actual, expected, strict=False)):
-            worst.same_bits(f"{file.name}: sample {number}", trimmed(input_read), trimmed(input_expected))
+            worst.same_bits(
+                f"{file.name}: sample {number}", remove_padding(input_read), remove_padding(input_expected)
+            )
     for description, value in {
         "input that is an object": object(),
         "input that is text": [["a"]],
@@ -206,7 +215,7 @@ def _read(data: Data, files: Sequence[Path], bench: Workbench, worst: Worst) -> 
     """Read user files, check their samples, and return the inputs without padding."""
     with cache_in(bench.first.cache):
         split = data.read(files)
-    sample_of_split = parts(bench.data)["train"][0]
+    sample_of_split = splits_by_name(bench.data)["train"][0]
     like, expected = sample_of_split["input"], bench.data.input_shape
     inputs = []
     for number, sample in samples(split):
@@ -222,6 +231,6 @@ def _read(data: Data, files: Sequence[Path], bench: Workbench, worst: Worst) -> 
         worst.count(not known, f"{where}: input of shape {shape}, expected {expected}")
         worst.same(f"{where}: type of the input", sample["input"].dtype, like.dtype)
         worst.same(f"{where}: index", (sample["index"].dtype, int(sample["index"])), (torch.int64, number))
-        inputs.append(trimmed(sample["input"]))
+        inputs.append(remove_padding(sample["input"]))
     worst.count(not inputs, f"{len(files)} files gave no sample")
     return inputs

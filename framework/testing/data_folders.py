@@ -15,7 +15,7 @@ import numpy as np
 
 from framework.data import Data
 from framework.storage.generated import MARK
-from framework.testing.data_samples import Contents, hash_split, parts
+from framework.testing.data_samples import Contents, hash_split, splits_by_name
 from framework.testing.finding import SEED
 from framework.testing.rows import NEEDS_ROWS, Damage, DataRow
 
@@ -138,7 +138,7 @@ class Workbench:
     @cached_property
     def contents(self) -> dict[str, Contents]:
         """Name of each split → hashes of its samples."""
-        return {name: hash_split(split) for name, split in parts(self.data).items()}
+        return {name: hash_split(split) for name, split in splits_by_name(self.data).items()}
 
     @cached_property
     def location_keys(self) -> list[str]:
@@ -193,7 +193,7 @@ def first_match(folder: Path, pattern: str) -> Path:
     matches = sorted(path for path in folder.glob(pattern) if path.is_file())
     if not matches:
         raise ValueError(
-            f"The pattern {pattern!r} of `fragile` fits no file in {folder}. Correct the pattern in rows.py."
+            f"The pattern {pattern!r} of `fragile` matches no file in {folder}. Correct the pattern in rows.py."
         )
     return matches[0]
 

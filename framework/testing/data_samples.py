@@ -50,14 +50,14 @@ def indices_to_check(split: Any) -> list[int]:
     return [0, *random_picks[1:-1], length - 1]
 
 
-def parts(data: Data) -> dict[str, Any]:
+def splits_by_name(data: Data) -> dict[str, Any]:
     """Return the splits of a data set by name."""
     return data.splits()._asdict()
 
 
-def total(data: Data) -> int:
+def total_samples(data: Data) -> int:
     """Return the number of samples in all splits."""
-    return sum(map(len, parts(data).values()))
+    return sum(map(len, splits_by_name(data).values()))
 
 
 def samples(split: Any) -> Iterator[tuple[int, Batch]]:
@@ -75,14 +75,14 @@ def batches(indices: Sequence[int], sizes: Sequence[int]) -> Iterator[list[int]]
         start, count = start + size, count + 1
 
 
-def fits(shape: tuple[int, ...], expected: tuple[int, ...]) -> bool:
+def shape_fits(shape: tuple[int, ...], expected: tuple[int, ...]) -> bool:
     """Return whether an input has the expected shape; a cloud, (points, columns), may have fewer points."""
     if len(expected) == 2 and len(shape) == 2:
         return 0 < shape[0] <= expected[0] and shape[1] == expected[1]
     return shape == expected
 
 
-def trimmed(inputs: Tensor) -> Tensor:
+def remove_padding(inputs: Tensor) -> Tensor:
     """Return a cloud without its padding, the rows of NaN at its end; return any other input unchanged."""
     if inputs.dim() != 2 or not inputs.is_floating_point():
         return inputs
@@ -99,7 +99,7 @@ def hash_samples(batch: Batch) -> list[Hashes]:
     rows: dict[str, list[int]] = {}
     for key, values in batch.items():
         if key == "input" and values.dim() == 3 and values.is_floating_point() and values.isnan().any():
-            rows[key] = [_hash_rows(trimmed(cloud)[None])[0] for cloud in values]
+            rows[key] = [_hash_rows(remove_padding(cloud)[None])[0] for cloud in values]
         else:
             rows[key] = _hash_rows(values)
     return [dict(zip(rows, row, strict=True)) for row in zip(*rows.values(), strict=True)]
@@ -154,12 +154,14 @@ def check_equal_splits(
     actual: Data, expected: Mapping[str, Contents], label: str, worst: Worst, *, only: tuple[str, ...] = ()
 ) -> None:
     """Check that every split has the same samples as `expected`, in all fields or in those of `only`."""
-    for name, split in parts(actual).items():
+    for name, split in splits_by_name(actual).items():
         before = expected[name]
         worst.same(f"{label}: length of {name}", len(split), before.length)
         indices = [number for number in before.hashes if number < len(split)]
         for number, hashes in hash_split(split, indices).hashes.items():
-            check_equal_hashes(hashes, before.hashes[number], f"{label}: {name} {number}", worst, only=only)
+            check_equal_hashes(
+                hashes, before.hashes[number], f"{label}: {name} sample {number}", worst, only=only
+            )
 
 
 def check_equal_fields(

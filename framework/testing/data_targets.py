@@ -5,7 +5,7 @@ from torch import Tensor
 
 from framework.data import Data
 from framework.datasets.fields import fetch
-from framework.testing.data_samples import batches, indices_to_check, parts, trimmed
+from framework.testing.data_samples import batches, indices_to_check, remove_padding, splits_by_name
 from framework.testing.finding import SEED, Worst
 
 LEAST, MOST = 192, 960
@@ -29,7 +29,7 @@ def check_targets_belong(data: Data, worst: Worst) -> None:
     A target is predicted by the median target of the samples with the nearest inputs. If inputs do not predict their
     own targets, they must not predict those of the previous or the next sample either.
     """
-    for name, split in parts(data).items():
+    for name, split in splits_by_name(data).items():
         indices = indices_to_check(split)[:MOST]
         worst.count(False, f"{name} has {len(indices)} samples to check")
         if len(indices) < LEAST:
@@ -77,7 +77,7 @@ def _input_features(inputs: Tensor) -> Tensor:
     inputs = inputs.double()
     if inputs.dim() != 2:
         return inputs.reshape(-1)
-    points = trimmed(inputs)
+    points = remove_padding(inputs)
     centred = points - points.mean(0)
     return torch.cat([points.mean(0), (centred.T @ centred).reshape(-1) / len(points), centred.abs().amax(0)])
 

@@ -40,7 +40,7 @@ SCALES = (1e-2, 0.1, 1.0, 10.0, 1e2, 1e3)
 CELLS = 24
 """Number of cells of about equal mass in which draws of one number are counted."""
 MEDIAN_DRAWS = 2000
-"""Number of draws from which a median is check_estimate, where it has no closed form."""
+"""Number of draws from which a median is estimated, where it has no closed form."""
 Check = Callable[[Distribution, Worst], None]
 
 
@@ -76,7 +76,9 @@ def examine_densities(subject: HeadSubject) -> Iterator[Finding]:
         scales = {"own": [own] * 3, "many": [s for s in (1e-2, 1.0, 1e2) for _ in range(64)]}.get(
             batch, [s for s in (*SCALES, own) for _ in range(repeats)]
         )
-        raw = subject.raws(len(scales)).double() * torch.tensor(scales, dtype=torch.float64).unsqueeze(-1)
+        raw = subject.raw_parameters(len(scales)).double() * torch.tensor(
+            scales, dtype=torch.float64
+        ).unsqueeze(-1)
         head = subject.make().double()
         head.requires_grad_(False)
         names = [f"raw parameters of size {scale:g}, batch row {row}" for row, scale in enumerate(scales)]
@@ -110,14 +112,14 @@ def _examine_protocol(subject: HeadSubject, draws: bool) -> Iterator[Finding]:
         """Return densities of batch_shape (3, 2)."""
         head = subject.make().double()
         head.requires_grad_(False)
-        return head(subject.row.scale * subject.raws(3, 2).double())
+        return head(subject.row.scale * subject.raw_parameters(3, 2).double())
 
     @cache
     def rows() -> Distribution:
         """Return densities of batch_shape (3,)."""
         head = subject.make().double()
         head.requires_grad_(False)
-        return head(subject.row.scale * subject.raws(3).double())
+        return head(subject.row.scale * subject.raw_parameters(3).double())
 
     @cache
     def mixture() -> Distribution:
@@ -171,7 +173,7 @@ def _examine_protocol(subject: HeadSubject, draws: bool) -> Iterator[Finding]:
 
 
 def _numbers(subject: HeadSubject) -> int:
-    """Return the number of numbers of a target."""
+    """Return how many numbers a target has."""
     return math.prod(subject.row.target.event_shape)
 
 
@@ -355,14 +357,16 @@ def periodic(density: Distribution, worst: Worst) -> None:
         # the rounding error of the number of turns times 2π is relative to its size
         scale = scale * (1 + moved.abs().amax(-1))
         error = (density.log_prob(moved) - log_prob.detach()).abs() / scale
-        worst.record(error, lambda at, turns=turns: f"{turns} turns, value {at[0]}, {worst.row(at[1])}")
+        worst.record(
+            error, lambda at, turns=turns: f"shift by {turns} · 2π, value {at[0]}, {worst.row(at[1])}"
+        )
 
 
 def entropy(density: Distribution, worst: Worst) -> None:
     """Check that the entropy is -∫ p log p.
 
-    The integral is a sum for classes, a quadrature for one or two numbers, and else a mean over draws. The error is in
-    units of 1e-6 nats (relative above 1 nat), plus the standard errors where the entropy or the integral is estimated
+    The integral is a sum for classes, a quadrature for one or two numbers, and else a mean over draws. The unit of the
+    error is 1e-6 nats (relative above 1 nat), plus a statistical error where the entropy or the integral is estimated
     from draws.
     """
     entropies = torch.stack([_call_seeded(number, density.entropy) for number in range(2)]).double()
@@ -419,7 +423,8 @@ def mode_is_highest(density: Distribution, worst: Worst) -> None:
 def mode_of_mixture(density: Distribution, worst: Worst) -> None:
     """Check the mode of a mixture; the error is in units of the height by which the search for the mode may be wrong.
 
-    This height is 0.05 nats where `quadratic_bound` leads up from the modes of the components, else log 2 nats.
+    This height is 0.05 nats if `quadratic_bound` is known, so that the search can climb from the components' modes.
+    Otherwise it is log 2 nats.
     """
     known = density.has_enumerate_support or quadratic_bound(density, density.mode) is not None
     inner = Worst()
@@ -494,9 +499,9 @@ def median_is_best(density: Distribution, worst: Worst) -> None:
 def moments(density: Distribution, worst: Worst) -> None:
     """Compare mean and variance, where the density has them, with the quadrature; errors are in standard deviations.
 
-    The quadrature adapts to the density rather than to its moments, which have an error for heavy tails. Only
-    differences beyond this error count. If the density states that its variance does not exist, the variance of the
-    quadrature must be huge, and the mean need not exist either.
+    The quadrature adapts to the density, so that its moments have an error for heavy tails. Only differences beyond
+    this error count. If the density states that its variance does not exist, the variance of the quadrature must be
+    huge, and the mean need not exist either.
     """
     quadrature = boxes(density)
     offset = quadrature.value - quadrature.mapping.mode  # keeps the digits of a narrow density far from 0

@@ -92,7 +92,7 @@ def _check_groups(encoder: Encoder, batch: Tensor, worst: Worst, *, slow: bool) 
             ends = [_loss_at(values, directions, sign * step, total) for sign in (1, -1)]
             numeric = (ends[0] - ends[1]) / (2 * step)
             error = min(error, abs(analytic - numeric) / floor)
-            description = f"{names}, in {where}: {analytic:.6g}, by differences {numeric:.6g}"
+            description = f"{names}, in {where} mode: {analytic:.6g}, by differences {numeric:.6g}"
             if error < CLOSE:
                 break
         worst.record(error, description)

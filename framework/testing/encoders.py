@@ -60,8 +60,8 @@ def examine_encoder(row: EncoderRow, build: Callable[[tuple[int, ...]], Encoder]
         "same seed, same bits": (0.0, lambda worst: _repeatable(make, inputs, worst)),
         "batch rows are independent": (1e-4, lambda worst: _rows_apart(make, inputs, worst, slow=slow())),
         "state-dict round trip": (0.0, lambda worst: _round_trip(make, inputs, worst)),
-        "inputs are left as they are": (0.0, lambda worst: _untouched(make, inputs, worst)),
-        "fixed and vectorises are true": (1e-4, lambda worst: _claims(make, inputs, worst)),
+        "inputs are left as they are": (0.0, lambda worst: _inputs_unchanged(make, inputs, worst)),
+        "fixed and vectorises are true": (1e-4, lambda worst: _stated_attributes(make, inputs, worst)),
         "gradients reach every parameter": (0.0, lambda worst: _gradients(make, inputs, worst)),
         "gradient": (1e-4, lambda worst: _against_differences(make, inputs, worst)),
         "gradient in weights": (
@@ -74,7 +74,7 @@ def examine_encoder(row: EncoderRow, build: Callable[[tuple[int, ...]], Encoder]
         checks["bytes are read as 0 to 1"] = (1e-5, lambda worst: _bytes(make, row, worst))
         checks["every part of an image is read"] = (
             0.0,
-            lambda worst: _every_part(make, inputs(4 if slow() else 16), worst),
+            lambda worst: _all_image_parts(make, inputs(4 if slow() else 16), worst),
         )
     if isinstance(row, CloudRow):
         clouds = different_clouds(*row.input_shape)
@@ -146,7 +146,7 @@ def _bytes(make: Make, row: EncoderRow, worst: Worst) -> None:
         )
 
 
-def _every_part(make: Make, batch: Tensor, worst: Worst) -> None:
+def _all_image_parts(make: Make, batch: Tensor, worst: Worst) -> None:
     """Check that each channel and each quarter of an image affects the features."""
     encoder = make()
     perturb_parameters(encoder)
@@ -229,7 +229,7 @@ def _is_slow(make: Make, inputs: Callable[[int], Tensor]) -> bool:
     return time.process_time() - start > SLOW
 
 
-def _untouched(make: Make, inputs: Callable[[int], Tensor], worst: Worst) -> None:
+def _inputs_unchanged(make: Make, inputs: Callable[[int], Tensor], worst: Worst) -> None:
     """Check that encoding does not change the batch, since other members of an ensemble read it."""
     encoder, batches = make(), {"floats": inputs(4)}
     if batches["floats"].dim() == 4:
@@ -259,7 +259,7 @@ def _round_trip(make: Callable[..., Encoder], inputs: Callable[[int], Tensor], w
         worst.same_bits("features of a copy", copy.deepcopy(encoder)(inputs(3)), encoder(inputs(3)))
 
 
-def _claims(make: Callable[..., Encoder], inputs: Callable[[int], Tensor], worst: Worst) -> None:
+def _stated_attributes(make: Callable[..., Encoder], inputs: Callable[[int], Tensor], worst: Worst) -> None:
     """Check that the attributes `fixed` and `vectorises` are true.
 
     If `fixed`, features depend on the inputs alone. If `vectorises`, torch.vmap over the parameters of several encoders

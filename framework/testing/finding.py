@@ -53,7 +53,7 @@ class Worst:
 
     Attributes:
         error: Largest error so far; -∞ before the first, NaN once an error was NaN.
-        case: Description of the case with that error.
+        case: Description of the case with that error. It names the fault that is searched for, also if the error is 0.
         rows: Description of each batch row of the densities under test; empty to describe rows by their number.
     """
 

@@ -29,7 +29,7 @@ def gradient(subject: HeadSubject, worst: Worst) -> None:
     head = subject.make().double().train()
     for size in (0.1, 1.0, 3.0, 30.0, 1e3):
         # not the features to which trees were fitted, since trees jump there
-        raw = (1.013 * size * subject.raws(8).double()).requires_grad_()
+        raw = (1.013 * size * subject.raw_parameters(8).double()).requires_grad_()
         value = as_type(subject.values(8), torch.float64)
         with torch.no_grad():
             # at large raw parameters, a draw of several reals may be rounded by more than the width of the density
@@ -143,7 +143,7 @@ def proper(subject: HeadSubject, worst: Worst) -> None:
         return
     head, draws = subject.make().double(), 1000 if len(subject.row.target.names) > 2 else 4000
     for size in (0.3, 3.0, 30.0):
-        raw = (size * subject.raws(3).double()).expand(draws, -1, -1).clone().requires_grad_()
+        raw = (size * subject.raw_parameters(3).double()).expand(draws, -1, -1).clone().requires_grad_()
         with torch.no_grad():
             value = head.eval()(raw[0]).sample(torch.Size((draws,)))
         # gradients at random targets show how large the gradient at values that were not drawn may be

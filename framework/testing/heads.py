@@ -74,7 +74,7 @@ class HeadSubject:
         with torch.random.fork_rng(devices=[]):
             return self.make().size
 
-    def raws(self, *batch: int) -> Tensor:
+    def raw_parameters(self, *batch: int) -> Tensor:
         """Return seeded raw parameters with a standard normal distribution, (*batch, size), float32."""
         generator = torch.Generator().manual_seed(SEED)
         return torch.randn(*batch, self.size, generator=generator)
@@ -87,7 +87,7 @@ class HeadSubject:
         """Return whether log_prob draws random numbers, that is, differs between seeds for the same inputs."""
         try:
             with torch.no_grad():
-                head, raw, value = self.make(), self.raws(4), self.values(4)
+                head, raw, value = self.make(), self.raw_parameters(4), self.values(4)
                 log_probs = []
                 for number in (0, 1):
                     seed(number)
@@ -142,7 +142,7 @@ def examine_head(subject: HeadSubject) -> Iterator[Finding]:
         ("finite for any raw parameters", 0.0, _finite_anywhere),
         ("calibrate does not harm", 1e-5, _calibrate),
         ("calibrate ignores the order of rows", 1e-5, _calibrate_backwards),
-        ("every raw parameter is read", 0.0, _all_read),
+        ("every raw parameter is read", 0.0, _reads_all_parameters),
         ("loss is in nats", 1e-5, _loss_in_nats),
         ("several values at once", 1e-5, _several_values),
         ("target's unit", TOLERANCE, units),
@@ -167,8 +167,8 @@ def _on_one_device(subject: HeadSubject, worst: Worst) -> None:
     def calls(mode: OneDevice) -> Calls:
         head = subject.make()
         mode.label_module(head)
-        raw, value = mode.label_device((subject.raws(2), subject.values(2)))
-        pairs = mode.label_device(subject.raws(1, 2))
+        raw, value = mode.label_device((subject.raw_parameters(2), subject.values(2)))
+        pairs = mode.label_device(subject.raw_parameters(1, 2))
         index = mode.label_device(torch.tensor([[0], [1], [0]]))
         temperature = mode.label_device(torch.tensor(1.7, dtype=torch.float64))
 
@@ -191,7 +191,11 @@ def _shapes(subject: HeadSubject, worst: Worst) -> None:
     target = subject.row.target
     event = target.event_shape
     for batch in BATCH_SHAPES:
-        head, raw, value = subject.make(), subject.raws(*batch).requires_grad_(), subject.values(*batch)
+        head, raw, value = (
+            subject.make(),
+            subject.raw_parameters(*batch).requires_grad_(),
+            subject.values(*batch),
+        )
         loss = head.train().loss(raw, value)
         worst.same(f"shape of the loss of a batch of shape {batch}", tuple(loss.shape), batch)
         loss.sum().backward()
@@ -241,7 +245,7 @@ def _number_types(subject: HeadSubject, worst: Worst) -> None:
         head = subject.make().to(result_dtype)
         value = as_type(subject.values(4), result_dtype)
         with torch.no_grad():
-            density = head(subject.raws(4).to(input_dtype))
+            density = head(subject.raw_parameters(4).to(input_dtype))
             worst.same(
                 f"log_prob of {input_dtype} raw parameters", density.log_prob(value).dtype, result_dtype
             )
@@ -255,7 +259,7 @@ def _refuses_non_finite(subject: HeadSubject, worst: Worst) -> None:
     head = subject.make()
     for bad in (math.nan, math.inf, -math.inf):
         for column in range(0, head.size, max(1, head.size // 7)):
-            raw = subject.raws(5)
+            raw = subject.raw_parameters(5)
             raw[3, column] = bad
             raw[4] = bad
             try:
@@ -270,7 +274,7 @@ def _refuses_non_finite(subject: HeadSubject, worst: Worst) -> None:
 
 def _repeatable(subject: HeadSubject, worst: Worst) -> None:
     """Check that results are equal for equal seeds, also after calls with other inputs and in training mode."""
-    raw, value = subject.raws(4), subject.values(4)
+    raw, value = subject.raw_parameters(4), subject.values(4)
 
     def compute_results(head: DensityHead) -> dict[str, Tensor]:
         seed(SEED)
@@ -301,7 +305,7 @@ def _rows_apart(subject: HeadSubject, worst: Worst) -> None:
     """
     results = []
     for factor in (1.0, -3.0):
-        head, raw, value = subject.make(), subject.raws(4), subject.values(4)
+        head, raw, value = subject.make(), subject.raw_parameters(4), subject.values(4)
         raw[[0, 1, 3]] *= factor
         with torch.no_grad():
             seed(SEED)
@@ -319,7 +323,7 @@ def _rows_apart(subject: HeadSubject, worst: Worst) -> None:
             seed(SEED)
             results[-1]["loss"] = head.train().loss(raw, value)[2]
     if not subject.draws():
-        head, raw, value = subject.make(), subject.raws(MANY_ROWS), subject.values(MANY_ROWS)
+        head, raw, value = subject.make(), subject.raw_parameters(MANY_ROWS), subject.values(MANY_ROWS)
         with torch.no_grad():
             for start in (0, MANY_ROWS - 3):
                 few = slice(start, start + 3)
@@ -340,7 +344,7 @@ def _rows_apart(subject: HeadSubject, worst: Worst) -> None:
         alone = results[0][name]
         gap = (results[1][name] - alone).abs() > 1e-5 * alone.abs().clamp(min=1)
         worst.count(gap, f"{name} of row 2 when other rows change")
-    raw = subject.raws(4).requires_grad_()
+    raw = subject.raw_parameters(4).requires_grad_()
     subject.make().train().loss(raw, subject.values(4))[2].backward()
     if raw.grad is None:
         worst.record(math.inf, "the loss does not depend on the raw parameters")
@@ -352,7 +356,7 @@ def _rows_apart(subject: HeadSubject, worst: Worst) -> None:
 
 def _round_trip(subject: HeadSubject, worst: Worst) -> None:
     """Check that `calibrate` changes no parameters, and that a new head with the stored state has the same log_prob."""
-    head, raw, value = subject.make(), subject.raws(32), subject.values(32)
+    head, raw, value = subject.make(), subject.raw_parameters(32), subject.values(32)
     before = {name: parameter.clone() for name, parameter in head.named_parameters()}
     with torch.no_grad():
         head.calibrate(raw, value)
@@ -369,7 +373,7 @@ def _round_trip(subject: HeadSubject, worst: Worst) -> None:
 
 def _mixture_of_one(subject: HeadSubject, worst: Worst) -> None:
     """Check that a `Mixture` of one component equals the component to the last bit."""
-    head, raw, value = subject.make(), subject.raws(4), subject.values(4)
+    head, raw, value = subject.make(), subject.raw_parameters(4), subject.values(4)
     with torch.no_grad():
         results = {}
         for number in (1, 2):
@@ -394,7 +398,8 @@ def _knobs(subject: HeadSubject, worst: Worst) -> None:
             setattr(head, name, setting)
             with torch.no_grad():
                 worst.finite(
-                    f"log_prob with {name} = {setting}", head(subject.raws(3)).log_prob(subject.values(3))
+                    f"log_prob with {name} = {setting}",
+                    head(subject.raw_parameters(3)).log_prob(subject.values(3)),
                 )
 
 
@@ -403,7 +408,7 @@ def _finite_anywhere(subject: HeadSubject, worst: Worst) -> None:
     for dtype in (torch.float32, torch.float64):
         head = subject.make().to(dtype)
         for size in (*SIZES, torch.finfo(dtype).max):
-            raw = subject.raws(8).sign().to(dtype) * size
+            raw = subject.raw_parameters(8).sign().to(dtype) * size
             raw[:2], raw[2:4] = size, -size
             value = as_type(subject.values(8), dtype)
             where = f"{str(dtype)[6:]}, raw parameters of size {size:.3g}"
@@ -436,7 +441,7 @@ def _calibrate(subject: HeadSubject, worst: Worst) -> None:
         "draws far from it": 3.0,
     }
     for target_kind, spread in spreads.items():
-        head, raw, value = subject.make(), subject.raws(64), subject.values(64)
+        head, raw, value = subject.make(), subject.raw_parameters(64), subject.values(64)
         if spread is not None and (head.direct or isinstance(head, Fitted)):  # it reads features
             break
         with torch.no_grad():
@@ -462,7 +467,7 @@ def _calibrate_backwards(subject: HeadSubject, worst: Worst) -> None:
     if subject.draws():
         worst.count(False, "log_prob draws random numbers")
         return
-    raw, value = subject.raws(64), subject.values(64)
+    raw, value = subject.raw_parameters(64), subject.values(64)
     if value.is_floating_point() and subject.row.target.kind == "real":
         value[32:] = 2 * value[32:]
     log_probs = []
@@ -475,7 +480,7 @@ def _calibrate_backwards(subject: HeadSubject, worst: Worst) -> None:
     worst.record(gap, "log_prob after calibrate on rows in reverse order")
 
 
-def _all_read(subject: HeadSubject, worst: Worst) -> None:
+def _reads_all_parameters(subject: HeadSubject, worst: Worst) -> None:
     """Check that a change of each raw parameter changes the loss of some target."""
     head, columns = subject.make().double().train(), range(subject.size)
     if head.direct or isinstance(head, Fitted):
@@ -483,7 +488,7 @@ def _all_read(subject: HeadSubject, worst: Worst) -> None:
         return
     unread = set(columns)
     for size in (0.3, 1.0, 3.0):
-        raw, value = (size * subject.raws(8)).double(), as_type(subject.values(8), torch.float64)
+        raw, value = (size * subject.raw_parameters(8)).double(), as_type(subject.values(8), torch.float64)
         with torch.no_grad():
             seed(SEED)
             before = head.loss(raw, value)
@@ -509,7 +514,7 @@ def _loss_in_nats(subject: HeadSubject, worst: Worst) -> None:
     if subject.draws():
         worst.count(False, "log_prob draws random numbers, so the loss may be a bound on it")
         return
-    head, raw = subject.make().double(), subject.raws(6).double()
+    head, raw = subject.make().double(), subject.raw_parameters(6).double()
     with torch.no_grad():
         density = head.eval()(raw)
         seed(SEED)
@@ -542,7 +547,7 @@ def _loss_in_nats(subject: HeadSubject, worst: Worst) -> None:
 def _several_values(subject: HeadSubject, worst: Worst) -> None:
     """Check that log_prob of several values (5, *batch) equals log_prob of each value alone."""
     with torch.no_grad():
-        density, value = subject.make()(subject.raws(4)), subject.values(5, 4)
+        density, value = subject.make()(subject.raw_parameters(4)), subject.values(5, 4)
         together = density.log_prob(value)
         if subject.draws():
             worst.count(False, "log_prob draws random numbers")

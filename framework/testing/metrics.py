@@ -157,14 +157,14 @@ def examine_metric(row: MetricRow, build: Make) -> Iterator[Finding]:
     many, kind = Many(build, row, images=reads), row.target.kind
     checks: dict[str, tuple[float, Callable[[Worst], None]]] = {
         "on the device of its inputs": (0.0, lambda worst: _on_one_device(build, whole, worst)),
-        "named numbers": (0.0, lambda worst: _named(build, whole, worst)),
-        "NaN without samples": (0.0, lambda worst: _nothing(build, whole, worst)),
+        "named numbers": (0.0, lambda worst: _column_names(build, whole, worst)),
+        "NaN without samples": (0.0, lambda worst: _no_samples(build, whole, worst)),
         "batches do not matter": (1e-9, lambda worst: _batches(build, whole, many, worst)),
         "order does not matter": (1e-9, lambda worst: _order(build, whole, many, worst)),
         "states merge": (1e-9, lambda worst: _merge(build, whole, worst)),
         "reset and copy": (0.0, lambda worst: _reset(build, whole, worst)),
         "computing changes nothing": (1e-9, lambda worst: _computed_twice(build, whole, worst)),
-        "predictions are left as they are": (0.0, lambda worst: _untouched(build, whole, worst)),
+        "predictions are left as they are": (0.0, lambda worst: _prediction_unchanged(build, whole, worst)),
         "perfect beats random": (0.0, lambda worst: _perfect(build, row, worst)),
         "standard errors": (math.log(1.3), lambda worst: _standard_errors(build, row, worst)),
     }
@@ -286,7 +286,7 @@ def _on_one_device(build: Make, predict: "Predictions", worst: Worst) -> None:
     check_devices(calls, worst)
 
 
-def _named(build: Make, predict: Predict, worst: Worst) -> None:
+def _column_names(build: Make, predict: Predict, worst: Worst) -> None:
     metric = build()
     numbers = _compute(build, predict, [torch.arange(SAMPLES)])
     worst.count(
@@ -306,7 +306,7 @@ def _named(build: Make, predict: Predict, worst: Worst) -> None:
     )
 
 
-def _nothing(build: Make, predict: Predict, worst: Worst) -> None:
+def _no_samples(build: Make, predict: Predict, worst: Worst) -> None:
     for situation, parts in {"no update": [], "an empty batch": [torch.arange(0)]}.items():
         for key, value in _compute_quietly(build, predict, parts).items():
             worst.count(not value.isnan().item(), f"{situation}: {key} is {value.item():g}")
@@ -445,7 +445,7 @@ def _computed_twice(build: Make, predict: Predict, worst: Worst) -> None:
     check_same("computed again", metric.compute(), expected, worst)
 
 
-def _untouched(build: Make, predict: Predict, worst: Worst) -> None:
+def _prediction_unchanged(build: Make, predict: Predict, worst: Worst) -> None:
     """Check that an update does not change the prediction, since other metrics read the same prediction."""
     metric, index = build(), torch.arange(SAMPLES)
     for split in metric.splits:

@@ -92,7 +92,7 @@ def examine_objective(row: ObjectiveRow, build: Make) -> Iterator[Finding]:
         "gradient": (1e-5, lambda worst: _gradient(build, row, worst)),
         "weight is a factor": (1e-6, lambda worst: _weight(build, row, worst)),
         "same seed, same bits": (0.0, lambda worst: _repeatable(build, row, worst)),
-        "no side effects": (0.0, lambda worst: _traces(build, row, worst)),
+        "no side effects": (0.0, lambda worst: _side_effects(build, row, worst)),
         "order does not matter": (1e-5, lambda worst: _order(build, row, worst)),
         "every sample counts": (0.0, lambda worst: _each_sample(build, row, worst)),
         "a mean over samples": (1e-5, lambda worst: _mean(build, row, worst)),
@@ -250,7 +250,7 @@ def _repeatable(build: Make, row: ObjectiveRow, worst: Worst) -> None:
     worst.same_bits("penalty of two equal objectives", penalties[2], penalties[0])
 
 
-def _traces(build: Make, row: ObjectiveRow, worst: Worst) -> None:
+def _side_effects(build: Make, row: ObjectiveRow, worst: Worst) -> None:
     """Check that a penalty changes no training modes, buffers, parameters, gradients or fields of the batch."""
     for training in (True, False):
         predictor, batch = predictor_of(row), batch_of(row, SAMPLES)

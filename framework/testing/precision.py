@@ -46,7 +46,7 @@ def precision(subject: HeadSubject, worst: Worst) -> None:
     single = subject.make()
     double = copy.deepcopy(single).double()
     for size in (1e-8, 1e-3, 1.0, 10.0, 1e2, 1e3, 1e4, 1e6):
-        raw = size * subject.raws(64)
+        raw = size * subject.raw_parameters(64)
         with torch.no_grad():
             at_mode = seeded(single, raw).mode
         for where, value in (("the mode", at_mode), ("a random value", subject.values(64))):

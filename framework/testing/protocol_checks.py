@@ -45,7 +45,7 @@ draws. Chance exceeds this value once in 10⁶ comparisons.
 """
 
 
-def some_values(density: Distribution, count: int = 6) -> Tensor:
+def draws_and_mode(density: Distribution, count: int = 6) -> Tensor:
     """Return `count` draws and the mode, (count + 1, *batch, *event)."""
     seed(SEED + 3)
     draws = density.sample(torch.Size((count,)))
@@ -64,7 +64,7 @@ def check_estimate(density: Distribution, worst: Worst) -> None:
     If log_prob draws no random numbers, the standard error must be 0 or unknown. If it does, the standard error must be
     at least a fifth of the standard deviation of log_prob over seeds.
     """
-    value = some_values(density)
+    value = draws_and_mode(density)
     expected = seeded_log_prob(density, value)
     seed(SEED)
     stated = estimate(density, value)
@@ -104,12 +104,11 @@ def check_estimate(density: Distribution, worst: Worst) -> None:
 
 
 def check_powers(density: Distribution, worst: Worst) -> None:
-    """Check that tempered(density, T), where known, is proportional to p^(1/T), with the same shapes and dtype."""
-    while isinstance(
-        density, Mixture
-    ):  # the power of a mixture is the mixture of the powers of its components
+    """Check that `tempered_density`, where known, is proportional to p^(1/T), with the same shapes and dtype."""
+    # the power of a mixture is the mixture of the powers of its components
+    while isinstance(density, Mixture):
         density = density.components
-    value = some_values(density)
+    value = draws_and_mode(density)
     log_prob = density.log_prob(value).double()
     for temperature in TEMPERATURES:
         try:
@@ -181,8 +180,8 @@ def compare_draws(density: Distribution, first: Tensor, second: Tensor, worst: W
 
 
 def check_quadratic_bound(density: Distribution, worst: Worst) -> None:
-    """Check that slope(density, value) has the value and gradient of log_prob and is a lower bound elsewhere."""
-    value = some_values(density).requires_grad_()
+    """Check that `quadratic_bound` has the value and gradient of log_prob at a point and is a lower bound elsewhere."""
+    value = draws_and_mode(density).requires_grad_()
     with torch.enable_grad():
         log_prob = density.log_prob(value)
         (gradient,) = torch.autograd.grad(log_prob.sum(), value)
@@ -217,7 +216,7 @@ def check_quadratic_bound(density: Distribution, worst: Worst) -> None:
 
 
 def check_recentre(density: Distribution, worst: Worst) -> None:
-    """Check that about(density, index, place) at d is log_prob at place + d, for densities of one number."""
+    """Check for densities of one number that `recentre(density, index, place)` at d has log_prob of place + d."""
     rows = density.batch_shape[0]
     index = torch.arange(2 * rows + 1) % rows
     width = known_widths(density)
@@ -246,7 +245,7 @@ def known_widths(density: Distribution) -> Tensor:
 def check_normals(density: Distribution, worst: Worst) -> None:
     """Check that `normals` gives log p and that `mahalanobis` is -2 log p plus a constant, if they are known."""
     worst.count(False, "not known")
-    value = some_values(density)
+    value = draws_and_mode(density)
     log_prob = density.log_prob(value).double()
     size = log_prob.abs().clamp(min=1)
     if density.event_shape == (1,) and (known := normals(density)) is not None:
@@ -267,17 +266,17 @@ def check_mode_candidates(density: Distribution, worst: Worst) -> None:
     """Check that `mode_candidates` and `peak_widths` are finite, have the documented shapes, and widths above 0."""
     places = mode_candidates(density)
     shape = (*density.batch_shape, *density.event_shape)
-    worst.same("shape of a peak", tuple(places.shape[1:]), shape)
+    worst.same("shape of a mode candidate", tuple(places.shape[1:]), shape)
     worst.finite("mode_candidates", places)
     if density.event_shape == (1,):
         widths = peak_widths(density)
-        worst.same("shape of the scales", tuple(widths.shape), tuple(places.shape[:-1]))
-        worst.count(~(widths > 0) | widths.isnan(), "a scale not above 0")
+        worst.same("shape of the peak widths", tuple(widths.shape), tuple(places.shape[:-1]))
+        worst.count(~(widths > 0) | widths.isnan(), "a peak width not above 0")
 
 
 def check_marginal_cdfs(density: Distribution, worst: Worst) -> None:
-    """Check that each_cdf is the share of draws below a value, for each number; in standard errors of MANY draws."""
-    value = some_values(density)
+    """Check that `marginal_cdfs` is the share of draws below a value for each number; the unit is a standard error."""
+    value = draws_and_mode(density)
     stated = marginal_cdfs(density, value)
     if stated is None:
         worst.count(False, "not known")

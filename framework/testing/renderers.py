@@ -38,13 +38,13 @@ def examine_renderer(row: RendererRow, build: Make) -> Iterator[Finding]:
         "empty view is background": (0.0, _background),
         "no faces, only background": (0.0, _no_faces),
         "bad triangles are left out": (0.0, _bad_triangles),
-        "lower face wins": (0.0, _ties),
+        "lower face wins": (0.0, _equal_faces),
         "no holes": (0.0, _no_holes),
-        "nearer hides farther": (0.0, _hiding),
+        "nearer hides farther": (0.0, _nearer_surface),
         "sphere: depth, metres": (2e-3, _sphere),
-        "one pixel, one row": (0.0, _small),
-        "drawn at the projected pixel": (0.0, _places),
-        "faces cut by the near plane": (2e-3, _cut),
+        "one pixel, one row": (0.0, _small_images),
+        "drawn at the projected pixel": (0.0, _projected_pixels),
+        "faces cut by the near plane": (2e-3, _near_plane),
         "extreme scenes": (0.0, extremes),
         "colours": (2e-3, colors),
         "visible faces": (0.0, visibility),
@@ -180,7 +180,7 @@ def _check_background(renderer: Renderer, scene: Scene, situation: str, worst: W
             worst.count(value != background[name], f"{name} of a scene, {situation}")
 
 
-def _ties(renderer: Renderer, worst: Worst) -> None:
+def _equal_faces(renderer: Renderer, worst: Worst) -> None:
     """Check that of faces in the same position the one with the lowest index is visible."""
     if "face" not in renderer.channels:
         worst.count(False, "the renderer does not draw face")
@@ -216,7 +216,7 @@ def _no_holes(renderer: Renderer, worst: Worst) -> None:
         worst.count(False, "the renderer draws neither mask nor depth")
 
 
-def _hiding(renderer: Renderer, worst: Worst) -> None:
+def _nearer_surface(renderer: Renderer, worst: Worst) -> None:
     if "face" not in renderer.channels:
         worst.count(False, "the renderer does not draw face")
         return
@@ -258,7 +258,7 @@ def _sphere(renderer: Renderer, worst: Worst) -> None:
     worst.record((depth - true).abs().where(clear, 0), lambda at: f"pixel {at}: {depth[at].item():.6g} m")
 
 
-def _small(renderer: Renderer, worst: Worst) -> None:
+def _small_images(renderer: Renderer, worst: Worst) -> None:
     scene = sphere()
     for height, width in ((1, 1), (1, 64), (64, 1)):
         view = look_from(0.0, 0.0, 0.0, distance=4.0, field_of_view=0.1, size=(height, width))
@@ -273,7 +273,7 @@ def _small(renderer: Renderer, worst: Worst) -> None:
                 worst.finite(f"{name} of {height} × {width}", value)
 
 
-def _places(renderer: Renderer, worst: Worst) -> None:
+def _projected_pixels(renderer: Renderer, worst: Worst) -> None:
     """Check that a triangle inside a pixel is drawn at the pixel and depth that `Camera.project` returns."""
     if "mask" not in renderer.channels:
         worst.count(False, "the renderer does not draw mask")
@@ -307,7 +307,7 @@ def _places(renderer: Renderer, worst: Worst) -> None:
             )
 
 
-def _cut(renderer: Renderer, worst: Worst) -> None:
+def _near_plane(renderer: Renderer, worst: Worst) -> None:
     """Check the relative depth of a floor that extends behind the camera; the renderer may also leave the floor out."""
     if "depth" not in renderer.channels:
         worst.count(False, "the renderer does not draw depth")

@@ -11,7 +11,7 @@ from framework.testing.scenes import SIZE, sphere, square
 
 
 def normal(renderer: Renderer, worst: Worst) -> None:
-    """Check that normals of a fine sphere point away from its centre; the error is 1 - cosine of the angle between."""
+    """Check that normals of a fine sphere point away from its centre; the error is 1 - cosine of their angle."""
     scene = sphere(rings=120)
     rendered = renderer(replace(scene, colors=None), ("normal", "depth"))
     y, x = torch.meshgrid(*[torch.arange(side, dtype=torch.float64) for side in SIZE], indexing="ij")

@@ -101,10 +101,10 @@ def examine_wrapper(
         "number types": (0.0, lambda worst: _number_types(make, row, worst)),
         "same seed, same bits": (0.0, lambda worst: _repeatable(make, row, worst)),
         "batch rows are independent": (1e-5, lambda worst: _rows_apart(make, row, worst)),
-        "no side effects": (0.0, lambda worst: _traces(make, row, worst)),
+        "no side effects": (0.0, lambda worst: _side_effects(make, row, worst)),
         "knobs can be set": (0.0, lambda worst: _knobs(make, row, worst)),
         "loss and its gradient": (0.0, lambda worst: _loss(make, row, worst)),
-        "loss trains all wrapped models": (0.0, lambda worst: _trains(make, row, worst)),
+        "loss trains all wrapped models": (0.0, lambda worst: _loss_improves_models(make, row, worst)),
         "training densities": (1e-5, lambda worst: _training_densities(make, row, worst)),
         "state-dict round trip": (
             0.0,
@@ -306,7 +306,7 @@ def _rows_apart(make: Make, row: WrapperRow, worst: Worst) -> None:
         worst.record(leaf.grad[[0, 1, 3, 4]].abs().max(), "gradient of the loss of row 2 in other inputs")
 
 
-def _traces(make: Make, row: WrapperRow, worst: Worst) -> None:
+def _side_effects(make: Make, row: WrapperRow, worst: Worst) -> None:
     """Check that predictions change no training modes, buffers or parameters, and that calibrate changes no modes."""
     target = values(row.target, (5,))
     for training in (True, False):
@@ -357,7 +357,7 @@ def _loss(make: Make, row: WrapperRow, worst: Worst) -> None:
         worst.finite("gradient", gradient)
 
 
-def _trains(make: Make, row: WrapperRow, worst: Worst) -> None:
+def _loss_improves_models(make: Make, row: WrapperRow, worst: Worst) -> None:
     """Check in evaluation mode that a small step against the gradient of the loss improves every wrapped model."""
     wrapper = make().double()
     features, target = inputs(64).double(), values(row.target, (64,))

@@ -106,7 +106,7 @@ def of_head(name: str, row: HeadRow) -> Subject:
         row, lambda: fit_if_needed(build("density_head", config, target=row.target), row.target)
     )
     encoder = [resolve("encoder", SMALL)] if made.make().backbones else []
-    return Subject(parts(encoder, config), row.target, made.raws(4))
+    return Subject(parts(encoder, config), row.target, made.raw_parameters(4))
 
 
 def of_encoder(name: str, row: EncoderRow) -> Subject:
