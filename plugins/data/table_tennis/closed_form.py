@@ -1,7 +1,7 @@
-"""Landing on a spring and damper in closed form, with 50 digits: the reference for the accuracy of the solvers.
+"""Bouncing on a spring and damper in closed form, with 50 digits: the reference for the accuracy of the solvers.
 
-Without air and friction the height is a parabola in the air, and a damped oscillation about its rest height while the
-table pushes. Each phase ends at a root of its own formula, so nothing is integrated.
+Without air and friction, the height of the ball over time is a parabola in the air, and a damped oscillation while the
+table pushes. Each phase ends at a root of its formula, so nothing is integrated numerically.
 """
 
 from collections.abc import Callable
@@ -14,81 +14,91 @@ from plugins.data.table_tennis.contact import Spring
 
 DIGITS = 50
 Motion = Callable[[Any], tuple[Any, Any]]
-"""Function from seconds since the phase began to height above the touching ball's, and velocity upwards."""
+"""Function from the seconds since a phase began to the height of the ball, 0 where it touches the table, and its upward
+velocity.
+"""
 
 
 def landing(
     height: float, climb: float, times: list[float], constants: Constants, spring: Spring
 ) -> list[float]:
-    """Return heights above the touching ball's, m, at rising times, s, of a ball released above the table at time 0.
+    """Return the heights of a ball that is released above the table at time 0.
+
+    All heights are in metres above the height at which the ball touches the table.
 
     Args:
-        height: height above the touching ball's at time 0, m.
-        climb: velocity upwards at time 0, m/s.
-        times: rising times, s.
-        constants: constants of the ball and the table.
-        spring: frequency and damping of the table.
+        height: Height at time 0.
+        climb: Upward velocity at time 0, m/s.
+        times: Increasing times, s, at which heights are returned.
+        constants: Constants of the ball and the table.
+        spring: Frequency and damping of the table.
     """
     with mpmath.workdps(DIGITS):
         fall, rate, damping = map(mpmath.mpf, (constants.gravity, spring.frequency, spring.damping))
-        found: list[float] = []
-        begin, place, speed = mpmath.mpf(0), mpmath.mpf(height), mpmath.mpf(climb)
+        heights: list[float] = []
+        begin, z, speed = mpmath.mpf(0), mpmath.mpf(height), mpmath.mpf(climb)
         pushed = False
-        while len(found) < len(times):
+        while len(heights) < len(times):
             if pushed:
-                motion = _pressed(place, speed, fall, rate, damping)
-                left = mpmath.mpf(times[-1]) - begin
-                length = _until(lambda t, m=motion: _push(*m(t), rate, damping), 1 / rate, left)
+                motion = _damped_oscillation(z, speed, fall, rate, damping)
+                remaining = mpmath.mpf(times[-1]) - begin
+                length = _first_root(lambda t, m=motion: _push(*m(t), rate, damping), 1 / rate, remaining)
             else:
-                motion = _thrown(place, speed, fall)
-                inside = place < 0
-                whole = (speed + mpmath.sqrt(abs(speed**2 + 2 * fall * place))) / fall
-                length = _out(place, speed, fall, rate, damping) if inside else whole
+                motion = _free_fall(z, speed, fall)
+                inside = z < 0
+                until_landing = (speed + mpmath.sqrt(abs(speed**2 + 2 * fall * z))) / fall
+                length = _end_of_loose(z, speed, fall, rate, damping) if inside else until_landing
             end = mpmath.inf if length is None else begin + length
-            while len(found) < len(times) and mpmath.mpf(times[len(found)]) <= end:
-                found.append(float(motion(mpmath.mpf(times[len(found)]) - begin)[0]))
+            while len(heights) < len(times) and mpmath.mpf(times[len(heights)]) <= end:
+                heights.append(float(motion(mpmath.mpf(times[len(heights)]) - begin)[0]))
             if length is None:
                 break
-            place, speed = motion(length)
+            z, speed = motion(length)
             begin = end
-            if not pushed and abs(place) < mpmath.mpf(10) ** (-DIGITS // 2):
-                place = mpmath.mpf(0)
+            if not pushed and abs(z) < mpmath.mpf(10) ** (-DIGITS // 2):
+                z = mpmath.mpf(0)
                 pushed = speed < 0
             else:
                 pushed = not pushed
-        return found
+        return heights
 
 
-def _thrown(place: Any, speed: Any, fall: Any) -> Motion:
-    return lambda t: (place + speed * t - fall * t**2 / 2, speed - fall * t)
+def _free_fall(z: Any, speed: Any, fall: Any) -> Motion:
+    return lambda t: (z + speed * t - fall * t**2 / 2, speed - fall * t)
 
 
-def _pressed(place: Any, speed: Any, fall: Any, rate: Any, damping: Any) -> Motion:
-    """Return the motion under z'' = -Ω² z - 2 ζ Ω z' - g, about its rest height at -g/Ω²."""
+def _damped_oscillation(z: Any, speed: Any, fall: Any, rate: Any, damping: Any) -> Motion:
+    """Return the motion under z'' = -Ω² z - 2 ζ Ω z' - g, which oscillates about -g/Ω²."""
     rest = -fall / rate**2
-    first = place - rest
+    first = z - rest
 
     def critical(t: Any) -> tuple[Any, Any]:
         slope = speed + rate * first
         size = mpmath.exp(-rate * t)
         return rest + size * (first + slope * t), size * (slope - rate * (first + slope * t))
 
-    def swinging(t: Any) -> tuple[Any, Any]:
-        turn = rate * mpmath.sqrt(1 - damping**2)
-        slope = (speed + damping * rate * first) / turn
-        size, cosine, sine = mpmath.exp(-damping * rate * t), mpmath.cos(turn * t), mpmath.sin(turn * t)
+    def underdamped(t: Any) -> tuple[Any, Any]:
+        frequency = rate * mpmath.sqrt(1 - damping**2)
+        slope = (speed + damping * rate * first) / frequency
+        size, angle = mpmath.exp(-damping * rate * t), frequency * t
+        cosine, sine = mpmath.cos(angle), mpmath.sin(angle)
         swing = first * cosine + slope * sine
-        return rest + size * swing, size * (turn * (slope * cosine - first * sine) - damping * rate * swing)
+        velocity = size * (frequency * (slope * cosine - first * sine) - damping * rate * swing)
+        return rest + size * swing, velocity
 
-    return critical if damping == 1 else swinging
-
-
-def _push(place: Any, speed: Any, rate: Any, damping: Any) -> Any:
-    return -(rate**2) * place - 2 * damping * rate * speed
+    return critical if damping == 1 else underdamped
 
 
-def _until(value: Callable[[Any], Any], scale: Any, longest: Any) -> Any | None:
-    """Return the first time at which a value that starts above 0 falls to 0; None if not by `longest` or 60 scales."""
+def _push(z: Any, speed: Any, rate: Any, damping: Any) -> Any:
+    """Return the upward push of the table per mass, before it is clipped at 0."""
+    return -(rate**2) * z - 2 * damping * rate * speed
+
+
+def _first_root(value: Callable[[Any], Any], scale: Any, longest: Any) -> Any | None:
+    """Return the first time at which a function of time that starts above 0 falls to 0.
+
+    The search takes steps of `scale`/64. The result is None if there is no root within `longest` or within 60 scales.
+    """
     step = scale / 64
     before, number = step / 2**20, 0
     while number < 60 * 64:
@@ -102,13 +112,13 @@ def _until(value: Callable[[Any], Any], scale: Any, longest: Any) -> Any | None:
     return None
 
 
-def _out(place: Any, speed: Any, fall: Any, rate: Any, damping: Any) -> Any:
-    """Return when a ball that is inside the table and not pushed leaves it or is pushed again, whichever is first."""
-    under = speed**2 + 2 * fall * place
-    leaves = (speed - mpmath.sqrt(under)) / fall if under >= 0 else None
-    # Ω² z + 2 ζ Ω z' = 0 along the parabola: a quadratic in t
-    a, b, c = -fall / 2, speed - 2 * damping / rate * fall, place + 2 * damping / rate * speed
+def _end_of_loose(z: Any, speed: Any, fall: Any, rate: Any, damping: Any) -> Any:
+    """Return the time at which a ball that is inside the table and not pushed leaves the table or is pushed again."""
+    discriminant = speed**2 + 2 * fall * z
+    leaves = (speed - mpmath.sqrt(discriminant)) / fall if discriminant >= 0 else None
+    # along the parabola, Ω² z + 2 ζ Ω z' = 0 is a quadratic equation in t
+    a, b, c = -fall / 2, speed - 2 * damping / rate * fall, z + 2 * damping / rate * speed
     root = mpmath.sqrt(b**2 - 4 * a * c)
-    again = (-b - root) / (2 * a)
-    again = again if again > mpmath.mpf(10) ** (-DIGITS // 2) / rate else None
-    return min(one for one in (leaves, again) if one is not None)
+    pushed_again = (-b - root) / (2 * a)
+    pushed_again = pushed_again if pushed_again > mpmath.mpf(10) ** (-DIGITS // 2) / rate else None
+    return min(time for time in (leaves, pushed_again) if time is not None)

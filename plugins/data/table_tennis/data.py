@@ -27,40 +27,41 @@ from plugins.data.table_tennis.recordings import (
     SUFFIXES,
     Flight,
     TimesIn,
-    distinct,
+    count_missing_frames,
+    drop_repeated,
     flights_of,
-    irregular,
-    listed,
-    other_columns,
+    list_files,
+    unread_columns,
 )
-from plugins.data.table_tennis.simulator import Simulation, simulated
+from plugins.data.table_tennis.simulator import Simulation, ensure_simulated
 from plugins.data.table_tennis.windows import Grid, Window, prefix, windows
 
 Share = Annotated[float, Field(gt=0, lt=1, allow_inf_nan=False)]
 
 
 class TableTennis(Data):
-    """Future positions of a ball, predicted from the positions seen so far (thesis §4.2); simulated without a root.
+    """Future positions of a ball, predicted from its observed positions (thesis §4.2); simulated if no root is given.
 
-    An input is `observed` frames of `PARTS`, flattened. The target is the positions at the next `future` multiples of
-    the step, metres, as they were recorded. Batches also hold "truth", shaped like the target: for simulated flights
-    the positions without noise, for recorded ones the target itself; and "flight", the flight's number.
+    An input is the flattened array of the last `observed` frames, with the numbers `PARTS` for each frame. The target
+    is the recorded positions at the next `future` multiples of the step, metres. Batches also hold "flight", the number
+    of the flight, and "truth", with the shape of the target: the positions without noise if the flight was simulated,
+    otherwise the target itself.
 
     All windows of a flight are in one split; a flight that is recorded twice counts once.
 
     Args:
-        root: a folder of flights, or one file: *.csv with the columns t (s), x, y, z (m), or *.mat of the WAM
+        root: A folder of flights, or one file: *.csv with the columns t (s), x, y, z (m), or *.mat of the WAM
             laboratory. None for simulated flights.
-        grid: the frames that are read and predicted.
-        validation: share of the flights for validation, drawn at random.
-        test: share of the flights for the test, drawn at random.
-        data_seed: seed of that draw; it does not depend on the seed of the run.
-        forget: share of the seen frames that are hidden at random from each training window.
-        unreadable: treatment of files that cannot be read: refuse or skip.
-        times_in: the unit of the files' times.
-        writing: how CSV files are written.
-        simulation: settings of the simulated flights.
-        constants: constants of the simulated ball and table.
+        grid: Settings of the frames that are read and predicted.
+        validation: Share of the flights for validation, chosen at random.
+        test: Share of the flights for the test, chosen at random.
+        data_seed: Seed of this choice, independent of the seed of the run.
+        forget: Share of the observed frames that are hidden at random from each training window.
+        unreadable: Treatment of files that cannot be read. "error" refuses them, "skip" leaves them out.
+        times_in: Unit of the times in the files.
+        writing: How CSV files are written.
+        simulation: Settings of the simulated flights.
+        constants: Constants of the simulated ball and table.
     """
 
     bibtex = """@article{gomez2020real,
@@ -105,32 +106,33 @@ class TableTennis(Data):
 
     def prepare(self) -> None:
         if self.root is None:
-            root = simulated(self.simulation, self.constants, self.grid.step)
+            root = ensure_simulated(self.simulation, self.constants, self.grid.step)
         else:
             root = Path(self.root).expanduser()
-        found, left_out = self._found(root)
-        flights, self.repeated = distinct(found)
-        held = [windows(flight, self.grid) for flight in flights]
-        whole = [number for number, windows_of in enumerate(held) if windows_of]
-        self.short = len(flights) - len(whole)
-        if len(whole) < 3:
+        recordings, left_out = self._read_flights(root)
+        flights, self.repeated = drop_repeated(recordings)
+        windows_of = [windows(flight, self.grid) for flight in flights]
+        usable = [number for number, flight_windows in enumerate(windows_of) if flight_windows]
+        self.short = len(flights) - len(usable)
+        if len(usable) < 3:
             raise DataError(
-                f"{root} has {len(flights)} flights, of which {len(whole)} are long enough for {self.grid.least} "
-                f"frames to read and {self.grid.future} to predict without a gap; wanted three or more. Lower "
-                "data.future "
-                "or data.least, or give more flights."
+                f"{root} has {len(flights)} flights, of which {len(usable)} are long enough for {self.grid.least} "
+                f"frames to read and {self.grid.future} to predict without a gap, but at least three such flights are "
+                "required. Lower data.future or data.least, or give more flights."
             )
-        self.lost = sum(irregular(flight, self.grid.step) for flight in flights)
-        order = stream(self.data_seed, "splits").permutation(len(whole))
-        cuts = [max(1, round(share * len(whole))) for share in self.shares]
-        if sum(cuts) >= len(whole):
+        self.lost = sum(count_missing_frames(flight, self.grid.step) for flight in flights)
+        order = stream(self.data_seed, "splits").permutation(len(usable))
+        sizes = [max(1, round(share * len(usable))) for share in self.shares]
+        if sum(sizes) >= len(usable):
             raise DataError(
-                f"data.validation + data.test = {sum(self.shares):g} leaves none of {len(whole)} flights for training; "
-                "lower them."
+                f"data.validation + data.test = {sum(self.shares):g} leaves none of {len(usable)} flights for "
+                "training. Lower these shares."
             )
-        chosen = np.split(order, [len(whole) - sum(cuts), len(whole) - cuts[1]])
+        chosen = np.split(order, [len(usable) - sum(sizes), len(usable) - sizes[1]])
         self._tables = {
-            name: _table([(whole[n], window) for n in sorted(part.tolist()) for window in held[whole[n]]])
+            name: _table(
+                [(usable[n], window) for n in sorted(part.tolist()) for window in windows_of[usable[n]]]
+            )
             for name, part in zip(Splits._fields, chosen, strict=True)
         }
         train = self._tables["train"].fields["target"].double()
@@ -138,32 +140,34 @@ class TableTennis(Data):
         self.target = Target("real", self.grid.names, tuple(train.mean(0).tolist()), tuple(scale.tolist()))
         self.synthetic = read_mark(root) is not None if root.is_dir() else False
         self.skipped = left_out
-        others = shorten(", ".join(self._others))
-        said = (
-            (others, f"left out: the columns {others}"),
+        unread = shorten(", ".join(self._unread_columns))
+        remarks = (
+            (unread, f"left out: the columns {unread}"),
             (self.repeated, f"left out: {self.repeated} repeated flights"),
             (
                 self.short,
                 f"left out: {self.short} flights too short to read {self.grid.least} frames and predict",
             ),
-            (self.lost, f"{self.lost} frames are missing, by the times of the others"),
+            (self.lost, f"{self.lost} frames are missing, according to the times of the other frames"),
         )
-        self.remarks = tuple(remark for counts, remark in said if counts)
+        self.remarks = tuple(remark for applies, remark in remarks if applies)
 
-    def _found(self, root: Path) -> tuple[list[Flight], int]:
+    def _read_flights(self, root: Path) -> tuple[list[Flight], int]:
+        """Return the flights of all files, and the number of files that are left out.
+
+        Keep the names of the columns of the first file that are not read.
+        """
         flights, left_out = [], 0
-        others: list[str] | None = None
-        for file in listed(root):
+        unread: list[str] | None = None
+        for file in list_files(root):
             try:
                 flights += self._flights_of(file)
-                others = (
-                    other_columns(file, self.writing) if others is None else others
-                )  # columns of the first file alone
+                unread = unread_columns(file, self.writing) if unread is None else unread
             except DataError:
                 if self.unreadable == "error":
                     raise
                 left_out += 1
-        self._others = others or []
+        self._unread_columns = unread or []
         return flights, left_out
 
     def _flights_of(self, file: Path) -> list[Flight]:
@@ -173,10 +177,10 @@ class TableTennis(Data):
         return Splits(**self._tables)
 
     def read(self, files: Sequence[Path]) -> Dataset[Batch]:
-        """Return the input at the last frame of each flight; the next frames are predicted from it."""
+        """Return the input at the last frame of each flight, from which the next frames are predicted."""
         if not files:
             raise DataError(
-                "No file was given; wanted a flight as CSV with the columns t, x, y, z, or as *.mat."
+                "No file was given. Give a flight as CSV with the columns t, x, y, z, or as *.mat."
             )
         flights = [flight for file in files for flight in self._flights_of(Path(file))]
         return Fields(
@@ -184,13 +188,14 @@ class TableTennis(Data):
         )
 
     def _last(self, flight: Flight) -> Tensor:
-        found = prefix(flight, len(flight.times) - 1, self.grid)
-        if found is None:
+        """Return the input at the last frame of a flight."""
+        frames = prefix(flight, len(flight.times) - 1, self.grid)
+        if frames is None:
             raise DataError(
                 f"{flight.name} has fewer than {self.grid.least} frames in its last "
-                f"{self.grid.observed * self.grid.step:g} s; wanted as many, to predict from. Give a longer recording."
+                f"{self.grid.observed * self.grid.step:g} s, which is too few to predict from. Give a longer recording."
             )
-        return torch.from_numpy(found).float()
+        return torch.from_numpy(frames).float()
 
     def inputs(self, user_data: Any) -> Tensor:
         """Return inputs from files, from one flight as an array (frame, 4) of t, x, y, z, or from ready inputs."""
@@ -207,9 +212,9 @@ class TableTennis(Data):
         if not self.forget:
             return batch
         inputs = batch["input"].unflatten(-1, (self.grid.observed, len(PARTS)))
-        kept = torch.rand(inputs.shape[:2]).to(inputs.device) >= self.forget
-        kept[:, -1] = True
-        return {**batch, "input": (inputs * kept[..., None]).flatten(1)}
+        visible = torch.rand(inputs.shape[:2]).to(inputs.device) >= self.forget
+        visible[:, -1] = True
+        return {**batch, "input": (inputs * visible[..., None]).flatten(1)}
 
     def fingerprint(self) -> Mapping[str, str]:
         digest = hashlib.sha256()
@@ -231,15 +236,17 @@ class TableTennis(Data):
         return side_view(inputs.unflatten(-1, (self.grid.observed, len(PARTS))).detach().cpu().numpy())
 
 
-def _table(held: Sequence[tuple[int, Window]]) -> Fields:
-    single = [
-        torch.from_numpy(np.stack(part)).float() for part in list(zip(*(w for _, w in held), strict=True))[:3]
-    ]
+def _table(samples: Sequence[tuple[int, Window]]) -> Fields:
+    """Return the samples of a split from windows, each with the number of its flight."""
+    inputs, target, truth = (
+        torch.from_numpy(np.stack(part)).float()
+        for part in list(zip(*(window for _, window in samples), strict=True))[:3]
+    )
     return Fields(
-        input=single[0],
-        target=single[1],
-        truth=single[2],
-        group=torch.zeros(len(held), dtype=torch.int64),
-        flight=torch.tensor([flight for flight, _ in held]),
-        index=torch.arange(len(held)),
+        input=inputs,
+        target=target,
+        truth=truth,
+        group=torch.zeros(len(samples), dtype=torch.int64),
+        flight=torch.tensor([flight for flight, _ in samples]),
+        index=torch.arange(len(samples)),
     )

@@ -1,4 +1,4 @@
-"""Rows of the contract: a few simulated flights, a folder of a user's own, and the laboratory's layout."""
+"""Contract-test cases: a few simulated flights, a folder of a user's own, and the laboratory's layout."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -12,7 +12,7 @@ SMALL = {"flights": 12, "observed": 6, "future": 4, "least": 4, "stride": 20}
 
 
 def table(number: int, frames: int = 40) -> np.ndarray:
-    """Return t, x, y, z of a ball whose start depends on the number."""
+    """Return t, x, y, z (frame, 4) of a ball whose start depends on the number."""
     t = 0.016 * np.arange(frames)
     return np.column_stack([t, 0.1 * number + 0.5 * t, -4 + 5 * t, -0.6 + 1.5 * t - 4.9 * t**2])
 
@@ -23,36 +23,36 @@ def write_csv(file: Path, rows: np.ndarray) -> Path:
     return file
 
 
-def folder(place: Path) -> Mapping[str, str]:
-    """Write eight flights, and one of them again, cut short."""
+def write_csv_folder(folder: Path) -> Mapping[str, str]:
+    """Write eight flights as CSV, and a shorter recording of one of them."""
     for number in range(8):
-        write_csv(place / f"{number}.csv", table(number))
-    write_csv(place / "again.csv", table(3)[:30])
-    return {"root": str(place)}
+        write_csv(folder / f"{number}.csv", table(number))
+    write_csv(folder / "again.csv", table(3)[:30])
+    return {"root": str(folder)}
 
 
-def matlab(place: Path) -> Mapping[str, str]:
-    """Write the laboratory's two layouts side by side, with two flights in both."""
+def write_matlab(folder: Path) -> Mapping[str, str]:
+    """Write one file in each of the laboratory's two layouts, with two flights in both files."""
     cells, times, balls = (np.empty(count, object) for count in (6, 4, 4))
     for number in range(6):
         cells[number] = table(number, 36)
     for number in range(4):
         whole = table(number + 4, 50)
         times[number], balls[number] = whole[:, 0], whole[:, 1:]
-    savemat(place / "ballTrain.mat", {"ballTrain": {"data": cells, "error": np.zeros(6)}})
-    savemat(place / "knn.mat", {"time": times, "ball": balls})
-    return {"root": str(place)}
+    savemat(folder / "ballTrain.mat", {"ballTrain": {"data": cells, "error": np.zeros(6)}})
+    savemat(folder / "knn.mat", {"time": times, "ball": balls})
+    return {"root": str(folder)}
 
 
-def files(place: Path) -> Sequence[Path]:
-    """Write three flights that a model is asked about."""
-    return [write_csv(place / f"{number}.csv", table(number + 20, 13 + number)) for number in range(3)]
+def files(folder: Path) -> Sequence[Path]:
+    """Write three flights for prediction."""
+    return [write_csv(folder / f"{number}.csv", table(number + 20, 13 + number)) for number in range(3)]
 
 
-SEEN: tuple[Damage, ...] = ("empty", "garbage", "folder")
+DETECTED: tuple[Damage, ...] = ("empty", "garbage", "folder")
 """Kinds of damage that the data set detects.
 
-It cannot detect a missing file, which makes a smaller set, or half a flight, which is a shorter one.
+It cannot detect a missing file, because the set without it is valid, or a file cut in half, which is a shorter flight.
 """
 ROWS = {
     "table_tennis": (
@@ -66,15 +66,19 @@ ROWS = {
         DataRow(
             "a folder of one's own",
             {**SMALL, "stride": 50, "forget": 0.2},
-            write=folder,
+            write=write_csv_folder,
             synthetic=False,
             files=files,
-            fragile={"*.csv": SEEN},
+            fragile={"*.csv": DETECTED},
             skip={"unreadable": "skip"},
             changes={"data_seed": 1, "stride": 8},
         ),
         DataRow(
-            "of the laboratory", SMALL, write=matlab, synthetic=False, fragile={"ball*.mat": (*SEEN, "cut")}
+            "of the laboratory",
+            SMALL,
+            write=write_matlab,
+            synthetic=False,
+            fragile={"ball*.mat": (*DETECTED, "cut")},
         ),
     ),
 }

@@ -1,4 +1,4 @@
-"""Windows of a flight: the frames until now, which a model reads, and the positions at fixed later times."""
+"""Windows of a flight: the frames up to a moment, which a model reads, and the positions at fixed later times."""
 
 from dataclasses import dataclass
 from typing import Annotated, NamedTuple
@@ -13,18 +13,18 @@ from plugins.data.table_tennis.recordings import Flight
 
 @dataclass(frozen=True, kw_only=True)
 class Grid:
-    """Frames of a flight that are read and predicted.
+    """Settings of the frames of a flight that are read and predicted.
 
     Attributes:
-        observed: largest number of frames that are read; earlier ones are dropped.
-        future: number of frames that are predicted.
-        least: number of frames that must be present among those that are read.
-        stride: frames from one window of a flight to the next.
-        step: seconds from frame to frame.
-        gap: longest time between two frames, seconds, across which a position to predict may be interpolated; a window
-            with a wider gap in its future is left out.
-        outlier: distance, metres, from the position that its neighbours suggest, beyond which a frame is not used as a
-            target. It is still read.
+        observed: Largest number of frames that are read; earlier frames are not read.
+        future: Number of frames that are predicted.
+        least: Smallest number of frames that must be present among those that are read.
+        stride: Number of frames from one window of a flight to the next.
+        step: Seconds from frame to frame.
+        gap: Largest time between two frames, seconds, across which a target is interpolated; a window with a wider gap
+            in its future is left out.
+        outlier: Distance, metres, between a frame and the position that its neighbours suggest, above which the frame
+            is not used as a target. It is still read.
     """
 
     observed: Annotated[int, Field(ge=3, le=1000)] = 20
@@ -42,7 +42,14 @@ class Grid:
 
 
 class Window(NamedTuple):
-    """One sample: input (observed × 5,), target and target without noise (future × 3,), and its frame in the flight."""
+    """One sample.
+
+    Attributes:
+        inputs: The input, (observed × 5,).
+        target: The target, (future × 3,).
+        truth: The target without noise, (future × 3,).
+        frame: Index of the last frame that is read.
+    """
 
     inputs: Float[np.ndarray, "number"]
     target: Float[np.ndarray, "number"]
@@ -51,71 +58,82 @@ class Window(NamedTuple):
 
 
 def prefix(flight: Flight, now: int, grid: Grid) -> Float[np.ndarray, "number"] | None:
-    """Return the input at frame `now`; None where fewer frames than `least` are present.
+    """Return the input at frame `now`; None if fewer than `least` frames are present.
 
-    Each frame is put at the nearest multiple of `step` before now. If two frames have the same place, the nearer one
-    takes it.
+    Each frame is assigned to the nearest multiple of `step` before frame `now`. If two frames are assigned to the same
+    multiple, the nearer frame is used.
     """
     since = flight.times[: now + 1] - flight.times[now]
-    place = np.rint(since / grid.step).astype(int)
-    near = np.abs(since - place * grid.step)
-    read = np.zeros((grid.observed, len(PARTS)))
-    for frame in np.argsort(-near, kind="stable"):
-        slot = grid.observed - 1 + place[frame]
+    steps = np.rint(since / grid.step).astype(int)
+    distance = np.abs(since - steps * grid.step)
+    frames = np.zeros((grid.observed, len(PARTS)))
+    for frame in np.argsort(-distance, kind="stable"):
+        slot = grid.observed - 1 + steps[frame]
         if slot >= 0:
-            read[slot] = [since[frame], *flight.places[frame], 1]
-    return read.ravel() if read[:, -1].sum() >= grid.least else None
+            frames[slot] = [since[frame], *flight.places[frame], 1]
+    return frames.ravel() if frames[:, -1].sum() >= grid.least else None
 
 
 def windows(flight: Flight, grid: Grid) -> list[Window]:
-    """Return the windows of a flight, every `stride` frames; an empty list for a flight that is too short."""
-    good = believed(flight, grid.outlier)
-    times, places = flight.times[good], flight.places[good]
-    truth = places if flight.truth is None else flight.truth[good]
-    found = []
+    """Return the windows of a flight, one every `stride` frames; an empty list if the flight is too short."""
+    good = is_no_outlier(flight, grid.outlier)
+    times, positions = flight.times[good], flight.places[good]
+    truth = positions if flight.truth is None else flight.truth[good]
+    result = []
     for now in range(grid.least - 1, len(flight.times), grid.stride):
         inputs = prefix(flight, now, grid)
-        asked = flight.times[now] + grid.step * np.arange(1, grid.future + 1)
-        after = np.searchsorted(times, asked)
+        target_times = flight.times[now] + grid.step * np.arange(1, grid.future + 1)
+        after = np.searchsorted(times, target_times)
         if inputs is None or after[-1] >= len(times) or after[0] == 0:
             continue
         if (times[after] - times[after - 1]).max() > grid.gap:
             continue
-        target, exact = (between(times, some, asked, after).ravel() for some in (places, truth))
-        found.append(Window(inputs, target, exact, now))
-    return found
+        target, exact = (
+            interpolate(times, values, target_times, after).ravel() for values in (positions, truth)
+        )
+        result.append(Window(inputs, target, exact, now))
+    return result
 
 
-def between(
+def interpolate(
     times: Float[np.ndarray, "frame"],
-    places: Float[np.ndarray, "frame 3"],
-    asked: Float[np.ndarray, "time"],
+    positions: Float[np.ndarray, "frame 3"],
+    target_times: Float[np.ndarray, "time"],
     after: np.ndarray,
 ) -> Float[np.ndarray, "time 3"]:
-    """Return the places at the requested times: linear between two frames, and in z on the parabola of a free fall."""
+    """Return the positions at the target times, from the frames before and after each.
+
+    x and y are interpolated linearly; z follows the parabola of a free fall.
+
+    Args:
+        times: Times of the frames, s.
+        positions: Positions of the frames, m.
+        target_times: Target times, s.
+        after: Index of the first frame at or after each target time.
+    """
     left, right = times[after - 1], times[after]
-    share = ((asked - left) / (right - left))[:, None]
-    found = (1 - share) * places[after - 1] + share * places[after]
-    found[:, 2] += GRAVITY / 2 * (asked - left) * (right - asked)
-    return found
+    share = ((target_times - left) / (right - left))[:, None]
+    interpolated = (1 - share) * positions[after - 1] + share * positions[after]
+    interpolated[:, 2] += GRAVITY / 2 * (target_times - left) * (right - target_times)
+    return interpolated
 
 
-def believed(flight: Flight, farthest: float) -> Bool[np.ndarray, "frame"]:
+def is_no_outlier(flight: Flight, farthest: float) -> Bool[np.ndarray, "frame"]:
     """Return a mask of the frames that are not outliers.
 
     While a frame is farther than `farthest` metres from the position that its neighbours suggest, the worst frame is
-    removed. The first and the last frame have only one neighbour and stay.
+    removed. The first and the last frame have only one neighbour and are never removed.
     """
-    kept = np.arange(len(flight.times))
-    while len(kept) > 2:
-        times, places = flight.times[kept], flight.places[kept]
+    remaining = np.arange(len(flight.times))
+    while len(remaining) > 2:
+        times, positions = flight.times[remaining], flight.places[remaining]
         share = ((times[1:-1] - times[:-2]) / (times[2:] - times[:-2]))[:, None]
-        straight = (1 - share) * places[:-2] + share * places[2:]
-        straight[:, 2] += GRAVITY / 2 * (times[1:-1] - times[:-2]) * (times[2:] - times[1:-1])
-        apart = np.linalg.norm(places[1:-1] - straight, axis=1)
-        if apart.max() <= farthest:
+        expected = (1 - share) * positions[:-2] + share * positions[2:]
+        expected[:, 2] += GRAVITY / 2 * (times[1:-1] - times[:-2]) * (times[2:] - times[1:-1])
+        distance = np.linalg.norm(positions[1:-1] - expected, axis=1)
+        if distance.max() <= farthest:
             break
-        kept = np.delete(kept, int(apart.argmax()) + 1)
-    good = np.zeros(len(flight.times), bool)
-    good[kept] = True
-    return good
+        remaining = np.delete(remaining, int(distance.argmax()) + 1)
+    mask = np.zeros(len(flight.times), bool)
+    mask[remaining] = True
+    return mask
