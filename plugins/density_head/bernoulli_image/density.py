@@ -25,8 +25,8 @@ from framework.geometry.srgb import linear_from_srgb
 class BernoulliImage(Distribution):
     """Independent numbers of an image, each 1 with its own probability and otherwise 0.
 
-    log p is y log σ(r) + (1 - y) log σ(-r). A value y between 0 and 1 is the share of a pixel that is 1, and log p the
-    mean over its parts; values beyond are clamped.
+    log p is y log σ(r) + (1 - y) log σ(-r). A value y between 0 and 1 is read as the share of the pixel that is 1;
+    log p is then the mean over the parts of the pixel. Values outside [0, 1] are clamped.
 
     Args:
         logits: r, (*batch, height, width, number), log-odds of 1.
@@ -107,12 +107,12 @@ def _(density: BernoulliImage, temperature: Tensor) -> BernoulliImage:
 
 @images.register
 def _(density: BernoulliImage, channels: Collection[str]) -> dict[str, Tensor]:
-    """Return the probabilities in linear RGB as "color"; as "mask" the pixels whose number is at least as likely 1."""
+    """Return the channels "color", the probabilities in linear RGB, and "mask", true where 1 is at least as likely."""
     if (
         not channels
         or not set(channels) <= {"color", "mask"}
         or ("mask" in channels and density.event_shape[-1] > 1)
     ):
         return images.dispatch(Distribution)(density, channels)
-    drawn = {"color": lambda: linear_from_srgb(density.mean), "mask": lambda: density.logits[..., 0] >= 0}
-    return {name: drawn[name]() for name in channels}
+    compute = {"color": lambda: linear_from_srgb(density.mean), "mask": lambda: density.logits[..., 0] >= 0}
+    return {name: compute[name]() for name in channels}

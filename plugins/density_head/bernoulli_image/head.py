@@ -16,33 +16,28 @@ from framework.target import Target
 from plugins.density_head.bernoulli_image.density import BernoulliImage
 
 SMALLEST = 1e-3
-"""Smallest probability; the largest is 1 less this.
+"""Smallest probability; the largest is 1 - SMALLEST.
 
-An error therefore costs at most 7 nats a number, before calibration. A step of 8 bits is 4e-3: smaller probabilities
-carry no information about an image.
+A wrong number therefore costs at most 7 nats before calibration. A step of an 8-bit image is 4e-3, so that smaller
+probabilities carry no information about an image.
 """
 LEAST, MOST, ROUNDS = 1e-2, 1e2, 60
-"""Bounds on the factor of log-odds, and number of halvings of the interval in which it is searched."""
+"""Bounds on the calibrated factor of the log-odds, and number of bisections by which the factor is found."""
 
 
 class BernoulliImageHead(DensityHead):
     """Bernoulli densities over the numbers of an image (`BernoulliImage`), read from an image on white ground.
 
-    Features are (channel, height, width), one channel for each of the target's. 1 is the white of the empty ground,
-    where the number is certainly 0; 0 is black, where it is certainly 1; values beyond are clamped. The loss is the
-    cross-entropy in nats per number, so that it does not grow with the image. One factor of all log-odds is fitted to
-    the validation split (Guo et al. 2017, its inverse).
+    Features are (channel, height, width), with one channel for each channel of the target. A feature of 1 is the white
+    of the background, where the number is almost certainly 0; a feature of 0 is black, where the number is almost
+    certainly 1. Features outside [0, 1] are clamped. The loss is the cross-entropy in nats per number, so that it does
+    not grow with the size of the image. One factor on all log-odds, an inverse temperature (Guo et al. 2017), is fitted
+    to the validation split.
     """
 
     knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
     direct: ClassVar[bool] = True
-    bibtex = """@inproceedings{guo2017calibration,
-  author    = {Guo, Chuan and Pleiss, Geoff and Sun, Yu and Weinberger, Kilian Q.},
-  title     = {On Calibration of Modern Neural Networks},
-  booktitle = {International Conference on Machine Learning},
-  pages     = {1321--1330},
-  year      = {2017}
-}"""
+    bibtex = "guo2017calibration"
 
     factor: Tensor
 
@@ -69,7 +64,9 @@ class BernoulliImageHead(DensityHead):
         """Fit the factor of log-odds by maximum likelihood."""
         # the log-likelihood is concave in the factor, so that its derivative has a single zero
         if len(raw) == 0:
-            raise ValueError("the factor of log-odds is fitted to validation data, but got none of it.")
+            raise ValueError(
+                "the factor of the log-odds is fitted to the validation split, but got no sample of this split."
+            )
         low, high = math.log(LEAST), math.log(MOST)
         for _ in range(ROUNDS):
             middle = (low + high) / 2
@@ -77,15 +74,15 @@ class BernoulliImageHead(DensityHead):
             low, high = (middle, high) if rising else (low, middle)
         self.factor.fill_(math.exp((low + high) / 2))
 
-    def _slope(self, raw: Tensor, target: Tensor, factor: float) -> float:
+    def _slope(self, raws: Tensor, target: Tensor, factor: float) -> float:
         """Return the derivative of the log-likelihood in the factor f, Σ r (y - σ(f r)), computed image by image."""
         total = 0.0
-        for one, value in zip(raw, target, strict=True):
-            logits = self._logits(one).double()
+        for raw, value in zip(raws, target, strict=True):
+            logits = self._logits(raw).double()
             total += float((logits * (value.double().clamp(0, 1) - (factor * logits).sigmoid())).sum())
         return total
 
     def _logits(self, raw: Float[Tensor, "*batch size"]) -> Float[Tensor, "*batch height width number"]:
         image = require_finite(raw, self.size).unflatten(-1, self.shape).movedim(-3, -1)
-        # log((1 - w) / w) of white w; in float64, since near 1 a float32 has too few digits of 1 - w
+        # log((1 - w) / w) for the feature w, in float64, because near 1 a float32 has too few digits of 1 - w
         return -hardtanh(image.double(), SMALLEST, 1 - SMALLEST).logit().to(image.dtype)

@@ -1,4 +1,4 @@
-"""Rows of the contract: images of few pixels, with log-densities from 50 digits."""
+"""Contract-test cases: images of few pixels, with log-densities from a 50-digit reference."""
 
 from collections.abc import Iterator
 
@@ -14,24 +14,24 @@ PARTS = Target("image", ("skin", "cloth"), size=(1, 2))
 WHITE = (-1e30, 0.0, 1e-7, 0.0625, 0.25, 0.5, 0.875, 0.9990234375, 1.0, 3.0)
 
 
-def bernoulli(head: DensityHead) -> Iterator[Case]:
-    """Yield cases with Σ log w where the number is 0, Σ log(1 - w) where it is 1, and white w within its bounds."""
-    for given in WHITE:
-        raw = torch.full((2, head.size), given, dtype=torch.float64)
+def bernoulli_cases(head: DensityHead) -> Iterator[Case]:
+    """Yield cases of log p = Σ log w for numbers of 0 and Σ log(1 - w) for numbers of 1, with the feature w clamped."""
+    for white in WHITE:
+        raw = torch.full((2, head.size), white, dtype=torch.float64)
         with mpmath.workdps(50):
-            white = min(max(mpmath.mpf(given), mpmath.mpf(1e-3)), mpmath.mpf(1 - 1e-3))
-            log_prob = [float(head.size * mpmath.log(part)) for part in (white, 1 - white)]
+            bounded_white = min(max(mpmath.mpf(white), mpmath.mpf(1e-3)), mpmath.mpf(1 - 1e-3))
+            log_prob = [float(head.size * mpmath.log(part)) for part in (bounded_white, 1 - bounded_white)]
         shape = (2, 3, 1) if head.size == 6 else (1, 2, 2)
         value = torch.tensor([0.0, 1.0]).double().reshape(2, 1, 1, 1).expand(2, *shape)
-        yield Case(f"w = {given:g}", raw, value, torch.tensor(log_prob, dtype=torch.float64))
+        yield Case(f"w = {white:g}", raw, value, torch.tensor(log_prob, dtype=torch.float64))
 
 
 DISCRETE = {
-    "integral by draws": "it is over 0 and 1 and no density over reals; test_bernoulli_image.py sums it"
+    "integral by draws": "the density is over 0 and 1, not over reals; test_bernoulli_image.py sums the probabilities"
 }
 ROWS = {
     "bernoulli_image": (
-        HeadRow("a silhouette", SILHOUETTE, cases=bernoulli, leave_out=DISCRETE),
-        HeadRow("two parts", PARTS, cases=bernoulli, leave_out=DISCRETE),
+        HeadRow("a silhouette", SILHOUETTE, cases=bernoulli_cases, leave_out=DISCRETE),
+        HeadRow("two parts", PARTS, cases=bernoulli_cases, leave_out=DISCRETE),
     )
 }

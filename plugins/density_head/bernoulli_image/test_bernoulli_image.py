@@ -30,9 +30,9 @@ def test_it_is_torchs_bernoulli_of_every_number() -> None:
     torch.testing.assert_close(ours.mean, theirs.mean)
     torch.testing.assert_close(ours.variance, theirs.variance)
     assert torch.equal(ours.mode, theirs.mode) and torch.equal(median(ours, 1), theirs.mode)
-    drawn = ours.sample(torch.Size((20_000,)))
-    assert set(drawn.unique().tolist()) == {0.0, 1.0}
-    torch.testing.assert_close(drawn.mean(0), ours.mean, atol=0.02, rtol=0)
+    samples = ours.sample(torch.Size((20_000,)))
+    assert set(samples.unique().tolist()) == {0.0, 1.0}
+    torch.testing.assert_close(samples.mean(0), ours.mean, atol=0.02, rtol=0)
     # a quarter of a pixel counts for a quarter
     half = ours.log_prob(torch.full((4, 5, 2), 0.25).double())
     parts = [ours.log_prob(torch.full((4, 5, 2), number).double()) for number in (1.0, 0.0)]
@@ -42,10 +42,10 @@ def test_it_is_torchs_bernoulli_of_every_number() -> None:
 @pytest.mark.parametrize("size", [0.0, 1e-12, 1.0, 40.0, 800.0, 1e30])
 def test_entropy_and_log_prob_are_finite_and_right_however_sure(size: float) -> None:
     for sign in (-1.0, 1.0):
-        one = BernoulliImage(torch.full((1, 1, 1), sign * size).double())
-        both = torch.stack([one.log_prob(torch.full((1, 1, 1), number).double()) for number in (0.0, 1.0)])
+        pixel = BernoulliImage(torch.full((1, 1, 1), sign * size).double())
+        both = torch.stack([pixel.log_prob(torch.full((1, 1, 1), number).double()) for number in (0.0, 1.0)])
         assert both.isfinite().all() and both.exp().sum() == pytest.approx(1.0, abs=1e-15)
-        assert float(one.entropy()) == pytest.approx(float(-(both.exp() * both).sum()), abs=1e-12)
+        assert float(pixel.entropy()) == pytest.approx(float(-(both.exp() * both).sum()), abs=1e-12)
 
 
 def test_members_tempering_and_picking_keep_the_shape_of_an_image() -> None:
@@ -57,18 +57,20 @@ def test_members_tempering_and_picking_keep_the_shape_of_an_image() -> None:
     chosen = pick(members, torch.tensor([2, 0]))
     assert torch.equal(chosen.logits, torch.stack([members.logits[0, 2], members.logits[1, 0]]))
     hot = temper(members, torch.tensor(2.0).double())
-    one, other = value.unsqueeze(1), 1 - value.unsqueeze(1)
-    odds = hot.log_prob(one) - hot.log_prob(other)
-    torch.testing.assert_close(odds, (members.log_prob(one) - members.log_prob(other)) / 2)
+    image, inverted = value.unsqueeze(1), 1 - value.unsqueeze(1)
+    odds = hot.log_prob(image) - hot.log_prob(inverted)
+    torch.testing.assert_close(odds, (members.log_prob(image) - members.log_prob(inverted)) / 2)
 
 
 def test_a_mask_is_what_is_rather_there_and_the_colour_the_light_of_its_share() -> None:
-    one = density(2)
-    drawn = images(one, {"color", "mask"})
-    assert drawn["mask"].dtype == torch.bool and torch.equal(drawn["mask"], one.mean[..., 0] >= 0.5)
-    torch.testing.assert_close(drawn["color"], linear_from_srgb(one.mean))
-    for density_, channels in ((one, {"depth"}), (density(2, numbers=3), {"mask"})):
-        with pytest.raises(UserError, match="draws no"):
+    silhouettes = density(2)
+    channel_images = images(silhouettes, {"color", "mask"})
+    assert channel_images["mask"].dtype == torch.bool and torch.equal(
+        channel_images["mask"], silhouettes.mean[..., 0] >= 0.5
+    )
+    torch.testing.assert_close(channel_images["color"], linear_from_srgb(silhouettes.mean))
+    for density_, channels in ((silhouettes, {"depth"}), (density(2, numbers=3), {"mask"})):
+        with pytest.raises(UserError, match="provides no"):
             images(density_, channels)
 
 
@@ -91,5 +93,5 @@ def test_the_loss_is_the_cross_entropy_a_number_and_calibration_finds_the_likeli
         losses[factor] = -float(head(raw).log_prob(target).double().mean())
     assert min(losses, key=losses.__getitem__) == fitted and fitted == pytest.approx(0.4, abs=0.1)
     torch.testing.assert_close(head.loss(raw, target), wanted.float())  # independent of the calibration
-    with pytest.raises(ValueError, match="got none of it"):
+    with pytest.raises(ValueError, match="got no sample"):
         head.calibrate(raw[:0], target[:0])

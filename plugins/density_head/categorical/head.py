@@ -19,13 +19,7 @@ class CategoricalHead(DensityHead):
     """Class probabilities by softmax; trains by cross-entropy."""
 
     knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
-    bibtex = """@incollection{bridle1990probabilistic,
-  title = {Probabilistic Interpretation of Feedforward Classification Network Outputs, with Relationships to Statistical Pattern Recognition},
-  author = {Bridle, John S.},
-  booktitle = {Neurocomputing},
-  publisher = {Springer},
-  year = {1990}
-}"""  # noqa: E501
+    bibtex = "bridle1990probabilistic"  # noqa: E501
 
     def __init__(self, target: Target) -> None:
         super().__init__()
@@ -41,22 +35,14 @@ class BernoulliHead(DensityHead):
     """Two classes by a logistic (thesis eq. 2.9-2.11); trains by binary cross-entropy."""
 
     knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
-    bibtex = """@article{cox1958regression,
-  title = {The Regression Analysis of Binary Sequences},
-  author = {Cox, David R.},
-  journal = {Journal of the Royal Statistical Society: Series B},
-  volume = {20},
-  number = {2},
-  pages = {215--242},
-  year = {1958}
-}"""
+    bibtex = "cox1958regression"
 
     def __init__(self, target: Target) -> None:
         super().__init__()
         target.require("class", by="density_head bernoulli")
         if len(target.names) != 2:
             raise ConfigError(
-                f"density_head bernoulli describes two classes; this data set has {len(target.names)}: "
+                f"density_head bernoulli describes exactly two classes, but this data set has {len(target.names)}: "
                 f"{target.listed_names}. Choose density_head=categorical."
             )
         self.size = 1
@@ -71,5 +57,5 @@ class BernoulliHead(DensityHead):
 def classes(logits: Float[Tensor, "*batch label"]) -> Categorical:
     """Return the density of the classes by softmax of the logits, clamped so that their differences do not overflow."""
     most = torch.finfo(logits.dtype).max / 4
-    # Normalised here with the largest logit subtracted first: torch's own normalisation loses digits of large logits.
+    # log_softmax subtracts the largest logit first; torch's Categorical does not, and loses digits of large logits.
     return CategoricalDensity(logits=logits.clamp(-most, most).log_softmax(-1), validate_args=False)

@@ -1,4 +1,4 @@
-"""Rows of the contract: class probabilities, with log-probabilities from 50 digits."""
+"""Contract-test cases: class probabilities, with log-probabilities from a 50-digit reference."""
 
 from collections.abc import Iterator
 
@@ -15,15 +15,18 @@ LOGITS = ((0.0, 0.0), (1e-8, 0.0), (3.0, -2.0), (50.0, -50.0), (1e4, -1e4), (-1e
 
 
 def exact(logits: list[float], label: int) -> float:
-    """Return l_k - log Σ exp l_j, less the largest logit: 50 digits are too few if exponents differ by thousands."""
+    """Return the log-probability l_k - log Σ_j exp l_j of class `label`, computed with 50 digits.
+
+    The largest logit is subtracted first, since 50 digits are too few for exponents that differ by thousands.
+    """
     with mpmath.workdps(50):
         largest = max(logits)
         total = mpmath.fsum(mpmath.e ** (mpmath.mpf(logit) - largest) for logit in logits)
         return float(mpmath.mpf(logits[label]) - largest - mpmath.log(total))
 
 
-def softmax(head: DensityHead) -> Iterator[Case]:
-    """Yield cases with two logits that differ; the others equal the second."""
+def softmax_cases(head: DensityHead) -> Iterator[Case]:
+    """Yield cases in which the first logit differs from all others."""
     for first, second in LOGITS:
         raw = torch.tensor([first] + [second] * (head.size - 1), dtype=torch.float32).double()
         value = torch.arange(head.size)
@@ -33,8 +36,8 @@ def softmax(head: DensityHead) -> Iterator[Case]:
         yield Case(f"logits {first:g}, {second:g}", raw.expand(head.size, -1), value, log_prob)
 
 
-def logistic(head: DensityHead) -> Iterator[Case]:
-    """Yield cases with -log(1 + exp(∓r)) (eq. 2.10-2.11)."""
+def logistic_cases(head: DensityHead) -> Iterator[Case]:
+    """Yield cases of the log-probabilities -log(1 + exp(∓r)) of the two classes (eq. 2.10-2.11)."""
     for raw in (0.0, 1e-8, -2.0, 40.0, -700.0, 1e4, 1e30):
         number = torch.tensor(raw, dtype=torch.float32).double()
         log_prob = [exact([0.0, number.item()], label) for label in (0, 1)]
@@ -43,6 +46,9 @@ def logistic(head: DensityHead) -> Iterator[Case]:
 
 
 ROWS = {
-    "categorical": (HeadRow("five classes", FIVE, cases=softmax), HeadRow("two classes", TWO, cases=softmax)),
-    "bernoulli": (HeadRow("two classes", TWO, cases=logistic),),
+    "categorical": (
+        HeadRow("five classes", FIVE, cases=softmax_cases),
+        HeadRow("two classes", TWO, cases=softmax_cases),
+    ),
+    "bernoulli": (HeadRow("two classes", TWO, cases=logistic_cases),),
 }

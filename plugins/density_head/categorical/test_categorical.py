@@ -38,8 +38,8 @@ def test_a_mixture_averages_probabilities_and_not_logits():
     raw = torch.tensor([[[8.0, 0.0], [0.0, 2.0]]])
     density = Mixture(torch.zeros(1, 2), head("categorical", TWO)(raw))
     wanted = special.softmax(raw.double().numpy(), -1).mean(1)[0]
-    found = density.log_prob(torch.tensor([[0], [1]])).exp()[:, 0]
-    np.testing.assert_allclose(found.numpy(), wanted, rtol=1e-6)
+    probabilities = density.log_prob(torch.tensor([[0], [1]])).exp()[:, 0]
+    np.testing.assert_allclose(probabilities.numpy(), wanted, rtol=1e-6)
     assert density.mode.item() == median(density, 10).item() == wanted.argmax()
     assert density.entropy().item() == pytest.approx(-(wanted * np.log(wanted)).sum(), rel=1e-6)
     torch.manual_seed(0)

@@ -28,14 +28,19 @@ from framework.flights.trajectories import simulate, simulate_with_jacobian
 from framework.heads.parameters import require_finite
 from framework.storage.weights import require_state
 from framework.target import Target
-from plugins.density_head.flights.identification import bounds_of, found_of, identified, with_found
+from plugins.density_head.flights.identification import (
+    constant_bounds,
+    fitted_constants,
+    identify,
+    replace_constants,
+)
 
 WINDOWS = 32
 """Largest number of windows from which `fit` identifies the constants, evenly spaced."""
 LEAST_NOISE, MOST_NOISE = 1e-4, 1.0
 """Bounds of the noise, metres."""
 SPREAD = (0.1, 1e3)
-"""Smallest and largest factor that `calibrate` fits."""
+"""Smallest and largest factor on a standard deviation that `calibrate` fits."""
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
@@ -44,17 +49,17 @@ class BallisticHead(DensityHead, Fitted):
 
     Position, velocity and spin at the first frame are estimated from the frames by robust least squares. The equation
     is integrated to the requested times, through a bounce if there is one. `fit` identifies the constants of ball and
-    table, and the noise, that make whole training windows most likely. `calibrate` fits a factor for the spread of each
-    number.
+    table, and the noise, that make whole training windows most likely. `calibrate` fits one factor for the standard
+    deviation of each number.
 
-    The density is that of the state, N(estimate, (JᵀJ)⁻¹), propagated to the future. `linearised` is a normal density;
-    `sampled` is a mixture of as many flights as there are samples, which can go to either side of a table's edge. Input
-    and target are in metres; the head has no gradient.
+    The density of the state, N(estimate, (JᵀJ)⁻¹), is propagated to the future. "linearised" gives a normal density.
+    "sampled" gives a mixture with one component for each sampled flight; flights can go to either side of a table's
+    edge. Input and target are in metres. The gradient of the density in the input is set to 0.
 
     Args:
-        observed, step: as of the data.
+        observed, step: number of observed frames, and time between frames in seconds; equal to those of the data.
         density: method by which the state's uncertainty is propagated.
-        samples: number of flights of the mixture; may be set at any time.
+        samples: number of sampled flights in the mixture; may be set at any time.
         spin: prior standard deviation of each component of the spin, rad/s.
         noise: standard deviation of a coordinate, m; initial value of `fit`.
         steps: largest number of steps of the search for a state; real flights take about ten.
@@ -63,15 +68,7 @@ class BallisticHead(DensityHead, Fitted):
     """
 
     knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {"samples": (1, 3, 10, 30, 100)}
-    bibtex = """@article{mulling2011biomimetic,
-  author  = {M{\\"u}lling, Katharina and Kober, Jens and Peters, Jan},
-  title   = {A Biomimetic Approach to Robot Table Tennis},
-  journal = {Adaptive Behavior},
-  volume  = {19},
-  number  = {5},
-  pages   = {359--376},
-  year    = {2011}
-}"""
+    bibtex = "mulling2011biomimetic"
 
     found: Tensor
     noise: Tensor
@@ -100,84 +97,90 @@ class BallisticHead(DensityHead, Fitted):
         self.prior = Prior(spin=spin)
         self.steps = steps
         self.identify = identify
-        self.given = constants
+        self.initial_constants = constants
         self.size = observed * len(PARTS)
-        self.register_buffer("found", found_of(constants))
+        self.register_buffer("found", fitted_constants(constants))
         self.register_buffer("noise", torch.tensor(noise).double())
         self.register_buffer("spread", torch.ones(3 * self.future, dtype=torch.float64))
         within = min(LEAST_NOISE, noise), max(MOST_NOISE, noise)
-        require_state(self, found=bounds_of(constants), noise=within, spread=SPREAD)
+        require_state(self, found=constant_bounds(constants), noise=within, spread=SPREAD)
 
     @property
     def constants(self) -> Constants:
         """Constants of the config, with the values that `fit` found."""
-        return with_found(self.given, self.found)
+        return replace_constants(self.initial_constants, self.found)
 
     @torch.no_grad()
     def fit(self, features: Float[Tensor, "sample size"], target: Tensor, seed: int) -> None:
-        """Fit constants and noise that make whole windows most likely (identification.py)."""
+        """Fit the constants and the noise that make whole training windows most likely (identification.py)."""
         chosen = torch.linspace(0, len(features) - 1, min(WINDOWS, len(features))).round().long()
-        seen = observed_frames(features[chosen].unflatten(-1, (self.observed, len(PARTS))).cpu(), self.step)
-        after = self._after(seen)
+        observations = observed_frames(
+            features[chosen].unflatten(-1, (self.observed, len(PARTS))).cpu(), self.step
+        )
+        after = self._after(observations)
         future = target[chosen].double().cpu().unflatten(-1, (self.future, 3))
         whole = ObservedFrames(
-            torch.cat([seen.times, after], 1),
-            torch.cat([seen.places, torch.where(future.abs() < 50, future, torch.nan)], 1),
+            torch.cat([observations.times, after], 1),
+            torch.cat([observations.places, torch.where(future.abs() < 50, future, torch.nan)], 1),
         )
         estimate = estimate_states(whole, self.constants, float(self.noise), self.prior, most=self.steps)
         self._measure_noise(whole, estimate.state)
         if self.identify:
-            numbers, states = identified(whole, self.constants, estimate.state, float(self.noise), self.prior)
+            numbers, states = identify(whole, self.constants, estimate.state, float(self.noise), self.prior)
             self.found.copy_(numbers)
             self._measure_noise(whole, states)
 
-    def _measure_noise(self, seen: ObservedFrames, states: Tensor) -> None:
-        apart = simulate(states, seen.times, self.constants)[..., :3] - seen.places
-        left = apart[~apart.isnan()].abs()
-        if len(left):  # the median of |r| is 0.6745 of a normal's standard deviation
-            self.noise.copy_((left.median() / 0.6745).clamp(LEAST_NOISE, MOST_NOISE))
+    def _measure_noise(self, observations: ObservedFrames, states: Tensor) -> None:
+        residuals = simulate(states, observations.times, self.constants)[..., :3] - observations.places
+        magnitudes = residuals[~residuals.isnan()].abs()
+        if len(magnitudes):  # the median of |r| is 0.6745 of a normal's standard deviation
+            self.noise.copy_((magnitudes.median() / 0.6745).clamp(LEAST_NOISE, MOST_NOISE))
 
     def forward(self, raw: Float[Tensor, "*batch size"]) -> Distribution:
         """Return the density for raw parameters."""
         raw = require_finite(raw, self.size)
         flat = raw.detach().reshape(math.prod(raw.shape[:-1]), self.size)
-        seen = observed_frames(flat.unflatten(-1, (self.observed, len(PARTS))).cpu(), self.step)
-        estimate = estimate_states(seen, self.constants, float(self.noise), self.prior, most=self.steps)
+        observations = observed_frames(flat.unflatten(-1, (self.observed, len(PARTS))).cpu(), self.step)
+        estimate = estimate_states(
+            observations, self.constants, float(self.noise), self.prior, most=self.steps
+        )
         build = self._linearised if self.density == "linearised" else self._sampled
         # The gradient is 0: the search is not differentiated.
-        return build(seen, estimate, raw, (raw * 0).sum(-1, keepdim=True))
+        return build(observations, estimate, raw, (raw * 0).sum(-1, keepdim=True))
 
     @torch.no_grad()
     def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
         """Fit a factor of each number's standard deviation, so that its variance equals the mean squared residual."""
         self.spread.fill_(1.0)
-        seen = observed_frames(raw.unflatten(-1, (self.observed, len(PARTS))).cpu(), self.step)
-        estimate = estimate_states(seen, self.constants, float(self.noise), self.prior, most=self.steps)
-        mean, factor = self._carried(seen, estimate)
+        observations = observed_frames(raw.unflatten(-1, (self.observed, len(PARTS))).cpu(), self.step)
+        estimate = estimate_states(
+            observations, self.constants, float(self.noise), self.prior, most=self.steps
+        )
+        mean, factor = self._carried(observations, estimate)
         variance = factor.square().sum(-1) + float(self.noise) ** 2
         ratio = (target.double().cpu() - mean).square() / variance
         if len(ratio):
-            # A mean of n squares has a relative error of √(2/n). With few windows the common factor of all numbers is
-            # weighted in.
+            # A mean of n squares has a relative error of √(2/n). With few windows, the factor of each number is
+            # therefore averaged with the common factor of all numbers.
             weight = len(ratio) / (len(ratio) + 20)
             self.spread.copy_((weight * ratio.mean(0) + (1 - weight) * ratio.mean()).sqrt().clamp(*SPREAD))
 
-    def _after(self, seen: ObservedFrames) -> Float[Tensor, "flight time"]:
+    def _after(self, observations: ObservedFrames) -> Float[Tensor, "flight time"]:
         moments = self.step * torch.arange(1, self.future + 1, dtype=torch.float64)
-        return moments.expand(len(seen.times), -1)
+        return moments.expand(len(observations.times), -1)
 
-    def _whole(self, seen: ObservedFrames) -> Float[Tensor, "flight time"]:
-        return torch.cat([seen.times, self._after(seen)], 1)
+    def _whole(self, observations: ObservedFrames) -> Float[Tensor, "flight time"]:
+        return torch.cat([observations.times, self._after(observations)], 1)
 
-    def _carried(self, seen: ObservedFrames, estimate: Estimate) -> tuple[Tensor, Tensor]:
-        """Return the mean of the future (flight, number), and a factor F of its covariance F Fᵀ (flight, number, 9)."""
-        places, slopes = simulate_with_jacobian(estimate.state, self._whole(seen), self.constants)
+    def _carried(self, observations: ObservedFrames, estimate: Estimate) -> tuple[Tensor, Tensor]:
+        """Return the mean future positions (flight, number), and F (flight, number, 9) with the covariance F Fᵀ."""
+        places, slopes = simulate_with_jacobian(estimate.state, self._whole(observations), self.constants)
         mean = places[:, -self.future :].flatten(1)
         self._require_course(mean, estimate)
         return mean, slopes[:, -self.future :].flatten(1, 2) @ covariance_root(estimate.covariance)
 
     def _require_course(self, places: Tensor, estimate: Estimate) -> None:
-        """Require flights with a finite course; implausible physical constants lead to infinite ones.
+        """Require finite positions and covariances of all flights; implausible constants lead to infinite ones.
 
         Raises:
             NonFiniteParameters: the message names the first such row.
@@ -190,9 +193,9 @@ class BallisticHead(DensityHead, Fitted):
             )
 
     def _linearised(
-        self, seen: ObservedFrames, estimate: Estimate, raw: Tensor, zero: Tensor
+        self, observations: ObservedFrames, estimate: Estimate, raw: Tensor, zero: Tensor
     ) -> Distribution:
-        mean, factor = self._carried(seen, estimate)
+        mean, factor = self._carried(observations, estimate)
         spread = self.spread.cpu()
         factor = spread.unsqueeze(-1) * factor
         covariance = factor @ factor.mT + torch.diag((float(self.noise) * spread).square())
@@ -200,22 +203,25 @@ class BallisticHead(DensityHead, Fitted):
         if failed.any():
             deviation, noise = float(factor.square().sum(-1).amax().sqrt()), float(self.noise)
             raise NonFiniteParameters(
-                f"The covariance of the flight in batch row {int(failed.nonzero()[0])} is not positive definite: it "
-                f"has deviations of {deviation:.2g} m beside a noise of {noise:.2g} m. No training ends with such "
-                "constants: train the head again, or restore its checkpoint."
+                f"The covariance of the flight in batch row {int(failed.nonzero()[0])} is not positive definite: its "
+                f"largest standard deviation is {deviation:.2g} m, and the noise is {noise:.2g} m. Training never ends "
+                "with such constants, so the checkpoint is probably damaged: train the head again, or copy the "
+                "checkpoint again from its source."
             )
         shape = raw.shape[:-1]
         joint = scale.reshape(*shape, *scale.shape[-2:]).to(raw)
         return JointNormal(mean.reshape(*shape, mean.shape[-1]).to(raw) + zero, joint)
 
-    def _sampled(self, seen: ObservedFrames, estimate: Estimate, raw: Tensor, zero: Tensor) -> Distribution:
+    def _sampled(
+        self, observations: ObservedFrames, estimate: Estimate, raw: Tensor, zero: Tensor
+    ) -> Distribution:
         count, flights = self.samples, len(estimate.state)
-        # the same points at every call, so that the density is a fixed function and no random estimate
+        # every call uses the same points, so that the density is a fixed function and not a random estimate
         points = torch.quasirandom.SobolEngine(9, scramble=True, seed=0).draw(count, dtype=torch.float64)
         noise = torch.special.ndtri(points.clamp(1e-9, 1 - 1e-9))
         self._require_course(estimate.state, estimate)
         states = estimate.state.unsqueeze(1) + noise @ covariance_root(estimate.covariance).mT
-        times = self._whole(seen).repeat_interleave(count, 0)
+        times = self._whole(observations).repeat_interleave(count, 0)
         places = simulate(states.reshape(-1, 9), times, self.constants)[:, -self.future :, :3]
         places = places.reshape(flights, count, 3 * self.future)
         self._require_course(places, estimate)

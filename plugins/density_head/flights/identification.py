@@ -11,7 +11,7 @@ from framework.flights.physics import Constants
 from framework.flights.trajectories import simulate, simulate_with_jacobian
 
 FITTED = ("drag", "lift", "restitution", "friction", "surface")
-"""Names of the constants that are identified."""
+"""Names of the constants that are identify."""
 LOW, HIGH = (0.0, -0.02, 0.3, 0.0, -0.3), (1.0, 0.02, 1.0, 1.0, 0.3)
 """Bounds of the constants; those of the surface are metres from its value in the config."""
 SIZES = (0.05, 0.002, 0.05, 0.05, 0.01)
@@ -19,66 +19,75 @@ SIZES = (0.05, 0.002, 0.05, 0.05, 0.01)
 ROUNDS = 40
 """Largest number of steps."""
 ENOUGH = 3e-4
-"""Share of the cost; the search ends after two steps in a row that save less. For 32 windows it is under half a nat."""
+"""The search ends after two steps in a row that lower the cost by less than this share of it.
+
+For 32 windows the share is less than half a nat.
+"""
 
 
-def with_found(constants: Constants, numbers: Float[Tensor, "constant"]) -> Constants:
-    """Return the constants with `FITTED` replaced."""
+def replace_constants(constants: Constants, numbers: Float[Tensor, "constant"]) -> Constants:
+    """Return the constants, with the values of those in `FITTED` replaced by `numbers`."""
     return replace(constants, **dict(zip(FITTED, numbers.tolist(), strict=True)))
 
 
-def found_of(constants: Constants) -> Float[Tensor, "constant"]:
-    """Return the values of the constants `FITTED`."""
+def fitted_constants(constants: Constants) -> Float[Tensor, "constant"]:
+    """Return the values of the constants in `FITTED`, float64."""
     return torch.tensor([asdict(constants)[name] for name in FITTED], dtype=torch.float64)
 
 
-def bounds_of(constants: Constants) -> tuple[Float[Tensor, "constant"], Float[Tensor, "constant"]]:
-    """Return bounds of stored values of `FITTED`: the range of `identified`, extended to the config's values."""
-    given = found_of(constants)
-    middle = torch.zeros_like(given)
-    middle[-1] = given[-1]
+def constant_bounds(constants: Constants) -> tuple[Float[Tensor, "constant"], Float[Tensor, "constant"]]:
+    """Return the bounds of stored values of `FITTED`: the range of `identify`, extended to the values in the config."""
+    values = fitted_constants(constants)
+    middle = torch.zeros_like(values)
+    middle[-1] = values[-1]
     low, high = (middle + torch.tensor(bound, dtype=torch.float64) for bound in (LOW, HIGH))
-    return torch.minimum(low, given), torch.maximum(high, given)
+    return torch.minimum(low, values), torch.maximum(high, values)
 
 
-def identified(
-    seen: ObservedFrames, given: Constants, states: Float[Tensor, "flight 9"], noise: float, prior: Prior
+def identify(
+    observations: ObservedFrames,
+    initial: Constants,
+    states: Float[Tensor, "flight 9"],
+    noise: float,
+    prior: Prior,
 ) -> tuple[Float[Tensor, "constant"], Float[Tensor, "flight 9"]]:
-    """Return the constants `FITTED` and the states that fit best, by Levenberg and Marquardt's method.
+    """Return the values of `FITTED` and the states that fit best, by Levenberg and Marquardt's method.
 
     A flight's state affects no other flight's residuals. So each state is eliminated on its own, and the remaining
     system has as many equations as there are constants (Schur's complement, as in bundle adjustment: Triggs et al.
     2000, §6.1).
 
     Args:
-        seen: whole flights, from before the window to after it.
-        given: initial constants.
+        observations: whole flights, from before the window to after it.
+        initial: constants from which the search starts.
         states: states at the first frames, from which the search starts.
         noise: standard deviation of each coordinate, m.
         prior: prior of the states.
     """
-    numbers = found_of(given)
-    middle = torch.tensor([0.0, 0.0, 0.0, 0.0, given.surface], dtype=torch.float64)
+    numbers = fitted_constants(initial)
+    middle = torch.tensor([0.0, 0.0, 0.0, 0.0, initial.surface], dtype=torch.float64)
     low, high = (middle + torch.tensor(bound, dtype=torch.float64) for bound in (LOW, HIGH))
     sizes = torch.tensor(SIZES, dtype=torch.float64)
     numbers = numbers.clamp(low, high)
 
     def paths(numbers: Tensor, states: Tensor) -> Tensor:
-        return simulate(states, seen.times, with_found(given, numbers))[..., :3]
+        return simulate(states, observations.times, replace_constants(initial, numbers))[..., :3]
 
     def cost(numbers: Tensor, states: Tensor) -> float:
-        apart = cauchy((paths(numbers, states) - seen.places) / noise)[0].nan_to_num(0.0)
-        return float(apart.square().sum() + (states / prior.scale).square().sum()) / 2
+        residuals = cauchy((paths(numbers, states) - observations.places) / noise)[0].nan_to_num(0.0)
+        return float(residuals.square().sum() + (states / prior.scale).square().sum()) / 2
 
     least, damping, quiet = cost(numbers, states), 1e-3, 0
     linear = None
     for _ in range(ROUNDS):
         if linear is None:
-            places, slopes = simulate_with_jacobian(states, seen.times, with_found(given, numbers))
-            bent, steep = cauchy((places - seen.places) / noise)
+            places, slopes = simulate_with_jacobian(
+                states, observations.times, replace_constants(initial, numbers)
+            )
+            bent, steep = cauchy((places - observations.places) / noise)
             bent, steep = bent.nan_to_num(0.0).flatten(1), steep.nan_to_num(0.0).unsqueeze(-1) / noise
             shifts = torch.diag(sizes / 1000)
-            turn = [(paths(numbers + one, states) - places) / 1e-3 for one in shifts]
+            turn = [(paths(numbers + shift, states) - places) / 1e-3 for shift in shifts]
             # states are in units of the prior, constants in units of SIZES
             by_state = (steep * slopes).flatten(1, 2) * prior.scale
             by_constant = (steep * torch.stack(turn, -1)).flatten(1, 2)
@@ -87,8 +96,8 @@ def identified(
             own = by_state.mT @ by_state + torch.eye(9, dtype=torch.float64)
             linear = (own, by_state.mT @ by_constant, (by_constant.mT @ by_constant).sum(0), pull, push)
         push = linear[-1]
-        held = (numbers <= low) & (push > 0) | (numbers >= high) & (push < 0)
-        state_step, step = _step(*linear, damping, held)
+        at_bound = (numbers <= low) & (push > 0) | (numbers >= high) & (push < 0)
+        state_step, step = _step(*linear, damping, at_bound)
         tried = (numbers + step * sizes).clamp(low, high)
         moved = states + state_step * prior.scale
         now = cost(tried, moved)
@@ -110,12 +119,12 @@ def _step(
     pull: Float[Tensor, "flight 9"],
     push: Float[Tensor, "constant"],
     damping: float,
-    held: Tensor,
+    at_bound: Tensor,
 ) -> tuple[Float[Tensor, "flight 9"], Float[Tensor, "constant"]]:
-    """Return steps of states and constants that solve the damped normal equations; constants at a bound stay."""
+    """Return the steps of states and constants that solve the damped normal equations; constants at a bound stay."""
     own = own + damping * torch.diag_embed(own.diagonal(dim1=-2, dim2=-1))
     # the diagonal is 0 for a constant that no residual depends on
-    whole = whole + torch.diag(damping * whole.diagonal() + 1e-9 + 1e12 * held)
+    whole = whole + torch.diag(damping * whole.diagonal() + 1e-9 + 1e12 * at_bound)
     factor = torch.linalg.cholesky(own)
     solved = torch.cholesky_solve(torch.cat([both, pull.unsqueeze(-1)], -1), factor)
     left = whole - (both.mT @ solved[..., :-1]).sum(0)

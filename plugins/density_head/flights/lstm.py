@@ -1,4 +1,4 @@
-"""A recurrent network that predicts a flight frame by frame, each from its previous prediction."""
+"""A recurrent network that predicts a flight frame by frame; each prediction is the input of the next one."""
 
 import math
 from collections.abc import Mapping
@@ -17,7 +17,7 @@ from framework.heads.parameters import require_finite
 from framework.target import Target
 
 FARTHEST = 100.0
-"""Bound, metres or seconds, to which the inputs are clamped."""
+"""Bound to which the inputs are clamped, metres or seconds."""
 LEAST, WIDEST = 1e-4, 1e3
 """Smallest and largest standard deviation, metres."""
 
@@ -26,9 +26,9 @@ class LSTMHead(DensityHead):
     """LSTM over the observed frames, continued over the future ones (Hochreiter & Schmidhuber 1997; thesis [121]).
 
     At each frame the network predicts the ball's displacement to the next frame, and its standard deviation. If the
-    next frame is missing or in the future, the predicted position is read in its place. So errors accumulate with time,
-    which this head is meant to show. A frame's coordinates are independent normals; the head is trained by their
-    likelihood.
+    next frame is missing or in the future, the network reads its predicted position instead. So errors accumulate with
+    time, which this head is meant to demonstrate. The coordinates of a frame are independent and normal; the head is
+    trained by likelihood.
 
     Args:
         observed: number of frames of an input, as in the data.
@@ -37,15 +37,7 @@ class LSTMHead(DensityHead):
 
     knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
     direct = True
-    bibtex = """@article{hochreiter1997long,
-  author  = {Hochreiter, Sepp and Schmidhuber, J{\\"u}rgen},
-  title   = {Long Short-Term Memory},
-  journal = {Neural Computation},
-  volume  = {9},
-  number  = {8},
-  pages   = {1735--1780},
-  year    = {1997}
-}"""
+    bibtex = "hochreiter1997long"
 
     def __init__(
         self,
@@ -75,14 +67,14 @@ class LSTMHead(DensityHead):
         begun = frames.new_zeros(len(flat), 1)
         state = None
         for frame in frames.unbind(1):
-            there = (frame[:, 4:] > 0.5).to(frames.dtype)
+            visible = (frame[:, 4:] > 0.5).to(frames.dtype)
             expected = place + move
-            now = torch.where(there > 0, frame[:, 1:4], expected)
+            now = torch.where(visible > 0, frame[:, 1:4], expected)
             # the first frame that is seen has no known displacement
             moved = begun * (now - place)
-            begun = torch.maximum(begun, there)
+            begun = torch.maximum(begun, visible)
             place = begun * now
-            move, _, state = self._next(place, moved, there, state)
+            move, _, state = self._next(place, moved, visible, state)
             move = begun * move
         places, widths = [], []
         unseen = torch.zeros_like(begun)
@@ -97,10 +89,10 @@ class LSTMHead(DensityHead):
         return IndependentNormals(require_finite(mean, shape[-1]), require_finite(scale, shape[-1]))
 
     def _next(
-        self, place: Tensor, move: Tensor, there: Tensor, state: tuple[Tensor, Tensor] | None
+        self, place: Tensor, move: Tensor, visible: Tensor, state: tuple[Tensor, Tensor] | None
     ) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor]]:
         """Return the next displacement (batch, 3), its standard deviation, and the network's state."""
-        hidden, memory = self.cell(torch.cat([place, 10 * move, there], -1), state)
+        hidden, memory = self.cell(torch.cat([place, 10 * move, visible], -1), state)
         numbers = self.out(hidden)
         # a frame's displacement is about a tenth of a metre; the network predicts the change of the last displacement
         width = (0.05 * nn.functional.softplus(numbers[:, 3:])).clamp(max=WIDEST) + LEAST

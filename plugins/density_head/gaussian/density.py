@@ -91,13 +91,13 @@ class Gaussian(Distribution):
         """The matrix (I - φ)⁻¹, unit lower triangular: d = (I - φ)⁻¹ e."""
         assert self.coefficients is not None
         identity = torch.eye(self.event_shape[0], dtype=self.scale.dtype, device=self.scale.device)
-        found = torch.linalg.solve_triangular(
+        inverse = torch.linalg.solve_triangular(
             identity - self.coefficients,
             identity.expand_as(self.coefficients),
             upper=False,
             unitriangular=True,
         )
-        return self._representable(found)
+        return self._representable(inverse)
 
     def _representable(self, numbers: Tensor) -> Tensor:
         """Return the numbers unchanged.
@@ -108,9 +108,10 @@ class Gaussian(Distribution):
         assert self.coefficients is not None
         if not bool(numbers.isfinite().all()) and bool(self.coefficients.isfinite().all()):
             raise ValueError(
-                f"the covariance of {self.event_shape[0]} numbers whose regression coefficients reach "
-                f"{self.coefficients.abs().amax().item():.3g} is beyond {self.scale.dtype}: its density is known, but "
-                "neither draws nor marginals are. Choose covariance=diagonal, standardise the targets, or use float64."
+                f"the covariance of {self.event_shape[0]} numbers with regression coefficients of up to "
+                f"{self.coefficients.abs().amax().item():.3g} exceeds the range of {self.scale.dtype}. The density "
+                "can be computed, but samples and marginals cannot. Choose covariance=diagonal, standardise the "
+                "targets, or use float64."
             )
         return numbers
 
@@ -136,7 +137,7 @@ class Gaussian(Distribution):
 
 
 def _times(matrix: Tensor, vector: Tensor) -> Tensor:
-    """Return the product in the dtype of the numbers: `@` is computed in bfloat16 under mixed precision."""
+    """Return matrix times vector in the dtype of both; under mixed precision `@` would compute it in bfloat16."""
     return (matrix * vector.unsqueeze(-2)).sum(-1)
 
 
@@ -145,8 +146,8 @@ estimate.register(Gaussian, exact_estimate)
 
 @marginal.register
 def _(density: Gaussian, index: int) -> Gaussian:
-    here = slice(index, index + 1)
-    return Gaussian(density.location[..., here], density.stddev[..., here])
+    part = slice(index, index + 1)
+    return Gaussian(density.location[..., part], density.stddev[..., part])
 
 
 @pick.register

@@ -18,10 +18,10 @@ from framework.target import Target
 from plugins.density_head.gaussian.density import Gaussian
 
 LARGEST_MEAN = 1e8
-"""Bound to which means are clamped; beyond it squares of standardised residuals overflow float32."""
+"""Bound to which means are clamped, because squares of larger standardised residuals overflow float32."""
 LARGEST_SCALE = 1e12
 WIDEST_SCALE = 1e18
-"""Largest standard deviation that is calibrated, and accepted from a file."""
+"""Largest standard deviation that calibration sets and that a stored state may hold."""
 LARGEST_COEFFICIENT = 1e3
 SMALLEST_SCALE = 1e-6
 
@@ -31,23 +31,19 @@ class GaussianHead(DensityHead):
 
     With `scale="predicted"` each input has its own standard deviations, trained by likelihood (eq. 2.8). With "fixed"
     it trains by squared error, which is likelihood with σ = 1, and `calibrate` fits one covariance to the validation
-    residuals by maximum likelihood. Raw parameters are in standard deviations from the mean of the training targets, if
-    `Target` has these; the density is then in the target's own unit and in double precision.
+    residuals by maximum likelihood. If `Target` has the mean and the standard deviations of the training targets, raw
+    parameters are relative to them; the density is then in the target's own unit and in double precision.
 
     Args:
         scale: source of the standard deviations.
         covariance: "diagonal": independent numbers; "full": with regression coefficients of each number on the previous
             ones.
-        floor: smallest σ, in the same deviations: no density can become narrower around a training value.
+        floor: smallest σ, in the same unit as the raw parameters; it prevents ever narrower densities around training
+            values.
     """
 
     knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
-    bibtex = """@inproceedings{nix1994estimating,
-  title = {Estimating the Mean and Variance of the Target Probability Distribution},
-  author = {Nix, David A. and Weigend, Andreas S.},
-  booktitle = {Proceedings of the IEEE International Conference on Neural Networks (ICNN)},
-  year = {1994}
-}"""
+    bibtex = "nix1994estimating"
 
     scale: Tensor
     coefficients: Tensor
@@ -75,7 +71,7 @@ class GaussianHead(DensityHead):
                 self.numbers if self.full else 0
             )  # none for a diagonal covariance, which may have very many numbers
             self.register_buffer("coefficients", torch.zeros(side, side, dtype=torch.float64))
-            # no calibration gives less than the floor, except for rounding; squares above the largest overflow float32
+            # calibration sets no σ below the floor, except for rounding; squares above WIDEST_SCALE overflow float32
             coefficient = (-LARGEST_COEFFICIENT, LARGEST_COEFFICIENT)
             require_state(self, scale=(0.99 * floor, WIDEST_SCALE), coefficients=coefficient)
 
@@ -95,7 +91,7 @@ class GaussianHead(DensityHead):
         """Return the negative log-likelihood of each sample, nats; with a fixed scale that for σ = 1."""
         if self.predicted:
             return -self(raw).log_prob(target)
-        # σ = 1, whatever was calibrated. Few passes over the numbers, since there may be very many.
+        # σ = 1 here also after calibration. There may be very many numbers, so that few passes over them are made.
         target = self.unit.standardise(target).to(raw)
         mean, target = torch.broadcast_tensors(self._mean(require_finite(raw, self.size)), target)
         constant = self.numbers * math.log(2 * math.pi) / 2 + self.unit.log_volume
@@ -107,7 +103,9 @@ class GaussianHead(DensityHead):
         if self.predicted:
             return
         if len(raw) == 0:
-            raise ValueError("a fixed covariance is calibrated on validation data, but got none of it.")
+            raise ValueError(
+                "a fixed covariance is fitted to the validation split, but got no sample of this split."
+            )
         residual = (
             self.unit.standardise(target).double() - self._mean(require_finite(raw, self.size)).double()
         )
@@ -125,16 +123,16 @@ class GaussianHead(DensityHead):
     def _coefficients(self, raw: Tensor) -> Tensor:
         bounded = LARGEST_COEFFICIENT * torch.tanh(raw / LARGEST_COEFFICIENT)
         row, column = torch.tril_indices(self.numbers, self.numbers, -1, device=raw.device)
-        found = raw.new_zeros(*raw.shape[:-1], self.numbers, self.numbers)
-        found[..., row, column] = bounded
-        return found
+        coefficients = raw.new_zeros(*raw.shape[:-1], self.numbers, self.numbers)
+        coefficients[..., row, column] = bounded
+        return coefficients
 
 
 def scale_of_raw(raw: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-    """Return exp(r) for r ≤ 0 and (1 + r/4)⁴ above: 1 at 0, smooth, at most LARGEST_SCALE.
+    """Return σ = exp(r) for r ≤ 0 and (1 + r/4)⁴ for r > 0; it is smooth, 1 at 0, and at most LARGEST_SCALE.
 
-    The Fisher information of log σ is constant, so a logarithmic map trains best; the power keeps an outlier from
-    exploding.
+    The Fisher information of log σ is constant, so that a logarithmic map trains best. The fourth power keeps σ from
+    exploding at an outlier.
     """
     most = 4 * (LARGEST_SCALE**0.25 - 1)
     high = (1 + raw.clamp(0, most) / 4).square().square()
@@ -144,7 +142,10 @@ def scale_of_raw(raw: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
 def fit(
     residual: Float[Tensor, "sample number"],
 ) -> tuple[Float[Tensor, "number"], Float[Tensor, "number number"]]:
-    """Return the maximum-likelihood σ and φ of zero-mean residuals: least squares of each number on those before it."""
+    """Return the maximum-likelihood σ and φ of residuals of mean 0.
+
+    They come from a least-squares regression of each number on the numbers before it.
+    """
     count = residual.shape[-1]
     scale, coefficients = residual.new_zeros(count), residual.new_zeros(count, count)
     for number in range(count):

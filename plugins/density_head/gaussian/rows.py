@@ -1,4 +1,4 @@
-"""Rows of the contract: Gaussian heads, with log-densities from 50 digits."""
+"""Contract-test cases: Gaussian heads, with log-densities from a 50-digit reference."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -16,14 +16,14 @@ OFFSETS = (0.0, 1e-6, 1.0, -3.0, 40.0, 1e6)
 
 
 def exact(residual: list[float], scale: list[Any]) -> Any:
-    """Return Σ -(d/σ)²/2 - log σ - log(2π)/2 (eq. 2.8)."""
+    """Return the log-density Σ -(d/σ)²/2 - log σ - log(2π)/2 (eq. 2.8), nats, as an mpmath number."""
     return sum(
         -((mpmath.mpf(d) / s) ** 2) / 2 - mpmath.log(s) - mpmath.log(2 * mpmath.pi) / 2
         for d, s in zip(residual, scale, strict=True)
     )
 
 
-def predicted(head: DensityHead) -> Iterator[Case]:
+def predicted_cases(head: DensityHead) -> Iterator[Case]:
     """Yield cases with σ = floor + exp(r) or floor + (1 + r/4)⁴, mean 0, and coefficients of 0 for three numbers."""
     numbers = 1 if head.size == 2 else 3
     floor = mpmath.mpf(head.floor)  # pyright: ignore[reportArgumentType]  # a number of this head
@@ -42,10 +42,10 @@ def predicted(head: DensityHead) -> Iterator[Case]:
 
 ROWS = {
     "gaussian": (
-        HeadRow("one number", ONE, cases=predicted),
-        HeadRow("three numbers", THREE, cases=predicted, scale=0.5),
-        HeadRow("full covariance", THREE, {"covariance": "full"}, cases=predicted, scale=0.5),
+        HeadRow("one number", ONE, cases=predicted_cases),
+        HeadRow("three numbers", THREE, cases=predicted_cases, scale=0.5),
+        HeadRow("full covariance", THREE, {"covariance": "full"}, cases=predicted_cases, scale=0.5),
         HeadRow("one spread for all", THREE, {"scale": "fixed", "covariance": "full"}),
-        HeadRow("least spread 0.1", ONE, {"floor": 0.1}, cases=predicted),
+        HeadRow("least spread 0.1", ONE, {"floor": 0.1}, cases=predicted_cases),
     )
 }

@@ -14,7 +14,7 @@ from plugins.density_head.gaussian.head import scale_of_raw
 from plugins.density_head.gaussian.rows import ONE, THREE
 
 
-def head(config=None, target=THREE):
+def build_head(config=None, target=THREE):
     return build(
         "density_head", resolve("density_head", {"name": "gaussian", **(config or {})}), target=target
     )
@@ -24,7 +24,7 @@ def head(config=None, target=THREE):
 def full():
     """Return a batch of full Gaussians in float64, and their covariances by inversion."""
     torch.manual_seed(0)
-    density = head({"covariance": "full"}).double()(torch.randn(5, 9, dtype=torch.float64))
+    density = build_head({"covariance": "full"}).double()(torch.randn(5, 9, dtype=torch.float64))
     inverse = np.linalg.inv(np.eye(3) - density.coefficients.numpy())
     return density, inverse @ (density.scale.numpy()[:, :, None] ** 2 * inverse.transpose(0, 2, 1))
 
@@ -44,11 +44,11 @@ def test_full_covariance_agrees_with_scipy(full):
 def test_samples_have_the_covariance(full):
     density, covariance = full
     torch.manual_seed(1)
-    drawn = density.sample((40_000,)).numpy()
+    samples = density.sample((40_000,)).numpy()
     scale = np.sqrt(np.einsum("bii->bi", covariance))
     for row in range(5):
-        found = np.cov(drawn[:, row].T) / np.outer(scale[row], scale[row])
-        np.testing.assert_allclose(found, covariance[row] / np.outer(scale[row], scale[row]), atol=0.04)
+        correlation = np.cov(samples[:, row].T) / np.outer(scale[row], scale[row])
+        np.testing.assert_allclose(correlation, covariance[row] / np.outer(scale[row], scale[row]), atol=0.04)
 
 
 def test_marginals_and_picked_components(full):
@@ -56,8 +56,8 @@ def test_marginals_and_picked_components(full):
     value = torch.linspace(-2, 2, 5, dtype=torch.float64)[:, None]
     for index in range(3):
         wanted = stats.norm(density.mean[:, index].numpy(), np.sqrt(covariance[:, index, index]))
-        found = marginal(density, index).log_prob(value).numpy()
-        np.testing.assert_allclose(found, wanted.logpdf(value[:, 0].numpy()), rtol=1e-10)
+        log_prob = marginal(density, index).log_prob(value).numpy()
+        np.testing.assert_allclose(log_prob, wanted.logpdf(value[:, 0].numpy()), rtol=1e-10)
     chosen = pick(density, torch.tensor([3, 0]))
     whole = density.log_prob(value.expand(5, 3)[:, None])
     torch.testing.assert_close(chosen.log_prob(value.expand(5, 3)[:, None]), whole[:, [3, 0]])
@@ -65,50 +65,50 @@ def test_marginals_and_picked_components(full):
 
 @pytest.mark.parametrize("covariance", ["diagonal", "full"])
 def test_calibration_maximises_the_likelihood(covariance):
-    made = head({"scale": "fixed", "covariance": covariance}).double()
+    head = build_head({"scale": "fixed", "covariance": covariance}).double()
     torch.manual_seed(2)
     mixing = torch.tensor([[1.0, 0, 0], [0.8, 0.3, 0], [-2.0, 0.1, 0.5]], dtype=torch.float64)
     raw = torch.randn(400, 3, dtype=torch.float64)
     target = raw + torch.randn(400, 3, dtype=torch.float64) @ mixing.T
-    before = made.loss(raw, target)
-    made.calibrate(raw, target)
+    before = head.loss(raw, target)
+    head.calibrate(raw, target)
     residual = (target - raw).numpy()
     wanted = residual.T @ residual / 400  # maximum likelihood of a covariance around a known mean
     wanted = wanted if covariance == "full" else np.diag(np.diag(wanted))
     best = stats.multivariate_normal(np.zeros(3), wanted).logpdf(residual)
-    np.testing.assert_allclose(made(raw).log_prob(target).numpy(), best, rtol=1e-9)
-    assert torch.equal(made.loss(raw, target), before)  # squared error does not change with calibration
+    np.testing.assert_allclose(head(raw).log_prob(target).numpy(), best, rtol=1e-9)
+    assert torch.equal(head.loss(raw, target), before)  # squared error does not change with calibration
 
 
 def test_calibration_on_perfect_collinear_and_no_data():
-    made = head({"scale": "fixed", "covariance": "full"})
+    head = build_head({"scale": "fixed", "covariance": "full"})
     raw = torch.randn(20, 3)
-    made.calibrate(raw, raw)
-    assert torch.allclose(made.scale, torch.full((3,), 1e-4, dtype=torch.float64))
-    made.calibrate(raw, raw + torch.randn(20, 1))  # all three numbers have the same error
-    assert made(raw).log_prob(raw).isfinite().all()
-    with pytest.raises(ValueError, match="got none"):
-        made.calibrate(raw[:0], raw[:0])
+    head.calibrate(raw, raw)
+    assert torch.allclose(head.scale, torch.full((3,), 1e-4, dtype=torch.float64))
+    head.calibrate(raw, raw + torch.randn(20, 1))  # all three numbers have the same error
+    assert head(raw).log_prob(raw).isfinite().all()
+    with pytest.raises(ValueError, match="got no sample"):
+        head.calibrate(raw[:0], raw[:0])
 
 
 def test_the_fixed_loss_is_half_the_squared_error_up_to_a_constant():
-    made = head({"scale": "fixed"}).double()
+    head = build_head({"scale": "fixed"}).double()
     raw, target = torch.randn(7, 3).double(), torch.randn(7, 3).double()
-    constant = made.loss(raw, target) - (raw - target).square().sum(-1) / 2
+    constant = head.loss(raw, target) - (raw - target).square().sum(-1) / 2
     torch.testing.assert_close(constant, constant[0].expand(7))
 
 
 def test_the_scale_is_smooth_and_bounded():
     raw = torch.tensor([-1e-9, 0.0, 1e-9], dtype=torch.float64, requires_grad=True)
-    found = scale_of_raw(raw)
-    (slope,) = torch.autograd.grad(found.sum(), raw)
-    torch.testing.assert_close(found, torch.ones(3).double(), rtol=0, atol=2e-9)
+    scale = scale_of_raw(raw)
+    (slope,) = torch.autograd.grad(scale.sum(), raw)
+    torch.testing.assert_close(scale, torch.ones(3).double(), rtol=0, atol=2e-9)
     torch.testing.assert_close(slope, torch.ones(3).double(), rtol=0, atol=2e-9)
     assert scale_of_raw(torch.tensor(1e30)) == pytest.approx(1e12)
 
 
 def test_one_number_with_full_covariance_is_the_diagonal_head():
-    assert head({"covariance": "full"}, ONE).size == head({}, ONE).size == 2
+    assert build_head({"covariance": "full"}, ONE).size == build_head({}, ONE).size == 2
 
 
 def test_reparametrised_samples_have_gradients():
@@ -120,25 +120,25 @@ def test_reparametrised_samples_have_gradients():
 @pytest.mark.parametrize("kind", ["angle", "class"])
 def test_other_targets_are_refused(kind):
     with pytest.raises(ConfigError, match="gaussian describes targets of kind 'real'"):
-        head({}, Target(kind, ("azimuth", "elevation")))
+        build_head({}, Target(kind, ("azimuth", "elevation")))
 
 
 @pytest.mark.parametrize("config", [{"floor": 0.0}, {"scale": "guess"}, {"covariance": "low_rank"}])
 def test_a_config_out_of_range_is_refused(config):
     with pytest.raises(ConfigError, match=r"density_head\."):
-        head(config)
+        build_head(config)
 
 
 @pytest.mark.parametrize("numbers", [2, 3, 20, 100])
 def test_a_covariance_is_a_number_or_refused(numbers):
     """Check raw parameters of any size: infinite or NaN deviations, samples or marginals always raise an error."""
     target = Target("real", tuple(f"x{i}" for i in range(numbers)))
-    made = build(
+    head = build(
         "density_head", resolve("density_head", {"name": "gaussian", "covariance": "full"}), target=target
     )
     for dtype in (torch.float32, torch.float64):
         for size in (0.1, 1.0, 30.0, 1e3):
-            density = made.to(dtype)(torch.full((1, made.size), size, dtype=dtype))
+            density = head.to(dtype)(torch.full((1, head.size), size, dtype=dtype))
             assert (
                 density.log_prob(torch.zeros(1, numbers, dtype=dtype)).isfinite()
                 and density.entropy().isfinite()
@@ -161,17 +161,17 @@ def test_a_covariance_is_a_number_or_refused(numbers):
 def test_mixed_precision_does_not_round_the_covariance():
     """Compare densities and samples under autocast with those in float32."""
     torch.manual_seed(0)
-    made = head({"covariance": "full"})
-    raw = torch.randn(50, made.size)
+    head = build_head({"covariance": "full"})
+    raw = torch.randn(50, head.size)
     value = 5 * torch.randn(50, 3)
 
-    def answers():
+    def compute_results():
         torch.manual_seed(1)
-        density = made(raw)
+        density = head(raw)
         return [density.log_prob(value), density.sample(), *quadratic_bound(density, value)]
 
-    wanted = answers()
+    wanted = compute_results()
     with torch.autocast("cpu", torch.bfloat16):
-        found = answers()
-    for one, other in zip(found, wanted, strict=True):
-        torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-5)
+        in_half_precision = compute_results()
+    for rounded, exact in zip(in_half_precision, wanted, strict=True):
+        torch.testing.assert_close(rounded, exact, rtol=1e-5, atol=1e-5)

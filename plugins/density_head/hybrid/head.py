@@ -16,7 +16,7 @@ from framework.heads.unit import Unit
 from framework.target import Target
 
 LARGEST = 1e4
-"""Bound on the magnitude of the features; larger ones are clamped."""
+"""Largest magnitude of the features; larger ones are clamped."""
 LARGEST_LOG_UNIT = 20.0
 
 
@@ -25,8 +25,8 @@ class HybridHead(DensityHead):
 
     The first numbers that the head reads are the mean, in the target's unit and order. As many logarithms of units
     follow; in these units the component describes the distance of the target from the mean. A network of two hidden
-    layers reads all numbers and predicts the parameters of the component. Its last layer begins at 0, unless the
-    component has layers of its own: at first the mean is the encoder's alone.
+    layers reads all numbers and predicts the parameters of the component. Unless the component has layers of its own,
+    the last layer of the network starts at 0, so that at first the mean is that of the encoder alone.
 
     Args:
         further: number of features of the encoder beside the mean and the units.
@@ -37,15 +37,7 @@ class HybridHead(DensityHead):
 
     knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
     direct = True
-    bibtex = """@article{psichogios1992hybrid,
-  author  = {Psichogios, Dimitris C. and Ungar, Lyle H.},
-  title   = {A Hybrid Neural Network-First Principles Approach to Process Modeling},
-  journal = {AIChE Journal},
-  volume  = {38},
-  number  = {10},
-  pages   = {1499--1511},
-  year    = {1992}
-}"""
+    bibtex = "psichogios1992hybrid"
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""Rows of the contract: a Gaussian, and a CVAE over the numbers of two frames, around the mean in the input."""
+"""Contract-test cases: a Gaussian, and a CVAE over the numbers of two frames, around the mean in the input."""
 
 from collections.abc import Mapping
 
@@ -12,10 +12,10 @@ TVAE = {
 }  # fmt: skip
 BOUND: Mapping[str, str] = dict.fromkeys(
     ("integral", "samples follow log_prob", "entropy", "mode"),
-    "log_prob is the importance-weighted bound (eq. 3.19), the rest is of the mixture drawn from the prior",
+    "log_prob is the importance-weighted bound (eq. 3.19); all other results are of the mixture sampled from the prior",
 )
 DEEP = {"float32 against float64": 256.0}
-"""Limits for seven layers in sequence; the last one multiplies outputs of the previous one with a latent vector."""
+"""Limit for seven layers in sequence, the last of which multiplies outputs of the one before by a latent vector."""
 ROWS = {
     "hybrid": (
         HeadRow("three numbers", THREE, {"further": 4, "hidden": 8}),

@@ -7,7 +7,7 @@ from framework.configuration.schema import build, resolve
 from framework.target import Target
 
 
-def test_an_untrained_hybrid_is_about_the_encoders_mean() -> None:
+def test_an_untrained_hybrid_is_centred_on_the_encoders_mean() -> None:
     target = Target("real", ("x", "y"), (3.0, -1.0), (0.1, 20.0))
     head = build("density_head", resolve("density_head", {"name": "hybrid", "further": 1}), target=target)
     units = torch.tensor([[0.005, 1.0], [0.1, 20.0]])
@@ -22,8 +22,8 @@ def test_an_untrained_hybrid_is_about_the_encoders_mean() -> None:
 
 
 @pytest.mark.parametrize("component", ["gaussian", "cvae"])
-def test_a_hybrid_does_not_care_for_the_targets_unit(component: str) -> None:
-    found = []
+def test_a_hybrid_does_not_depend_on_the_targets_unit(component: str) -> None:
+    results = []
     for location, scale in (((3.0, -1.0), (0.1, 20.0)), ((0.0, 0.0), (1.0, 1.0))):
         target = Target("real", ("x", "y"), location, scale)
         config = {"name": "hybrid", "further": 1, "component": {"name": component}}
@@ -36,6 +36,6 @@ def test_a_hybrid_does_not_care_for_the_targets_unit(component: str) -> None:
         raw = torch.tensor([[3.2, 15.0, -5.0, 0.0, 0.4], [2.9, -30.0, -2.0, 3.0, 7.0]])
         torch.manual_seed(1)
         density = head(raw)
-        found.append((density.log_prob(raw[:, :2].double()).detach(), density.sample((5,)).detach()))
-    for one, other in zip(*found, strict=True):
-        torch.testing.assert_close(one.double(), other.double(), rtol=1e-4, atol=1e-4)
+        results.append((density.log_prob(raw[:, :2].double()).detach(), density.sample((5,)).detach()))
+    for scaled, standard in zip(*results, strict=True):
+        torch.testing.assert_close(scaled.double(), standard.double(), rtol=1e-4, atol=1e-4)

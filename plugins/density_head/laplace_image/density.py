@@ -25,10 +25,11 @@ from framework.geometry.srgb import linear_from_srgb
 class LaplaceImage(Distribution):
     """Independent Laplace densities of the numbers of an image: log p is -|y - μ|/b - log 2b.
 
-    With one b for all numbers, the negative log-likelihood is the L1 distance of images, up to a factor and a constant.
+    With one b for all numbers, the negative log-likelihood is the L1 distance between images, up to a factor and a
+    constant.
 
     Args:
-        location: μ, (*batch, height, width, number), in numbers as files hold them (sRGB).
+        location: μ, (*batch, height, width, number), in sRGB as image files hold it.
         scale: b > 0, broadcastable to `location`.
     """
 
@@ -74,9 +75,9 @@ class LaplaceImage(Distribution):
     def rsample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
         """Return samples, (*sample, *batch, *event), differentiable in the parameters."""
         shape = torch.Size(sample_shape) + self.location.shape
-        # the difference of two exponential draws is a Laplace draw, without the logarithm of a rounded 0
-        drawn = self.location.new_empty(2, *shape).exponential_()
-        return self.location + self.scale * (drawn[0] - drawn[1])
+        # the difference of two exponential samples is a Laplace sample; no logarithm of a rounded 0 can occur
+        exponentials = self.location.new_empty(2, *shape).exponential_()
+        return self.location + self.scale * (exponentials[0] - exponentials[1])
 
     def entropy(self) -> Tensor:
         """Return the entropy, nats, (*batch)."""

@@ -19,52 +19,44 @@ from plugins.density_head.laplace_image.density import LaplaceImage
 FURTHEST = 1e6
 """Bound to which locations are clamped, so that no sum over an image overflows."""
 SMALLEST_SCALE, LARGEST_SCALE = 1e-4, 1e6
-"""Bounds on scales. A step of 8 bits is 4e-3: a scale below a fortieth of it carries no information."""
+"""Bounds on scales; a scale below a fortieth of a step of an 8-bit image (4e-3) carries no information."""
 WHITE = 1 - 0.5 / 255
-"""Value above which a number is stored as 1: rounding of white between linear RGB and sRGB makes no foreground."""
+"""Value above which an 8-bit file stores a number as 1.
+
+White that was rounded in a conversion between linear RGB and sRGB is therefore not read as foreground.
+"""
 
 
 class LaplaceImageHead(DensityHead):
     """Laplace densities over the numbers of an image (`LaplaceImage`), read from an image of an encoder.
 
-    Features are (channel, height, width): first the image, one channel for each of the target's, then log-scales. The
-    loss is the mean over the numbers of an image, in nats per number, so that it does not grow with the image. With one
-    fixed scale it is the L1 distance and a constant.
+    Features are (channel, height, width): first the image, with one channel for each channel of the target, then
+    log-scales. The loss is the mean over the numbers of an image, in nats per number, so that it does not grow with the
+    size of the image. With one fixed scale the loss is the L1 distance plus a constant.
 
     Args:
         scale: "fixed": one b for all images and pixels, 1 in training, fitted to the validation split; "pixel": one
             predicted for each pixel, "number": for each number. Predicted scales are trained by likelihood and
             multiplied by one factor that is fitted to the validation split.
-        cover: mass of the central intervals that the factor is fitted to: this share of the validation split's numbers,
-            in pixels that are not white, lies in their intervals (split conformal prediction). null: the most likely
-            factor, of all pixels. For scales of each pixel that factor is a bad one: three quarters of an image of a
-            person are a background with errors far smaller than any useful scale, and the factor makes the person's
-            scales too small with them.
+        cover: probability c of the central intervals to which the factor is fitted: a share c of the validation
+            split's numbers, in pixels that are not white, lies in these intervals (split conformal prediction). null:
+            the most likely factor over all pixels. That factor suits predicted scales badly: three quarters of an image
+            of a person are background, whose errors are far smaller than any useful scale, and they make the factor too
+            small for the person.
         balance: β of Seitzer et al. 2022: the gradient of each number, not the loss, is multiplied by its scale to this
-            power. By likelihood alone (0) a location is learned more slowly if its scale is wider, so that large errors
-            persist. At 1 all locations are learned as by the L1 distance.
-        floor: constant that is added to every predicted scale. Files hold steps of 8 bits. Where an image is exactly
-            white the likelihood would grow as the scale shrinks, until one wrong pixel outweighs a whole image. Half a
-            step, 0.002, prevents that.
-        foreground: weight in the loss of pixels where the true image is not white (1 in all channels, as 8 bits store
-            it), relative to white ones. Most of an image of a person is background, and white everywhere is a good
-            first prediction.
+            power. With 0 (the likelihood alone) a location is learned more slowly the wider its scale is, so that large
+            errors persist. With 1 all locations are learned as with the L1 distance.
+        floor: constant that is added to every predicted scale. Where an image is exactly white, the likelihood would
+            otherwise grow without end as the scale shrinks, until one wrong pixel outweighs a whole image. Half a step
+            of an 8-bit image, 0.002, prevents that.
+        foreground: weight in the loss of pixels where the true image is not white, relative to white pixels. A pixel
+            is white if an 8-bit file stores 1 in all channels. Most of an image of a person is background, so that
+            without a weight the network may predict white everywhere.
     """
 
     knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
     direct: ClassVar[bool] = True
-    bibtex = """@inproceedings{kendall2017uncertainties,
-  title = {What Uncertainties Do We Need in {B}ayesian Deep Learning for Computer Vision?},
-  author = {Kendall, Alex and Gal, Yarin},
-  booktitle = {Advances in Neural Information Processing Systems (NeurIPS)},
-  year = {2017}
-}
-@inproceedings{seitzer2022pitfalls,
-  title = {On the Pitfalls of Heteroscedastic Uncertainty Estimation with Probabilistic Neural Networks},
-  author = {Seitzer, Maximilian and Tavakoli, Arash and Antic, Dimitrije and Martius, Georg},
-  booktitle = {International Conference on Learning Representations (ICLR)},
-  year = {2022}
-}"""
+    bibtex = "kendall2017uncertainties, seitzer2022pitfalls"
 
     factor: Tensor
 
@@ -100,38 +92,39 @@ class LaplaceImageHead(DensityHead):
         """Return the weighted mean negative log-density of the numbers of each image, nats per number."""
         # without the calibrated factor, so that the loss does not change with calibration
         density = LaplaceImage(*self._parts(raw))
-        each = -density.each_log_prob(target)
+        losses = -density.each_log_prob(target)
         if self.balance:
             share = density.scale.detach() ** self.balance
-            each = share * each + ((1 - share) * each).detach()
+            losses = share * losses + ((1 - share) * losses).detach()
         if self.foreground != 1:
-            weight = 1 + (self.foreground - 1) * coloured(target).to(each)
-            return (each * weight).mean((-3, -2, -1)) / weight.mean((-3, -2, -1))
-        return each.mean((-3, -2, -1))
+            weight = 1 + (self.foreground - 1) * coloured(target).to(losses)
+            return (losses * weight).mean((-3, -2, -1)) / weight.mean((-3, -2, -1))
+        return losses.mean((-3, -2, -1))
 
     @torch.no_grad()
     def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
         """Fit the factor of the scales to the validation split."""
         if len(raw) == 0:
             raise ValueError(
-                "the scale of an image's numbers is fitted to validation data, but got none of it."
+                "the scale of an image's numbers is fitted to the validation split, but got no sample of this split."
             )
         parts = zip(target, map(self._parts, raw), strict=True)
-        each = (((value - location).abs() / scale) for value, (location, scale) in parts)
+        distances = (((value - location).abs() / scale) for value, (location, scale) in parts)
         if self.cover is None:
             # the most likely factor of all scales: the mean of |y - μ|/b
-            found = sum(distance.double().mean() for distance in each) / len(raw)
+            factor = sum(distance.double().mean() for distance in distances) / len(raw)
         else:
             # |y - μ|/b is exponential: its quantile of mass c is -log(1 - c)
-            pairs = zip(each, target, strict=True)
+            pairs = zip(distances, target, strict=True)
             inside = torch.cat([distance[coloured(true).expand_as(distance)] for distance, true in pairs])
             if len(inside) == 0:
                 raise ValueError(
-                    "`cover` is fitted to pixels that are not white, but there is none in the validation data."
+                    "density_head.cover is fitted to pixels that are not white, but all pixels of the validation split "
+                    "are white. Set density_head.cover=null."
                 )
             rank = min(len(inside), math.ceil(self.cover * (len(inside) + 1)))
-            found = inside.kthvalue(rank).values.double() / -math.log1p(-self.cover)
-        self.factor.copy_(torch.as_tensor(found).clamp(SMALLEST_SCALE, LARGEST_SCALE))
+            factor = inside.kthvalue(rank).values.double() / -math.log1p(-self.cover)
+        self.factor.copy_(torch.as_tensor(factor).clamp(SMALLEST_SCALE, LARGEST_SCALE))
 
     def _parts(self, raw: Float[Tensor, "*batch size"]) -> tuple[Tensor, Tensor]:
         """Return locations (*batch, height, width, number) and scales, broadcastable, before calibration."""
@@ -144,5 +137,5 @@ class LaplaceImageHead(DensityHead):
 
 
 def coloured(image: Float[Tensor, "*batch number"]) -> Bool[Tensor, "*batch 1"]:
-    """Return which pixels are not white once they are stored."""
+    """Return which pixels are not white after they are stored with 8 bits."""
     return (image < WHITE).any(-1, keepdim=True)

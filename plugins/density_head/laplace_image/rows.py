@@ -1,4 +1,4 @@
-"""Rows of the contract: images of few pixels, with log-densities from 50 digits."""
+"""Contract-test cases: images of few pixels, with log-densities from a 50-digit reference."""
 
 from collections.abc import Iterator
 
@@ -14,8 +14,8 @@ GREY = Target("image", ("grey",), size=(1, 1))
 OFFSETS = (0.0, 1e-6, 0.5, -1.0, 30.0)
 
 
-def laplace(head: DensityHead) -> Iterator[Case]:
-    """Yield cases with Σ -|d|/b - log 2b, where b = exp(r) within its bounds, or 1 if no scale is predicted."""
+def laplace_cases(head: DensityHead) -> Iterator[Case]:
+    """Yield cases of log p = Σ -|d|/b - log 2b, with b = exp(r) clamped, or b = 1 if no scale is predicted."""
     numbers = 3 if head.size % 9 == 0 or head.size % 6 == 0 else 1
     pixels = 6 if numbers == 3 else 1
     predicted = head.size - numbers * pixels
@@ -35,23 +35,25 @@ def laplace(head: DensityHead) -> Iterator[Case]:
 
 ROWS = {
     "laplace_image": (
-        HeadRow("one scale", SMALL, cases=laplace),
-        HeadRow("a scale for each pixel", SMALL, {"scale": "pixel"}, cases=laplace),
-        HeadRow("a scale for each number", SMALL, {"scale": "number"}, cases=laplace),
-        # finite differences at raw parameters of size 1000 step over the kink of |d| at a draw
-        HeadRow("one grey pixel", GREY, {"scale": "number"}, cases=laplace, limits={"loss gradient": 0.1}),
+        HeadRow("one scale", SMALL, cases=laplace_cases),
+        HeadRow("a scale for each pixel", SMALL, {"scale": "pixel"}, cases=laplace_cases),
+        HeadRow("a scale for each number", SMALL, {"scale": "number"}, cases=laplace_cases),
+        # finite differences at raw parameters of size 1000 step over the kink of |d| at a sample
+        HeadRow(
+            "one grey pixel", GREY, {"scale": "number"}, cases=laplace_cases, limits={"loss gradient": 0.1}
+        ),
         HeadRow(
             "balanced, fitted to intervals",
             SMALL,
             {"scale": "pixel", "balance": 1.0, "cover": 0.9, "floor": 0.002},
-            leave_out={"loss gradient": "it is weighed by the scale, while the loss is not"},
+            leave_out={"loss gradient": "the gradient is weighted by the scale, while the loss is not"},
         ),
         HeadRow(
             "foreground",
             SMALL,
             {"scale": "pixel", "foreground": 5.0},
             leave_out={
-                "loss is least for its own density": "it weighs pixels by the truth, as no proper score does"
+                "loss is least for its own density": "the loss weights pixels by the true image, so it is not proper"
             },
         ),
     )

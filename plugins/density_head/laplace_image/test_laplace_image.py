@@ -29,9 +29,9 @@ def test_it_is_torchs_laplace_of_every_number() -> None:
     torch.testing.assert_close(ours.log_prob(value), theirs.log_prob(value))
     torch.testing.assert_close(ours.entropy(), theirs.entropy())
     torch.testing.assert_close(ours.variance, theirs.variance)
-    drawn = ours.sample(torch.Size((20_000,)))
-    torch.testing.assert_close(drawn.std(0), theirs.stddev, rtol=0.06, atol=0)
-    torch.testing.assert_close((drawn - ours.location).abs().mean(0) / ours.scale, torch.ones(2, 3, 4, 5, 3).double(),
+    samples = ours.sample(torch.Size((20_000,)))
+    torch.testing.assert_close(samples.std(0), theirs.stddev, rtol=0.06, atol=0)
+    torch.testing.assert_close((samples - ours.location).abs().mean(0) / ours.scale, torch.ones(2, 3, 4, 5, 3).double(),
                                rtol=0.06, atol=0)  # fmt: skip
     torch.testing.assert_close(median(ours, 1), ours.location)
 
@@ -55,10 +55,10 @@ def test_members_tempering_and_picking_keep_the_shape_of_an_image() -> None:
 
 def test_the_picture_is_the_light_of_its_numbers_and_that_of_members_their_mean() -> None:
     members = density(2, 3)
-    drawn = images(members, {"color"})["color"]
-    torch.testing.assert_close(srgb_from_linear(drawn), members.location)
+    colors = images(members, {"color"})["color"]
+    torch.testing.assert_close(srgb_from_linear(colors), members.location)
     whole = images(Mixture(torch.zeros(2, 3).double(), members), {"color"})["color"]
-    torch.testing.assert_close(whole, drawn.mean(1))
+    torch.testing.assert_close(whole, colors.mean(1))
     with pytest.raises(UserError, match="provides no depth"):
         images(members, {"depth"})
 
@@ -91,7 +91,7 @@ def test_calibration_takes_the_most_likely_factor_and_leaves_the_loss(scale: str
         head.factor *= other
         assert head(raw).log_prob(target).sum() < best
         head.factor /= other
-    with pytest.raises(ValueError, match="got none of it"):
+    with pytest.raises(ValueError, match="got no sample"):
         head.calibrate(raw[:0], target[:0])
 
 
@@ -104,10 +104,10 @@ def test_balanced_locations_are_learned_as_by_the_distance_and_scales_as_by_like
         loss = LaplaceImageHead(TARGET, scale="pixel", balance=balance).loss(raw, target)
         loss.sum().backward()
         gradients.append((loss.detach(), raw.grad.reshape(2, 4, 4, 5), raw.detach().reshape(2, 4, 4, 5)))
-    (plain, by_likelihood, raw), (loss, found, _) = gradients
+    (plain, by_likelihood, raw), (loss, balanced, _) = gradients
     torch.testing.assert_close(loss, plain)
-    torch.testing.assert_close(found[:, :3], (raw[:, :3] - target.movedim(-1, 1)).sign() / 60)
-    torch.testing.assert_close(found[:, 3], by_likelihood[:, 3] * raw[:, 3].exp())
+    torch.testing.assert_close(balanced[:, :3], (raw[:, :3] - target.movedim(-1, 1)).sign() / 60)
+    torch.testing.assert_close(balanced[:, 3], by_likelihood[:, 3] * raw[:, 3].exp())
 
 
 @pytest.mark.parametrize("mass", [0.5, 0.9])
@@ -121,8 +121,8 @@ def test_intervals_are_fitted_to_what_is_not_background(mass: float) -> None:
 
     def covered(head: LaplaceImageHead) -> float:
         head.calibrate(raw.flatten(1), target)
-        found = marginal_cdfs(head(raw.flatten(1)), target)[:, 0]
-        return ((2 * found - 1).abs() <= mass + 1e-6).double().mean().item()
+        quantiles = marginal_cdfs(head(raw.flatten(1)), target)[:, 0]
+        return ((2 * quantiles - 1).abs() <= mass + 1e-6).double().mean().item()
 
     assert covered(LaplaceImageHead(TARGET, scale="pixel", cover=mass)) == pytest.approx(mass, abs=0.02)
     assert covered(LaplaceImageHead(TARGET, scale="pixel")) < mass - 0.15
@@ -160,7 +160,7 @@ def test_the_entropy_of_members_of_large_images_is_drawn_in_parts(monkeypatch: p
     monkeypatch.setattr(LaplaceImage, "sample", counted)
     monkeypatch.setattr(density_module, "LARGEST", 10_000)
     with torch.no_grad():
-        found = whole.entropy()
+        entropy = whole.entropy()
     assert len(largest) > 100
     assert max(largest) <= 10_000
-    torch.testing.assert_close(found, members.entropy().mean(1) + torch.tensor(2.0).double().log())
+    torch.testing.assert_close(entropy, members.entropy().mean(1) + torch.tensor(2.0).double().log())

@@ -1,4 +1,4 @@
-"""The conditional variational autoencoder: its networks, its two bounds as functions, and the head."""
+"""The conditional variational autoencoder: its networks, its two lower bounds, and the density head."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -22,7 +22,7 @@ from plugins.density_head.latent.density import MODERATE, Latent, LatentDensity
 from plugins.density_head.latent.monte_carlo import Effort
 
 LARGEST_LOG_SCALE = 7.0
-"""Bound on log standard deviations of z, which stay within e^±7, so that no ratio of two of them overflows."""
+"""Bound on the log standard deviations of z, so that no ratio of two standard deviations overflows."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Gaussian:
         return self.at(torch.randn(count, *self.mean.shape, dtype=self.mean.dtype, device=self.mean.device))
 
     def at(self, noise: Tensor) -> Tensor:
-        """Return z at standard normal numbers (*sample, *batch, latent)."""
+        """Return z for standard normal noise (*sample, *batch, latent), in the same shape."""
         return self.mean + self.log_scale.exp() * noise
 
     def log_prob(self, z: Tensor) -> Tensor:
@@ -45,12 +45,12 @@ class Gaussian:
         return self.log_prob_at((z - self.mean) * torch.exp(-self.log_scale))
 
     def log_prob_at(self, noise: Tensor) -> Tensor:
-        """Return log_prob of `at(noise)`, without the cancellation in z - mean if the mean is large."""
+        """Return log_prob of `at(noise)`, (*sample, *batch), without the cancellation in z - mean for a large mean."""
         return -(noise.square() / 2 + self.log_scale + math.log(2 * math.pi) / 2).sum(-1)
 
 
 def kl_divergence(first: Gaussian, second: Gaussian) -> Tensor:
-    """Return KL(first || second), nats, (*batch,), exactly 0 for equals (Kingma & Welling 2014, appendix B)."""
+    """Return KL(first || second), nats, (*batch,); 0 for equal arguments (Kingma & Welling 2014, appendix B)."""
     log_ratio = 2 * (first.log_scale - second.log_scale)
     shift = (first.mean - second.mean) * torch.exp(-second.log_scale)
     return ((torch.expm1(log_ratio) - log_ratio + shift.square()) / 2).sum(-1)
@@ -58,14 +58,14 @@ def kl_divergence(first: Gaussian, second: Gaussian) -> Tensor:
 
 @dataclass(frozen=True)
 class Networks(Latent):
-    """The networks of one batch of inputs x.
+    """The networks of a CVAE, applied to one batch of inputs x.
 
     Attributes:
         prior: p(z|x), of shape (*batch, latent).
-        posterior: φ of shape (*sample, *batch, *event) → q(z|x,φ) of shape (*sample, *batch, latent).
-        decode: z of shape (*sample, *batch, latent) → the component's raw parameters (*sample, *batch, number).
-        component: raw parameters → p(φ|x,z).
-        rows: indices (rows,) into the flattened batch → the networks of these inputs.
+        posterior: function from φ (*sample, *batch, *event) to q(z|x,φ) of shape (*sample, *batch, latent).
+        decode: function from z (*sample, *batch, latent) to the component's raw parameters (*sample, *batch, number).
+        component: function from raw parameters to p(φ|x,z).
+        rows: function from indices (rows,) into the flattened batch to the networks of these inputs.
         width: number of activations that one decoded z holds in memory.
         size: number of raw parameters that the component reads.
     """
@@ -84,7 +84,7 @@ class Networks(Latent):
         return self.prior.mean
 
     def numbers(self, noise: Tensor) -> Tensor:
-        """Return the component's raw parameters at z of the noise, (*batch, sample, number)."""
+        """Return the component's raw parameters at the z of the noise, (*batch, sample, number)."""
         z = self.prior.at(noise.reshape(len(noise), *self.center.shape))
         return torch.cat([self.decode(part) for part in z.split(self.at_once(len(z)))]).movedim(0, -2)
 
@@ -96,8 +96,8 @@ class Networks(Latent):
         """Return `count` values of each item, each with a new z."""
         step = self.at_once(count)
         parts = [
-            self.component(self.decode(self.prior.draw(min(step, count - done)))).sample()
-            for done in range(0, count, step)
+            self.component(self.decode(self.prior.draw(min(step, count - start)))).sample()
+            for start in range(0, count, step)
         ]
         return torch.cat(parts)
 
@@ -111,7 +111,7 @@ class Networks(Latent):
 
 
 def importance_log_weights(networks: Networks, value: Tensor, noise: Tensor) -> Tensor:
-    """Return log p(φ|x,z) p(z|x) / q(z|x,φ), nats, of z ~ q at standard normal `noise` (terms of eq. 3.19).
+    """Return log p(φ|x,z) p(z|x) / q(z|x,φ), nats, for z ~ q at standard normal `noise` (terms of eq. 3.19).
 
     Shapes: value (*sample, *batch, *event), noise (*draw, *sample, *batch, latent), result (*draw, *sample, *batch).
     """
@@ -122,7 +122,10 @@ def importance_log_weights(networks: Networks, value: Tensor, noise: Tensor) -> 
 
 
 def evidence_bound(networks: Networks, value: Tensor, samples: int) -> Tensor:
-    """Return a lower bound on log p(φ|x), nats: the first term by `samples` draws, the second exactly (eq. 3.17)."""
+    """Return a lower bound on log p(φ|x), nats, (*batch,) (eq. 3.17).
+
+    The first term is a mean over `samples` samples of z; the divergence is exact.
+    """
     posterior = networks.posterior(value)
     likelihood = networks.component(networks.decode(posterior.draw(samples))).log_prob(value)
     return likelihood.mean(0) - kl_divergence(posterior, networks.prior)
@@ -132,14 +135,14 @@ class CVAEHead(DensityHead):
     """CVAE: an infinite mixture over a latent z with a learned prior (thesis §3.5.2, eq. 3.12-3.20).
 
     Prior p(z|x), encoder q(z|x,φ) and decoder p(φ|x,z) train by the evidence lower bound (eq. 3.17-3.18); log_prob is
-    the importance-weighted bound (eq. 3.19). The framework's linear layer is the part of each network's first layer
-    that reads the features; it is computed once per item.
+    the importance-weighted bound (eq. 3.19). The framework's linear layer serves as the part of each network's first
+    layer that reads the features, and is computed once per item.
 
     Args:
         latent: dimensions of z.
         hidden: width of each of the three networks.
         training_samples: S of the training loss.
-        samples: S in evaluation, of the bound and of the mixture it is drawn as; may be set at any time.
+        samples: S in evaluation, for the bound and for the mixture that gives mode and entropy; may be set at any time.
         tolerance: nats; may be set at any time. In evaluation log_prob then draws `samples` and doubles them until its
             estimated error is below the tolerance. None: S samples.
         backbones: "shared": prior, encoder and decoder read the features of one network; "each": each reads those of
@@ -148,18 +151,7 @@ class CVAEHead(DensityHead):
     """
 
     knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {"samples": (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)}
-    bibtex = """@inproceedings{sohn2015learning,
-  title = {Learning Structured Output Representation using Deep Conditional Generative Models},
-  author = {Sohn, Kihyuk and Lee, Honglak and Yan, Xinchen},
-  booktitle = {Advances in Neural Information Processing Systems (NIPS)},
-  year = {2015}
-}
-@inproceedings{burda2016importance,
-  title = {Importance Weighted Autoencoders},
-  author = {Burda, Yuri and Grosse, Roger and Salakhutdinov, Ruslan},
-  booktitle = {International Conference on Learning Representations (ICLR)},
-  year = {2016}
-}"""
+    bibtex = "sohn2015learning, burda2016importance"
 
     def __init__(
         self,
@@ -181,11 +173,11 @@ class CVAEHead(DensityHead):
         self.samples = samples
         self.tolerance = tolerance
         self.component = require_trained(component)
-        self.prior = _rest(hidden, 2 * latent)
+        self.prior = _layers_after_first(hidden, 2 * latent)
         self.from_value = nn.Linear(
             len(target.names) * (2 if target.kind == "angle" else 1), hidden, bias=False
         )
-        self.posterior = _rest(hidden, 2 * latent)
+        self.posterior = _layers_after_first(hidden, 2 * latent)
         self.decoder = LatentDecoder(latent, hidden, component.size)
         parts = (hidden, hidden, self.decoder.size)
         self.size = sum(parts)
@@ -204,7 +196,7 @@ class CVAEHead(DensityHead):
     def networks(self, raw: Float[Tensor, "*batch size"]) -> Networks:
         """Return prior, encoder and decoder, given the features."""
         raw = require_finite(raw, self.size)
-        # clamped, so that no raw parameter overflows in the layers that follow
+        # clamped, so that nothing overflows in the layers that follow
         features = raw.to(self.from_value.weight.dtype).clamp(-LARGEST_FEATURE, LARGEST_FEATURE)
         return self._networks(features)
 
@@ -234,7 +226,7 @@ class CVAEHead(DensityHead):
         return self.unit.standardise(value)
 
 
-def _rest(hidden: int, numbers: int) -> nn.Sequential:
+def _layers_after_first(hidden: int, numbers: int) -> nn.Sequential:
     """Return the layers of a network after its first linear layer."""
     return nn.Sequential(nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, numbers))
 

@@ -1,4 +1,4 @@
-"""The decoder of latent-variable density heads, from features and a latent vector to a component's raw parameters."""
+"""The decoder of latent-variable density heads: features and a latent vector give a component's raw parameters."""
 
 import torch
 from jaxtyping import Float
@@ -11,16 +11,16 @@ LARGEST_FEATURE = 1e6
 class LatentDecoder(nn.Module):
     """Two hidden layers of (features, z), plus a path linear in the features and one linear in z.
 
-    The decoder reads `size` raw parameters of an item: `hidden` features of the network, then `numbers` that are added
-    to its output for every z, then `numbers × latent` that modify the path linear in z. So the framework's linear layer
-    is the first layer of all three and is computed once per item; a layer of z alone is added to the features, once per
-    sample.
+    The decoder reads `size` raw parameters of an item: `hidden` features, then `numbers` values that are added to the
+    output for every z, then `numbers × latent` values that modify the path linear in z. So the framework's linear layer
+    is the first layer of all three parts and is computed once per item. A layer of z alone is computed once per sample
+    and added to the features.
 
-    The two linear paths prevent a mixture over several numbers from collapsing. The shared numbers shift all components
-    together, so that what each component must learn (an angle that the image determines) does not favour the component
-    that learnt it first. `spread` makes components differ from the first step. The image modifies it: two opposite
-    directions, whose mean carries no information, differ in the second moment, and this path learns from it at first
-    order.
+    The two linear paths prevent a mixture over several numbers from collapsing. The path linear in the features shifts
+    all components together. So what every component must learn (an angle that the image determines) does not favour the
+    component that learned it first. The matrix `spread` of the path linear in z makes components differ from the first
+    step, and the features modify it. Two opposite directions have a mean without information and differ only in the
+    second moment; this path can learn from the second moment at first order.
 
     Args:
         latent: dimensions of z.
@@ -40,7 +40,7 @@ class LatentDecoder(nn.Module):
     def forward(
         self, raw: Float[Tensor, "*#batch size"], z: Float[Tensor, "*#batch latent"]
     ) -> Float[Tensor, "*batch numbers"]:
-        """Return the component's raw parameters, (*batch, numbers), for each z."""
+        """Return the component's raw parameters for each z, (*batch, numbers)."""
         raw = raw.to(z.dtype).clamp(-LARGEST_FEATURE, LARGEST_FEATURE)
         features, shared, turned = raw.split(self.parts, -1)
         spread = self.spread + turned.unflatten(-1, self.spread.shape)

@@ -28,20 +28,25 @@ from plugins.density_head.latent.monte_carlo import (
     SampledMixture,
     estimate_log_mean,
     rows_of,
-    stretched,
+    stretch,
 )
 
 CHUNK = 2**22
-"""Largest number of hidden activations held at once without gradient (16 MiB in float32)."""
+"""Largest number of hidden activations in memory at once, if no gradient is needed (16 MiB in float32)."""
 MODERATE = {"name": "von_mises", "floor": 1.0}
-"""Settings of a component that cannot become uniform alone: several together can, and each still learns a direction."""
+"""Settings of the default component, which cannot become uniform.
+
+Several components together can describe a uniform density, and each still learns a direction.
+"""
 
 
 class Latent(ABC):
-    """p(φ|x,z) and z for one batch of inputs x; a standard normal vector, the noise, determines z.
+    """Base class of the networks of a latent-variable head, applied to one batch of inputs x.
+
+    It gives z as a function of a standard normal vector, the noise, and p(φ|x,z).
 
     Attributes:
-        component: raw parameters (*batch, number) → p(φ|x,z).
+        component: function from raw parameters (*batch, number) to p(φ|x,z).
         center: z of the prior at noise 0, (*batch, latent).
         width: number of activations that one decoded z holds in memory.
         size: number of raw parameters that the component reads.
@@ -53,18 +58,18 @@ class Latent(ABC):
     size: int
 
     def example(self) -> Distribution:
-        """Return the component of raw parameters 0, (*batch); it shows the support without the cost of a decoder."""
+        """Return the component for raw parameters of 0, (*batch); its support is known without running the decoder."""
         return self.component(self.center.new_zeros(*self.center.shape[:-1], self.size))
 
     @abstractmethod
     def numbers(self, noise: Float[Tensor, "sample item latent"]) -> Float[Tensor, "*batch sample number"]:
-        """Return the component's raw parameters at z of the prior; without gradient chunk by chunk."""
+        """Return the component's raw parameters at the z of the noise; computed in chunks if no gradient is needed."""
 
     @abstractmethod
     def log_weights(
         self, value: Tensor, items: Int[Tensor, "row"], noise: Float[Tensor, "*draw row latent"]
     ) -> Float[Tensor, "*draw row"]:
-        """Return the log of weights whose mean is p(φ|x), nats.
+        """Return the log of weights, nats; the mean of the weights over the noise is p(φ|x).
 
         Args:
             value: (row, *event).
@@ -86,24 +91,26 @@ class Latent(ABC):
         return self.center.shape[:-1].numel()
 
     def full_precision(self) -> torch.autocast:
-        """Return the context in which networks are not rounded, whatever the precision that training chose."""
+        """Return a context without autocast, so that networks are computed in full precision also in mixed training."""
         return torch.autocast(self.center.device.type, enabled=False)
 
-    def points(self, effort: Effort, kept: int = 0) -> NormalPoints:
-        """Return the noise of every item."""
+    def points(self, effort: Effort, kept_count: int = 0) -> NormalPoints:
+        """Return the sequences of noise for all items."""
         dtype, device = self.center.dtype, self.center.device
         dimensions = self.center.shape[-1]
-        return NormalPoints(self.items, effort.replicates, dimensions, dtype=dtype, device=device, kept=kept)
+        return NormalPoints(
+            self.items, effort.replicates, dimensions, dtype=dtype, device=device, kept_count=kept_count
+        )
 
     def at_once(self, count: int) -> int:
-        """Return how many of `count` z of every item are decoded together; with gradient all of them."""
+        """Return how many of `count` samples z of an item are decoded together; all of them if a gradient is needed."""
         if torch.is_grad_enabled():
             return max(1, count)
         return max(1, CHUNK // (max(1, self.items) * self.width))
 
 
 def sampled_mixture(latent: Latent, points: NormalPoints, effort: Effort) -> SampledMixture:
-    """Return a mixture of a component at each of S points, with equal weights (eq. 3.21)."""
+    """Return the mixture, with equal weights, of the components at S points z (eq. 3.21)."""
     items = torch.arange(latent.items, device=latent.center.device)
     number = latent.numbers(points(items, 0, effort.first).flatten(0, 1))
     weights = torch.zeros(number.shape[:-1], dtype=number.dtype, device=number.device)
@@ -113,10 +120,10 @@ def sampled_mixture(latent: Latent, points: NormalPoints, effort: Effort) -> Sam
 class LatentDensity(Distribution):
     """The density p(φ|x) = ∫ p(φ|x,z) p(z|x) dz (eq. 3.12, 3.21).
 
-    `log_prob` is the log of a mean weight at points z that are drawn once, so that it is a function of φ. Its
-    expectation over the draw is below the truth and rises to it with the number of samples. With a tolerance it doubles
-    the samples of each value until the estimated error is below the tolerance. `sample` draws a new z for every value.
-    `entropy`, `mode`, `median` and `marginal` are those of `mixture`.
+    `log_prob` is the log of a mean weight at points z. The points are sampled once, so that log_prob is a fixed
+    function of φ. Its expectation over the points is below the true log-density and rises towards it with the number of
+    samples. With a tolerance, the samples of each value are doubled until the estimated error is below the tolerance.
+    `sample` draws a new z for every value. `entropy`, `mode`, `median` and `marginal` are those of `mixture`.
     """
 
     arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
@@ -126,8 +133,8 @@ class LatentDensity(Distribution):
     def __init__(self, latent: Latent, effort: Effort) -> None:
         self.latent = latent
         self.effort = effort
-        # drawn now, so that no result depends on the order of calls
-        self.points = latent.points(effort, kept=effort.first)
+        # sampled here, so that no result depends on the order of calls
+        self.points = latent.points(effort, kept_count=effort.first)
         self._fixed = Effort(effort.samples)
         self._mixture_points = latent.points(self._fixed)
         self._example = latent.example()
@@ -140,12 +147,12 @@ class LatentDensity(Distribution):
         return self._example.support  # pyright: ignore[reportReturnType]
 
     def enumerate_support(self, expand: bool = True) -> Tensor:
-        """Return every class, (class, *batch) or (class, *1) without `expand`."""
+        """Return every class, (class, *batch) if `expand`, else (class, *1)."""
         return self._example.enumerate_support(expand)
 
     @cached_property
     def mixture(self) -> SampledMixture:
-        """The mixture of S components with equal weights and z from the prior: decoded at first use, then kept."""
+        """The mixture, with equal weights, of S components at z from the prior; computed once, at first use."""
         with self.latent.full_precision():
             return sampled_mixture(self.latent, self._mixture_points, self._fixed)
 
@@ -160,8 +167,8 @@ class LatentDensity(Distribution):
         if shape.numel() == 0 or self.batch_shape.numel() == 0:
             return self._example.sample(shape)
         with self.latent.full_precision():
-            drawn = self.latent.sample(shape.numel())
-        return drawn.reshape(shape + self.batch_shape + self.event_shape)
+            samples = self.latent.sample(shape.numel())
+        return samples.reshape(shape + self.batch_shape + self.event_shape)
 
     @property
     def mode(self) -> Tensor:
@@ -182,16 +189,16 @@ def _(density: LatentDensity, value: Tensor) -> Estimate:
         noise = density.points(items[rows], start, count)
         if not density.effort.tolerance:
             return latent.log_weights(values[rows], items[rows], noise)
-        noise, log_share = stretched(noise)
-        found = latent.log_weights(values[rows], items[rows], noise)
-        return torch.stack([found + log_share, log_share.expand_as(found)])
+        noise, log_share = stretch(noise)
+        weights = latent.log_weights(values[rows], items[rows], noise)
+        return torch.stack([weights + log_share, log_share.expand_as(weights)])
 
     at_once = CHUNK // latent.width
     with latent.full_precision():
-        found = estimate_log_mean(
+        result = estimate_log_mean(
             log_weights, len(items), density.effort, at_once=at_once, device=latent.center.device
         )
-    return found.map_fields(lambda field: field.reshape(shape))
+    return result.map_fields(lambda field: field.reshape(shape))
 
 
 @marginal.register
@@ -221,10 +228,10 @@ def _(density: LatentDensity) -> Tensor:
 
 @tempered_density.register
 def _(density: LatentDensity, temperature: Tensor) -> Distribution:
-    """Return the density with tempered components at the same points; for classes the whole density is tempered."""
+    """Return the density with tempered components at the same points z; for classes the whole density is tempered."""
     changed = copy.copy(density)
     if temperature.requires_grad:
-        changed.effort = density._fixed  # with a tolerance, the draws of all rounds would be held
+        changed.effort = density._fixed  # with a tolerance, the samples of all rounds would stay in memory
     if density.has_enumerate_support:
         return tempered_classes(changed, temperature)
     changed.__dict__.pop("mixture", None)  # the cached mixture is that of the untempered components

@@ -17,21 +17,24 @@ from framework.distributions.tempering import tempered_classes
 from framework.errors import ConfigError
 
 REPLICATES = 8
-"""Largest number of independent estimates that a standard error is computed from."""
+"""Largest number of independent estimates from which a standard error is computed."""
 TO_TOLERANCE, LEAST = 32, 8
-"""Number of independent estimates with a tolerance, and smallest number of points of each.
+"""Number of independent estimates if there is a tolerance, and smallest number of points of each estimate.
 
-With a tolerance, samples are doubled until the error is small, which favours errors that are small by chance. The error
-would be underestimated by a third with 8 estimates, by some percent with 32.
+With a tolerance, samples are doubled until the estimated error is small, which favours errors that are small by chance.
+With 8 estimates the error would be underestimated by a third, with 32 only by some percent.
 """
 STRETCH = 0.4
-"""Heaviness of the tails of these points (`stretched`): in one dimension 3 % lie above 4, of normal ones 0.003 %."""
+"""Heaviness of the tails of the points of `stretch`.
+
+In one dimension 3 % of them lie above 4; of normal points 0.003 % do.
+"""
 MOST = 2**18
-"""Number of samples after which an item that has not reached its tolerance is given up."""
+"""Largest number of samples of an item; if its error is still above the tolerance, it is reported as unresolved."""
 GENERATOR = 1267
-"""Generator of the lattice, chosen by measured variance (benchmarks/densities/latent.md)."""
+"""Multiplier a of the lattice, chosen by measured variance (benchmarks/densities/latent.md)."""
 LARGEST_KEPT = 2**22
-"""Largest number of normal points that a density keeps (16 MiB in float32); more are recomputed for every value."""
+"""Largest number of normal points that a density keeps in memory (16 MiB in float32); more are recomputed."""
 
 
 @dataclass(frozen=True)
@@ -40,11 +43,11 @@ class Effort:
 
     Args:
         samples: S; with a tolerance, the samples of the first round, rounded up to a power of two and at least 256.
-        tolerance: nats. Samples are doubled until an item's estimated error is below, or MOST are drawn. None: S
-            samples.
+        tolerance: nats. Samples are doubled until an item's estimated error is below the tolerance, or MOST samples are
+            drawn. None: exactly S samples.
 
     Raises:
-        ConfigError: no sample, or a tolerance that is not above zero.
+        ConfigError: `samples` is below 1, or the tolerance is not above 0.
     """
 
     samples: int
@@ -52,11 +55,11 @@ class Effort:
 
     def __post_init__(self) -> None:
         if self.samples < 1:
-            raise ConfigError(f"samples = {self.samples}; wanted 1 or more.")
+            raise ConfigError(f"density_head.samples is {self.samples}, expected 1 or more.")
         if self.tolerance is not None and not 0 < self.tolerance < math.inf:
             raise ConfigError(
-                f"tolerance = {self.tolerance} nats; wanted a number above 0, such as 0.01, or null for a fixed number "
-                "of samples."
+                f"density_head.tolerance is {self.tolerance} nats, expected a number above 0, such as 0.01, or null "
+                "for a fixed number of samples."
             )
 
     @property
@@ -95,7 +98,7 @@ def _(density: SampledMixture, value: Tensor) -> Estimate:
         return concatenate_estimates([estimate(density, part) for part in parts])
     log_weights = density.components.log_prob(value.unsqueeze(-1 - len(density.event_shape)))
     log_weights = log_weights.unflatten(-1, (density.replicates, -1))
-    return estimated(torch.logsumexp(log_weights, -1).movedim(-1, 0), log_weights.shape[-1])
+    return estimate_from_sums(torch.logsumexp(log_weights, -1).movedim(-1, 0), log_weights.shape[-1])
 
 
 @marginal.register
@@ -105,28 +108,34 @@ def _(density: SampledMixture, index: int) -> Distribution:
 
 @tempered_density.register
 def _(density: SampledMixture, temperature: Tensor) -> Distribution:
-    """Return the mixture of tempered components; of classes the whole is tempered, which keeps the likeliest class."""
+    """Return the mixture of tempered components; for classes the whole mixture is tempered, which keeps its mode."""
     if density.has_enumerate_support:
         return tempered_classes(density, temperature)
     components = tempered_density(density.components, temperature)
     return SampledMixture(density.log_weights, components, density.replicates)
 
 
-def estimated(
+def estimate_from_sums(
     log_sums: Float[Tensor, "replicate *items"],
     count: int,
     log_shares: Float[Tensor, "replicate *items"] | None = None,
 ) -> Estimate:
-    """Return the estimate from independent replicates, each the log of a sum of `count` weights.
+    """Return the estimate of the log of a mean weight, nats, with its standard error, from independent replicates.
 
-    With shares, whose mean is known to be 1, the estimate is the ratio of both means: it has no error if the weights
-    are proportional to the shares. Below, m_r is then the mean weight less the part that the share explains (ratio
-    estimator, Cochran 1977, §6).
+    Let m_r be the mean weight of replicate r divided by the mean weight of all R replicates. The squared relative
+    standard error of the mean weight is s² = Σ (m_r - 1)² / (R (R - 1)), and s is also the standard error of its
+    logarithm (delta method). The expectation of the logarithm is too small by s²/2, which `debiased` adds. A jackknife
+    over replicates removes the same term, but is infinite if one replicate has all the weight; s² is at most 1, and
+    the correction at most 1/2.
 
-    With m_r the mean weight of replicate r over that of all, the squared standard error of the mean weight, relative to
-    it, is s² = Σ (m_r - 1)² / (R (R - 1)), and s is also that of its logarithm (delta method). The expectation of the
-    logarithm is low by s²/2. A jackknife over replicates removes the same term, but is infinite if one replicate has
-    all the weight; s² is at most 1, and the correction 1/2.
+    The shares have a known mean of 1. With shares, the estimate is the ratio of the mean weight to the mean share,
+    which has no error if the weights are proportional to the shares. The 1 in s² is then replaced by the relative mean
+    share of replicate r (ratio estimator, Cochran 1977, §6).
+
+    Args:
+        log_sums: log of the sum of the weights of each replicate.
+        count: number of weights of each replicate.
+        log_shares: log of the sum of the shares of each replicate (`stretch`), or None.
     """
     replicates = len(log_sums)
     log_count = math.log(replicates * count) if log_shares is None else torch.logsumexp(log_shares, 0)
@@ -144,9 +153,9 @@ def estimated(
     return Estimate(log_mean, log_mean + correction, standard_error, samples, torch.zeros_like(nothing))
 
 
-def estimated_error(found: Estimate) -> Float[Tensor, "*items"]:
+def estimated_error(result: Estimate) -> Float[Tensor, "*items"]:
     """Return the root mean square error of log_mean, nats, from standard error and bias together."""
-    return torch.hypot(found.standard_error, found.standard_error.square() / 2)
+    return torch.hypot(result.standard_error, result.standard_error.square() / 2)
 
 
 def estimate_log_mean(
@@ -157,15 +166,16 @@ def estimate_log_mean(
     at_once: int,
     device: torch.device,
 ) -> Estimate:
-    """Return log E w of each of `items`, (items,), in rounds that double the samples of items above the tolerance.
+    """Return an estimate of log E w for each item, (items,), nats.
 
-    Only a sum for each replicate and the current chunk are held. The result is differentiable if log_weights is; then
-    all draws are held, and nothing is chunked.
+    After each round, the samples of the items with an error above the tolerance are doubled. Only one sum for each
+    replicate and the current chunk are in memory. The result is differentiable if log_weights is; then all weights are
+    in memory at once.
 
     Args:
-        log_weights: (items (n,) int64, start, count) → (replicate, count, n), nats: of these items, at the points
-            `start` to `start + count` of each replicate. -inf is a weight of zero. Or (2, replicate, count, n), of
-            weights and of shares as `estimated` reads them.
+        log_weights: function of (items (n,) int64, start, count) that returns (replicate, count, n): the log of the
+            weights of these items at the points `start` to `start + count` of each replicate, nats, -inf for a weight
+            of 0. It may return (2, replicate, count, n) instead: the logs of weights and shares (`stretch`).
         items: number of items.
         effort: number of samples, and tolerance.
         at_once: largest number of weights requested together (at least one for each replicate).
@@ -175,27 +185,29 @@ def estimate_log_mean(
         at_once = max(at_once, items * effort.replicates * MOST)
     rows = torch.arange(items, device=device)
     log_sums = _log_sums(log_weights, rows, 0, effort.first, effort.replicates, at_once)
-    done = effort.first
+    drawn_count = effort.first
     finished: list[tuple[Tensor, Estimate]] = []
     while True:
-        found = (
-            estimated(log_sums, done) if log_sums.dim() == 2 else estimated(log_sums[0], done, log_sums[1])
+        result = (
+            estimate_from_sums(log_sums, drawn_count)
+            if log_sums.dim() == 2
+            else estimate_from_sums(log_sums[0], drawn_count, log_sums[1])
         )
         if effort.tolerance is None:
-            return found
-        # a NaN weight stays NaN, whatever is added
-        wanting = ~(estimated_error(found) <= effort.tolerance)
-        more = wanting & ~found.log_mean.isnan()
-        if effort.replicates * done * 2 > MOST:
+            return result
+        # the estimate of a NaN weight stays NaN, so that more samples cannot help
+        wanting = ~(estimated_error(result) <= effort.tolerance)
+        more = wanting & ~result.log_mean.isnan()
+        if effort.replicates * drawn_count * 2 > MOST:
             more = torch.zeros_like(more)
-        found = found._replace(unresolved=wanting)
-        finished.append((rows[~more], found.map_fields(lambda field, chosen=~more: field[chosen])))
+        result = result._replace(unresolved=wanting)
+        finished.append((rows[~more], result.map_fields(lambda field, chosen=~more: field[chosen])))
         if not more.any():
             break
         rows = rows[more]
-        further = _log_sums(log_weights, rows, done, done, effort.replicates, at_once)
+        further = _log_sums(log_weights, rows, drawn_count, drawn_count, effort.replicates, at_once)
         log_sums = torch.logaddexp(log_sums[..., more], further)
-        done *= 2
+        drawn_count *= 2
     order = torch.cat([rows for rows, _ in finished]).argsort()
     return concatenate_estimates([part for _, part in finished]).map_fields(lambda field: field[order])
 
@@ -208,7 +220,7 @@ def _log_sums(
     replicates: int,
     at_once: int,
 ) -> Float[Tensor, "*pair replicate rows"]:
-    """Return the log of the sum of `count` weights of each replicate, computed chunk by chunk."""
+    """Return the log of the sum of `count` weights of each replicate, nats, computed chunk by chunk."""
     step = max(1, min(count, at_once // replicates))
     parts = []
     for some in rows.split(max(1, at_once // (replicates * step))):
@@ -237,19 +249,19 @@ def rows_of(
 
 
 class NormalPoints:
-    """Standard normal points z: a sequence for each item and replicate that can be extended without limit.
+    """Standard normal points z: one sequence, of any length, for each item and replicate.
 
-    All are one extensible lattice (`lattice`), each shifted by a random vector modulo 1 (Cranley & Patterson 1976), so
-    that a replicate's mean is unbiased and replicates are independent, and mapped by the normal quantile. They are
-    drawn from torch's global generator in float64, so that float32 and float64 get the same points.
+    Every sequence is the same lattice (`lattice`), shifted by its own random vector modulo 1 (Cranley & Patterson 1976)
+    and mapped by the normal quantile. So the mean of a replicate is unbiased, and replicates are independent. The
+    shifts come from torch's global generator in float64, so that float32 and float64 have the same points.
 
     Args:
         items: number of items of a flattened batch.
         replicates: R.
         dimensions: dimensions of z.
-        dtype, device: of the points.
-        kept: number of first points of each replicate that are kept from first use, for many values at the same points;
-            none are kept if they exceed LARGEST_KEPT.
+        dtype, device: dtype and device of the points.
+        kept_count: number of first points of each replicate that stay in memory after their first use, because many
+            values are evaluated at the same points; 0 is used if this would exceed LARGEST_KEPT.
     """
 
     def __init__(
@@ -260,37 +272,37 @@ class NormalPoints:
         *,
         dtype: torch.dtype,
         device: torch.device,
-        kept: int = 0,
+        kept_count: int = 0,
     ) -> None:
         self.shift = torch.rand(replicates, 1, items, dimensions, dtype=torch.float64, device=device)
         self.dtype = dtype
-        self.kept = kept if self.shift.numel() * kept <= LARGEST_KEPT else 0
+        self.kept_count = kept_count if self.shift.numel() * kept_count <= LARGEST_KEPT else 0
 
     def __call__(
         self, items: Int[Tensor, "rows"], start: int, count: int
     ) -> Float[Tensor, "replicate count rows dimension"]:
-        """Return points `start` to `start + count` of the sequences of some items."""
-        if start + count <= self.kept:
+        """Return the points `start` to `start + count` of the sequences of the given items."""
+        if start + count <= self.kept_count:
             return self._first[:, start : start + count, items]
         return self._points(self.shift[:, :, items], start, count)
 
     @cached_property
     def _first(self) -> Tensor:
-        return self._points(self.shift, 0, self.kept)
+        return self._points(self.shift, 0, self.kept_count)
 
     def _points(self, shift: Tensor, start: int, count: int) -> Tensor:
         places = lattice(start, count, shift.shape[-1], shift.device)
         return normal_quantile(torch.remainder(places[:, None] + shift, 1.0)).to(self.dtype)
 
 
-def stretched(
+def stretch(
     points: Float[Tensor, "*shape dimension"],
 ) -> tuple[Float[Tensor, "*shape dimension"], Float[Tensor, "*shape"]]:
-    """Return points of heavier tails, z = y exp(h y²/2) of standard normal y (Tukey's h), and the log of their shares.
+    """Return points with heavier tails, z = y exp(h y²/2) for normal y (Tukey's h), and the log of their shares.
 
-    A share is the standard normal density at z over the density of the points. Weights times shares have the mean that
-    weights have under normal points, but no weight is large only in a region with hardly any point (defensive sampling,
-    Hesterberg 1995).
+    The share of a point is the standard normal density at z divided by the density from which z comes. Weights times
+    shares at these points have the same mean as weights at normal points, but regions far from 0 hold more points, so
+    that large weights there are not missed (defensive sampling, Hesterberg 1995).
     """
     h = STRETCH / points.shape[-1] ** 0.5
     square = points.square()
@@ -301,10 +313,11 @@ def stretched(
 def lattice(
     start: int, count: int, dimensions: int, device: torch.device | None = None
 ) -> Float[Tensor, "count dimension"]:
-    """Return points `start` to `start + count` of an extensible Korobov sequence in [0, 1), float64 and exact.
+    """Return points `start` to `start + count` of an extensible Korobov sequence in [0, 1), float64, without rounding.
 
-    Point i is r(i) (1, a, a², …) mod 1 with r the radical inverse: the binary digits of i mirrored at the binary point.
-    The first 2^m points, for any m, are a whole lattice (Hickernell, Hong, L'Ecuyer & Lemieux 2000, §2).
+    Point i is r(i) (1, a, a², …) mod 1, with a = GENERATOR and the radical inverse r, which mirrors the binary digits
+    of i at the binary point. The first 2^m points, for any m, are a complete lattice (Hickernell, Hong, L'Ecuyer &
+    Lemieux 2000, §2).
     """
     number = torch.arange(start, start + count, device=device)
     inverse = torch.zeros(count, dtype=torch.float64, device=device)

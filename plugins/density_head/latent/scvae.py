@@ -1,4 +1,4 @@
-"""The simplified conditional variational autoencoder: its decoder for one batch, and the head."""
+"""The simplified conditional variational autoencoder: its decoder for one batch, and the density head."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -23,12 +23,12 @@ from plugins.density_head.latent.monte_carlo import Effort
 
 @dataclass(frozen=True)
 class Networks(Latent):
-    """The decoder for one batch of inputs x; z is the noise itself.
+    """The decoder of an SCVAE, applied to one batch of inputs x; z is the noise itself.
 
     Attributes:
         raw: raw parameters of each input, (*batch, size).
-        decode: (raw, z), broadcast against each other → the component's raw parameters (*batch, number).
-        component: raw parameters → p(φ|x,z).
+        decode: function from (raw, z), which are broadcast, to the component's raw parameters (*batch, number).
+        component: function from raw parameters to p(φ|x,z).
         center: zeros, (*batch, latent), of the dtype of z.
         width: number of activations that one decoded z holds in memory.
         size: number of raw parameters that the component reads.
@@ -42,7 +42,7 @@ class Networks(Latent):
     size: int
 
     def numbers(self, noise: Tensor) -> Tensor:
-        """Return the component's raw parameters at z of the noise, (*batch, sample, number)."""
+        """Return the component's raw parameters at z = noise, (*batch, sample, number)."""
         return self._decoded(noise.movedim(0, 1).reshape(*self.raw.shape[:-1], len(noise), noise.shape[-1]))
 
     def _decoded(self, z: Float[Tensor, "*batch sample latent"]) -> Float[Tensor, "*batch sample number"]:
@@ -82,13 +82,7 @@ class SCVAEHead(DensityHead):
     """
 
     knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {"samples": (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)}
-    bibtex = """@inproceedings{prokudin2018deep,
-  author    = {Prokudin, Sergey and Gehler, Peter and Nowozin, Sebastian},
-  title     = {Deep Directional Statistics: Pose Estimation with Uncertainty Quantification},
-  booktitle = {European Conference on Computer Vision (ECCV)},
-  pages     = {534--551},
-  year      = {2018}
-}"""
+    bibtex = "prokudin2018deep"
 
     def __init__(
         self,
@@ -132,5 +126,5 @@ class SCVAEHead(DensityHead):
     def decode(
         self, raw: Float[Tensor, "*batch size"], z: Float[Tensor, "*batch sample latent"]
     ) -> Float[Tensor, "*batch sample number"]:
-        """Return the component's raw parameters at every z."""
+        """Return the component's raw parameters at every z, (*batch, sample, number)."""
         return self.decoder(raw.unsqueeze(-2), z)

@@ -11,16 +11,16 @@ def test_it_is_a_network_of_both_plus_a_path_of_each() -> None:
     assert decoder.size == 5 + 4 + 12
     raw = torch.randn(2, 1, decoder.size, dtype=torch.float64)
     z = torch.randn(2, 7, 3, dtype=torch.float64)
-    found = decoder(raw, z)
+    decoded = decoder(raw, z)
     for item in range(2):
         features, shared, turned = raw[item, 0, :5], raw[item, 0, 5:9], raw[item, 0, 9:].reshape(4, 3)
         for sample in range(7):
-            one = z[item, sample]
-            hidden = (features + decoder.from_latent.weight @ one).clamp(min=0)
+            point = z[item, sample]
+            hidden = (features + decoder.from_latent.weight @ point).clamp(min=0)
             hidden = (decoder.body[1].weight @ hidden + decoder.body[1].bias).clamp(min=0)
             wanted = decoder.body[3].weight @ hidden + decoder.body[3].bias + shared
-            wanted = wanted + (decoder.spread + turned) @ one
-            torch.testing.assert_close(found[item, sample], wanted, rtol=1e-12, atol=1e-12)
+            wanted = wanted + (decoder.spread + turned) @ point
+            torch.testing.assert_close(decoded[item, sample], wanted, rtol=1e-12, atol=1e-12)
 
 
 def test_numbers_start_with_unit_spread_over_z() -> None:

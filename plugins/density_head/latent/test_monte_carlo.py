@@ -14,12 +14,12 @@ from plugins.density_head.latent.monte_carlo import (
     Effort,
     NormalPoints,
     SampledMixture,
+    estimate_from_sums,
     estimate_log_mean,
-    estimated,
     estimated_error,
     lattice,
     rows_of,
-    stretched,
+    stretch,
 )
 
 CPU = torch.device("cpu")
@@ -33,7 +33,7 @@ def bump(z, items):
     return -FALL[items] * (z.sum(-1) / z.shape[-1] ** 0.5 - 0.4).square() / 2
 
 
-def sampled(effort, dimensions=2, seed=0, at_once=2**20, log_weight=bump):
+def run_estimate(effort, dimensions=2, seed=0, at_once=2**20, log_weight=bump):
     """Return the estimate as a density computes it: to a tolerance by points of heavier tails."""
     torch.manual_seed(seed)
     points = NormalPoints(ITEMS, effort.replicates, dimensions, dtype=torch.float64, device=CPU)
@@ -42,7 +42,7 @@ def sampled(effort, dimensions=2, seed=0, at_once=2**20, log_weight=bump):
         z = points(items, start, count)
         if effort.tolerance is None:
             return log_weight(z, items)
-        z, log_share = stretched(z)
+        z, log_share = stretch(z)
         return torch.stack([log_weight(z, items) + log_share, log_share])
 
     with torch.no_grad():
@@ -50,12 +50,12 @@ def sampled(effort, dimensions=2, seed=0, at_once=2**20, log_weight=bump):
 
 
 def test_the_lattice_mirrors_digits_and_continues():
-    found = lattice(0, 40, 3)
+    points = lattice(0, 40, 3)
     for number in range(40):
         inverse = int(format(number, "032b")[::-1], 2) / 2**32
         expected = [math.fmod(inverse * pow(1267, power, 2**20), 1.0) for power in range(3)]
-        assert found[number].tolist() == expected
-    assert torch.equal(lattice(13, 27, 3), found[13:])
+        assert points[number].tolist() == expected
+    assert torch.equal(lattice(13, 27, 3), points[13:])
     far = lattice(2**30, 4, 8)
     assert ((far >= 0) & (far < 1)).all()
     assert len(far.unique(dim=0)) == 4
@@ -70,9 +70,9 @@ def test_powers_of_two_fill_every_cell_of_a_line_once(power):
 
 def test_the_quantile_agrees_with_40_digits_and_is_never_infinite():
     places = [2.0**-50, 1e-12, 1e-5, 0.02425, 0.3, 0.5, 0.8, 1 - 1e-9, 1 - 2.0**-53]
-    found = normal_quantile(torch.tensor(places, dtype=torch.float64))
+    quantiles = normal_quantile(torch.tensor(places, dtype=torch.float64))
     with mpmath.workdps(40):
-        for z, place in zip(found.tolist(), places, strict=True):
+        for z, place in zip(quantiles.tolist(), places, strict=True):
             # compared through Φ, relative to the smaller tail: rounding of a position near 1 is no error of z
             tail, back = (
                 (mpmath.mpf(place), mpmath.ncdf(z))
@@ -96,10 +96,10 @@ def test_points_are_normal_apart_and_the_same_in_both_precisions():
     means = z.square().mean(1)[..., 0]
     assert abs(np.corrcoef(means.numpy())[0, 1:]).max() < 4 / 500**0.5
     torch.manual_seed(3)
-    kept = NormalPoints(500, 4, 2, dtype=torch.float32, device=CPU, kept=40)
+    single = NormalPoints(500, 4, 2, dtype=torch.float32, device=CPU, kept_count=40)
     some = torch.tensor([7, 7, 0])
     for start, count in ((0, 40), (10, 7), (30, 34)):  # kept and recomputed
-        assert torch.equal(kept(some, start, count), z[:, start : start + count, some].float())
+        assert torch.equal(single(some, start, count), z[:, start : start + count, some].float())
 
 
 def test_replicates_divide_the_samples():
@@ -120,42 +120,42 @@ def test_replicates_divide_the_samples():
     "samples, tolerance", [(0, None), (10, 0.0), (10, -1.0), (10, math.nan), (10, math.inf)]
 )
 def test_an_effort_that_makes_no_sense_is_refused(samples, tolerance):
-    with pytest.raises(ConfigError, match="wanted"):
+    with pytest.raises(ConfigError, match="expected"):
         Effort(samples, tolerance)
 
 
 def test_an_estimate_of_given_sums():
     weights = np.array([[1.0, 5.0], [2.0, 5.0], [6.0, 5.0]])  # (replicate, item), sums of 4
-    found = estimated(torch.from_numpy(np.log(weights)), 4)
-    np.testing.assert_allclose(found.log_mean, np.log(weights.mean(0) / 4), rtol=1e-14)
+    result = estimate_from_sums(torch.from_numpy(np.log(weights)), 4)
+    np.testing.assert_allclose(result.log_mean, np.log(weights.mean(0) / 4), rtol=1e-14)
     error = weights.std(0, ddof=1) / 3**0.5 / weights.mean(0)
-    np.testing.assert_allclose(found.standard_error, error, rtol=1e-14, atol=1e-15)
-    np.testing.assert_allclose(found.debiased - found.log_mean, error**2 / 2, rtol=1e-13, atol=1e-15)
-    assert found.samples.tolist() == [12, 12]
+    np.testing.assert_allclose(result.standard_error, error, rtol=1e-14, atol=1e-15)
+    np.testing.assert_allclose(result.debiased - result.log_mean, error**2 / 2, rtol=1e-13, atol=1e-15)
+    assert result.samples.tolist() == [12, 12]
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_extreme_sums(dtype):
     inf = math.inf
     sums = torch.tensor([[-1e4, 1e4, -inf, -1e4, -1e30], [-1e4 + 1, 1e4, -inf, 1e4, -inf]], dtype=dtype)
-    found = estimated(sums, 1)
-    assert found.log_mean.tolist()[2] == found.debiased.tolist()[2] == -inf
+    result = estimate_from_sums(sums, 1)
+    assert result.log_mean.tolist()[2] == result.debiased.tolist()[2] == -inf
     # weights 1 and e: the ratio of their half difference to their mean
-    assert found.standard_error.tolist() == pytest.approx([math.tanh(0.5), 0, inf, 1, 1], rel=1e-3)
-    assert found.log_mean[[0, 1, 3]].tolist() == pytest.approx(
+    assert result.standard_error.tolist() == pytest.approx([math.tanh(0.5), 0, inf, 1, 1], rel=1e-3)
+    assert result.log_mean[[0, 1, 3]].tolist() == pytest.approx(
         [-1e4 + math.log((1 + math.e) / 2), 1e4, 1e4 - math.log(2)], rel=1e-6
     )
-    assert (found.debiased - found.log_mean)[[0, 1, 3, 4]].max() <= 0.5 + 1e-2
-    one = estimated(sums[:1], 1)
-    assert one.standard_error[:2].isnan().all()
-    assert torch.equal(one.log_mean, sums[0])
+    assert (result.debiased - result.log_mean)[[0, 1, 3, 4]].max() <= 0.5 + 1e-2
+    one_replicate = estimate_from_sums(sums[:1], 1)
+    assert one_replicate.standard_error[:2].isnan().all()
+    assert torch.equal(one_replicate.log_mean, sums[0])
 
 
 @pytest.mark.parametrize("shift", [-1e4, 1e4])
 @pytest.mark.parametrize("effort", [Effort(64), Effort(64, 0.01)])
 def test_a_factor_of_all_weights_changes_nothing_else(shift, effort):
-    plain = sampled(effort)
-    moved = sampled(effort, log_weight=lambda z, items: bump(z, items) + shift)
+    plain = run_estimate(effort)
+    moved = run_estimate(effort, log_weight=lambda z, items: bump(z, items) + shift)
     torch.testing.assert_close(moved.log_mean - shift, plain.log_mean, rtol=0, atol=1e-10)
     torch.testing.assert_close(moved.standard_error, plain.standard_error, rtol=1e-6, atol=1e-10)
     assert torch.equal(moved.samples, plain.samples)
@@ -163,48 +163,52 @@ def test_a_factor_of_all_weights_changes_nothing_else(shift, effort):
 
 def test_chunks_change_nothing():
     for effort in (Effort(60), Effort(64, 0.02)):
-        whole, chunked = sampled(effort), sampled(effort, at_once=50)
+        whole, chunked = run_estimate(effort), run_estimate(effort, at_once=50)
         torch.testing.assert_close(chunked.log_mean, whole.log_mean, rtol=1e-12, atol=1e-12)
         assert torch.equal(chunked.samples, whole.samples)
 
 
 def test_no_more_is_asked_for_at_once_than_allowed():
-    asked = []
+    sizes = []
 
     def log_weight(z, items):
-        asked.append(z[..., 0].numel())
+        sizes.append(z[..., 0].numel())
         return bump(z, items)
 
-    sampled(Effort(64, 0.01), at_once=200, log_weight=log_weight)
-    assert max(asked) <= 200
-    assert sum(asked) > 20 * 200
+    run_estimate(Effort(64, 0.01), at_once=200, log_weight=log_weight)
+    assert max(sizes) <= 200
+    assert sum(sizes) > 20 * 200
 
 
 def test_the_estimate_is_the_mean_over_the_points():
     torch.manual_seed(0)
     points = NormalPoints(ITEMS, 5, 2, dtype=torch.float64, device=CPU)
     weights = bump(points(torch.arange(ITEMS), 0, 10), torch.arange(ITEMS)).exp()
-    torch.testing.assert_close(sampled(Effort(50)).log_mean, weights.mean((0, 1)).log())
+    torch.testing.assert_close(run_estimate(Effort(50)).log_mean, weights.mean((0, 1)).log())
 
 
 @pytest.mark.parametrize("samples", [64, 500])
 def test_the_standard_error_is_that_of_many_seeds(samples):
-    found = [sampled(Effort(samples), seed=seed) for seed in range(200)]
-    errors = torch.stack([one.log_mean for one in found]) - TRUTH
-    told = torch.stack([one.standard_error for one in found])
-    ratio = errors.square().mean(0).sqrt() / told.square().mean(0).sqrt()
+    estimates = [run_estimate(Effort(samples), seed=seed) for seed in range(200)]
+    errors = torch.stack([result.log_mean for result in estimates]) - TRUTH
+    standard_errors = torch.stack([result.standard_error for result in estimates])
+    ratio = errors.square().mean(0).sqrt() / standard_errors.square().mean(0).sqrt()
     assert ratio.median() == pytest.approx(1, abs=0.1)
     assert ratio.min() > 0.7
     assert ratio.max() < 1.5
     # five or eight replicates: Student's t with 4 or 7 degrees of freedom has 88 % to 92 % within 2
-    within = ((torch.stack([one.debiased for one in found]) - TRUTH).abs() < 2 * told).double().mean()
+    within = (
+        ((torch.stack([result.debiased for result in estimates]) - TRUTH).abs() < 2 * standard_errors)
+        .double()
+        .mean()
+    )
     assert 0.83 < within < 0.96
 
 
 def test_debiasing_takes_most_of_the_bias():
-    found = [sampled(Effort(32), seed=seed) for seed in range(1000)]
-    bias = (torch.stack([one.log_mean for one in found]) - TRUTH).mean(0)
-    debiased = (torch.stack([one.debiased for one in found]) - TRUTH).mean(0)
+    estimates = [run_estimate(Effort(32), seed=seed) for seed in range(1000)]
+    bias = (torch.stack([result.log_mean for result in estimates]) - TRUTH).mean(0)
+    debiased = (torch.stack([result.debiased for result in estimates]) - TRUTH).mean(0)
     assert bias.mean() < -0.05
     assert debiased.mean().abs() < bias.mean().abs() / 2, (bias.mean(), debiased.mean())
 
@@ -217,20 +221,20 @@ def test_lattice_points_are_better_than_independent_ones(dimensions, factor):
         return torch.logsumexp(weights, 0) - math.log(512)
 
     independent = torch.stack([by_chance(seed) for seed in range(40)]) - TRUTH
-    ours = torch.stack([sampled(Effort(512), dimensions, seed).log_mean for seed in range(40)]) - TRUTH
+    ours = torch.stack([run_estimate(Effort(512), dimensions, seed).log_mean for seed in range(40)]) - TRUTH
     assert ours.square().mean() < independent.square().mean() / factor
 
 
 @pytest.mark.parametrize("tolerance", [0.1, 0.01, 0.001])
 def test_the_tolerance_is_reached(tolerance):
-    found = [sampled(Effort(64, tolerance), seed=seed) for seed in range(30)]
-    error = (torch.stack([one.log_mean for one in found]) - TRUTH).abs()
-    assert not any(one.unresolved.any() for one in found)
-    assert all((estimated_error(one) <= tolerance).all() for one in found)
+    estimates = [run_estimate(Effort(64, tolerance), seed=seed) for seed in range(30)]
+    error = (torch.stack([result.log_mean for result in estimates]) - TRUTH).abs()
+    assert not any(result.unresolved.any() for result in estimates)
+    assert all((estimated_error(result) <= tolerance).all() for result in estimates)
     # the estimated error is a standard error, with eight replicates' uncertainty: 75 % within one, 99 % within three
     assert (error < tolerance).double().mean() > 0.75
     assert (error < 3 * tolerance).double().mean() > 0.97
-    samples = torch.stack([one.samples for one in found])
+    samples = torch.stack([result.samples for result in estimates])
     assert samples.min() >= 64
     assert (samples & (samples - 1) == 0).all()  # doubled
     assert samples[:, -1].double().mean() > samples[:, 0].double().mean()  # narrow weights need more samples
@@ -239,7 +243,7 @@ def test_the_tolerance_is_reached(tolerance):
 @pytest.mark.parametrize("dimensions, highest", [(1, 25.0), (2, 25.0), (4, 9.0)])
 def test_shares_have_the_mean_1_and_points_come_far_out(dimensions, highest):
     points = NormalPoints(1, 1, dimensions, dtype=torch.float64, device=CPU)
-    z, log_share = stretched(points(torch.zeros(1, dtype=torch.int64), 0, 2**16))
+    z, log_share = stretch(points(torch.zeros(1, dtype=torch.int64), 0, 2**16))
     share = log_share.exp()[0, :, 0]
     assert share.mean().item() == pytest.approx(1, abs=0.01)
     assert (share * z[0, :, 0, 0].square()).mean().item() == pytest.approx(1, abs=0.02)
@@ -248,7 +252,7 @@ def test_shares_have_the_mean_1_and_points_come_far_out(dimensions, highest):
 
 @pytest.mark.parametrize("dimensions", [1, 2])
 @pytest.mark.parametrize("tolerance", [0.1, 0.01])
-def test_the_told_error_is_the_error_however_samples_were_chosen(dimensions, tolerance):
+def test_the_estimated_error_is_the_error_however_samples_were_chosen(dimensions, tolerance):
     """Compare estimated and actual errors of weights like those of a decoder, and of a far too narrow proposal.
 
     The root mean square is within 15 % of the estimated one, and about 1 % lie beyond three standard errors.
@@ -260,20 +264,22 @@ def test_the_told_error_is_the_error_however_samples_were_chosen(dimensions, tol
         return (z.square().sum(-1) * (1 - s.square()) / 2) + dimensions * s.log()
 
     for log_weight, truth in ((bump, TRUTH), (narrow_proposal, torch.zeros(ITEMS, dtype=torch.float64))):
-        found = [
-            sampled(Effort(64, tolerance), dimensions, seed, log_weight=log_weight) for seed in range(30)
+        estimates = [
+            run_estimate(Effort(64, tolerance), dimensions, seed, log_weight=log_weight) for seed in range(30)
         ]
-        error = torch.stack([one.log_mean for one in found]) - truth
-        told = torch.stack([one.standard_error for one in found])
-        held = ~torch.stack([one.unresolved for one in found])
-        assert held.all()
-        assert error.square().mean().sqrt() / told.square().mean().sqrt() == pytest.approx(1, abs=0.15)
-        assert (error.abs() > 3 * told).double().mean() < 0.02
+        error = torch.stack([result.log_mean for result in estimates]) - truth
+        standard_errors = torch.stack([result.standard_error for result in estimates])
+        resolved = ~torch.stack([result.unresolved for result in estimates])
+        assert resolved.all()
+        assert error.square().mean().sqrt() / standard_errors.square().mean().sqrt() == pytest.approx(
+            1, abs=0.15
+        )
+        assert (error.abs() > 3 * standard_errors).double().mean() < 0.02
 
 
 @pytest.mark.parametrize("height", [5.0, 20.0, 60.0])
 @pytest.mark.parametrize("border", [3.0, 4.0, 5.0])
-def test_a_rare_event_is_found_or_told(height, border):
+def test_a_rare_event_is_sampled_or_reported(height, border):
     """Check weights 1 up to a border and e^height above: log(1 + P (e^height - 1)).
 
     The estimate is right to four standard errors and a fifth of the tolerance, or it is reported as unresolved.
@@ -281,18 +287,18 @@ def test_a_rare_event_is_found_or_told(height, border):
     rare = math.log1p(float(mpmath.ncdf(-border)) * math.expm1(height))
     honest = []
     for seed in range(5):
-        found = sampled(
+        result = run_estimate(
             Effort(500, 0.05),
             1,
             seed,
             log_weight=lambda z, items: torch.where(z[..., 0] > border, height, 0.0),
         )
-        error = (found.log_mean - rare).abs()
-        honest.append(found.unresolved | (error < 4 * found.standard_error + 0.01))
+        error = (result.log_mean - rare).abs()
+        honest.append(result.unresolved | (error < 4 * result.standard_error + 0.01))
     assert torch.stack(honest).double().mean() > 0.97
 
 
-def test_what_cannot_be_resolved_is_given_up_and_said(monkeypatch):
+def test_what_cannot_be_resolved_is_given_up_and_reported(monkeypatch):
     monkeypatch.setattr(monte_carlo, "MOST", 1000)
 
     def log_weight(z, items):
@@ -300,14 +306,14 @@ def test_what_cannot_be_resolved_is_given_up_and_said(monkeypatch):
         weights = torch.where(items == 3, -math.inf, weights)
         return torch.where(items == 5, math.nan, weights)
 
-    found = sampled(Effort(64, 1e-12), log_weight=log_weight)
-    assert found.samples.max() == 512
-    assert found.unresolved.all()
-    assert found.log_mean[3] == -math.inf
-    assert found.log_mean[5].isnan()
-    assert found.samples[5] == 256  # more samples cannot help
+    result = run_estimate(Effort(64, 1e-12), log_weight=log_weight)
+    assert result.samples.max() == 512
+    assert result.unresolved.all()
+    assert result.log_mean[3] == -math.inf
+    assert result.log_mean[5].isnan()
+    assert result.samples[5] == 256  # more samples cannot help
     good = torch.tensor([item for item in range(ITEMS) if item not in (3, 5)])
-    torch.testing.assert_close(found.log_mean[good], TRUTH[good], rtol=0, atol=0.2)
+    torch.testing.assert_close(result.log_mean[good], TRUTH[good], rtol=0, atol=0.2)
 
 
 def test_an_estimate_is_differentiable():
@@ -331,8 +337,8 @@ def test_nothing_is_estimated_of_no_items():
         def nothing(items, start, count, replicates=effort.replicates):
             return torch.zeros(replicates, count, len(items))
 
-        found = estimate_log_mean(nothing, 0, effort, at_once=10, device=CPU)
-        assert found.log_mean.shape == found.samples.shape == (0,)
+        result = estimate_log_mean(nothing, 0, effort, at_once=10, device=CPU)
+        assert result.log_mean.shape == result.samples.shape == (0,)
 
 
 def test_a_sampled_mixture_tells_its_error():
@@ -340,10 +346,10 @@ def test_a_sampled_mixture_tells_its_error():
     components = Independent(Normal(torch.randn(3, 40, 1), torch.ones(3, 40, 1)), 1)
     density = SampledMixture(torch.zeros(3, 40), components, 8)
     value = torch.randn(7, 3, 1)
-    found = estimate(density, value)
-    torch.testing.assert_close(found.log_mean, density.log_prob(value))
+    result = estimate(density, value)
+    torch.testing.assert_close(result.log_mean, density.log_prob(value))
     weights = components.log_prob(value[:, :, None]).exp().reshape(7, 3, 8, 5).mean(-1)
-    torch.testing.assert_close(found.standard_error, weights.std(-1) / 8**0.5 / weights.mean(-1))
+    torch.testing.assert_close(result.standard_error, weights.std(-1) / 8**0.5 / weights.mean(-1))
     with torch.no_grad():  # in parts
         many = torch.randn(2**20 // 120 + 5, 3, 1)
         torch.testing.assert_close(estimate(density, many).log_mean, density.log_prob(many))

@@ -22,30 +22,22 @@ class LorentzianHead(DensityHead, Fitted):
     """A least-squares fit of Lorentzian lines to each spectrum (`framework.spectra.fit`).
 
     The covariance of the parameters follows from the Jacobian. The head reads spectra of `data=cest` unchanged, without
-    an encoder, and needs no training. The target decides which preset is fitted. The gradient of the density in the
-    spectrum is set to 0.
+    an encoder, and needs no training and no calibration. The names of the target decide which preset is fitted. The
+    gradient of the density in the spectrum is set to 0.
 
     Attributes:
         steps: largest number of steps of a fit (a knob).
 
     Args:
-        steps: as the attribute.
+        steps: initial value of the attribute.
         offsets: frequency offsets of the data, ppm.
 
     Raises:
-        ConfigError: the target is that of no preset.
+        ConfigError: no preset has this target.
     """
 
     knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {"steps": (1, 3, 10, 30, 100)}
-    bibtex = """@article{zaiss2011quantitative,
-  author  = {Zaiss, Moritz and Schmitt, Benjamin and Bachert, Peter},
-  title   = {Quantitative separation of {CEST} effect from magnetization transfer and spillover effects by
-             {Lorentzian}-line-fit analysis of z-spectra},
-  journal = {Journal of Magnetic Resonance},
-  volume  = {211},
-  pages   = {149--155},
-  year    = {2011}
-}"""
+    bibtex = "zaiss2011quantitative"
     offsets: Tensor
 
     def __init__(
@@ -64,15 +56,15 @@ class LorentzianHead(DensityHead, Fitted):
         self.size = len(self.offsets)
 
     def fit(self, features: Float[Tensor, "sample size"], target: Tensor, seed: int) -> None:
-        """Do nothing, since each spectrum is fitted on its own."""
+        """Do nothing, since each spectrum is fitted separately in `forward`."""
 
     def forward(self, raw: Float[Tensor, "*batch size"]) -> Distribution:
         """Return the density for raw parameters."""
         raw = require_finite(raw, self.size)
-        found = fit(raw.reshape(-1, self.size), self.offsets, self.wanted, most=self.steps)
+        fitted = fit(raw.reshape(-1, self.size), self.offsets, self.wanted, most=self.steps)
         zero = (raw * 0).sum(-1, keepdim=True)
         zero = zero.double() if self.scaled else zero
-        return density(found, self.wanted.target_count, raw.shape[:-1], zero)
+        return density(fitted, self.wanted.target_count, raw.shape[:-1], zero)
 
 
 def parameters_of(names: tuple[str, ...], by: str) -> Parameters:
@@ -86,6 +78,6 @@ def parameters_of(names: tuple[str, ...], by: str) -> Parameters:
             return preset
     known = " or ".join(str(len(preset.target)) for preset in PRESETS.values())
     raise ConfigError(
-        f"{by} fits Lorentzian lines, {known} numbers such as {', '.join(PRESETS['ten'].target[:2])}; the data's are "
-        f"{', '.join(names[:10])}. Choose data=cest."
+        f"{by} fits {known} parameters of Lorentzian lines, such as {', '.join(PRESETS['ten'].target[:2])}, but the "
+        f"targets of this data set are {', '.join(names[:10])}. Choose data=cest."
     )

@@ -1,4 +1,4 @@
-"""Tests of the state of the head of Lorentzian lines, and of the targets that it refuses."""
+"""Tests of the Lorentzian head: its stored state is empty, and other targets are refused."""
 
 import pytest
 
@@ -15,6 +15,7 @@ def test_the_head_holds_nothing_that_was_fitted():
 
 def test_a_target_of_other_numbers_is_refused():
     with pytest.raises(
-        ConfigError, match=r"fits Lorentzian lines, 10 or 15 numbers.*; the data's are x, y\."
+        ConfigError,
+        match=r"fits 10 or 15 parameters of Lorentzian lines.*targets of this data set are x, y\.",
     ):
         LorentzianHead(Target("real", ("x", "y")))

@@ -11,17 +11,17 @@ from plugins.density_head.matrix_fisher import quadrature, quaternions
 from plugins.density_head.matrix_fisher.functions import Frame, log_height
 
 CHUNK = 2**18
-"""Number of points at which the density is evaluated at once: arrays of 2 MB stay in the cache."""
+"""Number of points at which the density is evaluated at once; arrays of 2 MB stay in the processor's cache."""
 FEW = {32: 19.0, 48: 54.0, 96: 236.0, 192: 368.0}
-"""Number of nodes of a plain rule, and the largest λ for which this number suffices.
+"""Numbers of nodes of a quadrature with fixed nodes, each with the largest λ for which this number suffices.
 
-Σ λᵢqᵢ² is c₀ - κ cos(a - φ) in each angle, with κ at most half the largest λ, whatever the other angles are. For
-exp(κ cos) the trapezium rule of N nodes on the circle errs by 2 I_N(κ)/I₀(κ), here below 1e-15 of the integral. For
-Gauss-Legendre quadrature on half of the circle the bounds were found by experiment
-(`test_few_nodes_do_up_to_their_bound`: 5e-12). For a larger λ, the nodes follow the peaks.
+As a function of any one angle a, Σ λᵢqᵢ² is c₀ - κ cos(a - φ), with κ at most half of the largest λ. For exp(κ cos) the
+trapezium rule with N nodes on the circle has the relative error 2 I_N(κ)/I₀(κ), here below 1e-15. For Gauss-Legendre
+quadrature on half of the circle the bounds were found by experiment (`test_few_nodes_do_up_to_their_bound`: 5e-12). For
+a larger λ, the nodes are placed around the peaks.
 """
 MOST = 2 * quadrature.PEAKS * sum(quadrature.NODES)
-"""Number of nodes that follow the peaks."""
+"""Number of nodes if they are placed around the peaks."""
 
 
 @torch.no_grad()
@@ -30,9 +30,9 @@ def log_marginal(angle: Float[Tensor, "..."], frame: Frame, index: int) -> Float
 
     The batch shape of `frame` broadcasts with the shape of `angle`.
 
-    The aligned quaternion is linear in (cos, sin) of half of each angle, so the energy Σ λᵢqᵢ² is a quadratic form of
-    the first angle's pair. Its smaller and larger eigenvalues μ and ν give the integral over that angle, and the second
-    angle is integrated by quadrature:
+    The aligned quaternion is linear in the pair (cos, sin) of half of each angle, so that Σ λᵢqᵢ² is a quadratic form
+    of the pair of one of the other angles. The smaller and larger eigenvalues μ and ν of this form give the integral
+    over that angle, and the remaining angle, here e, is integrated by quadrature:
 
         p(a) = ∫ cos e / (4π k(λ)) exp(-μ) I₀ₑ((ν-μ)/2) de.
     """
@@ -41,23 +41,23 @@ def log_marginal(angle: Float[Tensor, "..."], frame: Frame, index: int) -> Float
     parts = [part.expand(*shape, part.shape[-1]).reshape(-1, part.shape[-1]) for part in parts]
     angles = angle.double().expand(shape).reshape(-1)
     bounds = torch.tensor(list(FEW.values()), dtype=torch.float64, device=angles.device)
-    kind = torch.bucketize(parts[2].amax(-1), bounds)  # NaN counts as the last kind
-    found = torch.empty_like(angles)
+    kind = torch.bucketize(parts[2].amax(-1), bounds)  # NaN belongs to the last kind
+    log_density = torch.empty_like(angles)
     for number, count in enumerate([*FEW, None]):
         for rows in (kind == number).nonzero()[:, 0].split(CHUNK // (count or MOST)):
             if len(rows) == 0:
                 continue
             left, right, falls = (part[rows] for part in parts)
-            found[rows] = _log_integral(angles[rows], left, right, falls, index, count)
-    return found.reshape(shape) + log_height(frame.falls)
+            log_density[rows] = _log_integral(angles[rows], left, right, falls, index, count)
+    return log_density.reshape(shape) + log_height(frame.falls)
 
 
 def _log_integral(
     angle: Tensor, left: Tensor, right: Tensor, falls: Tensor, index: int, count: int | None
 ) -> Tensor:
-    """Return the log of the integral over both other angles, without 1/k(λ), with `count` nodes.
+    """Return the log of the integral over both other angles, without the factor 1/k(λ), with `count` nodes.
 
-    If `count` is None, the nodes follow the peaks.
+    If `count` is None, the nodes are placed around the peaks.
     """
     around = index == 1  # quadrature runs over the azimuth then, otherwise over the elevation
     log_density = _log_density(angle, left, right, falls, index)
@@ -74,7 +74,7 @@ def _log_integral(
 def _log_density(
     angle: Tensor, left: Tensor, right: Tensor, falls: Tensor, index: int
 ) -> Callable[[Tensor], Tensor]:
-    """Return the log-density of a second angle, points (*batch, point), with the third angle integrated out."""
+    """Return the log-density as a function of a second angle, (*batch, point), integrated over the third angle."""
     _, i, _, k = torch.eye(4, dtype=falls.dtype, device=falls.device)
     product = quaternions.product
     # the viewpoint's quaternion is (1, k)·(cos, sin)(t/2) (1, i)·(cos, sin)(e/2 - π/4) (1, -k)·(cos, sin)(a/2)
@@ -101,7 +101,7 @@ def _log_density(
         one_one = _sum(fall[n] * first[n] * first[n] for n in range(3))
         two_two = _sum(scaled[n] * second[n] for n in range(3))
         one_two = _sum(scaled[n] * first[n] for n in range(3))
-        # determinant of a Gram matrix as a sum of squares (Cauchy and Binet), so nothing cancels
+        # the determinant of a Gram matrix is a sum of squares (Cauchy-Binet formula), so that nothing cancels
         determinant = _sum(
             fall[n] * fall[m] * (first[n] * second[m] - first[m] * second[n]).square()
             for n, m in ((0, 1), (0, 2), (1, 2))

@@ -21,7 +21,7 @@ VOLUME = 8 * math.pi**2
 CHART = ((-math.pi, math.pi), (-math.pi / 2, math.pi / 2), (-math.pi, math.pi))
 """Ranges of azimuth, elevation and tilt, radians."""
 SUMMITS = 6
-"""Number of the highest maxima of the density of one angle on a grid, near which its mode is searched."""
+"""Number of maxima of one angle's density on a grid, the highest ones, near which the mode is searched."""
 
 
 class MatrixFisher(Distribution):
@@ -32,18 +32,18 @@ class MatrixFisher(Distribution):
 
         log p(a, e, t) = log p(R) + log(cos e / 8π²),
 
-    p(R) with respect to the rotation-invariant measure of total mass 1. The density integrates to 1 over the chart, and
-    samples lie in the chart. An elevation outside is read as the same rotation's viewpoint inside, (a+π, π-e, t+π):
-    over the whole torus of three angles the density would integrate to 2. Independent von Mises angles integrate to 1
-    over the torus; their mass outside the chart belongs to no viewpoint, so that on data from the chart this density
-    starts with an advantage of up to log 2.
+    where p(R) is with respect to the rotation-invariant measure of total mass 1. The density integrates to 1 over the
+    chart, and samples lie in the chart. A viewpoint with an elevation outside the chart is read as the viewpoint of the
+    same rotation inside, (a+π, π-e, t+π), so that the density would integrate to 2 over the torus of all three angles.
+    Independent von Mises angles integrate to 1 over this torus, and their probability outside the chart is lost. So
+    their log-density at data in the chart is lower by up to log 2.
 
-    At the poles the density is 0 in da de dt. No floating-point number is exactly π/2, so that log_prob and its
-    gradients stay finite there.
+    At the poles the density is 0 with respect to da de dt. No floating-point number is exactly π/2, so that log_prob
+    and its gradients stay finite there.
 
     Args:
         parameter: F, (*batch, 3, 3); 0 is the uniform density of rotations.
-        dtype: number type of log_prob, samples and so on; by default the parameter's. All computations are in float64.
+        dtype: dtype of all results; by default the dtype of the parameter. All computations are in float64.
     """
 
     arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
@@ -97,9 +97,9 @@ class MatrixFisher(Distribution):
 class Angle(Distribution):
     """The density of one angle of a matrix Fisher density; without gradients.
 
-    A second angle is integrated to a Bessel function in closed form, the third by quadrature whose nodes follow the
-    peaks (at most two for most F), from the uniform density to concentrations of 1e12. Elevations outside the chart
-    are read as the equivalent elevations inside.
+    The integral over a second angle is a Bessel function. The integral over the third angle is computed by quadrature
+    with nodes around the peaks (at most two for most F), from the uniform density to concentrations of 1e12. Elevations
+    outside the chart are read as the equivalent elevations inside.
 
     Args:
         joint: the density of all three angles.
@@ -120,15 +120,15 @@ class Angle(Distribution):
         return Circular((CHART[self.index],))
 
     def log_prob(self, value: Float[Tensor, "... 1"]) -> Float[Tensor, "..."]:
-        found = angles.log_marginal(value.double().squeeze(-1), self.joint.frame, self.index)
-        return found.to(self.joint.dtype)
+        log_prob = angles.log_marginal(value.double().squeeze(-1), self.joint.frame, self.index)
+        return log_prob.to(self.joint.dtype)
 
     def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
         return self.joint.sample(sample_shape)[..., self.index : self.index + 1]
 
     @property
     def mode(self) -> Float[Tensor, "*batch 1"]:
-        """The highest of the peaks next to the joint mode's angle and next to the maxima on a grid."""
+        """The highest of the peaks near the angle of the joint mode and near the maxima on a grid, radians."""
         points = 90
         around = grid(points, dtype=torch.float64, device=self.joint.parameter.device)
         step = 2 * math.pi / points
@@ -138,8 +138,8 @@ class Angle(Distribution):
         lower = torch.maximum(height.roll(1, -1), height.roll(-1, -1))
         summits = height.where(height >= lower, -math.inf).topk(SUMMITS).indices
         starts = torch.cat([around[summits], self.joint.mode.double()[..., self.index, None]], -1)
-        found = quadrature.maximum(self._log_density, starts, step)
-        return found.unsqueeze(-1).to(self.joint.dtype)
+        highest = quadrature.maximum(self._log_density, starts, step)
+        return highest.unsqueeze(-1).to(self.joint.dtype)
 
     def entropy(self) -> Tensor:
         """Return the entropy, nats, by quadrature."""
@@ -162,7 +162,7 @@ def _log_volume(elevation: Tensor) -> Tensor:
 
 
 estimate.register(MatrixFisher, exact_estimate)
-estimate.register(Angle, exact_estimate)  # quadrature draws nothing
+estimate.register(Angle, exact_estimate)  # quadrature uses no random samples
 
 
 @marginal.register

@@ -5,10 +5,11 @@ the unit quaternion q of the aligned rotation UᵀRV,
 
     tr(FᵀR) = tr S - λ₁q₁² - λ₂q₂² - λ₃q₃²,   λ₁ = 2(s₂+s₃), λ₂ = 2(s₁+s₃), λ₃ = 2(s₁+s₂),
 
-so that q is Bingham (Mardia & Jupp 2000, §13.2.3) with any *falls* 0 ≤ λ₁ ≤ λ₂ ≤ λ₃. No function below
-subtracts large numbers that nearly agree: the density is its height at the mode, 1/k(λ) with
-k(λ) = c(F) exp(-tr S) = E exp(-Σ λᵢqᵢ²) over uniform q, times exp(-Σ λᵢqᵢ²). Densities are with respect to the
-rotation-invariant measure of total mass 1. All computations are in float64.
+so that q has a Bingham density (Mardia & Jupp 2000, §13.2.3). The coefficients 0 ≤ λ₁ ≤ λ₂ ≤ λ₃ are called *falls*: λᵢ
+says how fast the log-density falls along qᵢ. No function below subtracts large numbers that nearly agree. The density
+is its height at the mode, 1/k(λ), times exp(-Σ λᵢqᵢ²), where k(λ) = c(F) exp(-tr S) is the mean of exp(-Σ λᵢqᵢ²) over
+uniform q. Densities are with respect to the rotation-invariant measure of total mass 1. All computations are in
+float64.
 """
 
 from fractions import Fraction
@@ -24,24 +25,25 @@ from torch.autograd import Function
 from plugins.density_head.matrix_fisher import quaternions
 
 SAMPLING_ROUNDS = 96
-"""Largest number of proposals per lane.
+"""Largest number of proposals per sample.
 
-At least 45 % of proposals are accepted (README), so after 96 rounds fewer than one lane in 10^24 is left.
+At least 45 % of proposals are accepted (README), so that fewer than one sample in 10^24 has no accepted proposal after
+96.
 """
 REACH = 44.0
-"""Exponent beyond which terms are left out: exp(-44) is less than half the last digit of float64."""
+"""Exponent beyond which terms are neglected, since exp(-44) is less than half the last digit of float64."""
 NODES = (64, 48)
 PANEL = 4.0
-"""Length of the last panel in y; the two panels have NODES nodes.
+"""Length in y of the last of the two panels, which have NODES nodes.
 
-112 nodes in two panels keep log k to 3e-14 for falls from 0 to 1e30 (README).
+With these 112 nodes the error of log k is at most 3e-14 for falls from 0 to 1e30 (README).
 """
 LARGE = 25.0
-"""Concentration from which on the asymptotic series of I₁/I₀ has all digits."""
+"""Concentration above which the asymptotic series of I₁/I₀ is exact to the last digit."""
 
 
 class Frame(NamedTuple):
-    """The proper singular value decomposition of F, without redundant numbers.
+    """The proper singular value decomposition of F, with falls instead of singular values.
 
     Attributes:
         left, right: (*batch, 3, 3), the rotations U and V.
@@ -71,9 +73,9 @@ class Frame(NamedTuple):
 def log_prob(turn: Float[Tensor, "... 4"], parameter: Float[Tensor, "... 3 3"]) -> Float[Tensor, "..."]:
     """Return the log-density, nats, float64, of the rotation with unit quaternion `turn`; batch shapes broadcast.
 
-    Its first and second derivatives in both arguments are accurate everywhere, also where singular values are equal
-    or zero: they are moments of the rotation, and are computed without division by a gap between singular values. The
-    derivative in the turn is meant for chains that keep the quaternion of unit length.
+    Its first and second derivatives in both arguments are accurate everywhere, also where singular values are equal or
+    zero: they are moments of the rotation, and are computed without division by a difference of singular values. The
+    derivative in `turn` is only valid for changes that keep the quaternion of unit length.
     """
     return _LogProb.apply(turn.double(), parameter.double())
 
@@ -91,7 +93,7 @@ def entropy(falls: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
 
 @torch.no_grad()
 def align(parameter: Float[Tensor, "*batch 3 3"]) -> Frame:
-    """Return the proper singular value decomposition, float64; with equal singular values, one of the many."""
+    """Return the proper singular value decomposition, float64; any one of them if singular values are equal."""
     left, singular, right = torch.linalg.svd(parameter.double())
     right = right.mT
     flips = torch.stack([torch.linalg.det(left), torch.linalg.det(right)]).sign()
@@ -140,14 +142,14 @@ def fourth_moments(falls: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4 
         )
         squares = circle.square * (1 - sine), circle.square * sine
         blocks.append((squares, circle.square**2 * (1 - sine - both), circle.square**2 * both, sine_fourth))
-    (zero, one), (two, three) = blocks[0][0], blocks[1][0]
-    found = [
-        [blocks[0][1], blocks[0][2], zero * two, zero * three],
-        [blocks[0][2], outer.square**2 * blocks[0][3], one * two, one * three],
-        [zero * two, one * two, blocks[1][1], blocks[1][2]],
-        [zero * three, one * three, blocks[1][2], inner.square**2 * blocks[1][3]],
+    (q0, q1), (q2, q3) = blocks[0][0], blocks[1][0]
+    moments = [
+        [blocks[0][1], blocks[0][2], q0 * q2, q0 * q3],
+        [blocks[0][2], outer.square**2 * blocks[0][3], q1 * q2, q1 * q3],
+        [q0 * q2, q1 * q2, blocks[1][1], blocks[1][2]],
+        [q0 * q3, q1 * q3, blocks[1][2], inner.square**2 * blocks[1][3]],
     ]
-    return torch.stack([torch.stack([(mass * moment).sum(-1) for moment in row], -1) for row in found], -2)
+    return torch.stack([torch.stack([(mass * moment).sum(-1) for moment in row], -1) for row in moments], -2)
 
 
 @torch.no_grad()
@@ -155,13 +157,15 @@ def sample(falls: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4"]:
     """Return one aligned quaternion per element by rejection (Kent, Ganeiber & Mardia 2018, §3), float64.
 
     The proposal is the angular central Gaussian z/|z| with zᵢ ~ N(0, 1/(1 + 2λᵢ/b)); b solves Σᵢ 1/(b + 2λᵢ) = 1,
-    with λ₀ = 0 included. Lanes that have not accepted after SAMPLING_ROUNDS keep their last proposal, so that no input
-    can hang the loop.
+    with λ₀ = 0 included. Elements without an accepted proposal after SAMPLING_ROUNDS keep their last proposal, so that
+    the loop always ends.
     """
     fall = falls.double().reshape(-1, 3)
     fall = torch.cat([torch.zeros_like(fall[:, :1]), fall], -1)
     width = torch.ones_like(fall[:, :1])
-    for _ in range(40):  # Newton's method from the left on a convex falling function never oversteps
+    for _ in range(
+        40
+    ):  # Newton's method from the left on a convex, falling function never steps beyond the root
         parts = 1 / (width + 2 * fall)
         width = width + (parts.sum(-1, keepdim=True) - 1) / parts.square().sum(-1, keepdim=True)
     width = width.clamp(1, 4)
@@ -176,7 +180,7 @@ def sample(falls: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4"]:
 
 
 def _propose(fall: Tensor, width: Tensor) -> tuple[Tensor, Tensor]:
-    """Return one proposal per lane, and whether it is rejected."""
+    """Return one proposal per element, and whether the proposal is rejected."""
     normal = torch.randn_like(fall) / (1 + 2 * fall / width).sqrt()
     turn = normal / torch.linalg.vector_norm(normal, dim=-1, keepdim=True)
     cost = (fall * turn.square()).sum(-1)
@@ -187,22 +191,22 @@ def _propose(fall: Tensor, width: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class _Circle(NamedTuple):
-    """The circle (r cos φ, r sin φ) at the nodes, as r² and the concentration of 2φ, which is von Mises about 0."""
+    """The circle (r cos φ, r sin φ) at the nodes, by r² and the concentration of 2φ, which is von Mises around 0."""
 
     square: Tensor
     concentration: Tensor
 
 
 def _quadrature(falls: Tensor) -> tuple[_Circle, _Circle, Tensor]:
-    """Return k(λ) as a sum over nodes: the circles of (q₀, q₁) and of (q₂, q₃), and the mass (*batch, node).
+    """Return the circles of (q₀, q₁) and of (q₂, q₃) at the nodes, and terms (*batch, node) whose sum is k(λ).
 
-    w = q₂² + q₃² is uniform on [0, 1] and the two directions are uniform (cf. Lee 2018, eq. 12, which pairs the
-    components otherwise). On each circle the density integrates to a Bessel function:
+    w = q₂² + q₃² is uniform on [0, 1] and the two directions are uniform (cf. Lee 2018, eq. 12, with other pairs of
+    components). On each circle the density integrates to a Bessel function:
 
         k(λ) = ∫₀¹ exp(-λ₂w) I₀ₑ((λ₃-λ₂)w/2) I₀ₑ(λ₁(1-w)/2) dw,   I₀ₑ(x) = I₀(x) exp(-x).
 
-    This pairing decays fastest. Its scales 1/λ₃ ≪ 1/λ₂ are spread out by √w = t₀ sinh y, with Gauss-Legendre quadrature
-    in y on two panels, of which the last holds the decay.
+    With these pairs the integrand decays fastest. Its length scales 1/λ₃ ≪ 1/λ₂ are resolved by √w = t₀ sinh y, with
+    Gauss-Legendre quadrature in y on two panels; the integrand decays in the last panel.
     """
     first, second, third = (falls.double()[..., index, None] for index in range(3))
     end = REACH / second.clamp(min=REACH)
@@ -256,7 +260,7 @@ def _sine_fourth(concentration: Tensor) -> Tensor:
 
 
 def _ratio(concentration: Tensor) -> tuple[Tensor, Tensor]:
-    """Return whether the concentration is small enough to compute 1 - A directly, and A."""
+    """Return whether the concentration is small enough to compute 1 - A by subtraction, and A."""
     return concentration < LARGE, torch.special.i1e(concentration) / torch.special.i0e(concentration)
 
 
@@ -271,9 +275,9 @@ def _series(name: str, concentration: Tensor) -> Tensor:
 
 @cache
 def _coefficients(terms: int = 20) -> dict[str, list[float]]:
-    """Return coefficients of the asymptotic series in 1/κ.
+    """Return the coefficients of the asymptotic series in 1/κ of E sin²φ and E sin⁴φ, by name.
 
-    The series of A solves A' = 1 - A² - A/κ (Mardia & Jupp 2000, A.14).
+    They follow from the series of A, which solves A' = 1 - A² - A/κ (Mardia & Jupp 2000, A.14).
     """
     ratio = [Fraction(1)]
     for order in range(1, terms):
@@ -281,13 +285,13 @@ def _coefficients(terms: int = 20) -> dict[str, list[float]]:
         ratio.append(((order - 2) * ratio[order - 1] - squares) / 2)
     sine_squared = [Fraction(0), *(-number / 2 for number in ratio[1:])]
     both = [Fraction(0), *(number / 4 for number in ratio[:-1])]
-    fourth = [one - other for one, other in zip(sine_squared, both, strict=True)]
-    found = {"sine_squared": sine_squared, "sine_fourth": fourth}
-    return {name: [float(number) for number in numbers] for name, numbers in found.items()}
+    fourth = [square - product for square, product in zip(sine_squared, both, strict=True)]
+    series = {"sine_squared": sine_squared, "sine_fourth": fourth}
+    return {name: [float(number) for number in numbers] for name, numbers in series.items()}
 
 
 class _LogProb(Function):
-    """The log-density; its derivative in F is R - E R, and in the quaternion that of -Σ λᵢqᵢ²."""
+    """The log-density; its derivative in F is R - E R, and its derivative in the quaternion is that of -Σ λᵢqᵢ²."""
 
     @staticmethod
     def forward(ctx: Any, turn: Tensor, parameter: Tensor) -> Tensor:
@@ -300,7 +304,7 @@ class _LogProb(Function):
         turn, parameter, *parts = ctx.saved_tensors
         frame = Frame(*parts)
         by_turn = by_parameter = None
-        if torch.is_grad_enabled():  # a second derivative is wanted: use operations that have a derivative
+        if torch.is_grad_enabled():  # for second derivatives, use operations that have derivatives
             if ctx.needs_input_grad[0]:
                 by_turn = 2 * (_quadratic_form(parameter) @ turn[..., None]).squeeze(-1)
             if ctx.needs_input_grad[1]:
@@ -314,9 +318,11 @@ class _LogProb(Function):
                 )
                 by_turn = frame.turn(pull)
             if ctx.needs_input_grad[1]:
-                # R - E R = U ((Q - I) + (I - D)) Vᵀ, both brackets without cancellation
-                apart = quaternions.matrix_less_identity(aligned) + torch.diag_embed(_shrinkage(frame.falls))
-                by_parameter = frame.left @ apart @ frame.right.mT
+                # R - E R = U ((Q - I) + (I - D)) Vᵀ; both terms in brackets are computed without cancellation
+                difference = quaternions.matrix_less_identity(aligned) + torch.diag_embed(
+                    _shrinkage(frame.falls)
+                )
+                by_parameter = frame.left @ difference @ frame.right.mT
         if by_turn is not None:
             by_turn = (grad[..., None] * by_turn).sum_to_size(turn.shape)
         if by_parameter is not None:
@@ -337,16 +343,18 @@ class _Mean(Function):
     def backward(ctx: Any, grad: Tensor) -> Tensor:
         if torch.is_grad_enabled():
             raise RuntimeError(
-                "a third derivative of the matrix Fisher density, or a second of its mean rotation, was asked for "
-                "(create_graph=True); only two and one are known. Leave create_graph out of the last derivative."
+                "The matrix Fisher density has no third derivative, and its mean rotation no second derivative, but "
+                "one of them was requested with create_graph=True. Leave out create_graph in the last derivative."
             )
         frame = Frame(*ctx.saved_tensors)
         aligned = frame.left.mT @ grad @ frame.right
         fourth, second = fourth_moments(frame.falls), second_moments(frame.falls)
         covariance = fourth[..., 1:, 1:] - second[..., :, None] * second[..., None, :]
         # Qᵢᵢ = 1 - 2 Σ_{j≠i} qⱼ²
-        others = 1 - torch.eye(3, dtype=second.dtype, device=second.device)
-        diagonal = 4 * others @ covariance @ others @ aligned.diagonal(dim1=-2, dim2=-1)[..., None]
+        off_diagonal = 1 - torch.eye(3, dtype=second.dtype, device=second.device)
+        diagonal = (
+            4 * off_diagonal @ covariance @ off_diagonal @ aligned.diagonal(dim1=-2, dim2=-1)[..., None]
+        )
         # Q₁₂ = 2(q₁q₂ - q₀q₃) and Q₂₁ = 2(q₁q₂ + q₀q₃): odd moments vanish
         straight, crossed = torch.zeros_like(aligned), torch.zeros_like(aligned)
         for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):

@@ -15,7 +15,7 @@ from plugins.density_head.matrix_fisher.density import MatrixFisher
 
 ANGLES = ("azimuth", "elevation", "tilt")
 LARGEST_PARAMETER = 1e12
-"""Largest |F|, with standard deviations of a microradian; float32 angles resolve no more."""
+"""Largest |F|, for standard deviations of a microradian, which is the resolution of float32 angles."""
 
 
 class MatrixFisherHead(DensityHead):
@@ -24,20 +24,15 @@ class MatrixFisherHead(DensityHead):
     The thesis leaves this joint density to future work (§3.7). The network is as in Mohlin et al. 2020.
 
     The head reads the nine elements of a matrix X, row by row. F is a multiple of X that grows faster than X
-    (`parameter_of_raw`). F is the density's natural parameter, so that the uniform density of rotations, X = 0, is a
-    point like any other.
+    (`parameter_of_raw`). F is the density's natural parameter, so that the uniform density of rotations, X = 0, needs
+    no special case.
 
     Raises:
         ConfigError: the target is not azimuth, elevation and tilt, in this order.
     """
 
     knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
-    bibtex = """@inproceedings{mohlin2020probabilistic,
-  title = {Probabilistic Orientation Estimation with Matrix Fisher Distributions},
-  author = {Mohlin, David and Sullivan, Josephine and Bianchi, G{\\'e}rald},
-  booktitle = {Advances in Neural Information Processing Systems (NeurIPS)},
-  year = {2020}
-}"""
+    bibtex = "mohlin2020probabilistic"
 
     def __init__(self, target: Target) -> None:
         super().__init__()
@@ -45,8 +40,8 @@ class MatrixFisherHead(DensityHead):
         if target.names != ANGLES:
             raise ConfigError(
                 f"density_head matrix_fisher describes rotations by the three angles {', '.join(ANGLES)}, in this "
-                f"order; this data set's targets are {target.listed_names}. Choose another density_head, or "
-                "other data; von_mises describes any angles."
+                f"order, but the targets of this data set are {target.listed_names}. Choose another density_head, or "
+                "other data; density_head=von_mises describes any angles."
             )
         self.size = 9
 
@@ -61,8 +56,8 @@ def parameter_of_raw(raw: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 
     F = X near 0, and |F| grows with the fourth power: |X| = 27 already gives a concentration of 1e4, and no gradient
     explodes. The function is smooth at 0, since it reads only |X|².
     """
-    raw = raw.double().clamp(-1e100, 1e100)  # keeps squares from overflowing
+    raw = raw.double().clamp(-1e100, 1e100)  # so that squares do not overflow
     square = raw.square().sum((-2, -1), keepdim=True)
     growth = (1 + square / 16) ** 1.5
-    # where the bound applies the norm is at least 1; the clamp avoids the root at 0, which has no gradient
+    # where the bound applies, the norm is at least 1; the clamp avoids the square root at 0, which has no gradient
     return raw * torch.minimum(growth, LARGEST_PARAMETER / square.clamp(min=1).sqrt())

@@ -1,4 +1,4 @@
-"""Integrals over one angle of many functions at once, each with one or two peaks of any width."""
+"""Quadrature over one angle for a batch of functions, each with one or two peaks of any width."""
 
 from collections.abc import Callable
 from functools import cache
@@ -15,7 +15,7 @@ PEAKS = 2
 ROUNDS = 14
 """Number of rounds that refine a peak.
 
-Each round narrows a peak's bracket fivefold, or moves it: 0.1 rad becomes 1e-8 in ten rounds.
+Each round makes a peak's bracket five times narrower, or moves it: 0.1 rad becomes 1e-8 in ten rounds.
 """
 NEAR = 12.0
 """Number of a peak's widths that the panel next to the peak covers; a second panel covers the rest."""
@@ -32,14 +32,14 @@ def nodes(
 ) -> tuple[Float[Tensor, "*batch node"], Float[Tensor, "*batch node"]]:
     """Return nodes, radians, and weights of a quadrature over [low, high] that resolves exp(log_density).
 
-    Where log_density has more than two maxima, only the two highest have nodes of their own.
+    If log_density has more than two maxima, only the two highest have nodes of their own.
 
     Args:
         log_density: maps points (*batch, point) to values (*batch, point), nats up to a constant per batch element.
         low: lower end, radians.
         high: upper end, radians.
-        like: a tensor with the batch shape and device.
-        periodic: whether high is the same angle as low; then the interval is cut where log_density is least.
+        like: a tensor with the batch shape and the device of the result.
+        periodic: whether `high` is the same angle as `low`; the interval then starts where log_density is smallest.
     """
     step = (high - low) / GRID
     grid = torch.linspace(low, high, GRID + 1, dtype=torch.float64, device=like.device)
@@ -55,16 +55,15 @@ def nodes(
     summits = value.where((value > before) & (value >= after), -torch.inf)
     heights, index = summits.topk(PEAKS)
     absent = heights == -torch.inf
-    index, order = index.where(~absent, GRID).sort(
-        -1
-    )  # an absent peak moves to the end, where its piece is empty
+    # a peak that does not exist is placed at the upper end, where its piece of the interval is empty
+    index, order = index.where(~absent, GRID).sort(-1)
     absent = absent.gather(-1, order)
     summit = grid.gather(-1, index)
     peak, width = _refine(
         log_density, summit, step, (summit - step).maximum(ends[0]), (summit + step).minimum(ends[1])
     )
     peak = peak.where(~absent, ends[1])
-    # between two peaks the pieces meet where the function is least
+    # the border between the pieces of two peaks is where the function is smallest
     inside = torch.arange(GRID + 1, device=like.device)
     borders = [ends[0]]
     for number in range(PEAKS - 1):
@@ -105,18 +104,18 @@ def gauss(count: int, low: float, high: float) -> tuple[Float[Tensor, "node"], F
 def maximum(
     log_density: Callable[[Tensor], Tensor], starts: Float[Tensor, "*batch start"], step: float
 ) -> Float[Tensor, "*batch"]:
-    """Return the place of the highest of the maxima within `step` of each start, radians."""
-    found, _ = _refine(log_density, starts, step, starts - step, starts + step)
-    best = log_density(found).argmax(-1, keepdim=True)
-    return found.gather(-1, best).squeeze(-1)
+    """Return the position, radians, of the highest of the maxima within `step` of any start."""
+    peaks, _ = _refine(log_density, starts, step, starts - step, starts + step)
+    best = log_density(peaks).argmax(-1, keepdim=True)
+    return peaks.gather(-1, best).squeeze(-1)
 
 
 def _refine(
     log_density: Callable[[Tensor], Tensor], centre: Tensor, reach: float, low: Tensor, high: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return peaks, kept in [low, high], and the widths over which the logarithm falls by about one.
+    """Return the peaks in [low, high], and the distances from them at which the log-density has fallen by about 1.
 
-    A peak is found by parabolas through three points that come ever closer.
+    A peak is found by parabolas through three points, which come closer with each round.
     """
     width, step = torch.full_like(centre, torch.inf), torch.full_like(centre, reach)
     for _ in range(ROUNDS):
@@ -128,15 +127,15 @@ def _refine(
         fall = torch.maximum(bend.clamp(min=0).sqrt(), slope.abs())
         width = torch.where(fall > 0.3, step / fall, width)
         centre = torch.maximum(torch.minimum(centre + step * move, high), low)
-        # a parabola whose maximum lies outside of the three points is not trusted: the step stays as it is
+        # if the maximum of the parabola lies outside the three points, the step is not reduced
         step = torch.where(inside | (centre == high) | (centre == low), step / 5, step)
     return centre, width.clamp(max=1.0)
 
 
 def _half(length: Tensor, width: Tensor) -> tuple[Tensor, Tensor]:
-    """Return offsets from a peak and their weights over [0, length].
+    """Return the offsets of nodes from a peak, in [0, length], and their weights.
 
-    This is Gauss-Legendre quadrature in y with offset = width sinh y.
+    They are those of Gauss-Legendre quadrature in y with offset = width · sinh y.
     """
     ends = [
         torch.asinh(torch.minimum(length / width, torch.full_like(length, NEAR))),

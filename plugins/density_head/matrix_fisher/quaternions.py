@@ -1,6 +1,7 @@
-"""Unit quaternions (…, 4), real part first, as rotations; small rotations keep all digits, and q equals -q.
+"""Rotations as unit quaternions (…, 4), real part first; q and -q are the same rotation.
 
-A viewpoint's rotation is framework.geometry.rotation.viewpoint_rotation: Rz(tilt) Rx(elevation - π/2) Rz(-azimuth).
+The functions keep all digits of small rotations. The rotation of a viewpoint is Rz(tilt) Rx(elevation - π/2)
+Rz(-azimuth), as in framework.geometry.rotation.viewpoint_rotation.
 """
 
 import math
@@ -60,7 +61,7 @@ def viewpoint(turn: Quaternions) -> Float[Tensor, "... 3"]:
     """Return azimuth and tilt in [-π, π] and elevation in [-π/2, π/2], radians; at the poles one of many viewpoints."""
     real, x, y, z = turn.unbind(-1)
     elevation = math.pi / 2 - 2 * torch.atan2(torch.hypot(x, y), torch.hypot(real, z))
-    # the inverse of of_viewpoint; in the chart its sine is never positive and its cosine never negative
+    # the inverse of of_viewpoint, whose `sine` is at most 0 and `cosine` at least 0 for elevations in the chart
     difference, sum_ = torch.atan2(z, real), torch.atan2(-y, -x)
     azimuth, tilt = sum_ - difference, sum_ + difference
     turn_ = 2 * math.pi
@@ -71,7 +72,7 @@ def viewpoint(turn: Quaternions) -> Float[Tensor, "... 3"]:
 def of_matrix(matrix: Float[Tensor, "... 3 3"]) -> Quaternions:
     """Return the quaternion of a rotation matrix, to full precision at any angle."""
     (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in matrix.unbind(-2))
-    # 4 q qᵀ; the row of its largest diagonal element, at least 1, is a multiple of q
+    # The rows of 4 q qᵀ are multiples of q; the one with the largest diagonal element, at least 1, is used.
     rows = torch.stack(
         [
             torch.stack([1 + a + e + i, h - f, c - g, d - b], -1),
@@ -87,7 +88,7 @@ def of_matrix(matrix: Float[Tensor, "... 3 3"]) -> Quaternions:
 
 
 def matrix_less_identity(turn: Quaternions) -> Float[Tensor, "... 3 3"]:
-    """Return R - I, for small rotations without cancellation."""
+    """Return R - I, without cancellation for small rotations."""
     w, x, y, z = turn.unbind(-1)
     rows = [
         torch.stack([-2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),

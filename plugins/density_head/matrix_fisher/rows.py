@@ -1,4 +1,4 @@
-"""Rows of the contract for the matrix Fisher head, with log-densities from 60 digits and another quadrature."""
+"""Contract-test cases: the matrix Fisher head, with log-densities from 60 digits and an independent quadrature."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -15,7 +15,7 @@ from plugins.density_head.matrix_fisher.head import ANGLES, LARGEST_PARAMETER
 
 TARGET = Target("angle", ANGLES)
 TURN = [[2.0, -1.0, 2.0], [2.0, 2.0, -1.0], [-1.0, 2.0, 2.0]]
-"""A rotation multiplied by three, so that all singular values are exactly 3."""
+"""A rotation matrix multiplied by 3, so that all singular values are exactly 3."""
 GENERIC = [[0.5, -1.25, 0.75], [2.0, 0.125, -0.5], [0.25, 1.5, -1.0]]
 VALUES = [[0.3, 0.2, -0.1], [2.5, -1.2, 3.0], [-1.0, 1.5, 0.7], [4.0, 2.0, -5.0], [1000.0, -0.5, -1e6]]
 RAWS = {
@@ -38,7 +38,10 @@ RAWS = {
 
 
 def exact(raw: np.ndarray, value: np.ndarray) -> float:
-    """Return log p(a, e, t) = tr(FᵀR) - log c(F) + log(|cos e| / 8π²), in 60 digits, and 15 for c(F) exp(-tr S)."""
+    """Return log p(a, e, t) = tr(FᵀR) - log c(F) + log(|cos e| / 8π²), nats.
+
+    All terms are computed with 60 digits, except for c(F) exp(-tr S), which has 15.
+    """
     with mpmath.workdps(60):
         parameter = _parameter(raw)
         left, singular, right = mpmath.svd_r(parameter)
@@ -52,10 +55,10 @@ def exact(raw: np.ndarray, value: np.ndarray) -> float:
 
 
 def log_constant(first: float, second: float, third: float) -> float:
-    """Return log(c(F) exp(-tr S)) by Lee's integral (2018, eq. 12, u = 1 - 2w) of the falls λ.
+    """Return log(c(F) exp(-tr S)) for the falls λ, by the integral of Lee 2018, eq. 12, with u = 1 - 2w.
 
-    The integral uses Gauss-Legendre quadrature on panels that shrink tenfold every other panel towards both ends. It
-    pairs the quaternion's components otherwise than functions.py does: (q₀, q₃) and (q₁, q₂).
+    It is computed by Gauss-Legendre quadrature on panels that shrink towards both ends, tenfold over two panels. It
+    pairs the components of the quaternion as (q₀, q₃) and (q₁, q₂), unlike functions.py.
     """
     borders = np.concatenate([[0.0], np.logspace(-40, np.log10(0.5), 80)])
     nodes, weights = np.polynomial.legendre.leggauss(24)
@@ -91,7 +94,7 @@ def _rotation(azimuth: Any, elevation: Any, tilt: Any) -> Any:
 
 
 def cases(head: DensityHead) -> Iterator[Case]:
-    """Yield a case for every matrix with a few viewpoints, some outside the chart or many turns further."""
+    """Yield a case for every matrix at a few viewpoints, some outside the chart or many turns away."""
     for name, matrix in RAWS.items():
         raw = torch.tensor(matrix.ravel()).float().double().expand(len(VALUES), 9)
         value = torch.tensor(VALUES).float().double()
@@ -106,8 +109,8 @@ ROWS = {
             TARGET,
             cases=cases,
             leave_out={
-                "mode": "the mode is the likeliest rotation; the chart's cos e moves the highest point off it",
-                "tempered: power": "the density of rotations is raised to the power, and not the chart's cos e",
+                "mode": "the mode is the likeliest rotation; the highest point in the chart differs, because of cos e",
+                "tempered: power": "only the density of rotations is raised to the power, not the chart's cos e",
             },
         ),
     )

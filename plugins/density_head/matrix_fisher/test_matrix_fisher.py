@@ -51,7 +51,7 @@ def chart(points=72):
     return torch.stack(axes, -1), double(weights)[:, None] * math.pi / 2 * (2 * math.pi / points) ** 2
 
 
-def head(config="matrix_fisher", target=TARGET):
+def build_head(config="matrix_fisher", target=TARGET):
     return build("density_head", resolve("density_head", config), target=target)
 
 
@@ -92,14 +92,14 @@ def test_viewpoints_at_the_poles_and_borders_turn_back(angles):
 
 def test_height_agrees_with_another_quadrature_of_another_pairing():
     falls = [
-        (one, two, three)
-        for i, one in enumerate(FALLS)
-        for j, two in enumerate(FALLS[i:], i)
-        for three in FALLS[j:]
+        (smallest, middle, largest)
+        for i, smallest in enumerate(FALLS)
+        for j, middle in enumerate(FALLS[i:], i)
+        for largest in FALLS[j:]
     ]
-    found = -functions.log_height(double(falls))
+    heights = -functions.log_height(double(falls))
     reference = double([log_constant(*map(float, row)) for row in falls])
-    error = (found - reference).abs() / reference.abs().clamp(min=1)
+    error = (heights - reference).abs() / reference.abs().clamp(min=1)
     assert error.max() < 1e-12, falls[error.argmax()]
 
 
@@ -115,9 +115,9 @@ def test_height_agrees_with_closed_forms(fall):
         }
     for falls, constant in references.items():
         for dtype in (torch.float32, torch.float64):
-            found = -functions.log_height(torch.tensor(falls, dtype=dtype))
+            height = -functions.log_height(torch.tensor(falls, dtype=dtype))
             if dtype == torch.float64 or float(torch.tensor(fall, dtype=dtype)) == fall:
-                assert found.item() == pytest.approx(float(mpmath.log(constant)), rel=1e-12, abs=1e-14)
+                assert height.item() == pytest.approx(float(mpmath.log(constant)), rel=1e-12, abs=1e-14)
 
 
 @pytest.mark.parametrize("fall", AROUND)
@@ -132,17 +132,19 @@ def test_moments_agree_with_closed_forms(fall):
     moments = functions.fourth_moments(falls)
     torch.testing.assert_close(moments[1:, 1:].sum(), double(float(fourth)), rtol=1e-12, atol=0)
     torch.testing.assert_close(moments.sum(), double(1.0), rtol=1e-12, atol=0)
-    each = double(float(fourth)) / 15  # symmetric: E qᵢ⁴ = 3 E qᵢ²qⱼ²
-    torch.testing.assert_close(moments[1:, 1:], each * (1 + 2 * torch.eye(3).double()), rtol=1e-11, atol=0)
+    product_moment = double(float(fourth)) / 15  # symmetric: E qᵢ⁴ = 3 E qᵢ²qⱼ²
+    torch.testing.assert_close(
+        moments[1:, 1:], product_moment * (1 + 2 * torch.eye(3).double()), rtol=1e-11, atol=0
+    )
 
 
 def test_height_beyond_1e12_and_of_nothing():
     falls = double([[1e30, 1e30, 1e30], [0, 1e24, 1e30], [0, 0, 1e30]])
     # Laplace's method: exact to 1/λ
     wanted = [-0.5 * math.log(math.pi) - 1.5 * math.log(1e30), -0.5 * math.log(1e54), None]
-    found = -functions.log_height(falls)
-    assert found[:2].tolist() == pytest.approx(wanted[:2], rel=1e-13)
-    assert found.isfinite().all()
+    heights = -functions.log_height(falls)
+    assert heights[:2].tolist() == pytest.approx(wanted[:2], rel=1e-13)
+    assert heights.isfinite().all()
     assert functions.log_height(torch.zeros(0, 3)).shape == (0,)
 
 
@@ -189,7 +191,7 @@ def test_gradient_of_a_concentrated_density_keeps_its_digits(concentration):
 
 def test_third_derivatives_are_refused():
     parameter = torch.eye(3).double().requires_grad_()
-    with pytest.raises(RuntimeError, match=r"third derivative.*create_graph"):
+    with pytest.raises(RuntimeError, match=r"no third derivative.*create_graph"):
         torch.autograd.grad(functions.mean_rotation(parameter).sum(), parameter, create_graph=True)
 
 
@@ -205,18 +207,21 @@ def test_integral_marginals_and_entropies_agree_with_brute_force(name):
     assert mass.sum().item() == pytest.approx(1, abs=1e-12)
     surprise = -(mass * log_density).sum().item()
     assert density.entropy().item() == pytest.approx(surprise, abs=5e-6)  # log cos e bends at the poles
-    each = weight[:, 0]
-    step = 2 * math.pi / len(each)
-    for index, axis, length in ((0, angles[:, 0, 0, 0], step), (1, angles[0, :, 0, 1], each / step**2)):
-        others = [number for number in range(3) if number != index]
-        wanted = mass.sum(others) / length
-        found = marginal(density, index).log_prob(axis[:, None]).exp()
-        torch.testing.assert_close(found, wanted, rtol=1e-9, atol=1e-11)
+    node_weights = weight[:, 0]
+    step = 2 * math.pi / len(node_weights)
+    for index, axis, length in (
+        (0, angles[:, 0, 0, 0], step),
+        (1, angles[0, :, 0, 1], node_weights / step**2),
+    ):
+        other_angles = [number for number in range(3) if number != index]
+        wanted = mass.sum(other_angles) / length
+        probabilities = marginal(density, index).log_prob(axis[:, None]).exp()
+        torch.testing.assert_close(probabilities, wanted, rtol=1e-9, atol=1e-11)
         per_angle = -(wanted * length * wanted.log()).sum().item()
         limit = 1e-7 if index == 0 else 5e-6
         assert marginal(density, index).entropy().item() == pytest.approx(per_angle, abs=limit)
-    found = marginal(density, 2).log_prob(angles[0, 0, :, 2, None]).exp()
-    torch.testing.assert_close(found, mass.sum((0, 1)) / step, rtol=1e-9, atol=1e-11)
+    probabilities = marginal(density, 2).log_prob(angles[0, 0, :, 2, None]).exp()
+    torch.testing.assert_close(probabilities, mass.sum((0, 1)) / step, rtol=1e-9, atol=1e-11)
 
 
 def test_uniform_rotations_have_the_entropy_of_the_chart():
@@ -234,18 +239,18 @@ def test_concentrated_densities_are_normal(concentration):
     density = MatrixFisher(concentration * viewpoint_rotation(viewpoint))
     torch.testing.assert_close(density.mode, viewpoint, rtol=0, atol=1e-14)
     # small rotations have variance 1/(2s) about each axis; cos e da de dt is their volume
-    one = 0.5 * math.log(math.pi * math.e / concentration)
+    entropy = 0.5 * math.log(math.pi * math.e / concentration)
     limit = 5 / concentration + 2e-6
-    assert density.entropy().item() == pytest.approx(3 * one - math.log(math.cos(0.6)), abs=limit)
+    assert density.entropy().item() == pytest.approx(3 * entropy - math.log(math.cos(0.6)), abs=limit)
     for index, spread in ((0, 1 / math.cos(0.6)), (1, 1.0), (2, 1 / math.cos(0.6))):
         alone = marginal(density, index)
-        assert alone.entropy().item() == pytest.approx(one + math.log(spread), abs=5 * limit)
+        assert alone.entropy().item() == pytest.approx(entropy + math.log(spread), abs=5 * limit)
         assert alone.mode.item() == pytest.approx(viewpoint[index].item(), abs=2 / concentration + 1e-8)
         deviation = spread / math.sqrt(2 * concentration)
         offsets = double([-2.0, 0.0, 1.0])
-        found = alone.log_prob((viewpoint[index] + deviation * offsets)[:, None])
+        log_prob = alone.log_prob((viewpoint[index] + deviation * offsets)[:, None])
         wanted = -offsets.square() / 2 - math.log(deviation * math.sqrt(2 * math.pi))
-        torch.testing.assert_close(found, wanted, rtol=0, atol=10 / math.sqrt(concentration) + 1e-8)
+        torch.testing.assert_close(log_prob, wanted, rtol=0, atol=10 / math.sqrt(concentration) + 1e-8)
 
 
 @pytest.mark.parametrize("concentration", [1e-3, 1.0, 1e2, 1e4])
@@ -304,9 +309,9 @@ def test_few_nodes_do_up_to_their_bound(index, count, monkeypatch):
     torch.testing.assert_close(density.frame.falls, falls.expand(9, -1, -1))
     reach = math.pi / 2 - 0.02 if index == 1 else math.pi
     places = torch.linspace(-reach, reach, 31).double()[:, None, None, None].expand(-1, 9, len(shapes), 1)
-    found = marginal(density, index).log_prob(places)
+    log_prob = marginal(density, index).log_prob(places)
     monkeypatch.setattr(angles, "FEW", {1500: 1e9})
-    torch.testing.assert_close(found, marginal(density, index).log_prob(places), rtol=0, atol=5e-12)
+    torch.testing.assert_close(log_prob, marginal(density, index).log_prob(places), rtol=0, atol=5e-12)
 
 
 @pytest.mark.parametrize("name", [*PARAMETERS, "concentrated", "ring"])
@@ -317,17 +322,17 @@ def test_samples_follow_the_density(name):
     parameter = left @ torch.diag(more[name]) @ right.T if name in more else double(PARAMETERS[name])
     density = MatrixFisher(parameter)
     count = 20_000
-    drawn = density.sample((count,))
-    assert drawn[:, 1].abs().max() <= math.pi / 2
-    assert drawn[:, [0, 2]].abs().max() <= math.pi
-    rotations = viewpoint_rotation(drawn)
+    samples = density.sample((count,))
+    assert samples[:, 1].abs().max() <= math.pi / 2
+    assert samples[:, [0, 2]].abs().max() <= math.pi
+    rotations = viewpoint_rotation(samples)
     deviation = (rotations.mean(0) - density.mean_rotation) / rotations.std(0) * count**0.5
     assert deviation.abs().max() < 4.5
-    surprise = -density.log_prob(drawn)
+    surprise = -density.log_prob(samples)
     error = (surprise.mean() - density.entropy()) / (surprise.std() + 1e-9) * count**0.5
     assert error.abs() < 4.5
     for index in range(3):
-        sorted_ = drawn[:, index].sort().values
+        sorted_ = samples[:, index].sort().values
         # the distribution function between neighbouring hundredths of the samples, by Gauss-Legendre
         marks = torch.cat([sorted_[:1], sorted_[100::200], sorted_[-1:]])
         nodes, weights = (double(numbers) for numbers in np.polynomial.legendre.leggauss(12))
@@ -355,11 +360,13 @@ def test_samples_of_concentrated_densities_are_normal(fall):
 def test_more_than_44_percent_of_proposals_are_accepted(falls, monkeypatch):
     torch.manual_seed(0)
     monkeypatch.setattr(functions, "SAMPLING_ROUNDS", 1)
-    seen = []
+    proposals = []
     propose = functions._propose
-    monkeypatch.setattr(functions, "_propose", lambda *given: seen.append(propose(*given)) or seen[-1])
+    monkeypatch.setattr(
+        functions, "_propose", lambda *arguments: proposals.append(propose(*arguments)) or proposals[-1]
+    )
     functions.sample(double(falls).expand(20_000, 3))
-    assert (~seen[0][1]).double().mean() > 0.44
+    assert (~proposals[0][1]).double().mean() > 0.44
 
 
 def test_sampling_ends_whatever_it_is_given():
@@ -428,11 +435,11 @@ def test_parameter_of_raw_is_smooth_at_zero_and_bounded():
     torch.testing.assert_close(jacobian.reshape(9, 9), torch.eye(9).double(), rtol=0, atol=0)
     for size in (1.0, 30.0, 2e3, 3e3, 1e38, 1.7e308):
         raw = torch.full((3, 3), size, dtype=torch.float64 if size > 1e38 else torch.float32)
-        found = parameter_of_raw(raw)
-        assert found.norm() <= LARGEST_PARAMETER * (1 + 1e-12)
+        parameter = parameter_of_raw(raw)
+        assert parameter.norm() <= LARGEST_PARAMETER * (1 + 1e-12)
         norm = min(3 * size, 1e6)
         wanted = min(norm * (1 + norm**2 / 16) ** 1.5, LARGEST_PARAMETER)
-        assert found.norm().item() == pytest.approx(wanted, rel=1e-6)
+        assert parameter.norm().item() == pytest.approx(wanted, rel=1e-6)
     generic = torch.randn(3, 3).double().requires_grad_()
     assert torch.autograd.gradcheck(parameter_of_raw, generic)
 
@@ -442,40 +449,44 @@ MIXED = {"name": "mixture", "components": 3, "component": {"name": "matrix_fishe
 
 def test_a_mixture_of_matrix_fishers():
     torch.manual_seed(0)
-    made = head(MIXED).double().eval()
-    raw = (0.3 * torch.randn(4, made.size).double()).requires_grad_()
-    density = made(raw)
+    head = build_head(MIXED).double().eval()
+    raw = (0.3 * torch.randn(4, head.size).double()).requires_grad_()
+    density = head(raw)
     assert isinstance(density, Mixture)
     angles, weight = chart(48)
     with torch.no_grad():
         log_density = density.log_prob(angles.unsqueeze(-2).expand(48, 48, 48, 4, 3))
         parts = MatrixFisher(density.components.parameter.movedim(1, 0))
-        each = torch.stack([parts.log_prob(angles[1, 2, 3].expand(4, 3))[k] for k in range(3)], -1)
-        torch.testing.assert_close(log_density[1, 2, 3], torch.logsumexp(density.log_weights + each, -1))
+        component_log_prob = torch.stack(
+            [parts.log_prob(angles[1, 2, 3].expand(4, 3))[k] for k in range(3)], -1
+        )
+        torch.testing.assert_close(
+            log_density[1, 2, 3], torch.logsumexp(density.log_weights + component_log_prob, -1)
+        )
         torch.testing.assert_close(
             (log_density.exp() * weight[..., None]).sum((0, 1, 2)), torch.ones(4).double()
         )
-        drawn = density.sample((4000,))
-        surprise = -density.log_prob(drawn)
+        samples = density.sample((4000,))
+        surprise = -density.log_prob(samples)
         assert ((surprise.mean(0) - density.entropy()).abs() < 5 * surprise.std(0) / 1000**0.5).all()
         alone = marginal(density, 0)
-        turn, found = circular_grid(alone, 48)
+        turn, log_prob = circular_grid(alone, 48)
         assert torch.equal(turn, turn.sort().values)
         wanted = (log_density.exp() * weight[..., None]).sum((1, 2)) / (2 * math.pi / 48)
-        torch.testing.assert_close(found.exp(), wanted, rtol=1e-6, atol=1e-8)
+        torch.testing.assert_close(log_prob.exp(), wanted, rtol=1e-6, atol=1e-8)
         assert alone.entropy().isfinite().all()
         assert median(density, 100).shape == density.mode.shape == (4, 3)
-    made.loss(raw, drawn[0]).sum().backward()
+    head.loss(raw, samples[0]).sum().backward()
     assert raw.grad.isfinite().all()
 
 
 @pytest.mark.parametrize("names", [("azimuth",), ("tilt", "azimuth", "elevation"), ("x", "y", "z")])
 def test_other_angles_are_refused(names):
     with pytest.raises(ConfigError, match=rf"matrix_fisher.*azimuth, elevation, tilt.*{', '.join(names)}"):
-        head(target=Target("angle", names))
+        build_head(target=Target("angle", names))
 
 
 @pytest.mark.parametrize("kind", ["real", "class"])
 def test_other_targets_are_refused(kind):
     with pytest.raises(ConfigError, match=f"matrix_fisher.*'{kind}'"):
-        head(target=Target(kind, ("azimuth", "elevation", "tilt")))
+        build_head(target=Target(kind, ("azimuth", "elevation", "tilt")))

@@ -14,15 +14,19 @@ from framework.heads.parameters import require_finite, require_trained
 from framework.target import Target
 
 MODERATE = {"name": "von_mises", "floor": 1.0}
-"""Settings of a component that cannot become uniform alone: several together can, and each still learns a direction."""
+"""Settings of the default component, which cannot become uniform.
+
+Several components together can describe a uniform density, and each still learns a direction.
+"""
 
 
 class MixtureHead(DensityHead):
     """Finite mixture of any other head's densities, weights by softmax (thesis eq. 3.10-3.11).
 
-    The head reads K logits, then the raw parameters of K components, then one more set of raw parameters that is added
-    to all K: all components learn together what each of them must know, and none falls behind (README). A component
-    that is fitted after training (it has a buffer) is refused, because it is not known which data belongs to it.
+    The head reads K logits, then the raw parameters of K components, then one further set of raw parameters that is
+    added to each of the K. Through this set all components learn together what they have in common, and none falls
+    behind (README). A component that is fitted after training (it has a buffer) is refused, because it is not known
+    which samples belong to which component.
 
     Args:
         components: K. With 1 the density is the component, to the last bit.
@@ -30,13 +34,7 @@ class MixtureHead(DensityHead):
     """
 
     knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
-    bibtex = """@techreport{bishop1994mixture,
-  title = {Mixture Density Networks},
-  author = {Bishop, Christopher M.},
-  institution = {Aston University},
-  number = {NCRG/94/004},
-  year = {1994}
-}"""
+    bibtex = "bishop1994mixture"
 
     def __init__(
         self,
@@ -50,7 +48,7 @@ class MixtureHead(DensityHead):
         self.component = require_trained(component)
         self.size = components * (component.size + 1)
         if components > 1:
-            # the parameters that all components share, and offsets that make them differ from the first step
+            # raw parameters that all components share, and offsets that make the components differ from the first step
             self.size += component.size
             self.spread = nn.Parameter(torch.randn(components, component.size))
 
@@ -58,8 +56,8 @@ class MixtureHead(DensityHead):
         """Return the density for raw parameters."""
         raw = require_finite(raw, self.size)
         own = self.components * self.component.size
-        logits, apart, common = raw.tensor_split([self.components, self.components + own], -1)
-        numbers = apart.unflatten(-1, (self.components, self.component.size))
+        logits, separate, common = raw.tensor_split([self.components, self.components + own], -1)
+        numbers = separate.unflatten(-1, (self.components, self.component.size))
         if self.components > 1:
             most = torch.finfo(raw.dtype).max / 4  # so that the sum does not overflow
             numbers = (

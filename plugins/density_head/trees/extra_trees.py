@@ -29,29 +29,30 @@ from plugins.density_head.trees.stored_forest import require_forest
 
 INTEGERS = ("feature", "branch", "root", "start", "label", "count")
 ROUNDS = 200
-"""Largest number of rounds of expectation and maximisation; they end when no width changes by a millionth."""
+"""Largest number of rounds of expectation maximisation, which ends when no variance changes by a millionth."""
 
 
 class ExtraTreesHead(DensityHead, Fitted):
     """A forest of trees with random thresholds, fitted to all training samples at once (Geurts et al. 2006).
 
-    Classes: with f_k the mean over T trees of the share of class k in the leaf, p_k = (T f_k + a) / (T + a K). This is
-    Laplace's rule on T votes: no class has probability 0, and the order of the classes is the forest's. `smoothing` is
-    a. Reals: the mixture over the trees of normal densities around each tree's mean, with one width for each number of
-    the target. After the fit the width is the targets' standard deviation; `calibrate` fits it to the validation set by
-    maximum likelihood. The output of the trees is piecewise constant in the features, and its gradient is 0.
+    Classes: p_k = (T f_k + a) / (T + a K) for K classes and T trees, where f_k is the share of class k in a sample's
+    leaf, averaged over the trees, and a is `smoothing`. This is Laplace's rule on T votes: no class has probability 0,
+    and the order of the classes is that of f_k. Reals: a mixture with one normal density around the mean of each tree,
+    with one width for each number of the target. After the fit the width is the standard deviation of the training
+    targets; `calibrate` fits it to the validation split by maximum likelihood. The output of the trees is piecewise
+    constant in the features, and its gradient is 0.
 
     The forest is stored as flat arrays of integers and thresholds; scikit-learn grows it and is not needed to use it.
 
     Attributes:
-        trees: number of the forest's trees that are used, the first ones (a knob).
+        trees: number of trees that are used, counted from the first (a knob).
 
     Args:
-        trees: number of trees that are grown.
+        trees: number of trees that are grow_forest.
         features: share of the features tried at each split; None: their square root for classes, all for reals.
         leaf: smallest number of training samples of a leaf.
         depth: largest number of splits from root to leaf.
-        smoothing: a.
+        smoothing: a; number of votes that every class has in addition.
 
     Raises:
         ConfigError: the target is an angle.
@@ -59,14 +60,7 @@ class ExtraTreesHead(DensityHead, Fitted):
     """
 
     knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {"trees": (1, 3, 10, 30, 100, 300)}
-    bibtex = """@article{geurts2006extremely,
-  author  = {Geurts, Pierre and Ernst, Damien and Wehenkel, Louis},
-  title   = {Extremely randomized trees},
-  journal = {Machine Learning},
-  volume  = {63},
-  pages   = {3--42},
-  year    = {2006}
-}"""
+    bibtex = "geurts2006extremely"
 
     feature: Tensor
     threshold: Tensor
@@ -109,12 +103,12 @@ class ExtraTreesHead(DensityHead, Fitted):
     def fit(self, features: Float[Tensor, "sample size"], target: Tensor, seed: int) -> None:
         """Grow the trees from all training samples."""
         from plugins.density_head.trees.growing import (
-            grown,
+            grow_forest,
         )  # scikit-learn, which a stored forest does not need
 
         target = target if self.classes else self.unit.standardise(target.double())
         wanted = target.cpu().numpy()
-        arrays = grown(
+        arrays = grow_forest(
             single(features).numpy(),
             wanted,
             classes=self.classes,
@@ -157,11 +151,11 @@ class ExtraTreesHead(DensityHead, Fitted):
         if self.classes:
             return
         if len(raw) == 0:
-            raise ValueError("widths are calibrated on validation data, but got none of it.")
+            raise ValueError("widths are fitted to the validation split, but got no sample of this split.")
         density = self(raw.double())
         assert isinstance(density, Mixture)
         means, target = map(self.unit.standardise, (density.components.mean, target.double()))
-        width = fitted_width(target.unsqueeze(1) - means)  # of (sample, tree, number)
+        width = fit_width(target.unsqueeze(1) - means)  # of (sample, tree, number)
         self.width.copy_(width.clamp(max=WIDEST))
 
     def _require(self, arrays: Mapping[str, np.ndarray]) -> None:
@@ -172,12 +166,12 @@ class ExtraTreesHead(DensityHead, Fitted):
         self.size = int(self.read)
 
 
-def fitted_width(residual: Float[Tensor, "sample tree number"]) -> Float[Tensor, "number"]:
+def fit_width(residual: Float[Tensor, "sample tree number"]) -> Float[Tensor, "number"]:
     """Return widths σ that maximise Σ_i log (1/T) Σ_t Π_d N(residual_itd; 0, σ_d²), by expectation maximisation.
 
-    r_it = N(residual_it; 0, σ²) / Σ_s N(residual_is; 0, σ²) and σ_d² = mean_i Σ_t r_it residual_itd² (Dempster, Laird &
-    Rubin 1977). The start is the largest useful width, at which every tree has weight. Each round raises the
-    likelihood.
+    A round computes r_it = N(residual_it; 0, σ²) / Σ_s N(residual_is; 0, σ²), then σ_d² = mean_i Σ_t r_it residual_itd²
+    (Dempster, Laird & Rubin 1977). It never lowers the likelihood. The search starts from the largest useful width, at
+    which all trees have similar weights.
     """
     squares = residual.square()
     variance = squares.mean((0, 1)).clamp(min=FLOOR**2)

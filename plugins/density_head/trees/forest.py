@@ -1,12 +1,12 @@
-"""A forest in flat arrays, and the compiled functions that walk it; the library that grew the forest is not needed.
+"""A forest in flat arrays, and the compiled functions that walk through its trees without scikit-learn.
 
 Arrays:
     feature: (node,) int32, the feature that a node compares; -1 at a leaf.
-    threshold: (node,) float32; samples whose feature is at most this go left.
-    branch: (node, 2) int32, the nodes to the left and right; at a leaf its number, twice.
+    threshold: (node,) float32; samples whose feature is at most the threshold go left.
+    branch: (node, 2) int32, the left and the right child of a node; at a leaf, the number of the leaf, twice.
     root: (tree,) int32, the root node of each tree.
 
-`no_type_check` prevents the type checks that tests switch on from wrapping a kernel before it is compiled.
+Tests switch on type checks, which would wrap a function before it is compiled; `no_type_check` prevents that.
 """
 
 from pathlib import Path
@@ -20,7 +20,7 @@ compiled = compiler(kernel_cache("forest", [Path(__file__)]))
 
 
 def at_most(threshold: np.ndarray) -> np.ndarray:
-    """Return the largest float32 that is at most `threshold`; comparisons of float32 features with either agree."""
+    """Return the largest float32 that is at most `threshold`; float32 features compare equally with either."""
     rounded = threshold.astype(np.float32)
     return np.where(rounded > threshold, np.nextafter(rounded, np.float32(-np.inf)), rounded)
 
@@ -29,31 +29,31 @@ def at_most(threshold: np.ndarray) -> np.ndarray:
 @no_type_check
 def leaves(samples, feature, threshold, branch, root):
     """Return the leaf of each sample in each tree, (tree, sample) int32, for samples (sample, feature) float32."""
-    found = np.empty((len(root), len(samples)), np.int32)
+    leaf = np.empty((len(root), len(samples)), np.int32)
     for tree in range(len(root)):
         for sample in range(len(samples)):
             node = root[tree]
             while feature[node] >= 0:
                 side = 0 if samples[sample, feature[node]] <= threshold[node] else 1
                 node = branch[node, side]
-            found[tree, sample] = branch[node, 0]
-    return found
+            leaf[tree, sample] = branch[node, 0]
+    return leaf
 
 
 @compiled
 @no_type_check
 def frequencies(leaf, start, label, count, classes):
-    """Return the mean over the trees of the shares of the classes in a sample's leaves, (sample, class) float64.
+    """Return the share of each class in a sample's leaves, averaged over the trees, (sample, class) float64.
 
     Args:
-        leaf: (tree, sample).
-        start: (leaf + 1,), the first entry of each leaf.
+        leaf: (tree, sample), the leaf of each sample in each tree.
+        start: (leaf + 1,), index of the first entry of each leaf, then the number of entries.
         label: (entry,), the class of each entry.
         count: (entry,), the number of training samples of that class in the leaf.
         classes: number of classes.
     """
     trees, samples = leaf.shape
-    found = np.zeros((samples, classes))
+    total_share = np.zeros((samples, classes))
     for tree in range(trees):
         for sample in range(samples):
             at = leaf[tree, sample]
@@ -61,5 +61,5 @@ def frequencies(leaf, start, label, count, classes):
             for entry in range(start[at], start[at + 1]):
                 total += count[entry]
             for entry in range(start[at], start[at + 1]):
-                found[sample, label[entry]] += count[entry] / total
-    return found / trees
+                total_share[sample, label[entry]] += count[entry] / total
+    return total_share / trees

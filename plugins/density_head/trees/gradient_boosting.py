@@ -43,7 +43,7 @@ class XGBoostHead(DensityHead, Fitted):
     The model is stored as bytes in the library's own portable binary format (UBJSON), which contains no code.
 
     Attributes:
-        rounds: number of rounds whose trees are used, the first ones (a knob).
+        rounds: number of boosting rounds whose trees are used, counted from the first (a knob).
 
     Args:
         rounds: number of boosting rounds.
@@ -52,9 +52,9 @@ class XGBoostHead(DensityHead, Fitted):
         samples: share of the training samples drawn in each round.
         features: share of the features drawn for each tree.
         weight: smallest sum of second derivatives of the loss in a leaf.
-        splits: "hist" tries the borders of at most 256 bins of each feature, "exact" the values of every sample. For
-            few samples of very many features "exact" is faster and takes less memory, since the memory for bins grows
-            with the features.
+        splits: "hist" tries the borders of at most 256 bins of each feature as thresholds, "exact" the values of all
+            samples. For few samples with very many features "exact" is faster and takes less memory, since the memory
+            for bins grows with the number of features.
 
     Raises:
         ConfigError: the target is an angle, or a single class.
@@ -62,13 +62,7 @@ class XGBoostHead(DensityHead, Fitted):
     """
 
     knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {"rounds": (1, 3, 10, 30, 100)}
-    bibtex = """@inproceedings{chen2016xgboost,
-  author    = {Chen, Tianqi and Guestrin, Carlos},
-  title     = {{XGBoost}: A Scalable Tree Boosting System},
-  booktitle = {ACM SIGKDD International Conference on Knowledge Discovery and Data Mining},
-  pages     = {785--794},
-  year      = {2016}
-}"""
+    bibtex = "chen2016xgboost"
 
     model: Tensor
     width: Tensor
@@ -91,8 +85,8 @@ class XGBoostHead(DensityHead, Fitted):
         self.classes = len(target.names) if target.kind == "class" else 0
         if self.classes == 1:
             raise ConfigError(
-                f"density_head xgboost tells two classes or more apart; this data set has one, {target.names[0]}. "
-                "Choose other data."
+                f"density_head xgboost needs two classes or more, but this data set has one, {target.names[0]}. Choose "
+                "other data."
             )
         self.numbers = self.classes or len(target.names)
         self.unit = Unit.of(target)
@@ -148,7 +142,9 @@ class XGBoostHead(DensityHead, Fitted):
         if self.classes:
             return
         if len(raw) == 0:
-            raise ValueError("a standard deviation is calibrated on validation data, but got none of it.")
+            raise ValueError(
+                "a standard deviation is fitted to the validation split, but got no sample of this split."
+            )
         self._measure_width(raw, target)
 
     def _measure_width(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
@@ -156,13 +152,13 @@ class XGBoostHead(DensityHead, Fitted):
         self.width.copy_(residual.square().mean(0).sqrt().clamp(FLOOR, WIDEST))
 
     def _sums(self, raw: Float[Tensor, "sample size"]) -> Float[Tensor, "sample number"]:
-        """Return the sums of the trees, float32."""
+        """Return the sums of the trees' outputs, (sample, number), float32."""
         assert self.booster is not None
         rounds = min(max(1, self.rounds), self.booster.num_boosted_rounds())
-        found = self.booster.inplace_predict(
+        sums = self.booster.inplace_predict(
             single(raw).numpy(), iteration_range=(0, rounds), predict_type="margin"
         )
-        return torch.from_numpy(found).reshape(len(raw), self.numbers)
+        return torch.from_numpy(sums).reshape(len(raw), self.numbers)
 
     def _require(self, arrays: Mapping[str, np.ndarray]) -> None:
         content, size = arrays["model"], arrays["read"]
@@ -172,13 +168,15 @@ class XGBoostHead(DensityHead, Fitted):
             or not 0 <= int(size) < 2**31
             or bool(len(content)) != bool(size)
         ):
-            raise ValueError("model and read are no row of bytes and the number of features that they read")
+            raise ValueError(
+                "`model` is not a row of bytes, or `read` is not the number of features that the model reads"
+            )
         if len(content):
             require_boosting(content.tobytes(), self.classes, self.numbers, int(size))
         require_widths(arrays["width"], 0 if self.classes else self.numbers)
 
     def _open(self, *_: Any) -> None:
-        """Read the stored model."""
+        """Build the library's model from the stored bytes."""
         self.size = int(self.read)
         self.booster = None
         if self.size:

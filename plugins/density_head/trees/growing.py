@@ -1,4 +1,4 @@
-"""Growing of forests with scikit-learn and their layout in flat arrays; a stored forest is read without this module."""
+"""Functions that grow a forest with scikit-learn and store it in flat arrays; reading it does not need them."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -12,7 +12,7 @@ from plugins.density_head.trees.forest import at_most
 Arrays = dict[str, np.ndarray]
 
 
-def grown(
+def grow_forest(
     features: np.ndarray,
     target: np.ndarray,
     *,
@@ -23,16 +23,16 @@ def grown(
     depth: int | None,
     seed: int,
 ) -> Arrays:
-    """Return the arrays of a forest: its nodes (plugins.density_head.trees.forest), and the content of its leaves.
+    """Grow a forest and return its arrays: nodes (plugins.density_head.trees.forest) and content of the leaves.
 
     Args:
         features: (sample, feature) float32.
         target: (sample,) labels below `classes`; or (sample, number) float64 if `classes` is 0.
         classes: number of classes; 0 for reals.
-        trees: `trees` of the head.
-        share: `features` of the head.
-        leaf: `leaf` of the head.
-        depth: `depth` of the head.
+        trees: number of trees.
+        share: share of the features tried at each split; None for the default of the head.
+        leaf: smallest number of training samples of a leaf.
+        depth: largest number of splits from root to leaf; None for no limit.
         seed: seed of the forest.
     """
     options: dict[str, Any] = {
@@ -72,7 +72,10 @@ def nodes(trees: Sequence[Any]) -> Arrays:
 
 
 def votes(trees: Sequence[Any], labels: np.ndarray) -> Arrays:
-    """Return the number of training samples of each class in each leaf; `labels` are the classes that occur."""
+    """Return the arrays `start`, `label` and `count`: how many training samples of each class are in each leaf.
+
+    `labels` are the classes that occur in the training samples.
+    """
     counts = []
     for tree in trees:
         leaf = tree.children_left < 0

@@ -1,4 +1,4 @@
-"""Shared parts of heads without gradient (framework.density_head.Fitted): loading of state, inputs, and refusals."""
+"""Functions shared by the heads of trees (framework.density_head.Fitted): checks, inputs, and loading of states."""
 
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -14,9 +14,12 @@ from framework.heads.parameters import require_finite
 from framework.target import Target
 
 FLOOR = 1e-4
-"""Smallest standard deviation of a density over reals, in units of the training targets' one where `Target` has it."""
+"""Smallest standard deviation of a density over reals.
+
+The unit is the standard deviation of the training targets, if `Target` has it.
+"""
 WIDEST = 1e18
-"""Largest standard deviation of such a density: the square of a larger one exceeds float32."""
+"""Largest standard deviation of a density over reals; the square of a larger one exceeds float32."""
 
 
 def require_class_or_real(target: Target, by: str) -> None:
@@ -27,7 +30,7 @@ def require_class_or_real(target: Target, by: str) -> None:
     """
     if target.kind not in ("class", "real"):
         raise ConfigError(
-            f"{by} describes targets of kind 'class' or 'real', but this data set's are {target.kind!r} "
+            f"{by} describes targets of kind 'class' or 'real', but the targets of this data set are {target.kind!r} "
             f"({target.listed_names}). Choose another density_head, or other data."
         )
 
@@ -37,11 +40,12 @@ def require_fitted(raw: Float[Tensor, "*batch size"], size: int, by: str) -> Flo
 
     Raises:
         UserError: `size` is 0, as it is before `fit`.
-        ValueError: as framework.heads.parameters.require_finite.
+        ValueError: `raw` is not finite or has another size (framework.heads.parameters.require_finite).
     """
     if size == 0:
         raise UserError(
-            f"{by} was not fitted: train it with `python -m framework ...`, or load a trained run with framework.load."
+            f"{by} is not fitted yet. Train the head with `python -m framework ...`, or load a trained run with "
+            "framework.load."
         )
     return require_finite(raw, size)
 
@@ -57,7 +61,8 @@ def with_gradient_of_0(
 ) -> Float[Tensor, "*batch_and_more"]:
     """Return `numbers` with a gradient of 0 in `raw`.
 
-    The output of trees is piecewise constant in `raw`. The framework asks for a gradient as of any head; it is 0.
+    The framework needs a gradient from every head. The output of trees is piecewise constant in `raw`, so that its
+    gradient is 0.
     """
     if not raw.requires_grad:
         return numbers
@@ -71,15 +76,16 @@ Arrays = Mapping[str, np.ndarray]
 def load_any_shape(
     head: nn.Module, require: Callable[[Any, Arrays], None], then: Callable[[Any, Any], None]
 ) -> None:
-    """Let `load_state_dict` give the head's own buffers the shapes of the state, and call `then` afterwards.
+    """Make `load_state_dict` give the head's own buffers the shapes of the state, and call `then` afterwards.
 
-    A state comes from an untrusted source: nothing of its arrays is used before `require` has checked them all.
+    A state may come from an untrusted source: `require` checks all arrays before any of them is used.
 
     Args:
         head: the module whose buffers take the shapes of a state.
-        require: receives the head and the arrays that it would have, with the dtypes of its buffers; raises a
-            ValueError with a clause that says what is wrong if they do not fit.
-        then: receives the head and torch's lists of missing and unexpected keys; reads what was loaded.
+        require: function of the head and of the stored arrays, converted to the dtypes of the buffers. It raises a
+            ValueError if they do not fit; the message is a clause that says what is wrong.
+        then: function of the head and of torch's lists of missing and unexpected keys, called after the buffers are
+            loaded.
     """
     head.register_load_state_dict_pre_hook(partial(_take_shapes, require))
     head.register_load_state_dict_post_hook(then)
@@ -92,10 +98,12 @@ def _take_shapes(
     prefix: str,
     *_: Any,
 ) -> None:
-    """Replace buffers by ones with the state's shapes, and their own dtype and device; torch copies the numbers later.
+    """Replace the head's buffers by empty ones with the shapes of the state; torch copies the numbers later.
+
+    Dtypes and devices of the buffers stay.
 
     Raises:
-        CheckpointError: the state is not one of such a head.
+        CheckpointError: `require` refuses the state.
     """
     own = dict(head.named_buffers(recurse=False))
     stored = {name: state.get(prefix + name, buffer) for name, buffer in own.items()}
@@ -103,17 +111,21 @@ def _take_shapes(
         require(head, {name: _array(name, stored[name], buffer) for name, buffer in own.items()})
     except ValueError as error:
         raise CheckpointError(
-            f"The state of {type(head).__name__} is damaged: {shorten(error)}. Load another checkpoint, or train anew."
+            f"The state of {type(head).__name__} is damaged: {shorten(error)}. Load another checkpoint, or train the "
+            "head again."
         ) from None
     for name, buffer in own.items():
         setattr(head, name, torch.empty(stored[name].shape, dtype=buffer.dtype, device=buffer.device))
 
 
-def _array(name: str, found: Any, buffer: Tensor) -> np.ndarray:
-    """Return the array that a buffer will hold; the width of floating-point numbers may differ, as in a cast model."""
-    if not isinstance(found, Tensor) or found.layout != torch.strided or found.is_quantized:
-        raise ValueError(f"{name} is no array of numbers")
-    if found.dtype != buffer.dtype and not (found.is_floating_point() and buffer.is_floating_point()):
-        raise ValueError(f"{name} holds numbers of type {found.dtype}; wanted {buffer.dtype}")
-    found = found.detach().to("cpu", buffer.dtype)
-    return (found.float() if found.dtype == torch.bfloat16 else found).numpy()  # NumPy has no bfloat16
+def _array(name: str, stored: Any, buffer: Tensor) -> np.ndarray:
+    """Return a stored tensor as an array of the buffer's dtype.
+
+    Floating-point numbers may have another precision than the buffer, as in the state of a model in half precision.
+    """
+    if not isinstance(stored, Tensor) or stored.layout != torch.strided or stored.is_quantized:
+        raise ValueError(f"{name} is not an array of numbers")
+    if stored.dtype != buffer.dtype and not (stored.is_floating_point() and buffer.is_floating_point()):
+        raise ValueError(f"{name} has the dtype {stored.dtype}, expected {buffer.dtype}")
+    stored = stored.detach().to("cpu", buffer.dtype)
+    return (stored.float() if stored.dtype == torch.bfloat16 else stored).numpy()  # NumPy has no bfloat16

@@ -1,7 +1,7 @@
-"""Rows of the contract: few trees, for classes and for reals. The checks first fit them to random features.
+"""Contract-test cases: few trees, for classes and for reals, fitted to random features by the tests.
 
-No reference is given: test_extra_trees.py and test_gradient_boosting.py compare the trees with the libraries that grow
-them.
+The cases have no reference values: test_extra_trees.py and test_gradient_boosting.py compare the heads with the
+libraries that grow the trees.
 """
 
 from framework.target import Target

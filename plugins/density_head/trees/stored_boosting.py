@@ -10,7 +10,7 @@ import numpy as np
 from plugins.density_head.trees.ubjson import parse
 
 NOBODY = 2**31 - 1
-"""Number that stands for the missing parent of a root."""
+"""Number that xgboost stores as the parent of a root."""
 FLOATS = ("base_weights", "loss_changes", "split_conditions", "sum_hessian")
 LINKS = ("left_children", "right_children", "parents", "split_indices")
 FLAGS = ("default_left", "split_type")
@@ -24,10 +24,10 @@ TREE = {*FLOATS, *LINKS, *FLAGS, *CATEGORIES, "id", "tree_param"}
 
 
 def require_boosting(content: bytes, classes: int, numbers: int, features: int) -> None:
-    """Require that these bytes are trees for one target, and that every walk through a tree ends at a leaf.
+    """Require that the bytes encode trees for this target, and that every walk through a tree ends at a leaf.
 
-    A node is the child of at most one node, whose number it holds as its parent; the root is the child of none. So no
-    walk visits a node twice.
+    Every node but the root is the child of exactly one node, and stores the number of this parent. The root is the
+    child of none. So no walk visits a node twice.
 
     Args:
         content: UBJSON, as `xgboost.Booster.save_raw` writes it.
@@ -36,13 +36,13 @@ def require_boosting(content: bytes, classes: int, numbers: int, features: int) 
         features: number of features that the trees read.
 
     Raises:
-        ValueError: the bytes are something else; the message is a clause with what came and what was wanted.
+        ValueError: the bytes are not such a model; the message is a clause that says what is wrong.
     """
-    model = _keys(parse(content), "the model", {"learner", "version"})
+    model = _require_keys(parse(content), "the model", {"learner", "version"})
     version = model["version"]
-    if not _whole(version) or len(version) != 3:
-        raise ValueError("version is not three whole numbers")
-    learner = _keys(
+    if not _are_integers(version) or len(version) != 3:
+        raise ValueError("version does not consist of three integers")
+    learner = _require_keys(
         model["learner"],
         "learner",
         {
@@ -54,47 +54,47 @@ def require_boosting(content: bytes, classes: int, numbers: int, features: int) 
             "objective",
         },
     )
-    _equal(learner["attributes"], {}, "attributes")
-    _equal(learner["feature_names"], [], "feature_names")
-    _equal(learner["feature_types"], [], "feature_types")
-    said = _keys(
+    _require_equal(learner["attributes"], {}, "attributes")
+    _require_equal(learner["feature_names"], [], "feature_names")
+    _require_equal(learner["feature_types"], [], "feature_types")
+    parameters = _require_keys(
         learner["learner_model_param"],
         "learner_model_param",
         {"base_score", "boost_from_average", "num_class", "num_feature", "num_target"},
     )
-    base = said.pop("base_score")
-    _base_score(base, numbers)
+    base = parameters.pop("base_score")
+    _require_base_score(base, numbers)
     targets = "1" if classes else str(numbers)
     wanted = {"num_class": str(classes), "num_feature": str(features), "num_target": targets}
-    _equal(said, wanted | {"boost_from_average": "1"}, "learner_model_param")
+    _require_equal(parameters, wanted | {"boost_from_average": "1"}, "learner_model_param")
     softmax = {"name": "multi:softprob", "softmax_multiclass_param": {"num_class": str(classes)}}
     square = {"name": "reg:squarederror", "reg_loss_param": {"scale_pos_weight": "1"}}
-    _equal(learner["objective"], softmax if classes else square, "objective")
+    _require_equal(learner["objective"], softmax if classes else square, "objective")
 
-    booster = _keys(learner["gradient_booster"], "gradient_booster", {"model", "name"})
-    _equal(booster["name"], "gbtree", "gradient_booster.name")
+    booster = _require_keys(learner["gradient_booster"], "gradient_booster", {"model", "name"})
+    _require_equal(booster["name"], "gbtree", "gradient_booster.name")
     wanted_keys = {"gbtree_model_param", "iteration_indptr", "tree_info", "trees"}
-    forest = _keys(
+    forest = _require_keys(
         booster["model"], "gradient_booster.model", wanted_keys, {"cats"}
     )  # xgboost writes "cats" since version 3.1
-    for name, part in _keys(
+    for name, part in _require_keys(
         forest.get("cats", {}), "cats", set(), {"enc", "feature_segments", "sorted_idx"}
     ).items():
         if not isinstance(part, list | np.ndarray) or len(part):
             raise ValueError(f"cats.{name} is not empty")
     trees = forest["trees"]
     if not isinstance(trees, list) or not trees or len(trees) % numbers:
-        raise ValueError(f"trees are not one or more for each of {numbers} sums")
+        raise ValueError(f"the number of trees is not a positive multiple of the {numbers} sums")
     counted = {"num_parallel_tree": "1", "num_trees": str(len(trees))}
-    _equal(forest["gbtree_model_param"], counted, "gbtree_model_param")
-    _equal(forest["iteration_indptr"], [*range(0, len(trees) + 1, numbers)], "iteration_indptr")
-    _equal(forest["tree_info"], [*range(numbers)] * (len(trees) // numbers), "tree_info")
+    _require_equal(forest["gbtree_model_param"], counted, "gbtree_model_param")
+    _require_equal(forest["iteration_indptr"], [*range(0, len(trees) + 1, numbers)], "iteration_indptr")
+    _require_equal(forest["tree_info"], [*range(numbers)] * (len(trees) // numbers), "tree_info")
     for number, tree in enumerate(trees):
-        _tree(_keys(tree, f"tree {number}", TREE), number, features)
+        _require_tree(_require_keys(tree, f"tree {number}", TREE), number, features)
 
 
-def _tree(tree: Mapping[str, Any], number: int, features: int) -> None:
-    _equal(tree["id"], number, f"tree {number}: id")
+def _require_tree(tree: Mapping[str, Any], number: int, features: int) -> None:
+    _require_equal(tree["id"], number, f"tree {number}: id")
     count = len(tree["left_children"]) if isinstance(tree["left_children"], np.ndarray) else 0
     sizes = {
         "num_deleted": "0",
@@ -102,57 +102,65 @@ def _tree(tree: Mapping[str, Any], number: int, features: int) -> None:
         "num_nodes": str(count),
         "size_leaf_vector": "1",
     }
-    _equal(tree["tree_param"], sizes, f"tree {number}: tree_param")
+    _require_equal(tree["tree_param"], sizes, f"tree {number}: tree_param")
     types = dict.fromkeys(FLOATS, ">f4") | dict.fromkeys(LINKS, ">i4") | dict.fromkeys(FLAGS, "u1")
     for name, dtype in (types | CATEGORIES).items():
         array, length = tree[name], count if name in types else 0
         if not isinstance(array, np.ndarray) or array.dtype != dtype or len(array) != length:
-            raise ValueError(f"tree {number}: {name} is no array of {length} numbers of type {dtype}")
+            raise ValueError(f"tree {number}: {name} is not an array of {length} numbers of type {dtype}")
     left, right, parent, feature = (tree[name].astype(np.int64) for name in LINKS)
     inner = np.flatnonzero(left >= 0)
     outer = np.flatnonzero(left < 0)
     children = np.concatenate([left[inner], right[inner]])
     if count == 0 or (left[outer] != -1).any() or (right[outer] != -1).any():
-        raise ValueError(f"tree {number} has a node with one child, or no node")
+        raise ValueError(f"tree {number} has no node, or a node with only one child")
     if len(children) != count - 1 or (children <= 0).any() or (children >= count).any():
         raise ValueError(
-            f"tree {number} has nodes that are no other's child, or children that are none of its nodes"
+            f"tree {number} has nodes without a parent beside its root, or children that do not exist"
         )
     if (np.bincount(children, minlength=count)[1:] != 1).any():
-        raise ValueError(f"tree {number} has a node of two parents: a walk might not end")
+        raise ValueError(f"tree {number} has a node with two parents, so that a walk might not end")
     wanted = np.full(count, NOBODY)
     wanted[left[inner]] = wanted[right[inner]] = inner
     if (parent != wanted).any():
-        raise ValueError(f"tree {number} has a parent that does not name its child")
+        raise ValueError(f"tree {number} has a node whose stored parent is not its parent")
     if (feature < 0).any() or (feature >= features).any():
-        raise ValueError(f"tree {number} asks for a feature beyond {features}")
+        raise ValueError(f"tree {number} reads a feature that is not among the {features} features")
     if tree["split_type"].any() or (tree["default_left"] > 1).any():
-        raise ValueError(f"tree {number} has splits that are not of numbers")
+        raise ValueError(
+            f"tree {number} has splits by categories or with an invalid default, expected splits by numbers"
+        )
     condition = tree["split_conditions"]
     if np.isnan(condition).any() or not np.isfinite(condition[outer]).all():
         raise ValueError(f"tree {number} has a leaf that is not finite, or a threshold that is NaN")
 
 
-def _base_score(text: Any, numbers: int) -> None:
-    """Require one finite number, or since xgboost 3.1 one for each sum: "[5E-1,1E0]"."""
+def _require_base_score(text: Any, numbers: int) -> None:
+    """Require one finite number or, as xgboost 3.1 and later write it, one for each sum: "[5E-1,1E0]"."""
     if not isinstance(text, str) or not re.fullmatch(r"\[?[-+.,\dE]{1,100000}\]?", text):
-        raise ValueError("base_score is no list of numbers")
-    found = [float(part) for part in text.strip("[]").split(",")]
-    if len(found) not in (1, numbers) or not all(map(math.isfinite, found)):
-        raise ValueError(f"base_score is not 1 or {numbers} finite numbers")
+        raise ValueError("base_score is not a list of numbers")
+    scores = [float(part) for part in text.strip("[]").split(",")]
+    if len(scores) not in (1, numbers) or not all(map(math.isfinite, scores)):
+        raise ValueError(f"base_score does not consist of 1 or {numbers} finite numbers")
 
 
-def _keys(value: Any, name: str, wanted: Set[str], optional: Set[str] = frozenset()) -> dict[str, Any]:
+def _require_keys(
+    value: Any, name: str, wanted: Set[str], optional: Set[str] = frozenset()
+) -> dict[str, Any]:
     if not isinstance(value, dict) or not wanted <= value.keys() <= wanted | optional:
-        keys = ", ".join(sorted(wanted)) or "nothing else than it has of old"
-        raise ValueError(f"{name} does not hold what it should: {keys}")
+        keys = ", ".join(sorted(wanted)) or "no further keys"
+        raise ValueError(f"{name} has other keys than expected: {keys}")
     return dict(value)
 
 
-def _equal(value: Any, wanted: Any, name: str) -> None:
-    if type(value) is not type(wanted) or value != wanted or (isinstance(value, list) and not _whole(value)):
+def _require_equal(value: Any, wanted: Any, name: str) -> None:
+    if (
+        type(value) is not type(wanted)
+        or value != wanted
+        or (isinstance(value, list) and not _are_integers(value))
+    ):
         raise ValueError(f"{name} is not {str(wanted)[:100] or 'empty'}")
 
 
-def _whole(values: Any) -> bool:
+def _are_integers(values: Any) -> bool:
     return isinstance(values, Sequence) and all(type(value) is int for value in values)

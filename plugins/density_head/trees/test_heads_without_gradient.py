@@ -39,9 +39,9 @@ def test_log_prob_and_entropy_are_sums_of_scipys(shape):
 def test_the_framework_treats_them_as_any_independent_normals():
     mean, scale = torch.randn(4, 3, 2), torch.rand(4, 3, 2) + 0.5
     density = IndependentNormals(mean, scale)
-    one = marginal(density, 1)
-    assert one.event_shape == (1,)
-    assert torch.equal(normals(one).mean, mean[..., 1:].double())
+    second = marginal(density, 1)
+    assert second.event_shape == (1,)
+    assert torch.equal(normals(second).mean, mean[..., 1:].double())
     assert pick(density, torch.tensor([0, 1, 2, 1])).batch_shape == (4,)
     value = torch.randn(4, 3, 2)
     wanted = ((value - mean) / scale).double().square().sum(-1)
@@ -52,17 +52,17 @@ def test_the_framework_treats_them_as_any_independent_normals():
 
 def test_single_precision_cuts_off_what_exceeds_it():
     largest = torch.finfo(torch.float32).max
-    found = single(torch.tensor([1e300, -1e300, 0.1], dtype=torch.float64))
-    assert found.tolist() == [largest, -largest, float(np.float32(0.1))]
+    rounded = single(torch.tensor([1e300, -1e300, 0.1], dtype=torch.float64))
+    assert rounded.tolist() == [largest, -largest, float(np.float32(0.1))]
     assert single(torch.ones(3, 2).T).is_contiguous()
 
 
 @pytest.mark.parametrize("shape", [(4,), (4, 3), (4, 7, 3)])
 def test_a_gradient_is_0_where_it_is_asked_for(shape):
     raw, numbers = torch.randn(4, 5, requires_grad=True), torch.randn(shape)
-    found = with_gradient_of_0(numbers, raw)
-    assert torch.equal(found, numbers) and with_gradient_of_0(numbers, raw.detach()) is numbers
-    found.sum().backward()
+    result = with_gradient_of_0(numbers, raw)
+    assert torch.equal(result, numbers) and with_gradient_of_0(numbers, raw.detach()) is numbers
+    result.sum().backward()
     assert torch.equal(raw.grad, torch.zeros(4, 5))
 
 
@@ -72,15 +72,15 @@ class Sized(torch.nn.Module):
     def __init__(self, count):
         super().__init__()
         self.register_buffer("numbers", torch.arange(count, dtype=torch.int32))
-        self.seen = []
-        load_any_shape(self, lambda head, _: None, lambda head, _: head.seen.append(head.numbers.tolist()))
+        self.loaded = []
+        load_any_shape(self, lambda head, _: None, lambda head, _: head.loaded.append(head.numbers.tolist()))
 
 
 def test_a_state_of_another_shape_is_taken_and_then_read():
     holder = torch.nn.Sequential(Sized(0), Sized(2))
     holder.load_state_dict(torch.nn.Sequential(Sized(5), Sized(1)).state_dict())
-    assert holder[0].seen == [[0, 1, 2, 3, 4]] and holder[0].numbers.dtype == torch.int32
-    assert holder[1].seen == [[0]]
+    assert holder[0].loaded == [[0, 1, 2, 3, 4]] and holder[0].numbers.dtype == torch.int32
+    assert holder[1].loaded == [[0]]
     twin = copy.deepcopy(holder)
     twin.load_state_dict(torch.nn.Sequential(Sized(3), Sized(2)).state_dict())
     assert twin[0].numbers.tolist() == [0, 1, 2] and holder[0].numbers.tolist() == [0, 1, 2, 3, 4]
@@ -103,30 +103,30 @@ STORED = {
 """Names and dtypes of the stored arrays of each head: old checkpoints must always load."""
 
 
-def head(name, target):
+def build_head(name, target):
     few = {"extra_trees": {"trees": 6}, "xgboost": {"rounds": 8}}[name]
     return build("density_head", resolve("density_head", {"name": name, **few}), target=target)
 
 
-def fitted(name, target):
+def fit_head(name, target):
     """Return a head and its training data: features that are informative about the target."""
     features = torch.randn(300, 5, generator=torch.Generator().manual_seed(0))
     wanted = features[:, :2] @ torch.tensor([[1.0, 0.5], [-1.0, 2.0]])
     if target.kind == "class":
         wanted = (features[:, 0] > 0).long() + 2 * (features[:, 1] > 0).long()
-    made = head(name, target)
-    made.fit(features, wanted, 5)
-    return made, features, wanted
+    head = build_head(name, target)
+    head.fit(features, wanted, 5)
+    return head, features, wanted
 
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("target", [FOUR, TWO], ids=["classes", "reals"])
 def test_its_state_is_plain_tensors_that_another_head_takes(name, target):
-    made, features, wanted = fitted(name, target)
-    made.calibrate(features, wanted)
-    assert {key: tensor.dtype for key, tensor in made.state_dict().items()} == STORED[name]
-    other = Model([], head(name, target), (5,))
-    model = Model([], made, (5,))
+    head, features, wanted = fit_head(name, target)
+    head.calibrate(features, wanted)
+    assert {key: tensor.dtype for key, tensor in head.state_dict().items()} == STORED[name]
+    other = Model([], build_head(name, target), (5,))
+    model = Model([], head, (5,))
     other.load_state_dict(model.state_dict())
     assert other.head.size == 5
     inputs = torch.randn(40, 5)
@@ -139,28 +139,28 @@ def test_a_forest_written_by_hand_is_read():
     numbers |= {"start": [0, 1, 3], "label": [3, 0, 1], "count": [9, 1, 1], "threshold": [0.5, 0.0, 0.0]}
     state = {key: torch.tensor(value, dtype=STORED["extra_trees"][key]) for key, value in numbers.items()}
     state |= {"mean": torch.zeros(0, 0).double(), "width": torch.zeros(0).double(), "read": torch.tensor(2)}
-    made = head("extra_trees", FOUR)
-    made.load_state_dict(state)
-    found = made(torch.tensor([[0.5, 7.0], [0.6, -7.0]], dtype=torch.float64)).probs
+    head = build_head("extra_trees", FOUR)
+    head.load_state_dict(state)
+    probabilities = head(torch.tensor([[0.5, 7.0], [0.6, -7.0]], dtype=torch.float64)).probs
     # Laplace's rule on one vote: (f + 1) / (1 + 4)
-    torch.testing.assert_close(found, torch.tensor([[1, 1, 1, 2], [1.5, 1.5, 1, 1]]).double() / 5)
+    torch.testing.assert_close(probabilities, torch.tensor([[1, 1, 1, 2], [1.5, 1.5, 1, 1]]).double() / 5)
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_features_beyond_float32_and_of_any_batch_shape(name):
-    made, features, _ = fitted(name, FOUR)
-    asked = features[:6].double()
-    asked[0], asked[1] = 1e300, -1e300
-    found = made(asked.reshape(2, 3, 5)).logits
-    assert found.shape == (2, 3, 4) and found.isfinite().all()
+    head, features, _ = fit_head(name, FOUR)
+    queries = features[:6].double()
+    queries[0], queries[1] = 1e300, -1e300
+    logits = head(queries.reshape(2, 3, 5)).logits
+    assert logits.shape == (2, 3, 4) and logits.isfinite().all()
     largest = torch.finfo(torch.float32).max
-    assert torch.equal(found.reshape(6, 4), made(asked.clamp(-largest, largest)).logits)
-    assert made(asked[:0]).logits.shape == (0, 4)
+    assert torch.equal(logits.reshape(6, 4), head(queries.clamp(-largest, largest)).logits)
+    assert head(queries[:0]).logits.shape == (0, 4)
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_it_is_refused_before_the_fit_and_for_angles(name):
-    with pytest.raises(UserError, match=f"{name} was not fitted"):
-        head(name, FOUR)(torch.zeros(1, 0))
+    with pytest.raises(UserError, match=f"{name} is not fitted yet"):
+        build_head(name, FOUR)(torch.zeros(1, 0))
     with pytest.raises(ConfigError, match="kind 'class' or 'real'"):
-        head(name, Target("angle", ("azimuth",)))
+        build_head(name, Target("angle", ("azimuth",)))

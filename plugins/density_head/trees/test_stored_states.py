@@ -14,21 +14,21 @@ TARGETS = {"classes": Target("class", ("a", "b", "c", "d")), "reals": Target("re
 ASKED = torch.randn(40, 5, generator=torch.Generator().manual_seed(3))
 
 
-def fitted(name, kind, **more):
+def fit_head(name, kind, **more):
     """Return a head fitted to features that are informative about the target."""
     few = {"extra_trees": {"trees": 6}, "xgboost": {"rounds": 8, "depth": 3}}[name]
-    made = build("density_head", resolve("density_head", {"name": name, **few, **more}), target=TARGETS[kind])
+    head = build("density_head", resolve("density_head", {"name": name, **few, **more}), target=TARGETS[kind])
     features = torch.randn(300, 5, generator=torch.Generator().manual_seed(0))
     wanted = features[:, :2] @ torch.tensor([[1.0, 0.5], [-1.0, 2.0]])
     if kind == "classes":
         wanted = (features[:, 0] > 0).long() + 2 * (features[:, 1] > 0).long()
-    made.fit(features, wanted, 5)
-    return made
+    head.fit(features, wanted, 5)
+    return head
 
 
-def answer(made):
-    density = made(ASKED)
-    return density.logits if made.classes else density.mode
+def predict(head):
+    density = head(ASKED)
+    return density.logits if head.classes else density.mode
 
 
 def put(place, value):
@@ -69,23 +69,23 @@ OF_FOREST = {
 @pytest.mark.parametrize("kind", TARGETS)
 @pytest.mark.parametrize("name", ["extra_trees", "xgboost"])
 def test_each_damaged_array_is_refused_and_changes_nothing(name, kind):
-    made = fitted(name, kind)
-    whole, before = {key: array.clone() for key, array in made.state_dict().items()}, answer(made)
+    head = fit_head(name, kind)
+    whole, before = {key: array.clone() for key, array in head.state_dict().items()}, predict(head)
     tried = set()
     for key, array in whole.items():
         if array.dim() and not array.numel():
             continue  # belongs to the other kind of target
         damages = {**OF_ANY, **dict(enumerate(OF_FOREST[key] if name == "extra_trees" else []))}
-        for said, damage in damages.items():
+        for description, damage in damages.items():
             with pytest.raises(CheckpointError, match=r"is damaged: .*\. Load another"):
-                made.load_state_dict({**whole, key: damage(array.clone())})
-                raise AssertionError(f"{key}: {said} is taken")
+                head.load_state_dict({**whole, key: damage(array.clone())})
+                raise AssertionError(f"{key}: {description} is taken")
             tried.add(key)
     assert tried >= {key for key, array in whole.items() if array.numel()}
-    assert torch.equal(answer(made), before)
+    assert torch.equal(predict(head), before)
     other = build("density_head", resolve("density_head", {"name": name}), target=TARGETS[kind])
-    other.load_state_dict(made.double().state_dict())  # the state of a cast model
-    assert torch.equal(answer(other), before)
+    other.load_state_dict(head.double().state_dict())  # the state of a cast model
+    assert torch.equal(predict(other), before)
 
 
 def number(content, after, place, value, kind=">i"):
@@ -136,26 +136,26 @@ def damaged_models(content):
 @pytest.mark.parametrize("kind", TARGETS)
 def test_bytes_that_are_no_model_of_this_head_are_refused(kind):
     """Check the message for each; an empty model aborts the process in xgboost, and a cycle of nodes never ends."""
-    made = fitted("xgboost", kind)
-    state, before = made.state_dict(), answer(made)
+    head = fit_head("xgboost", kind)
+    state, before = head.state_dict(), predict(head)
     content, count = state["model"].numpy().tobytes(), 0
     for damaged in damaged_models(content):
         assert damaged != content
         model = torch.tensor(list(damaged), dtype=torch.uint8)
         with pytest.raises(CheckpointError, match=r"XGBoostHead is damaged: .*\. Load another"):
-            made.load_state_dict({**state, "model": model})
+            head.load_state_dict({**state, "model": model})
             pytest.fail(repr(damaged[:100]))
         count += 1
     assert count > 80
-    assert torch.equal(answer(made), before)
-    assert torch.equal(answer(fitted("xgboost", kind)), before)
+    assert torch.equal(predict(head), before)
+    assert torch.equal(predict(fit_head("xgboost", kind)), before)
 
 
 def test_a_model_of_another_target_is_refused():
     for name in ("extra_trees", "xgboost"):
         for kind, other in (("classes", "reals"), ("reals", "classes")):
             with pytest.raises(CheckpointError, match="is damaged"):
-                fitted(name, kind).load_state_dict(fitted(name, other).state_dict())
+                fit_head(name, kind).load_state_dict(fit_head(name, other).state_dict())
 
 
 @pytest.mark.parametrize("splits", ["hist", "exact"])
@@ -167,7 +167,7 @@ def test_every_model_that_is_trained_is_taken(splits, kind):
         {"weight": 1000.0},
         {"samples": 0.3, "features": 0.3, "depth": 12, "weight": 0.0},
     ):
-        made = fitted("xgboost", kind, splits=splits, **more)
+        head = fit_head("xgboost", kind, splits=splits, **more)
         other = build("density_head", resolve("density_head", {"name": "xgboost"}), target=TARGETS[kind])
-        other.load_state_dict(made.state_dict())
-        assert torch.equal(answer(other), answer(made))
+        other.load_state_dict(head.state_dict())
+        assert torch.equal(predict(other), predict(head))

@@ -1,6 +1,6 @@
-"""A strict and bounded parser of UBJSON as xgboost writes it.
+"""A strict parser, with bounded memory, of the UBJSON that xgboost writes.
 
-It is own code: xgboost offers no check of a model, and its loader aborts the process on an empty one (xgboost 3.2).
+A library cannot replace it: xgboost cannot check a model, and its loader aborts the process for an empty one (3.2).
 """
 
 import struct
@@ -25,42 +25,45 @@ WORDS = {"T": True, "F": False, "Z": None}
 
 
 def parse(content: bytes) -> Any:
-    """Return the object, array or number that all bytes together encode; typed arrays become NumPy arrays.
+    """Return the object, array or number that the bytes encode; typed arrays become NumPy arrays.
 
     Raises:
-        ValueError: the bytes are cut short, continue after the end, repeat a key, or hold what xgboost does not write.
+        ValueError: the bytes end too early, continue after the end, repeat a key, or hold something that xgboost does
+            not write.
     """
     reader = _Reader(content)
-    found = reader.value(0)
+    content_value = reader.value(0)
     if reader.place != len(content):
-        raise ValueError(f"{len(content) - reader.place} bytes follow the end")
-    return found
+        raise ValueError(f"{len(content) - reader.place} bytes follow the end of the content")
+    return content_value
 
 
 class _Reader:
     def __init__(self, content: bytes) -> None:
         self.content, self.place = content, 0
 
-    def taken(self, size: int) -> bytes:
+    def take(self, size: int) -> bytes:
         if not 0 <= size <= len(self.content) - self.place:
-            raise ValueError(f"byte {self.place} announces {size} more, and it ends before")
+            raise ValueError(
+                f"{size} more bytes are announced at byte {self.place}, but the content ends earlier"
+            )
         self.place += size
         return self.content[self.place - size : self.place]
 
     def marker(self) -> str:
-        return self.taken(1).decode("latin1")
+        return self.take(1).decode("latin1")
 
     def length(self) -> int:
         if self.marker() != "L":
-            raise ValueError(f"byte {self.place - 1} is no length")
-        return LENGTH.unpack(self.taken(8))[0]
+            raise ValueError(f"byte {self.place - 1} does not begin a length")
+        return LENGTH.unpack(self.take(8))[0]
 
     def text(self) -> str:
-        return self.taken(self.length()).decode("ascii")
+        return self.take(self.length()).decode("ascii")
 
     def value(self, depth: int) -> Any:
         if depth > DEEPEST:
-            raise ValueError(f"values are more than {DEEPEST} deep in others")
+            raise ValueError(f"values are nested more than {DEEPEST} levels deep")
         kind = self.marker()
         if kind == "{":
             return self._object(depth)
@@ -69,33 +72,35 @@ class _Reader:
         if kind == "S":
             return self.text()
         if kind in NUMBERS:
-            return NUMBERS[kind].unpack(self.taken(NUMBERS[kind].size))[0]
+            return NUMBERS[kind].unpack(self.take(NUMBERS[kind].size))[0]
         if kind in WORDS:
             return WORDS[kind]
-        raise ValueError(f"byte {self.place - 1} begins no value")
+        raise ValueError(f"byte {self.place - 1} does not begin a value")
 
     def _object(self, depth: int) -> dict[str, Any]:
-        found: dict[str, Any] = {}
+        entries: dict[str, Any] = {}
         while self.content[self.place : self.place + 1] != b"}":
             key = self.text()
-            if key in found:
-                raise ValueError(f"byte {self.place} says a key twice")
-            found[key] = self.value(depth + 1)
+            if key in entries:
+                raise ValueError(f"a key is repeated before byte {self.place}")
+            entries[key] = self.value(depth + 1)
         self.place += 1
-        return found
+        return entries
 
     def _array(self, depth: int) -> Any:
         marker, kind = self.marker(), ""
         if marker == "$":
             kind, marker = self.marker(), self.marker()
             if kind not in ARRAYS:
-                raise ValueError(f"byte {self.place - 2} is no type of an array")
+                raise ValueError(f"byte {self.place - 2} is not a known type of an array")
         if marker != "#":
-            raise ValueError(f"byte {self.place - 1} begins no array whose length is said")
+            raise ValueError(f"byte {self.place - 1} does not begin the length of an array")
         count = self.length()
         if kind:
             dtype = np.dtype(ARRAYS[kind])
-            return np.frombuffer(self.taken(count * dtype.itemsize), dtype)
+            return np.frombuffer(self.take(count * dtype.itemsize), dtype)
         if not 0 <= count <= len(self.content) - self.place:  # each value takes at least one byte
-            raise ValueError(f"byte {self.place} announces {count} values, and it ends before")
+            raise ValueError(
+                f"{count} values are announced at byte {self.place}, but the content ends earlier"
+            )
         return [self.value(depth + 1) for _ in range(count)]

@@ -69,7 +69,7 @@ class Floored(Distribution):
         return self.floored(value, self.density.log_prob(value))[0]
 
     def floored(self, value: Tensor, log_prob: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the log-density, if that of p is `log_prob`, and log (1 - γ) p, the part of it from p."""
+        """Return the log-density and the part of it that comes from p, log (1 - γ) p, for log p = `log_prob`; nats."""
         above = log_prob + math.log1p(-self.weight)
         below = self.floor.log_prob(value).double() + math.log(self.weight)
         return torch.logaddexp(above, below.to(above.dtype)), above
@@ -77,10 +77,10 @@ class Floored(Distribution):
     @torch.no_grad()
     def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
         """Return samples, (*sample, *batch, *event)."""
-        drawn = self.density.sample(torch.Size(sample_shape))
-        below = self.floor.sample(torch.Size(sample_shape)).to(drawn.dtype)
-        chance = torch.rand(drawn.shape[: drawn.dim() - len(self.event_shape)], device=drawn.device)
-        return torch.where((chance < self.weight)[(..., *(None,) * len(self.event_shape))], below, drawn)
+        samples = self.density.sample(torch.Size(sample_shape))
+        below = self.floor.sample(torch.Size(sample_shape)).to(samples.dtype)
+        chance = torch.rand(samples.shape[: samples.dim() - len(self.event_shape)], device=samples.device)
+        return torch.where((chance < self.weight)[(..., *(None,) * len(self.event_shape))], below, samples)
 
     def entropy(self) -> Tensor:
         """Return the entropy, nats.
@@ -107,10 +107,12 @@ def _(density: Floored) -> Distribution:
 
 @estimate.register
 def _(density: Floored, value: Tensor) -> Estimate:
-    found = estimate(density.density, value)
-    log_sum, above = density.floored(value, found.log_mean)
+    component = estimate(density.density, value)
+    log_sum, above = density.floored(value, component.log_mean)
     # the floor is exact
-    return estimate_of_sum(found.map_fields(lambda field: field.unsqueeze(-1)), above.unsqueeze(-1), log_sum)
+    return estimate_of_sum(
+        component.map_fields(lambda field: field.unsqueeze(-1)), above.unsqueeze(-1), log_sum
+    )
 
 
 @arc_probability.register
@@ -124,13 +126,13 @@ def _(density: Floored, start: Tensor, end: Tensor) -> Tensor | None:
 @quadratic_bound.register
 def _(density: Floored, value: Tensor) -> QuadraticBound | None:
     if isinstance(density.support, Circular) and density.support.ranges is not None:
-        return None  # the floor itself has a slope there
-    found = quadratic_bound(density.density, value)
-    if found is None:
+        return None  # the floor itself is not constant over rotations
+    component = quadratic_bound(density.density, value)
+    if component is None:
         return None
-    log_prob, above = density.floored(value, found.log_prob)
+    log_prob, above = density.floored(value, component.log_prob)
     share = (above - log_prob).exp().unsqueeze(-1)
-    return QuadraticBound(log_prob, share * found.pull, share * found.stiffness)
+    return QuadraticBound(log_prob, share * component.pull, share * component.stiffness)
 
 
 @mode_candidates.register
@@ -140,7 +142,7 @@ def _(density: Floored) -> Tensor:
 
 @images.register
 def _(density: Floored, channels: Collection[str]) -> dict[str, Tensor]:
-    return images(density.density, channels)  # drawn at the mode, which a floor does not change
+    return images(density.density, channels)  # images show the mode, which a floor does not change
 
 
 @peak_widths.register
@@ -159,7 +161,7 @@ def _(density: Floored, index: tuple[Tensor, ...], place: Tensor) -> Floored:
 def _(density: Floored, samples: int) -> Tensor:
     if isinstance(density.support, Circular) and density.support.ranges is not None:
         return median.dispatch(Distribution)(density, samples)
-    # the expected error under a uniform density is equal for every angle and every label
+    # under a uniform density the expected error is the same for every angle and every label
     return median(density.density, samples)
 
 

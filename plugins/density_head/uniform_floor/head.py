@@ -1,4 +1,4 @@
-"""A declared uniform floor under any bounded density."""
+"""A density head that adds a small uniform density to the density of another head."""
 
 import math
 from collections.abc import Mapping
@@ -21,11 +21,11 @@ COMPONENT = {"name": "von_mises"}
 
 
 class UniformFloorHead(DensityHead):
-    """A declared uniform floor under a component's density: (1 - γ) p + γ u, so that no target is impossible.
+    """A component's density p with a uniform floor u, (1 - γ) p + γ u, so that no target is impossible.
 
-    No loss exceeds log(1/(γu)). The authors' original code adds such a floor to its mixtures without saying so. Here it
-    is a head of its own: it appears in the config, in the run's parameters and in the method's name, and with γ = 0 it
-    equals its component.
+    No loss exceeds log(1/(γu)). The authors' original code silently adds such a floor to its mixtures. Here the floor
+    is a head of its own, so that it appears in the config, in the run's parameters and in the name of the method. With
+    γ = 0 the head equals its component.
 
     Args:
         weight: γ.
@@ -33,13 +33,7 @@ class UniformFloorHead(DensityHead):
     """
 
     knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
-    bibtex = """@inproceedings{prokudin2018deep,
-  author    = {Prokudin, Sergey and Gehler, Peter and Nowozin, Sebastian},
-  title     = {Deep Directional Statistics: Pose Estimation with Uncertainty Quantification},
-  booktitle = {European Conference on Computer Vision (ECCV)},
-  pages     = {534--551},
-  year      = {2018}
-}"""
+    bibtex = "prokudin2018deep"
 
     def __init__(
         self,
@@ -51,8 +45,8 @@ class UniformFloorHead(DensityHead):
         super().__init__()
         if target.kind == "real":
             raise ConfigError(
-                "density_head uniform_floor needs a bounded target; no density is uniform over the reals "
-                f"({target.listed_names}). Choose the component itself, with its own floor."
+                "density_head uniform_floor needs a bounded target, since no density is uniform over the reals "
+                f"({target.listed_names}). Choose the component alone as density_head, with its own setting `floor`."
             )
         self.weight = weight
         self.component = require_trained(component)
@@ -68,12 +62,12 @@ class UniformFloorHead(DensityHead):
         """Return the component's loss with the floor added, nats."""
         if self.weight == 0:
             return self.component.loss(raw, target)
-        # the loss of a variational component is a bound; the floor is added to it as to a density
+        # the loss of a variational component is a bound on -log p; the floor is added as if it were -log p
         above = math.log1p(-self.weight) - self.component.loss(raw, target)
         below = self._law(raw).log_prob(target).double() + math.log(self.weight)
         return -torch.logaddexp(above, below.to(above.dtype))
 
     def _law(self, raw: Tensor) -> Distribution:
-        """Return the uniform density over the component's support; the state of the random generator is kept."""
+        """Return the uniform density over the component's support, without a change of the random generator's state."""
         with torch.no_grad(), torch.random.fork_rng([raw.device] if raw.is_cuda else []):
             return uniform(self.component(raw))

@@ -1,4 +1,4 @@
-"""Rows of the contract: floors under densities of angles and of classes."""
+"""Contract-test cases: uniform floors with densities over angles and over classes."""
 
 import math
 from collections.abc import Iterator
@@ -14,7 +14,7 @@ THREE = Target("angle", ("azimuth", "elevation", "tilt"))
 CLASSES = Target("class", ("a", "b", "c"))
 
 
-def outlier(head: DensityHead) -> Iterator[Case]:
+def outlier_cases(head: DensityHead) -> Iterator[Case]:
     """Yield a case half a turn from a density of κ = 1e6, where only the floor remains: log γ - log 2π."""
     raw = torch.tensor([[1e6, 0.0, 0.0]], dtype=torch.float64)
     value = torch.tensor([[3.0]], dtype=torch.float64)
@@ -22,17 +22,17 @@ def outlier(head: DensityHead) -> Iterator[Case]:
     yield Case("κ = 1e6, 3 rad off", raw, value, log_prob)
 
 
-FLOOR = {"tempered: power": "the component is raised to it, and the floor stays"}
+FLOOR = {"tempered: power": "only the component is raised to the power; the floor stays"}
 ROWS = {
     "uniform_floor": (
-        HeadRow("one angle", ONE, {"weight": 0.125}, cases=outlier, leave_out=FLOOR),
+        HeadRow("one angle", ONE, {"weight": 0.125}, cases=outlier_cases, leave_out=FLOOR),
         HeadRow("three angles", THREE, {"weight": 0.01}, leave_out=FLOOR),
         HeadRow(
             "rotations",
             THREE,
             {"weight": 0.5, "component": {"name": "matrix_fisher"}},
             leave_out={
-                "mode": "matrix_fisher's mode is the likeliest rotation, not the highest point in the angles",
+                "mode": "matrix_fisher's mode is the likeliest rotation, not the likeliest angles",
                 **FLOOR,
             },
         ),

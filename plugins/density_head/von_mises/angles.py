@@ -13,10 +13,10 @@ _PI = tuple(
 
 
 def half_angle(value: Tensor, mean: Tensor) -> tuple[Tensor, Tensor]:
-    """Return sin and cos of (φ-μ)/2 up to one common sign, with the difference computed without rounding."""
+    """Return sin and cos of (φ-μ)/2, computed without rounding of φ-μ; both may have the wrong sign together."""
     if in_single(value, mean):
         return _half_angle_in_single(value, mean)
-    sine, cosine, odd = _reduced(value, mean)
+    sine, cosine, odd = _reduce(value, mean)
     return torch.where(odd > 0, cosine, sine), torch.where(odd > 0, -sine, cosine)
 
 
@@ -25,7 +25,7 @@ def half_products(value: Tensor, mean: Tensor) -> tuple[Tensor, Tensor]:
     if in_single(value, mean):
         sine, cosine = _half_angle_in_single(value, mean)
         return sine * sine, sine * cosine
-    sine, cosine, odd = _reduced(value, mean)
+    sine, cosine, odd = _reduce(value, mean)
     # Arithmetic replaces `where`: a compiler that splits value and gradient would store a mask, at several times the
     # cost of everything else.
     square = sine * sine
@@ -33,24 +33,24 @@ def half_products(value: Tensor, mean: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def in_single(value: Tensor, mean: Tensor) -> bool:
-    """Return whether both arguments are float32 and nothing is compiled, so that float32 alone is used."""
+    """Return whether float32 is enough: both arguments are float32, and no compiler is active."""
     return value.dtype == mean.dtype == torch.float32 and not torch.compiler.is_compiling()
 
 
 def _half_angle_in_single(value: Tensor, mean: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the result of `half_angle`, computed in float32 alone."""
+    """Return the result of `half_angle` for float32 arguments, computed in float32 only."""
     sine, cosine, small_sine, small_cosine = parts_in_single(value, mean)
     return sine * small_cosine + cosine * small_sine, cosine * small_cosine - sine * small_sine
 
 
 def parts_in_single(value: Tensor, mean: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return sin and cos of half the rounded difference, and of half its rounding error.
+    """Return sin and cos of half the rounded difference φ-μ, then sin and cos of half its rounding error.
 
-    This takes fewer operations than `_reduced`. float32's sine and cosine are exact for large angles.
+    This takes fewer operations than `_reduce`, because float32's sine and cosine are also exact for large angles.
     """
     high = value - mean
     with torch.no_grad():
-        low = _lost(value, mean, high) / 2
+        low = _rounding_error(value, mean, high) / 2
         square = low * low  # below 2^-10 for angles up to 1e6 rad
         small_sine, small_cosine = low - low * square / 6, 1 - square / 2
         far = square > 2**-10
@@ -61,21 +61,21 @@ def parts_in_single(value: Tensor, mean: Tensor) -> tuple[Tensor, Tensor, Tensor
     return torch.sin(half), torch.cos(half), small_sine, small_cosine
 
 
-def _lost(value: Tensor, mean: Tensor, high: Tensor) -> Tensor:
-    """Return the rounding error of φ-μ: `high` plus it is the exact difference (Knuth's two-sum)."""
+def _rounding_error(value: Tensor, mean: Tensor, high: Tensor) -> Tensor:
+    """Return the rounding error of high = φ-μ, so that high + error is the exact difference (Knuth's two-sum)."""
     back = value - high
     return (value - (high + back)) + (back - mean)
 
 
-def _reduced(value: Tensor, mean: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return sin and cos of half the remainder of φ-μ from the nearest multiple of π, and its parity, 0 or 1."""
+def _reduce(value: Tensor, mean: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return sin(ρ/2), cos(ρ/2) and the parity of n, 0 or 1, where φ-μ = nπ + ρ with the smallest |ρ|."""
     if value.dtype == torch.float32 and mean.dtype == torch.float32:
         high = value.double() - mean.double()
         low = None
     else:
         high = value - mean
         with torch.no_grad():
-            low = _lost(value, mean, high)
+            low = _rounding_error(value, mean, high)
     with torch.no_grad():
         count = torch.round(high * (1 / math.pi))
         odd = 2 * torch.frac(count * 0.5).abs().to(value.dtype)
@@ -88,7 +88,8 @@ def _reduced(value: Tensor, mean: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 def _sine_and_cosine(angle: Tensor) -> tuple[Tensor, Tensor]:
     """Return sin and cos of an angle in [-π/4, π/4].
 
-    Other angles only come from numbers so large that neighbouring ones are a turn apart; their result has no meaning.
+    Other angles occur only for numbers so large that neighbouring floats differ by a whole turn; the result then has no
+    meaning.
     """
     if not torch.compiler.is_compiling():
         return torch.sin(angle), torch.cos(angle)

@@ -17,19 +17,19 @@ _TABLES = {
 
 
 def log_height(concentration: Tensor) -> Tensor:
-    """Return the log-density at the mean, κ - log(2π I0(κ)), nats, without gradient of its own."""
+    """Return the log-density at the mean, κ - log(2π I0(κ)), nats; see `functions.log_peak` for its gradient."""
     return torch.log(concentration + 2) / 2 - polynomial("log_peak", 2 / (concentration + 2))
 
 
 def height_and_deviation(concentration: Tensor) -> tuple[Tensor, Tensor]:
     """Return log_peak and its derivative 1 - A = v (1/4 + v G'(v)/2), G the polynomial, in one pass."""
     v = 2 / (concentration + 2)
-    rows, piece, y, by_v = _place("log_peak", v)
+    rows, piece, y, by_v = _locate("log_peak", v)
     total = _coefficient(rows[-1], piece, y)
     slope = torch.zeros_like(total)
     for row in range(len(rows) - 2, -1, -1):
         slope = torch.addcmul(total, slope, y)
-        total = _fused(_coefficient(rows[row], piece, y), total, y)
+        total = _multiply_add(_coefficient(rows[row], piece, y), total, y)
     return torch.log(concentration + 2) / 2 - total, v * (0.25 + v * (slope * (by_v / 2)))
 
 
@@ -39,25 +39,25 @@ def deviation_of(concentration: Tensor) -> Tensor:
 
 
 def polynomial(name: str, v: Tensor) -> Tensor:
-    """Return one of the smooth functions of v = 2/(κ+2) in fit_coefficients.py."""
-    rows, piece, y, _ = _place(name, v)
+    """Return the smooth function `name` of v = 2/(κ+2), as defined by `smooth` in fit_coefficients.py."""
+    rows, piece, y, _ = _locate(name, v)
     total = _coefficient(rows[-1], piece, y)
     for row in range(len(rows) - 2, -1, -1):
-        total = _fused(_coefficient(rows[row], piece, y), total, y)
+        total = _multiply_add(_coefficient(rows[row], piece, y), total, y)
     return total
 
 
-def _place(name: str, v: Tensor) -> tuple[Any, Any, Tensor, Any]:
-    """Return a function's rows of coefficients, v's piece of [0, 1], its position y ∈ [-1, 1] there, and dy/dv.
+def _locate(name: str, v: Tensor) -> tuple[Any, Any, Tensor, Any]:
+    """Return the rows of coefficients, the piece of [0, 1] that holds v, the position y ∈ [-1, 1] in it, and dy/dv.
 
-    Compiled float32 has few pieces, and comparisons choose among their coefficients; otherwise a table is read.
+    Compiled code in float32 has few pieces and selects their coefficients by comparisons; otherwise a table is read.
     """
     if v.dtype == torch.float32 and torch.compiler.is_compiling():
         rows = CHAINS[name]
         beyond = tuple(v >= border for border in BORDERS[1:-1])
         spans = list(pairwise(BORDERS))
-        middle = _chosen([(low + high) / 2 for low, high in spans], beyond, v)
-        slope = _chosen([2 / (high - low) for low, high in spans], beyond, v)
+        middle = _select_piece([(low + high) / 2 for low, high in spans], beyond, v)
+        slope = _select_piece([2 / (high - low) for low, high in spans], beyond, v)
         return rows, beyond, (v - middle) * slope, slope
     rows = _TABLES[v.dtype, name].to(v.device)
     pieces = rows.shape[1]
@@ -67,25 +67,25 @@ def _place(name: str, v: Tensor) -> tuple[Any, Any, Tensor, Any]:
     return rows, piece, 2 * (place - piece) - 1, 2 * pieces
 
 
-def _chosen(values: Sequence[float], beyond: tuple[Tensor, ...], like: Tensor) -> Tensor:
-    """Return the value of the last border that is passed."""
-    found = torch.full_like(like, values[0])
+def _select_piece(values: Sequence[float], beyond: tuple[Tensor, ...], like: Tensor) -> Tensor:
+    """Return for each element the value of its piece: `beyond` says for each inner border whether it is passed."""
+    selected = torch.full_like(like, values[0])
     for passed, value in zip(beyond, values[1:], strict=True):
-        found = torch.where(passed, value, found)
-    return found
+        selected = torch.where(passed, value, selected)
+    return selected
 
 
 def _coefficient(row: Any, piece: Any, like: Tensor) -> Tensor:
     if isinstance(piece, tuple):
-        return _chosen(row, piece, like)
+        return _select_piece(row, piece, like)
     if torch.compiler.is_compiling():
         return row[piece]
     # the same result in a quarter of the time without a compiler
     return row.index_select(0, piece.reshape(-1)).view(piece.shape)
 
 
-def _fused(coefficient: Tensor, total: Tensor, y: Tensor) -> Tensor:
-    """Return coefficient + total y, in the coefficient's own memory if nothing else reads it."""
+def _multiply_add(coefficient: Tensor, total: Tensor, y: Tensor) -> Tensor:
+    """Return coefficient + total y; the result replaces the coefficient in memory if no gradient needs it."""
     if torch.compiler.is_compiling() or (torch.is_grad_enabled() and total.requires_grad | y.requires_grad):
         return torch.addcmul(coefficient, total, y)
     return coefficient.addcmul_(total, y)

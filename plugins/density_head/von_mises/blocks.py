@@ -6,11 +6,14 @@ import torch
 from torch import Tensor
 
 BLOCK = 2**16
-"""Number of elements of a pass on a processor without a compiler: its intermediate results stay in the cache."""
+"""Number of elements of a block; the intermediate results of a block stay in the processor's cache."""
 
 
 def in_blocks(function: Callable[..., tuple[Tensor, ...]], *arguments: Tensor) -> tuple[Tensor, ...]:
-    """Return the elementwise function, in blocks for arguments of one shape; otherwise, and compiled, at once."""
+    """Return the result of an elementwise function, computed block by block on the CPU.
+
+    Compiled code, other devices, few elements, and arguments of different shapes are computed without blocks.
+    """
     first = arguments[0]
     if (
         torch.compiler.is_compiling()
@@ -22,9 +25,9 @@ def in_blocks(function: Callable[..., tuple[Tensor, ...]], *arguments: Tensor) -
     flat = [argument.detach().reshape(-1).split(BLOCK) for argument in arguments]
     results: list[Tensor] = []
     for start, parts in zip(range(0, first.numel(), BLOCK), zip(*flat, strict=True), strict=True):
-        made = function(*parts)
+        block = function(*parts)
         if not results:
-            results = [torch.empty(first.numel(), dtype=part.dtype, device=part.device) for part in made]
-        for result, part in zip(results, made, strict=True):
+            results = [torch.empty(first.numel(), dtype=part.dtype, device=part.device) for part in block]
+        for result, part in zip(results, block, strict=True):
             result[start : start + BLOCK] = part
     return tuple(result.view(first.shape) for result in results)

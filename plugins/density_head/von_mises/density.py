@@ -51,8 +51,9 @@ class VonMises(Distribution):
         negative = concentration.detach() < 0
         if bool(negative.any()):
             raise ValueError(
-                f"{int(negative.sum())} of {negative.numel()} concentrations are negative, the first "
-                f"{concentration.detach()[negative][0].item():g}; wanted κ ≥ 0. Turn the mean by π instead."
+                f"{int(negative.sum())} of {negative.numel()} concentrations are negative, the first of them is "
+                f"{concentration.detach()[negative][0].item():g}; expected κ ≥ 0. Add π to the mean instead of using a "
+                "negative κ."
             )
         self.location = mean
         self.concentration = concentration.clamp(max=LARGEST[concentration.dtype])
@@ -92,8 +93,8 @@ estimate.register(VonMises, exact_estimate)
 
 @marginal.register
 def _(density: VonMises, index: int) -> VonMises:
-    here = slice(index, index + 1)
-    return VonMises(density.location[..., here], density.concentration[..., here])
+    part = slice(index, index + 1)
+    return VonMises(density.location[..., part], density.concentration[..., part])
 
 
 @pick.register

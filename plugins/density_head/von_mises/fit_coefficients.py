@@ -20,9 +20,9 @@ NAMES = ("log_peak", "ratio", "ratio_slope")
 PIECES = {"float32": 32, "float64": 64}
 BORDERS = ("0", "0.125", "0.3125", "0.625", "1")
 CHAIN_TOLERANCE = mpmath.mpf("4e-8")
-"""Tolerance of the few pieces of compiled float32.
+"""Tolerance on the few pieces between BORDERS, which compiled code in float32 uses.
 
-Pieces are shorter near 0, since the singularities of log I0 accumulate there.
+The pieces are shorter near v = 0, since the singularities of log I0 accumulate there.
 """
 TOLERANCE = {"float32": mpmath.mpf("1e-8"), "float64": mpmath.mpf("2e-17")}
 NODES = 24
@@ -32,10 +32,10 @@ QUADRATURES = (14, 40)
 def bessel(kappa: Real) -> tuple[Real, Real]:
     """Return log(I0(κ) exp(-κ)) and 1 - I1(κ)/I0(κ), by asymptotic series (DLMF 10.40.1) where it has 60 digits."""
     if kappa < 400:
-        zero, one = mpmath.besseli(0, kappa), mpmath.besseli(1, kappa)
-        return mpmath.log(zero) - kappa, 1 - one / zero
-    zero, one = (_hankel_series(order, kappa) for order in (0, 1))
-    return mpmath.log(zero) - mpmath.log(2 * mpmath.pi * kappa) / 2, (zero - one) / zero
+        zero, first = mpmath.besseli(0, kappa), mpmath.besseli(1, kappa)
+        return mpmath.log(zero) - kappa, 1 - first / zero
+    zero, first = (_hankel_series(order, kappa) for order in (0, 1))
+    return mpmath.log(zero) - mpmath.log(2 * mpmath.pi * kappa) / 2, (zero - first) / zero
 
 
 def _hankel_series(order: int, kappa: Real) -> Real:
@@ -71,7 +71,7 @@ def smooth(v: Real) -> tuple[Real, ...]:
 
 
 def chebyshev_series(low: Real, high: Real, which: int) -> list[Real]:
-    """Return the series of one function on [low, high] of v, by interpolation at NODES Chebyshev nodes."""
+    """Return Chebyshev coefficients of function number `which` on [low, high] of v, from NODES interpolation nodes."""
     angles = [mpmath.pi * (2 * i + 1) / (2 * NODES) for i in range(NODES)]
     values = [smooth((low + high) / 2 + (high - low) / 2 * mpmath.cos(angle))[which] for angle in angles]
     return [
@@ -83,9 +83,10 @@ def chebyshev_series(low: Real, high: Real, which: int) -> list[Real]:
 
 
 def degree(series: list[Real], pieces: Real, tolerance: Real) -> int:
-    """Return the least degree with a remainder within the tolerance and its derivative in v within four times as much.
+    """Return the smallest degree at which the remainder and its derivative in v are small enough.
 
-    1 - A takes at most half of the derivative, and is at least a quarter where it takes any.
+    The remainder must be below the tolerance, and its derivative below four times the tolerance: 1 - A contains at most
+    half of the derivative, and is at least a quarter wherever it contains the derivative at all.
     """
     return next(
         d
@@ -96,8 +97,8 @@ def degree(series: list[Real], pieces: Real, tolerance: Real) -> int:
 
 
 def powers(series: list[Real]) -> list[Real]:
-    """Return the coefficients of 1, y, y², … of a Chebyshev series in y."""
-    found = [mpmath.mpf(0)] * len(series)
+    """Return the coefficients of 1, y, y², … of the polynomial that a Chebyshev series in y describes."""
+    coefficients = [mpmath.mpf(0)] * len(series)
     before, current = [mpmath.mpf(1)], [mpmath.mpf(0), mpmath.mpf(1)]
     for j, weight in enumerate(series):
         if j >= 2:
@@ -106,53 +107,54 @@ def powers(series: list[Real]) -> list[Real]:
                 following[i] -= c
             before, current = current, following
         for i, c in enumerate(before if j == 0 else current):
-            found[i] += weight * c
-    return found
+            coefficients[i] += weight * c
+    return coefficients
 
 
 def table(dtype: str, which: int) -> list[tuple[float, ...]]:
-    """Return rows of coefficients of y^j on each piece, v ascending; all pieces have the largest degree needed."""
+    """Return coefficients, (power, piece), v ascending; all pieces have the largest degree that any piece needs."""
     count = PIECES[dtype]
     edges = [mpmath.mpf(i) / count for i in range(count + 1)]
     series = [chebyshev_series(low, high, which) for low, high in pairwise(edges)]
-    highest = max(degree(one, count, TOLERANCE[dtype]) for one in series)
-    columns = [powers(one[: highest + 1]) for one in series]
+    highest = max(degree(piece, count, TOLERANCE[dtype]) for piece in series)
+    columns = [powers(piece[: highest + 1]) for piece in series]
     return [tuple(float(column[j]) for column in columns) for j in range(highest + 1)]
 
 
 def chain(which: int) -> list[tuple[float, ...]]:
-    """Return rows of coefficients of y^j on each piece between BORDERS, for float32, of the largest degree needed."""
+    """Return coefficients, (power, piece), between BORDERS; all pieces have the largest degree that any piece needs."""
     spans = list(pairwise(mpmath.mpf(border) for border in BORDERS))
     series = [chebyshev_series(low, high, which) for low, high in spans]
     highest = max(
-        degree(one, 1 / (high - low), CHAIN_TOLERANCE) for one, (low, high) in zip(series, spans, strict=True)
+        degree(piece, 1 / (high - low), CHAIN_TOLERANCE)
+        for piece, (low, high) in zip(series, spans, strict=True)
     )
-    columns = [powers(one[: highest + 1]) for one in series]
+    columns = [powers(piece[: highest + 1]) for piece in series]
     return [tuple(float(column[j]) for column in columns) for j in range(highest + 1)]
 
 
 def gauss_legendre(count: int) -> list[tuple[float, float]]:
-    """Return (position, weight) on [0, 1], by Newton's method in 60 digits.
+    """Return the pairs (position, weight) of Gauss-Legendre quadrature on [0, 1], by Newton's method in 60 digits.
 
-    In float64 the outer weights would lose two digits.
+    In float64 arithmetic the outer weights would lose two digits.
     """
-    found = []
+    nodes = []
     for i in range(count):
         x = mpmath.cos(mpmath.pi * (i + mpmath.mpf("0.75")) / (count + mpmath.mpf("0.5")))
         slope = mpmath.mpf(1)
         for _ in range(8):
-            before, here = mpmath.mpf(1), x  # Legendre polynomials (DLMF 18.9.1)
+            before, current = mpmath.mpf(1), x  # Legendre polynomials (DLMF 18.9.1)
             for n in range(1, count):
-                before, here = here, ((2 * n + 1) * x * here - n * before) / (n + 1)
-            slope = count * (x * here - before) / (x * x - 1)
-            x -= here / slope
-        found.append((float((1 - x) / 2), float(1 / ((1 - x * x) * slope**2))))
-    return found
+                before, current = current, ((2 * n + 1) * x * current - n * before) / (n + 1)
+            slope = count * (x * current - before) / (x * x - 1)
+            x -= current / slope
+        nodes.append((float((1 - x) / 2), float(1 / ((1 - x * x) * slope**2))))
+    return nodes
 
 
 def main() -> None:
     """Write coefficients.npz; its keys are explained in coefficients.py."""
-    arrays = {"borders": np.array([float(border) for border in BORDERS])}
+    arrays: dict[str, Any] = {"borders": np.array([float(border) for border in BORDERS])}
     for which, name in enumerate(NAMES):
         for dtype in PIECES:
             arrays[f"table/{dtype}/{name}"] = np.array(table(dtype, which))

@@ -21,14 +21,18 @@ from plugins.density_head.von_mises.bessel import deviation_of, height_and_devia
 from plugins.density_head.von_mises.blocks import BLOCK, in_blocks
 
 SAMPLING_ROUNDS = 64
-"""Largest number of proposals: at least 65.7 % are accepted, so that fewer than one lane in 10^29 is left after 64."""
+"""Largest number of proposals per sample.
+
+At least 65.7 % of proposals are accepted, so that fewer than one sample in 10^29 has no accepted proposal after 64.
+"""
 
 
 def log_prob(value: Tensor, mean: Tensor, concentration: Tensor) -> Tensor:
     """Return the log-density, nats, with accurate first and second derivatives in all three arguments.
 
-    The difference φ-μ is never rounded: float32 angles of any size are read modulo 2π exactly (compiled: up to 4e8
-    radians), float64 ones up to 4e8 radians, and beyond that to one unit of their rounding.
+    The difference φ-μ is not rounded. float32 angles of any size are read modulo 2π exactly (compiled: up to 4e8
+    radians). float64 angles are read exactly up to 4e8 radians; larger ones have an error of one unit of their last
+    digit.
     """
     dtype = torch.promote_types(torch.promote_types(value.dtype, mean.dtype), concentration.dtype)
     value, mean, concentration = value.to(dtype), mean.to(dtype), concentration.to(dtype)
@@ -40,8 +44,9 @@ def log_prob(value: Tensor, mean: Tensor, concentration: Tensor) -> Tensor:
 def log_prob_and_slopes(value: Tensor, mean: Tensor, concentration: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return log p, its derivative in the mean, κ sin(φ-μ), and in κ, 1 - A(κ) - 2 sin²((φ-μ)/2), in one pass.
 
-    Arguments have one dtype, and the result has no gradient: it is what `log_prob` computes under gradient. Compiled,
-    it is one loop, while a compiler splits the gradient of `log_prob` into two that repeat much of the computation.
+    The arguments have one dtype, and the results have no gradient. `log_prob` computes the same under gradient, but a
+    compiler turns `log_prob` and its gradient into two loops that repeat much of the computation, and this function
+    into one.
     """
     return _value_and_slopes(value, mean, concentration)
 
@@ -78,8 +83,8 @@ def concentration_of_moments(resultant: Tensor, deviation: Tensor) -> Tensor:
 
     Args:
         resultant: R, the mean of cos(φ-μ); below 0 the result is κ = 0.
-        deviation: V = 1 - R, the mean of 2 sin²((φ-μ)/2). It is given too, because R has no digits of a large κ and V
-            has none of a small one. For 0 the result is infinity.
+        deviation: V = 1 - R, the mean of 2 sin²((φ-μ)/2); for 0 the result is infinity. Both are needed: for a large κ
+            rounding of R loses all digits, and for a small κ rounding of V does.
     """
     resultant, deviation = resultant.double().clamp(min=0), deviation.double()
     spread_out = resultant < 0.5
@@ -104,8 +109,8 @@ def sample(mean: Tensor, concentration: Tensor) -> Tensor:
     """Return one angle in [-π, π] per element, by rejection (Best & Fisher 1979), computed in float64.
 
     Best and Fisher propose from a wrapped Cauchy density of the same peak. With t = tan(θ/2) its proposal is t =
-    (1-ρ)/(1+ρ) tan(πu/2), u uniform on (-1, 1), and 1 - cos θ = 2t²/(1+t²): nothing cancels at any κ. Lanes that have
-    not accepted after SAMPLING_ROUNDS keep their last proposal, so that no input makes the loop endless.
+    (1-ρ)/(1+ρ) tan(πu/2), u uniform on (-1, 1), and 1 - cos θ = 2t²/(1+t²): nothing cancels at any κ. Elements without
+    an accepted proposal after SAMPLING_ROUNDS keep their last proposal, so that the loop always ends.
     """
     mean, concentration = torch.broadcast_tensors(mean, concentration)
     kappa = concentration.double().flatten()
@@ -118,7 +123,7 @@ def sample(mean: Tensor, concentration: Tensor) -> Tensor:
 
 
 def _half_tangent(kappa: Tensor) -> Tensor:
-    """Return tan(θ/2) of one accepted proposal per lane."""
+    """Return tan(θ/2) of one accepted proposal per element."""
     root = torch.hypot(torch.ones_like(kappa), 2 * kappa)
     tau = 1 + root
     span = tau + torch.sqrt(2 * tau)  # 2κ/ρ
@@ -136,7 +141,7 @@ def _half_tangent(kappa: Tensor) -> Tensor:
 
 
 def _propose(kappa: Tensor, scale: Tensor, floor: Tensor) -> tuple[Tensor, Tensor]:
-    """Return tan(θ/2) of one wrapped Cauchy proposal per lane, and whether it is rejected."""
+    """Return tan(θ/2) of one wrapped Cauchy proposal per element, and whether the proposal is rejected."""
     uniform, accept = torch.rand(2, kappa.numel(), dtype=kappa.dtype, device=kappa.device)
     tangent = scale * torch.tan(math.pi * (uniform - 0.5))
     square = tangent * tangent
@@ -174,7 +179,7 @@ def fall(value: Tensor, mean: Tensor, concentration: Tensor) -> Tensor:
 
 
 class _LogProb(Function):
-    """The log-density: `forward` computes value and derivatives in one pass, and `backward` multiplies."""
+    """The log-density; `forward` computes value and derivatives in one pass, and `backward` only multiplies."""
 
     @staticmethod
     def forward(
@@ -189,7 +194,7 @@ class _LogProb(Function):
     def backward(ctx: Any, grad: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
         value, mean, concentration, by_mean, by_concentration = ctx.saved_tensors
         if torch.is_grad_enabled() and not torch.compiler.is_compiling():
-            # a second derivative is wanted: the same derivatives by differentiable operations
+            # For second derivatives, the first ones are computed by differentiable operations.
             sine, cosine = half_angle(value, mean)
             by_mean = 2 * concentration * sine * cosine
             by_concentration = mean_deviation(concentration) - 2 * sine * sine

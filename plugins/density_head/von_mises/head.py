@@ -17,12 +17,12 @@ from plugins.density_head.von_mises.angles import half_angle
 from plugins.density_head.von_mises.density import VonMises
 
 LARGEST_CONCENTRATION = 1e12
-"""Largest κ: a standard deviation of a microradian, the resolution of float32 angles."""
+"""Largest κ, for a standard deviation of a microradian, which is the resolution of float32 angles."""
 LEAST_SCALE = 0.25
-"""Smallest scale of the pair, so that κ falls to 0 with the pair alone.
+"""Smallest value of the scale g(r), so that κ can reach 0 only if the pair (cos, sin) does.
 
-If the scale could fall to 0 too, so would the pair's gradient, and an angle that was given up early would not be
-learned again.
+If the scale could reach 0 too, the pair's gradient would vanish, and an angle that the network at first treats as
+unpredictable could not be learned later.
 """
 
 
@@ -30,10 +30,10 @@ class VonMisesHead(DensityHead):
     """One von Mises density per angle: biternion mean, predicted or one global concentration (thesis §3.4).
 
     With `concentration="predicted"` the head reads (cos, sin, r) per angle and trains by likelihood (eq. 3.7), with κ =
-    |(cos, sin)| g(r). Up to the scale g(r), which stays above a quarter, the pair is the density's natural parameter,
-    so that the uniform density is an ordinary point. If the pair were normalised, as in eq. 3.1, and κ = g(r), the
-    gradients in both would vanish with κ, and a network that first finds an angle unpredictable would stay there
-    (README).
+    |(cos, sin)| g(r). The scale g(r) stays above a quarter. Up to this scale, the pair is the density's natural
+    parameter, so that the uniform density needs no special case. If the pair were normalised, as in eq. 3.1, and κ =
+    g(r), the gradients in both would vanish with κ, and a network that cannot predict an angle at first would never
+    learn it (README).
 
     With "fixed" it reads (cos, sin) and trains with κ = 1, which is the cosine loss of Biternion networks up to
     constants (eq. 3.8-3.9); `calibrate` sets one κ per angle by maximum likelihood on the validation split (eq. 3.5).
@@ -44,13 +44,7 @@ class VonMisesHead(DensityHead):
     """
 
     knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
-    bibtex = """@inproceedings{prokudin2018deep,
-  author    = {Prokudin, Sergey and Gehler, Peter and Nowozin, Sebastian},
-  title     = {Deep Directional Statistics: Pose Estimation with Uncertainty Quantification},
-  booktitle = {European Conference on Computer Vision (ECCV)},
-  pages     = {534--551},
-  year      = {2018}
-}"""
+    bibtex = "prokudin2018deep"
 
     concentration: Tensor
 
@@ -93,11 +87,13 @@ class VonMisesHead(DensityHead):
         if self.predicted:
             return
         if len(raw) == 0:
-            raise ValueError("a fixed concentration is calibrated on validation data, but got none of it.")
+            raise ValueError(
+                "a fixed concentration is fitted to the validation split, but got no sample of this split."
+            )
         sine, _ = half_angle(target.double(), self(raw).mean.double())
         deviation = 2 * sine.square()
-        found = functions.concentration_of_moments((1 - deviation).mean(0), deviation.mean(0))
-        self.concentration.copy_(found.clamp(self.floor, LARGEST_CONCENTRATION))
+        concentration = functions.concentration_of_moments((1 - deviation).mean(0), deviation.mean(0))
+        self.concentration.copy_(concentration.clamp(self.floor, LARGEST_CONCENTRATION))
 
     def _per_angle(self, raw: Tensor) -> Tensor:
         return require_finite(raw, self.size).unflatten(-1, (self.angles, -1))
@@ -108,7 +104,7 @@ def polar(
 ) -> tuple[Float[Tensor, "*shape"], Float[Tensor, "*shape"]]:
     """Return angle, radians, and length of a pair (eq. 3.1), with finite gradients at any pair, also at zero."""
     shortest = 1e-18
-    # moved away from zero, where the angle has no gradient; that of length × cos(φ - angle) stays correct there
+    # A pair at zero is moved a little, because its angle has no gradient; length × cos(φ - angle) keeps its gradient.
     cosine = torch.where((cosine.abs() < shortest) & (sine.abs() < shortest), cosine + 2 * shortest, cosine)
     # both are divided by the larger one, so that no square over- or underflows
     size = torch.maximum(cosine.detach().abs(), sine.detach().abs())
@@ -117,11 +113,11 @@ def polar(
 
 
 def scale_of_raw(raw: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-    """Return g(r), from c = LEAST_SCALE to LARGEST_CONCENTRATION, 1 and smooth at 0.
+    """Return the scale g(r), which rises from LEAST_SCALE to LARGEST_CONCENTRATION, and is 1 and smooth at r = 0.
 
-    g(r) = c + (1 - c) exp(r / (1 - c)) for r ≤ 0, and (1 + r/4)⁴ above. The Fisher information of log κ is nearly
-    constant (1/2 for large κ), so that a logarithmic map trains best. The power keeps that shape over the κ that occur,
-    but prevents κ and an outlier's gradient from exploding.
+    With c = LEAST_SCALE, g(r) = c + (1 - c) exp(r / (1 - c)) for r ≤ 0, and (1 + r/4)⁴ for r > 0. The Fisher
+    information of log κ is nearly constant (1/2 for large κ), so that a logarithmic map trains best. The fourth power
+    is similar to the exponential over the values of κ that occur, but κ and the gradient of an outlier do not explode.
     """
     most = 4 * (LARGEST_CONCENTRATION**0.25 - 1)
     high = (1 + raw.clamp(0, most) / 4).square().square()

@@ -18,13 +18,10 @@ from plugins.density_head.von_mises.coefficients import NODES
 from plugins.density_head.von_mises.functions import fall, mean_resultant, mean_resultant_slope
 
 ROUNDS = 64
-"""Largest number of rounds of the inversion in `half_width`: bisection alone narrows [0, π] to its last digit in 53."""
+"""Largest number of rounds of the inversion in `half_width`; bisection alone needs 53 to reach the last digit."""
 
 CUT = 40.0
-"""Negative logarithm of the fall of the density at which integrals end.
-
-The factor exp(-40) is a quarter of float64's last digit, even in the tail.
-"""
+"""Integrals end where the density has fallen by the factor exp(-CUT), a quarter of float64's last digit."""
 
 
 def kl_divergence(
@@ -32,16 +29,16 @@ def kl_divergence(
 ) -> Tensor:
     """Return the Kullback-Leibler divergence of the second density from the first, ∫ p₁ log(p₁/p₂), nats.
 
-    A(κ₁) κ₂ (1 - cos(μ₁-μ₂)) + ∫_{κ₁}^{κ₂} (κ₂-x) A'(x) dx, both without a negative part: log I0 has the derivative A,
-    so that the integral is log I0(κ₂) - log I0(κ₁) - A(κ₁)(κ₂-κ₁). It is 0 for equal densities and keeps its digits for
-    nearly equal ones. It is differentiable like `log_prob`.
+    It is A(κ₁) κ₂ (1 - cos(μ₁-μ₂)) + ∫_{κ₁}^{κ₂} (κ₂-x) A'(x) dx. Neither term is negative. log I0 has the derivative
+    A, so that the integral is log I0(κ₂) - log I0(κ₁) - A(κ₁)(κ₂-κ₁). The divergence is exactly 0 for equal densities
+    and accurate for nearly equal ones. It is differentiable like `log_prob`.
     """
     turned = -fall(first_mean, second_mean, mean_resultant(first_concentration) * second_concentration)
     return turned + _Bregman.apply(*torch.broadcast_tensors(first_concentration, second_concentration))
 
 
 def cdf(value: Tensor, mean: Tensor, concentration: Tensor) -> Tensor:
-    """Return the probability of the arc from mean - π to value, in [0, 1] on that turn; each further turn adds 1.
+    """Return the probability of the arc from mean - π to value, in [0, 1] within one turn; each further turn adds 1.
 
     The convention is SciPy's. Quadrature in float64 has an absolute error below 1e-15; the relative error of the lower
     tail is below 4e-15 times the greater of 1 and its logarithm. The result is differentiable, once, in all three
@@ -54,17 +51,18 @@ def cdf(value: Tensor, mean: Tensor, concentration: Tensor) -> Tensor:
 
 @torch.no_grad()
 def half_width(mass: Tensor, concentration: Tensor) -> Tensor:
-    """Return half the width, radians in [0, π], of the shortest arc that holds the mass: its centre is the mean.
+    """Return half the width, radians in [0, π], of the shortest arc with the probability `mass`, centred on the mean.
 
-    Newton's method works on the mass within or, above one half, on the logarithm of the mass outside. Bisection narrows
-    a bracket if a step leaves it; there are at most ROUNDS rounds. The result has no gradient.
+    Newton's method solves for the probability inside the arc or, above one half, for the logarithm of the probability
+    outside. If a step leaves the bracket, bisection is used. There are at most ROUNDS rounds. The result has no
+    gradient.
 
     Raises:
         ValueError: a mass outside [0, 1].
     """
     if not bool(((mass >= 0) & (mass <= 1)).all()):
         raise ValueError(
-            f"the mass of an arc lies between 0 and 1, got {mass.min().item()} to {mass.max().item()}."
+            f"the mass of an arc must lie between 0 and 1, got values from {mass.min().item()} to {mass.max().item()}."
         )
     dtype = torch.promote_types(mass.dtype, concentration.dtype)
     mass, kappa = torch.broadcast_tensors(mass.double(), concentration.double())
@@ -74,18 +72,20 @@ def half_width(mass: Tensor, concentration: Tensor) -> Tensor:
     # starting value: the normal density of z = 2√κ sin(θ/2), or the uniform one if that is wider than the circle
     normal = torch.special.ndtri((1 + mass) / 2).clamp(max=38) / (2 * kappa.sqrt())
     width = torch.minimum(2 * torch.asin(normal.clamp(max=1)), math.pi * (1 + 3 * kappa) * mass).nan_to_num()
-    done = (mass == 0) | (mass == 1)
-    width = torch.where(done, math.pi * mass, width.clamp(max=3.1))
+    finished = (mass == 0) | (mass == 1)
+    width = torch.where(finished, math.pi * mass, width.clamp(max=3.1))
     for _ in range(ROUNDS):
-        if bool(done.all()):
+        if bool(finished.all()):
             break
         sine, cosine = torch.sin(width / 2), torch.cos(width / 2)
-        found, _ = _one_side(sine, cosine, kappa, inside)
+        mass_of_side, _ = _one_side(sine, cosine, kappa, inside)
         slope = torch.exp(log_height(kappa) - 2 * (kappa * sine) * sine)
-        too_wide = (found > target) == inside
+        too_wide = (mass_of_side > target) == inside
         low, high = torch.where(too_wide, low, width), torch.where(too_wide, width, high)
-        straight = (target - found) / torch.where(inside, slope, -slope)
-        following = width + torch.where(inside, straight, found * torch.log(found / target) / slope)
+        straight = (target - mass_of_side) / torch.where(inside, slope, -slope)
+        following = width + torch.where(
+            inside, straight, mass_of_side * torch.log(mass_of_side / target) / slope
+        )
         # near π the mass outside falls linearly, not exponentially
         following = torch.where((following > low) & (following < high), following, width + straight)
         following = torch.where((following > low) & (following < high), following, (low + high) / 2)
@@ -93,13 +93,13 @@ def half_width(mass: Tensor, concentration: Tensor) -> Tensor:
         near = 1e-10 * torch.minimum(width, math.pi - width) + 4e-16 * width
         settled = (straight.abs() <= near) | (high - low <= 4e-16 * high)
         following = torch.where(settled, (width + straight).clamp(0, math.pi), following)
-        width = torch.where(done, width, following)
-        done = done | settled
+        width = torch.where(finished, width, following)
+        finished = finished | settled
     return width.to(dtype)
 
 
 def interval(mass: Tensor, mean: Tensor, concentration: Tensor) -> tuple[Tensor, Tensor]:
-    """Return both ends, radians, of the shortest arc that holds the mass; the first is smaller and not wrapped."""
+    """Return both ends, radians, of the shortest arc with the probability `mass`; the first end is not wrapped."""
     width = half_width(mass, concentration)
     return mean - width, mean + width
 
@@ -107,9 +107,9 @@ def interval(mass: Tensor, mean: Tensor, concentration: Tensor) -> tuple[Tensor,
 def _one_side(sine: Tensor, cosine: Tensor, concentration: Tensor, within: Tensor) -> tuple[Tensor, Tensor]:
     """Return the mass on one side of the mean and its derivative in κ.
 
-    The mass is that between the mean and t if `within`, else that from t to π. t ∈ [0, π] is given by sin(t/2) and
-    cos(t/2). With the density at the arc's start b factored out, the integrand over s is exp(-2κ sin(s/2) sin(b+s/2)):
-    it falls from 1 to exp(-CUT) at most.
+    It is the probability between the mean and t where `within` is true, and from t to π elsewhere. t ∈ [0, π] is given
+    by sin(t/2) and cos(t/2). The density at the start b of the arc is factored out, so that the integrand over s is
+    exp(-2κ sin(s/2) sin(b+s/2)), which falls from 1 to exp(-CUT) at most.
     """
     height, deviation = height_and_deviation(concentration)
     reach = CUT / (2 * concentration)
@@ -137,7 +137,7 @@ def _one_side(sine: Tensor, cosine: Tensor, concentration: Tensor, within: Tenso
 
 
 def _cdf_and_slopes(value: Tensor, mean: Tensor, concentration: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the distribution function and its derivatives in value and in κ."""
+    """Return the distribution function, its derivative in the value (the density), and its derivative in κ."""
     sine, cosine = half_angle(value, mean)
     ahead = sine * cosine >= 0
     sine, cosine = sine.abs(), cosine.abs()
@@ -146,9 +146,9 @@ def _cdf_and_slopes(value: Tensor, mean: Tensor, concentration: Tensor) -> tuple
     within = (concentration * sine * sine < 0.1) & (sine < cosine)
     mass, slope = _one_side(sine, cosine, concentration, within)
     sign = torch.where(ahead, 1.0, -1.0)
-    found = torch.where(within, 0.5 + sign * mass, torch.where(ahead, 1 - mass, mass))
+    fraction = torch.where(within, 0.5 + sign * mass, torch.where(ahead, 1 - mass, mass))
     density = torch.exp(log_height(concentration) - 2 * (concentration * sine) * sine)
-    return turns + found, density, torch.where(within, sign, -sign) * slope
+    return turns + fraction, density, torch.where(within, sign, -sign) * slope
 
 
 class _Cdf(Function):
@@ -156,9 +156,9 @@ class _Cdf(Function):
 
     @staticmethod
     def forward(ctx: Any, value: Tensor, mean: Tensor, concentration: Tensor) -> Tensor:
-        found, density, by_concentration = in_blocks(_cdf_and_slopes, value, mean, concentration)
+        probability, density, by_concentration = in_blocks(_cdf_and_slopes, value, mean, concentration)
         ctx.save_for_backward(density, by_concentration)
-        return found
+        return probability
 
     @staticmethod
     @once_differentiable
@@ -168,7 +168,7 @@ class _Cdf(Function):
 
 
 def _log_quotient(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
-    """Return log((κ₂+2)/(κ₁+2)), and whether it is so small that integrals from κ₁ to κ₂ need quadrature."""
+    """Return log((κ₂+2)/(κ₁+2)), and whether its magnitude is so small that integrals over κ need quadrature."""
     quotient = torch.log((second + 2) / (first + 2))
     near = quotient.abs() <= 1
     exact = torch.log1p(torch.where(near, (second - first) / (first + 2), 0))
@@ -212,8 +212,8 @@ class _RatioRise(Function):
         v = 2 / (first + 2)
         total = torch.zeros_like(step)
         for place, weight in NODES[14]:
-            here = v * torch.exp(-place * step)
-            total += weight * here * polynomial("ratio_slope", here)
+            scaled = v * torch.exp(-place * step)
+            total += weight * scaled * polynomial("ratio_slope", scaled)
         return torch.where(near, step * total, deviation_of(first) - deviation_of(second))
 
     @staticmethod

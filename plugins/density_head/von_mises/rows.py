@@ -1,4 +1,4 @@
-"""Rows of the contract: von Mises heads, with log-densities known to 50 digits."""
+"""Contract-test cases: von Mises heads, with log-densities from a 50-digit reference."""
 
 import math
 from collections.abc import Iterator
@@ -20,16 +20,16 @@ OFFSETS = (0.0, 1e-8, 1e-3, 1.0, 3.0, -math.pi, 2 * math.pi, 1e6)
 
 
 def exact(offset: float, concentration: float) -> Any:
-    """Return κ cos d - log(2π I0(κ)) (eq. 3.3) in 50 digits."""
+    """Return the log-density κ cos d - log(2π I0(κ)) (eq. 3.3), nats, computed with 50 digits."""
     with mpmath.workdps(50):
         kappa = mpmath.mpf(concentration)
         return kappa * mpmath.cos(mpmath.mpf(offset)) - mpmath.log(2 * mpmath.pi * mpmath.besseli(0, kappa))
 
 
-def predicted(head: DensityHead) -> Iterator[Case]:
-    """Yield cases with pairs (κ, 0) and r = 0: mean 0 and concentration κ without rounding.
+def predicted_cases(head: DensityHead) -> Iterator[Case]:
+    """Yield cases with pairs (κ, 0) and r = 0, which give mean 0 and concentration κ without rounding.
 
-    The angles use the offsets in turn.
+    Each angle has the same offsets from the mean, in a cyclic order that starts one offset later for each angle.
     """
     angles = head.size // 3
     for concentration in CONCENTRATIONS:
@@ -43,8 +43,8 @@ def predicted(head: DensityHead) -> Iterator[Case]:
         yield Case(f"κ = {concentration:g}", raw, value, torch.tensor(log_prob, dtype=torch.float64))
 
 
-def fixed(head: DensityHead) -> Iterator[Case]:
-    """Yield cases with the untrained κ = 1, on which the length of the pair has no influence."""
+def fixed_cases(head: DensityHead) -> Iterator[Case]:
+    """Yield cases with the untrained κ = 1, which does not depend on the length of the pair."""
     for length in (1e-10, 1.0, 1e10):
         raw = torch.tensor([[length, 0.0]], dtype=torch.float32).double().repeat(len(OFFSETS), 1)
         value = torch.tensor(OFFSETS, dtype=torch.float32).double()[:, None]
@@ -54,11 +54,11 @@ def fixed(head: DensityHead) -> Iterator[Case]:
 
 ROWS = {
     "von_mises": (
-        HeadRow("one angle", ONE, cases=predicted),
+        HeadRow("one angle", ONE, cases=predicted_cases),
         HeadRow("narrow", ONE, scale=3.0),
         HeadRow("two angles, narrow", TWO, {"floor": 0.5}, scale=3.0),
-        HeadRow("three angles", THREE, cases=predicted),
-        HeadRow("fixed concentration", ONE, {"concentration": "fixed"}, cases=fixed),
+        HeadRow("three angles", THREE, cases=predicted_cases),
+        HeadRow("fixed concentration", ONE, {"concentration": "fixed"}, cases=fixed_cases),
         HeadRow("least concentration 1", THREE, {"floor": 1.0}),
     )
 }

@@ -54,8 +54,8 @@ LIMIT = 8  # units of machine epsilon; the requirement is 16
 def bessel(concentration):
     """Return log(I0(κ) exp(-κ)), A(κ), 1 - A(κ), A'(κ)."""
     kappa = mpmath.mpf(concentration)
-    zero, one = mpmath.besseli(0, kappa), mpmath.besseli(1, kappa)
-    ratio = one / zero
+    zero, first = mpmath.besseli(0, kappa), mpmath.besseli(1, kappa)
+    ratio = first / zero
     slope = 1 - ratio**2 - ratio / kappa if kappa else mpmath.mpf(1) / 2
     return mpmath.log(zero) - kappa, ratio, 1 - ratio, slope
 
@@ -64,15 +64,15 @@ def leaf(number, dtype):
     return torch.tensor(number, dtype=dtype, requires_grad=True)
 
 
-def error(found, reference, scale, dtype):
+def error(computed, reference, scale, dtype):
     """Return the error in machine epsilons of `scale`."""
-    return float(abs(mpmath.mpf(found.item()) - reference) / scale) / torch.finfo(dtype).eps
+    return float(abs(mpmath.mpf(computed.item()) - reference) / scale) / torch.finfo(dtype).eps
 
 
-def check_points(value, mean, concentration, found, slopes):
-    """Compare log_prob and its three gradients with 90 digits."""
+def check_points(value, mean, concentration, log_prob, slopes):
+    """Compare log_prob and its three gradients with a 90-digit reference."""
     dtype = value.dtype
-    columns = (value, mean, concentration, found, *slopes)
+    columns = (value, mean, concentration, log_prob, *slopes)
     for row in zip(*(column.detach().reshape(-1) for column in columns), strict=True):
         at, centre, concentrated, log_p, by_value, by_mean, by_concentration = row
         kappa = mpmath.mpf(concentrated.item())
@@ -91,9 +91,9 @@ def check_points(value, mean, concentration, found, slopes):
 
 
 def check_point(value, mean, concentration):
-    found = functions.log_prob(value, mean, concentration)
-    slopes = torch.autograd.grad(found, (value, mean, concentration))
-    check_points(value, mean, concentration, found, slopes)
+    log_prob = functions.log_prob(value, mean, concentration)
+    slopes = torch.autograd.grad(log_prob, (value, mean, concentration))
+    check_points(value, mean, concentration, log_prob, slopes)
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -123,22 +123,22 @@ def test_functions_of_the_concentration_agree_with_90_digits(concentration, dtyp
     tiny = mpmath.mpf(torch.finfo(dtype).tiny)
     height = -mpmath.log(2 * mpmath.pi) - scaled
     entropy = exact * complement - height
-    for found, reference, scale in (
+    for computed, reference, scale in (
         (functions.log_peak(kappa), height, max(1, abs(height))),
         (functions.entropy(kappa), entropy, max(1, abs(entropy))),
         (functions.mean_resultant(kappa), ratio, ratio + tiny),
         (functions.mean_deviation(kappa), complement, complement),
         (functions.mean_resultant_slope(kappa), slope, slope + tiny),
     ):
-        assert error(found, reference, scale, dtype) < LIMIT
+        assert error(computed, reference, scale, dtype) < LIMIT
     for function, reference in (
         (functions.log_peak, complement),
         (functions.entropy, -exact * slope),
         (functions.mean_resultant, slope),
         (functions.mean_deviation, -slope),
     ):
-        (found,) = torch.autograd.grad(function(kappa), kappa)
-        assert error(found, reference, abs(reference) + tiny, dtype) < LIMIT
+        (computed,) = torch.autograd.grad(function(kappa), kappa)
+        assert error(computed, reference, abs(reference) + tiny, dtype) < LIMIT
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -149,8 +149,8 @@ def test_no_seam_between_two_pieces(dtype):
     edges = torch.tensor([[2 * pieces / i - 2] for i in range(1, pieces)], dtype=torch.float64)
     near = (edges * (1 + eps * torch.arange(-40, 41))).to(dtype)
     for name in fit_coefficients.NAMES:
-        found = polynomial(name, 2 / (near + 2))
-        assert (found.diff().abs() <= 4 * eps * found[:, 1:].abs()).all()
+        values_near_edges = polynomial(name, 2 / (near + 2))
+        assert (values_near_edges.diff().abs() <= 4 * eps * values_near_edges[:, 1:].abs()).all()
     for function, size in (
         (functions.log_peak, functions.log_peak(near).abs().clamp(min=1)),
         (functions.mean_deviation, functions.mean_deviation(near)),
@@ -207,8 +207,8 @@ def test_blocks_change_nothing(dtype):
         torch.testing.assert_close(
             whole[part], few, rtol=16 * torch.finfo(dtype).eps, atol=4 * torch.finfo(dtype).eps
         )
-    one = functions.log_prob(value[:, None], mean[:, None], kappa[:, None].to(dtype))
-    torch.testing.assert_close(whole, one[:, 0])
+    in_one_pass = functions.log_prob(value[:, None], mean[:, None], kappa[:, None].to(dtype))
+    torch.testing.assert_close(whole, in_one_pass[:, 0])
     assert gradients[0].shape == gradients[1].shape == (count,)
 
 
@@ -216,11 +216,11 @@ COMPILED = """
 import sys, torch
 from plugins.density_head.von_mises import functions
 grid, path = torch.load(sys.argv[1]), sys.argv[2]
-found = []
+results = []
 for arguments in grid:
     density = torch.compile(functions.log_prob, fullgraph=True, dynamic=False)(*arguments)
-    found.append((density.detach(), *torch.autograd.grad(density.sum(), arguments)))
-torch.save(found, path)
+    results.append((density.detach(), *torch.autograd.grad(density.sum(), arguments)))
+torch.save(results, path)
 """
 
 
@@ -231,10 +231,10 @@ def test_compiled_log_prob_and_gradients_agree_with_90_digits(tmp_path):
     )
     grid = [[leaf(column, dtype) for column in columns] for dtype in DTYPES]
     torch.save(grid, tmp_path / "grid.pt")
-    command = [sys.executable, "-c", COMPILED, str(tmp_path / "grid.pt"), str(tmp_path / "found.pt")]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=600)
-    assert done.returncode == 0, done.stderr
-    for arguments, (density, *slopes) in zip(grid, torch.load(tmp_path / "found.pt"), strict=True):
+    command = [sys.executable, "-c", COMPILED, str(tmp_path / "grid.pt"), str(tmp_path / "results.pt")]
+    process = subprocess.run(command, capture_output=True, text=True, timeout=600)
+    assert process.returncode == 0, process.stderr
+    for arguments, (density, *slopes) in zip(grid, torch.load(tmp_path / "results.pt"), strict=True):
         check_points(*arguments, density, slopes)
 
 
@@ -253,12 +253,18 @@ def test_divergence_agrees_with_120_digits(dtype):
     turned = integrals.kl_divergence(zero, first, zero + 0.25, second)
     assert (straight >= 0).all()
     for row in zip(first, second, straight, turned, strict=True):
-        one, two = (mpmath.mpf(kappa.item()) for kappa in row[:2])
-        logs, complements = zip(*(many_digits(kappa) for kappa in (one, two)), strict=True)
-        bregman = logs[1] + two - logs[0] - one - (1 - complements[0]) * (two - one)
-        turning = (1 - complements[0]) * two * 2 * mpmath.sin(mpmath.mpf("0.125")) ** 2
-        for found, reference in ((row[2], bregman), (row[3], bregman + turning)):
-            assert error(found, reference, abs(reference) + torch.finfo(dtype).tiny, dtype) < 16, row
+        first_kappa, second_kappa = (mpmath.mpf(kappa.item()) for kappa in row[:2])
+        logs, complements = zip(*(many_digits(kappa) for kappa in (first_kappa, second_kappa)), strict=True)
+        bregman = (
+            logs[1]
+            + second_kappa
+            - logs[0]
+            - first_kappa
+            - (1 - complements[0]) * (second_kappa - first_kappa)
+        )
+        turning = (1 - complements[0]) * second_kappa * 2 * mpmath.sin(mpmath.mpf("0.125")) ** 2
+        for computed, reference in ((row[2], bregman), (row[3], bregman + turning)):
+            assert error(computed, reference, abs(reference) + torch.finfo(dtype).tiny, dtype) < 16, row
     mpmath.mp.dps = 90
 
 
@@ -313,12 +319,12 @@ def test_cdf_agrees_with_quadrature_in_both_tails(kappa):
 @pytest.mark.parametrize("kappa", [1e-3, 1.0, 12.0, 45.0])
 def test_cdf_agrees_with_scipy_and_rises(kappa):
     value = torch.linspace(-7, 7, 2001, dtype=torch.float64)
-    found = integrals.cdf(value, torch.zeros(()), torch.tensor(kappa))
+    probability = integrals.cdf(value, torch.zeros(()), torch.tensor(kappa))
     np.testing.assert_allclose(
-        found, stats.vonmises.cdf(value.numpy(), np.float32(kappa)), rtol=0, atol=1e-12
+        probability, stats.vonmises.cdf(value.numpy(), np.float32(kappa)), rtol=0, atol=1e-12
     )
-    assert (found.diff() >= -1e-15).all()
-    assert found[0] < 0 < 1 < found[-1]
+    assert (probability.diff() >= -1e-15).all()
+    assert probability[0] < 0 < 1 < probability[-1]
 
 
 @pytest.mark.parametrize("kappa", [0.1, 1.0, 20.0])
@@ -350,7 +356,7 @@ def test_arc_holds_its_mass(kappa):
 
 
 def test_an_arc_of_more_than_all_is_refused():
-    with pytest.raises(ValueError, match=r"between 0 and 1, got 0.5 to 1.5"):
+    with pytest.raises(ValueError, match=r"between 0 and 1, got values from 0.5 to 1.5"):
         integrals.half_width(torch.tensor([0.5, 1.5]), torch.ones(2))
 
 
@@ -362,47 +368,49 @@ def test_concentration_of_moments_inverts_the_moments(concentration):
 
 
 def test_concentration_of_moments_at_its_ends():
-    found = functions.concentration_of_moments(torch.tensor([0.0, -0.4, 1.0]), torch.tensor([1.0, 1.4, 0.0]))
-    assert found.tolist() == [0.0, 0.0, math.inf]
+    concentration = functions.concentration_of_moments(
+        torch.tensor([0.0, -0.4, 1.0]), torch.tensor([1.0, 1.4, 0.0])
+    )
+    assert concentration.tolist() == [0.0, 0.0, math.inf]
 
 
 @pytest.mark.parametrize("concentration", [0, 1e-30, 1e-3, 0.5, 1, 3, 30, 1e3, 1e6, 1e12, 1e16, 1e30])
 def test_samples_follow_the_density(concentration):
     torch.manual_seed(3)
     count = 20_000
-    drawn = functions.sample(torch.zeros(count, dtype=torch.float64), torch.full((count,), concentration))
-    assert drawn.abs().max() <= math.pi
+    samples = functions.sample(torch.zeros(count, dtype=torch.float64), torch.full((count,), concentration))
+    assert samples.abs().max() <= math.pi
     if concentration > 1e6:  # there the density is normal to 1/κ
         law = stats.norm(scale=concentration**-0.5).cdf
     else:
         law = stats.vonmises(max(concentration, 1e-9)).cdf
-    assert stats.kstest(drawn.numpy(), law).pvalue > 1e-3
-    assert len(drawn.unique()) > 0.999 * count
+    assert stats.kstest(samples.numpy(), law).pvalue > 1e-3
+    assert len(samples.unique()) > 0.999 * count
 
 
 def test_sampling_ends_whatever_it_is_given():
-    drawn = functions.sample(torch.zeros(4), torch.tensor([math.nan, math.inf, 0.0, 1e38]))
-    assert drawn[0].isnan()
-    assert drawn[2:].isfinite().all()
+    samples = functions.sample(torch.zeros(4), torch.tensor([math.nan, math.inf, 0.0, 1e38]))
+    assert samples[0].isnan()
+    assert samples[2:].isfinite().all()
     assert functions.sample(torch.zeros(0, 2), torch.zeros(0, 2)).shape == (0, 2)
 
 
 def test_sampling_shifts_by_the_mean():
     torch.manual_seed(0)
-    drawn = functions.sample(torch.full((1000,), 1e4 + 1.0, dtype=torch.float64), torch.full((1000,), 1e8))
-    torch.testing.assert_close((drawn - 1e4 - 1.0).cos(), torch.ones(1000).double(), rtol=0, atol=1e-6)
+    samples = functions.sample(torch.full((1000,), 1e4 + 1.0, dtype=torch.float64), torch.full((1000,), 1e8))
+    torch.testing.assert_close((samples - 1e4 - 1.0).cos(), torch.ones(1000).double(), rtol=0, atol=1e-6)
 
 
 ONE, TWO, THREE = (Target("angle", ("azimuth", "elevation", "tilt")[:count]) for count in (1, 2, 3))
 PREDICTED, FIXED = "von_mises", {"name": "von_mises", "concentration": "fixed"}
 
 
-def head(config=PREDICTED, target=ONE):
+def build_head(config=PREDICTED, target=ONE):
     return build("density_head", resolve("density_head", config), target=target)
 
 
 def test_independent_angles_add_up():
-    density = head(target=THREE)(torch.randn(2, 9))
+    density = build_head(target=THREE)(torch.randn(2, 9))
     value = values(THREE, (2,))
     parts = [marginal(density, index).log_prob(value[:, index : index + 1]) for index in range(3)]
     torch.testing.assert_close(density.log_prob(value), sum(parts))
@@ -423,11 +431,11 @@ def test_picked_components_are_those_at_the_index():
 
 
 def test_fixed_loss_is_the_cosine_loss_up_to_a_constant():
-    made, target = head(FIXED), torch.randn(50, 1)
+    head, target = build_head(FIXED), torch.randn(50, 1)
     raw = torch.randn(50, 2)
     unit = raw / raw.norm(dim=-1, keepdim=True)
     cosine_loss = 1 - (unit * torch.cat([target.cos(), target.sin()], -1)).sum(-1)  # eq. 3.2
-    constant = made.loss(raw, target) - cosine_loss
+    constant = head.loss(raw, target) - cosine_loss
     torch.testing.assert_close(constant, constant[0].expand(50))
 
 
@@ -441,26 +449,26 @@ def test_the_scale_of_the_pair_has_a_floor_and_no_kink():
 
 @pytest.mark.parametrize("shrunken", [-3.0, -20.0, -1e4])
 def test_an_angle_given_up_is_found_again(shrunken):
-    made, target = head(), 0.7 + 0.1 * torch.randn(64, 1)
+    head, target = build_head(), 0.7 + 0.1 * torch.randn(64, 1)
     raw = torch.tensor([1e-4, -1e-4, shrunken], requires_grad=True)
     optimizer = torch.optim.Adam([raw], lr=0.05)
     for _ in range(400):
         optimizer.zero_grad()
-        made.loss(raw.expand(64, -1), target).mean().backward()
+        head.loss(raw.expand(64, -1), target).mean().backward()
         optimizer.step()
-    density = made(raw)
+    density = head(raw)
     assert density.mean.item() == pytest.approx(0.7, abs=0.1)
     assert density.concentration.item() > 1
 
 
 def test_calibrated_concentration_maximises_the_likelihood():
-    made = head(FIXED, TWO).eval()
+    head = build_head(FIXED, TWO).eval()
     torch.manual_seed(1)
     raw = torch.randn(400, 4)
-    target = functions.sample(made(raw).mean, torch.tensor([40.0, 0.3]))
-    before = made.loss(raw, target)
-    made.calibrate(raw, target)
-    density = made(raw)
+    target = functions.sample(head(raw).mean, torch.tensor([40.0, 0.3]))
+    before = head.loss(raw, target)
+    head.calibrate(raw, target)
+    density = head(raw)
     for index in (0, 1):
         alone = marginal(density, index)
         offsets = (target[:, index] - alone.mean[:, 0]).double().numpy()
@@ -470,30 +478,30 @@ def test_calibrated_concentration_maximises_the_likelihood():
             method="bounded",
             options={"xatol": 1e-6},
         ).x
-        assert made.concentration[index].item() == pytest.approx(best, rel=1e-4)
-    assert torch.equal(made.loss(raw, target), before)
+        assert head.concentration[index].item() == pytest.approx(best, rel=1e-4)
+    assert torch.equal(head.loss(raw, target), before)
 
 
 def test_calibration_on_perfect_and_on_no_data():
-    made = head(FIXED).eval()
+    head = build_head(FIXED).eval()
     raw = torch.tensor([[1.0, 0.0], [0.0, 1.0]])
-    made.calibrate(raw, made(raw).mean)
-    assert made.concentration.item() == 1e12
-    with pytest.raises(ValueError, match="got none"):
-        made.calibrate(raw[:0], raw[:0, :1])
+    head.calibrate(raw, head(raw).mean)
+    assert head.concentration.item() == 1e12
+    with pytest.raises(ValueError, match="got no sample"):
+        head.calibrate(raw[:0], raw[:0, :1])
 
 
 def test_the_zero_pair_has_the_gradient_of_the_natural_parameter():
     # log p = η·(cos φ, sin φ) - log I0(|η|) with η the pair: at 0 the gradient is (cos φ, sin φ)
-    made, target = head().double(), torch.tensor([[2.0]], dtype=torch.float64)
+    head, target = build_head().double(), torch.tensor([[2.0]], dtype=torch.float64)
     for pair in ([0.0, 0.0], [1e-30, -1e-30], [-1e-12, 1e-13]):
         raw = torch.tensor([[*pair, 0.0]], dtype=torch.float64, requires_grad=True)
-        (gradient,) = torch.autograd.grad(-made.loss(raw, target), raw)
+        (gradient,) = torch.autograd.grad(-head.loss(raw, target), raw)
         np.testing.assert_allclose(gradient[0, :2], [math.cos(2.0), math.sin(2.0)], rtol=1e-9)
 
 
 def test_concentration_reaches_a_million_and_more():
-    density = head()(torch.tensor([[30.0, 40.0, 60.0], [1.0, 0.0, 130.0], [0.0, 1.0, 3e38]]))
+    density = build_head()(torch.tensor([[30.0, 40.0, 60.0], [1.0, 0.0, 130.0], [0.0, 1.0, 3e38]]))
     assert density.concentration[:, 0].tolist() == pytest.approx([50 * 16.0**4, 33.5**4, 1e12])
     assert density.mean[:, 0].tolist() == pytest.approx([math.atan2(4, 3), 0, math.pi / 2])
 
@@ -501,7 +509,7 @@ def test_concentration_reaches_a_million_and_more():
 @pytest.mark.parametrize("kind", ["real", "class"])
 def test_other_targets_are_refused(kind):
     with pytest.raises(ConfigError, match=f"von_mises.*'{kind}'"):
-        head(target=Target(kind, ("a", "b")))
+        build_head(target=Target(kind, ("a", "b")))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -525,17 +533,17 @@ def test_angles_of_any_size_are_read_as_the_docstring_says(dtype, monkeypatch):
         2e-6 if dtype == torch.float32 else (2e-15 + 2.1 * unit.where(value.abs() > 4e8, 0)).clamp(max=4.01)
     )
     assert ((functions.log_prob(value, mean, kappa).double() - wanted).abs() <= limit).all()
-    found = functions.log_prob(value, mean.requires_grad_(), kappa)
-    (by_mean,) = torch.autograd.grad(found.sum(), mean)
-    assert ((found.double() - wanted).abs() <= limit).all() and (
+    log_prob = functions.log_prob(value, mean.requires_grad_(), kappa)
+    (by_mean,) = torch.autograd.grad(log_prob.sum(), mean)
+    assert ((log_prob.double() - wanted).abs() <= limit).all() and (
         (by_mean.double() - slope).abs() <= limit
     ).all()
     # what is compiled, step by step: as exact up to 4e8 radians, beyond them never above or below the density's range
     monkeypatch.setattr(torch.compiler, "is_compiling", lambda: True)
-    found = functions.log_prob(value, mean, kappa).detach().double()
+    log_prob = functions.log_prob(value, mean, kappa).detach().double()
     near = value.abs() < 4e8
-    assert ((found - wanted).abs() <= 2e-6)[near].all()
-    assert (found >= -2.1 + float(height)).all() and (found <= 2.1 + float(height)).all()
+    assert ((log_prob - wanted).abs() <= 2e-6)[near].all()
+    assert (log_prob >= -2.1 + float(height)).all() and (log_prob <= 2.1 + float(height)).all()
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -544,11 +552,11 @@ def test_a_concentration_at_its_ends_is_a_number_or_refused(dtype):
     mean = torch.tensor([[0.5], [3.0]], dtype=dtype)
     for kappa in (1e38, 3e38, math.inf, torch.finfo(dtype).max):
         density = VonMises(mean, torch.full_like(mean, kappa))
-        here, there = density.log_prob(mean), density.log_prob(mean + 1)
+        at_mean, off_mean = density.log_prob(mean), density.log_prob(mean + 1)
         size = min(kappa, LARGEST[dtype])
-        assert here.tolist() == pytest.approx([math.log(size / (2 * math.pi)) / 2] * 2, rel=1e-6)
-        assert (there < -1e37).all() and not there.isnan().any()
-        assert density.entropy().tolist() == pytest.approx([0.5 - here[0].item()] * 2, rel=1e-6)
+        assert at_mean.tolist() == pytest.approx([math.log(size / (2 * math.pi)) / 2] * 2, rel=1e-6)
+        assert (off_mean < -1e37).all() and not off_mean.isnan().any()
+        assert density.entropy().tolist() == pytest.approx([0.5 - at_mean[0].item()] * 2, rel=1e-6)
         assert torch.equal(density.sample(), mean)
         assert arc_probability(density, mean - 0.1, mean + 0.1).tolist() == [1, 1]
         assert arc_probability(density, mean + 0.1, mean - 0.1).tolist() == [0, 0]
@@ -556,5 +564,5 @@ def test_a_concentration_at_its_ends_is_a_number_or_refused(dtype):
         (slope,) = torch.autograd.grad(VonMises(mean, kappa).log_prob(mean).sum(), kappa)
         assert not slope.isnan().any()
     for kappa in (-1e-30, -1.0, -math.inf):
-        with pytest.raises(ValueError, match=r"1 of 2 concentrations are negative.*wanted κ ≥ 0"):
+        with pytest.raises(ValueError, match=r"1 of 2 concentrations are negative.*expected κ ≥ 0"):
             VonMises(mean, torch.tensor([[1.0], [kappa]], dtype=dtype))
