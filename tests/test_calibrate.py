@@ -48,11 +48,11 @@ def test_it_is_the_model_that_was_trained_with_the_wrappers(framework: Framework
     done = framework(*wrapped, *QUIET, folder="calibrated")
     assert numbers(done) == numbers(both)
     assert numbers(done)["method"] == "vanilla_128 + temperature + conformal"
-    for remark in ("temperature: ", "conformal: the threshold is set by 20 validation rows"):
+    for remark in ("temperature: ", "conformal: the threshold is set by 20 validation samples"):
         assert remark in done.out and remark in both.out and remark in str(read_stored(done.folder)[0])
     # what every other mode takes
     again = framework("mode=test", f"checkpoint={done.folder}", *QUIET, folder="again")
-    assert numbers(again) == numbers(done) and "set by 20 validation rows" in again.out
+    assert numbers(again) == numbers(done) and "set by 20 validation samples" in again.out
     predicted = framework("mode=predict", f"checkpoint={done.folder}", *QUIET[:2], folder="predicted")
     assert predicted.code == 0 and "set" in (predicted.folder / "predictions.csv").read_text().splitlines()[0]
     first, second = package.load(done.folder), package.load(both.folder)
@@ -153,17 +153,17 @@ def test_few_rows_are_said_with_what_they_leave_open(rows: int, miscoverage: flo
     assert not wrapper.remark
     wrapper.calibrate([batch])
     said = wrapper.remark
-    assert f"the threshold is set by {rows} validation rows" in said
+    assert f"the threshold is set by {rows} validation samples" in said
     kept = rows - int((rows + 1) * miscoverage * (1 + 1e-12))
     if kept == rows:
-        assert "the sets are everything" in said and wrapper.threshold.isinf()
+        assert "every set holds all values" in said and wrapper.threshold.isinf()
         return
     low, high = stats.beta(kept + 1, rows - kept).ppf([0.05, 0.95])
     assert f"between {100 * low:.3g} and {100 * high:.3g} %" in said
     scores = torch.rand(4000, rows, generator=generator).sort(1).values[:, kept]
     inside = ((scores >= low) & (scores <= high)).double().mean().item()
     assert inside == pytest.approx(0.9, abs=0.02)
-    assert ("These are few" in said) == (max(high - 1 + miscoverage, 1 - miscoverage - low) > 0.03)
+    assert ("keep the deviation within" in said) == (max(high - 1 + miscoverage, 1 - miscoverage - low) > 0.03)
 
 
 def test_a_checkpoint_of_before_has_no_remarks(tmp_path: Path) -> None:

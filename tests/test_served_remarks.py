@@ -67,7 +67,7 @@ def test_a_density_of_classes_prints_names_and_values(kind: str) -> None:
         assert "batch=(1,)" in line and "names=cat, dog" in line and "\n" not in line and len(line) <= LONGEST
         assert "[-1.313, -0.3133]" in line, line
         if kind == "set":
-            assert "promised=0.9" in line and "threshold=[0.7]" in line
+            assert "stated_probability=0.9" in line and "threshold=[0.7]" in line
 
 
 def test_it_is_a_categorical_of_torch_for_everything_else() -> None:

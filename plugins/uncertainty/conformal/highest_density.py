@@ -14,26 +14,26 @@ from framework.distributions.panels import first_in_cell, known_scales
 from framework.distributions.protocol import mode_candidates
 
 FOLD = 12
-"""Nodes for each factor e of the distance from a peak: neighbours are 8 % of that distance apart."""
+"""Number of nodes per factor e of the distance from a peak; neighbouring nodes are 8 % of this distance apart."""
 NEAREST, FARTHEST = 1e-11, 1e11
-"""Smallest and largest distance of nodes from a peak, in the target's unit; for angles the largest is half a turn."""
+"""Smallest and largest distance of nodes from a peak, in the target's unit; the largest is π for angles."""
 TURN = 720
-"""Number of further nodes all around a circle, for broad humps that have no peak of their own."""
+"""Number of further nodes, evenly spaced on the circle, for broad humps that have no peak among the candidates."""
 PEAKS, CANDIDATES = 8, 64
 """Number of peaks that get nodes of their own, and number of candidates among which they are chosen."""
 PARTED = 0.1
-"""Smallest depth, nats, of a valley between two separate humps."""
+"""Smallest depth, nats, of a valley that separates two humps."""
 BISECTIONS = 52
 """Number of halvings of a cell; the ends are then as exact as the dtype."""
 
 
 @dataclass(frozen=True)
 class Ends:
-    """Ends of the parts of one number's range in which the density is above a level.
+    """Parts of one number's range in which the density is above a level, by their ends.
 
     Attributes:
-        length: total length of all parts of an item, (item,), float64.
-        intervals: (low, high) of each item's parts, ascending.
+        length: total length of the parts of each item, (item,), float64.
+        intervals: (low, high) of the parts of each item, in ascending order.
     """
 
     length: Float[Tensor, "item"]
@@ -71,14 +71,14 @@ class Line:
         return self.density.log_prob(places.to(self.dtype).unsqueeze(-1)).double()
 
     def score_of(self, level: Float[Tensor, "item"]) -> Float[Tensor, "item"]:
-        """Return -log of the probability of values that are less dense than a log-density, nats, at least 0.
+        """Return -log of the probability of all values whose log-density is below `level`, nats, at least 0.
 
         The score falls as the level rises.
         """
         return (self._log_whole - self._log_less(level)).clamp(min=0)
 
     def level_of(self, score: Float[Tensor, ""]) -> Float[Tensor, "item"]:
-        """Return the log-density whose `score_of` is `score` to 1e-12, by regula falsi (Illinois)."""
+        """Return the log-density at which `score_of` is `score` to 1e-12, by regula falsi in the Illinois variant."""
         high, reach = self.heights.amax(0), score.clamp(min=0) + 1
         if score < 0:  # no score is negative
             return torch.full_like(high, math.inf)
@@ -91,16 +91,18 @@ class Line:
             over_low = self.score_of(low) - score
         last = torch.zeros_like(high)
         for _ in range(200):
-            apart = over_low - over_high
+            difference = over_low - over_high
             middle = torch.where(
-                apart.isfinite() & (apart > 0), (low * -over_high + high * over_low) / apart, (low + high) / 2
+                difference.isfinite() & (difference > 0),
+                (low * -over_high + high * over_low) / difference,
+                (low + high) / 2,
             )
             middle = middle.clamp(low, high)
             over = self.score_of(middle) - score
             if not ((over.abs() > 1e-12 * (1 + score)) & (high - low > 1e-14 * (1 + high.abs()))).any():
                 return middle
             above = over > 0
-            # the value at an end that stays twice is halved, so that the other end comes nearer
+            # if an end of the bracket stays twice, its value is halved, so that the next step moves this end
             over_high = torch.where(above & (last > 0), over_high / 2, over_high)
             over_low = torch.where(~above & (last < 0), over_low / 2, over_low)
             low, over_low = torch.where(above, middle, low), torch.where(above, over, over_low)
@@ -109,7 +111,7 @@ class Line:
         return high
 
     def ends(self, level: Float[Tensor, "item"]) -> Ends:
-        """Return the ends of the parts with log p ≥ level; NaN lengths and no intervals if log p is NaN."""
+        """Return the parts of each item with log p ≥ level; the length is NaN, without intervals, if log p is NaN."""
         inside = self.heights >= level
         start, stop = self.nodes, self.nodes.roll(-1, 0)
         following = inside.roll(-1, 0)
@@ -121,15 +123,15 @@ class Line:
         change = before != following
         places = self._crossings(change, start, stop, before, level)
         broken = self.heights.isnan().any(0).tolist()
-        found = [
-            [] if wrong else self._joined(*crossing, bool(first), bool(last))
+        intervals = [
+            [] if wrong else self._pair_ends(*crossing, bool(first), bool(last))
             for crossing, first, last, wrong in zip(places, inside[0], inside[-1], broken, strict=True)
         ]
         lengths = [
             math.nan if wrong else sum(high - low for low, high in parts)
-            for parts, wrong in zip(found, broken, strict=True)
+            for parts, wrong in zip(intervals, broken, strict=True)
         ]
-        return Ends(torch.tensor(lengths, dtype=torch.float64, device=self.device), found)
+        return Ends(torch.tensor(lengths, dtype=torch.float64, device=self.device), intervals)
 
     def _crossings(
         self, change: Bool[Tensor, "cell item"], start: Tensor, stop: Tensor, before: Tensor, level: Tensor
@@ -138,7 +140,7 @@ class Line:
         most = int(change.sum(0).amax()) if change.numel() else 0
         # the changed cells of each item first, in order
         order = change.to(torch.int8).sort(dim=0, descending=True, stable=True).indices[:most]
-        low, high, leaves = (each.gather(0, order) for each in (start, stop, before))
+        low, high, leaves = (cells.gather(0, order) for cells in (start, stop, before))
         for _ in range(BISECTIONS if most else 0):  # torch's Independent refuses an empty tensor
             middle = (low + high) / 2
             same = (self.at(middle) >= level) == leaves
@@ -147,10 +149,10 @@ class Line:
         middles, rising = ((low + high) / 2).T.tolist(), (~leaves).T.tolist()
         return [(places[:n], up[:n]) for places, up, n in zip(middles, rising, counts, strict=True)]
 
-    def _joined(
+    def _pair_ends(
         self, places: list[float], rising: list[bool], first: bool, last: bool
     ) -> list[tuple[float, float]]:
-        """Return the crossings as intervals."""
+        """Return the intervals of one item between its crossings; `first`, `last`: whether the end nodes are inside."""
         if not places:
             return [self.range] if first else []
         lows = [place for place, up in zip(places, rising, strict=True) if up]
@@ -160,13 +162,13 @@ class Line:
             highs = [*highs, self.range[1]] if last else highs
             return list(zip(lows, highs, strict=True))
         turn = 2 * math.pi
-        if highs[0] < lows[0]:  # an arc across the cut
+        if highs[0] < lows[0]:  # an arc across ±π
             highs = [*highs[1:], highs[0] + turn]
-        found = [
+        arcs = [
             (low - turn, high - turn) if low >= math.pi else (low, high)
             for low, high in zip(lows, highs, strict=True)
         ]
-        return sorted(found)
+        return sorted(arcs)
 
     def _nodes(self) -> Float[Tensor, "node item"]:
         places = self._peaks()  # (peak, item)
@@ -176,20 +178,23 @@ class Line:
             math.log10(NEAREST), math.log10(farthest), count, dtype=torch.float64, device=self.device
         )
         steps = torch.cat([-steps.flip(0), steps.new_zeros(1), steps])
-        found = (places + steps.reshape(-1, 1, 1)).flatten(0, 1)
+        nodes = (places + steps.reshape(-1, 1, 1)).flatten(0, 1)
         if math.isfinite(self.range[1]):
             low, high = self.range
             turn = grid(TURN, dtype=torch.float64, device=self.device) / (2 * math.pi)
             around = (low + high) / 2 + turn * (high - low)
             ends = around.new_tensor([low, high])[: 1 if self.closed else 2]
             around = torch.cat([around, ends])
-            found = torch.cat([found, around.unsqueeze(-1).expand(-1, self.items)])
-            found = wrap(found) if self.closed else found.clamp(low, high)
+            nodes = torch.cat([nodes, around.unsqueeze(-1).expand(-1, self.items)])
+            nodes = wrap(nodes) if self.closed else nodes.clamp(low, high)
         # rounded to the dtype in which the density reads them; a closed circle has no second end
-        return found.to(self.dtype).double().sort(0).values
+        return nodes.to(self.dtype).double().sort(0).values
 
     def _peaks(self) -> Float[Tensor, "peak item"]:
-        """Return the highest humps, at most PEAKS; a candidate belongs to a chosen hump if no valley separates them."""
+        """Return the positions of the highest humps, at most PEAKS of each item.
+
+        A candidate belongs to a hump that was already chosen if no valley separates them.
+        """
         places = self._candidates()  # (candidate, item), ascending; the last ones may repeat
         heights = self.at(places).nan_to_num(nan=-math.inf)
         tops = self._tops(places, heights)
@@ -210,7 +215,7 @@ class Line:
         return torch.cat(chosen)
 
     def _candidates(self) -> Float[Tensor, "candidate item"]:
-        """Return one of the `mode_candidates` in each quarter of their scale, since hundreds may lie on one hump."""
+        """Return at most one mode candidate in each quarter of a peak width, since hundreds may lie on one hump."""
         places = mode_candidates(self.density).squeeze(-1).double()
         if self.closed:
             places = wrap(places)
@@ -240,22 +245,22 @@ class Line:
         return tops.scatter(0, heights.argmax(0, keepdim=True), True)
 
     def _cells(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the lower and the higher log p at each cell's ends, and the log of its width."""
+        """Return, for each cell, the lower and the higher log p of its two ends, and the log of its width."""
         ahead, heights = self.nodes.roll(-1, 0), self.heights.roll(-1, 0)
         width = ahead - self.nodes
         if self.closed:
             width = torch.cat([width[:-1], width[-1:] + 2 * math.pi])
         else:
             width, heights = width[:-1], heights[:-1]
-        here = self.heights[: len(heights)]
-        high = torch.maximum(here, heights)
-        low = torch.minimum(here, heights).nan_to_num(nan=math.nan, neginf=-1e300)
+        lower_end = self.heights[: len(heights)]
+        high = torch.maximum(lower_end, heights)
+        low = torch.minimum(lower_end, heights).nan_to_num(nan=math.nan, neginf=-1e300)
         return low, high, width.log()
 
     def _log_less(self, level: Float[Tensor, "item"]) -> Float[Tensor, "item"]:
-        """Return the log of the probability below a level.
+        """Return the log of the probability of all values whose log-density is below `level`, (item,).
 
-        For each cell it is ∫ exp(a + b x) dx over the part below the level, which is the cell's width times
+        The probability of a cell is ∫ exp(a + b x) dx over its part below the level, which is the cell's width times
         (exp(c) - exp(low)) / (high - low) with c = min(level, high).
         """
         top = torch.minimum(level, self._high)

@@ -1,4 +1,4 @@
-"""Densities with a prediction set for the target: labels, arcs, intervals."""
+"""Densities with a prediction set for the target: a set of labels, arcs, intervals, or a region."""
 
 import math
 from functools import cached_property
@@ -18,13 +18,13 @@ from plugins.uncertainty.conformal.highest_density import Ends, Line
 
 Score = Literal["density", "mass"]
 FEW = 8
-"""Number of values of each item up to which their scores cost less than the level of one score."""
+"""Number of values per item up to which computing their scores is faster than computing the level of the threshold."""
 DRAWS = 1000
-"""Number of samples of each density over several numbers, whose sets have no ends to compute."""
+"""Number of samples of each density over several numbers; the ends of its sets cannot be computed."""
 WIDENED = (1.0, 2.0, 4.0, 8.0)
-"""Factors by which a density of several reals is widened to cover its set.
+"""Factors by which a density over several reals is widened, so that samples cover its whole set.
 
-An overconfident density has all its samples in the interior of the set.
+An overconfident density has all its own samples in the interior of the set.
 """
 
 
@@ -33,17 +33,17 @@ class PredictionSet(Mixture, ValueSet):
 
     A score is larger for a less expected value:
 
-    - "density": -log p(y), nats: the set is where the density is above one level, the same for every item
-      (for classes Sadinle, Lei & Wasserman 2019);
-    - "mass": -log of the probability of all values that are less dense than y, nats: the set is each item's own
-      smallest region of one and the same probability (for classes Romano, Sesia & Candès 2020, for numbers a
-      highest-density region). For classes p(y) itself counts with a share u(x) in (0, 1), which looks random and is a
-      function of the density. Without it all wrong labels of two classes, and most correct ones, would have equal
-      scores.
+    - "density": -log p(y), nats. The set holds the values with a density above one level, the same for every item (for
+      classes Sadinle, Lei & Wasserman 2019).
+    - "mass": -log of the probability of all values with a smaller density than y, nats. The set is the smallest region
+      of one probability, the same for every item (for classes Romano, Sesia & Candès 2020, for numbers a
+      highest-density region). For classes, a share u(x) in (0, 1) of p(y) itself is added to this probability; u(x)
+      looks random, but is a function of the density. Without it, all wrong labels of two classes and most correct ones
+      would have equal scores.
 
-    Either is a function of the density and the value alone, which is all that split conformal prediction requires: on
+    Both scores are functions of the density and the value alone, as split conformal prediction requires: on
     exchangeable data the set has its stated coverage for any density (Vovk, Gammerman & Shafer 2005, §4.1).
-    Probabilities over several numbers are shares of random samples, drawn once.
+    Probabilities over several numbers are shares of random samples, which are drawn once.
 
     Args:
         density: any density.
@@ -80,65 +80,66 @@ class PredictionSet(Mixture, ValueSet):
         if self.score == "density":
             return -log_prob
         if self._classes:
-            return _of_labels(log_prob, self._log_labels)
+            return _label_scores(log_prob, self._log_labels)
         if log_prob.numel() == 0:
             return log_prob
-        if self._one:
+        if self._one_number:
             flat = log_prob.reshape(-1, self._line.items)
             return torch.stack([self._line.score_of(level) for level in flat]).reshape(log_prob.shape)
-        return _among(log_prob, self._log_draws)
+        return _share_scores(log_prob, self._log_draws)
 
     @torch.no_grad()
     def contains(self, value: Tensor) -> Bool[Tensor, "*shape"]:
-        """Return whether each value (*sample, *batch, *event) is in its item's set; that of a NaN density is empty."""
-        if self._everything:
+        """Return whether each value (*sample, *batch, *event) is in its item's set; no value is for a NaN density."""
+        if self._holds_everything:
             return ~self.density.log_prob(value).isnan()
         several = value.numel() > FEW * self.batch_shape.numel()
-        if self._one and self.score == "mass" and several:
+        if self._one_number and self.score == "mass" and several:
             return self.density.log_prob(value).double() >= self._level.reshape(self.batch_shape)
         return self.scores(value) <= self.threshold
 
     @torch.no_grad()
     def size(self) -> Float[Tensor, "*batch"]:
-        """Return the size of each set: number of labels, length of arcs, radians, length of intervals, or volume.
+        """Return the size of each set: the number of labels, the length of arcs (radians) or intervals, or the volume.
 
-        The volume is that of several numbers: exact for a normal density, whose set is an ellipsoid, otherwise an
-        estimate with a `size_error`. The result is float64; infinite if the set is unbounded, NaN if the density is
-        NaN.
+        The volume over several numbers is exact for a normal density, whose set is an ellipsoid, and otherwise an
+        estimate with a `size_error`. The result is float64, infinite if the set is unbounded, and NaN if the density
+        is NaN.
         """
         if self._classes:
             return self.labels().sum(-1).double()
-        if self._one:
+        if self._one_number:
             return self._ends.length.reshape(self.batch_shape)
-        if self._everything:
-            return self._log_draws[0].new_full(self.batch_shape, self._whole)
+        if self._holds_everything:
+            return self._log_draws[0].new_full(self.batch_shape, self._support_volume)
         return self._volume[0]
 
     @torch.no_grad()
     def size_error(self) -> Float[Tensor, "*batch"]:
-        """Return the standard error of `size`, float64: above 0 if it is estimated from samples."""
+        """Return the standard error of `size`, float64; it is 0 unless the size is estimated from samples."""
         size = self.size()
-        if self._classes or self._one or self._everything:
+        if self._classes or self._one_number or self._holds_everything:
             return torch.zeros_like(size)
         return self._volume[1]
 
     @cached_property
     @torch.no_grad()
     def _volume(self) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
-        """Volume of a set of several numbers, and its standard error."""
+        """Volume of a set of several numbers, and the standard error of the volume."""
         mode = self.density.mode
         if mahalanobis(self.density, mode) is not None:
             volume = self._ellipsoid(self.density.log_prob(mode).double())
             return volume, torch.zeros_like(volume)
-        # importance sampling from equal shares of the density widened around its mode, or of the uniform density of
-        # angles: multiple proposals with the balance heuristic (Veach & Guibas 1995, eq. 9)
+        # Importance sampling with several proposals of equal shares and the balance heuristic (Veach & Guibas 1995,
+        # eq. 9). For angles the proposals are the density and the uniform density; for reals the density, widened
+        # around its mode by each of the factors.
         draws, factors = self._draws, WIDENED
         if isinstance(self.support, Circular):
             ranges = self.support.ranges or ((-math.pi, math.pi),) * self.event_shape[0]
             low, high = torch.tensor(ranges, dtype=torch.float64, device=draws.device).T
             uniform = low + torch.rand(draws.shape, dtype=torch.float64, device=draws.device) * (high - low)
             places = [draws, uniform.to(draws.dtype)]
-            log_whole = math.log(self._whole)
+            log_whole = math.log(self._support_volume)
 
             def log_proposal(value: Tensor) -> Tensor:
                 own = self.density.log_prob(value).double()
@@ -147,11 +148,11 @@ class PredictionSet(Mixture, ValueSet):
             places = [mode + factor * (draws - mode) for factor in factors]
 
             def log_proposal(value: Tensor) -> Tensor:
-                each = [
+                log_densities = [
                     self.density.log_prob(mode + (value - mode) / factor).double() - volume
                     for factor, volume in ((c, self.event_shape[0] * math.log(c)) for c in factors)
                 ]
-                return torch.stack(each).logsumexp(0) - math.log(len(factors))
+                return torch.stack(log_densities).logsumexp(0) - math.log(len(factors))
 
         parts = [torch.where(self.contains(y), (-log_proposal(y)).exp(), 0.0) for y in places]
         volume = torch.stack([part.mean(0) for part in parts]).mean(0)
@@ -160,7 +161,7 @@ class PredictionSet(Mixture, ValueSet):
         return volume.masked_fill(broken, math.nan), variance.sqrt()
 
     def _ellipsoid(self, top: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-        """Return the volume in which a normal density, log p = `top` at its mode, is above the set's level, nats."""
+        """Return the volume of the set of a normal density, an ellipsoid; `top` is log p at the mode, nats."""
         count = self.event_shape[0]
         level = -self.threshold.to(top) if self.score == "density" else self._level_of_share
         radius = (2 * (top - level)).clamp(min=0).sqrt()
@@ -170,26 +171,26 @@ class PredictionSet(Mixture, ValueSet):
 
     @property
     def _level_of_share(self) -> Float[Tensor, "*batch"]:
-        """Least log-density whose mass score, a share of samples (`_among`), is at most the threshold, nats."""
-        drawn, threshold = self._log_draws, float(self.threshold)
+        """Smallest log-density, nats, at which the mass score (`_share_scores`) is at most the threshold."""
+        log_draws, threshold = self._log_draws, float(self.threshold)
         if threshold < 0:  # no score is negative
-            return torch.full_like(drawn[0], math.inf)
-        beyond = threshold - math.log(len(drawn) + 1)
+            return torch.full_like(log_draws[0], math.inf)
+        beyond = threshold - math.log(len(log_draws) + 1)
         if beyond > 0:
-            return drawn[0] - beyond
-        rank = (len(drawn) + 1) * math.exp(-threshold) - 1
-        if rank > len(drawn):
-            return torch.full_like(drawn[0], math.inf)
-        above = min(int(rank), len(drawn) - 1)
+            return log_draws[0] - beyond
+        rank = (len(log_draws) + 1) * math.exp(-threshold) - 1
+        if rank > len(log_draws):
+            return torch.full_like(log_draws[0], math.inf)
+        above = min(int(rank), len(log_draws) - 1)
         if above < 1:
-            return drawn[0]
-        return drawn[above - 1] + min(rank - above, 1.0) * (drawn[above] - drawn[above - 1])
+            return log_draws[0]
+        return log_draws[above - 1] + min(rank - above, 1.0) * (log_draws[above] - log_draws[above - 1])
 
     def empty(self) -> Bool[Tensor, "*batch"]:
         """Return whether the set is empty."""
         if self._classes:
             return ~self.labels().any(-1)
-        if self._one:
+        if self._one_number:
             return self.size() == 0
         return ~(self.contains(self._draws).any(0) | self.contains(self.density.mode))
 
@@ -201,48 +202,49 @@ class PredictionSet(Mixture, ValueSet):
         """
         if not self._classes:
             raise UserError(
-                "labels() are of classes; this set is of numbers: use intervals() or contains(value)."
+                "labels() exists only for sets of classes, but this set holds numbers. Use intervals() or "
+                "contains(value)."
             )
         return self.contains(self.density.enumerate_support()).movedim(0, -1)
 
     def intervals(self) -> list[list[tuple[float, float]]]:
-        """Return the set of every item of the flattened batch as (low, high), ascending.
+        """Return the set of every item of the flattened batch as intervals (low, high), in ascending order.
 
-        For a real they may be infinite. For an angle they are radians, from low in [-π, π) counter-clockwise to high,
-        which may lie beyond π but is at most low + 2π; the whole circle is (-π, π). The ends are as exact as the
-        density's dtype. A hump of the density is found if one of its components has its mode there.
+        The ends of an interval of a real may be infinite. An interval of an angle is in radians, from low in [-π, π)
+        counter-clockwise to high, which may lie beyond π but is at most low + 2π; the whole circle is (-π, π). The ends
+        are as exact as the density's dtype. A hump of the density is found if a component has its mode there.
 
         Raises:
             UserError: the density is not over one number.
         """
-        if not self._one:
+        if not self._one_number:
             raise UserError(
-                "intervals() are of one angle or one real; use labels() of classes, and of several numbers "
-                "contains(value), or a set of the marginal() of each."
+                "intervals() exists only for sets of one angle or one real. For classes use labels(); for several "
+                "numbers use contains(value), or the prediction set of the marginal() of each number."
             )
         return self._ends.intervals
 
     def parts(self) -> list[list[int]] | list[list[tuple[float, float]]] | None:
-        """Return the labels or the intervals of each set; None for several numbers."""
+        """Return the labels or the intervals of each set; None for sets of several numbers."""
         if self._classes:
             labels = self.labels().reshape(-1, len(self._log_labels))
             return [row.nonzero().flatten().tolist() for row in labels]
-        return self.intervals() if self._one else None
+        return self.intervals() if self._one_number else None
 
     @property
     def _classes(self) -> bool:
         return self.density.has_enumerate_support
 
     @property
-    def _one(self) -> bool:
+    def _one_number(self) -> bool:
         return tuple(self.event_shape) == (1,)
 
     @property
-    def _everything(self) -> bool:
+    def _holds_everything(self) -> bool:
         return float(self.threshold) == math.inf
 
     @property
-    def _whole(self) -> float:
+    def _support_volume(self) -> float:
         """Volume of the whole support."""
         support = self.support
         if not isinstance(support, Circular):
@@ -273,9 +275,9 @@ class PredictionSet(Mixture, ValueSet):
     @cached_property
     @torch.no_grad()
     def _level(self) -> Float[Tensor, "item"]:
-        """Least log-density in the set, nats, for one number."""
+        """Smallest log-density in the set of one number, nats, for each item."""
         threshold = self.threshold.double().to(self._line.heights.device)
-        if self.score == "mass" and not self._everything:
+        if self.score == "mass" and not self._holds_everything:
             return self._line.level_of(threshold)
         return (-threshold).expand(self._line.items)
 
@@ -285,40 +287,46 @@ class PredictionSet(Mixture, ValueSet):
         return self._line.ends(self._level)
 
 
-def _of_labels(log_prob: Tensor, every: Float[Tensor, "label *batch"]) -> Tensor:
-    """Return -log(Σ_j p_j of the less probable labels + (1 - u) p(y)).
+def _label_scores(log_prob: Tensor, every: Float[Tensor, "label *batch"]) -> Tensor:
+    """Return the mass score -log(Σ_j p_j + (1 - u) p(y)), nats, where j ranges over the less probable labels.
 
-    The sum is the complement of the sum from the top of Romano, Sesia & Candès 2020 (eq. 5), which rounds to 1 where
-    small differences matter.
+    Romano, Sesia & Candès 2020 (eq. 5) sum over the more probable labels. That sum is 1 minus this one, and rounds to 1
+    where small differences matter.
     """
     top = every.topk(min(2, len(every)), dim=0).values
     margin = top[0] - top[-1]
-    # the insignificant digits of the margin: they differ for different inputs and agree for equal ones
+    # u is made of the last digits of the margin, which are equal for equal inputs and differ for different ones
     share = torch.frac(997 * margin.where(margin.isfinite(), 0.0)).clamp(1e-6, 1 - 1e-6)
-    less = torch.where(_beside(every, log_prob) < log_prob, _beside(every, log_prob), -math.inf).logsumexp(0)
+    less = torch.where(
+        _broadcast_labels(every, log_prob) < log_prob, _broadcast_labels(every, log_prob), -math.inf
+    ).logsumexp(0)
     return -torch.logaddexp(less, log_prob + torch.log1p(-share))
 
 
-def _beside(every: Tensor, values: Tensor) -> Tensor:
-    """Return (label, *batch) reshaped to (label, *1, *batch), to broadcast with values (*sample, *batch)."""
+def _broadcast_labels(every: Tensor, values: Tensor) -> Tensor:
+    """Return `every`, (label, *batch), reshaped to (label, *1, *batch), to broadcast with values (*sample, *batch)."""
     return every.reshape(len(every), *(1,) * (values.dim() - every.dim() + 1), *every.shape[1:])
 
 
-def _among(log_prob: Tensor, drawn: Float[Tensor, "draw *batch"]) -> Tensor:
-    """Return -log of the share of samples, ascending, that are less dense.
+def _share_scores(log_prob: Tensor, log_draws: Float[Tensor, "draw *batch"]) -> Tensor:
+    """Return the mass score, nats: -log of the share of samples with a smaller log-density than `log_prob`.
 
-    It is linear between samples, and linear in log p below the last of them, so that equal scores are rare.
+    The samples are in ascending order. Equal scores are rare, because the share is linear between two samples, and the
+    score is linear in log p below the first sample.
     """
-    edges = drawn.movedim(0, -1).contiguous()
+    edges = log_draws.movedim(0, -1).contiguous()
     lead = log_prob.shape[: log_prob.dim() - edges.dim() + 1]
     flat = log_prob.reshape(lead.numel(), *edges.shape[:-1]).movedim(0, -1).contiguous()
     above = torch.searchsorted(edges, flat)
-    low, high = edges.gather(-1, (above - 1).clamp(min=0)), edges.gather(-1, above.clamp(max=len(drawn) - 1))
+    low, high = (
+        edges.gather(-1, (above - 1).clamp(min=0)),
+        edges.gather(-1, above.clamp(max=len(log_draws) - 1)),
+    )
     part = torch.where(high > low, (flat - low) / (high - low), 0.0).clamp(0, 1)
-    rank = above + part.where((above > 0) & (above < len(drawn)), 0.0)
+    rank = above + part.where((above > 0) & (above < len(log_draws)), 0.0)
     beyond = (edges[..., :1] - flat).clamp(min=0)
-    found = math.log(len(drawn) + 1) - (rank + 1).log() + beyond
-    return found.movedim(-1, 0).reshape(log_prob.shape)
+    score = math.log(len(log_draws) + 1) - (rank + 1).log() + beyond
+    return score.movedim(-1, 0).reshape(log_prob.shape)
 
 
 @value_set.register

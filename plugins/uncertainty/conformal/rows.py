@@ -1,4 +1,4 @@
-"""Rows of the contract: both scores on every kind of target."""
+"""Contract-test cases: both scores on every kind of target."""
 
 from framework.target import Target
 from framework.testing.rows import WrapperRow

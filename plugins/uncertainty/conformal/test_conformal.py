@@ -17,19 +17,19 @@ from framework.model import Predictor
 from framework.target import Target
 from framework.testing.metrics import Cardioid
 from plugins.uncertainty.conformal.prediction_set import PredictionSet
-from plugins.uncertainty.conformal.wrapper import halves, threshold
+from plugins.uncertainty.conformal.wrapper import split_in_halves, threshold
 
 CLASSES, ANGLE = Target("class", ("upper", "lower")), Target("angle", ("azimuth",))
 SPLITS, POOL = 200, 1600
 
 
-class Given(Predictor):
+class PredictorOf(Predictor):
     """A predictor whose densities are made of the inputs; remembers its calibration data."""
 
     def __init__(self, make):
         super().__init__()
         self.make = make
-        self.seen = []
+        self.calibration_rows = []
         self.weight = nn.Parameter(torch.ones(()))
 
     def forward(self, inputs):
@@ -42,7 +42,7 @@ class Given(Predictor):
         return self(inputs)
 
     def calibrate(self, batches):
-        self.seen = torch.cat([batch["index"] for batch in batches]).tolist()
+        self.calibration_rows = torch.cat([batch["index"] for batch in batches]).tolist()
 
 
 def around(model, target=CLASSES, name="conformal", **config):
@@ -95,10 +95,12 @@ def test_coverage_is_what_was_promised(problem, score, miscoverage):
     """
     make, predict, target = PROBLEMS[problem]
     inputs, label = make(POOL)
-    wrapper = around(Given(predict), target, score=score, miscoverage=miscoverage)
+    wrapper = around(PredictorOf(predict), target, score=score, miscoverage=miscoverage)
     scores = wrapper(inputs).scores(label)
     half = POOL // 2
-    mine = torch.cat([batch["index"] for batch in halves(list(batches(inputs[:half], label[:half])))[1]])
+    mine = torch.cat(
+        [batch["index"] for batch in split_in_halves(list(batches(inputs[:half], label[:half])))[1]]
+    )
     generator = torch.Generator().manual_seed(0)
     covered = []
     for _ in range(SPLITS):
@@ -110,8 +112,8 @@ def test_coverage_is_what_was_promised(problem, score, miscoverage):
     wrapper.calibrate(batches(inputs[order[:half]], label[order[:half]]))
     assert wrapper.threshold.item() == pytest.approx(threshold(validation[mine], miscoverage), rel=1e-9)
     rest = order[half:]
-    held = wrapper(inputs[rest]).contains(label[rest])
-    assert held.double().mean().item() == pytest.approx(covered[-1].item(), abs=2 / len(rest))
+    inside = wrapper(inputs[rest]).contains(label[rest])
+    assert inside.double().mean().item() == pytest.approx(covered[-1].item(), abs=2 / len(rest))
     # without it, the model's own region of that mass covers too little
     if score == "mass":
         own = PredictionSet(predict(inputs), -torch.tensor(miscoverage).double().log(), "mass")
@@ -125,15 +127,15 @@ def test_around_a_temperature_it_still_covers():
     for _ in range(20):
         order = torch.randperm(1500, generator=generator)
         first, rest = order[:1000], order[1000:]
-        inner = around(Given(sure_classifier), name="temperature")
+        inner = around(PredictorOf(sure_classifier), name="temperature")
         wrapper = around(inner, miscoverage=0.1, score="mass")
         wrapper.calibrate(batches(inputs[first], label[first]))
         covered.append(wrapper(inputs[rest]).contains(label[rest]).double().mean())
     # one split's coverage has a standard deviation of about 0.019, so their mean one of 0.004
     assert torch.stack(covered).mean().item() == pytest.approx(0.9, abs=0.02)
     assert inner.temperature.item() > 1.5
-    alone = around(Given(sure_classifier), name="temperature")
-    theirs, _ = halves(list(batches(inputs[first], label[first])))
+    alone = around(PredictorOf(sure_classifier), name="temperature")
+    theirs, _ = split_in_halves(list(batches(inputs[first], label[first])))
     alone.calibrate(theirs)
     assert inner.temperature.item() == alone.temperature.item()
 
@@ -143,9 +145,9 @@ def test_wrappers_compose_in_any_order(target):
     def members(inputs):
         both = [inputs[:, :2], 0.5 * inputs[:, :2]]
         if target is CLASSES:
-            parts = [Categorical(logits=one, validate_args=False) for one in both]
+            parts = [Categorical(logits=parameters, validate_args=False) for parameters in both]
         else:
-            parts = [Cardioid(one[:, :1]) for one in both]
+            parts = [Cardioid(parameters[:, :1]) for parameters in both]
         return Mixture(torch.zeros(len(inputs), 2, dtype=inputs.dtype), Stacked(parts))
 
     torch.manual_seed(0)
@@ -154,7 +156,7 @@ def test_wrappers_compose_in_any_order(target):
     names = ["temperature", "conformal"] + (["platt"] if target is CLASSES else [])
     for first in names:
         for second in names:
-            wrapper = around(around(Given(members), target, name=first), target, name=second)
+            wrapper = around(around(PredictorOf(members), target, name=first), target, name=second)
             wrapper.calibrate(batches(inputs, label, 16))
             density = wrapper(inputs)
             assert isinstance(density, PredictionSet) == (second == "conformal")
@@ -162,25 +164,25 @@ def test_wrappers_compose_in_any_order(target):
 
 
 def test_what_is_wrapped_gets_one_half():
-    model = Given(sure_classifier)
+    model = PredictorOf(sure_classifier)
     inputs, label = moons(47)
     wrapper = around(model)
     wrapper.calibrate(batches(inputs, label, 5))
-    theirs = set(model.seen)
+    theirs = set(model.calibration_rows)
     rest = torch.tensor([index for index in range(47) if index not in theirs])
-    assert len(theirs) == 24 and model.seen == sorted(theirs)
+    assert len(theirs) == 24 and model.calibration_rows == sorted(theirs)
     mine = PredictionSet(sure_classifier(inputs[rest]), wrapper.threshold, "density").scores(label[rest])
     assert wrapper.threshold.item() == threshold(mine, 0.1)
     wrapper.calibrate(batches(inputs, label, 11))  # the batches do not matter
-    assert set(model.seen) == theirs
-    ones = halves(list(batches(inputs[:4], label[:4], 1)))
+    assert set(model.calibration_rows) == theirs
+    ones = split_in_halves(list(batches(inputs[:4], label[:4], 1)))
     assert [len(half) for half in ones] == [2, 2]  # no empty batches
 
 
 def test_neighbours_that_alternate_do_not_split_by_class():
     inputs, label = moons(400)
     turns = torch.stack([(label == 0).nonzero()[:190, 0], (label == 1).nonzero()[:190, 0]], 1).flatten()
-    inner = around(Given(sure_classifier), name="platt")
+    inner = around(PredictorOf(sure_classifier), name="platt")
     around(inner).calibrate(batches(inputs[turns], label[turns]))
     assert inner.slope > 0.05 and inner.biases.abs().max() < 1
 
@@ -204,11 +206,11 @@ def test_however_much_may_be_missed_the_threshold_is_the_least_score(count):
 @pytest.mark.parametrize("score", ["density", "mass"])
 def test_too_few_samples_make_the_set_everything_and_it_is_said(score, caplog):
     inputs, label = moons(16)  # 8 samples for the threshold; 10 % needs 9
-    wrapper = around(Given(sure_classifier), score=score)
+    wrapper = around(PredictorOf(sure_classifier), score=score)
     assert wrapper(inputs).labels().all()  # before calibration too
     wrapper.calibrate(batches(inputs, label))
     assert wrapper.threshold.item() == math.inf and wrapper(inputs).labels().all()
-    assert "with 8 validation samples" in caplog.text and "9 would do" in caplog.text
+    assert "with 8 validation samples" in caplog.text and "9 samples would be enough" in caplog.text
     caplog.clear()
     inputs, label = moons(18)
     wrapper.calibrate(batches(inputs, label))
@@ -221,28 +223,28 @@ def test_targets_that_are_ruled_out_are_ordinary_scores(caplog):
 
     inputs, label = torch.zeros(400, 2), torch.zeros(400, dtype=torch.int64)
     label[::10] = 1  # about 10 %, beyond α = 5 %
-    wrapper = around(Given(certain), miscoverage=0.05)
+    wrapper = around(PredictorOf(certain), miscoverage=0.05)
     wrapper.calibrate(batches(inputs, label))
-    assert wrapper(inputs).labels().all() and "The sets are everything" in caplog.text
-    loose = around(Given(certain), miscoverage=0.2)
+    assert wrapper(inputs).labels().all() and "every set holds all values" in caplog.text
+    loose = around(PredictorOf(certain), miscoverage=0.2)
     loose.calibrate(batches(inputs, label))
     assert loose(inputs).labels().tolist() == [[True, False]] * 400
 
 
 def test_bad_sets_get_a_sentence():
     inputs, label = moons(60)
-    _, mine = halves(list(batches(inputs, label)))
+    _, mine = split_in_halves(list(batches(inputs, label)))
     first, second = mine[0]["index"][:2].tolist()
     inputs[[first, second]] = math.nan
     with pytest.raises(UserError, match=rf"score of validation samples \[{first}, {second}\] is NaN"):
-        around(Given(sure_classifier)).calibrate(batches(inputs, label))
+        around(PredictorOf(sure_classifier)).calibrate(batches(inputs, label))
     with pytest.raises(UserError, match="conformal is calibrated on the validation split, but got no sample"):
-        around(Given(sure_classifier)).calibrate(iter(()))
-    with pytest.raises(UserError, match="got one sample of it; wanted 2 or more"):
-        around(Given(sure_classifier)).calibrate(batches(inputs[:1], label[:1]))
+        around(PredictorOf(sure_classifier)).calibrate(iter(()))
+    with pytest.raises(UserError, match="at least 2 samples are required, but got one sample"):
+        around(PredictorOf(sure_classifier)).calibrate(batches(inputs[:1], label[:1]))
 
 
 @pytest.mark.parametrize("config", [{"miscoverage": 0.0}, {"miscoverage": 1.0}, {"score": "rank"}])
 def test_a_config_out_of_range_is_refused(config):
     with pytest.raises(ConfigError, match="uncertainty"):
-        around(Given(sure_classifier), **config)
+        around(PredictorOf(sure_classifier), **config)

@@ -64,8 +64,8 @@ def test_the_density_is_kept_to_the_last_bit(kind, score):
     value = density.sample((3,))
     torch.manual_seed(1)
     assert torch.equal(whole.sample((3,)), value)
-    found = whole.log_prob(value)
-    assert found.dtype == density.log_prob(value).dtype and torch.equal(found, density.log_prob(value))
+    log_prob = whole.log_prob(value)
+    assert log_prob.dtype == density.log_prob(value).dtype and torch.equal(log_prob, density.log_prob(value))
     assert torch.equal(whole.mode, density.mode)
     torch.manual_seed(2)
     wanted = density.entropy()
@@ -86,20 +86,20 @@ def test_estimates_and_marginals_are_those_of_the_density():
     head.samples = 16
     with torch.no_grad():
         sampled = head(torch.randn(4, head.size))
-    found = estimate(PredictionSet(sampled, hot(1.0), "density"), torch.zeros(4, 1))
-    assert (found.standard_error > 0).all()
-    assert torch.equal(found.standard_error, estimate(sampled, torch.zeros(4, 1)).standard_error)
+    result = estimate(PredictionSet(sampled, hot(1.0), "density"), torch.zeros(4, 1))
+    assert (result.standard_error > 0).all()
+    assert torch.equal(result.standard_error, estimate(sampled, torch.zeros(4, 1)).standard_error)
     several = PredictionSet(Cardioid(torch.randn(4, 3)), hot(1.0), "density")
     assert type(marginal(several, 1)) is Cardioid
-    one = PredictionSet(Cardioid(torch.randn(4, 1)), hot(1.0), "density")
-    assert marginal(one, 0) is one
+    single = PredictionSet(Cardioid(torch.randn(4, 1)), hot(1.0), "density")
+    assert marginal(single, 0) is single
 
 
 def test_density_sets_of_classes_are_those_above_the_level():
     density = Categorical(probs=torch.tensor([[0.6, 0.3, 0.1], [0.4, 0.35, 0.25]]), validate_args=False)
-    found = PredictionSet(density, -hot(0.3).log() + 1e-6, "density")
-    assert found.labels().tolist() == [[True, True, False], [True, True, False]]
-    assert found.size().tolist() == [2.0, 2.0]
+    sets = PredictionSet(density, -hot(0.3).log() + 1e-6, "density")
+    assert sets.labels().tolist() == [[True, True, False], [True, True, False]]
+    assert sets.size().tolist() == [2.0, 2.0]
     strict = PredictionSet(density, -hot(0.5).log(), "density")
     assert strict.labels().tolist() == [[True, False, False], [False, False, False]]
     assert strict.empty().tolist() == [False, True]
@@ -110,13 +110,13 @@ def test_mass_scores_of_classes_by_a_loop():
     """Compare with -log(Σ of the less probable + (1 - u) p), where u depends on an item's two best labels."""
     torch.manual_seed(4)
     density = Categorical(logits=4 * torch.randn(50, 5).double(), validate_args=False)
-    found = PredictionSet(density, EVERYTHING, "mass").scores(density.enumerate_support())
+    scores = PredictionSet(density, EVERYTHING, "mass").scores(density.enumerate_support())
     for item, row in enumerate(density.probs.tolist()):
         best, second = sorted(row, reverse=True)[:2]
         share = min(max((997 * (math.log(best) - math.log(second))) % 1, 1e-6), 1 - 1e-6)
         for label, own in enumerate(row):
             wanted = -math.log(sum(other for other in row if other < own) + (1 - share) * own)
-            assert found[label, item].item() == pytest.approx(wanted, rel=1e-9, abs=1e-9)
+            assert scores[label, item].item() == pytest.approx(wanted, rel=1e-9, abs=1e-9)
 
 
 @pytest.mark.parametrize("score", ["density", "mass"])
@@ -126,9 +126,9 @@ def test_certain_classes_have_scores_that_are_numbers(score, size):
     if math.isinf(size):
         logits = torch.tensor([[0.0, -size], [-size, 0.0], [0.0, 0.0]])
     density = Categorical(logits=logits.log_softmax(-1), validate_args=False)
-    found = PredictionSet(density, EVERYTHING, score).scores(density.enumerate_support())
-    assert not found.isnan().any()
-    assert (found.diagonal()[:2] < 20).all() and (found[[1, 0], [0, 1]] >= 1e4).all()
+    scores = PredictionSet(density, EVERYTHING, score).scores(density.enumerate_support())
+    assert not scores.isnan().any()
+    assert (scores.diagonal()[:2] < 20).all() and (scores[[1, 0], [0, 1]] >= 1e4).all()
 
 
 CONCENTRATIONS = [0.01, 0.5, 5.0, 1e4, 1e8, 1e12]
@@ -139,31 +139,31 @@ def test_arcs_of_one_level(concentration):
     """Check that log p falls by 1 nat where κ (1 - cos d) = 1."""
     density = von_mises([3.1, 0.0, -40.0], concentration)
     level = -density.log_prob(density.mode)[0] + 1
-    found = PredictionSet(density, level, "density")
+    sets = PredictionSet(density, level, "density")
     if concentration < 0.5:
         half, wanted = math.pi, TURN
     else:
         half = 2 * math.asin(math.sqrt(1 / (2 * concentration)))
         wanted = 2 * half
     # relative to an arc's size, or to the resolution of a float64 angle of 3
-    np.testing.assert_allclose(found.size().numpy(), wanted, rtol=1e-9, atol=1e-13)
+    np.testing.assert_allclose(sets.size().numpy(), wanted, rtol=1e-9, atol=1e-13)
     if half < math.pi:
-        (low, high), *more = found.intervals()[0]
+        (low, high), *more = sets.intervals()[0]
         assert not more and -math.pi <= low < math.pi < 3.1 + half + 0.1
         assert (low, high) == pytest.approx((3.1 - half, 3.1 + half), abs=1e-12)
         beyond = hot([[3.1], [0.0], [-40.0]]) + half * torch.tensor([1.001]).double()
         inside = hot([[3.1], [0.0], [-40.0]]) - half * torch.tensor([0.999]).double()
-        assert not found.contains(beyond).any() and found.contains(inside).all()
+        assert not sets.contains(beyond).any() and sets.contains(inside).all()
 
 
 @pytest.mark.parametrize("concentration", CONCENTRATIONS)
 def test_arcs_of_one_mass(concentration):
-    found = PredictionSet(von_mises([0.0, 2.0], concentration), -hot(0.1).log(), "mass").size().numpy()
+    sizes = PredictionSet(von_mises([0.0, 2.0], concentration), -hot(0.1).log(), "mass").size().numpy()
     if concentration < 1e8:
         wanted = 2 * stats.vonmises.ppf(0.95, concentration)
     else:  # the normal limit
         wanted = 2 * stats.norm.ppf(0.95) / concentration**0.5
-    np.testing.assert_allclose(found, wanted, rtol=2e-3)
+    np.testing.assert_allclose(sizes, wanted, rtol=2e-3)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -172,10 +172,10 @@ def test_intervals_of_reals(dtype, spread):
     density = normal([0.0, 0.5, -2.0], spread, dtype)
     drop = 2.0  # nats: log p falls by d²/2σ²
     level = -density.log_prob(density.mode)[0].double() + drop
-    found = PredictionSet(density, level, "density")
+    sets = PredictionSet(density, level, "density")
     half = math.sqrt(2 * drop) * spread
     digits = {torch.float32: 1e-6, torch.float64: 1e-11}[dtype]
-    for place, parts in zip((0.0, 0.5, -2.0), found.intervals(), strict=True):
+    for place, parts in zip((0.0, 0.5, -2.0), sets.intervals(), strict=True):
         assert len(parts) == 1
         assert parts[0] == pytest.approx((place - half, place + half), abs=digits * (half + abs(place)))
     narrowest = PredictionSet(density, -hot(0.1).log(), "mass").size()[0].item()
@@ -188,10 +188,10 @@ def test_far_values_have_scores_that_differ():
     """Check an overconfident model, whose masses all round to 1 while their complements do not."""
     density = normal([0.0] * 4, 1.0)
     value = torch.tensor([[8.0], [20.0], [100.0], [1e6]]).double()
-    found = PredictionSet(density, EVERYTHING, "mass").scores(value)
+    scores = PredictionSet(density, EVERYTHING, "mass").scores(value)
     wanted = -(stats.norm.logsf(value[:, 0].numpy()) + math.log(2))
-    np.testing.assert_allclose(found.numpy(), wanted, rtol=2e-3)
-    assert (found.diff() > 0).all()
+    np.testing.assert_allclose(scores.numpy(), wanted, rtol=2e-3)
+    assert (scores.diff() > 0).all()
 
 
 def two_humps(first, second, spreads, weights=(0.5, 0.5)):
@@ -226,8 +226,8 @@ def test_arcs_across_the_cut_and_several_of_them():
     means = torch.tensor([[[3.1], [0.5], [-1.2]]]).double()
     density = Mixture(torch.zeros(1, 3), kind(means, torch.full((1, 3, 1), 200.0).double()))
     level = density.log_prob(density.mode) - 3
-    found = PredictionSet(density, -level[0], "density")
-    parts = found.intervals()[0]
+    sets = PredictionSet(density, -level[0], "density")
+    parts = sets.intervals()[0]
     assert len(parts) == 3 and parts == sorted(parts)
     assert (
         sum(low < mean % TURN < high or low < mean < high for low, high in parts for mean in (3.1, 0.5, -1.2))
@@ -235,8 +235,8 @@ def test_arcs_across_the_cut_and_several_of_them():
     )
     assert parts[-1][1] > math.pi  # counter-clockwise across the cut
     angles, _ = circular_grid(density, 100_000)
-    share = found.contains(angles.reshape(-1, 1, 1)).double().mean().item()
-    assert found.size().item() == pytest.approx(TURN * share, abs=1e-4)
+    share = sets.contains(angles.reshape(-1, 1, 1)).double().mean().item()
+    assert sets.size().item() == pytest.approx(TURN * share, abs=1e-4)
     # the complement of one arc: one arc
     wide = PredictionSet(Cardioid(torch.tensor([[0.3]]).double()), hot(4.0), "density")
     ((low, high),) = wide.intervals()[0]
@@ -251,8 +251,8 @@ def test_part_of_a_turn_has_ends():
     assert whole.intervals() == [[(-math.pi / 2, math.pi / 2)]] * 2
     # uniform rotations: p(e) = cos(e)/2, above cos(1)/2 within ±1
     level = math.log(math.cos(1.0) / 2)
-    found = PredictionSet(elevation, -hot(level), "density").intervals()
-    np.testing.assert_allclose(found, [[(-1.0, 1.0)]] * 2, atol=1e-6)
+    intervals = PredictionSet(elevation, -hot(level), "density").intervals()
+    np.testing.assert_allclose(intervals, [[(-1.0, 1.0)]] * 2, atol=1e-6)
     mass = PredictionSet(elevation, -hot(0.1).log(), "mass").size().double().numpy()
     np.testing.assert_allclose(mass, 2 * math.asin(0.9), rtol=2e-3)
 
@@ -262,9 +262,9 @@ def test_volumes_of_several_numbers():
     root = torch.tensor([[2.0, 0.0], [0.7, 0.5]]).double().expand(3, 2, 2)
     density = MultivariateNormal(torch.zeros(3, 2).double(), scale_tril=root, validate_args=False)
     area = 2 * math.pi * 1.0 * 1.5  # of the ellipse where log p has fallen by 1.5 nats, |Σ|^½ = 1
-    found = PredictionSet(density, -density.log_prob(density.mode)[0] + 1.5, "density")
-    np.testing.assert_allclose(found.size().numpy(), area, rtol=0.15)
-    assert not found.empty().any()
+    sets = PredictionSet(density, -density.log_prob(density.mode)[0] + 1.5, "density")
+    np.testing.assert_allclose(sets.size().numpy(), area, rtol=0.15)
+    assert not sets.empty().any()
     nine = PredictionSet(density, -hot(0.1).log(), "mass")
     inside = nine.contains(density.sample((4000,))).double().mean(0)
     np.testing.assert_allclose(inside.numpy(), 0.9, atol=0.04)
@@ -284,13 +284,13 @@ def test_sets_of_a_normal_density_are_ellipsoids(count, drop, dtype):
     root = torch.eye(count).tril() + 0.3 * torch.ones(count, count).tril(-1)
     root = (root * (1 + torch.arange(count)).reshape(-1, 1)).to(dtype).expand(3, count, count)
     density = MultivariateNormal(torch.ones(3, count, dtype=dtype), scale_tril=root, validate_args=False)
-    found = PredictionSet(density, drop - density.log_prob(density.mode)[0].double(), "density")
+    sets = PredictionSet(density, drop - density.log_prob(density.mode)[0].double(), "density")
     ball = {0: 1.0, 1: 2.0}
     for n in range(2, count + 1):
         ball[n] = 2 * math.pi / n * ball[n - 2]
     volume = ball[count] * (2 * drop) ** (count / 2) * math.factorial(count)
-    np.testing.assert_allclose(found.size().numpy(), volume, rtol=1e-5 if dtype == torch.float32 else 1e-10)
-    assert not found.size_error().any()
+    np.testing.assert_allclose(sets.size().numpy(), volume, rtol=1e-5 if dtype == torch.float32 else 1e-10)
+    assert not sets.size_error().any()
 
 
 @pytest.mark.parametrize("drop", [1.0, 6.0, 30.0])
@@ -315,7 +315,7 @@ def test_other_volumes_have_an_error_that_covers_the_quadratures(kind, drop):
     wanted = cell * float((-density.log_prob(grid) <= threshold).double().sum())
     sets = [PredictionSet(density, threshold, "density") for _ in range(40)]
     size, error = (
-        torch.cat(each) for each in zip(*((one.size(), one.size_error()) for one in sets), strict=True)
+        torch.cat(column) for column in zip(*((part.size(), part.size_error()) for part in sets), strict=True)
     )
     gap = (size - wanted).abs()
     assert (gap <= 4.5 * error + 0.01 * wanted).all() and error.max() < 0.15 * wanted
@@ -331,9 +331,9 @@ def test_shares_among_draws_by_a_loop():
     density = MultivariateNormal(torch.zeros(1, 2).double(), torch.eye(2).double(), validate_args=False)
     sets = PredictionSet(density, EVERYTHING, "mass")
     value = torch.tensor([[[0.5, 0.5]], [[1.0, 2.0]]]).double()
-    found = sets.scores(value)[:, 0]
-    for one, score in zip(density.log_prob(value)[:, 0].tolist(), found.tolist(), strict=True):
-        fewer = sum(drawn < one for drawn in sets._log_draws[:, 0].tolist())
+    scores = sets.scores(value)[:, 0]
+    for log_prob, score in zip(density.log_prob(value)[:, 0].tolist(), scores.tolist(), strict=True):
+        fewer = sum(sample < log_prob for sample in sets._log_draws[:, 0].tolist())
         low, high = -math.log((fewer + 2) / 1001), -math.log((fewer + 1) / 1001)
         assert low - 1e-9 <= score <= high + 1e-9
 
@@ -353,10 +353,10 @@ def test_everything_empty_batches_and_nothing(kind, score):
         "real": MultivariateNormal(torch.zeros(0, 1), torch.eye(1), validate_args=False),
         "reals": MultivariateNormal(torch.zeros(0, 2), torch.eye(2), validate_args=False),
     }[kind]
-    found = PredictionSet(none, hot(1.0), score)
-    assert found.size().shape == found.empty().shape == found.scores(none.sample()).shape == (0,)
+    sets = PredictionSet(none, hot(1.0), score)
+    assert sets.size().shape == sets.empty().shape == sets.scores(none.sample()).shape == (0,)
     if kind in ("angle", "real"):
-        assert found.intervals() == []
+        assert sets.intervals() == []
 
 
 def test_batches_of_any_shape_and_what_wrappers_make():
@@ -373,17 +373,17 @@ def test_nan_is_in_no_set():
     density = normal([math.nan, 0.0], 1.0)
     for score in ("density", "mass"):
         for threshold in (hot(1.0), EVERYTHING):
-            found = PredictionSet(density, threshold, score)
-            assert found.contains(torch.zeros(2, 1).double()).tolist() == [False, True]
-            assert found.size().isnan().tolist() == [True, False]
-        assert found.scores(torch.zeros(2, 1).double()).isnan().tolist() == [True, False]
+            sets = PredictionSet(density, threshold, score)
+            assert sets.contains(torch.zeros(2, 1).double()).tolist() == [False, True]
+            assert sets.size().isnan().tolist() == [True, False]
+        assert sets.scores(torch.zeros(2, 1).double()).isnan().tolist() == [True, False]
 
 
 def test_what_a_set_has_not_gets_a_sentence():
-    with pytest.raises(UserError, match=r"labels\(\) are of classes"):
+    with pytest.raises(UserError, match=r"labels\(\) exists only for sets of classes"):
         PredictionSet(DENSITIES["angle"], hot(1.0), "density").labels()
     for kind in ("classes", "reals"):
-        with pytest.raises(UserError, match=r"intervals\(\) are of one angle or one real"):
+        with pytest.raises(UserError, match=r"intervals\(\) exists only for sets of one angle or one real"):
             PredictionSet(DENSITIES[kind], hot(1.0), "density").intervals()
 
 
@@ -404,23 +404,23 @@ def test_sets_are_what_contains_says(means, exponents, mass, score):
     threshold = -hot(1 - mass).log()
     if score == "density":
         threshold = -density.log_prob(density.mode)[0] - math.log(mass)
-    found = PredictionSet(density, threshold, score)
-    parts = found.intervals()[0]
-    assert found.size().item() == pytest.approx(sum(high - low for low, high in parts))
+    sets = PredictionSet(density, threshold, score)
+    parts = sets.intervals()[0]
+    assert sets.size().item() == pytest.approx(sum(high - low for low, high in parts))
     for low, high in parts:
         assert -math.pi <= low < math.pi and low < high <= low + TURN + 1e-9
         within = torch.linspace(low, high, 7).double()[1:-1].reshape(-1, 1, 1)
-        assert found.contains(within).all()
+        assert sets.contains(within).all()
     gaps = [
         (high, low) for (_, high), (low, _) in zip(parts, [*parts[1:], (parts[0][0] + TURN, 0)], strict=True)
     ]
-    for high, low in gaps if found.size().item() < TURN - 1e-6 else []:
+    for high, low in gaps if sets.size().item() < TURN - 1e-6 else []:
         assert low > high
         middle = torch.tensor([(low + high) / 2]).double().reshape(1, 1, 1)
-        assert not found.contains(middle).any() or low - high < 1e-9
+        assert not sets.contains(middle).any() or low - high < 1e-9
     if score == "mass":
         torch.manual_seed(6)
-        share = found.contains(density.sample((4000,))).double().mean().item()
+        share = sets.contains(density.sample((4000,))).double().mean().item()
         assert share == pytest.approx(mass, abs=0.04)
 
 
@@ -446,12 +446,12 @@ def test_no_hump_is_lost_among_many_components(closed, humps, count):
         component = Independent(Normal(place, torch.full_like(place, 0.02), validate_args=False), 1)
     density = Mixture(torch.zeros(ITEMS, count, dtype=torch.float64), component)
     level = -math.log(1e-4)
-    found = PredictionSet(density, hot(level), "density")
-    assert [len(parts) for parts in found.intervals()] == [humps] * ITEMS
+    sets = PredictionSet(density, hot(level), "density")
+    assert [len(parts) for parts in sets.intervals()] == [humps] * ITEMS
     grid = torch.linspace(-3.1, 2.2, 5001, dtype=torch.float64)
     inside = density.log_prob(grid.reshape(-1, 1, 1).expand(-1, ITEMS, 1)) >= -level
     wanted = inside.double().mean(0) * (grid[-1] - grid[0])
-    torch.testing.assert_close(found.size(), wanted, rtol=0, atol=1e-2 * humps)
+    torch.testing.assert_close(sets.size(), wanted, rtol=0, atol=1e-2 * humps)
 
 
 @pytest.mark.parametrize("name", ["scvae", "cvae"])

@@ -1,4 +1,4 @@
-"""Split conformal prediction: sets that hold the target with a stated probability for any model."""
+"""Split conformal prediction: for any model, sets that hold the target with a stated probability."""
 
 import logging
 import math
@@ -19,11 +19,11 @@ from framework.uncertainty import Uncertainty
 from plugins.uncertainty.conformal.prediction_set import PredictionSet, Score
 
 SEED = 71
-"""Seed of the split into halves."""
+"""Seed of the random split into halves."""
 NEAR = 0.03
-"""Largest deviation of a coverage from the stated one without a remark.
+"""Largest likely deviation of the coverage from the stated one for which the remark calls the samples enough.
 
-The remark names the number of rows that keep it within this deviation in 90 % of cases.
+Otherwise the remark names the number of samples with which the deviation is at most this in 90 % of cases.
 """
 NINETY = 1.645
 """Number of standard deviations to either side that hold the middle 90 % of a normal density."""
@@ -33,13 +33,14 @@ _log = logging.getLogger(__name__)
 class Conformal(Uncertainty):
     """Unchanged densities, each with a set (`prediction_set.py`) that holds the target with probability 1 - α.
 
-    On data that is exchangeable with the validation set, a new target lies in its set with a probability of at least 1
-    - α, and of at most 1 - α + 1/(n + 1) if no two of the n scores are equal. This is an average over targets and
-    validation sets, for any model, however wrong (Vovk, Gammerman & Shafer 2005, §4.1). It does not hold for each input
-    separately. Use it as the outermost wrapper: a wrapper around it keeps the densities and drops the sets.
+    For data that is exchangeable with the validation split, a new target lies in its set with a probability of at least
+    1 - α, and of at most 1 - α + 1/(n + 1) if no two of the n scores are equal. This is an average over targets and
+    validation splits, for any model, however wrong (Vovk, Gammerman & Shafer 2005, §4.1). It does not hold for each
+    input separately. Use the wrapper as the outermost one: a wrapper around it keeps the densities and drops the sets.
 
-    The wrapped model is calibrated on a random half of the validation set, always the same, and the threshold is fitted
-    to the rest: scores to which a temperature was fitted have no guarantee. Before `calibrate` the set is everything.
+    The wrapped model is calibrated on a random half of the validation split, which is always the same half. The
+    threshold is fitted to the other half, because scores of samples to which a temperature was fitted give no
+    guarantee. Before `calibrate` every set holds all values.
 
     Args:
         miscoverage: α, the share of targets that may lie outside.
@@ -50,32 +51,10 @@ class Conformal(Uncertainty):
         threshold: the largest score in a set, nats, a float64 buffer.
 
     Raises:
-        UserError: fewer than 2 validation samples, or a score that is NaN (its samples are named).
+        UserError: there are fewer than 2 validation samples, or a score is NaN (the message names the samples).
     """
 
-    bibtex = """@book{vovk2005algorithmic,
-  author    = {Vovk, Vladimir and Gammerman, Alexander and Shafer, Glenn},
-  title     = {Algorithmic Learning in a Random World},
-  publisher = {Springer},
-  year      = {2005}
-}
-
-@article{sadinle2019least,
-  author  = {Sadinle, Mauricio and Lei, Jing and Wasserman, Larry},
-  title   = {Least Ambiguous Set-Valued Classifiers with Bounded Error Levels},
-  journal = {Journal of the American Statistical Association},
-  volume  = {114},
-  number  = {525},
-  pages   = {223--234},
-  year    = {2019}
-}
-
-@inproceedings{romano2020classification,
-  author    = {Romano, Yaniv and Sesia, Matteo and Cand{\\`e}s, Emmanuel J.},
-  title     = {Classification with Valid and Adaptive Coverage},
-  booktitle = {Advances in Neural Information Processing Systems},
-  year      = {2020}
-}"""
+    bibtex = "vovk2005algorithmic, sadinle2019least, romano2020classification"
     threshold: Tensor
 
     def __init__(
@@ -99,75 +78,84 @@ class Conformal(Uncertainty):
 
     def calibrate(self, batches: Iterable[Batch]) -> None:
         """Calibrate the wrapped model on one half of the batches, and fit the threshold to the other."""
-        theirs, mine = halves(nonempty_batches(batches, by="conformal"))
-        if not mine:
+        model_half, own_half = split_in_halves(nonempty_batches(batches, by="conformal"))
+        if not own_half:
             raise UserError(
-                "conformal shares the validation split with what it wraps, and got one sample of it; wanted 2 or more. "
-                "Give the data set a larger validation split."
+                "uncertainty conformal shares the validation split with the wrapped model, so that at least 2 samples "
+                "are required, but got one sample. Give the data set a larger validation split."
             )
-        self.model.calibrate(theirs)
+        self.model.calibrate(model_half)
         sets = [
             PredictionSet(density, self.threshold, self.score)
-            for density in predict_densities(self.model, mine)
+            for density in predict_densities(self.model, own_half)
         ]
-        scores = torch.cat([one.scores(batch["target"]) for one, batch in zip(sets, mine, strict=True)])
-        require_numbers(scores, mine, "score")
+        scores = torch.cat(
+            [
+                prediction_set.scores(batch["target"])
+                for prediction_set, batch in zip(sets, own_half, strict=True)
+            ]
+        )
+        require_numbers(scores, own_half, "score")
         self.threshold.fill_(threshold(scores, self.miscoverage))
-        self.remark = remark(len(scores), self.miscoverage)
+        self.remark = coverage_remark(len(scores), self.miscoverage)
         if self.threshold.isinf():
             _log.warning(
-                "conformal: with %d validation samples no set short of everything is certain to miss %g of the targets "
-                "or fewer; %d would do, if no density ruled them out. The sets are everything.",
+                "conformal: with %d validation samples, no smaller set than all values is certain to miss at most a "
+                "share of %g of the targets, so that every set holds all values. %d samples would be enough, if every "
+                "density gives each target a probability above 0.",
                 len(scores),
                 self.miscoverage,
                 math.ceil(1 / self.miscoverage) - 1,
             )
 
 
-def halves(batches: Sequence[Batch]) -> tuple[list[Batch], list[Batch]]:
+def split_in_halves(batches: Sequence[Batch]) -> tuple[list[Batch], list[Batch]]:
     """Return a random half of the samples, rounded up, and the rest, both in order and without empty batches.
 
-    Alternating samples would not do: in many data sets neighbours alternate, or belong together. The split is the same
-    for all sets of one size.
+    Taking every other sample would be biased: in many data sets neighbours alternate between classes, or belong
+    together. The split depends only on the number of samples.
     """
     sizes = [len(batch["target"]) for batch in batches]
     order = torch.randperm(sum(sizes), generator=torch.Generator().manual_seed(SEED))
     chosen = torch.zeros(sum(sizes), dtype=torch.bool)
     chosen[order[: (len(order) + 1) // 2]] = True
-    found: tuple[list[Batch], list[Batch]] = ([], [])
+    parts: tuple[list[Batch], list[Batch]] = ([], [])
     for batch, mask in zip(batches, chosen.split(sizes), strict=True):
-        for part, some in zip(found, (mask, ~mask), strict=True):
+        for part, some in zip(parts, (mask, ~mask), strict=True):
             rows = some.nonzero().flatten().to(batch["target"].device)
             if len(rows):
                 part.append({name: field[rows] for name, field in batch.items()})
-    return found
+    return parts
 
 
-def remark(count: int, miscoverage: float) -> str:
-    """Return how far the coverage of sets from `count` scores may deviate, and how many rows would reduce that.
+def coverage_remark(count: int, miscoverage: float) -> str:
+    """Return a remark: how far the coverage of sets from `count` scores may deviate, and how many scores are enough.
 
     The share that sets from n distinct scores cover is itself random, Beta(k, n + 1 - k) with k as in `threshold` (Vovk
     2012, prop. 2a): on average over validation sets it is k / (n + 1).
     """
     left_out = _left_out(count, miscoverage)
     if not left_out:
-        return f"conformal: the threshold is set by {count} validation rows, too few for any: the sets are everything."
+        return (
+            f"conformal: the threshold is set by {count} validation samples, which are too few: every set holds all "
+            "values."
+        )
     from scipy.special import betaincinv  # importing SciPy takes longer than most commands need it
 
     low, high = betaincinv(count + 1 - left_out, left_out, [0.05, 0.95])
-    told = (
-        f"conformal: the threshold is set by {count} validation rows; of sets that so many make, 90 % hold between "
-        f"{100 * low:.3g} and {100 * high:.3g} % of the targets, where {100 * (1 - miscoverage):g} % are promised on "
-        "average over validation sets"
+    summary = (
+        f"conformal: the threshold is set by {count} validation samples. With so many samples, the sets hold between "
+        f"{100 * low:.3g} and {100 * high:.3g} % of the targets for 90 % of validation splits, and "
+        f"{100 * (1 - miscoverage):g} % on average over validation splits"
     )
     if max(high - (1 - miscoverage), 1 - miscoverage - low) <= NEAR:
-        return f"{told}."
+        return f"{summary}."
     wanted = math.ceil(miscoverage * (1 - miscoverage) * (NINETY / NEAR) ** 2)
-    return f"{told}. These are few: about {wanted:,} keep it within {100 * NEAR:g} %."
+    return f"{summary}. About {wanted:,} samples would keep the deviation within {100 * NEAR:g} %."
 
 
 def _left_out(count: int, miscoverage: float) -> int:
-    """Return the number of scores at or above the threshold, ⌊(n + 1) α⌋."""
+    """Return the number of scores at or above the threshold, ⌊(n + 1) α⌋, for n = `count`."""
     # α is rounded, so that (n + 1) α may fall just below an integer; the factor corrects that
     return min(count, math.floor((count + 1) * miscoverage * (1 + 1e-12)))
 

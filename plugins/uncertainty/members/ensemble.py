@@ -22,28 +22,22 @@ WORTH_TRYING = (1, 2, 3, 5, 10, 20, 50)
 
 
 class Ensemble(Uncertainty, Joining, SeveralModels):
-    """T independently trained models; p(y|x) = (1/T) Σ_t p_t(y|x) (thesis eq. 2.17).
+    """Mixture of the densities of T independently trained models: p(y|x) = (1/T) Σ_t p_t(y|x) (thesis eq. 2.17).
 
-    They differ in initial weights and in the order of batches. If every encoder vectorises (`Encoder.vectorises`),
-    their parameters are stacked and one pass trains and evaluates all; otherwise they are computed one after the other.
-    In both cases each member has its own gradient, which is clipped separately, so that it trains as it would alone. An
-    ensemble of one member equals the wrapped model, to the last bit.
+    The members differ in their initial weights and in the order of their batches. If all encoders can be vectorised
+    (`Encoder.vectorises`), the parameters are stacked, and one pass trains and evaluates all members. Otherwise the
+    members are computed one after the other. In both cases the gradient of each member is clipped separately, so that
+    the member trains as it would alone. An ensemble of one member equals the wrapped model, to the last bit.
 
     Attributes:
-        members: number of the trained members that are used, the first ones; may be lowered after training (a knob).
+        members: number of members that are used, counted from the first; may be lowered after training (a knob).
 
     Raises:
         ConfigError: more members are used than were trained.
-        UserError: a member's parameters of the density are not finite; it is named and not averaged in.
+        UserError: the distribution parameters of a member are not finite; the message names the member.
     """
 
-    bibtex = """@inproceedings{lakshminarayanan2017simple,
-  author    = {Lakshminarayanan, Balaji and Pritzel, Alexander and Blundell, Charles},
-  title     = {Simple and Scalable Predictive Uncertainty Estimation using Deep Ensembles},
-  booktitle = {Advances in Neural Information Processing Systems},
-  pages     = {6402--6413},
-  year      = {2017}
-}"""
+    bibtex = "lakshminarayanan2017simple"
 
     def __init__(self, model: Callable[[], Predictor], *, members: Annotated[int, Field(ge=1)] = 5) -> None:
         super().__init__()
@@ -55,10 +49,10 @@ class Ensemble(Uncertainty, Joining, SeveralModels):
         self.apart = nn.ModuleList()
         self.heads = nn.ModuleList()
         self.together: SideBySide | None = None
-        if members > 1 and all(vectorises(one) for one in built):
+        if members > 1 and all(vectorises(model) for model in built):
             models = cast(list[Model], built)
-            self.together = SideBySide([network(one) for one in models])
-            self.heads.extend(one.head for one in (models if has_state(models[0].head) else models[:1]))
+            self.together = SideBySide([network(model) for model in models])
+            self.heads.extend(model.head for model in (models if has_state(models[0].head) else models[:1]))
         else:
             self.apart.extend(built)
 
@@ -66,24 +60,24 @@ class Ensemble(Uncertainty, Joining, SeveralModels):
         """Return the mixture of the densities of the members in use."""
         if not 1 <= self.members <= self.model_count:
             raise ConfigError(
-                f"members = {self.members} of an ensemble of {self.model_count}: wanted a number from 1 to "
-                f"{self.model_count}."
+                f"uncertainty.ensemble.members is {self.members}, expected a number from 1 to {self.model_count}, the "
+                "number of trained members."
             )
         if self.together is None:
-            found = [self._of(index, inputs) for index in range(self.members)]
-            if len(found) == 1:
-                return found[0]
-            components: Distribution = Stacked(found)
+            densities = [self._of(index, inputs) for index in range(self.members)]
+            if len(densities) == 1:
+                return densities[0]
+            components: Distribution = Stacked(densities)
         else:
             components = self._densities(self.together(inputs, self.members))
         return equal_mixture(components, self, inputs.device)
 
     def loss(self, inputs: Tensor, target: Tensor) -> Float[Tensor, "batch"]:
-        """Return the loss of each sample, nats, such that each member trains as it would alone."""
+        """Return the loss of each sample, nats; its gradient trains each member as the member would train alone."""
         if self.own_batches:
             return own_sample_penalty(self._own_losses(inputs, target), self.model_count)
         if self.together is None:
-            losses = torch.stack([member.loss(inputs, target) for member in self._apart()], 1)
+            losses = torch.stack([member.loss(inputs, target) for member in self._separate_members()], 1)
         else:
             raw = self.together(inputs)
             if len(self.heads) == 1:
@@ -95,10 +89,12 @@ class Ensemble(Uncertainty, Joining, SeveralModels):
         return independent_penalty(losses)
 
     def _own_losses(self, inputs: Tensor, target: Tensor) -> Float[Tensor, "batch"]:
-        """Return each member's losses of its own rows."""
+        """Return the loss of each sample, where each member computes the loss of its own rows."""
         if self.together is None:
-            parts = zip(self._apart(), self._parts(inputs), target.chunk(self.model_count), strict=True)
-            return torch.cat([member.loss(given, wanted) for member, given, wanted in parts])
+            parts = zip(
+                self._separate_members(), self._parts(inputs), target.chunk(self.model_count), strict=True
+            )
+            return torch.cat([member.loss(part, wanted) for member, part, wanted in parts])
         raw = self._own_raw(inputs)
         wanted = target.unflatten(0, (self.model_count, -1))
         if len(self.heads) == 1:
@@ -108,15 +104,15 @@ class Ensemble(Uncertainty, Joining, SeveralModels):
         )
 
     def _parts(self, inputs: Tensor) -> Sequence[Tensor]:
-        """Return each member's own rows: the same tensors as long as `one_pass` keeps results computed from them."""
-        return self.shared_result.get_or_compute(inputs, lambda given: given.chunk(self.model_count))
+        """Return the rows of each member; inside `one_pass`, repeated calls return the same tensors."""
+        return self.shared_result.get_or_compute(inputs, lambda batch: batch.chunk(self.model_count))
 
     def _own_raw(self, inputs: Tensor) -> Float[Tensor, "member batch size"]:
         assert self.together is not None
         return self.together.own(inputs.unflatten(0, (self.model_count, -1)))
 
     def clip_each_model(self, max_norm: float) -> None:
-        """Shorten each member's gradient to the norm `max_norm`."""
+        """Scale the gradient of each member down to the norm `max_norm` if it is longer."""
         for member in self.apart:
             nn.utils.clip_grad_norm_(member.parameters(), max_norm)
         if self.together is not None:
@@ -128,19 +124,22 @@ class Ensemble(Uncertainty, Joining, SeveralModels):
             own = self.own_batches
             return self._densities(self._own_raw(inputs).movedim(0, 1) if own else self.together(inputs))
         parts = self._parts(inputs) if self.own_batches else [inputs] * self.model_count
-        found = [member.training_densities(part) for member, part in zip(self._apart(), parts, strict=True)]
-        return found[0] if len(found) == 1 else Stacked(found)
+        densities = [
+            member.training_densities(part)
+            for member, part in zip(self._separate_members(), parts, strict=True)
+        ]
+        return densities[0] if len(densities) == 1 else Stacked(densities)
 
     @torch.no_grad()
     def calibrate(self, batches: Iterable[Batch]) -> None:
         """Calibrate each member."""
-        seen = list(batches)
+        kept_batches = list(batches)
         if self.together is None:
-            for member in self._apart():
-                member.calibrate(seen)
+            for member in self._separate_members():
+                member.calibrate(kept_batches)
         elif len(self.heads) > 1:
-            raw = torch.cat([self.together(batch["input"]) for batch in seen])
-            target = torch.cat([batch["target"] for batch in seen])
+            raw = torch.cat([self.together(batch["input"]) for batch in kept_batches])
+            target = torch.cat([batch["target"] for batch in kept_batches])
             for index in range(self.model_count):
                 self._head(index).calibrate(raw[:, index], target)
 
@@ -153,7 +152,8 @@ class Ensemble(Uncertainty, Joining, SeveralModels):
         """Copy the state of separately trained members into this ensemble."""
         if len(members) != self.model_count:
             raise ConfigError(
-                f"an ensemble of {self.model_count} was given {len(members)} members; wanted as many."
+                f"Got {len(members)} members for an ensemble of {self.model_count}, but these numbers must be equal. "
+                f"Build the ensemble with members={len(members)}."
             )
         for index, member in enumerate(members):
             if self.together is None:
@@ -166,8 +166,8 @@ class Ensemble(Uncertainty, Joining, SeveralModels):
 
     def _of(self, index: int, inputs: Tensor) -> Distribution:
         try:
-            return self._apart()[index](inputs)
-        except ValueError as error:  # the message of a head that was given NaN names the row
+            return self._separate_members()[index](inputs)
+        except ValueError as error:  # a head's message about NaN names the row
             raise UserError(
                 f"member {index} of {self.model_count} of the ensemble: {error} {REMEDY}"
             ) from error
@@ -177,11 +177,11 @@ class Ensemble(Uncertainty, Joining, SeveralModels):
         bad = (~raw.isfinite()).any(-1).nonzero()
         if len(bad):
             row, index = bad[0].tolist()
-            others = len(bad[:, 1].unique()) - 1
-            more = f" (and {others} other members)" if others else ""
+            other_members = len(bad[:, 1].unique()) - 1
+            more = f" (and {other_members} other members)" if other_members else ""
             raise UserError(
-                f"member {index} of {self.model_count} of the ensemble{more} gives numbers that are not finite, first "
-                f"for row {row} of the batch. {REMEDY}"
+                f"member {index} of {self.model_count} of the ensemble{more} gives distribution parameters that are "
+                f"not finite, first for row {row} of the batch. {REMEDY}"
             )
         if len(self.heads) == 1:
             return self._head(0)(raw)
@@ -190,24 +190,22 @@ class Ensemble(Uncertainty, Joining, SeveralModels):
     def _head(self, index: int) -> DensityHead:
         return cast(DensityHead, self.heads[index])
 
-    def _apart(self) -> list[Predictor]:
+    def _separate_members(self) -> list[Predictor]:
         return cast(list[Predictor], list(self.apart))
 
 
 REMEDY = (
-    "It is not averaged in. Look at the inputs; if they are sound, train the ensemble again with a lower "
-    "optimizer.learning_rate, or join the sound runs of a sweep with mode=combine."
+    "Such a member is never averaged with the others. Check the inputs; if the inputs are valid, train the ensemble "
+    "again with a lower optimizer.learning_rate, or combine only the runs of a sweep that succeeded, with mode=combine."
 )
 
 
 def vectorises(member: Predictor) -> bool:
-    """Return whether members like this one can be computed in one vectorised pass."""
+    """Return whether several members of this architecture can be computed in one vectorised pass."""
     if not isinstance(member, Model) or isinstance(member.head, Fitted):
         return False
-    if not any(
-        True for _ in network(member).parameters()
-    ):  # only the head has parameters: there is nothing to stack
-        return False
+    if not any(True for _ in network(member).parameters()):
+        return False  # only the head has parameters: there is nothing to stack
     return all(encoder.vectorises for encoder in member.encoders)
 
 
@@ -217,5 +215,5 @@ def network(member: Model) -> nn.Sequential:
 
 
 def has_state(head: nn.Module) -> bool:
-    """Return whether the heads of two members can differ."""
+    """Return whether the head has parameters or buffers, so that the heads of two members can differ."""
     return bool(head.state_dict())

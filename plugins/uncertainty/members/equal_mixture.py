@@ -8,10 +8,10 @@ from framework.distributions.density import Mixture
 
 
 def equal_mixture(components: Distribution, model: nn.Module, device: torch.device) -> Mixture:
-    """Return (1/S) Σ_s p_s over the last batch dimension of `components`.
+    """Return the mixture (1/S) Σ_s p_s over the last batch dimension of `components`.
 
-    Weights have the dtype of the model's parameters, as densities have. They are float32 for parameters of half
-    precision, in which S weights would not sum to 1.
+    The weights have the dtype of the model's parameters, or float32 for parameters in half precision, in which S
+    weights would not sum to 1.
     """
     dtypes = (parameter.dtype for parameter in model.parameters())
     dtype = next(dtypes, torch.get_default_dtype())  # trees have no parameters

@@ -1,4 +1,4 @@
-"""Dropout that stays active in evaluation, and the mixture over its masks."""
+"""Monte Carlo dropout: dropout stays active in evaluation, and the density is a mixture over dropout masks."""
 
 import warnings
 from collections.abc import Callable, Iterator
@@ -21,15 +21,19 @@ from plugins.uncertainty.members.equal_mixture import equal_mixture
 
 DROPOUT = (nn.Dropout, nn.Dropout1d, nn.Dropout2d, nn.Dropout3d, nn.AlphaDropout, nn.FeatureAlphaDropout)
 AT_ONCE = 2**24
-"""Largest number of values that enter a dropout layer together (64 MiB in float32); more samples are taken in parts."""
+"""Largest number of values that enter a dropout layer at once (64 MiB in float32).
+
+If the samples need more, they are computed in parts.
+"""
 
 
 class Layout(NamedTuple):
-    """The way in which samples are computed.
+    """How the samples of a model are computed.
 
     Attributes:
-        vectorised: whether `torch.vmap` runs the network, and so everything before the first dropout only once.
-        widest: number of values of one input, or of the input of a dropout layer; the largest that is repeated.
+        vectorised: whether `torch.vmap` runs the network; layers before the first dropout are then computed only once.
+        widest: largest number of values, for one input, in any tensor that is repeated for every sample: the input of a
+            dropout layer or, without vmap, the network's input.
     """
 
     vectorised: bool
@@ -37,31 +41,25 @@ class Layout(NamedTuple):
 
 
 class MCDropout(Uncertainty):
-    """The equally weighted mixture of densities under S dropout masks (thesis eq. 2.16; Gal & Ghahramani 2016).
+    """Mixture, with equal weights, of the densities under S dropout masks (thesis eq. 2.16; Gal & Ghahramani 2016).
 
-    Training, and the validation loss, are those of the wrapped model. In evaluation its dropout layers (`DROPOUT`) stay
-    active, and nothing else: batch norm normalises as in any evaluation. Every input of a batch has its own S masks,
-    drawn from torch's global generator. The wrapped model calibrates its own density without dropout.
+    Training and the validation loss are those of the wrapped model. In evaluation only its dropout layers (`DROPOUT`)
+    stay in training mode; batch norm normalises as in any evaluation. Every input of a batch has its own S masks,
+    sampled from torch's global generator. The wrapped model is calibrated without dropout.
 
     Layers before the first dropout are computed once and not S times, if the network can be vectorised.
 
     Args:
-        model: the wrapped model; needs a dropout layer of probability above 0.
-        samples: S, also a knob; 1 is one stochastic pass.
+        model: function that builds the wrapped model, which needs a dropout layer with a probability above 0.
+        samples: S, a knob; with 1 the density is that of one stochastic pass.
 
     Raises:
-        ConfigError: there is no such dropout layer, or `samples` was set below 1.
-        UserError: the network's output is not finite under some mask; the mask is named and not averaged in.
+        ConfigError: the model has no such dropout layer, or `samples` was set below 1.
+        UserError: the network's output is not finite under some mask; the message names the mask and the input.
     """
 
     knobs = {"samples": (1, 3, 10, 30, 100)}  # noqa: RUF012 - never written
-    bibtex = """@inproceedings{gal2016dropout,
-  author    = {Gal, Yarin and Ghahramani, Zoubin},
-  title     = {Dropout as a {Bayesian} Approximation: Representing Model Uncertainty in Deep Learning},
-  booktitle = {International Conference on Machine Learning},
-  pages     = {1050--1059},
-  year      = {2016}
-}"""
+    bibtex = "gal2016dropout"
 
     def __init__(
         self, model: Callable[[], Predictor], *, samples: Annotated[int, Field(ge=1, le=MOST_DRAWS)] = 50
@@ -72,8 +70,8 @@ class MCDropout(Uncertainty):
         self.layout: Layout | None = None  # determined at the first prediction
         if not any(layer.p > 0 for layer in _dropouts(self.model)):
             raise ConfigError(
-                "uncertainty mc_dropout: the model has no dropout layer of probability above 0, so that every sample "
-                "would be the same. Give the encoder dropout, e.g. encoder.mlp.dropout=0.2."
+                "uncertainty mc_dropout needs a dropout layer with a probability above 0, but the model has none, so "
+                "that every sample would be the same. Give the encoder dropout, e.g. encoder.mlp.dropout=0.2."
             )
 
     def forward(self, inputs: Tensor) -> Distribution:
@@ -81,17 +79,17 @@ class MCDropout(Uncertainty):
         if self.training:
             return self.model(inputs)
         if self.samples < 1:
-            raise ConfigError(f"uncertainty mc_dropout: samples = {self.samples}; wanted 1 or more.")
+            raise ConfigError(f"uncertainty.mc_dropout.samples is {self.samples}, expected 1 or more.")
         with set_flag(self.model, DROPOUT, "training", True):
             components = self._components(inputs)
         return equal_mixture(components, self.model, inputs.device)
 
     def _components(self, inputs: Tensor) -> Distribution:
-        """Return the densities under S masks each, batch_shape (batch, S)."""
+        """Return the densities of every input under its S masks, batch_shape (batch, S)."""
         whole = (len(inputs), self.samples)
         if self.samples == 1 or len(inputs) == 0:
-            one = self.model(inputs)
-            return Reshaped(one, whole) if self.samples == 1 else Stacked([one] * self.samples)
+            density = self.model(inputs)
+            return Reshaped(density, whole) if self.samples == 1 else Stacked([density] * self.samples)
         if isinstance(self.model, Model):
             return self.model.head(require_finite(self._raws(self.model, inputs)))
         if inputs.numel() * self.samples <= AT_ONCE:
@@ -99,7 +97,7 @@ class MCDropout(Uncertainty):
         return Stacked([self.model(inputs) for _ in range(self.samples)])
 
     def _raws(self, model: Model, inputs: Tensor) -> Float[Tensor, "batch sample size"]:
-        """Return the raw parameters that the head reads under each mask."""
+        """Return the head's raw parameters under each mask."""
         self.layout = self.layout or layout_of(model, inputs)
         at_once = max(1, AT_ONCE // (len(inputs) * self.layout.widest))
         counts = [min(at_once, self.samples - start) for start in range(0, self.samples, at_once)]
@@ -117,8 +115,8 @@ def require_finite(raw: Float[Tensor, "batch sample size"]) -> Float[Tensor, "ba
     if len(bad):
         row, sample = bad[0].tolist()
         raise UserError(
-            f"uncertainty mc_dropout: the network gives numbers that are not finite under {len(bad)} dropout masks, "
-            f"first sample {sample} of row {row} of the batch. Look at this input, or train with a lower "
+            f"uncertainty mc_dropout: the output of the network is not finite under {len(bad)} dropout masks, the "
+            f"first of them is sample {sample} of row {row} of the batch. Check this input, or train with a lower "
             "optimizer.learning_rate."
         )
     return raw
@@ -129,21 +127,21 @@ def _dropouts(model: nn.Module) -> Iterator[Any]:
 
 
 def _vectorised(model: Model, inputs: Tensor, count: int) -> Float[Tensor, "batch sample size"]:
-    """Return `count` passes in one: torch.vmap repeats nothing until a dropout layer makes the samples differ."""
+    """Return the raw parameters of `count` passes; torch.vmap computes layers before the first dropout once."""
     sampled = torch.vmap(lambda _: model.raw(inputs), randomness="different", out_dims=1)
     return sampled(torch.empty(count, device=inputs.device))
 
 
 def _repeated(model: Model, inputs: Tensor, count: int) -> Float[Tensor, "batch sample size"]:
-    """Return `count` passes, computed in one pass over `count` copies of every input."""
+    """Return the raw parameters of `count` passes, computed in one pass over `count` copies of every input."""
     return model.raw(inputs.repeat_interleave(count, 0)).unflatten(0, (len(inputs), count))
 
 
 def layout_of(model: Model, inputs: Tensor) -> Layout:
-    """Return how to compute samples of a model with active dropout layers; it tries two samples on one input.
+    """Return how to compute samples of a model with active dropout layers; it is tried on two samples of one input.
 
-    A network with operations that torch.vmap cannot run, or runs slowly with a warning, is run on copies of the inputs.
-    The state of the global generators is kept.
+    If torch.vmap cannot run the network, or warns that it is slow, the network is run on copies of the inputs. The
+    global random generators keep their state.
     """
     devices = [inputs.device] if inputs.device.type == "cuda" else []
     with torch.random.fork_rng(devices), torch.no_grad(), warnings.catch_warnings(), _widths(model) as widths:
@@ -159,10 +157,10 @@ def layout_of(model: Model, inputs: Tensor) -> Layout:
 
 @contextmanager
 def _widths(model: Model) -> Iterator[list[int]]:
-    """Yield a list that records how many values enter each dropout layer in a pass."""
+    """Yield a list to which each dropout layer adds the number of values that enter it in a pass."""
     widths: list[int] = [0]
     hooks = [
-        layer.register_forward_pre_hook(lambda _, given: widths.append(given[0].numel()))
+        layer.register_forward_pre_hook(lambda _, arguments: widths.append(arguments[0].numel()))
         for layer in _dropouts(model)
     ]
     try:

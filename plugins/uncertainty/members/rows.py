@@ -1,7 +1,7 @@
-"""Rows of the contract: ensembles and Monte Carlo dropout, for each kind of target.
+"""Contract-test cases: ensembles and Monte Carlo dropout, for each kind of target.
 
-No row of dropout has an identity: with one sample the density is that of one stochastic pass (test_mc_dropout.py), not
-the model's.
+No case of dropout has an identity, a setting with which the wrapper equals the model: with one sample the density is
+that of one stochastic pass (test_mc_dropout.py).
 """
 
 from framework.target import Target

@@ -1,4 +1,4 @@
-"""Networks of one architecture with stacked parameters, all computed in one pass."""
+"""Several networks of one architecture with stacked parameters, computed in one pass."""
 
 import copy
 from collections.abc import Mapping, Sequence
@@ -11,12 +11,12 @@ from torch.func import functional_call, vmap
 
 
 class SideBySide(nn.Module):
-    """T networks as one: the first dimension of each parameter is the members, and each layer is one batched product.
+    """T networks computed as one, by batched matrix products; the first dimension of each parameter is the member.
 
     An optimiser that works element by element (SGD, Adam and similar ones) updates every member as it would alone.
 
     Args:
-        networks: of one architecture, without buffers; their parameters are copied.
+        networks: networks of one architecture, without buffers; their parameters are copied.
     """
 
     _template: ClassVar[nn.Module]
@@ -32,11 +32,11 @@ class SideBySide(nn.Module):
         self.__dict__["_template"] = copy.deepcopy(networks[0])
 
     def forward(self, inputs: Tensor, used: int | None = None) -> Float[Tensor, "batch member size"]:
-        """Return the output of each of the first `used` members (all by default); each has its own dropout masks."""
+        """Return the outputs of the first `used` members (default: all); each member has its own dropout masks."""
         return self._computed(inputs, used, None).movedim(0, 1)
 
     def own(self, inputs: Float[Tensor, "member batch *input"]) -> Float[Tensor, "member batch size"]:
-        """Return the output of each member for its own inputs."""
+        """Return the outputs of each member for its own inputs."""
         return self._computed(inputs, None, 0)
 
     def _computed(
@@ -50,28 +50,31 @@ class SideBySide(nn.Module):
         if used is not None and used < self.count:
             parameters = {name: parameter[:used] for name, parameter in parameters.items()}
 
-        def one(mine: dict[str, Tensor], given: Tensor) -> Tensor:
-            return functional_call(template, mine, (given,))
+        def compute_member(parameters: dict[str, Tensor], inputs: Tensor) -> Tensor:
+            return functional_call(template, parameters, (inputs,))
 
-        return vmap(one, in_dims=(0, members), randomness="different")(parameters, inputs)
+        return vmap(compute_member, in_dims=(0, members), randomness="different")(parameters, inputs)
 
     def clip_each(self, most: float, beside: Sequence[nn.Module]) -> None:
-        """Shorten each member's gradient to the norm `most`, as torch's clip_grad_norm_ does for one network.
+        """Scale each member's gradient down to the norm `most` if it is longer, like torch's clip_grad_norm_.
 
         Args:
             most: largest norm of a member's gradient.
-            beside: further modules of each member.
+            beside: one further module for each member, whose gradient belongs to the member's.
         """
-        gradients = [one.grad for one in self.parameters() if one.grad is not None]
-        others = [[one.grad for one in module.parameters() if one.grad is not None] for module in beside]
-        norms = [torch.linalg.vector_norm(one.reshape(self.count, -1), dim=1) for one in gradients]
-        norms += [torch.stack([one.norm() for one in some]) for some in zip(*others, strict=True)]
+        gradients = [gradient.grad for gradient in self.parameters() if gradient.grad is not None]
+        further = [
+            [gradient.grad for gradient in module.parameters() if gradient.grad is not None]
+            for module in beside
+        ]
+        norms = [torch.linalg.vector_norm(gradient.reshape(self.count, -1), dim=1) for gradient in gradients]
+        norms += [torch.stack([gradient.norm() for gradient in some]) for some in zip(*further, strict=True)]
         factor = (most / (torch.linalg.vector_norm(torch.stack(norms), dim=0) + 1e-6)).clamp(max=1)
-        for one in gradients:
-            one.mul_(factor.view(-1, *[1] * (one.dim() - 1)))
-        for index, some in enumerate(others):
-            for one in some:
-                one.mul_(factor[index])
+        for gradient in gradients:
+            gradient.mul_(factor.view(-1, *[1] * (gradient.dim() - 1)))
+        for index, some in enumerate(further):
+            for gradient in some:
+                gradient.mul_(factor[index])
 
     @torch.no_grad()
     def write(self, index: int, parameters: Mapping[str, Tensor]) -> None:

@@ -39,14 +39,14 @@ def ensemble(members=3, seed=0, **kind):
 
 def members_of(wrapper, **kind):
     """Return each member as a model of its own."""
-    found = []
+    members = []
     for index in range(wrapper.model_count):
         model = factory(**kind)()
         network(model).load_state_dict(wrapper.together.read(index))
         head = wrapper.heads[min(index, len(wrapper.heads) - 1)]
         model.head.load_state_dict(head.state_dict())
-        found.append(model.train(wrapper.training))
-    return found
+        members.append(model.train(wrapper.training))
+    return members
 
 
 def data(target=CLASSES, count=64):
@@ -139,30 +139,32 @@ def test_each_member_reads_its_own_batches_and_clips_its_own_gradient(kind, clip
     rows = [torch.randperm(64, generator=torch.Generator().manual_seed(seed))[:16] for seed in range(3)]
     torch.manual_seed(0)
     with own_batches(whole):
-        found = whole.loss(inputs[torch.cat(rows)], target[torch.cat(rows)])
-    found.mean().backward()
+        joint_losses = whole.loss(inputs[torch.cat(rows)], target[torch.cat(rows)])
+    joint_losses.mean().backward()
     losses = []
     torch.manual_seed(0)
     for model, some in zip(alone, rows, strict=True):
         losses.append(model.loss(inputs[some], target[some]))
         losses[-1].mean().backward()
-    torch.testing.assert_close(found, torch.cat(losses), rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(joint_losses, torch.cat(losses), rtol=1e-12, atol=1e-12)
     if clip is not None:
         whole.clip_each_model(clip)
         for model in alone:
             nn.utils.clip_grad_norm_(model.parameters(), clip)
     for index, model in enumerate(alone):
         if whole.together is None:
-            found_gradients = [one.grad for one in whole.apart[index].parameters()]
+            gradients = [parameter.grad for parameter in whole.apart[index].parameters()]
         else:
-            found_gradients = [one.grad[index] for one in whole.together.parameters()]
-            found_gradients += (
-                [one.grad for one in whole.heads[index].parameters()] if len(whole.heads) > 1 else []
+            gradients = [parameter.grad[index] for parameter in whole.together.parameters()]
+            gradients += (
+                [parameter.grad for parameter in whole.heads[index].parameters()]
+                if len(whole.heads) > 1
+                else []
             )
-        wanted = [one.grad for one in model.parameters()]
-        for mine, theirs in zip(found_gradients, wanted, strict=True):
+        wanted = [parameter.grad for parameter in model.parameters()]
+        for mine, theirs in zip(gradients, wanted, strict=True):
             torch.testing.assert_close(mine, theirs, rtol=1e-9, atol=1e-12)
-    assert not any(one.own_batches for one in whole.modules() if isinstance(one, Ensemble))
+    assert not any(wrapper.own_batches for wrapper in whole.modules() if isinstance(wrapper, Ensemble))
 
 
 def test_members_start_as_models_built_one_after_the_other():
@@ -189,9 +191,9 @@ def test_the_density_is_the_mean_of_the_members_densities(kind):
     whole = ensemble(3, **kind).eval()
     whole.calibrate([{"input": inputs, "target": target}])
     with torch.no_grad():
-        found = whole(inputs).log_prob(target).exp()
+        probability = whole(inputs).log_prob(target).exp()
         parts = [model(inputs).log_prob(target).exp() for model in members_of(whole, **kind)]
-        torch.testing.assert_close(found, torch.stack(parts).mean(0), rtol=1e-5, atol=1e-7)
+        torch.testing.assert_close(probability, torch.stack(parts).mean(0), rtol=1e-5, atol=1e-7)
         whole.members = 2
         torch.testing.assert_close(
             whole(inputs).log_prob(target).exp(), torch.stack(parts[:2]).mean(0), rtol=1e-5, atol=1e-7
@@ -216,7 +218,7 @@ def test_the_loss_is_the_mean_and_its_gradient_each_members_own():
     whole = ensemble(3)
     alone = members_of(whole)
     loss = whole.loss(inputs, target)
-    torch.testing.assert_close(loss, torch.stack([one.loss(inputs, target) for one in alone]).mean(0))
+    torch.testing.assert_close(loss, torch.stack([member.loss(inputs, target) for member in alone]).mean(0))
     loss.mean().backward()
     for index, model in enumerate(alone):
         model.loss(inputs, target).mean().backward()
@@ -229,8 +231,8 @@ def test_each_member_drops_other_outputs():
     encoder = {"name": "mlp", "widths": [64], "dropout": 0.5}
     torch.manual_seed(0)
     whole = SideBySide([network(factory(encoder=encoder)())] * 4).train()  # four times one network
-    found = whole(torch.ones(2, 4))
-    assert len({tuple(one) for one in found.detach().flatten(0, 1).tolist()}) == 8
+    outputs = whole(torch.ones(2, 4))
+    assert len({tuple(row) for row in outputs.detach().flatten(0, 1).tolist()}) == 8
     whole.eval()
     same = whole(torch.ones(2, 4)).detach()
     assert torch.equal(same[:, :1].expand_as(same), same)
@@ -288,10 +290,10 @@ def test_heads_that_learn_all_there_is_are_mixed_too():
     wrapper = Ensemble(lambda: Model([], Reading(), (4,)), members=3)
     assert wrapper.together is None
     train(wrapper, torch.optim.SGD(wrapper.parameters(), 0.1), inputs, target)
-    found = wrapper.eval()(inputs)
+    density = wrapper.eval()(inputs)
     alone = torch.stack([member(inputs).probs for member in wrapper.apart])
     assert (alone.std(0) > 1e-3).any()
-    torch.testing.assert_close(found.log_prob(target).exp(), alone.mean(0).gather(1, target[:, None])[:, 0])
+    torch.testing.assert_close(density.log_prob(target).exp(), alone.mean(0).gather(1, target[:, None])[:, 0])
 
 
 @pytest.mark.parametrize("batch_norm", [False, True], ids=["together", "apart"])
@@ -328,7 +330,7 @@ def test_joins_models_that_were_trained_apart(batch_norm, head):
     with torch.no_grad():
         parts = torch.stack([model(inputs).log_prob(labels).exp() for model in models])
         torch.testing.assert_close(whole(inputs).log_prob(labels).exp(), parts.mean(0))
-    with pytest.raises(ConfigError, match="2 members"):
+    with pytest.raises(ConfigError, match="Got 2 members"):
         whole.join(models[:2])
 
 
@@ -359,5 +361,5 @@ def test_equal_weights_sum_to_one_in_any_precision(dtype, members):
     components = Categorical(logits=torch.zeros(2, members, 3), validate_args=False)
     mixed = equal_mixture(components, nn.Linear(1, 1).to(dtype), torch.device("cpu"))
     assert mixed.log_weights.dtype == (torch.float64 if dtype == torch.float64 else torch.float32)
-    found = mixed.log_prob(torch.zeros(2, dtype=torch.int64))
-    torch.testing.assert_close(found.float(), torch.full((2,), -1.0986123), rtol=0, atol=1e-6)
+    log_prob = mixed.log_prob(torch.zeros(2, dtype=torch.int64))
+    torch.testing.assert_close(log_prob.float(), torch.full((2,), -1.0986123), rtol=0, atol=1e-6)

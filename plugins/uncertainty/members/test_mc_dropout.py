@@ -104,14 +104,14 @@ def test_one_sample_is_one_stochastic_pass_to_the_last_bit(head, is_model):
     with torch.no_grad():
         torch.manual_seed(5)
         density = wrapped(inner, 1)(inputs)
-        found = density.log_prob(target), density.sample((3,))
+        results = density.log_prob(target), density.sample((3,))
         for layer in inner.modules():
             layer.train(isinstance(layer, nn.Dropout))
         torch.manual_seed(5)
         alone = inner(inputs)
         wanted = alone.log_prob(target), alone.sample((3,))
-    assert torch.equal(found[0], wanted[0])
-    assert torch.equal(found[1], wanted[1])
+    assert torch.equal(results[0], wanted[0])
+    assert torch.equal(results[1], wanted[1])
 
 
 @pytest.mark.parametrize("kind", ["vectorised", "repeated", "repeated predictor", "one by one"])
@@ -130,7 +130,7 @@ def test_many_samples_are_the_mean_over_every_mask(kind, monkeypatch):
         wanted += weight * special.softmax(logits, -1)
     samples = 4000
     if kind == "repeated":
-        monkeypatch.setattr(module, "layout_of", lambda *given: module.Layout(False, 4))
+        monkeypatch.setattr(module, "layout_of", lambda *arguments: module.Layout(False, 4))
     if kind == "one by one":
         monkeypatch.setattr(module, "AT_ONCE", 100)
     mcd = wrapped(inner if "ed" in kind and kind != "repeated predictor" else Plain(inner), samples)
@@ -139,11 +139,13 @@ def test_many_samples_are_the_mean_over_every_mask(kind, monkeypatch):
         density = mcd(inputs)
         expected = {"repeated predictor": Reshaped, "one by one": Stacked}.get(kind)
         assert expected is None or isinstance(density.components, expected)
-        each = density.components.log_prob(torch.arange(3)[:, None, None]).exp().double()  # (3, 5, S)
-        found = density.log_prob(torch.arange(3)[:, None]).exp()
-    error = each.std(-1).T.numpy() / samples**0.5
-    assert (np.abs(found.T.numpy() - wanted) < 5 * error + 1e-6).all()
-    torch.testing.assert_close(found.double(), each.mean(-1), rtol=1e-5, atol=1e-6)  # equal weights
+        probabilities = (
+            density.components.log_prob(torch.arange(3)[:, None, None]).exp().double()
+        )  # (3, 5, S)
+        mixed = density.log_prob(torch.arange(3)[:, None]).exp()
+    error = probabilities.std(-1).T.numpy() / samples**0.5
+    assert (np.abs(mixed.T.numpy() - wanted) < 5 * error + 1e-6).all()
+    torch.testing.assert_close(mixed.double(), probabilities.mean(-1), rtol=1e-5, atol=1e-6)  # equal weights
 
 
 def test_every_sample_of_every_input_has_its_own_mask():
@@ -219,14 +221,14 @@ def test_whole_channels_are_dropped_where_the_network_does(layer):
 
     inner = model("gaussian")
     inner = Model([Channels()], inner.head)
-    seen = []
-    inner.encoders[0].register_forward_hook(lambda _, given, found: seen.append(found))
+    outputs = []
+    inner.encoders[0].register_forward_hook(lambda _, arguments, output: outputs.append(output))
     with torch.no_grad(), torch.random.fork_rng():
         wrapped(inner, 3)(torch.ones(5, 32))
         features = torch.vmap(lambda _: inner.encoders[0](torch.ones(5, 32)), randomness="different")
         inner.encoders[0].layer.train()
         numbers = features(torch.empty(40)).unflatten(-1, (8, 4))
-    assert seen
+    assert outputs
     assert ((numbers == 0).all(-1) | (numbers == 2).all(-1)).all()
     assert 0.3 < (numbers == 0).double().mean() < 0.7
 
@@ -254,15 +256,15 @@ def test_training_is_that_of_the_model():
     mcd = wrapped(inner).train()
     inputs, target = torch.randn(6, 4), torch.randn(6, 1)
     for ask in (
-        lambda one: one.loss(inputs, target),
-        lambda one: one.training_densities(inputs).log_prob(target),
-        lambda one: one(inputs).log_prob(target),
+        lambda predictor: predictor.loss(inputs, target),
+        lambda predictor: predictor.training_densities(inputs).log_prob(target),
+        lambda predictor: predictor(inputs).log_prob(target),
     ):
-        found = []
-        for one in (mcd, inner):
+        results = []
+        for predictor in (mcd, inner):
             torch.manual_seed(1)
-            found.append(ask(one))
-        assert torch.equal(*found)
+            results.append(ask(predictor))
+        assert torch.equal(*results)
     mcd.eval()
     assert torch.equal(mcd.loss(inputs, target), inner.eval().loss(inputs, target))
 
@@ -287,7 +289,9 @@ def test_the_model_calibrates_without_dropout():
 def test_what_comes_before_the_first_dropout_is_computed_once():
     inner = vgg()
     passes = []
-    inner.encoders[0].convolutions.register_forward_hook(lambda _, given, found: passes.append(len(given[0])))
+    inner.encoders[0].convolutions.register_forward_hook(
+        lambda _, arguments, output: passes.append(len(arguments[0]))
+    )
     mcd = wrapped(inner, 30)
     images = torch.rand(4, 1, 32, 32)
     mcd(images)
@@ -320,11 +324,11 @@ def test_finding_out_how_leaves_the_noise_alone():
     assert layout_of(inner, torch.randn(2, 4, generator=torch.Generator())).widest == 16
     assert torch.equal(torch.rand(1), wanted)
     mcd, inputs = wrapped(inner), torch.randn(3, 4)
-    found = []
+    results = []
     for _ in range(2):  # the first call tries, the second does not
         torch.manual_seed(4)
-        found.append(mcd(inputs).log_prob(torch.zeros(3, dtype=torch.int64)))
-    assert torch.equal(*found)
+        results.append(mcd(inputs).log_prob(torch.zeros(3, dtype=torch.int64)))
+    assert torch.equal(*results)
 
 
 def test_memory_is_bounded(monkeypatch):
@@ -332,7 +336,7 @@ def test_memory_is_bounded(monkeypatch):
     inner = model(encoders=({"name": "mlp", "widths": [64], "dropout": 0.3},))
     inner.eval().encoders[0].layers[2].train()
     rows = []
-    inner.projection.register_forward_hook(lambda *given: rows.append(given[1][0].shape))
+    inner.projection.register_forward_hook(lambda *arguments: rows.append(arguments[1][0].shape))
     density = wrapped(inner, 7)(torch.randn(4, 4))
     assert density.components.batch_shape == (4, 7)
     assert len(rows) == 1 + 3  # the trial, then 3 + 3 + 1 samples
@@ -353,8 +357,8 @@ def test_sampling_follows_the_mixture():
     torch.manual_seed(0)
     with torch.no_grad():
         density = mcd(torch.randn(2, 4))
-        drawn = density.sample((4000,))
-        heights = density.log_prob(drawn).exp()
+        samples = density.sample((4000,))
+        heights = density.log_prob(samples).exp()
     grid = torch.linspace(-torch.pi, torch.pi, 2001)[:-1]
     mass = density.log_prob(grid.reshape(-1, 1, 1).expand(-1, 2, 1)).exp().detach()
     # E p(φ) under p against ∫ p², row by row
@@ -370,7 +374,7 @@ def test_the_knob_may_be_turned_after_training():
         mcd.samples = samples
         assert mcd(torch.randn(2, 4)).components.batch_shape == (2, samples)
     mcd.samples = 0
-    with pytest.raises(ConfigError, match="samples = 0; wanted 1 or more"):
+    with pytest.raises(ConfigError, match="samples is 0, expected 1 or more"):
         mcd(torch.randn(2, 4))
 
 
@@ -406,7 +410,9 @@ def test_numbers_that_are_not_finite_are_named_and_not_averaged_in(bad):
     mcd = wrapped(model(), 4)
     inputs = torch.randn(3, 4)
     inputs[1, 2] = bad
-    with pytest.raises(UserError, match="not finite under 4 dropout masks, first sample 0 of row 1"):
+    with pytest.raises(
+        UserError, match="not finite under 4 dropout masks, the first of them is sample 0 of row 1"
+    ):
         mcd(inputs)
 
 

@@ -1,4 +1,4 @@
-"""Rows of the contract: a model that is not refined at all, and one whose spectra are fitted."""
+"""Contract-test cases: a model without steps of the fit, which is not changed, and one with ten steps."""
 
 from framework.spectra.spectrum import PRESETS
 from framework.target import Target
@@ -6,7 +6,7 @@ from framework.testing.rows import WrapperRow
 
 TEN = Target("real", PRESETS["ten"].target)
 OFFSETS = [-1.0, -0.4, 0.0, 0.4, 1.0, 2.0]
-BY_DRAWS = "of ten numbers; the rows of density_head lorentzian integrate them by draws"
+BY_DRAWS = "the density is over ten numbers; the cases of density_head lorentzian integrate it by samples"
 TEN_NUMBERS = {"integral": BY_DRAWS, "samples follow log_prob": BY_DRAWS}
 ROWS = {
     "refined": (

@@ -29,16 +29,17 @@ def test_a_fit_begins_where_the_model_says():
     refined = Refined(lambda: wrapped, steps=3).eval()
     spectra = spectrum(torch.tensor([TEN.start, TEN.second_start], dtype=torch.float64), PLACES).float()
     with torch.no_grad():
-        found = refined(spectra)
+        density = refined(spectra)
         start = median(wrapped.eval()(spectra), 100)
     wanted = fit(spectra, PLACES, TEN, start=start, most=3)
-    torch.testing.assert_close(found.mean, wanted.parameters[:, :10].to(found.mean), rtol=0, atol=0)
+    torch.testing.assert_close(density.mean, wanted.parameters[:, :10].to(density.mean), rtol=0, atol=0)
 
 
 @pytest.mark.parametrize(("names", "length"), [(TEN.target, 5), (("x", "y"), len(OFFSETS))])
 def test_data_of_other_numbers_are_refused(names: tuple[str, ...], length: int):
     refined = Refined(lambda: model(Target("real", names), length))
     with pytest.raises(
-        ConfigError, match=rf"fits {len(OFFSETS)} offsets by 10 or 15 numbers.*of {length} and"
+        ConfigError,
+        match=rf"fits 10 or 15 parameters to spectra of {len(OFFSETS)} offsets.*have {length} numbers",
     ):
         refined(torch.rand(2, length))

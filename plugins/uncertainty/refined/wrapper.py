@@ -17,32 +17,26 @@ from framework.spectra.spectrum import PRESETS
 from framework.uncertainty import Uncertainty
 
 DRAWS = 100
-"""Number of samples from which a density without a known median is summarised."""
+"""Number of samples from which the median is computed if a density does not provide it."""
 
 
 class Refined(Uncertainty):
-    """Fits Lorentzian lines to each spectrum, starting from the wrapped model's prediction (the neural start).
+    """Least-squares fit of Lorentzian lines to each spectrum, starting from the wrapped model's prediction.
 
-    The density is that of the fit (`framework.spectra.fit`); the density of the wrapped model only gives the start. It
-    is a wrapper, since one experiment needs both a network and a fit: it is trained, stored and compared as any model,
-    and wraps any model, also an ensemble. With `steps=0` it equals the wrapped model.
+    The density is that of the fit (`framework.spectra.fit`); the density of the wrapped model only gives the starting
+    point. The fit is a wrapper, so that network and fit are one experiment: together they are trained, stored and
+    compared like any model. Any model can be wrapped, also an ensemble. With `steps=0` the wrapper equals the wrapped
+    model.
 
     Attributes:
         steps: largest number of steps of a fit (a knob).
 
     Args:
-        steps: as the attribute.
+        steps: initial value of the attribute.
         offsets: frequency offsets of the data, ppm.
     """
 
-    bibtex = """@article{levenberg1944method,
-  author  = {Levenberg, Kenneth},
-  title   = {A method for the solution of certain non-linear problems in least squares},
-  journal = {Quarterly of Applied Mathematics},
-  volume  = {2},
-  pages   = {164--168},
-  year    = {1944}
-}"""
+    bibtex = "levenberg1944method"
     offsets: Tensor
 
     def __init__(
@@ -63,14 +57,17 @@ class Refined(Uncertainty):
         start = self.model(inputs)
         if self.steps == 0:
             return start
-        wanted = next((one for one in PRESETS.values() if (one.target_count,) == start.event_shape), None)
-        if wanted is None or inputs.shape[1:].numel() != len(self.offsets):
+        preset = next(
+            (preset_ for preset_ in PRESETS.values() if (preset_.target_count,) == start.event_shape), None
+        )
+        if preset is None or inputs.shape[1:].numel() != len(self.offsets):
             raise ConfigError(
-                f"uncertainty refined fits {len(self.offsets)} offsets by 10 or 15 numbers, but the data have inputs "
-                f"of {inputs.shape[1:].numel()} and targets of {start.event_shape.numel()}. Choose data=cest."
+                f"uncertainty refined fits 10 or 15 parameters to spectra of {len(self.offsets)} offsets, but the "
+                f"inputs have {inputs.shape[1:].numel()} numbers and the targets {start.event_shape.numel()}. Choose "
+                "data=cest."
             )
         point = median(start, DRAWS)
         spectra = inputs.flatten(1)
-        found = fit(spectra, self.offsets, wanted, start=point, most=self.steps)
+        fitted = fit(spectra, self.offsets, preset, start=point, most=self.steps)
         zero = (spectra * 0).sum(-1, keepdim=True).to(point.dtype)
-        return density(found, wanted.target_count, start.batch_shape, zero)
+        return density(fitted, preset.target_count, start.batch_shape, zero)

@@ -1,4 +1,4 @@
-"""Maximum likelihood of parameters in a box, by SciPy's L-BFGS-B (Byrd, Lu, Nocedal & Zhu 1995)."""
+"""Maximum-likelihood estimation of parameters within bounds, by SciPy's L-BFGS-B (Byrd et al. 1995)."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -10,21 +10,21 @@ from scipy import optimize
 from torch import Tensor
 
 Term = Callable[[Tensor], Tensor]
-"""Part of the mean negative log-likelihood: parameters (n,), float64 → a scalar, differentiable."""
+"""Part of the mean negative log-likelihood, as a differentiable function of the parameters (n,), float64."""
 
 
 RESTARTS = 20
 NEAREST = 1e-9
-"""Smallest step, in units of the gradient, towards a region without finite values."""
+"""Smallest step towards a region without finite values, as a factor on the gradient."""
 
 
 class Minimum(NamedTuple):
     """Result of `minimise`.
 
     Attributes:
-        point: the minimum, within the box, float64.
-        value: value there, never above the value at the start.
-        active: -1 at a lower bound, 1 at an upper bound, beyond which the sum still falls; else 0.
+        point: position of the minimum within the bounds, float64.
+        value: value at the minimum, never above the value at the start.
+        active: for each parameter -1 at a lower bound or 1 at an upper bound beyond which the sum still falls, else 0.
     """
 
     point: Float[Tensor, "n"]
@@ -40,18 +40,18 @@ def minimise(
     *,
     rounding: float = 2e-16,
 ) -> Minimum:
-    """Return a local minimum of Σ terms in the box lower ≤ point ≤ upper; one term's graph is held at a time.
+    """Return a local minimum of Σ terms within lower ≤ point ≤ upper; one term's graph is in memory at a time.
 
     Args:
         terms: the terms of the sum.
-        start: first point, within the box.
+        start: first point, within the bounds.
         lower: lower bounds.
         upper: upper bounds.
         rounding: rounding error of the values, relative to 1 + |value|; smaller gains end the search.
     """
     low, high = lower.cpu().numpy(), upper.cpu().numpy()
     first, _ = value_and_slope(terms, start)
-    # a point where the sum is not finite is a failed step: its value is the worst and its gradient 0
+    # a point where the sum is not finite gets a value above the first one and the gradient 0, so that the step fails
     worse = first + 1 + abs(first)
     walled: list[np.ndarray] = []
 
@@ -66,17 +66,16 @@ def minimise(
     bounds = np.stack([low, high], 1)
     x, least = start.cpu().numpy(), first
     for _ in range(RESTARTS):
-        found = optimize.minimize(trial, x, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
-        gained = least - found.fun
+        result = optimize.minimize(trial, x, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+        gained = least - result.fun
         if gained >= 0:
-            x, least = found.x, found.fun
-        # L-BFGS-B ends after one step without gain, also where the gradient is large; a restart continues
+            x, least = result.x, result.fun
+        # L-BFGS-B ends after one step without gain, even if the gradient is large; so it is started again
         if gained <= rounding * (1 + abs(least)):
             break
     step = 1.0 if walled else 0.0
-    while (
-        step > NEAREST
-    ):  # SciPy's line search stops before a region without finite values: approach it by halved steps
+    # SciPy's line search stops before a region without finite values; halved steps approach the region
+    while step > NEAREST:
         value, slope = trial(x)
         ahead = np.clip(x - step * slope, low, high)
         further = trial(ahead)[0]
@@ -88,19 +87,19 @@ def minimise(
 
 
 def total(terms: Sequence[Term], point: Float[Tensor, "n"]) -> Float[Tensor, ""]:
-    """Return Σ terms, float64, without gradient."""
+    """Return the value of Σ terms at a point, float64, without gradient."""
     with torch.no_grad():
         return torch.stack([term(point).double() for term in terms]).sum()
 
 
 def value_and_slope(terms: Sequence[Term], point: Float[Tensor, "n"]) -> tuple[float, np.ndarray]:
-    """Return Σ terms and its gradient, float64."""
+    """Return the value of Σ terms at a point and the gradient (n,), float64."""
     value, slope = 0.0, torch.zeros_like(point)
     for term in terms:
         with torch.enable_grad():
-            here = point.detach().clone().requires_grad_()
-            part = term(here).double()
+            leaf = point.detach().clone().requires_grad_()
+            part = term(leaf).double()
             value += part.item()
             if part.requires_grad:  # False for a constant
-                slope += torch.autograd.grad(part, here)[0]
+                slope += torch.autograd.grad(part, leaf)[0]
     return value, slope.cpu().numpy()

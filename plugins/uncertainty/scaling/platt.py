@@ -1,4 +1,4 @@
-"""Platt scaling: a slope and biases on log-probabilities, fitted on the validation set."""
+"""Platt scaling: a slope and biases of log-probabilities, fitted to the validation split."""
 
 import logging
 from collections.abc import Callable, Iterable
@@ -22,43 +22,37 @@ STEEPEST = 20.0
 LARGEST_BIAS = 50.0
 """Largest bias of a class, nats, before the mean over classes is subtracted."""
 LEAST = -1e5
-"""Smallest log-probability, nats; smaller ones, and -∞, are replaced by it."""
+"""Smallest log-probability, nats; smaller ones and -∞ are replaced by this number."""
 _log = logging.getLogger(__name__)
 
 
 class Platt(Uncertainty):
     """Class log-probabilities l become a·l + b, normalised (thesis eq. 2.18-2.19).
 
-    There is one slope a ≥ 0, and a bias for each class, with sum 0. For two classes this is a slope and a bias on the
-    log-odds. The thesis writes the network's output probability in the exponent. Here, as in Platt 1999 and Guo et al.
-    2017, it is the log-odds, for which a = 1, b = 0 changes nothing: these are the values before `calibrate`. The
-    wrapped model may return any density over classes, also a mixture.
+    There is one slope a ≥ 0, and one bias for each class; the biases sum to 0. For two classes this is a slope and a
+    bias of the log-odds. In the thesis, the exponent holds the network's output probability. Here, as in Platt 1999 and
+    Guo et al. 2017, it holds the log-odds, so that a = 1, b = 0 changes nothing; these are the values before
+    `calibrate`. The wrapped model may return any density over classes, also a mixture.
 
-    A slope below 0 would reverse the order of the classes. Labels that contradict the wrapped model stop the slope at
-    0, where only the classes' shares remain. Slope and biases have upper bounds too. The log says if a bound is
-    reached.
+    A slope below 0 would reverse the order of the classes. If the labels contradict the wrapped model, the slope stops
+    at 0, and every prediction is then the share of each class. Slope and biases have upper bounds too. The log says if
+    a bound is reached.
 
     Args:
-        smoothing: fit to the labels that one more sample of each class would give, (N₊+1)/(N₊+2) and 1/(N₋+2) for two
-            classes (Platt 1999, §2.2); the fit is then finite also on separable and one-class sets.
+        smoothing: whether to fit to smoothed labels, as if there were one more sample of each class: (N₊+1)/(N₊+2) and
+            1/(N₋+2) for two classes (Platt 1999, §2.2). The fit is then finite also on a split that is separable or
+            has only one class.
 
     Attributes:
         slope: a, a float64 buffer.
         biases: b, (class,), nats, a float64 buffer.
 
     Raises:
-        ConfigError: the target is not of classes.
-        UserError: an empty validation set, or a likelihood that is NaN (its samples are named).
+        ConfigError: the target is not a class.
+        UserError: the validation split is empty, or a likelihood is NaN (the message names the samples).
     """
 
-    bibtex = """@incollection{platt1999probabilistic,
-  author    = {Platt, John C.},
-  title     = {Probabilistic Outputs for Support Vector Machines and Comparisons to Regularized Likelihood Methods},
-  booktitle = {Advances in Large Margin Classifiers},
-  publisher = {MIT Press},
-  pages     = {61--74},
-  year      = {1999}
-}"""
+    bibtex = "platt1999probabilistic"
     slope: Tensor
     biases: Tensor
 
@@ -83,27 +77,30 @@ class Platt(Uncertainty):
 
     def calibrate(self, batches: Iterable[Batch]) -> None:
         """Calibrate the wrapped model, then fit slope and biases."""
-        seen = nonempty_batches(batches, by="platt")
-        self.model.calibrate(seen)
-        found = predict_densities(self.model, seen)
-        log_prob = torch.cat([log_probabilities(density) for density in found]).detach().double()
-        require_numbers(log_prob.sum(-1), seen, "class probabilities")
-        label = torch.cat([batch["target"] for batch in seen])
+        kept_batches = nonempty_batches(batches, by="platt")
+        self.model.calibrate(kept_batches)
+        predicted = predict_densities(self.model, kept_batches)
+        log_prob = torch.cat([log_probabilities(density) for density in predicted]).detach().double()
+        require_numbers(log_prob.sum(-1), kept_batches, "class probabilities")
+        label = torch.cat([batch["target"] for batch in kept_batches])
         slope, biases = fit(log_prob, label, smoothing=self.smoothing)
         self.slope.fill_(slope)
         self.biases.copy_(biases)
-        self.remark = f"platt: slope {slope:.3g}, the likeliest of {len(label)} validation rows."
+        self.remark = f"platt: slope {slope:.3g}, the most likely value for {len(label)} validation samples."
 
 
 def fit(
     log_prob: Float[Tensor, "sample label"], label: Int[Tensor, "sample"], *, smoothing: bool
 ) -> tuple[float, Float[Tensor, "label"]]:
-    """Return slope and biases of least mean cross-entropy to (smoothed) labels (eq. 2.19); the problem is convex."""
+    """Return the slope and the biases with the smallest mean cross-entropy to the (smoothed) labels (eq. 2.19).
+
+    The problem is convex.
+    """
     classes = log_prob.shape[-1]
     wanted = targets(label, classes, smoothing=smoothing)
     heights = log_prob.clamp(min=LEAST)
     heights = heights - heights.mean(-1, keepdim=True)
-    # in units of their spread, so that slope and biases have similar magnitudes for the minimiser
+    # divided by their root mean square, so that slope and biases have similar magnitudes for the minimiser
     unit = heights.square().mean().sqrt().clamp(min=torch.finfo(torch.float64).eps)
     heights = heights / unit
 
@@ -121,23 +118,24 @@ def fit(
     biases = best.point[1:] - best.point[1:].mean()
     if best.active[0] < 0:
         _log.warning(
-            "platt: the slope stopped at 0: the validation labels do not follow what is wrapped, and only the classes' "
-            "shares are left of its probabilities."
+            "platt: the slope stopped at 0, because the validation labels contradict the wrapped model; every "
+            "prediction is now the share of each class."
         )
     elif best.active.any():
         _log.warning(
-            "platt: the %s stopped at its bound %g, where the likelihood of the validation set still rises: the set is "
-            "perfectly separable, or lacks a class. Use smoothing: true.",
+            "platt: the %s stopped at its bound %g, where the likelihood of the validation split still rises: the "
+            "split is perfectly separable, or lacks a class. Set uncertainty.platt.smoothing=true.",
             *("slope", STEEPEST) if best.active[0] else ("bias of a class", LARGEST_BIAS),
         )
     return slope, biases
 
 
 def targets(label: Int[Tensor, "sample"], classes: int, *, smoothing: bool) -> Float[Tensor, "sample label"]:
-    """Return the probabilities to fit: 1 for the label, or smoothed.
+    """Return the class probabilities to which the scaling is fitted, one row for each sample.
 
-    With N_k samples of the label and K classes, smoothed ones are (N_k+1)/(N_k+K) for the label, and 1/(N_k+K) for each
-    other class (for two classes Platt 1999, §2.2).
+    Without smoothing they are 1 for the label and 0 for other classes. With N_k samples of the label and K classes,
+    smoothed probabilities are (N_k+1)/(N_k+K) for the label, and 1/(N_k+K) for each other class (for two classes Platt
+    1999, §2.2).
     """
     exact = torch.nn.functional.one_hot(label, classes).double()
     if not smoothing:

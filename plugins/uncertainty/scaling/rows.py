@@ -1,4 +1,4 @@
-"""Rows of the contract: one temperature for every kind of target; slopes and biases for two and for several classes."""
+"""Contract-test cases: temperatures for every kind of target, and Platt scaling for two and for several classes."""
 
 from framework.target import Target
 from framework.testing.rows import WrapperRow

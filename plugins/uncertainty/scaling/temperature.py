@@ -1,4 +1,4 @@
-"""Temperature scaling: all densities are raised to the inverse of one number, fitted to the validation set."""
+"""Temperature scaling: every density is raised to the power 1/T, with one T fitted to the validation split."""
 
 import logging
 import math
@@ -19,17 +19,20 @@ from framework.uncertainty import Uncertainty
 from plugins.uncertainty.scaling.likelihood import Term, minimise, total
 
 GRID = 17
-"""Number of temperatures tried before the fit, which starts at the best, since mixtures may have several maxima."""
+"""Number of temperatures that are tried first; the fit starts at the best of them.
+
+The likelihood of mixtures may have several maxima.
+"""
 _log = logging.getLogger(__name__)
 
 
 class Temperature(Uncertainty):
     """Every density p becomes p^(1/T), normalised, with the T of highest validation likelihood.
 
-    For classes this divides logits by T (thesis eq. 2.19 with β = 0); it changes no mode. Before `calibrate` T is 1 and
-    the densities are those of the wrapped model. On the validation set T is never worse than 1. It stays within its
-    bounds for any labels: on a perfectly separable set, where the likelihood rises without end, it stops at the bound,
-    and the log says so.
+    For classes this divides logits by T (thesis eq. 2.19 with β = 0). No mode changes. Before `calibrate` T is 1, and
+    the densities are those of the wrapped model. The fitted T is never worse than 1 on the validation split. T stays
+    within its bounds for any targets: on a perfectly separable split, where the likelihood rises without end, T stops
+    at the bound, and the log says so.
 
     Args:
         lower, upper: bounds of T.
@@ -38,17 +41,11 @@ class Temperature(Uncertainty):
         temperature: T, a float64 buffer.
 
     Raises:
-        UserError: an empty validation set, a likelihood that is NaN (its samples are named), or a density that has no
-            known power.
+        UserError: the validation split is empty, a likelihood is NaN (the message names the samples), or the power of
+            the density is not known.
     """
 
-    bibtex = """@inproceedings{guo2017calibration,
-  author    = {Guo, Chuan and Pleiss, Geoff and Sun, Yu and Weinberger, Kilian Q.},
-  title     = {On Calibration of Modern Neural Networks},
-  booktitle = {International Conference on Machine Learning},
-  pages     = {1321--1330},
-  year      = {2017}
-}"""
+    bibtex = "guo2017calibration"
     temperature: Tensor
 
     def __init__(
@@ -72,18 +69,19 @@ class Temperature(Uncertainty):
 
     def calibrate(self, batches: Iterable[Batch]) -> None:
         """Calibrate the wrapped model, then fit the temperature."""
-        seen = nonempty_batches(batches, by="temperature")
-        self.model.calibrate(seen)
-        found = fit(predict_densities(self.model, seen), seen, self.lower, self.upper)
-        self.temperature.fill_(found)
-        rows = sum(len(batch["target"]) for batch in seen)
-        self.remark = f"temperature: {found:.3g}, the likeliest of {rows} validation rows."
+        kept_batches = nonempty_batches(batches, by="temperature")
+        self.model.calibrate(kept_batches)
+        fitted = fit(predict_densities(self.model, kept_batches), kept_batches, self.lower, self.upper)
+        self.temperature.fill_(fitted)
+        rows = sum(len(batch["target"]) for batch in kept_batches)
+        self.remark = f"temperature: T = {fitted:.3g}, the most likely value for {rows} validation samples."
 
 
 def fit(predicted: Sequence[Distribution], batches: Sequence[Batch], lower: float, upper: float) -> float:
-    """Return T in [lower, upper] with the least mean of -log p^(1/T)(y) + log Z (eq. 2.19); 1 if none is better.
+    """Return the T in [lower, upper] with the smallest mean of -log p^(1/T)(y) + log Z (eq. 2.19), or 1.
 
-    Targets with probability 0 have it at any T: they are counted in the log and left out.
+    The result is 1 if no other T is better. Targets of probability 0 have probability 0 at any T: they are left out,
+    and their number is logged.
     """
     targets = [batch["target"] for batch in batches]
     with torch.no_grad():
@@ -93,7 +91,8 @@ def fit(predicted: Sequence[Distribution], batches: Sequence[Batch], lower: floa
     possible = int((known > -math.inf).sum())
     if possible < len(known):
         _log.warning(
-            "temperature: %d of %d validation targets have probability 0 at any; it is fitted to the others.",
+            "temperature: %d of %d validation targets have probability 0 at any temperature; the temperature is fitted "
+            "to the others.",
             len(known) - possible,
             len(known),
         )
@@ -113,7 +112,8 @@ def fit(predicted: Sequence[Distribution], batches: Sequence[Batch], lower: floa
     least = rounding * (1 + values[0].abs())
     if not (values - values[0]).abs().max() > 4 * least:
         _log.warning(
-            "temperature: the validation likelihood is the same at any (every density is uniform); it stays 1."
+            "temperature: the validation likelihood is the same at any temperature, because every density is uniform; "
+            "the temperature stays 1."
         )
         return 1.0
     start = candidates[int(values.nan_to_num(nan=math.inf).argmin())]
@@ -122,17 +122,17 @@ def fit(predicted: Sequence[Distribution], batches: Sequence[Batch], lower: floa
         return 1.0
     if best.active.item():
         _log.warning(
-            "temperature: stopped at its %s bound %g, where the likelihood of the validation set still rises: %s.",
-            *("upper", upper, "what is wrapped knows nothing of the targets")
+            "temperature: T stopped at its %s bound %g, where the likelihood of the validation split still rises: %s.",
+            *("upper", upper, "the wrapped model carries no information about the targets")
             if best.active.item() > 0
-            else ("lower", lower, "the set is perfectly separable, or too small to tell"),
+            else ("lower", lower, "the split is perfectly separable, or too small"),
         )
     return min(max(best.point.exp().item(), lower), upper)
 
 
 def _term(density: Distribution, target: Tensor, possible: Tensor, count: int) -> Term:
-    """Return the function of log T that gives this batch's part of the mean negative log-likelihood."""
-    # the mode replaces a target of probability 0: an infinite value would give a gradient of 0 · ∞
+    """Return a function of log T: the part of the mean negative log-likelihood that comes from this batch."""
+    # the mode replaces a target of probability 0, whose infinite log-likelihood would give a gradient of 0 · ∞
     mask = possible.reshape(*possible.shape, *(1,) * (target.dim() - possible.dim()))
     value = target if bool(possible.all()) else torch.where(mask, target, density.mode)
 

@@ -8,8 +8,8 @@ from scipy import optimize
 from plugins.uncertainty.scaling.likelihood import minimise, total, value_and_slope
 
 
-def numbers(*given):
-    return torch.tensor(given, dtype=torch.float64)
+def numbers(*values):
+    return torch.tensor(values, dtype=torch.float64)
 
 
 def free(*start):
@@ -22,9 +22,9 @@ def rosenbrock(x):
 
 @pytest.mark.parametrize("start", [(-1.2, 1.0), (3.0, -7.0), (0.0, 0.0, 0.0)])
 def test_the_curved_valley(start):
-    found = minimise([rosenbrock], *free(*start))
-    torch.testing.assert_close(found.point, torch.ones(len(start)).double(), rtol=0, atol=1e-6)
-    assert not found.active.any()
+    minimum = minimise([rosenbrock], *free(*start))
+    torch.testing.assert_close(minimum.point, torch.ones(len(start)).double(), rtol=0, atol=1e-6)
+    assert not minimum.active.any()
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -37,7 +37,7 @@ def test_a_convex_sum_in_a_box_agrees_with_another_method(seed):
         for rows in torch.arange(60).split(16)
     ]
     lower, upper = numbers(-0.5, -0.2, -9.0), numbers(0.7, 0.3, 9.0)
-    found = minimise(terms, torch.zeros(3).double(), lower, upper)
+    minimum = minimise(terms, torch.zeros(3).double(), lower, upper)
     wanted = optimize.minimize(
         lambda x: total(terms, torch.from_numpy(x)).item(),
         np.zeros(3),
@@ -45,20 +45,20 @@ def test_a_convex_sum_in_a_box_agrees_with_another_method(seed):
         bounds=list(zip(lower, upper, strict=True)),
         options={"ftol": 1e-15},
     )
-    assert found.value <= wanted.fun * (1 + 1e-13)
-    np.testing.assert_allclose(found.point.numpy(), wanted.x, atol=1e-5)
+    assert minimum.value <= wanted.fun * (1 + 1e-13)
+    np.testing.assert_allclose(minimum.point.numpy(), wanted.x, atol=1e-5)
     at = (np.abs(wanted.x - upper.numpy()) < 1e-9).astype(int) - (np.abs(wanted.x - lower.numpy()) < 1e-9)
-    assert found.active.tolist() == at.tolist()
+    assert minimum.active.tolist() == at.tolist()
 
 
 def test_coupled_parameters_slide_along_a_bound():
     hessian, middle = numbers([1.0, 0.99], [0.99, 1.0]), numbers(-3.0, 4.0)
-    found = minimise(
+    minimum = minimise(
         [lambda x: (x - middle) @ hessian @ (x - middle) / 2], numbers(0, 5), numbers(0, 0), numbers(10, 10)
     )
     # with x₁ = 0 the best is x₂ = 4 + 0.99 · (-3 - 0)
-    torch.testing.assert_close(found.point, numbers(0.0, 4 - 0.99 * 3))
-    assert found.active.tolist() == [-1, 0]
+    torch.testing.assert_close(minimum.point, numbers(0.0, 4 - 0.99 * 3))
+    assert minimum.active.tolist() == [-1, 0]
 
 
 @pytest.mark.parametrize("start", [0.01, 0.5, 2.0, -1.0])
@@ -66,10 +66,10 @@ def test_negative_curvature_and_saddles(start):
     def wavy(x):
         return (torch.cos(3 * x) + 0.1 * x**2).sum()
 
-    found = minimise([wavy], *free(start, -start))
-    assert found.value < wavy(numbers(start, -start))
-    assert torch.autograd.functional.jacobian(wavy, found.point).abs().max() < 1e-6
-    assert torch.linalg.eigvalsh(torch.autograd.functional.hessian(wavy, found.point)).min() > 0
+    minimum = minimise([wavy], *free(start, -start))
+    assert minimum.value < wavy(numbers(start, -start))
+    assert torch.autograd.functional.jacobian(wavy, minimum.point).abs().max() < 1e-6
+    assert torch.linalg.eigvalsh(torch.autograd.functional.hessian(wavy, minimum.point)).min() > 0
 
 
 def test_flat_functions_stay_where_they_are():
@@ -79,8 +79,8 @@ def test_flat_functions_stay_where_they_are():
 
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
 def test_a_minimum_at_infinity_ends_at_the_bound(scale):
-    found = minimise([lambda x: scale * torch.exp(-x).sum()], numbers(0), numbers(-3), numbers(5))
-    assert found.point.item() == 5.0 and found.active.item() == 1
+    minimum = minimise([lambda x: scale * torch.exp(-x).sum()], numbers(0), numbers(-3), numbers(5))
+    assert minimum.point.item() == 5.0 and minimum.active.item() == 1
     loose = minimise([lambda x: torch.nn.functional.softplus(-x).sum()], *free(0.0))
     assert loose.value < 1e-11 and loose.point.isfinite()
 
@@ -90,8 +90,8 @@ def test_a_fall_without_end_ends():
 
 
 def test_regions_that_are_not_numbers_are_stepped_around():
-    found = minimise([lambda x: (x - torch.log(x)).sum()], *free(50.0, 1e-3))  # NaN below 0
-    torch.testing.assert_close(found.point, torch.ones(2).double(), atol=1e-6, rtol=0)
+    minimum = minimise([lambda x: (x - torch.log(x)).sum()], *free(50.0, 1e-3))  # NaN below 0
+    torch.testing.assert_close(minimum.point, torch.ones(2).double(), atol=1e-6, rtol=0)
     wall = minimise([lambda x: torch.where(x > 2, torch.nan, -x).sum()], *free(0.0))
     assert wall.point.item() == pytest.approx(2, abs=1e-6) and wall.point.item() <= 2
 
@@ -132,9 +132,9 @@ def test_never_above_the_start_never_outside_the_box(start, low, width, seed):
 
     lower, upper = numbers(*[low] * count), numbers(*[low + width] * count)
     begin = numbers(*start).clamp(lower, upper)
-    found = minimise([wild], begin, lower, upper)
-    assert found.value <= wild(begin).item()
-    assert (found.point >= lower).all() and (found.point <= upper).all()
+    minimum = minimise([wild], begin, lower, upper)
+    assert minimum.value <= wild(begin).item()
+    assert (minimum.point >= lower).all() and (minimum.point <= upper).all()
     # no small step within the box is better: the point is stationary there
-    slope = torch.autograd.functional.jacobian(wild, found.point)
-    assert ((found.point - slope).clamp(lower, upper) - found.point).abs().max() < 1e-3
+    slope = torch.autograd.functional.jacobian(wild, minimum.point)
+    assert ((minimum.point - slope).clamp(lower, upper) - minimum.point).abs().max() < 1e-3

@@ -22,7 +22,7 @@ from plugins.uncertainty.scaling.platt import LARGEST_BIAS, STEEPEST, fit, targe
 TWO, THREE = Target("class", ("off", "on")), Target("class", ("a", "b", "c"))
 
 
-class Given(Predictor):
+class PredictorOf(Predictor):
     """A predictor whose densities are made of the inputs."""
 
     def __init__(self, make):
@@ -48,7 +48,7 @@ def classes(inputs):
 
 def around(make=classes, target=THREE, **config):
     resolved = resolve("uncertainty", {"name": "platt", **config})
-    return build("uncertainty", resolved, model=lambda: Given(make), target=target).eval()
+    return build("uncertainty", resolved, model=lambda: PredictorOf(make), target=target).eval()
 
 
 def batches(inputs, target, size=64):
@@ -75,8 +75,8 @@ def test_two_classes_agree_with_scikit_learn(seed):
     model = LogisticRegression().fit(odds, label)
     model.coef_, model.intercept_ = np.ones((1, 1)), np.zeros(1)  # its decision is the log-odds
     other = CalibratedClassifierCV(FrozenEstimator(model), method="sigmoid").fit(odds, label.numpy())
-    found = wrapper(logits).log_prob(torch.ones(300, dtype=torch.int64)).exp()
-    np.testing.assert_allclose(found.numpy(), other.predict_proba(odds)[:, 1], atol=2e-4)
+    probability = wrapper(logits).log_prob(torch.ones(300, dtype=torch.int64)).exp()
+    np.testing.assert_allclose(probability.numpy(), other.predict_proba(odds)[:, 1], atol=2e-4)
 
 
 @pytest.mark.parametrize("count", [2, 3, 6])
@@ -101,10 +101,10 @@ def test_several_classes_agree_with_scipy(count, smoothing):
 
 def test_smoothed_targets_are_platts():
     label = torch.tensor([1, 1, 1, 0])
-    found = targets(label, 2, smoothing=True)
+    smoothed = targets(label, 2, smoothing=True)
     # (N₊ + 1)/(N₊ + 2) with 3 positive ones, 1/(N₋ + 2) with 1 negative one
-    np.testing.assert_allclose(found[:, 1].numpy(), [4 / 5, 4 / 5, 4 / 5, 1 / 3])
-    np.testing.assert_allclose(found.sum(-1).numpy(), 1)
+    np.testing.assert_allclose(smoothed[:, 1].numpy(), [4 / 5, 4 / 5, 4 / 5, 1 / 3])
+    np.testing.assert_allclose(smoothed.sum(-1).numpy(), 1)
     many = targets(torch.tensor([0, 2, 2]), 4, smoothing=True)
     np.testing.assert_allclose(many[1].numpy(), [1 / 6, 1 / 6, 3 / 6, 1 / 6])
 
@@ -210,5 +210,5 @@ def test_nothing_runs_away(logits, label, smoothing):
     slope, biases = fit(log_prob, torch.from_numpy(label), smoothing=smoothing)
     assert 0 <= slope <= STEEPEST
     assert biases.abs().max() <= 2 * LARGEST_BIAS and biases.sum().abs() < 1e-9
-    found = (slope * log_prob + biases).log_softmax(-1)
-    assert found.isfinite().all()
+    rescaled = (slope * log_prob + biases).log_softmax(-1)
+    assert rescaled.isfinite().all()

@@ -26,7 +26,7 @@ from framework.testing.wrappers import Plain
 CLASSES, ANGLE, REAL = Target("class", ("a", "b", "c")), Target("angle", ("azimuth",)), Target("real", ("x",))
 
 
-class Given(Predictor):
+class PredictorOf(Predictor):
     """A predictor whose densities are made of the inputs."""
 
     def __init__(self, make):
@@ -89,7 +89,7 @@ def cross_entropy(logits, label, logarithm):
 def test_the_temperature_agrees_with_scipy(scale):
     for dtype, digits in ((torch.float64, 1e-7), (torch.float32, 2e-3)):
         logits, label = labelled(400, scale, dtype=dtype)
-        wrapper = around(Given(classes)).eval()
+        wrapper = around(PredictorOf(classes)).eval()
         wrapper.calibrate(once(logits, label))
 
         nll = functools.partial(cross_entropy, logits.double().numpy(), label.numpy())
@@ -107,7 +107,7 @@ def test_of_normals_it_is_the_ratio_of_variances(spread, wanted):
     inputs = torch.randn(2000, 2, generator=generator, dtype=torch.float64)
     noise = spread * torch.randn(2000, 1, generator=generator, dtype=torch.float64)
     target = inputs[:, :1] + inputs[:, 1:].exp() * noise
-    wrapper = around(Given(reals), REAL).eval()
+    wrapper = around(PredictorOf(reals), REAL).eval()
     wrapper.calibrate(once(inputs, target, 64))
     exact = ((target - inputs[:, :1]) / inputs[:, 1:].exp()).square().mean().item()
     assert wrapper.temperature.item() == pytest.approx(exact, rel=1e-6)
@@ -122,7 +122,7 @@ def test_of_any_angle_and_of_a_mixture():
     # with t = tan(θ/2), density ∝ 1/(1+t²)^4: √7 t is Student's with 7 degrees of freedom
     chi = torch.randn(7, 800, generator=generator, dtype=torch.float64).norm(dim=0)
     target = place + 2 * torch.atan(normal[1] / chi)[:, None]
-    alone = around(Given(Cardioid), ANGLE).eval()
+    alone = around(PredictorOf(Cardioid), ANGLE).eval()
     alone.calibrate(once(place, target, 400))
     assert alone.temperature.item() == pytest.approx(1 / 3, rel=0.25)
 
@@ -130,7 +130,7 @@ def test_of_any_angle_and_of_a_mixture():
         places = inputs.unsqueeze(1).expand(-1, 2, -1)
         return Mixture(torch.zeros(places.shape[:2], dtype=inputs.dtype), Cardioid(places))
 
-    members = around(Given(twice), ANGLE).eval()
+    members = around(PredictorOf(twice), ANGLE).eval()
     members.calibrate(once(place, target, 400))
     assert members.temperature.item() == pytest.approx(alone.temperature.item(), rel=1e-6)
 
@@ -150,13 +150,16 @@ def test_never_worse_than_before_even_with_several_maxima():
             weights = torch.tensor([0.0, -2.0, -6.0]).expand(len(inputs), 3)
             return Mixture(weights, Independent(base, 1, validate_args=False))
 
-        wrapper = around(Given(mixture), REAL).eval()
+        wrapper = around(PredictorOf(mixture), REAL).eval()
         before = wrapper(inputs).log_prob(target).double().mean()
         wrapper.calibrate(once(inputs, target))
         after = wrapper(inputs).log_prob(target).double().mean()
         assert after >= before - 1e-6 * (1 + before.abs())
         grid = torch.logspace(math.log10(0.05), math.log10(20), 200, dtype=torch.float64)
-        best = max(temper(mixture(inputs), one).log_prob(target).double().mean().item() for one in grid)
+        best = max(
+            temper(mixture(inputs), temperature).log_prob(target).double().mean().item()
+            for temperature in grid
+        )
         assert after >= best - 1e-5 * (1 + abs(best))
 
 
@@ -167,13 +170,13 @@ def test_a_separable_set_stops_at_the_bound_and_says_so(caplog):
         (logits[:1].expand(5, 3), torch.zeros(5, dtype=torch.int64)),
     ):
         caplog.clear()
-        wrapper = around(Given(classes), lower=0.1).eval()
+        wrapper = around(PredictorOf(classes), lower=0.1).eval()
         wrapper.calibrate(once(inputs, label))
         assert wrapper.temperature.item() == pytest.approx(0.1)
         assert "stopped at its lower bound 0.1" in caplog.text and "perfectly separable" in caplog.text
         assert wrapper(inputs).log_prob(label).isfinite().all()
     caplog.clear()
-    wrapper = around(Given(classes)).eval()
+    wrapper = around(PredictorOf(classes)).eval()
     wrapper.calibrate(once(1e4 * logits, (torch.arange(3) + 1) % 3))  # sure, and always wrong
     assert wrapper.temperature.item() == pytest.approx(20) and "upper bound 20" in caplog.text
 
@@ -181,7 +184,7 @@ def test_a_separable_set_stops_at_the_bound_and_says_so(caplog):
 def test_uniform_densities_leave_it_at_one_and_it_is_said(caplog):
     for inputs in (torch.zeros(40, 3), torch.full((40, 3), -1e4)):
         caplog.clear()
-        wrapper = around(Given(classes)).eval()
+        wrapper = around(PredictorOf(classes)).eval()
         wrapper.calibrate(once(inputs, torch.arange(40) % 3))
         assert wrapper.temperature.item() == 1
         assert "the same at any" in caplog.text
@@ -193,15 +196,15 @@ def test_uniform_densities_leave_it_at_one_and_it_is_said(caplog):
 def test_probabilities_of_exactly_zero_and_one(caplog):
     logits, label = labelled(200, 2.0)
     logits[:3], label[:3] = torch.tensor([0.0, -math.inf, -math.inf]), torch.tensor([0, 1, 2])
-    wrapper = around(Given(classes)).eval()
+    wrapper = around(PredictorOf(classes)).eval()
     wrapper.calibrate(once(logits, label))
     assert "2 of 200 validation targets have probability 0" in caplog.text
-    others = around(Given(classes)).eval()
+    partly_impossible = around(PredictorOf(classes)).eval()
     keep = torch.ones(200, dtype=torch.bool)
     keep[1:3] = False
-    others.calibrate(once(logits[keep], label[keep]))
-    assert wrapper.temperature.item() == pytest.approx(others.temperature.item(), rel=1e-6)
-    impossible = around(Given(classes)).eval()
+    partly_impossible.calibrate(once(logits[keep], label[keep]))
+    assert wrapper.temperature.item() == pytest.approx(partly_impossible.temperature.item(), rel=1e-6)
+    impossible = around(PredictorOf(classes)).eval()
     impossible.calibrate(once(logits[:1].expand(4, 3), torch.ones(4, dtype=torch.int64)))
     assert impossible.temperature.item() == 1
 
@@ -210,24 +213,26 @@ def test_nan_is_named_and_an_empty_set_refused():
     logits, label = labelled(120, 1.0)
     logits[[3, 70]] = math.nan
     with pytest.raises(UserError, match=r"log-likelihood of validation samples \[3, 70\] is NaN"):
-        around(Given(classes)).calibrate(once(logits, label))
+        around(PredictorOf(classes)).calibrate(once(logits, label))
     for nothing in (iter(()), once(logits[:0], label[:0])):
         with pytest.raises(
             UserError, match="temperature is calibrated on the validation split, but got no sample"
         ):
-            around(Given(classes)).calibrate(nothing)
+            around(PredictorOf(classes)).calibrate(nothing)
 
 
 def test_what_is_wrapped_is_calibrated_first_and_left_as_it_was():
     logits, label = labelled(120, 3.0)
-    model = Given(classes)
+    model = PredictorOf(classes)
     wrapper = around(model).train()
     model.zero_grad()
     wrapper.calibrate(once(logits, label))
     assert model.calibrated == 3 and wrapper.training and model.training
     assert model.weight.grad is None
     wrapper.eval()
-    twice = around(around(Given(classes))).eval()  # a temperature of a temperature has nothing left to do
+    twice = around(
+        around(PredictorOf(classes))
+    ).eval()  # a temperature of a temperature has nothing left to do
     twice.calibrate(once(logits, label))
     assert twice.model.temperature.item() == pytest.approx(wrapper.temperature.item())
     assert twice.temperature.item() == pytest.approx(1, abs=1e-6)
@@ -268,7 +273,7 @@ def test_calibrated_angles_of_the_contract_are_densities():
 )
 def test_never_outside_its_bounds_and_never_worse(logits, label, lower, upper):
     inputs, target = torch.from_numpy(logits), torch.from_numpy(label)
-    wrapper = around(Given(classes), lower=lower, upper=upper).eval()
+    wrapper = around(PredictorOf(classes), lower=lower, upper=upper).eval()
     before = wrapper(inputs).log_prob(target).mean()
     wrapper.calibrate(once(inputs, target))
     assert lower <= wrapper.temperature <= upper
@@ -279,10 +284,10 @@ def test_never_outside_its_bounds_and_never_worse(logits, label, lower, upper):
 @pytest.mark.parametrize("config", [{"lower": 0.0}, {"lower": 2.0}, {"upper": 0.5}, {"upper": math.inf}])
 def test_a_config_out_of_range_is_refused(config):
     with pytest.raises(ConfigError, match="uncertainty"):
-        around(Given(classes), **config)
+        around(PredictorOf(classes), **config)
 
 
 def test_the_log_is_quiet_on_ordinary_sets(caplog):
     caplog.set_level(logging.WARNING)
-    around(Given(classes)).calibrate(once(*labelled(300, 2.0)))
+    around(PredictorOf(classes)).calibrate(once(*labelled(300, 2.0)))
     assert not caplog.text
