@@ -37,25 +37,25 @@ def labelled(head, count, dtype=torch.float64):
 
 
 class Recorded(Predictor):
-    """A predictor that records the inputs of each loss; the gradient of the loss in them is `slope`."""
+    """A predictor that records the inputs of each loss; the gradient of the loss in the inputs is `slope`."""
 
     def __init__(self, slope=1.0):
         super().__init__()
         self.scale = nn.Parameter(torch.ones(()))
         self.slope = slope
-        self.seen = []
+        self.recorded = []
 
     def loss(self, inputs, target):
-        self.seen.append(inputs.detach().clone())
+        self.recorded.append(inputs.detach().clone())
         return self.scale * (self.slope * inputs).flatten(1).sum(1)
 
     def forward(self, inputs):
-        raise AssertionError("only the loss is asked for")
+        raise AssertionError("only the loss may be called")
 
     training_densities = forward
 
     def calibrate(self, batches):
-        raise AssertionError("only the loss is asked for")
+        raise AssertionError("only the loss may be called")
 
 
 class Linear(Recorded):
@@ -76,22 +76,22 @@ def test_members_of_an_ensemble_are_each_moved_along_their_own_gradient(batch_no
     objective = Adversarial(weight=0.7, epsilon=0.3)
     wrapper = resolve("uncertainty", {"name": "ensemble", "members": 3})
     alone = [model("gaussian", batch_norm=batch_norm).double() for _ in range(3)]
-    for index, one in enumerate(alone):
-        for parameter in one.parameters():
+    for index, member in enumerate(alone):
+        for parameter in member.parameters():
             parameter.data += 0.1 * (index + 1)
-    made = iter(copy.deepcopy(alone))
-    whole = build("uncertainty", wrapper, model=lambda: next(made), target=TARGETS["gaussian"])
+    copies = iter(copy.deepcopy(alone))
+    whole = build("uncertainty", wrapper, model=lambda: next(copies), target=TARGETS["gaussian"])
     inputs, target = torch.randn(15, 4, dtype=torch.float64), labelled("gaussian", 15)
     with own_batches(whole):
-        found = objective(whole, {"input": inputs, "target": target})
-    found.backward()
+        penalty = objective(whole, {"input": inputs, "target": target})
+    penalty.backward()
     wanted = [
-        objective(one, {"input": inputs[rows], "target": target[rows]})
-        for one, rows in zip(alone, torch.arange(15).chunk(3), strict=True)
+        objective(member, {"input": inputs[rows], "target": target[rows]})
+        for member, rows in zip(alone, torch.arange(15).chunk(3), strict=True)
     ]
-    torch.testing.assert_close(found, torch.stack(wanted).mean(), rtol=1e-12, atol=0)
+    torch.testing.assert_close(penalty, torch.stack(wanted).mean(), rtol=1e-12, atol=0)
     sum(wanted).backward()
-    gradients = [torch.cat([part.grad.flatten() for part in one.parameters()]) for one in alone]
+    gradients = [torch.cat([part.grad.flatten() for part in member.parameters()]) for member in alone]
     total = torch.stack(gradients).norm()
     torch.testing.assert_close(
         torch.cat([part.grad.flatten() for part in whole.parameters()]).norm(), total, rtol=1e-9, atol=0
@@ -104,9 +104,9 @@ def test_agrees_with_brute_force(head):
     predictor = model(head).double()
     inputs, target = torch.randn(5, 4, dtype=torch.float64), labelled(head, 5)
 
-    def loss(given):
+    def loss(moved_inputs):
         with torch.no_grad():
-            return predictor.loss(torch.from_numpy(given), target).numpy()
+            return predictor.loss(torch.from_numpy(moved_inputs), target).numpy()
 
     start = inputs.numpy()
     gradient = np.zeros_like(start)
@@ -119,8 +119,8 @@ def test_agrees_with_brute_force(head):
     objective = build(
         "objective", resolve("objective", {"name": "adversarial", "weight": 0.7, "epsilon": 0.05})
     )
-    found = objective(predictor, {"input": inputs, "target": target})
-    assert found.item() == pytest.approx(wanted, rel=1e-12)
+    penalty = objective(predictor, {"input": inputs, "target": target})
+    assert penalty.item() == pytest.approx(wanted, rel=1e-12)
 
 
 @settings(deadline=None, max_examples=40)
@@ -134,15 +134,15 @@ def test_a_convex_loss_rises_by_at_least_its_slope(seed, epsilon, size):
     losses = predictor.loss(inputs, target)
     (gradient,) = torch.autograd.grad(losses.sum(), inputs)
     least = (losses + epsilon * gradient.abs().sum(1)).mean().item()
-    found = Adversarial(epsilon=epsilon)(predictor, {"input": inputs.detach(), "target": target}).item()
-    assert found >= least - 1e-9 * max(1, abs(least))
+    penalty = Adversarial(epsilon=epsilon)(predictor, {"input": inputs.detach(), "target": target}).item()
+    assert penalty >= least - 1e-9 * max(1, abs(least))
 
 
 def test_bytes_are_read_as_0_to_1_and_stay_there():
     predictor = Recorded()
     pixels = torch.tensor([[[[0, 255], [128, 254]]]], dtype=torch.uint8)
     Adversarial(epsilon=0.1)(predictor, {"input": pixels, "target": torch.zeros(1)})
-    first, moved = predictor.seen
+    first, moved = predictor.recorded
     torch.testing.assert_close(first, pixels / 255)
     torch.testing.assert_close(moved, (pixels / 255 + 0.1).clamp(max=1))
     Adversarial(epsilon=0.1)(Recorded(-1.0), {"input": pixels, "target": torch.zeros(1)})
@@ -151,13 +151,13 @@ def test_bytes_are_read_as_0_to_1_and_stay_there():
 def test_floats_may_leave_the_range_they_came_in():
     predictor = Recorded(-1.0)
     Adversarial(epsilon=0.1)(predictor, {"input": torch.zeros(1, 1, 2, 2), "target": torch.zeros(1)})
-    assert torch.equal(predictor.seen[1], torch.full((1, 1, 2, 2), -0.1))
+    assert torch.equal(predictor.recorded[1], torch.full((1, 1, 2, 2), -0.1))
 
 
 def test_where_the_loss_is_flat_nothing_moves():
     predictor = Recorded(torch.tensor([1.0, 0.0, -1.0]))
     Adversarial(epsilon=0.5)(predictor, {"input": torch.zeros(1, 3), "target": torch.zeros(1)})
-    assert predictor.seen[1].tolist() == [[0.5, 0.0, -0.5]]
+    assert predictor.recorded[1].tolist() == [[0.5, 0.0, -0.5]]
 
 
 def test_a_network_with_batch_norm_and_dropout_learns_from_it():
@@ -176,7 +176,7 @@ def test_a_network_with_batch_norm_and_dropout_learns_from_it():
 
 @pytest.mark.parametrize("kind", [torch.int64, torch.int32, torch.bool])
 def test_integers_that_are_not_bytes_are_refused(kind):
-    with pytest.raises(DataError, match=r"inputs of type torch\.(int64|int32|bool), which cannot be moved"):
+    with pytest.raises(DataError, match=r"inputs of type torch\.(int64|int32|bool), which cannot be changed"):
         Adversarial()(Recorded(), {"input": torch.ones(2, 3, dtype=kind), "target": torch.zeros(2)})
 
 
@@ -192,7 +192,7 @@ class Untrained(Recorded):
 
 @pytest.mark.parametrize("kind", [Detached, Untrained])
 def test_a_loss_without_a_gradient_in_the_inputs_is_refused(kind):
-    with pytest.raises(ConfigError, match="the loss has no gradient in them"):
+    with pytest.raises(ConfigError, match="the loss has no gradient in the inputs"):
         Adversarial()(kind(), {"input": torch.zeros(2, 3), "target": torch.zeros(2)})
 
 

@@ -1,4 +1,4 @@
-"""Discriminators of patches of an image."""
+"""Discriminators that judge overlapping patches of an image."""
 
 from itertools import pairwise
 
@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, leaky_relu
 
 STEEP = 0.2
-"""Slope of leaky ReLU below 0."""
+"""Slope of the leaky ReLU below 0."""
 
 
 class PatchDiscriminator(nn.Module):
@@ -16,7 +16,7 @@ class PatchDiscriminator(nn.Module):
 
     Args:
         width: channels of the first layer; each further layer has twice as many, at most eight times as many.
-        layers: number of layers of stride 2; with three a patch has sides of 70 pixels.
+        layers: number of layers of stride 2; with three layers a patch has 70 × 70 pixels.
     """
 
     def __init__(self, width: int, layers: int) -> None:
@@ -24,45 +24,45 @@ class PatchDiscriminator(nn.Module):
         widths = [3, *(width * min(2**layer, 8) for layer in range(layers + 1)), 1]
         steps = [2] * layers + [1, 1]
         self.layers = nn.ModuleList(
-            nn.Conv2d(one, other, 4, step, padding=2)
-            for (one, other), step in zip(pairwise(widths), steps, strict=True)
+            nn.Conv2d(channels, next_channels, 4, step, padding=2)
+            for (channels, next_channels), step in zip(pairwise(widths), steps, strict=True)
         )
 
     def forward(self, images: Float[Tensor, "image 3 height width"]) -> list[Tensor]:
         """Return the output of each layer; the last output is the judgement of each patch, near 1 for a true one."""
-        found = []
+        outputs = []
         for number, layer in enumerate(self.layers):
             images = layer(images)
             if number + 1 < len(self.layers):
-                images = leaky_relu(normalised(images) if number else images, STEEP)
-            found.append(images)
-        return found
+                images = leaky_relu(normalise(images) if number else images, STEEP)
+            outputs.append(images)
+        return outputs
 
 
-def normalised(features: Float[Tensor, "image channel height width"]) -> Tensor:
-    """Return each channel of each image, normalised to mean 0 and variance 1 (Ulyanov et al. 2016)."""
+def normalise(features: Float[Tensor, "image channel height width"]) -> Tensor:
+    """Normalise each channel of each image to mean 0 and variance 1 (Ulyanov et al. 2016)."""
     centred = features - features.mean((-2, -1), keepdim=True)
     return centred * (centred.square().mean((-2, -1), keepdim=True) + 1e-5).rsqrt()
 
 
 class Discriminators(nn.Module):
-    """Patch discriminators at several scales, each half of the previous one."""
+    """Patch discriminators at several scales, each with half the resolution of the previous one."""
 
     def __init__(self, scales: int, width: int, layers: int) -> None:
         super().__init__()
         self.scales = nn.ModuleList(PatchDiscriminator(width, layers) for _ in range(scales))
 
     def forward(self, images: Float[Tensor, "image 3 height width"]) -> list[list[Tensor]]:
-        """Return for each scale the outputs of `PatchDiscriminator`."""
-        found = []
-        for number, one in enumerate(self.scales):
+        """Return, for each scale, the outputs of all layers of its `PatchDiscriminator`."""
+        outputs = []
+        for number, discriminator in enumerate(self.scales):
             if number:
                 images = avg_pool2d(images, 3, 2, padding=1, count_include_pad=False)
-            found.append(one(images))
-        return found
+            outputs.append(discriminator(images))
+        return outputs
 
 
-def drawn(scales: int, width: int, layers: int, seed: int) -> Discriminators:
+def build_discriminators(scales: int, width: int, layers: int, seed: int) -> Discriminators:
     """Return discriminators whose initial weights are a function of the seed."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)

@@ -1,4 +1,4 @@
-"""Distances of predicted and true images in the features of a network."""
+"""Distances between the features of predicted and of true images, for a trained and for a random network."""
 
 from abc import abstractmethod
 from hashlib import sha256
@@ -15,28 +15,28 @@ from framework.errors import ConfigError
 from framework.model import Predictor, independent_penalty
 from framework.objective import Objective
 from plugins.objective.images.predicted import predicted_images
-from plugins.objective.images.vgg import TAPS, VGG, Depth, drawn, trained
+from plugins.objective.images.vgg import TAPS, VGG, Depth, random_vgg, read_vgg
 
 Weight = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Cache = Annotated[int, Field(ge=0, le=2**20)]
 
 
 class FeatureDistance(Objective):
-    """The mean L1 distance of features at several depths, with the largest weight on the deepest.
+    """The mean L1 distance between features at several depths, with the largest weight for the deepest features.
 
     It is Σ_l 2^(l - L) ‖φ_l(x) - φ_l(y)‖₁/n_l over the taps l = 1 … L (Wang et al. 2018, §3.4).
 
-    The features of true images are kept in memory as long as they fit. They are looked up by the content of the image,
-    so that data which vary between epochs are handled correctly.
+    The features of true images are cached until the cache is full. They are found by a hash of the image's content, so
+    that the result is also right if an image changes between epochs.
     """
 
     def __init__(self, weight: float, network: VGG, cache: int) -> None:
         super().__init__()
         self.weight = weight
         self.network = network
-        self.most = cache * 2**20
-        self.kept: dict[bytes, list[Tensor]] = {}
-        self.bytes = 0
+        self.cache_limit = cache * 2**20
+        self.cached_features: dict[bytes, list[Tensor]] = {}
+        self.cached_bytes = 0
 
     @property
     @abstractmethod
@@ -47,12 +47,14 @@ class FeatureDistance(Objective):
         """Return the weighted penalty of a batch."""
         images, true = predicted_images(predictor, batch)
         lead = images.shape[:-3]
-        found = self.network(images.reshape(-1, *images.shape[-3:]).movedim(-1, 1))
-        wanted = self._features(true.flatten(0, -4))
+        predicted_features = self.network(images.reshape(-1, *images.shape[-3:]).movedim(-1, 1))
+        true_features = self._features(true.flatten(0, -4))
         distance = images.new_zeros(lead)
-        for level, (one, other) in enumerate(zip(found, wanted, strict=True), 1 - len(found)):
-            ours = one.unflatten(0, lead)
-            theirs = other.unflatten(0, true.shape[:-3])
+        for level, (predicted, expected) in enumerate(
+            zip(predicted_features, true_features, strict=True), 1 - len(predicted_features)
+        ):
+            ours = predicted.unflatten(0, lead)
+            theirs = expected.unflatten(0, true.shape[:-3])
             distance = distance + 2.0**level * (ours - theirs).abs().mean((-3, -2, -1))
         mean = independent_penalty(distance).sum() / max(1, len(images))
         self.logged_terms = {self.term: mean.detach()}
@@ -60,52 +62,47 @@ class FeatureDistance(Objective):
 
     @torch.no_grad()
     def _features(self, true: Float[Tensor, "batch height width number"]) -> list[Tensor]:
-        if not self.most:
+        if not self.cache_limit:
             return self.network(true.movedim(-1, 1))
         keys = [sha256(image.cpu().numpy().tobytes()).digest() for image in true]
-        new = [row for row, key in enumerate(keys) if key not in self.kept]
+        new = [row for row, key in enumerate(keys) if key not in self.cached_features]
         rows = {}
         if new:
-            found = self.network(true[new].movedim(-1, 1))
-            rows = {keys[row]: [level[place] for level in found] for place, row in enumerate(new)}
-        every = [rows[key] if key in rows else self.kept[key] for key in keys]
+            new_features = self.network(true[new].movedim(-1, 1))
+            rows = {keys[row]: [level[place] for level in new_features] for place, row in enumerate(new)}
+        every = [rows[key] if key in rows else self.cached_features[key] for key in keys]
         for key, features in rows.items():
-            self._keep(key, features)
+            self._cache(key, features)
         return (
             [torch.stack(level) for level in zip(*every, strict=True)]
             if every
             else self.network(true.movedim(-1, 1))
         )
 
-    def _keep(self, key: bytes, features: list[Tensor]) -> None:
+    def _cache(self, key: bytes, features: list[Tensor]) -> None:
         size = sum(level.nbytes for level in features)
         # A full cache replaces nothing: each image comes once an epoch, and the oldest entry is the next one needed.
-        if self.bytes + size <= self.most:
-            self.kept[key] = features
-            self.bytes += size
+        if self.cached_bytes + size <= self.cache_limit:
+            self.cached_features[key] = features
+            self.cached_bytes += size
 
 
 class Perceptual(FeatureDistance):
-    """Distance of features of a VGG network trained on ImageNet, L_VGG of thesis eq. 7.6 (Johnson et al. 2016).
+    """Distance between features of a VGG network trained on ImageNet, L_VGG of thesis eq. 7.6 (Johnson et al. 2016).
 
     Args:
         weight: α.
-        weights: torchvision's file of the network. Nothing replaces it: without a file choose
-            objective=random_features, whose name says what it is.
-        layers: 16, with features of four depths, or 19, of five.
-        cache: MiB of true images' features that are kept.
+        weights: torchvision's file of the network's weights. There is no substitute for it; without the file choose
+            objective=random_features, whose network is not trained.
+        layers: 16, with features at four depths, or 19, with features at five.
+        cache: MiB of features of true images that are kept in memory.
 
     Raises:
-        ConfigError: no file, or one of another network.
+        ConfigError: no file is set, or the file belongs to another network.
         CheckpointError: the file is damaged.
     """
 
-    bibtex = """@inproceedings{johnson2016perceptual,
-  author    = {Johnson, Justin and Alahi, Alexandre and Fei-Fei, Li},
-  title     = {Perceptual Losses for Real-Time Style Transfer and Super-Resolution},
-  booktitle = {European Conference on Computer Vision (ECCV)},
-  year      = {2016}
-}"""
+    bibtex = "johnson2016perceptual"
 
     def __init__(
         self,
@@ -117,10 +114,11 @@ class Perceptual(FeatureDistance):
     ) -> None:
         if weights is None:
             raise ConfigError(
-                f"objective.perceptual.weights is null; wanted torchvision's file of VGG{layers}, which is not "
-                "shipped. Name it, or choose objective=random_features, whose network is not trained."
+                f"objective.perceptual.weights is null, but torchvision's file of VGG{layers} is required, which this "
+                "project does not contain. Set objective.perceptual.weights to this file, or choose "
+                "objective=random_features, whose network is not trained."
             )
-        super().__init__(weight, trained(layers, weights), cache)
+        super().__init__(weight, read_vgg(layers, weights), cache)
 
     @property
     def term(self) -> str:
@@ -129,24 +127,19 @@ class Perceptual(FeatureDistance):
 
 
 class RandomFeatures(FeatureDistance):
-    """Distance of features of a convolutional network with random weights: edges and textures of many scales.
+    """Distance between features of a convolutional network with random weights: edges and textures at many scales.
 
-    The network has learned nothing about images: the distance is no perceptual loss, and is never called one.
+    The network has learned nothing about images, so that the distance is not a perceptual loss and is not called one.
 
     Args:
         weight: factor.
         width: channels of the first block; VGG has 64.
         depth: number of blocks, each of half the resolution of the previous one.
         seed: seed of the weights.
-        cache: as of `Perceptual`.
+        cache: MiB of features of true images that are kept in memory.
     """
 
-    bibtex = """@inproceedings{ustyuzhaninov2017texture,
-  author    = {Ustyuzhaninov, Ivan and Brendel, Wieland and Gatys, Leon and Bethge, Matthias},
-  title     = {What Does it Take to Generate Natural Textures?},
-  booktitle = {International Conference on Learning Representations (ICLR)},
-  year      = {2017}
-}"""
+    bibtex = "ustyuzhaninov2017texture"
 
     def __init__(
         self,
@@ -157,7 +150,7 @@ class RandomFeatures(FeatureDistance):
         seed: Annotated[int, Field(ge=0, lt=2**31)] = 0,
         cache: Cache = 1024,
     ) -> None:
-        super().__init__(weight, drawn(16, width, TAPS[16][:depth], seed), cache)
+        super().__init__(weight, random_vgg(16, width, TAPS[16][:depth], seed), cache)
 
     @property
     def term(self) -> str:

@@ -14,13 +14,13 @@ def predicted_images(
 ) -> tuple[
     Float[Tensor, "batch *member height width number"], Float[Tensor, "batch *_member height width number"]
 ]:
-    """Return the means of the densities of the batch's inputs, in numbers as files hold them, and the true images.
+    """Return the predicted images, which are the means of the densities, and the true images, both in sRGB.
 
-    The true images have one member if all members read the same rows, and as many as there are if each has its own
-    rows.
+    The second dimension of the true images is 1 if all members read the same rows, and the number of members if each
+    member has its own rows.
 
     Raises:
-        ConfigError: the target is no image of red, green and blue.
+        ConfigError: the target is not an image of red, green and blue.
     """
     with set_flag(
         predictor, BATCH_NORM, "track_running_stats", False
@@ -28,8 +28,8 @@ def predicted_images(
         densities = predictor.training_densities(batch["input"])
     if len(densities.event_shape) != 3 or densities.event_shape[-1] != 3:
         raise ConfigError(
-            f"Targets are of shape {tuple(densities.event_shape)}; wanted images of three colours, (height, width, 3), "
-            "which this objective compares. Leave it out, or choose other data."
+            f"This objective compares images of three colours, (height, width, 3), but the targets have the shape "
+            f"{tuple(densities.event_shape)}. Leave out the objective, or choose other data."
         )
     images = densities.mean
     count, *members = images.shape[:-3]

@@ -1,4 +1,4 @@
-"""Rows of the contract: distances of features and discriminators, on images of few pixels."""
+"""Contract-test cases: distances between images or features, and discriminators, on images of few pixels."""
 
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -12,11 +12,11 @@ from plugins.objective.images.vgg import TAPS, WIDTHS, Depth, layers_of
 FOLDER = TemporaryDirectory()
 IMAGES = Target("image", ("red", "green", "blue"), size=(20, 16))
 KINKS = {"gradient": 0.05}
-"""Limits for finite differences that step over the kink of a ReLU."""
+"""Limit for finite differences that step over the kink of a ReLU."""
 
 
 def file_of(depth: Depth) -> str:
-    """Return a file of random weights in torchvision's names, for the layers that are read."""
+    """Write random weights, named as torchvision names them, of the layers that are read, and return the file."""
     generator, channels, state = torch.Generator().manual_seed(depth), 3, {}
     for block, _, index in layers_of(depth, TAPS[depth][-1]):
         width = WIDTHS[block]

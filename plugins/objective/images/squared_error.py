@@ -1,4 +1,4 @@
-"""Squared distance of predicted and true images."""
+"""Mean squared difference between predicted and true images."""
 
 from typing import Annotated
 
@@ -13,24 +13,16 @@ from plugins.objective.images.predicted import predicted_images
 
 
 class SquaredError(Objective):
-    """Mean squared distance of an image's numbers; the peak signal-to-noise ratio is a function of it.
+    """Mean squared difference of the numbers of predicted and true images, from which their PSNR follows.
 
-    The absolute distance has the same gradient for every error, and its optimum is a median. The squared distance gives
-    more weight to large errors, such as a silhouette in the wrong place (Wang and Bovik 2009, §II).
+    The gradient of an absolute difference is the same for every error, and its optimum is a median. A squared
+    difference gives more weight to large errors, such as a silhouette in the wrong place (Wang and Bovik 2009, §II).
 
     Args:
-        weight: factor. An error d of the range [0, 1] counts more by its square than by |d| if d > 1 / weight.
+        weight: factor; an error d in [0, 1] costs weight · d², which is more than |d| if d > 1 / weight.
     """
 
-    bibtex = """@article{wang2009mean,
-  author  = {Wang, Zhou and Bovik, Alan C.},
-  title   = {Mean Squared Error: Love It or Leave It? {A} New Look at Signal Fidelity Measures},
-  journal = {IEEE Signal Processing Magazine},
-  volume  = {26},
-  number  = {1},
-  pages   = {98--117},
-  year    = {2009}
-}"""
+    bibtex = "wang2009mean"
 
     def __init__(self, *, weight: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 5.0) -> None:
         super().__init__()

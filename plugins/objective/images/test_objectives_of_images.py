@@ -20,7 +20,7 @@ from plugins.objective.images.squared_error import SquaredError
 from plugins.objective.images.vgg import CONVOLUTIONS, TAPS, WIDTHS, Depth, layers_of
 
 
-class Given(Predictor):
+class PredictorOf(Predictor):
     """A predictor that returns the images it was constructed with."""
 
     def __init__(self, images: Tensor) -> None:
@@ -40,9 +40,9 @@ class Given(Predictor):
         pass
 
 
-def pair(*size: int) -> tuple[Given, dict[str, Tensor]]:
+def pair(*size: int) -> tuple[PredictorOf, dict[str, Tensor]]:
     torch.manual_seed(1)
-    predictor = Given(torch.rand(3, *size, 3))
+    predictor = PredictorOf(torch.rand(3, *size, 3))
     return predictor, {"input": torch.arange(3), "target": torch.rand(3, *size, 3)}
 
 
@@ -65,10 +65,10 @@ def test_each_member_of_an_ensemble_is_judged_by_the_images_of_its_own_rows(make
     """Compare value and gradients with those of models alone, each of which draws its own rows once."""
     torch.manual_seed(0)
     alone = [painter() for _ in range(3)]
-    given = iter(copy.deepcopy(alone))
+    copies = iter(copy.deepcopy(alone))
     ensemble = resolve("uncertainty", {"name": "ensemble", "members": 3})
-    whole = build("uncertainty", ensemble, model=lambda: next(given), target=IMAGES)
-    members = [one for one in whole.modules() if isinstance(one, Model)]
+    whole = build("uncertainty", ensemble, model=lambda: next(copies), target=IMAGES)
+    members = [module for module in whole.modules() if isinstance(module, Model)]
     if wrapped:
         inner = whole
         whole = build(
@@ -81,21 +81,21 @@ def test_each_member_of_an_ensemble_is_judged_by_the_images_of_its_own_rows(make
     objective = make()
     with own_batches(whole), one_pass(whole):
         whole.loss(inputs, target)
-        found = objective(whole, {"input": inputs, "target": target})
-    found.backward()
+        penalty = objective(whole, {"input": inputs, "target": target})
+    penalty.backward()
     assert painted == [2, 2, 2]
-    apart = [
-        objective(one, {"input": given, "target": true})
-        for one, given, true in zip(alone, inputs.chunk(3), target.chunk(3), strict=True)
+    separate = [
+        objective(model, {"input": rows, "target": true})
+        for model, rows, true in zip(alone, inputs.chunk(3), target.chunk(3), strict=True)
     ]
-    torch.testing.assert_close(found, torch.stack(apart).mean())
-    sum(apart).backward()
+    torch.testing.assert_close(penalty, torch.stack(separate).mean())
+    sum(separate).backward()
     for mine, theirs in zip(members, alone, strict=True):
         for ours, wanted in zip(mine.parameters(), theirs.parameters(), strict=True):
             torch.testing.assert_close(ours.grad, wanted.grad, rtol=1e-4, atol=1e-7)
     together = objective(whole, {"input": inputs, "target": target})
-    each = torch.stack([objective(one, {"input": inputs, "target": target}) for one in alone])
-    torch.testing.assert_close(together, each.mean(), msg="all see all rows where none has its own")
+    penalties = torch.stack([objective(model, {"input": inputs, "target": target}) for model in alone])
+    torch.testing.assert_close(together, penalties.mean(), msg="all see all rows where none has its own")
 
 
 def torchvision(depth: Depth) -> nn.Sequential:
@@ -123,7 +123,7 @@ def test_features_are_those_of_torchvisions_layout(
     torch.save({**stored, "classifier.0.weight": torch.zeros(2, 2)}, file)
     predictor, batch = pair(32, 32)
     objective = Perceptual(weight=2.0, weights=str(file), layers=depth)
-    found = objective(predictor, batch)
+    penalty = objective(predictor, batch)
 
     def features(images: Tensor) -> list[Tensor]:
         hidden = (images.movedim(-1, 1) - torch.tensor([0.485, 0.456, 0.406])[:, None, None]) / torch.tensor(
@@ -141,15 +141,15 @@ def test_features_are_those_of_torchvisions_layout(
         wanted = sum(
             2.0 ** (level + 1 - len(pairs)) * (a - b).abs().mean() for level, (a, b) in enumerate(pairs)
         )
-    torch.testing.assert_close(found, 2 * wanted)
+    torch.testing.assert_close(penalty, 2 * wanted)
     assert layers_of(depth, TAPS[depth][-1])[-1][2] == last - 1
-    assert objective.logged_terms["perceptual"] == found / 2
+    assert objective.logged_terms["perceptual"] == penalty / 2
     assert not list(objective.state_dict())
 
 
 def test_other_weights_are_refused(tmp_path: Path) -> None:
     with pytest.raises(
-        ConfigError, match=r"weights is null; wanted torchvision's file of VGG16.*random_features"
+        ConfigError, match=r"weights is null, but torchvision's file of VGG16.*random_features"
     ):
         Perceptual()
     with pytest.raises(ConfigError, match=r"The weight file .*gone\.pth does not exist"):
@@ -166,24 +166,24 @@ def test_what_is_kept_changes_no_number_and_stays_within_its_bound() -> None:
     predictor, batch = pair(24, 20)
     plain, keeping = RandomFeatures(width=4, cache=0), RandomFeatures(width=4, cache=1)
     calls: list[int] = []
-    keeping.network.register_forward_hook(lambda module, given, output: calls.append(len(given[0])))
+    keeping.network.register_forward_hook(lambda module, arguments, output: calls.append(len(arguments[0])))
     for number in range(4):
         torch.testing.assert_close(keeping(predictor, batch), plain(predictor, batch))
         if number == 2:  # another image under the same number is another image
             batch["target"][1] = 0.5
     assert calls == [3, 3, 3, 3, 3, 1]
-    assert 0 < keeping.bytes <= 2**20
+    assert 0 < keeping.cached_bytes <= 2**20
     tiny = RandomFeatures(width=64, cache=1)
     predictor, batch = pair(64, 64)
     for _ in range(2):
         tiny(predictor, batch)
-    assert tiny.bytes <= 2**20
+    assert tiny.cached_bytes <= 2**20
 
 
 def test_random_features_are_a_function_of_their_seed_and_keep_their_size() -> None:
     predictor, batch = pair(48, 48)
-    one, same, other = (RandomFeatures(seed=seed)(predictor, batch) for seed in (0, 0, 1))
-    assert one == same != other
+    first, same, other = (RandomFeatures(seed=seed)(predictor, batch) for seed in (0, 0, 1))
+    assert first == same != other
     features = RandomFeatures().network(batch["target"].movedim(-1, 1))
     assert all(0.2 < level.std() < 3 for level in features)
 
@@ -191,12 +191,16 @@ def test_random_features_are_a_function_of_their_seed_and_keep_their_size() -> N
 def test_the_discriminators_learn_against_the_predictor() -> None:
     predictor, batch = pair(40, 36)
     objective = PatchGAN(weight=3.0, feature_matching=0.25, width=8)
-    found = objective(predictor, batch)
-    found.backward()
-    told = objective.logged_terms
-    torch.testing.assert_close(found, 3 * (told["generator"] + 0.25 * told["feature_matching"]))
+    penalty = objective(predictor, batch)
+    penalty.backward()
+    terms = objective.logged_terms
+    torch.testing.assert_close(penalty, 3 * (terms["generator"] + 0.25 * terms["feature_matching"]))
     judge = objective.discriminators
-    ours = {name: one.grad.clone() for name, one in judge.named_parameters() if one.grad is not None}
+    ours = {
+        name: parameter.grad.clone()
+        for name, parameter in judge.named_parameters()
+        if parameter.grad is not None
+    }
     images = predictor.images.grad
     assert images is not None
     slope = images.clone()
@@ -213,11 +217,11 @@ def test_the_discriminators_learn_against_the_predictor() -> None:
         )
         / 2
     )
-    torch.testing.assert_close(told["discriminator"], own.detach())
+    torch.testing.assert_close(terms["discriminator"], own.detach())
     (3 * own).backward()
-    for name, one in judge.named_parameters():
-        assert one.grad is not None
-        torch.testing.assert_close(ours[name], one.grad)
+    for name, parameter in judge.named_parameters():
+        assert parameter.grad is not None
+        torch.testing.assert_close(ours[name], parameter.grad)
 
     predictor.zero_grad()
     false = judged(predictor.images)
@@ -230,16 +234,16 @@ def test_the_discriminators_learn_against_the_predictor() -> None:
             for a, b in zip(f[:-1], t[:-1], strict=True)
         ]
     ).mean()
-    torch.testing.assert_close(told["generator"], fooled.detach())
-    torch.testing.assert_close(told["feature_matching"], alike.detach())
+    torch.testing.assert_close(terms["generator"], fooled.detach())
+    torch.testing.assert_close(terms["feature_matching"], alike.detach())
     (3 * (fooled + 0.25 * alike)).backward()
     assert predictor.images.grad is not None
     torch.testing.assert_close(slope, predictor.images.grad)
 
 
 def test_targets_that_are_no_images_are_refused() -> None:
-    predictor = Given(torch.rand(3, 4, 4, 2))
-    with pytest.raises(ConfigError, match=r"\(4, 4, 2\); wanted images of three colours"):
+    predictor = PredictorOf(torch.rand(3, 4, 4, 2))
+    with pytest.raises(ConfigError, match=r"images of three colours.*\(4, 4, 2\)"):
         RandomFeatures()(predictor, {"input": torch.arange(3), "target": torch.rand(3, 4, 4, 2)})
 
 
@@ -249,12 +253,12 @@ def test_the_squared_error_is_torchs_and_each_member_has_its_own() -> None:
     wanted = mse_loss(predictor.images, batch["target"])
     torch.testing.assert_close(objective(predictor, batch), 3 * wanted)
     torch.testing.assert_close(objective.logged_terms["squared_error"], wanted.detach())
-    members = Given(torch.rand(3, 2, 6, 5, 3))
-    found = objective(members, batch)
-    slope = torch.autograd.grad(found, members.images)[0]
+    members = PredictorOf(torch.rand(3, 2, 6, 5, 3))
+    penalty = objective(members, batch)
+    slope = torch.autograd.grad(penalty, members.images)[0]
     for member in range(2):
-        alone = Given(members.images[:, member].detach().clone())
+        alone = PredictorOf(members.images[:, member].detach().clone())
         own = torch.autograd.grad(objective(alone, batch), alone.images)[0]
         torch.testing.assert_close(slope[:, member], own)
     empty = {name: values[:0] for name, values in batch.items()}
-    assert objective(Given(torch.rand(0, 6, 5, 3)), empty).item() == 0
+    assert objective(PredictorOf(torch.rand(0, 6, 5, 3)), empty).item() == 0

@@ -30,10 +30,10 @@ MEAN, SPREAD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
 class VGG(nn.Module):
-    """Features of images after some of the convolutions, in the images' own dtype; no parameter is trained.
+    """Part of a VGG network that returns features after some of its convolutions; its weights are not trained.
 
     Args:
-        depth: number of layers of the whole network; only the convolutions up to the last tap are kept.
+        depth: number of layers of the whole network, 16 or 19; only the convolutions up to the last tap are used.
         widths: channels of each block.
         taps: convolutions whose outputs are features, ascending.
     """
@@ -45,15 +45,15 @@ class VGG(nn.Module):
         channels = 3
         for block, place, _ in self.layers:
             shape = (widths[block], channels, 3, 3)
-            # not in a checkpoint: the weights come from a file, or from a seed
+            # not stored in a checkpoint, since the weights come from a file or from a seed
             self.register_buffer(f"weight_{block}_{place}", torch.zeros(shape), persistent=False)
             self.register_buffer(f"bias_{block}_{place}", torch.zeros(widths[block]), persistent=False)
             channels = widths[block]
 
     def forward(self, images: Float[Tensor, "image 3 height width"]) -> list[Tensor]:
-        """Return (image, channel, height, width) of each tap, for images in numbers as files hold them."""
+        """Return the features (image, channel, height, width) after each tap, for images in sRGB; the dtype stays."""
         mean, spread = (images.new_tensor(values)[:, None, None] for values in (MEAN, SPREAD))
-        hidden, found, block_before = (images - mean) / spread, [], 0
+        hidden, features, block_before = (images - mean) / spread, [], 0
         for block, place, _ in self.layers:
             if block != block_before:
                 hidden, block_before = max_pool2d(hidden, 2), block
@@ -62,33 +62,33 @@ class VGG(nn.Module):
             )
             hidden = relu(conv2d(hidden, weight, bias, padding=1))
             if (block, place) in self.taps:
-                found.append(hidden)
-        return found
+                features.append(hidden)
+        return features
 
     @property
     def least_side(self) -> int:
-        """Smallest side, pixels, of an image that still has the last features."""
+        """Smallest side of an image, pixels, for which the last features exist."""
         return 2 ** self.taps[-1][0]
 
 
 def layers_of(depth: Depth, last: tuple[int, int]) -> list[tuple[int, int, int]]:
-    """Return block, convolution and index in torchvision's `features` of every convolution up to the last tap."""
-    found, index = [], 0
+    """Return (block, convolution in it, index in torchvision's `features`) of all convolutions up to the last tap."""
+    layers, index = [], 0
     for block, count in enumerate(CONVOLUTIONS[depth]):
         for place in range(count):
-            found.append((block, place, index))
+            layers.append((block, place, index))
             index += 2  # the convolution and its ReLU
             if (block, place) == last:
-                return found
+                return layers
         index += 1  # the pooling
-    return found
+    return layers
 
 
-def trained(depth: Depth, file: str) -> VGG:
-    """Return the network with weights of a file as torchvision writes it, whole or its `features` alone.
+def read_vgg(depth: Depth, file: str) -> VGG:
+    """Return the network with the weights in torchvision's file of the whole network, or of its `features` alone.
 
     Raises:
-        ConfigError: there is no such file, or it holds other weights.
+        ConfigError: the file does not exist, or holds the weights of another network.
         CheckpointError: the file is damaged.
     """
     network = VGG(depth, WIDTHS, TAPS[depth])
@@ -97,25 +97,25 @@ def trained(depth: Depth, file: str) -> VGG:
         for name in ("weight", "bias"):
             own = getattr(network, f"{name}_{block}_{place}")
             key = f"features.{index}.{name}"
-            found = stored.get(key, stored.get(key.removeprefix("features.")))
-            if found is None or found.shape != own.shape:
-                came = "missing" if found is None else f"of shape {tuple(found.shape)}"
+            tensor = stored.get(key, stored.get(key.removeprefix("features.")))
+            if tensor is None or tensor.shape != own.shape:
+                state = "missing" if tensor is None else f"of shape {tuple(tensor.shape)}"
                 raise ConfigError(
-                    f"{file}: {key} is {came}; wanted shape {tuple(own.shape)}. Give torchvision's weights of "
-                    f"VGG{depth}, such as vgg{depth}-….pth."
+                    f"{file}: {key} is {state}, expected the shape {tuple(own.shape)}. Set "
+                    f"objective.perceptual.weights to torchvision's weights of VGG{depth}, such as vgg{depth}-….pth."
                 )
-            own.copy_(found)
+            own.copy_(tensor)
     return network
 
 
-def drawn(depth: Depth, width: int, taps: Sequence[tuple[int, int]], seed: int) -> VGG:
-    """Return the network with weights drawn from a seed, which keep the scale from layer to layer.
+def random_vgg(depth: Depth, width: int, taps: Sequence[tuple[int, int]], seed: int) -> VGG:
+    """Return the network with random weights, which preserve the scale of the features from layer to layer.
 
-    Their variance is that of He et al. 2015, eq. 10.
+    The variance of the weights is that of He et al. 2015, eq. 10.
 
     Args:
         depth: number of layers of the whole network, 16 or 19.
-        width: channels of the first block; those of the others are in VGG's proportion.
+        width: channels of the first block; the channels of further blocks are in the same proportion as in VGG.
         taps: convolutions whose outputs are features, ascending.
         seed: seed of the weights.
     """

@@ -11,13 +11,13 @@ from framework.distributions.circular import Circular
 from framework.distributions.closed_forms import normal_quantile
 
 DRAWS = 16
-"""Number of targets from which a divergence of a continuous density is estimated, for each item of the batch."""
+"""Number of targets from which the divergence of a continuous density is estimated, for each item of the batch."""
 
 
 def from_uniform(density: Distribution) -> Float[Tensor, "*batch"]:
     """Return KL(p ‖ u) = log K - H(p) over K classes, nats: the entropy of thesis eq. 2.21 up to a constant."""
     log_prob = density.log_prob(density.enumerate_support())
-    # p log p → 0 as p → 0; log p is clamped where p rounds to 0, which would give 0 × ∞
+    # p log p → 0 as p → 0; log p is clamped, because 0 × ∞ would be NaN where p rounds to 0
     return (log_prob.exp() * log_prob.clamp(min=-1e4)).sum(0) + math.log(len(log_prob))
 
 
@@ -30,35 +30,34 @@ def to_uniform(density: Distribution) -> Float[Tensor, "*batch"]:
 def to_ignorance(density: Distribution, scale: float) -> Float[Tensor, "*batch"]:
     """Return an unbiased estimate of KL(u ‖ p) = E_u[-log p] - H(u) of a continuous density, nats.
 
-    It is estimated from a few targets drawn from u, which is uniform in every angle and N(0, scale²) in every real. If
-    the density's support has ranges, the angles are those of a rotation, and u is uniform over rotations: sin e is
-    uniform for an elevation e in [-π/2, π/2]. The targets are a Latin hypercube: each of n equal shares of each
-    number's probability holds one (McKay, Beckman & Conover 1979), so that the estimate for one number has an error of
-    O(n^-3/2) instead of O(n^-1/2). All members of a batch of (batch, member) get the same targets.
+    It is estimated from a few targets sampled from u, which is uniform for every angle and N(0, scale²) for every real.
+    If the density's support has ranges, the angles are those of a rotation, and u is uniform over rotations: sin e is
+    uniform for an elevation e in [-π/2, π/2]. The n targets are a Latin hypercube (McKay, Beckman & Conover 1979): each
+    n-th part of each number's probability holds exactly one. The estimate for one number therefore has an error of
+    O(n^-3/2) instead of O(n^-1/2). All members of a density with batch_shape (batch, member) get the same targets.
     """
     support = density.support
     numbers = density.event_shape[0]
     members = (1,) * (len(density.batch_shape) - 1)
-    like = density.sample(torch.Size((0,)))  # an empty sample shows the density's dtype and device
+    like = density.sample(torch.Size((0,)))  # an empty sample has the density's dtype and device
     place = latin_hypercube((*density.batch_shape[:1], *members, numbers), like.device)
     if isinstance(support, Circular):
         ranges = support.ranges or ((-math.pi, math.pi),) * numbers
         low, high = torch.tensor(ranges, dtype=place.dtype, device=place.device).T
-        # an elevation, half a turn, has the density cos e / 2 of random rotations
+        # an elevation, whose range is half a turn, has the density cos e / 2 under random rotations
         elevation = high - low < 1.5 * math.pi
-        drawn = torch.where(elevation, (2 * place - 1).asin(), low + place * (high - low))
-        log_each = torch.where(elevation, (drawn.cos() / 2).log(), -(high - low).log())
-        entropy = -log_each.sum(-1).mean(
-            0
-        )  # at the same targets, so that the estimate is exactly 0 for equal densities
+        targets = torch.where(elevation, (2 * place - 1).asin(), low + place * (high - low))
+        log_each = torch.where(elevation, (targets.cos() / 2).log(), -(high - low).log())
+        # at the same targets, so that the estimate is exactly 0 for equal densities
+        entropy = -log_each.sum(-1).mean(0)
     else:
-        drawn = scale * normal_quantile(place)
+        targets = scale * normal_quantile(place)
         entropy = numbers * (0.5 + 0.5 * math.log(2 * math.pi) + math.log(scale))
-    found = -density.log_prob(drawn.to(like.dtype)).mean(0)
-    return found - torch.as_tensor(entropy).to(found)
+    cross_entropy = -density.log_prob(targets.to(like.dtype)).mean(0)
+    return cross_entropy - torch.as_tensor(entropy).to(cross_entropy)
 
 
 def latin_hypercube(shape: tuple[int, ...], device: torch.device) -> Float[Tensor, "draw *shape"]:
-    """Return DRAWS places in [0, 1) for each of `shape`, one in each DRAWS-th, in random order; float64."""
+    """Return DRAWS numbers in [0, 1) per element of `shape`, one in each DRAWS-th part, in random order; float64."""
     order = torch.rand(DRAWS, *shape, dtype=torch.float64, device=device).argsort(0)
     return (order + torch.rand(DRAWS, *shape, dtype=torch.float64, device=device)) / DRAWS

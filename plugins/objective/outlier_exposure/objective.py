@@ -1,4 +1,4 @@
-"""A penalty on densities of outliers that differ from a uniform density."""
+"""Outlier exposure: a penalty on predicted densities of outliers that differ from a uniform density."""
 
 from typing import Annotated, Literal
 
@@ -20,46 +20,35 @@ from plugins.objective.outlier_exposure.divergence import from_uniform, to_ignor
 
 
 class OutlierExposure(Objective):
-    """A penalty for densities of outliers that differ from a uniform one (thesis eq. 2.21), for all kinds of target.
+    """A penalty on predicted densities p of outliers that differ from a uniform density u (thesis eq. 2.21).
 
-    The penalty is the weight times the mean over outliers of a divergence, nats, that is 0 for a density without
-    information. For classes "entropy" is KL(p ‖ u) = log K - H(p): eq. 2.21 plus a constant, which has no gradient.
-    "cross_entropy" is KL(u ‖ p), whose gradient does not vanish if p is certain of a class. For angles and reals it is
-    KL(u ‖ p), estimated without bias from a few targets drawn from u. "auto" is the first for classes, and the second
-    for others.
+    The penalty is the weight times the mean over outliers of a divergence, nats, which is 0 for p = u. For classes,
+    "entropy" is KL(p ‖ u) = log K - H(p), which is eq. 2.21 plus a constant without gradient. "cross_entropy" is
+    KL(u ‖ p), whose gradient does not vanish if p is certain of a class. For angles and reals the divergence is
+    KL(u ‖ p), estimated without bias from a few targets sampled from u. "auto" is "entropy" for classes, and
+    "cross_entropy" for other targets.
 
-    Outliers are either the training split of other data, with that data's augmentation, or uniform numbers. Each step
-    draws its own, with replacement, from torch's global generator. Batch norm treats them as in a test: it normalises
-    them by the running moments of the training data, and does not update these.
+    Outliers are either samples of the training split of other data, with the augmentation of that data, or uniform
+    random numbers. Each step draws new outliers, with replacement, from torch's global generator. Batch norm treats
+    outliers as in a test: it normalises them by the running moments of the training data, and does not update these.
 
     Args:
         weight: λ.
-        outliers: data to draw from; prepared at once.
-        low, high: the range of uniform numbers, in the units of the inputs; for images, 0 and 1.
-        count: number of outliers of a step; None: the number of samples that the batch has for each model.
-        clearance: outliers nearer than this to an input of the batch (Euclidean, in its units) are left out: uniform
-            numbers also fall among the training data, where a uniform density costs likelihood. 0 keeps all.
+        outliers: data from which outliers are drawn; the constructor prepares it.
+        low, high: range of uniform random numbers, in the units of the inputs; 0 and 1 for images.
+        count: number of outliers of a step; None: the number of samples in the batch for each model.
+        clearance: outliers with a smaller Euclidean distance to an input of the batch, in the inputs' unit, are left
+            out: uniform numbers also fall among the training data, where a uniform density would be wrong. 0 keeps all.
         divergence: "auto", "entropy" or "cross_entropy".
         prior_scale: standard deviation of u for a real number, in the target's units.
 
     Raises:
-        ConfigError: both or neither of `outliers` and (`low`, `high`), an empty range; and in training, outliers of
-            another shape than the inputs, or "entropy" of a density that is not over classes.
-        DataError: as `outliers.prepare`.
+        ConfigError: both or neither of `outliers` and (`low`, `high`) are set, or the range is empty. In training:
+            outliers have another shape than the inputs, or "entropy" is chosen for a density that is not over classes.
+        DataError: `outliers.prepare` fails.
     """
 
-    bibtex = """@inproceedings{hendrycks2019deep,
-  author    = {Hendrycks, Dan and Mazeika, Mantas and Dietterich, Thomas},
-  title     = {Deep Anomaly Detection with Outlier Exposure},
-  booktitle = {International Conference on Learning Representations},
-  year      = {2019}
-}
-@inproceedings{hein2019why,
-  author    = {Hein, Matthias and Andriushchenko, Maksym and Bitterwolf, Julian},
-  title     = {Why {ReLU} Networks Yield High-Confidence Predictions Far Away From the Training Data and How to Mitigate the Problem},
-  booktitle = {IEEE/CVF Conference on Computer Vision and Pattern Recognition},
-  year      = {2019}
-}"""  # noqa: E501
+    bibtex = "hendrycks2019deep, hein2019why"  # noqa: E501
 
     def __init__(
         self,
@@ -89,12 +78,12 @@ class OutlierExposure(Objective):
         """Return the weighted penalty of a batch."""
         inputs = batch["input"]
         count = rows_per_model(predictor, len(inputs)) if self.count is None else self.count
-        drawn = self._uniform(inputs, count) if self.outliers is None else self._drawn(inputs, count)
+        outliers = self._uniform(inputs, count) if self.outliers is None else self._draw(inputs, count)
         if self.clearance > 0:
-            drawn = drawn[clear_of(drawn, inputs, self.clearance)]
+            outliers = outliers[far_from(outliers, inputs, self.clearance)]
         with set_flag(predictor, BATCH_NORM, "training", False), own_batches(predictor, False):
-            found = independent_penalty(self._divergences(predictor.training_densities(drawn)))
-        return self.weight * found.sum() / max(1, len(drawn))  # no outliers, no penalty
+            divergences = independent_penalty(self._divergences(predictor.training_densities(outliers)))
+        return self.weight * divergences.sum() / max(1, len(outliers))  # without outliers the penalty is 0
 
     def _divergences(self, density: Distribution) -> Float[Tensor, "batch *member"]:
         """Return the divergence of each outlier and member, nats."""
@@ -102,8 +91,8 @@ class OutlierExposure(Objective):
             return to_uniform(density) if self.divergence == "cross_entropy" else from_uniform(density)
         if self.divergence == "entropy":
             raise ConfigError(
-                "objective.outlier_exposure.divergence = 'entropy' is for classes, but the density is over "
-                f"{density.event_shape[0]} continuous numbers. Choose 'cross_entropy' or 'auto'."
+                "objective.outlier_exposure.divergence=entropy is for classes, but the density is over "
+                f"{density.event_shape[0]} continuous numbers. Choose cross_entropy or auto."
             )
         return to_ignorance(density, self.prior_scale)
 
@@ -112,18 +101,18 @@ class OutlierExposure(Objective):
         dtype = inputs.dtype if inputs.is_floating_point() else torch.get_default_dtype()
         return low + (high - low) * torch.rand(count, *inputs.shape[1:], dtype=dtype, device=inputs.device)
 
-    def _drawn(self, inputs: Tensor, count: int) -> Tensor:
+    def _draw(self, inputs: Tensor, count: int) -> Tensor:
         assert self.outliers is not None
         shape, wanted = tuple(self.outliers.input_shape), tuple(inputs.shape[1:])
         if shape != wanted:
             raise ConfigError(
-                f"objective.outlier_exposure.outliers has inputs of shape {shape}, the data of shape {wanted}; wanted "
-                "one shape. Set the size of either."
+                f"objective.outlier_exposure.outliers has inputs of shape {shape}, but the data has inputs of shape "
+                f"{wanted}. Both shapes must be equal: change the size of the inputs of one of them."
             )
         if count == 0:
             return inputs
         index = torch.randint(len(self.split), (count,)).tolist()  # pyright: ignore[reportArgumentType]
-        # a loader of one batch: it handles data sets that fetch many items at once
+        # a loader of one batch also handles data sets that fetch many items at once
         loader = DataLoader(
             self.split, batch_sampler=[index], collate_fn=as_batch, generator=torch.Generator()
         )
@@ -131,39 +120,40 @@ class OutlierExposure(Objective):
         return self.outliers.augment(batch)["input"]
 
 
-def clear_of(
+def far_from(
     outliers: Float[Tensor, "outlier *input"], inputs: Tensor, clearance: float
 ) -> Bool[Tensor, "outlier"]:
-    """Return which outliers are at least `clearance` away from every input; bytes are read as 0 to 1."""
+    """Return which outliers have at least the distance `clearance` from every input; uint8 is converted to 0…1."""
     if len(inputs) == 0 or len(outliers) == 0:
         return torch.ones(len(outliers), dtype=torch.bool, device=outliers.device)
-    some, others = (
-        given.flatten(1).float() / 255 if given.dtype == torch.uint8 else given.flatten(1)
-        for given in (outliers, inputs)
+    outlier_rows, input_rows = (
+        rows.flatten(1).float() / 255 if rows.dtype == torch.uint8 else rows.flatten(1)
+        for rows in (outliers, inputs)
     )
-    return torch.cdist(some, others.to(some)).amin(1) >= clearance
+    return torch.cdist(outlier_rows, input_rows.to(outlier_rows)).amin(1) >= clearance
 
 
 def uniform_range(low: float | None, high: float | None, *, other: bool) -> tuple[float, float]:
-    """Return (low, high), or NaNs if there is another source of outliers.
+    """Return (low, high), or a pair of NaN if `other`: if the outliers come from a data set.
 
     Raises:
-        ConfigError: both sources or neither, or an empty range.
+        ConfigError: both sources of outliers are set, or none, or the range is empty.
     """
-    given = [number for number in (low, high) if number is not None]
-    if other and not given:
+    bounds = [number for number in (low, high) if number is not None]
+    if other and not bounds:
         return torch.nan, torch.nan
     if other or low is None or high is None:
-        came = " and ".join(
+        settings = " and ".join(
             [f"{name} = {value:g}" for name, value in (("low", low), ("high", high)) if value is not None]
             + ["outliers"] * other
         )
         raise ConfigError(
-            f"objective.outlier_exposure got {came or 'no outliers'}; wanted either another data set, such as "
-            "`outliers={name: ..., ...}`, or uniform numbers, `low` and `high` (0 and 1 for images)."
+            f"objective.outlier_exposure got {settings or 'no source of outliers'}. Set either outliers to another "
+            "data set, such as outliers={name: ..., ...}, or low and high to the range of uniform numbers (0 and 1 for "
+            "images)."
         )
     if not low < high:
         raise ConfigError(
-            f"objective.outlier_exposure.low = {low:g} and high = {high:g}; wanted low below high. Swap them."
+            f"objective.outlier_exposure.low is {low:g} and high is {high:g}, but low must be below high. Swap them."
         )
     return low, high

@@ -1,4 +1,4 @@
-"""Rows of the contract: outlier exposure, for each kind of target and divergence."""
+"""Contract-test cases: outlier exposure, for each kind of target and divergence."""
 
 from framework.target import Target
 from framework.testing.rows import ObjectiveRow

@@ -41,18 +41,18 @@ def objective(**config):
     return build("objective", resolve("objective", {"name": "outlier_exposure", **config}))
 
 
-class Given(Predictor):
-    """A predictor with a head's densities at raw parameters that are a linear map of the inputs; keeps its inputs."""
+class ConstantPredictor(Predictor):
+    """A predictor that passes the same raw parameters to a head for every input, and records the inputs."""
 
     def __init__(self, head, raw, members=False):
         super().__init__()
         self.head = head
         self.raw = nn.Parameter(raw)
         self.members = members
-        self.seen = []
+        self.recorded = []
 
     def training_densities(self, inputs):
-        self.seen.append(inputs.detach().clone())
+        self.recorded.append(inputs.detach().clone())
         wide = self.raw.expand(len(inputs), *self.raw.shape)
         if self.members:
             return Stacked([self.head(wide[:, index]) for index in range(wide.shape[1])])
@@ -97,12 +97,12 @@ def test_divergences_of_classes_are_those_of_50_digits(logits, dtype):
 
 def test_the_penalty_is_lambda_times_the_mean_divergence():
     raw = torch.tensor([2.0, -1.0, 0.5], dtype=torch.float64)
-    predictor = Given(head("categorical", CLASSES), raw)
+    predictor = ConstantPredictor(head("categorical", CLASSES), raw)
     p = special.softmax(raw.numpy())
-    found = objective(**BOX, weight=0.4)(predictor, given_batch()).item()
-    assert found == pytest.approx(0.4 * (math.log(3) - stats.entropy(p)), rel=1e-12)
-    found = objective(**BOX, weight=0.4, divergence="cross_entropy")(predictor, given_batch()).item()
-    assert found == pytest.approx(0.4 * stats.entropy(np.full(3, 1 / 3), p), rel=1e-12)
+    penalty = objective(**BOX, weight=0.4)(predictor, given_batch()).item()
+    assert penalty == pytest.approx(0.4 * (math.log(3) - stats.entropy(p)), rel=1e-12)
+    penalty = objective(**BOX, weight=0.4, divergence="cross_entropy")(predictor, given_batch()).item()
+    assert penalty == pytest.approx(0.4 * stats.entropy(np.full(3, 1 / 3), p), rel=1e-12)
 
 
 def test_members_with_batches_of_their_own_see_the_same_outliers():
@@ -115,18 +115,18 @@ def test_members_with_batches_of_their_own_see_the_same_outliers():
     wanted = objective(**BOX)(whole, {"input": inputs[:5]})
     torch.manual_seed(0)
     with own_batches(whole):
-        found = objective(**BOX)(whole, {"input": inputs})
+        penalty = objective(**BOX)(whole, {"input": inputs})
         assert whole.own_batches
-    torch.testing.assert_close(found, wanted, rtol=0, atol=0)
+    torch.testing.assert_close(penalty, wanted, rtol=0, atol=0)
 
 
 def test_knowing_nothing_costs_nothing():
     for kind in ("entropy", "cross_entropy", "auto"):
-        predictor = Given(head("categorical", CLASSES), torch.full((3,), 7.0))
+        predictor = ConstantPredictor(head("categorical", CLASSES), torch.full((3,), 7.0))
         assert objective(**BOX, divergence=kind)(predictor, given_batch()).item() == pytest.approx(
             0, abs=3e-7
         )
-    angle = Given(head("von_mises", ANGLE), torch.zeros(3))
+    angle = ConstantPredictor(head("von_mises", ANGLE), torch.zeros(3))
     assert objective(**BOX)(angle, given_batch()).item() == pytest.approx(0, abs=1e-6)
 
 
@@ -140,17 +140,17 @@ def test_outliers_among_the_data_are_left_out(kind):
     else:
         edge = {"low": 0.0, "high": 1.0} if kind == "bytes" else BOX
         loss = objective(**edge, clearance=0.7, count=200)
-    predictor = Given(head("categorical", CLASSES), torch.randn(3))
-    found = loss(predictor, {"input": inputs})
-    (seen,) = predictor.seen
+    predictor = ConstantPredictor(head("categorical", CLASSES), torch.randn(3))
+    penalty = loss(predictor, {"input": inputs})
+    (outliers,) = predictor.recorded
     scale = 255 if kind == "bytes" else 1
-    gaps = np.linalg.norm(seen.numpy()[:, None] - inputs.numpy()[None] / scale, axis=-1).min(1)
-    assert 0 < len(seen) < 200
+    gaps = np.linalg.norm(outliers.numpy()[:, None] - inputs.numpy()[None] / scale, axis=-1).min(1)
+    assert 0 < len(outliers) < 200
     assert gaps.min() >= 0.7
-    one = objective(**BOX, count=1)(
+    single = objective(**BOX, count=1)(
         predictor, {"input": inputs}
     )  # the same density everywhere: the same mean
-    torch.testing.assert_close(found, one)
+    torch.testing.assert_close(penalty, single)
     all_near = objective(**BOX, clearance=100.0)
     assert all_near(predictor, {"input": inputs}).item() == 0
 
@@ -159,7 +159,9 @@ def test_outliers_among_the_data_are_left_out(kind):
 def test_a_sure_class_still_learns_from_cross_entropy_and_not_from_entropy(dtype):
     slopes = {}
     for kind in ("entropy", "cross_entropy"):
-        predictor = Given(head("categorical", CLASSES), torch.tensor([1e4, -1e4, 0.0], dtype=dtype))
+        predictor = ConstantPredictor(
+            head("categorical", CLASSES), torch.tensor([1e4, -1e4, 0.0], dtype=dtype)
+        )
         value = objective(**BOX, divergence=kind)(predictor, given_batch())
         value.backward()
         assert value.isfinite() and predictor.raw.grad.isfinite().all()
@@ -171,7 +173,7 @@ def test_a_sure_class_still_learns_from_cross_entropy_and_not_from_entropy(dtype
 def test_the_gradient_is_that_of_eq_2_21():
     """Check that the constant log K has no gradient."""
     raw = torch.randn(3, dtype=torch.float64)
-    predictor = Given(head("categorical", CLASSES), raw.clone())
+    predictor = ConstantPredictor(head("categorical", CLASSES), raw.clone())
     objective(**BOX)(predictor, given_batch()).backward()
     own = raw.clone().requires_grad_()
     p = own.softmax(-1)
@@ -190,12 +192,12 @@ def test_places_are_one_in_each_share(count, numbers):
     assert (shares == torch.arange(DRAWS)[:, None, None]).all()
 
 
-def averaged(density, scale, wanted, rows):
+def require_mean(density, scale, wanted, rows):
     """Return whether the mean over many independent estimates of one divergence equals the divergence."""
-    found = to_ignorance(density, scale).double().numpy()
-    assert len(found) == rows
-    assert found.mean() == pytest.approx(wanted, abs=5 * found.std() / rows**0.5 + 1e-9)
-    return found.std()
+    divergence = to_ignorance(density, scale).double().numpy()
+    assert len(divergence) == rows
+    assert divergence.mean() == pytest.approx(wanted, abs=5 * divergence.std() / rows**0.5 + 1e-9)
+    return divergence.std()
 
 
 @pytest.mark.parametrize("concentration", [1e-3, 0.7, 5.0, 80.0])
@@ -204,7 +206,7 @@ def test_of_a_von_mises_density(concentration):
     torch.manual_seed(0)
     density = von_mises(concentration, rows=4000)
     wanted = float(mpmath.log(mpmath.besseli(0, concentration)))
-    spread = averaged(density, 1.0, wanted, 4000)
+    spread = require_mean(density, 1.0, wanted, 4000)
     plain = concentration / math.sqrt(2 * DRAWS)  # of as many independent angles
     assert spread < 0.2 * plain + 1e-9
 
@@ -219,27 +221,27 @@ def von_mises(concentration, rows):
         return build_one(raw[: build_one.size].expand(rows, build_one.size))
 
     # log p at the mode minus at the antipode is 2κ
-    def found(size):
-        one = density(size)
-        mode = one.mode
-        return ((one.log_prob(mode) - one.log_prob(mode + math.pi))[0] / 2).item()
+    def concentration_of(size):
+        candidate = density(size)
+        mode = candidate.mode
+        return ((candidate.log_prob(mode) - candidate.log_prob(mode + math.pi))[0] / 2).item()
 
     for _ in range(200):
         middle = (low + high) / 2
-        low, high = (middle, high) if found(middle) < concentration else (low, middle)
-    assert found(low) == pytest.approx(concentration, rel=1e-6)
+        low, high = (middle, high) if concentration_of(middle) < concentration else (low, middle)
+    assert concentration_of(low) == pytest.approx(concentration, rel=1e-6)
     return density(low)
 
 
 def test_of_two_angles_it_is_the_sum():
     torch.manual_seed(0)
     raw = torch.randn(6, dtype=torch.float64)
-    one = head("von_mises", ANGLES)
-    density = one(raw.expand(4000, 6))
+    pair = head("von_mises", ANGLES)
+    density = pair(raw.expand(4000, 6))
     places = np.linspace(-math.pi, math.pi, 200, endpoint=False)
     grid = torch.from_numpy(np.stack(np.meshgrid(places, places, indexing="ij"), -1).reshape(-1, 1, 2))
-    wanted = -one(raw[None]).log_prob(grid).mean().item() - 2 * math.log(2 * math.pi)
-    averaged(density, 1.0, wanted, 4000)
+    wanted = -pair(raw[None]).log_prob(grid).mean().item() - 2 * math.log(2 * math.pi)
+    require_mean(density, 1.0, wanted, 4000)
 
 
 @pytest.mark.parametrize("mean, deviation, scale", [(0.0, 3.0, 3.0), (1.5, 0.4, 2.0), (-30.0, 5.0, 0.1)])
@@ -253,7 +255,7 @@ def test_of_a_gaussian(mean, deviation, scale):
         1,
     )
     wanted = 2 * (math.log(deviation / scale) + (scale**2 + mean**2) / (2 * deviation**2) - 0.5)
-    averaged(density, scale, wanted, 4000)
+    require_mean(density, scale, wanted, 4000)
 
 
 def test_rotations_at_random_cost_nothing_and_others_more():
@@ -278,8 +280,8 @@ def test_rotations_at_random_cost_nothing_and_others_more():
 @pytest.mark.parametrize("size", [0.0, 1.0, 1e4])
 def test_extreme_densities_have_a_finite_divergence_and_gradient(name, target, size, dtype):
     torch.manual_seed(0)
-    one = head(name, target)
-    predictor = Given(one, size * torch.randn(one.size, dtype=dtype))
+    density_head = head(name, target)
+    predictor = ConstantPredictor(density_head, size * torch.randn(density_head.size, dtype=dtype))
     value = objective(**BOX)(predictor, given_batch())
     value.backward()
     assert value.isfinite() and value.dtype == dtype
@@ -292,12 +294,12 @@ def test_extreme_densities_have_a_finite_divergence_and_gradient(name, target, s
 def test_members_train_as_if_alone():
     torch.manual_seed(0)
     raw = torch.randn(3, 3, dtype=torch.float64)
-    together = Given(head("categorical", CLASSES), raw.clone(), members=True)
+    together = ConstantPredictor(head("categorical", CLASSES), raw.clone(), members=True)
     value = objective(**BOX)(together, given_batch())
     value.backward()
     alone = []
-    for index, one in enumerate(raw):
-        predictor = Given(head("categorical", CLASSES), one.clone())
+    for index, member in enumerate(raw):
+        predictor = ConstantPredictor(head("categorical", CLASSES), member.clone())
         alone.append(objective(**BOX)(predictor, given_batch()))
         alone[-1].backward()
         torch.testing.assert_close(together.raw.grad[index], predictor.raw.grad, rtol=1e-12, atol=1e-14)
@@ -365,13 +367,13 @@ def test_outliers_are_drawn_from_the_training_split_and_augmented(one_by_one):
     assert data.prepared == 1
     if one_by_one:
         exposure.split = OneByOne(data.table)
-    predictor = Given(head("categorical", CLASSES), torch.zeros(3))
+    predictor = ConstantPredictor(head("categorical", CLASSES), torch.zeros(3))
     torch.manual_seed(3)
     exposure(predictor, given_batch())
     exposure(predictor, given_batch())
     torch.manual_seed(3)
     exposure(predictor, given_batch())
-    first, second, again = predictor.seen
+    first, second, again = predictor.recorded
     assert first.shape == (500, 2)
     assert set(first[:, 0].tolist()) == {index + 0.5 for index in range(10)}
     assert torch.equal(first, again) and not torch.equal(first, second)
@@ -380,20 +382,20 @@ def test_outliers_are_drawn_from_the_training_split_and_augmented(one_by_one):
 
 
 def test_there_are_as_many_outliers_as_samples_unless_told():
-    predictor = Given(head("categorical", CLASSES), torch.zeros(3))
+    predictor = ConstantPredictor(head("categorical", CLASSES), torch.zeros(3))
     for source in ({"outliers": Tiny()}, BOX):
         for wanted, count in ((4, None), (9, 9)):
             OutlierExposure(**source, count=count)(predictor, given_batch(4))
-            assert len(predictor.seen[-1]) == wanted
+            assert len(predictor.recorded[-1]) == wanted
         assert OutlierExposure(**source)(predictor, given_batch(0)).item() == 0.0
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.uint8])
 def test_uniform_numbers_fill_their_range(dtype):
-    predictor = Given(head("categorical", CLASSES), torch.zeros(3))
+    predictor = ConstantPredictor(head("categorical", CLASSES), torch.zeros(3))
     torch.manual_seed(0)
     OutlierExposure(low=0.0, high=1.0, count=300)(predictor, given_batch(4, (3, 4, 4), dtype))
-    noise = predictor.seen[0]
+    noise = predictor.recorded[0]
     assert noise.shape == (300, 3, 4, 4)
     assert noise.dtype == (dtype if dtype.is_floating_point else torch.float32)
     assert stats.kstest(noise.flatten().double().numpy(), "uniform").pvalue > 1e-4
@@ -407,7 +409,7 @@ def test_batch_norm_sees_outliers_as_in_a_test_and_learns_nothing_of_them():
     predictor.loss(torch.randn(64, 2), torch.randint(3, (64,)))
     moments = {name: value.clone() for name, value in predictor.named_buffers()}
     torch.manual_seed(1)
-    found = objective(**BOX)(predictor, given_batch(16)).item()
+    penalty = objective(**BOX)(predictor, given_batch(16)).item()
     assert predictor.training and encoder.training
     for name, value in predictor.named_buffers():
         assert torch.equal(value, moments[name]), name
@@ -415,7 +417,7 @@ def test_batch_norm_sees_outliers_as_in_a_test_and_learns_nothing_of_them():
     outliers = -4 + 8 * torch.rand(16, 2)
     predictor.eval()
     wanted = from_uniform(predictor(outliers)).mean().item()
-    assert found == pytest.approx(wanted, rel=1e-6)
+    assert penalty == pytest.approx(wanted, rel=1e-6)
 
 
 def test_a_network_learns_to_know_nothing_outside_its_data():
@@ -447,43 +449,43 @@ def test_a_network_learns_to_know_nothing_outside_its_data():
 
 
 @pytest.mark.parametrize(
-    "config, told",
+    "config, message",
     [
-        ({}, "got no outliers; wanted either another data set"),
-        ({"low": 0.0}, "got low = 0; wanted either"),
-        ({"high": 1.0}, "got high = 1; wanted either"),
-        ({"low": 1.0, "high": 1.0}, "low = 1 and high = 1; wanted low below high"),
+        ({}, "got no source of outliers. Set either outliers"),
+        ({"low": 0.0}, "got low = 0. Set either"),
+        ({"high": 1.0}, "got high = 1. Set either"),
+        ({"low": 1.0, "high": 1.0}, "low is 1 and high is 1, but low must be below high"),
         (
             {"outliers": Tiny(), "low": 0.0, "high": 1.0},
-            "got low = 0 and high = 1 and outliers; wanted either",
+            "got low = 0 and high = 1 and outliers. Set either",
         ),
-        ({"outliers": Tiny(), "high": 1.0}, "got high = 1 and outliers; wanted either"),
+        ({"outliers": Tiny(), "high": 1.0}, "got high = 1 and outliers. Set either"),
     ],
 )
-def test_one_source_of_outliers_is_wanted(config, told):
-    with pytest.raises(ConfigError, match=told):
+def test_one_source_of_outliers_is_wanted(config, message):
+    with pytest.raises(ConfigError, match=message):
         OutlierExposure(**config)
 
 
 def test_outliers_of_another_shape_are_refused():
-    predictor = Given(head("categorical", CLASSES), torch.zeros(3))
-    with pytest.raises(ConfigError, match=r"inputs of shape \(3,\), the data of shape \(2,\)"):
+    predictor = ConstantPredictor(head("categorical", CLASSES), torch.zeros(3))
+    with pytest.raises(ConfigError, match=r"inputs of shape \(3,\), but the data has inputs of shape \(2,\)"):
         OutlierExposure(outliers=Tiny((3,)))(predictor, given_batch())
 
 
 def test_entropy_of_a_continuous_density_is_refused():
-    predictor = Given(head("gaussian", REALS), torch.zeros(4))
+    predictor = ConstantPredictor(head("gaussian", REALS), torch.zeros(4))
     with pytest.raises(ConfigError, match="is for classes, but the density is over 2 continuous numbers"):
         objective(**BOX, divergence="entropy")(predictor, given_batch())
 
 
 def test_a_config_names_the_data_to_draw_from():
     exposure = objective(outliers={"name": "moons", "train": 20}, count=3)
-    predictor = Given(head("categorical", CLASSES), torch.zeros(3))
+    predictor = ConstantPredictor(head("categorical", CLASSES), torch.zeros(3))
     exposure(predictor, given_batch())
-    drawn, known = predictor.seen[0], exposure.outliers.splits().train.fields["input"]
-    assert drawn.shape == (3, 2)
-    assert all((known == one).all(1).any() for one in drawn)
+    outliers, known = predictor.recorded[0], exposure.outliers.splits().train.fields["input"]
+    assert outliers.shape == (3, 2)
+    assert all((known == outlier).all(1).any() for outlier in outliers)
     with pytest.raises(ConfigError, match="No data is called 'moon'"):
         objective(outliers={"name": "moon"})
 
