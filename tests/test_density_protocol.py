@@ -7,7 +7,6 @@ together by a plain loop, or is an explicit refusal. What is sampled is found ou
 import math
 import re
 from collections.abc import Iterator
-from importlib import import_module
 
 import numpy as np
 import pytest
@@ -998,29 +997,6 @@ def nodes(low: float, high: float) -> tuple[Tensor, Tensor]:
             torch.full((16,), 1 / 8, dtype=torch.float64),
         )
     return (low + high) / 2 + (high - low) / 2 * at, (high - low) / 2 * share
-
-
-OLD_NAMES = {
-    "density": "CHUNK Circular Mixture circular circular_entropy circular_grid marginal median pick take",
-    "rearranged": "Reshaped Stacked",
-    "circular": "angular_distance circular_mean circular_median grid wrap",
-    "temper": "CircularPower log_probabilities temper tempered_classes",
-    "monte_carlo": "Estimate estimate",
-    "cdf": "cdf",
-    "normals": "Normals mahalanobis normals one_normal",
-    "circular_moments": "CircularMoments circular_moments",
-    "class_probabilities": "class_probabilities require_labels",
-}
-
-
-def test_old_import_paths_give_what_they_gave() -> None:
-    for module, names in OLD_NAMES.items():
-        found = import_module(f"framework.{module}")
-        assert not [name for name in names.split() if not hasattr(found, name)], module
-    assert (
-        import_module("framework.density").marginal
-        is import_module("framework.distributions.protocol").marginal
-    )
 
 
 ANGLE, CLASSES = Target("angle", ("azimuth",)), Target("class", ("a", "b", "c"))

@@ -422,7 +422,7 @@ def test_a_store_that_only_a_file_names_is_not_contacted(
         monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
         if setting:
             monkeypatch.setenv("MLFLOW_TRACKING_URI", setting)
-        with pytest.raises(ConfigError, match=r"say so: add logger\.uri=") as caught:
+        with pytest.raises(ConfigError, match=r"is your store, add logger\.uri=") as caught:
             confirm_address(recorded, named, tmp_path / "run", Path("run.json"))
         assert "a:b" not in str(caught.value)
         assert str(caught.value).isprintable()

@@ -14,6 +14,7 @@ from framework.configuration.settings import Settings
 from framework.data import Data
 from framework.errors import CheckpointError, quote, shorten
 from framework.storage.limits import LONGEST_NAME, MOST_DRAWN, MOST_DRAWS, MOST_INPUT, MOST_NAMES, MOST_SIDES
+from framework.storage.old_versions import complete_description
 from framework.target import Kind, Target
 
 MOST_REMARKS, LONGEST_REMARK = 8, 500
@@ -32,8 +33,8 @@ class Description:
         input_shape: Shape of one input, as in `Data`.
         columns: Names of the input columns, as in `Data`.
         synthetic: Whether the model was trained on generated data.
-        method: Name of the model in tables; "" in checkpoints of version 0.1.
-        settings: Settings of the model's run that are in `INHERITED`; none in checkpoints of version 0.1.
+        method: Name of the model in tables; may be "" (`framework.storage.old_versions`).
+        settings: Settings of the model's run that are in `INHERITED`; may be empty (`framework.storage.old_versions`).
         data_state: `Data.state_dict` of the training data.
         path: Path of the checkpoint from which the description was read.
         dropped: Paths in the stored config that the user has not repeated, by dotted keys; in `config` these keys have
@@ -103,7 +104,7 @@ class Description:
             paths: Paths of the stored config that the user repeats (`framework.configuration.paths`).
 
         Raises:
-            CheckpointError: The checkpoint holds no description.
+            CheckpointError: The checkpoint contains no description.
             ConfigError: A plugin of the config is not installed, or the user does not repeat a path of the model.
             LookupError, TypeError, ValueError: The description is incomplete.
         """
@@ -113,6 +114,7 @@ class Description:
                 f"{path} was not written by this framework: it contains no model description of format 1. "
                 "Give a run folder, or a checkpoint from the folder checkpoints/ of a run."
             )
+        stored = complete_description(stored)
         target = stored_target(stored["target"])
         config, dropped = remove_paths(stored["config"], paths or {}, UNUSED)
         require_paths(dropped, MODEL, path)
@@ -120,16 +122,14 @@ class Description:
             check_config(config),
             target,
             stored_shape(stored["input_shape"]),
-            stored_names(stored.get("columns", ()), "columns"),
-            bool(stored.get("synthetic", False)),
-            str(stored.get("method", "")),
-            stored_settings(stored.get("settings", {}), target),
-            dict(stored.get("data_state", {})),
+            stored_names(stored["columns"], "columns"),
+            bool(stored["synthetic"]),
+            str(stored["method"]),
+            stored_settings(stored["settings"], target),
+            dict(stored["data_state"]),
             path,
             dropped,
-            tuple(
-                shorten(remark, LONGEST_REMARK) for remark in list(stored.get("remarks", ()))[:MOST_REMARKS]
-            ),
+            tuple(shorten(remark, LONGEST_REMARK) for remark in list(stored["remarks"])[:MOST_REMARKS]),
         )
 
 

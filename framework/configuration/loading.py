@@ -25,6 +25,7 @@ from framework.model import FrozenFrontEnd, Predictor
 from framework.storage import budget
 from framework.storage.checkpoints import latest_good, read
 from framework.storage.enclosed import require_plain_within
+from framework.storage.old_versions import complete_description
 from framework.storage.reading import translate_errors
 from framework.storage.weights import describe_mismatch
 from framework.target import Target
@@ -196,10 +197,11 @@ def read_interface(
         CheckpointError: The description is invalid.
     """
     with translate_errors(path, "a checkpoint of this framework", FOREIGN, kind=CheckpointError):
+        complete = complete_description(described)
         return (
-            stored_target(described["target"]),
-            stored_shape(described["input_shape"]),
-            stored_names(described.get("columns", ()), "columns"),
+            stored_target(complete["target"]),
+            stored_shape(complete["input_shape"]),
+            stored_names(complete["columns"], "columns"),
         )
 
 

@@ -32,6 +32,7 @@ from framework.evaluation.prediction_sets import set_columns
 from framework.evaluation.splits import BLOCK, predict
 from framework.model import Predictor
 from framework.prediction import named_columns, table_columns
+from framework.storage.old_versions import PREDICTION_SETTINGS
 
 CONTENT, NAME = "base64", "name"
 """Columns of a request with files: their content, and their names, which are needed if the suffix says the format."""
@@ -91,7 +92,9 @@ class ServedModel:
         batch = self._read_request(inputs)
         require_few_numbers(len(batch["input"]), batch["input"].numel())
         ticket = TICKET.get()
-        seed, samples = (self.description.settings.get(key, default) for key, default in _DEFAULTS.items())
+        seed, samples = (
+            self.description.settings.get(key, default) for key, default in PREDICTION_SETTINGS.items()
+        )
         parts = []
         for number, rows in enumerate(torch.arange(len(batch["input"])).split(BLOCK)):
             if ticket is not None:
@@ -285,10 +288,6 @@ def _name_rows(message: str, folder: Path, names: Sequence[str]) -> str:
     message = re.sub(rf"{re.escape(str(folder))}(?:/(\d+)(?:/[\w.…-]*[\w…-])?)?", name_row, message)
     # A message may have been shortened within a path.
     return re.sub(rf"{re.escape(str(folder.parent))}[^\s'\"]*…", "…", message)
-
-
-_DEFAULTS = {"seed": 0, "samples": 1000}
-"""Settings for checkpoints of version 0.1, which do not contain the settings of predictions."""
 
 
 def _are_texts(inputs: Sequence[Any] | np.ndarray) -> bool:

@@ -18,6 +18,7 @@ from framework.storage.cache import folder as cache_folder
 from framework.storage.enclosed import require_enclosed, require_plain_within
 from framework.storage.files import hold_lock, remove_leftovers, replacing
 from framework.storage.names import path_of, spell_name
+from framework.storage.old_versions import download_checkpoint_files, has_checkpoint_files
 from framework.tracking.run_info import MODEL, RunInfo, read_run_info
 from framework.tracking.sender import Record, Store, reason
 from framework.tracking.stores import address, require_own_files, sqlite_path, sqlite_uri, without_password
@@ -314,7 +315,7 @@ def run_folder(run_id: str, uri: str | None = None) -> Path:
         if not store.named:
             require_own_files(store.uri, (run.info.artifact_uri or "",))
         models = _models(run)
-        if not models and not client.list_artifacts(run_id, "checkpoints"):
+        if not models and not has_checkpoint_files(client, run_id):
             raise CheckpointError(
                 f"Run {run_id} of {store_name} has no checkpoints, and its folder {original_folder} does not exist. "
                 "Give another run, or the folder to which this run was moved."
@@ -327,8 +328,7 @@ def run_folder(run_id: str, uri: str | None = None) -> Path:
             if not store.named:
                 require_own_files(store.uri, (place or "",))
             return Path(artifacts.download_artifacts(place, dst_path=str(copy), tracking_uri=store.uri))
-        # runs of version 0.1 keep checkpoints as files
-        client.download_artifacts(run_id, "checkpoints", str(copy))
+        download_checkpoint_files(client, run_id, str(copy))
     except MlflowException as error:
         raise CheckpointError(
             f"Run {run_id} cannot be read from {store_name}: {reason(error)}. Check the id and the address of the "

@@ -6,6 +6,7 @@ from typing import Any, final
 from pytorch_lightning.plugins.io import CheckpointIO
 
 from framework.storage import checkpoints
+from framework.storage.old_versions import can_resume_from_best
 
 TRAINED = {"last.ckpt", "previous.ckpt"}
 """Names of checkpoints from which training can resume; all others hold weights only."""
@@ -40,5 +41,4 @@ def find_resumable(folder: Path) -> Path | None:
     if resumable is not None:
         return resumable
     best = checkpoints.latest_good(folder, names={BEST})
-    # Version 0.1 wrote best.ckpt with the optimiser's state.
-    return best if best is not None and "optimizer_states" in checkpoints.read(best) else None
+    return best if best is not None and can_resume_from_best(checkpoints.read(best)) else None

@@ -136,7 +136,7 @@ class Tabular(Data):
 
     @property
     def _reading(self) -> Reading:
-        # a checkpoint of version 0.1 does not hold the reading: then the training table is read again
+        # without a stored reading, as before training, the reading comes from the training table
         return self._trained or self._table.reading
 
     def state_dict(self) -> Mapping[str, Any]:

@@ -8,11 +8,11 @@ from typing import Annotated
 
 import numpy as np
 import torch
-from framework.fields import Fields
 from pydantic import Field
 from torch import Tensor
 
 from framework.data import Batch, Data
+from framework.datasets.fields import Fields
 from framework.errors import DataError
 from framework.target import Target
 

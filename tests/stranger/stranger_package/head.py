@@ -5,13 +5,13 @@ from collections.abc import Mapping
 from typing import Annotated, ClassVar
 
 import torch
-from framework.density import circular, marginal, median
-from framework.raw_numbers import require_finite
 from pydantic import Field
 from torch import Tensor
 from torch.distributions import Distribution
 
 from framework.density_head import DensityHead
+from framework.distributions.density import circular, marginal, median
+from framework.heads.parameters import require_finite
 from framework.target import Target
 
 

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from framework.fields import Fields
 from torch import Tensor
 
 from framework.data import Batch, Data, Splits
+from framework.datasets.fields import Fields
 from framework.errors import DataError
 from framework.geometry.srgb import linear_from_srgb
 from framework.target import Target

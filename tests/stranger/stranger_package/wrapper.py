@@ -4,13 +4,13 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Annotated, ClassVar
 
 import torch
-from framework.density import Mixture
 from pydantic import Field
 from torch import Tensor, nn
 from torch.distributions import Distribution
 
 from framework.data import Batch
 from framework.distributions.batch_shapes import Stacked
+from framework.distributions.density import Mixture
 from framework.model import Predictor
 from framework.uncertainty import Uncertainty
 
