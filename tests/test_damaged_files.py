@@ -278,14 +278,14 @@ def test_what_data_keep_with_a_model_is_checked(name: str) -> None:
     assert data.state_dict() == state
     for key in state:
         for value in wrong:
-            with pytest.raises(DataError, match=rf"^{name} keeps .* but was given .*\."):
+            with pytest.raises(DataError, match=rf"^The stored .* of {name} .*\."):
                 data.load_state_dict({**state, key: value})
-        with pytest.raises(DataError, match=f"^{name} keeps"):
+        with pytest.raises(DataError, match=f"^The stored .* of {name} "):
             data.load_state_dict({other: state[other] for other in state if other != key})
     for key in ("largest", "deviation"):
         for value in ([0.0, 1.0], [1.0, -1.0]):
             if key in state:
-                with pytest.raises(DataError, match="tabular keeps"):
+                with pytest.raises(DataError, match="The stored state of tabular"):
                     data.load_state_dict({**state, key: value})
     assert data.state_dict() == state
 

@@ -16,46 +16,42 @@ from framework.datasets.csv_columns import LabelledWriting
 from framework.errors import DataError, quote
 from plugins.data.tabular.picture import bars
 from plugins.data.tabular.table import (
+    InputColumns,
     Kind,
     Missing,
     Question,
-    Reading,
     Table,
     load,
-    of_rows,
     read,
-    stored_reading,
+    restore_columns,
 )
 
 Share = Annotated[float, Field(gt=0, lt=1, allow_inf_nan=False)]
 
 
 class Tabular(Data):
-    """Your own CSV table: columns of numbers are the input, one column (or several of one kind) is predicted.
+    """A user's own CSV table: columns of numbers are the input, and one column (or several of one kind) is the target.
 
-    Inputs are standardised by the mean and standard deviation of the training rows; a column that is constant there
-    becomes 0. Targets keep their own unit; degrees become radians. Batches also hold "line", the row's line number in
-    the file. A column `split` assigns each row to train, validation or test. A column `group` names the groups for
-    which results are also reported separately.
+    Inputs are standardised by the mean and standard deviation of the training rows; a column that is constant in these
+    rows becomes 0. Targets keep their own unit, but degrees become radians. Batches also hold "line", the line number
+    of the row in the file. A column `split` assigns each row to train, validation or test. A column `group` names the
+    groups for which results are also reported separately.
 
     Args:
-        path: the CSV file.
-        target: the column to predict, or several columns where they are numbers.
-        kind: kind of the target: a class label, a real number, or an angle in degrees or radians.
-        columns: columns of the input; None for every other column most of whose cells are numbers.
-        validation: share of the rows for validation, drawn at random, where there is no column `split`.
-        test: share of the rows for the test, likewise.
-        data_seed: seed of that draw; it does not depend on the seed of the run.
-        missing: treatment of rows with an empty cell where a number or a label is wanted: refuse or skip.
-        small_angles: whether angles in degrees may all lie within ±2π; by default this is refused, because such angles
+        path: The CSV file.
+        target: The column to predict, or several columns if they hold numbers.
+        kind: Kind of the target: a class label, a real number, or an angle in degrees or radians.
+        columns: Columns of the input; None for every other column whose cells are mostly numbers.
+        validation: Share of the rows for validation, chosen at random, if there is no column `split`.
+        test: Share of the rows for the test, chosen at random, if there is no column `split`.
+        data_seed: Seed of this choice, independent of the seed of the run.
+        missing: Treatment of rows without a number or a label. "error" refuses them, "skip" leaves them out.
+        small_angles: Whether angles in degrees may all lie within ±2π; by default this is refused, because such angles
             look like radians.
-        writing: how the file, and others like it, are written.
+        writing: How the file, and further files for prediction, are written.
     """
 
-    bibtex = """@misc{tabular,
-  title = {A table of the user's own},
-  note = {Cite the source of this table}
-}"""
+    bibtex = "tabular"
     synthetic = False
     suffixes = (".csv",)
     varies = False
@@ -77,7 +73,7 @@ class Tabular(Data):
         names = (target,) if isinstance(target, str) else tuple(dict.fromkeys(target))
         chosen = None if columns is None else tuple(columns)
         self.path = path
-        self._trained: Reading | None = None
+        self._trained: InputColumns | None = None
         self.small_angles = small_angles
         self.writing = writing
         self.question = Question(names, kind, chosen, validation, test, data_seed, missing)
@@ -85,7 +81,7 @@ class Tabular(Data):
     def prepare(self) -> None:
         table = self._table
         self.target = table.target
-        self.columns = table.reading.columns
+        self.columns = table.inputs.names
         self.input_shape = (len(self.columns),)
         self.plane = len(self.columns) == 2
         self.groups = table.groups
@@ -97,25 +93,25 @@ class Tabular(Data):
     @cached_property
     def _table(self) -> Table:
         if self.path is None:
-            raise DataError("data.path is not set; wanted the CSV file that holds your table.")
-        asked = self.question
-        if not asked.target or (asked.kind == "class" and len(asked.target) > 1):
+            raise DataError("data.path is not set. Set data.path to the CSV file that holds your table.")
+        question = self.question
+        if not question.target or (question.kind == "class" and len(question.target) > 1):
             raise DataError(
-                f"data.target = {list(asked.target)} with data.kind={asked.kind}: wanted one column, or several where "
-                "the kind is real or degrees."
+                f"data.target = {list(question.target)} does not fit data.kind={question.kind}. Name one column, or "
+                "several columns if the kind is real, degrees or radians."
             )
-        if self.small_angles and asked.kind != "degrees":
+        if self.small_angles and question.kind != "degrees":
             raise DataError(
-                f"data.small_angles=true changes nothing with data.kind={asked.kind}; wanted it with "
-                "data.kind=degrees. Leave it out."
+                f"data.small_angles=true has no effect with data.kind={question.kind}. Leave data.small_angles out, or "
+                "set data.kind=degrees."
             )
-        if asked.validation + asked.test >= 1:
+        if question.validation + question.test >= 1:
             raise DataError(
-                f"data.validation + data.test = {asked.validation + asked.test:g}: wanted less than 1, so that rows "
-                "are left for training."
+                f"data.validation + data.test = {question.validation + question.test:g}, but the sum must be less than "
+                "1 to leave rows for training. Reduce one of them."
             )
         file = Path(self.path).expanduser()
-        return load(file, asked, self._trained, self.writing, small_angles=self.small_angles)
+        return load(file, question, self._trained, self.writing, small_angles=self.small_angles)
 
     def check_files(self) -> None:
         _ = self._table
@@ -124,7 +120,7 @@ class Tabular(Data):
         return self._table.splits
 
     def read(self, files: Sequence[Path]) -> Dataset[Batch]:
-        return read(files, self._reading, self.writing)
+        return read(files, self._input_columns, self.writing)
 
     def inputs(self, user_data: Any) -> Tensor:
         """Return standardised inputs (row, column) from a CSV file, a DataFrame, a mapping by column, or an array."""
@@ -132,21 +128,21 @@ class Tabular(Data):
             isinstance(user_data, list) and isinstance(user_data[0], str | Path)
         ):
             return Data.inputs(self, user_data)
-        return of_rows(user_data, self._reading)
+        return from_memory(user_data, self._input_columns)
 
     @property
-    def _reading(self) -> Reading:
-        # without a stored reading, as before training, the reading comes from the training table
-        return self._trained or self._table.reading
+    def _input_columns(self) -> InputColumns:
+        # before training no columns are stored; the training table provides them
+        return self._trained or self._table.inputs
 
     def state_dict(self) -> Mapping[str, Any]:
-        columns, scaling = self._reading
+        names, scaling = self._input_columns
         numbers = {name: array.tolist() for name, array in scaling._asdict().items()}
-        return {"columns": list(columns), **numbers}
+        return {"columns": list(names), **numbers}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         if state:
-            self._trained = stored_reading(state)
+            self._trained = restore_columns(state)
 
     def augment(self, batch: Batch) -> Batch:
         return batch

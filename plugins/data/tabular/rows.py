@@ -1,4 +1,4 @@
-"""Rows of the contract: one table, with a label, numbers or an angle as the target."""
+"""Contract-test cases: one table, with a label, numbers or an angle as the target."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -9,7 +9,7 @@ LABELS = ("cat", "dog", "emu")
 
 
 def write(folder: Path, rows: int = 40) -> Mapping[str, str]:
-    """Write a table with a number, its square, a group, and three columns that can be predicted."""
+    """Write a table with a number, its square, a group, and three columns for the target."""
     lines = ["number,square,group,class,real,angle"]
     for row in range(rows):
         lines.append(f"{row},{row * row},{'ab'[row % 2]},{LABELS[row % 3]},{row / 2 - 3},{20 * row - 360}")
@@ -26,7 +26,7 @@ def files(folder: Path) -> Sequence[Path]:
 
 
 def row(name: str, target: object, kind: str) -> DataRow:
-    """Return the row of a target of a small table."""
+    """Return the test case with this target and kind."""
     return DataRow(
         name,
         {"target": target, "kind": kind, "columns": ["number", "square"]},

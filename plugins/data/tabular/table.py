@@ -38,11 +38,11 @@ Missing = Literal["error", "skip"]
 SPLITS = Splits._fields
 SPLIT, GROUP = "split", "group"
 MANY_LABELS = 20
-"""Largest number of numeric labels that may be classes where most of them occur on one row only."""
+"""Largest number of different numeric labels that are accepted as classes if most of them occur in one row only."""
 
 
 class Question(NamedTuple):
-    """Settings that say how a table is read; the names are those of the configuration."""
+    """Settings that determine how a table is read; their names are those of the configuration."""
 
     target: tuple[str, ...]
     kind: Kind
@@ -54,50 +54,70 @@ class Question(NamedTuple):
 
 
 class Scaling(NamedTuple):
-    """Scaling of each column x to (x / largest - mean) / deviation; it divides first, so that no square overflows."""
+    """Scaling of each column x to (x / largest - mean) / deviation.
+
+    Values are divided by `largest` first, so that no square overflows.
+
+    Attributes:
+        largest: Largest absolute value of each column.
+        mean: Mean of each column after this division.
+        deviation: Standard deviation of each column after this division.
+    """
 
     largest: Float[np.ndarray, "column"]
     mean: Float[np.ndarray, "column"]
     deviation: Float[np.ndarray, "column"]
 
 
-class Reading(NamedTuple):
-    """Columns and scaling by which rows become inputs."""
+class InputColumns(NamedTuple):
+    """Names and scaling of the columns that are the input."""
 
-    columns: tuple[str, ...]
+    names: tuple[str, ...]
     scaling: Scaling
 
 
-def stored_reading(state: Mapping[str, Any]) -> Reading:
-    """Return the reading of a model's training data from a checkpoint.
+def restore_columns(state: Mapping[str, Any]) -> InputColumns:
+    """Return the input columns of a model's training data from the state in a checkpoint.
 
     Raises:
-        DataError: the state is not one finite number for each column, or it would divide by 0.
+        DataError: The state does not hold finite numbers for each column, or a column would be divided by 0.
     """
-    columns: Sequence[Any] = state["columns"] if isinstance(state.get("columns"), list | tuple) else ()
-    named = bool(columns) and all(isinstance(name, str) for name in columns)
+    names: Sequence[Any] = state["columns"] if isinstance(state.get("columns"), list | tuple) else ()
+    are_names = bool(names) and all(isinstance(name, str) for name in names)
     try:
-        numbers = Scaling(*(np.array(state[name], np.float64) for name in Scaling._fields))
+        scaling = Scaling(*(np.array(state[name], np.float64) for name in Scaling._fields))
     except (KeyError, TypeError, ValueError):
-        numbers = Scaling(*(np.zeros(0) for _ in Scaling._fields))
+        scaling = Scaling(*(np.zeros(0) for _ in Scaling._fields))
     if (
-        not named
-        or any(part.shape != (len(columns),) or not np.isfinite(part).all() for part in numbers)
-        or (numbers.largest <= 0).any()
-        or (numbers.deviation <= 0).any()
+        not are_names
+        or any(part.shape != (len(names),) or not np.isfinite(part).all() for part in scaling)
+        or (scaling.largest <= 0).any()
+        or (scaling.deviation <= 0).any()
     ):
         raise DataError(
-            f"tabular keeps {', '.join(Scaling._fields)} of each column of its training table, but was given something "
-            "else. Load another checkpoint, or train anew."
+            f"The stored state of tabular must hold {', '.join(Scaling._fields)} of each input column, but holds "
+            "something else. Load another checkpoint, or train the model again."
         )
-    return Reading(tuple(columns), numbers)
+    return InputColumns(tuple(names), scaling)
 
 
 class Table(NamedTuple):
-    """Everything that is read from a table: target, inputs, splits, and remarks about what was left out."""
+    """Content of a table.
+
+    Attributes:
+        target: Description of the target.
+        inputs: The input columns.
+        constant: Names of the input columns that are constant in the training rows.
+        groups: Names of the groups.
+        splits: The three splits.
+        sizes: Number of samples of each split, by its name.
+        skipped: Number of rows that were left out.
+        digest: Hash of the cells and of the settings.
+        remarks: Clauses about columns that were left out or look odd.
+    """
 
     target: Target
-    reading: Reading
+    inputs: InputColumns
     constant: tuple[str, ...]
     groups: tuple[str, ...]
     splits: Splits
@@ -110,7 +130,7 @@ class Table(NamedTuple):
 def load(
     file: Path,
     question: Question,
-    trained: Reading | None = None,
+    trained: InputColumns | None = None,
     writing: Writing | None = None,
     *,
     small_angles: bool = False,
@@ -118,37 +138,37 @@ def load(
     """Read, check, split and standardise a table.
 
     Args:
-        file: the CSV file.
-        question: the settings of the data set.
-        trained: the reading of the model for which the table is read; None to fit it to the table's training rows.
-        writing: how the file is written.
-        small_angles: whether angles in degrees may all lie within ±2π.
+        file: The CSV file.
+        question: The settings of the data set.
+        trained: Input columns of a trained model; None to fit the scaling to the training rows of this table.
+        writing: How the file is written.
+        small_angles: Whether angles in degrees may all lie within ±2π.
 
     Raises:
-        DataError: the file, a column, a cell, a label or a split is not as wanted; the message names line and column.
+        DataError: The file, a column, a cell, a label or a split has a fault; the message names line and column.
     """
     cells = read_columns(file, writing or LabelledWriting())
     digest = hashlib.sha256(repr((cells.cells, question)).encode()).hexdigest()
-    taken = _inputs(cells, question) if trained is None else _named(cells, question, trained.columns)
-    columns = taken.names
+    choice = _choose_inputs(cells, question) if trained is None else _choose(cells, question, trained.names)
+    columns = choice.names
     require(cells, columns, "The trained model")
-    otherwise = "set data.missing=skip to leave such rows out" if question.missing == "error" else None
-    inputs = np.stack([numbers(cells, name, missing=otherwise, booleans=True) for name in columns], -1)
-    values, absent = _targets(cells, question, otherwise)
+    skip_remedy = "set data.missing=skip to leave such rows out" if question.missing == "error" else None
+    inputs = np.stack([numbers(cells, name, missing=skip_remedy, booleans=True) for name in columns], -1)
+    values, absent = _targets(cells, question, skip_remedy)
     _check_unit(cells, question, values, small_angles=small_angles)
-    whole = ~(np.isnan(inputs).any(-1) | absent)
-    rows = np.flatnonzero(whole)
+    complete = ~(np.isnan(inputs).any(-1) | absent)
+    rows = np.flatnonzero(complete)
     groups, group = _groups(file, cells, rows)
     split = _splits(cells, rows, question)
     training = rows[split == 0]
     scaling, constant = fit_scaling(inputs[training])
     scaling = scaling if trained is None else trained.scaling
     target, encoded = _encode(cells, rows, training, values, question)
-    scaled = as_float32(cells, columns, rows, standardised(inputs[rows], scaling))
+    scaled = as_float32(cells, columns, rows, standardise(inputs[rows], scaling))
     lines = torch.tensor(cells.lines)[torch.from_numpy(rows)]
     parts = {}
-    for number_of, name in enumerate(SPLITS):
-        chosen = torch.from_numpy(split == number_of)
+    for split_index, name in enumerate(SPLITS):
+        chosen = torch.from_numpy(split == split_index)
         parts[name] = Fields(
             input=scaled[chosen],
             target=encoded[chosen],
@@ -157,62 +177,73 @@ def load(
             index=torch.arange(int(chosen.sum())),
         )
     sizes = {name: str(len(part)) for name, part in parts.items()}
-    names = tuple(name for name, same in zip(columns, constant.tolist(), strict=True) if same)
-    skipped = len(whole) - len(rows)
-    reading = Reading(columns, scaling)
+    constant_names = tuple(
+        name for name, is_constant in zip(columns, constant.tolist(), strict=True) if is_constant
+    )
     return Table(
-        target, reading, names, groups, Splits(**parts), sizes, skipped, digest, describe_choice(taken)
+        target,
+        InputColumns(columns, scaling),
+        constant_names,
+        groups,
+        Splits(**parts),
+        sizes,
+        len(complete) - len(rows),
+        digest,
+        describe_choice(choice),
     )
 
 
-def read(files: Sequence[Path], reading: Reading, writing: Writing | None = None) -> Fields:
-    """Return the input columns of other files, standardised as the training rows were, one sample for each row.
+def read(files: Sequence[Path], columns: InputColumns, writing: Writing | None = None) -> Fields:
+    """Return the input columns of further files with the scaling of the training rows, one sample for each row.
 
     Raises:
-        DataError: there is no file, or a file cannot be read, lacks a column, or has a cell that is no finite number.
+        DataError: There is no file, or a file cannot be read, lacks a column, or has a cell that is no finite number.
     """
     parts = []
-    for cells, inputs in tables(files, reading.columns, "The trained model", writing or LabelledWriting()):
+    for cells, inputs in tables(files, columns.names, "The trained model", writing or LabelledWriting()):
         rows = np.arange(len(inputs))
-        parts.append(as_float32(cells, reading.columns, rows, standardised(inputs, reading.scaling)))
+        parts.append(as_float32(cells, columns.names, rows, standardise(inputs, columns.scaling)))
     inputs = torch.cat(parts)
     return Fields(input=inputs, index=torch.arange(len(inputs)))
 
 
-def of_rows(given: Any, reading: Reading) -> Float[Tensor, "row column"]:
+def from_memory(user_data: Any, columns: InputColumns) -> Float[Tensor, "row column"]:
     """Return standardised inputs from rows in memory: a DataFrame, a mapping by column, or an array in column order.
 
     Raises:
-        DataError: a column is missing, a cell is not a finite number, or an array has another number of columns.
+        DataError: A column is missing, a cell is not a finite number, or an array has another number of columns.
     """
-    if hasattr(given, "columns") or isinstance(given, Mapping):
-        missing = [name for name in reading.columns if name not in given]
+    if hasattr(user_data, "columns") or isinstance(user_data, Mapping):
+        missing = [name for name in columns.names if name not in user_data]
         if missing:
             raise DataError(
-                f"The model reads a column {missing[0]!r}, which is not given.{did_you_mean(missing[0], given)} "
-                f"It reads: {', '.join(reading.columns)}."
+                f"The model reads the column {missing[0]!r}, which the data do not "
+                f"have.{did_you_mean(missing[0], user_data)} It reads the columns {', '.join(columns.names)}."
             )
-        given = np.stack([np.atleast_1d(np.asarray(given[name])) for name in reading.columns], -1)
+        user_data = np.stack([np.atleast_1d(np.asarray(user_data[name])) for name in columns.names], -1)
     try:
-        rows = to_real(given, "it")
+        rows = to_real(user_data, "the input")
     except (TypeError, ValueError) as error:
         raise DataError(
-            f"{str(error)[:200]}; wanted rows of numbers: {', '.join(reading.columns)}."
+            f"{str(error)[:200]}. Give rows of numbers, in the columns {', '.join(columns.names)}."
         ) from error
-    rows = as_inputs(rows, (len(reading.columns),)).numpy()
-    scaled = standardised(rows, reading.scaling)
+    rows = as_inputs(rows, (len(columns.names),)).numpy()
+    scaled = standardise(rows, columns.scaling)
     wrong = np.argwhere(~(np.abs(scaled) <= np.finfo(np.float32).max))
     if len(wrong):
         row, column = wrong[0]
         raise DataError(
-            f"row {row}, column {reading.columns[column]!r}: {rows[row, column]} is no finite number within single "
-            "precision. Mend it, or leave the row out."
+            f"Row {row}, column {columns.names[column]!r}: {rows[row, column]} is no finite number within single "
+            "precision. Correct the number, or leave the row out."
         )
     return torch.from_numpy(scaled.astype(np.float32))
 
 
 def fit_scaling(inputs: Float[np.ndarray, "row column"]) -> tuple[Scaling, np.ndarray]:
-    """Return the scaling to mean 0 and standard deviation 1, and a mask of the constant columns, which become 0."""
+    """Return the scaling to mean 0 and standard deviation 1, and a mask (column,) of the constant columns.
+
+    Constant columns are scaled to 0.
+    """
     constant = inputs.max(0) == inputs.min(0)
     largest = np.where(constant, 1.0, np.abs(inputs).max(0))
     shrunk = inputs / largest
@@ -221,11 +252,9 @@ def fit_scaling(inputs: Float[np.ndarray, "row column"]) -> tuple[Scaling, np.nd
     return Scaling(largest, mean, deviation), constant
 
 
-def standardised(
-    inputs: Float[np.ndarray, "row column"], scaling: Scaling
-) -> Float[np.ndarray, "row column"]:
-    """Return the columns in standard deviations from their mean."""
-    with np.errstate(over="ignore"):  # as_float32 refuses the result and names its place
+def standardise(inputs: Float[np.ndarray, "row column"], scaling: Scaling) -> Float[np.ndarray, "row column"]:
+    """Return each column as its distance from the mean, in standard deviations."""
+    with np.errstate(over="ignore"):  # as_float32 refuses an infinite result and names its line and column
         return (inputs / scaling.largest - scaling.mean) / scaling.deviation
 
 
@@ -238,7 +267,7 @@ def as_float32(
     """Return the values in single precision.
 
     Raises:
-        DataError: a number is too large for single precision; the message names line and column.
+        DataError: A number is too large for single precision; the message names line and column.
     """
     with np.errstate(over="ignore"):
         narrow = values.astype(np.float32)
@@ -247,13 +276,14 @@ def as_float32(
         row, name = rows[wrong[0, 0]], columns[int(wrong[0, 1])]
         raise DataError(
             f"{cells.file} line {cells.lines[row]}, column {name!r}: {cells.cells[name][row]!r} lies beyond "
-            "single precision (3.4e38), as it is or in standard deviations of the training rows. Mend the cell, or "
-            "change the unit."
+            "single precision (3.4e38), either unscaled or in standard deviations of the training rows. Correct the "
+            "cell, or change the unit."
         )
     return torch.from_numpy(narrow)
 
 
-def _inputs(cells: Columns, question: Question) -> ColumnChoice:
+def _choose_inputs(cells: Columns, question: Question) -> ColumnChoice:
+    """Return the input columns: those that the settings name, or all columns of numbers."""
     require(cells, question.target, "data.target")
     if question.columns is not None:
         require(cells, question.columns, "data.columns")
@@ -261,47 +291,58 @@ def _inputs(cells: Columns, question: Question) -> ColumnChoice:
         known = set(columns) & set(question.target)
         if known:
             raise DataError(
-                f"data.columns names {min(known)!r}, which is what is to be predicted (data.target). Take it out."
+                f"data.columns names {min(known)!r}, but this column is the target (data.target). Remove it from "
+                "data.columns."
             )
-        chosen = _named(cells, question, columns)
+        chosen = _choose(cells, question, columns)
     else:
         chosen = numeric_columns(cells, (*question.target, SPLIT, GROUP), "data.columns")
     if not chosen.names:
         raise DataError(
-            f"{cells.file} has no column of numbers to read beside {', '.join(question.target)}; its columns: "
-            f"{shorten(', '.join(cells.cells))}. Name some with data.columns."
+            f"{cells.file} has no column of numbers besides {', '.join(question.target)}. Its columns are "
+            f"{shorten(', '.join(cells.cells))}. Name input columns in data.columns."
             + "".join(f" {quote(name)}: {why}." for name, why in list(chosen.left_out.items())[:8])
         )
     return chosen
 
 
-def _named(cells: Columns, question: Question, columns: tuple[str, ...]) -> ColumnChoice:
-    """Return the columns that are named, and list all others as left out."""
+def _choose(cells: Columns, question: Question, columns: tuple[str, ...]) -> ColumnChoice:
+    """Return these columns as the choice, with all columns that are not read as left out."""
     known = (*columns, *question.target, SPLIT, GROUP)
-    others = [name for name in cells.cells if name not in known]
-    return ColumnChoice(columns, dict(cells.left_out) | dict.fromkeys(others, "not among those to read"), {})
+    unread = [name for name in cells.cells if name not in known]
+    left_out = dict(cells.left_out) | dict.fromkeys(unread, "not among the columns to read")
+    return ColumnChoice(columns, left_out, {})
 
 
-def _targets(cells: Columns, question: Question, otherwise: str | None) -> tuple[np.ndarray, np.ndarray]:
-    """Return the targets as they are in the table, (row, name) numbers or (row,) labels, and which rows have none."""
+def _targets(cells: Columns, question: Question, skip_remedy: str | None) -> tuple[np.ndarray, np.ndarray]:
+    """Return the unconverted targets, and a mask (row,) of the rows without a target.
+
+    The targets are numbers (row, name) or labels (row,).
+
+    Args:
+        cells: The table.
+        question: The settings of the data set.
+        skip_remedy: End of the message about a row without a target; None if such rows are left out.
+    """
     if question.kind != "class":
         for name in question.target:
             if is_boolean(cells, name):
                 raise DataError(
-                    f"{cells.file}, column {name!r}: {cells.cells[name][0]!r} and the like are two words; wanted "
-                    f"numbers for data.kind={question.kind}. Set data.kind=class, or name another data.target."
+                    f"{cells.file}, column {name!r}: The column holds two words such as {cells.cells[name][0]!r}, but "
+                    f"data.kind={question.kind} requires numbers. Set data.kind=class, or name another data.target."
                 )
-        values = np.stack([numbers(cells, name, missing=otherwise) for name in question.target], -1)
+        values = np.stack([numbers(cells, name, missing=skip_remedy) for name in question.target], -1)
         return values, np.asarray(np.isnan(values).any(-1))
     name = question.target[0]
     labels = cells.cells[name]
     absent = np.array([label.lower() in cells.notation.missing for label in labels])
-    if otherwise is not None and absent.any():
+    if skip_remedy is not None and absent.any():
         row = int(absent.argmax())
-        what = f"{labels[row]!r}, which says that there is no label" if labels[row] else "no label"
-        where = " Or set data.missing_words=[] where that is a label." if labels[row] else ""
+        label = labels[row]
+        fault = f"{label!r} means that there is no label" if label else "The label is missing"
+        hint = f" If {label!r} is a label, set data.missing_words=[]." if label else ""
         raise DataError(
-            f"{cells.file} line {cells.lines[row]}, column {name!r}: {what}. Write it, or {otherwise}.{where}"
+            f"{cells.file} line {cells.lines[row]}, column {name!r}: {fault}. Write a label, or {skip_remedy}.{hint}"
         )
     return np.array(labels, dtype=object), absent
 
@@ -310,50 +351,54 @@ def _check_unit(cells: Columns, question: Question, values: np.ndarray, *, small
     """Refuse angles that look like the other unit.
 
     Raises:
-        DataError: the angles look like the other unit; the message names it, and what to set.
+        DataError: The angles look like the other unit; the message names the setting to change.
     """
     if question.kind not in ("degrees", "radians"):
         return
     for name, column in zip(question.target, values.T, strict=True):
         if question.kind == "radians":
             wrong = unlike_radians(column)
-            way = "Set data.kind=degrees, or wrap the angles into one turn"
+            remedy = "Set data.kind=degrees, or wrap the angles to one turn."
         else:
             wrong = "" if small_angles else unlike_degrees(column)
-            way = "Set data.kind=radians, or data.small_angles=true where they are degrees"
+            remedy = "Set data.kind=radians, or data.small_angles=true if the angles are in degrees."
         if wrong:
-            raise DataError(f"{cells.file}, column {name!r}: {wrong}. {way}.")
+            raise DataError(f"{cells.file}, column {name!r}: {wrong}. {remedy}")
 
 
 def _groups(file: Path, cells: Columns, rows: np.ndarray) -> tuple[tuple[str, ...], Int[Tensor, "row"]]:
+    """Return the names of the groups, and the index of the group of each row."""
     if GROUP not in cells.cells:
         return (file.stem,), torch.zeros(len(rows), dtype=torch.int64)
     words = [cells.cells[GROUP][row] for row in rows]
-    absent = [place for place, word in enumerate(words) if word.lower() in cells.notation.missing]
+    absent = [index for index, word in enumerate(words) if word.lower() in cells.notation.missing]
     if absent:
         word = words[absent[0]]
-        why = f" ({word!r})" if word else ""
+        fault = f"{word!r} means that there is no name" if word else "The name is missing"
         raise DataError(
-            f"{cells.file} line {cells.lines[rows[absent[0]]]}, column `{GROUP}`: no name{why}. "
-            "Write one in every row, or rename the column."
-            + (" Or set data.missing_words=[] where that is a name." if word else "")
+            f"{cells.file} line {cells.lines[rows[absent[0]]]}, column `{GROUP}`: {fault}. "
+            "Write a name in every row, or rename the column."
+            + (f" If {word!r} is a name, set data.missing_words=[]." if word else "")
         )
     groups = sorted(set(words), key=_order)
-    numbered = {name: index for index, name in enumerate(groups)}
-    return tuple(groups), torch.tensor([numbered[word] for word in words], dtype=torch.int64)
+    indices = {name: index for index, name in enumerate(groups)}
+    return tuple(groups), torch.tensor([indices[word] for word in words], dtype=torch.int64)
 
 
 def _splits(cells: Columns, rows: np.ndarray, question: Question) -> Int[np.ndarray, "row"]:
-    """Return the index into SPLITS of each row, from the column `split` or, without one, by shares of a permutation."""
+    """Return the index into SPLITS of each row.
+
+    The column `split` determines the split. Without that column the rows are divided at random.
+    """
     if SPLIT in cells.cells:
         for row, word in enumerate(cells.cells[SPLIT]):
             if word not in SPLITS:
                 raise DataError(
-                    f"{cells.file} line {cells.lines[row]}, column `{SPLIT}`: {word!r}; wanted one of "
+                    f"{cells.file} line {cells.lines[row]}, column `{SPLIT}`: {word!r} is no split. Write one of "
                     f"{', '.join(SPLITS)}.{did_you_mean(word, SPLITS)}"
                 )
         split = np.array([SPLITS.index(cells.cells[SPLIT][row]) for row in rows], dtype=np.int64)
-        remedy = f"Say so of some rows in the column `{SPLIT}`."
+        remedy = f"Assign rows to this split in the column `{SPLIT}`."
     else:
         split = np.zeros(len(rows), dtype=np.int64)
         order = np.random.default_rng(question.data_seed).permutation(len(rows))
@@ -364,8 +409,8 @@ def _splits(cells: Columns, rows: np.ndarray, question: Question) -> Int[np.ndar
     for index, name in enumerate(SPLITS):
         if not (split == index).any():
             raise DataError(
-                f"{cells.file}: the {name} split is empty ({len(rows)} rows, {len(cells.lines) - len(rows)} left out "
-                f"for want of a number). {remedy}"
+                f"{cells.file}: The {name} split is empty ({len(rows)} rows are used, {len(cells.lines) - len(rows)} "
+                f"are left out, because a number or a label is missing). {remedy}"
             )
     return split
 
@@ -373,25 +418,26 @@ def _splits(cells: Columns, rows: np.ndarray, question: Question) -> Int[np.ndar
 def _encode(
     cells: Columns, rows: np.ndarray, training: np.ndarray, values: np.ndarray, question: Question
 ) -> tuple[Target, Tensor]:
-    """Return the target's description, and its values as a batch holds them."""
+    """Return the description of the target, and the targets of the rows as a batch holds them."""
     if question.kind == "real":
         as_float32(cells, question.target, rows, values[rows])  # refuses numbers beyond single precision
-        seen = values[training]
-        constant = seen.max(0) == seen.min(0)
-        deviation = np.where(constant, 1.0, seen.std(0))
-        target = Target("real", question.target, tuple(seen.mean(0).tolist()), tuple(deviation.tolist()))
-        # keep double precision: small differences about a large value would be rounded away
+        training_values = values[training]
+        constant = training_values.max(0) == training_values.min(0)
+        deviation = np.where(constant, 1.0, training_values.std(0))
+        mean = tuple(training_values.mean(0).tolist())
+        target = Target("real", question.target, mean, tuple(deviation.tolist()))
+        # double precision keeps small differences of large values
         return target, torch.from_numpy(values[rows])
     if question.kind == "degrees":
-        # remove whole turns before the unit is changed: their multiple of 2π would be rounded
+        # whole turns are removed before the conversion, because a multiple of 2π would be rounded
         angle = wrap(torch.from_numpy(np.deg2rad(np.fmod(values[rows], 360.0))))
         return Target("angle", question.target), angle.float()
     if question.kind == "radians":
         return Target("angle", question.target), wrap(torch.from_numpy(values[rows])).float()
     labels = sorted(set(values[rows]), key=_order)
     _check_labels(cells, labels, rows, training, values, question.target[0])
-    numbered = {label: index for index, label in enumerate(labels)}
-    return Target("class", tuple(labels)), torch.tensor([numbered[values[row]] for row in rows])
+    indices = {label: index for index, label in enumerate(labels)}
+    return Target("class", tuple(labels)), torch.tensor([indices[values[row]] for row in rows])
 
 
 def _check_labels(
@@ -402,40 +448,48 @@ def _check_labels(
     values: np.ndarray,
     name: str,
 ) -> None:
+    """Refuse labels that cannot be classes, or that have no training row.
+
+    Raises:
+        DataError: There is only one label, the labels seem to be numbers, two labels are the same number, or a label
+            does not occur in the training rows.
+    """
     if len(labels) == 1:
         raise DataError(
-            f"{cells.file}, column {name!r}: every row is {labels[0]!r}; wanted two classes or more. Add rows of "
-            "others, or name another data.target."
+            f"{cells.file}, column {name!r}: All rows have the label {labels[0]!r}, but at least two classes are "
+            "required. Add rows of other classes, or name another data.target."
         )
-    found = [text.parse_number(label) for label in labels]
-    numeric = all(value is not None for value in found)
-    broken = any(value is not None and not value.is_integer() for value in found)
-    if numeric and len(labels) > (MANY_LABELS if broken else max(MANY_LABELS, len(rows) / 2)):
+    numeric_values = [text.parse_number(label) for label in labels]
+    numeric = all(value is not None for value in numeric_values)
+    fractional = any(value is not None and not value.is_integer() for value in numeric_values)
+    if numeric and len(labels) > (MANY_LABELS if fractional else max(MANY_LABELS, len(rows) / 2)):
         raise DataError(
             f"{cells.file}, column {name!r}: {len(labels)} different numbers in {len(rows)} rows are no classes. Set "
             "data.kind=real or data.kind=degrees, or name another data.target."
         )
-    written: dict[float, str] = {}
-    for label, value in zip(labels, found, strict=True):
-        if value is not None and written.setdefault(value, label) != label:
+    spelling: dict[float, str] = {}
+    for label, value in zip(labels, numeric_values, strict=True):
+        if value is not None and spelling.setdefault(value, label) != label:
             raise DataError(
-                f"{cells.file}, column {name!r}: the labels {written[value]!r} and {label!r} are the same number; "
-                "wanted each class written in one way. Mend the column."
+                f"{cells.file}, column {name!r}: The labels {spelling[value]!r} and {label!r} are the same number. "
+                "Write each class in the same way in all rows."
             )
     unseen = set(labels) - set(values[training])
     if unseen:
         row = next(row for row in rows if values[row] in unseen)
         real = (
-            " These look like numbers: data.kind=real predicts them." if numeric and len(labels) > 2 else ""
+            " The labels look like numbers; set data.kind=real to predict numbers."
+            if numeric and len(labels) > 2
+            else ""
         )
         raise DataError(
-            f"{cells.file} line {cells.lines[row]}, column {name!r}: no training row is {values[row]!r}, so it cannot "
-            f"be learned.{real} Add such rows, say in a column `{SPLIT}` which row is for what, or set another "
-            "data.data_seed."
+            f"{cells.file} line {cells.lines[row]}, column {name!r}: No training row has the label {values[row]!r}, so "
+            f"this class cannot be learned.{real} Add rows of this class, assign rows to splits in a column `{SPLIT}`, "
+            "or set another data.data_seed."
         )
 
 
 def _order(word: str) -> tuple[float, str]:
-    """Return a sort key that puts numbers by size before words."""
+    """Return a sort key that sorts numbers by size and puts them before words."""
     value = number(word)
     return (float("inf") if value is None or value != value else value, word)

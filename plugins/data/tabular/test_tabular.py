@@ -22,14 +22,17 @@ from framework.datasets.fields import Fields
 from framework.errors import ConfigError, DataError
 from plugins.data.tabular.data import Tabular
 from plugins.data.tabular.picture import HEIGHT, bars
-from plugins.data.tabular.table import fit_scaling, standardised
+from plugins.data.tabular.table import fit_scaling, standardise
 
 SPLITS = ("train", "validation", "test")
 ROWS = 40
 
 
 def table(folder: Path, text: str | None = None, rows: int = ROWS) -> Path:
-    """Return rows with a number, its square, a word, a constant, and three columns that can be predicted."""
+    """Write a table, and return its file.
+
+    Without `text`, the columns are a number, its square, a word, a constant, and three columns for the target.
+    """
     lines = ["number,square,word,same,class,real,angle"]
     for row in range(rows):
         label = ("cat", "dog", "emu")[row % 3]
@@ -50,14 +53,14 @@ def prepared(file: Path, **config: Any) -> Tabular:
 
 
 def fields(data: Tabular, split: str) -> Mapping[str, torch.Tensor]:
-    found = getattr(data.splits(), split)
-    assert isinstance(found, Fields)
-    return found.fields
+    dataset = getattr(data.splits(), split)
+    assert isinstance(dataset, Fields)
+    return dataset.fields
 
 
 def test_a_table_is_split_and_standardised_by_its_training_rows(tmp_path: Path) -> None:
     data = prepared(table(tmp_path), columns=None, target="class")
-    assert data.input_shape == (5,)  # number, square, same, real, angle: the word is none
+    assert data.input_shape == (5,)  # number, square, same, real and angle; words are not read
     assert data.target.kind == "class"
     assert data.target.names == ("cat", "dog", "emu")
     assert data.groups == ("mine",)
@@ -75,7 +78,7 @@ def test_a_table_is_split_and_standardised_by_its_training_rows(tmp_path: Path) 
     assert data.fingerprint()["columns"] == "number, square, same, real, angle"
 
 
-def test_the_random_split_is_a_function_of_the_data_seed(tmp_path: Path) -> None:
+def test_the_data_seed_determines_the_random_split(tmp_path: Path) -> None:
     file = table(tmp_path)
     lines = [fields(prepared(file, data_seed=seed), "test")["line"].tolist() for seed in (0, 0, 1)]
     assert lines[0] == lines[1] != lines[2]
@@ -103,7 +106,7 @@ def test_reals_keep_their_unit_and_degrees_become_radians(tmp_path: Path) -> Non
     assert several.input_shape == (3,)
 
 
-def test_many_turns_cost_no_digits(tmp_path: Path) -> None:
+def test_angles_of_many_turns_keep_their_digits(tmp_path: Path) -> None:
     text = "x,angle\n" + "\n".join(f"{row},{360 * 10**9 * (row - 20) + row}" for row in range(40))
     angle = prepared(table(tmp_path, text), target="angle", kind="degrees")
     for name in SPLITS:
@@ -133,6 +136,7 @@ def test_labels_are_ordered_by_size_where_they_are_numbers(tmp_path: Path) -> No
 
 
 def with_cell(cell: str, line: int = 5, column: int = 0) -> str:
+    """Return a good table in which one cell is replaced."""
     lines = [f"{row},{row + 1},{'ab'[row % 2]}" for row in range(ROWS)]
     cells = lines[line - 2].split(",")
     cells[column] = cell
@@ -151,7 +155,7 @@ def with_cell(cell: str, line: int = 5, column: int = 0) -> str:
             "x,klass\n1,a",
             r"data\.target names the column 'class', which .*mine\.csv does not have\. Did you mean 'klass'\?",
         ),
-        ("word,class\na,b\nc,d", "has no column of numbers to read beside class"),
+        ("word,class\na,b\nc,d", "has no column of numbers besides class"),
         (with_cell("abc"), r"mine\.csv line 5, column 'x': 'abc' is no finite number"),
         (
             with_cell(""),
@@ -160,32 +164,38 @@ def with_cell(cell: str, line: int = 5, column: int = 0) -> str:
         (with_cell("nan", 7, 1), r"line 7, column 'y': 'nan' is no finite number"),
         (with_cell("-inf", 7, 1), r"line 7, column 'y': '-inf' is no finite number"),
         (with_cell("1,2"), r"line 5: the line has 4 cells, but the first line names 3"),
-        (with_cell("", 9, 2), r"line 9, column 'class': no label\. Write it, or set data\.missing=skip"),
-        ("x,class\n" + "1,a\n" * 9, "every row is 'a'; wanted two classes or more"),
-        (with_cell("c", 4, 2), r"line 4, column 'class': no training row is 'c'"),
+        (
+            with_cell("", 9, 2),
+            r"line 9, column 'class': The label is missing\. Write a label, or set data\.missing=skip",
+        ),
+        ("x,class\n" + "1,a\n" * 9, "All rows have the label 'a', but at least two classes"),
+        (with_cell("c", 4, 2), r"line 4, column 'class': No training row has the label 'c'"),
         (
             "x,class\n" + "\n".join(f"{row},{row / 7}" for row in range(50)),
             r"50 different numbers in 50 rows are no classes\. Set data\.kind=real",
         ),
-        ("x,class\n1,a\n2,b", r"the validation split is empty \(2 rows, 0 left out"),
-        ("split,x,class\ntrain,1,a\ntest,2,b", r"the validation split is empty .* column `split`"),
-        ("split,x,class\ntrain,1,a\ntset,2,b", r"line 3, column `split`: 'tset'; .* Did you mean 'test'\?"),
-        ("group,x,class\na,1,a\n,2,b", r"line 3, column `group`: no name"),
+        ("x,class\n1,a\n2,b", r"The validation split is empty \(2 rows are used, 0 are left out"),
+        ("split,x,class\ntrain,1,a\ntest,2,b", r"The validation split is empty .* column `split`"),
+        (
+            "split,x,class\ntrain,1,a\ntset,2,b",
+            r"line 3, column `split`: 'tset' is no split\. .* Did you mean 'test'\?",
+        ),
+        ("group,x,class\na,1,a\n,2,b", r"line 3, column `group`: The name is missing"),
         (
             "group,x,class\na,1,a\nNA,2,b",
-            r"line 3, column `group`: no name \('NA'\).* data\.missing_words=\[\]",
+            r"line 3, column `group`: 'NA' means that .* data\.missing_words=\[\]",
         ),
         *(
             (
                 with_cell(word, 9, 2),
-                rf"line 9, column 'class': '{word}', which says .* data\.missing_words=\[\]",
+                rf"line 9, column 'class': '{word}' means that .* data\.missing_words=\[\]",
             )
             for word in ("nan", "NA", "N/A", "None", "null", "NaN", "-")
         ),
-        (with_cell("1", 9, 2).replace(",b", ",1.0"), "labels '1' and '1.0' are the same number"),
+        (with_cell("1", 9, 2).replace(",b", ",1.0"), r"labels '1' and '1\.0' are the same number"),
         (
             "x,class\n" + "\n".join(f"{row},{max(row - 30, 0) if row < 45 else 3}" for row in range(90)),
-            r"no training row is '\d+', so .* These look like numbers: data\.kind=real predicts them",
+            r"No training row has the label '\d+', so .* The labels look like numbers; set data\.kind=real",
         ),
         (with_cell("1e300", 3), r"line 3, column 'x': '1e300' lies beyond single precision"),
     ],
@@ -202,34 +212,34 @@ def test_wrong_tables_are_refused(tmp_path: Path, text: str, message: str) -> No
         prepared(file, data_seed=seed)
 
 
-def test_words_for_nothing_are_labels_where_that_is_said(tmp_path: Path) -> None:
+def test_missing_words_determine_which_words_are_labels(tmp_path: Path) -> None:
     text = "x,class\n" + "\n".join(f"{row},{('none', 'mild', 'NA')[row % 3]}" for row in range(60))
     data = prepared(table(tmp_path, text), missing_words=[])
     assert data.target.names == ("NA", "mild", "none")
-    kept = prepared(table(tmp_path, text), missing_words=["na"], missing="skip")
-    assert (kept.target.names, kept.skipped) == (("mild", "none"), 20)
+    skipping = prepared(table(tmp_path, text), missing_words=["na"], missing="skip")
+    assert (skipping.target.names, skipping.skipped) == (("mild", "none"), 20)
 
 
 @pytest.mark.parametrize("kind", ["degrees", "radians"])
 def test_angles_in_the_other_unit_are_refused(tmp_path: Path, kind: str) -> None:
-    turn = np.linspace(-180, 180, 61).round(3)
-    written = {"degrees": np.deg2rad(turn).round(4), "radians": turn}[kind]
-    text = "x,angle\n" + "\n".join(f"{row * row},{value}" for row, value in enumerate(written))
+    degrees = np.linspace(-180, 180, 61).round(3)
+    values = {"degrees": np.deg2rad(degrees).round(4), "radians": degrees}[kind]
+    text = "x,angle\n" + "\n".join(f"{row * row},{value}" for row, value in enumerate(values))
     file = table(tmp_path, text)
     other = {"degrees": "radians", "radians": "degrees"}[kind]
     with pytest.raises(DataError, match=rf"column 'angle': .* looks like {other}, .* Set data\.kind={other}"):
         prepared(file, target="angle", kind=kind)
     data = prepared(file, target="angle", kind=other)
     angle, line = (fields(data, "train")[name] for name in ("target", "line"))
-    gap = angle[:, 0].double() - torch.deg2rad(torch.from_numpy(turn)[line - 2])
-    np.testing.assert_allclose(torch.remainder(gap + 1, 2 * math.pi) - 1, 0, atol=1e-3)
+    error = angle[:, 0].double() - torch.deg2rad(torch.from_numpy(degrees)[line - 2])
+    np.testing.assert_allclose(torch.remainder(error + 1, 2 * math.pi) - 1, 0, atol=1e-3)
     if kind == "degrees":
         prepared(file, target="angle", kind=kind, small_angles=True)
-        with pytest.raises(DataError, match=r"small_angles=true changes nothing with data\.kind=real"):
+        with pytest.raises(DataError, match=r"small_angles=true has no effect with data\.kind=real"):
             prepared(file, target="angle", kind="real", small_angles=True)
 
 
-def test_what_is_read_predicted_and_left_out_is_said(tmp_path: Path) -> None:
+def test_remarks_name_the_target_and_the_columns_that_are_left_out(tmp_path: Path) -> None:
     text = "Unnamed: 0,a,flag,note,none,class\n"
     text += "\n".join(
         f"{row + 5},{row * row % 7},{('TRUE', 'false')[row % 2]},w,,{'ab'[row % 2]}" for row in range(40)
@@ -243,36 +253,36 @@ def test_what_is_read_predicted_and_left_out_is_said(tmp_path: Path) -> None:
     )
 
 
-def test_wrong_questions_are_refused(tmp_path: Path) -> None:
+def test_settings_that_do_not_fit_the_table_are_refused(tmp_path: Path) -> None:
     file = table(tmp_path)
     with pytest.raises(
         DataError, match=r"data\.columns names the column 'nomber', .* Did you mean 'number'\?"
     ):
         prepared(file, columns=["nomber"])
-    with pytest.raises(DataError, match=r"data\.columns names 'class', which is what is to be predicted"):
+    with pytest.raises(DataError, match=r"data\.columns names 'class', but this column is the target"):
         prepared(file, columns=["number", "class"])
     with pytest.raises(DataError, match=r"line 2, column 'word': 'a' is no finite number"):
         prepared(file, columns=["word"])
     with pytest.raises(DataError, match=r"line 2, column 'class': 'cat' is no finite number"):
         prepared(file, kind="real")
-    with pytest.raises(DataError, match=r"data\.target = \['class', 'word'\] with data\.kind=class"):
+    with pytest.raises(DataError, match=r"data\.target = \['class', 'word'\] does not fit data\.kind=class"):
         prepared(file, target=["class", "word"])
     with pytest.raises(DataError, match=r"data\.target = \[\]"):
         prepared(file, target=[], kind="real")
-    with pytest.raises(DataError, match="wanted less than 1"):
+    with pytest.raises(DataError, match="the sum must be less than 1"):
         prepared(file, validation=0.5, test=0.5)
-    with pytest.raises(DataError, match="has no column of numbers to read"):
+    with pytest.raises(DataError, match="has no column of numbers besides"):
         prepared(file, columns=[])
 
 
 @pytest.mark.parametrize("cell", ["", "NA", "nan", "?"])
-def test_rows_without_a_number_are_left_out_where_asked(tmp_path: Path, cell: str) -> None:
+def test_missing_skip_leaves_out_rows_without_a_number(tmp_path: Path, cell: str) -> None:
     lines = with_cell(cell).splitlines()
     lines[10] = lines[10].replace(",a", ",").replace(",b", ",")
     data = prepared(table(tmp_path, "\n".join(lines)), missing="skip")
     assert data.skipped == 2
-    kept = torch.cat([fields(data, name)["line"] for name in SPLITS])
-    assert sorted(kept.tolist()) == [line for line in range(2, ROWS + 2) if line not in (5, 11)]
+    used_lines = torch.cat([fields(data, name)["line"] for name in SPLITS])
+    assert sorted(used_lines.tolist()) == [line for line in range(2, ROWS + 2) if line not in (5, 11)]
     reals = prepared(table(tmp_path, with_cell(cell)), missing="skip", target="x", kind="real", columns=["y"])
     assert reals.skipped == 1
     with pytest.raises(DataError, match="line 5, column 'x': 'inf'"):
@@ -309,29 +319,29 @@ def test_read_uses_the_training_rows_and_needs_no_prepare(tmp_path: Path) -> Non
 @settings(deadline=None, max_examples=200)
 def test_any_column_is_standardised_without_overflow(values: list[float], constant: float) -> None:
     inputs = np.array([values, [constant] * len(values)]).T
-    scaling, same = fit_scaling(inputs)
-    found = standardised(inputs, scaling)
-    assert same.tolist() == [min(values) == max(values), True]
-    np.testing.assert_array_equal(found[:, 1], 0)
-    if not same[0]:
-        assert abs(found[:, 0].mean()) < 1e-6
-        assert found[:, 0].std() == pytest.approx(1, abs=1e-6)
+    scaling, is_constant = fit_scaling(inputs)
+    scaled = standardise(inputs, scaling)
+    assert is_constant.tolist() == [min(values) == max(values), True]
+    np.testing.assert_array_equal(scaled[:, 1], 0)
+    if not is_constant[0]:
+        assert abs(scaled[:, 0].mean()) < 1e-6
+        assert scaled[:, 0].std() == pytest.approx(1, abs=1e-6)
     else:
-        np.testing.assert_array_equal(found[:, 0], 0)
+        np.testing.assert_array_equal(scaled[:, 0], 0)
 
 
 def test_a_column_far_from_zero_keeps_its_digits() -> None:
     inputs = 1e9 + np.array([[0.0], [1.0], [2.0], [3.0]])
-    found = standardised(inputs, fit_scaling(inputs)[0])
-    np.testing.assert_allclose(found[:, 0], (np.arange(4) - 1.5) / np.std(np.arange(4)), rtol=1e-6)
+    scaled = standardise(inputs, fit_scaling(inputs)[0])
+    np.testing.assert_allclose(scaled[:, 0], (np.arange(4) - 1.5) / np.std(np.arange(4)), rtol=1e-6)
 
 
-def test_a_picture_has_a_bar_for_every_column() -> None:
-    picture = bars(np.array([3.0, -1.5, 0.0, 99.0]))
-    assert picture.shape == (HEIGHT, 256, 3)
-    blue, red = ((picture == colour).all(-1).sum(0) for colour in ((31, 119, 180), (214, 39, 40)))
-    heights = [(int(blue[place]), int(red[place])) for place in (10, 74, 138, 202)]
-    assert heights == [(31, 0), (0, 15), (0, 0), (31, 0)]  # less the grey line in the middle
+def test_an_image_has_a_bar_for_every_column() -> None:
+    image = bars(np.array([3.0, -1.5, 0.0, 99.0]))
+    assert image.shape == (HEIGHT, 256, 3)
+    blue, red = ((image == colour).all(-1).sum(0) for colour in ((31, 119, 180), (214, 39, 40)))
+    heights = [(int(blue[column]), int(red[column])) for column in (10, 74, 138, 202)]
+    assert heights == [(31, 0), (0, 15), (0, 0), (31, 0)]  # without the grey line in the middle
     assert bars(np.zeros(500)).shape == (HEIGHT, 1000, 3)
 
 
@@ -366,9 +376,9 @@ for line in json.load(sys.stdin):
 """
 
 
-def test_tables_of_every_kind_are_trained_on_tested_and_predicted_for(tmp_path: Path) -> None:
+def test_training_test_and_prediction_run_with_every_kind_of_target(tmp_path: Path) -> None:
     file = table(tmp_path, rows=90)
-    (tmp_path / "one.csv").write_text("square,number\n25,5\n")
+    (tmp_path / "new.csv").write_text("square,number\n25,5\n")
     lines = []
     for kind, (target, head, metric) in RUNS.items():
         lines += [
@@ -389,11 +399,11 @@ def test_tables_of_every_kind_are_trained_on_tested_and_predicted_for(tmp_path: 
             [
                 "mode=predict",
                 f"checkpoint={tmp_path / kind}",
-                f"mode.files={tmp_path / 'one.csv'}",
+                f"mode.files={tmp_path / 'new.csv'}",
                 f"hydra.run.dir={tmp_path / kind / 'predicted'}",
             ],
         ]
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", COMMANDS],
         input=json.dumps(lines),
         cwd=tmp_path,
@@ -402,7 +412,7 @@ def test_tables_of_every_kind_are_trained_on_tested_and_predicted_for(tmp_path: 
         text=True,
         timeout=300,
     )
-    assert done.returncode == 0, done.stdout + done.stderr
+    assert process.returncode == 0, process.stdout + process.stderr
     for kind in ("class", "real", "degrees"):
         results = json.loads((tmp_path / kind / "results.json").read_text())
         assert math.isfinite(results["log_likelihood"])
@@ -410,15 +420,15 @@ def test_tables_of_every_kind_are_trained_on_tested_and_predicted_for(tmp_path: 
         assert not results["synthetic"]
         with (tmp_path / kind / "predicted" / "predictions.csv").open(encoding="utf-8") as stream:
             (row,) = csv.DictReader(stream)
-        wanted = {"class": "class", "real": "real", "degrees": "angle_deg"}[kind]
-        names, found = list(row), list(row.values())
-        assert names[:2] == ["sample", wanted]
-        if kind == "class":  # by name, then every class's probability
-            shares = {name: float(value) for name, value in row.items() if name.startswith("p_")}
-            assert sum(shares.values()) == pytest.approx(1, abs=1e-5)
-            assert max(shares, key=shares.__getitem__) == f"p_{row['class']}"
-            found = [value for name, value in row.items() if name not in ("sample", "class")]
+        target_column = {"class": "class", "real": "real", "degrees": "angle_deg"}[kind]
+        names = list(row)
+        assert names[:2] == ["sample", target_column]
+        if kind == "class":  # the name of the class, then the probability of every class
+            probabilities = {name: float(value) for name, value in row.items() if name.startswith("p_")}
+            assert sum(probabilities.values()) == pytest.approx(1, abs=1e-5)
+            assert max(probabilities, key=probabilities.__getitem__) == f"p_{row['class']}"
+            numbers = [value for name, value in row.items() if name not in ("sample", "class")]
         else:
-            found = found[1:]
+            numbers = list(row.values())[1:]
         assert names[-1] == "entropy_nats"
-        assert all(math.isfinite(float(cell)) for cell in found)
+        assert all(math.isfinite(float(cell)) for cell in numbers)
