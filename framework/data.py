@@ -71,7 +71,7 @@ class Data(ABC):
 
     group: ClassVar[str] = "data"
     bibtex: ClassVar[str]
-    """Citation of the data set, as BibTeX."""
+    """Citation of the data set: BibTeX entries, or their keys in the `references.bib` of the package; "" for none."""
     target: Target
     """Description of the predicted quantity."""
     input_shape: tuple[int, ...]

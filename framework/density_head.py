@@ -36,7 +36,7 @@ class DensityHead(nn.Module, ABC):
 
     group: ClassVar[str] = "density_head"
     bibtex: ClassVar[str]
-    """Citation of the method, as BibTeX."""
+    """Citation of the method: BibTeX entries, or their keys in the `references.bib` of the package; "" for none."""
     knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
     """Attributes that trade error for run time, each with its useful values in ascending order.
 

@@ -28,7 +28,7 @@ class Encoder(nn.Module, ABC):
 
     group: ClassVar[str] = "encoder"
     bibtex: ClassVar[str]
-    """Citation of the method, as BibTeX."""
+    """Citation of the method: BibTeX entries, or their keys in the `references.bib` of the package; "" for none."""
     vectorises: bool = False
     """True if `torch.vmap` over the parameters of several such encoders gives their features in one pass, and faster.
 

@@ -28,7 +28,7 @@ class Metric(torchmetrics.Metric, ABC):
 
     group: ClassVar[str] = "metric"
     bibtex: ClassVar[str]
-    """Citation of the method, as BibTeX."""
+    """Citation of the method: BibTeX entries, or their keys in the `references.bib` of the package; "" for none."""
     full_state_update = False
     splits: ClassVar[tuple[Split, ...]] = ("test",)
     """Splits whose predictions `update` receives.

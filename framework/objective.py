@@ -43,7 +43,7 @@ class Objective(nn.Module, ABC):
 
     group: ClassVar[str] = "objective"
     bibtex: ClassVar[str]
-    """Citation of the method, as BibTeX."""
+    """Citation of the method: BibTeX entries, or their keys in the `references.bib` of the package; "" for none."""
 
     adversary_optimizer: AdversaryOptimizer | None = None
     """Optimiser of the objective's own parameters, if they are trained against the predictor's.

@@ -174,7 +174,7 @@ class Renderer(ABC):
 
     group: ClassVar[str] = "renderer"
     bibtex: ClassVar[str]
-    """Citation of the method, as BibTeX."""
+    """Citation of the method: BibTeX entries, or their keys in the `references.bib` of the package; "" for none."""
     channels: ClassVar[frozenset[str]]
     """Names of the channels that the renderer can draw.
 

@@ -24,7 +24,7 @@ class Uncertainty(Predictor):
 
     group: ClassVar[str] = "uncertainty"
     bibtex: ClassVar[str]
-    """Citation of the method, as BibTeX."""
+    """Citation of the method: BibTeX entries, or their keys in the `references.bib` of the package; "" for none."""
     knobs: Mapping[str, tuple[int, ...]] = {}
     """Attributes that trade error for run time, each with its useful values in ascending order.
 

@@ -13,7 +13,7 @@ from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 
 import framework.configuration.registry as registry
-from framework.configuration.assembly import entries
+from framework.configuration.citations import bibtex_of, entries, look_up
 from framework.configuration.composition import PluginConfigs, register
 from framework.configuration.composition import folder as folder_of_configs
 from framework.configuration.registry import GROUPS, config_folders, find, installed, load, unusable_names
@@ -275,7 +275,7 @@ def test_every_installed_plugin_loads_as_its_base(group: str) -> None:
 
 def test_a_key_cites_one_thing_and_once() -> None:
     """All plugins give the same text for a BibTeX key, and the list that a run records has each key once."""
-    texts = [load(group, name).bibtex for group in GROUPS for name in installed(group)]
+    texts = [bibtex_of(load(group, name)) for group in GROUPS for name in installed(group)]
     found = entries(text for text in texts if text.strip())
     for text in texts:
         for key, entry in entries([text]).items():
@@ -286,6 +286,29 @@ def test_a_key_cites_one_thing_and_once() -> None:
         ["@book{one,\n  title = {A, @ B}\n}\n@misc{two,\n}", " @book{one,\n}", "@misc{three, year = 1}"]
     )
     assert list(several) == ["one", "two", "three"] and several["one"] == "@book{one,\n  title = {A, @ B}\n}"
+
+
+def test_keys_are_looked_up_in_the_references_of_the_package(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    package = tmp_path / "cited_package"
+    package.mkdir()
+    (package / "__init__.py").touch()
+    (package / "references.bib").write_text("@book{a,\n}\n\n@misc{b,\n}\n", encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    assert look_up("b, a", "cited_package") == "@misc{b,\n}\n\n@book{a,\n}"
+    assert look_up("@misc{c,\n}", "cited_package") == "@misc{c,\n}"
+    with pytest.raises(ConfigError, match=r"cites the key 'aa'.*Did you mean 'a'\?"):
+        look_up("aa", "cited_package")
+    with pytest.raises(ConfigError, match="does not contain it"):
+        look_up("a", "no_such_package")
+
+
+def test_each_reference_is_cited() -> None:
+    """`plugins/references.bib` holds each entry once, by key in alphabetical order, and none that nobody cites."""
+    keys = list(entries([(ROOT / "plugins/references.bib").read_text(encoding="utf-8")]))
+    cited = entries(bibtex_of(load(group, name)) for group in GROUPS for name in installed(group))
+    assert keys == sorted(cited)
 
 
 @pytest.mark.parametrize("hiding", ["plugins/__init__.py", "plugins/mine.py", "plugins.py"])

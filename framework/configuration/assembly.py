@@ -1,11 +1,11 @@
 """Building of the parts of the density pipeline from a config: data, predictor, objectives and metrics."""
 
-import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
 
+from framework.configuration.citations import bibtex_of
 from framework.configuration.registry import GROUPS, installed, load
 from framework.configuration.schema import build, parts, resolve
 from framework.data import Data
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from framework.metric import Metric
 
 Resolved = dict[str, Any]
-"""Configs of all plugins of a run with every parameter, as plain values by group; a plural group holds a list."""
+"""Resolved configs of all plugins of a run by group, as plain values; a group of several plugins has a list."""
 
 
 def resolve_all(config: Mapping[str, Any]) -> Resolved:
@@ -188,7 +188,7 @@ def citations(resolved: Resolved) -> dict[str, str]:
             if group in ("metric", "objective"):
                 return
             raise
-        bibtex = str(getattr(cls, "bibtex", "")).strip()
+        bibtex = bibtex_of(cls)
         if bibtex:
             bibtex_by_part[f"{group} {part['name']}"] = bibtex
         for key, inner in parts(cls).items():
@@ -201,15 +201,6 @@ def citations(resolved: Resolved) -> dict[str, str]:
     for part in _items(resolved.get("outliers")):
         visit("data", part)
     return bibtex_by_part
-
-
-def entries(bibtex: Iterable[str]) -> dict[str, str]:
-    """Return the entries of several BibTeX texts by their keys, each once and in order."""
-    entries_by_key: dict[str, str] = {}
-    for entry in re.split(r"^(?=@)", "\n".join(bibtex), flags=re.MULTILINE):
-        if entry.strip():
-            entries_by_key.setdefault(entry.partition("{")[2].partition(",")[0].strip(), entry.strip())
-    return entries_by_key
 
 
 def _items(value: Any) -> list[Any]:

@@ -3,6 +3,7 @@
 import ast
 import re
 import unicodedata
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,9 +11,10 @@ from rich.console import Console
 from rich.padding import Padding
 from rich.text import Text
 
+from framework.configuration.citations import look_up
 from framework.configuration.config import Config, Options
 from framework.configuration.registry import GROUPS, Entry, installed, origin, package_folders, unusable_names
-from framework.errors import shorten
+from framework.errors import ConfigError, shorten
 
 
 def run(config: Config) -> None:
@@ -80,6 +82,8 @@ def describe(group: str, entry: Entry) -> Description:
     for path in (candidate for root in package_folders(package) for candidate in _candidates(root, rest)):
         if path.is_file():
             summary, bibtex = _docstring_and_bibtex(path, attribute)
+            with suppress(ConfigError):  # a run with this plugin names the missing key
+                bibtex = look_up(bibtex, package)
             break
     return Description(group, entry.name, origin(entry), summary, bibtex)
 

@@ -24,10 +24,10 @@ from framework.configuration.assembly import (
     build_outliers,
     build_predictor,
     citations,
-    entries,
     metrics_reading_outliers,
     require_outliers,
 )
+from framework.configuration.citations import entries
 from framework.configuration.config import Config
 from framework.configuration.description import Description
 from framework.configuration.loading import (

@@ -81,12 +81,7 @@ class CEST(Data, Mapped):
             "error" refuses the folder.
     """
 
-    bibtex = """@article{glang2019deepcest,
-  author  = {Glang, Felix and Deshmane, Anagha and Prokudin, Sergey and Martin, Florian and Herz, Kai and others},
-  title   = {{DeepCEST} {3T}: Robust {MRI} parameter determination and uncertainty quantification with neural networks},
-  journal = {Magnetic Resonance in Medicine},
-  year    = {2019}
-}"""
+    bibtex = "glang2019deepcest"
     title = "cest"
     suffixes = SUFFIXES
     companions = (".mask.nii.gz", ".mask.nii", ".offsets.txt")
@@ -118,7 +113,7 @@ class CEST(Data, Mapped):
         return offsets_of(self.configured_offsets)
 
     @property
-    def wanted(self) -> Parameters:
+    def parameters(self) -> Parameters:
         """Parameters that are fitted to each spectrum."""
         return Parameters.of(self.preset)
 
@@ -142,7 +137,7 @@ class CEST(Data, Mapped):
         training = self._splits.train.fields["target"].double()  # type: ignore[attr-defined]
         self.target = Target(
             "real",
-            self.wanted.target,
+            self.parameters.target,
             tuple(training.mean(0).tolist()),
             tuple(training.std(0, correction=0).clamp(min=1e-6).tolist()),
         )
@@ -164,7 +159,7 @@ class CEST(Data, Mapped):
     def _fit(self, spectra: Tensor) -> Float[Tensor, "voxel p"]:
         """Return the fitted parameters of spectra; read them from the cache if they are stored there."""
         key = hashlib.sha256(
-            spectra.numpy().tobytes() + repr((FIT_VERSION, self.wanted, self.offsets)).encode()
+            spectra.numpy().tobytes() + repr((FIT_VERSION, self.parameters, self.offsets)).encode()
         ).hexdigest()[:24]
         cache_file = folder("cest_fits") / f"{key}.npz"
         if cache_file.is_file():
@@ -172,7 +167,7 @@ class CEST(Data, Mapped):
                 return torch.from_numpy(read_npz(cache_file.read_bytes())["parameters"])
             except Exception:
                 _log.warning("%s cannot be read; the spectra are fitted again.", cache_file)
-        parameters = fit(spectra, torch.tensor(self.offsets), self.wanted).parameters
+        parameters = fit(spectra, torch.tensor(self.offsets), self.parameters).parameters
         stream = io.BytesIO()
         np.savez(stream, parameters=parameters.numpy())
         write_whole(cache_file, stream.getvalue())
@@ -194,7 +189,7 @@ class CEST(Data, Mapped):
             )
         return Fields(
             input=voxels.spectra[chosen],
-            target=voxels.lines[chosen, : self.wanted.target_count].float(),
+            target=voxels.lines[chosen, : self.parameters.target_count].float(),
             lines=voxels.lines[chosen].float(),
             group=voxels.region[chosen],
             place=voxels.place[chosen],
@@ -218,7 +213,7 @@ class CEST(Data, Mapped):
         """Write the maps of the predictions for a volume and return the paths of the files."""
         from plugins.data.cest.maps import write_maps
 
-        return write_maps(file, self.wanted.target, point, deviation, folder, synthetic=self.synthetic)
+        return write_maps(file, self.parameters.target, point, deviation, folder, synthetic=self.synthetic)
 
     def augment(self, batch: Batch) -> Batch:
         """Return a batch with random noise and a random B0 shift of the lines; the residuals of the fit stay in place.

@@ -43,13 +43,7 @@ class COIL20(Data):
         jitter: Largest random shift, zoom and change of brightness and contrast in training, as a share.
     """
 
-    bibtex = """@techreport{nene1996coil20,
-  title = {Columbia Object Image Library (COIL-20)},
-  author = {Nene, Sameer A. and Nayar, Shree K. and Murase, Hiroshi},
-  institution = {Columbia University},
-  number = {CUCS-005-96},
-  year = {1996}
-}"""
+    bibtex = "nene1996coil20"
 
     suffixes = images.SUFFIXES
 

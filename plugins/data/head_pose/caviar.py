@@ -30,20 +30,7 @@ class Caviar(Heads):
     Training mirrors no images, because the thesis authors' data hold no mirror images.
     """
 
-    bibtex = """@misc{fisher2005caviar,
-  author = {Fisher, Robert and Santos-Victor, Jose and Crowley, James},
-  title = {{CAVIAR}: Context Aware Vision using Image-based Active Recognition},
-  year = {2005}
-}
-@article{tosato2013characterizing,
-  author = {Tosato, Diego and Spera, Mauro and Cristani, Marco and Murino, Vittorio},
-  title = {Characterizing Humans on {Riemannian} Manifolds},
-  journal = {IEEE Transactions on Pattern Analysis and Machine Intelligence},
-  volume = {35},
-  number = {8},
-  pages = {1972--1984},
-  year = {2013}
-}"""
+    bibtex = "fisher2005caviar, tosato2013characterizing"
     groups = ("caviar",)
     target = Target("angle", ("gaze",))
 

@@ -30,21 +30,7 @@ class Idiap(Heads):
     Training mirrors no images, because the published set already contains the mirror images.
     """
 
-    bibtex = """@inproceedings{ba2005evaluation,
-  author = {Ba, Sil{\\`e}ye O. and Odobez, Jean-Marc},
-  title = {Evaluation of Multiple Cue Head Pose Estimation Algorithms in Natural Environments},
-  booktitle = {IEEE International Conference on Multimedia and Expo (ICME)},
-  year = {2005}
-}
-@article{tosato2013characterizing,
-  author = {Tosato, Diego and Spera, Mauro and Cristani, Marco and Murino, Vittorio},
-  title = {Characterizing Humans on {Riemannian} Manifolds},
-  journal = {IEEE Transactions on Pattern Analysis and Machine Intelligence},
-  volume = {35},
-  number = {8},
-  pages = {1972--1984},
-  year = {2013}
-}"""
+    bibtex = "ba2005evaluation, tosato2013characterizing"
     groups = ("idiap",)
 
     def __init__(

@@ -32,19 +32,7 @@ class TownCentre(Heads):
         invalid: Number of heads that are left out because their labels mark them as not valid; `prepare` sets it.
     """
 
-    bibtex = """@inproceedings{benfold2009guiding,
-  author = {Benfold, Ben and Reid, Ian},
-  title = {Guiding Visual Surveillance by Tracking Human Attention},
-  booktitle = {British Machine Vision Conference (BMVC)},
-  year = {2009}
-}
-@inproceedings{beyer2015biternion,
-  author    = {Beyer, Lucas and Hermans, Alexander and Leibe, Bastian},
-  title     = {Biternion Nets: Continuous Head Pose Regression from Discrete Training Labels},
-  booktitle = {German Conference on Pattern Recognition},
-  pages     = {157--168},
-  year      = {2015}
-}"""
+    bibtex = "benfold2009guiding, beyer2015biternion"
     groups = ("towncentre",)
     target = Target("angle", ("pan",))
 

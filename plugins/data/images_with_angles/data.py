@@ -37,10 +37,7 @@ class ImagesWithAngles(Data):
         writing: How the table is written.
     """
 
-    bibtex = """@misc{images_with_angles,
-  title = {Images with angles from a folder of the user's own},
-  note = {Cite the source of these images}
-}"""
+    bibtex = "images_with_angles"
 
     suffixes = images.SUFFIXES
 

@@ -64,14 +64,7 @@ class ModelNet40(LabelledClouds):
         models: Settings of the generated models.
     """
 
-    bibtex = """@inproceedings{wu2015modelnet,
-  title = {{3D ShapeNets}: A Deep Representation for Volumetric Shapes},
-  author = {Wu, Zhirong and Song, Shuran and Khosla, Aditya and Yu, Fisher and Zhang, Linguang and Tang, Xiaoou and
-            Xiao, Jianxiong},
-  booktitle = {IEEE Conference on Computer Vision and Pattern Recognition (CVPR)},
-  pages = {1912--1920},
-  year = {2015}
-}"""
+    bibtex = "wu2015modelnet"
     groups = ("modelnet40",)
 
     def __init__(
@@ -147,10 +140,7 @@ class PointCloudFolder(LabelledClouds):
         data_seed: Seed of points and splits, independent of the seed of the run.
     """
 
-    bibtex = """@misc{point_cloud_folder,
-  title = {Point clouds of the user's own},
-  note = {Cite the source of these files}
-}"""
+    bibtex = "point_cloud_folder"
     groups = ("point_cloud_folder",)
 
     def __init__(
@@ -237,13 +227,7 @@ class Dales(LabelledClouds):
         data_seed: Seed of the folds, of the validation split and of the points, independent of the seed of the run.
     """
 
-    bibtex = """@inproceedings{varney2020dales,
-  title = {{DALES}: A Large-scale Aerial {LiDAR} Data Set for Semantic Segmentation},
-  author = {Varney, Nina and Asari, Vijayan K. and Graehling, Quinn},
-  booktitle = {IEEE/CVF Conference on Computer Vision and Pattern Recognition Workshops (CVPRW)},
-  pages = {717--726},
-  year = {2020}
-}"""
+    bibtex = "varney2020dales"
     groups = ("dales",)
 
     def __init__(

@@ -22,14 +22,7 @@ class Moons(PlanePoints):
         noise: Standard deviation of the noise on either coordinate, in radii of the half circles.
     """
 
-    bibtex = """@article{pedregosa2011scikit,
-  title = {Scikit-learn: Machine Learning in {Python}},
-  author = {Pedregosa, Fabian and Varoquaux, Ga{\\"e}l and Gramfort, Alexandre and others},
-  journal = {Journal of Machine Learning Research},
-  volume = {12},
-  pages = {2825--2830},
-  year = {2011}
-}"""
+    bibtex = "pedregosa2011scikit"
     groups = ("moons",)
     plane = True
 

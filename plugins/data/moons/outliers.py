@@ -29,12 +29,7 @@ class MoonsOutliers(PlanePoints):
         radius: Radius of the discs.
     """
 
-    bibtex = """@phdthesis{prokudin2020robust,
-  title = {Robust and Efficient Deep Visual Learning},
-  author = {Prokudin, Sergey},
-  school = {Universit{\\"a}t T{\\"u}bingen},
-  year = {2020}
-}"""
+    bibtex = "prokudin2020robust"
     groups = ("outliers",)
 
     def __init__(

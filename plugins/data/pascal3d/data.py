@@ -114,12 +114,7 @@ class Pascal3D(Data):
         excluded: Number of objects that the protocol leaves out, by reason; `prepare` sets it.
     """
 
-    bibtex = """@inproceedings{xiang2014beyond,
-  author = {Xiang, Yu and Mottaghi, Roozbeh and Savarese, Silvio},
-  title = {Beyond {PASCAL}: A Benchmark for {3D} Object Detection in the Wild},
-  booktitle = {IEEE Winter Conference on Applications of Computer Vision (WACV)},
-  year = {2014}
-}"""
+    bibtex = "xiang2014beyond"
     target = Target("angle", ("azimuth", "elevation", "tilt"))
     directions = ("front", "left side", "back", "right side")
 

@@ -64,15 +64,7 @@ class TableTennis(Data):
         constants: Constants of the simulated ball and table.
     """
 
-    bibtex = """@article{gomez2020real,
-  author  = {Gomez-Gonzalez, Sebastian and Prokudin, Sergey and Sch{\\"o}lkopf, Bernhard and Peters, Jan},
-  title   = {Real Time Trajectory Prediction Using Deep Conditional Generative Models},
-  journal = {IEEE Robotics and Automation Letters},
-  volume  = {5},
-  number  = {2},
-  pages   = {970--976},
-  year    = {2020}
-}"""
+    bibtex = "gomez2020real"
     groups = ("table_tennis",)
     suffixes = SUFFIXES
 

@@ -35,13 +35,7 @@ class BiternionVGG(Encoder):
         ConfigError: the input is not an image, or too small for this many convolutions.
     """
 
-    bibtex = """@inproceedings{beyer2015biternion,
-  author    = {Beyer, Lucas and Hermans, Alexander and Leibe, Bastian},
-  title     = {Biternion Nets: Continuous Head Pose Regression from Discrete Training Labels},
-  booktitle = {German Conference on Pattern Recognition},
-  pages     = {157--168},
-  year      = {2015}
-}"""
+    bibtex = "beyer2015biternion"
 
     def __init__(
         self,

@@ -40,12 +40,7 @@ class BPS(Encoder):
     """
 
     fixed = True
-    bibtex = """@inproceedings{prokudin2019efficient,
-  title = {Efficient Learning on Point Clouds with Basis Point Sets},
-  author = {Prokudin, Sergey and Lassner, Christoph and Romero, Javier},
-  booktitle = {IEEE/CVF International Conference on Computer Vision (ICCV)},
-  year = {2019}
-}"""
+    bibtex = "prokudin2019efficient"
 
     basis: Tensor
 

@@ -37,12 +37,7 @@ class DenseBlocks(Encoder):
         ConfigError: a sample holds no numbers.
     """
 
-    bibtex = """@inproceedings{huang2017densely,
-  title = {Densely Connected Convolutional Networks},
-  author = {Huang, Gao and Liu, Zhuang and van der Maaten, Laurens and Weinberger, Kilian Q.},
-  booktitle = {IEEE Conference on Computer Vision and Pattern Recognition (CVPR)},
-  year = {2017}
-}"""
+    bibtex = "huang2017densely"
 
     def __init__(
         self,

@@ -36,15 +36,7 @@ class BallisticEncoder(Encoder):
         ConfigError: inputs are no frames of `PARTS`, flattened.
     """
 
-    bibtex = """@article{mulling2011biomimetic,
-  author  = {M{\\"u}lling, Katharina and Kober, Jens and Peters, Jan},
-  title   = {A Biomimetic Approach to Robot Table Tennis},
-  journal = {Adaptive Behavior},
-  volume  = {19},
-  number  = {5},
-  pages   = {359--376},
-  year    = {2011}
-}"""
+    bibtex = "mulling2011biomimetic"
     fixed = True
 
     def __init__(

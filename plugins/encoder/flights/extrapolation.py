@@ -43,15 +43,7 @@ class ExtrapolationEncoder(Encoder):
         ConfigError: inputs are no frames of `PARTS`, flattened.
     """
 
-    bibtex = """@article{holland1977robust,
-  author  = {Holland, Paul W. and Welsch, Roy E.},
-  title   = {Robust Regression Using Iteratively Reweighted Least-Squares},
-  journal = {Communications in Statistics},
-  volume  = {6},
-  number  = {9},
-  pages   = {813--827},
-  year    = {1977}
-}"""
+    bibtex = "holland1977robust"
     fixed = True
 
     def __init__(

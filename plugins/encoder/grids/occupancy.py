@@ -29,13 +29,7 @@ class Occupancy(Encoder):
     """
 
     fixed = True
-    bibtex = """@inproceedings{maturana2015voxnet,
-  author    = {Maturana, Daniel and Scherer, Sebastian},
-  title     = {{VoxNet}: A {3D} Convolutional Neural Network for Real-Time Object Recognition},
-  booktitle = {IEEE/RSJ International Conference on Intelligent Robots and Systems (IROS)},
-  pages     = {922--928},
-  year      = {2015}
-}"""
+    bibtex = "maturana2015voxnet"
 
     def __init__(
         self,

@@ -31,12 +31,7 @@ class TDF(Encoder):
     """
 
     fixed = True
-    bibtex = """@inproceedings{curless1996volumetric,
-  title = {A Volumetric Method for Building Complex Models from Range Images},
-  author = {Curless, Brian and Levoy, Marc},
-  booktitle = {Proceedings of SIGGRAPH},
-  year = {1996}
-}"""
+    bibtex = "curless1996volumetric"
 
     def __init__(
         self,

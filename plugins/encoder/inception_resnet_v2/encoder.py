@@ -43,13 +43,7 @@ class InceptionResNetV2(Encoder):
     """
 
     initial = frozenset({"weights"})
-    bibtex = """@inproceedings{szegedy2017inception,
-  author    = {Szegedy, Christian and Ioffe, Sergey and Vanhoucke, Vincent and Alemi, Alexander A.},
-  title     = {Inception-v4, Inception-ResNet and the Impact of Residual Connections on Learning},
-  booktitle = {AAAI Conference on Artificial Intelligence},
-  pages     = {4278--4284},
-  year      = {2017}
-}"""
+    bibtex = "szegedy2017inception"
 
     def __init__(
         self,

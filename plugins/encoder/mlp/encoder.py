@@ -33,14 +33,7 @@ class MLP(Encoder):
         ConfigError: a sample holds no numbers, or the number of probabilities differs from that of layers.
     """
 
-    bibtex = """@article{rumelhart1986learning,
-  author  = {Rumelhart, David E. and Hinton, Geoffrey E. and Williams, Ronald J.},
-  title   = {Learning representations by back-propagating errors},
-  journal = {Nature},
-  volume  = {323},
-  pages   = {533--536},
-  year    = {1986}
-}"""
+    bibtex = "rumelhart1986learning"
 
     def __init__(
         self,

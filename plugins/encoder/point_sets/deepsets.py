@@ -37,12 +37,7 @@ class DeepSets(Encoder):
         ConfigError: the input is no cloud, or has no attributes to read.
     """
 
-    bibtex = """@inproceedings{zaheer2017deep,
-  author    = {Zaheer, Manzil and Kottur, Satwik and Ravanbakhsh, Siamak and P{\\'o}czos, Barnab{\\'a}s and Salakhutdinov, Ruslan and Smola, Alexander J.},
-  title     = {Deep Sets},
-  booktitle = {Advances in Neural Information Processing Systems},
-  year      = {2017}
-}"""  # noqa: E501
+    bibtex = "zaheer2017deep"  # noqa: E501
 
     def __init__(
         self,

@@ -41,13 +41,7 @@ class PointNet(Encoder):
         ConfigError: the input is no cloud, or has no attributes to read.
     """
 
-    bibtex = """@inproceedings{qi2017pointnet,
-  author    = {Qi, Charles R. and Su, Hao and Mo, Kaichun and Guibas, Leonidas J.},
-  title     = {{PointNet}: Deep Learning on Point Sets for {3D} Classification and Segmentation},
-  booktitle = {IEEE Conference on Computer Vision and Pattern Recognition (CVPR)},
-  pages     = {652--660},
-  year      = {2017}
-}"""
+    bibtex = "qi2017pointnet"
 
     def __init__(
         self,

@@ -77,13 +77,7 @@ class PointNet2(Encoder):
         ConfigError: the input is no cloud, or has no attributes to read.
     """
 
-    bibtex = """@inproceedings{qi2017pointnetplusplus,
-  author    = {Qi, Charles R. and Yi, Li and Su, Hao and Guibas, Leonidas J.},
-  title     = {{PointNet++}: Deep Hierarchical Feature Learning on Point Sets in a Metric Space},
-  booktitle = {Advances in Neural Information Processing Systems},
-  pages     = {5099--5108},
-  year      = {2017}
-}"""
+    bibtex = "qi2017pointnetplusplus"
 
     def __init__(
         self,

@@ -28,15 +28,7 @@ class Points(Encoder):
     """
 
     fixed = True
-    bibtex = """@article{eldar1997farthest,
-  title = {The Farthest Point Strategy for Progressive Image Sampling},
-  author = {Eldar, Yuval and Lindenbaum, Michael and Porat, Moshe and Zeevi, Yehoshua Y.},
-  journal = {IEEE Transactions on Image Processing},
-  volume = {6},
-  number = {9},
-  pages = {1305--1315},
-  year = {1997}
-}"""
+    bibtex = "eldar1997farthest"
 
     def __init__(
         self,

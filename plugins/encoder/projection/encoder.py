@@ -205,13 +205,7 @@ class Projection(Encoder):
     """
 
     fixed = True
-    bibtex = """@inproceedings{prokudin2021smplpix,
-  title = {{SMPLpix}: Neural Avatars from {3D} Human Models},
-  author = {Prokudin, Sergey and Black, Michael J. and Romero, Javier},
-  booktitle = {IEEE/CVF Winter Conference on Applications of Computer Vision (WACV)},
-  pages = {1810--1819},
-  year = {2021}
-}"""
+    bibtex = "prokudin2021smplpix"
 
     def __init__(
         self,

@@ -38,15 +38,7 @@ class Slim(Encoder):
         ConfigError: the input is no image, or `crop` with `normalisation="group"`.
     """
 
-    bibtex = """@inproceedings{shi2016realtime,
-  author    = {Shi, Wenzhe and Caballero, Jose and Husz{\\'a}r, Ferenc and Totz, Johannes and Aitken, Andrew P. and
-               Bishop, Rob and Rueckert, Daniel and Wang, Zehan},
-  title     = {Real-Time Single Image and Video Super-Resolution Using an Efficient Sub-Pixel Convolutional Neural
-               Network},
-  booktitle = {IEEE Conference on Computer Vision and Pattern Recognition (CVPR)},
-  pages     = {1874--1883},
-  year      = {2016}
-}"""
+    bibtex = "shi2016realtime"
 
     report: Report | None = None
 

@@ -41,20 +41,7 @@ class UNet(Encoder):
         ConfigError: the input is no image, or `crop` with `normalisation="group"`.
     """
 
-    bibtex = """@inproceedings{prokudin2021smplpix,
-  title = {{SMPLpix}: Neural Avatars from {3D} Human Models},
-  author = {Prokudin, Sergey and Black, Michael J. and Romero, Javier},
-  booktitle = {IEEE/CVF Winter Conference on Applications of Computer Vision (WACV)},
-  pages = {1810--1819},
-  year = {2021}
-}
-@inproceedings{ronneberger2015unet,
-  author    = {Ronneberger, Olaf and Fischer, Philipp and Brox, Thomas},
-  title     = {{U-Net}: Convolutional Networks for Biomedical Image Segmentation},
-  booktitle = {Medical Image Computing and Computer-Assisted Intervention (MICCAI)},
-  pages     = {234--241},
-  year      = {2015}
-}"""
+    bibtex = "prokudin2021smplpix, ronneberger2015unet"
 
     report: Report | None = None
 

@@ -25,15 +25,7 @@ class Brier(Mean):
         DataError: a label is not a class of the data set.
     """
 
-    bibtex = """@article{brier1950verification,
-  author  = {Brier, Glenn W.},
-  title   = {Verification of Forecasts Expressed in Terms of Probability},
-  journal = {Monthly Weather Review},
-  volume  = {78},
-  number  = {1},
-  pages   = {1--3},
-  year    = {1950}
-}"""
+    bibtex = "brier1950verification"
     columns: ClassVar[dict[str, str]] = {"brier": "Brier"}
     better: ClassVar[dict[str, Literal["higher", "lower"]]] = {"brier": "lower"}
 

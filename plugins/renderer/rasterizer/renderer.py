@@ -49,35 +49,7 @@ class Rasterizer(Renderer):
     """
 
     channels = frozenset(CHANNELS)
-    bibtex = """@article{pineda1988parallel,
-  author = {Pineda, Juan},
-  title = {A parallel algorithm for polygon rasterization},
-  journal = {ACM SIGGRAPH Computer Graphics},
-  volume = {22},
-  number = {4},
-  pages = {17--20},
-  year = {1988}
-}
-@article{li2018differentiable,
-  author = {Li, Tzu-Mao and Aittala, Miika and Durand, Fr{\\'e}do and Lehtinen, Jaakko},
-  title = {Differentiable {Monte} {Carlo} ray tracing through edge sampling},
-  journal = {ACM Transactions on Graphics},
-  volume = {37},
-  number = {6},
-  year = {2018}
-}
-@inproceedings{kato2018neural,
-  author = {Kato, Hiroharu and Ushiku, Yoshitaka and Harada, Tatsuya},
-  title = {Neural {3D} mesh renderer},
-  booktitle = {Conference on Computer Vision and Pattern Recognition},
-  year = {2018}
-}
-@inproceedings{liu2019soft,
-  author = {Liu, Shichen and Li, Tianye and Chen, Weikai and Li, Hao},
-  title = {Soft rasterizer: A differentiable renderer for image-based {3D} reasoning},
-  booktitle = {International Conference on Computer Vision},
-  year = {2019}
-}"""
+    bibtex = "pineda1988parallel, li2018differentiable, kato2018neural, liu2019soft"
 
     def __init__(
         self,

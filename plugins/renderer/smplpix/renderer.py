@@ -51,13 +51,7 @@ class SMPLpix(Renderer):
 
     channels = frozenset({"color"})
     background = 1.0
-    bibtex = """@inproceedings{prokudin2021smplpix,
-  title = {{SMPLpix}: Neural Avatars from {3D} Human Models},
-  author = {Prokudin, Sergey and Black, Michael J. and Romero, Javier},
-  booktitle = {IEEE/CVF Winter Conference on Applications of Computer Vision (WACV)},
-  pages = {1810--1819},
-  year = {2021}
-}"""
+    bibtex = "prokudin2021smplpix"
 
     def __init__(
         self,
