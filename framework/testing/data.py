@@ -18,11 +18,11 @@ from framework.target import Target
 from framework.testing.data_files import (
     damaged_files,
     damaged_own_files,
-    left_out,
     missing_root,
     own_files,
     raw_input,
     read_back,
+    skipped_files,
 )
 from framework.testing.data_folders import Build, Workbench, cache_in, list_folders_backwards
 from framework.testing.data_samples import (
@@ -76,7 +76,7 @@ def examine_data(row: DataRow, build: Build) -> Iterator[Finding]:
             "official layout read back": (0.0, read_back),
             "missing root": (0.0, missing_root),
             "damaged files are named": (0.0, damaged_files),
-            "files left out are counted": (0.0, left_out),
+            "files left out are counted": (0.0, skipped_files),
             "own files": (0.0, own_files),
             "raw input": (0.0, raw_input),
             "damaged own files are named": (0.0, damaged_own_files),
@@ -158,14 +158,14 @@ def _are_names(names: Any) -> bool:
 
 def _constructor(bench: Workbench, worst: Worst) -> None:
     """Check that the constructor needs neither the files of the data set nor a cache in which to generate them."""
-    place = bench.make_place()
-    away = place.files.rename(place.files.with_name("away"))
-    unusable_cache = place.files.with_name("no folder")
+    workspace = bench.make_workspace()
+    away = workspace.files.rename(workspace.files.with_name("away"))
+    unusable_cache = workspace.files.with_name("no folder")
     unusable_cache.touch()
     with cache_in(unusable_cache):
-        data = bench.build_at(place)
-    away.rename(place.files)
-    with cache_in(place.cache):
+        data = bench.build_in(workspace)
+    away.rename(workspace.files)
+    with cache_in(workspace.cache):
         data.prepare()
     worst.same("target after prepare", data.target, bench.data.target)
 
@@ -338,10 +338,10 @@ def _repeatable(bench: Workbench, worst: Worst) -> None:
     torch.manual_seed(SEED + 7)
     np.random.seed(SEED + 7)  # noqa: NPY002 - the global generator is the point
     random.seed(SEED + 7)
-    place = bench.make_place()
+    workspace = bench.make_workspace()
     expected = bench.contents
     with list_folders_backwards():
-        again = bench.prepare_at(place)
+        again = bench.prepare_in(workspace)
         worst.same("target", again.target, bench.data.target)
         check_equal_splits(again, expected, "prepared in another folder", worst)
     check_equal_splits(bench.again, expected, "prepared again in the same folder", worst)
@@ -415,7 +415,7 @@ def _fingerprint(bench: Workbench, worst: Worst) -> None:
         "fingerprint of the same data prepared again", _fingerprint_entries(bench.again, worst), original
     )
     for key, value in bench.row.changes.items():
-        other = bench.prepare_at(bench.first, **{key: value})
+        other = bench.prepare_in(bench.first, **{key: value})
         worst.count(
             _fingerprint_entries(other, worst) == original, f"fingerprint unchanged with {key} = {value}"
         )

@@ -30,10 +30,10 @@ from framework.testing.rows import DAMAGES, Damage
 def read_back(bench: Workbench, worst: Worst) -> None:
     """Check that generated files give the same samples when read by `root`, and are synthetic only while marked so."""
     for mark_state, synthetic in {"generated files": True, "generated files without mark": False}.items():
-        place, source = bench.copy_files(
+        workspace, source = bench.copy_files(
             lambda root, keep=synthetic: None if keep else (root / MARK).unlink()
         )
-        reread = bench.prepare_at(place, **source)
+        reread = bench.prepare_in(workspace, **source)
         worst.same(f"{mark_state}: synthetic", reread.synthetic, synthetic)
         worst.same(f"{mark_state}: target", reread.target, bench.data.target)
         worst.same(f"{mark_state}: input_shape", reread.input_shape, bench.data.input_shape)
@@ -51,7 +51,7 @@ def missing_root(bench: Workbench, worst: Worst) -> None:
     nowhere = bench.make_folder() / "nowhere"
     for key in bench.location_keys:
         check_refused(
-            lambda key=key: bench.prepare_at(bench.first, **{key: str(nowhere)}),
+            lambda key=key: bench.prepare_in(bench.first, **{key: str(nowhere)}),
             [nowhere.name],
             f"{key} = {nowhere}",
             worst,
@@ -59,7 +59,7 @@ def missing_root(bench: Workbench, worst: Worst) -> None:
         if bench.row.synthetic is not False or bench.default(key) is not None:
             continue  # a data set that generates data by default may generate many samples here
         try:
-            generated = bench.prepare_at(bench.first, **{key: None})
+            generated = bench.prepare_in(bench.first, **{key: None})
         except DataError as error:
             worst.count(
                 f"data.{key}" not in str(error), f"{key} = None: the error does not name data.{key}: {error}"
@@ -81,20 +81,20 @@ def damaged_files(bench: Workbench, worst: Worst) -> None:
                 damage(file, kind)
                 names.append(file.name)
 
-            place, source = bench.copy_files(damage_file)
+            workspace, source = bench.copy_files(damage_file)
             check_refused(
-                lambda place=place, source=source: bench.prepare_at(place, **source),
+                lambda workspace=workspace, source=source: bench.prepare_in(workspace, **source),
                 names,
                 f"{names[0]}, damage {kind}",
                 worst,
             )
 
 
-def left_out(bench: Workbench, worst: Worst) -> None:
+def skipped_files(bench: Workbench, worst: Worst) -> None:
     """Check that the samples of an unreadable file are left out, and that `skipped` counts them."""
     pattern = next(iter(bench.row.fragile))
-    place, source = bench.copy_files(lambda root: damage(first_match(root, pattern), "garbage"))
-    remaining = bench.prepare_at(place, **source, **bench.row.skip)
+    workspace, source = bench.copy_files(lambda root: damage(first_match(root, pattern), "garbage"))
+    remaining = bench.prepare_in(workspace, **source, **bench.row.skip)
     missing_count = total_samples(bench.data) - total_samples(remaining)
     worst.count(remaining.skipped < 1, f"skipped {remaining.skipped} after damage to {pattern}")
     worst.same("samples left out", missing_count, remaining.skipped - bench.data.skipped)
@@ -142,7 +142,7 @@ def raw_input(bench: Workbench, worst: Worst) -> None:
     """Check that a data set built from config and stored state alone reads files as the prepared data set does."""
     files = list(bench.row.files(bench.make_folder())) if bench.row.files else []
     nowhere = {key: str(bench.make_folder() / "nowhere") for key in bench.location_keys}
-    data, trained = bench.build_at(bench.first, **nowhere), bench.data
+    data, trained = bench.build_in(bench.first, **nowhere), bench.data
     data.target, data.input_shape, data.columns = trained.target, trained.input_shape, trained.columns
     stored = io.BytesIO()
     torch.save(dict(trained.state_dict()), stored)
@@ -208,7 +208,7 @@ def check_refused(act: Callable[[], object], expected: Sequence[str], situation:
 def _user_files(bench: Workbench) -> tuple[list[Path], Data]:
     """Return the user files of the row, and a data set that is not prepared."""
     assert bench.row.files is not None
-    return list(bench.row.files(bench.make_folder())), bench.build_at(bench.first)
+    return list(bench.row.files(bench.make_folder())), bench.build_in(bench.first)
 
 
 def _read(data: Data, files: Sequence[Path], bench: Workbench, worst: Worst) -> list[Tensor]:

@@ -70,7 +70,7 @@ def list_folders_backwards() -> Iterator[None]:
         os.listdir, os.scandir = listdir, scandir
 
 
-class Place:
+class Workspace:
     """Folder for one preparation of a data set.
 
     Attributes:
@@ -105,35 +105,35 @@ class Workbench:
         path.mkdir()
         return path
 
-    def make_place(self) -> Place:
-        """Return a new place with the row's files."""
-        return Place(self.row, self.make_folder())
+    def make_workspace(self) -> Workspace:
+        """Return a new workspace with the row's files."""
+        return Workspace(self.row, self.make_folder())
 
-    def build_at(self, place: Place, **config: Any) -> Data:
-        """Build the data set at a place without preparing it; `config` overrides the row's parameters."""
-        return self.build({**place.source, **self.row.config, **config})
+    def build_in(self, workspace: Workspace, **config: Any) -> Data:
+        """Build the data set in a workspace without preparing it; `config` overrides the row's parameters."""
+        return self.build({**workspace.source, **self.row.config, **config})
 
-    def prepare_at(self, place: Place, **config: Any) -> Data:
-        """Build and prepare the data set at a place; `config` overrides the row's parameters."""
-        data = self.build_at(place, **config)
-        with cache_in(place.cache):
+    def prepare_in(self, workspace: Workspace, **config: Any) -> Data:
+        """Build and prepare the data set in a workspace; `config` overrides the row's parameters."""
+        data = self.build_in(workspace, **config)
+        with cache_in(workspace.cache):
             data.prepare()
         return data
 
     @cached_property
-    def first(self) -> Place:
-        """Place of the first preparation."""
-        return self.make_place()
+    def first(self) -> Workspace:
+        """Workspace of the first preparation."""
+        return self.make_workspace()
 
     @cached_property
     def data(self) -> Data:
         """Data set of the first preparation, for checks that do not change it."""
-        return self.prepare_at(self.first)
+        return self.prepare_in(self.first)
 
     @cached_property
     def again(self) -> Data:
-        """Data set of a second preparation at the same place, where generated data are read back from the cache."""
-        return self.prepare_at(self.first)
+        """Data set of a second preparation in the same workspace, where generated data are read back from the cache."""
+        return self.prepare_in(self.first)
 
     @cached_property
     def contents(self) -> dict[str, Contents]:
@@ -159,15 +159,15 @@ class Workbench:
             return None
         return next((mark.parent for mark in sorted(self.first.cache.rglob(MARK))), None)
 
-    def copy_files(self, change: Callable[[Path], None]) -> tuple[Place, dict[str, Any]]:
-        """Copy the data set's files and apply `change` to the copy; return its place and the parameters to read it."""
-        place = self.make_place()
+    def copy_files(self, change: Callable[[Path], None]) -> tuple[Workspace, dict[str, Any]]:
+        """Copy the data set's files and apply `change` to the copy; return its workspace and parameters to read it."""
+        workspace = self.make_workspace()
         if self.generated is None:
-            change(place.files)
-            return place, {}
-        shutil.copytree(self.generated, place.files, dirs_exist_ok=True)
-        change(place.files)
-        return place, {"root": str(place.files)}
+            change(workspace.files)
+            return workspace, {}
+        shutil.copytree(self.generated, workspace.files, dirs_exist_ok=True)
+        change(workspace.files)
+        return workspace, {"root": str(workspace.files)}
 
 
 def damage(file: Path, kind: Damage) -> None:

@@ -234,8 +234,8 @@ def integral_by_draws(density: Distribution, worst: Worst) -> None:
         if circular:
             inside = (offset.abs() <= math.pi).all(-1)
             for number, (low, high) in enumerate((isinstance(support, Circular) and support.ranges) or ()):
-                place = wrap(value[..., number])
-                inside &= (place >= low) & (place <= high)
+                angle = wrap(value[..., number])
+                inside &= (angle >= low) & (angle <= high)
         log_normal = -(standard.square() + math.log(2 * math.pi)).sum(-1) / 2 - volume
         return torch.where(inside, log_prob, -math.inf) - log_normal
 
@@ -286,17 +286,17 @@ def samples_follow_marginals(density: Distribution, worst: Worst) -> None:
 def _compare_draws(density: Distribution, draws: Tensor, worst: Worst, prefix: str) -> None:
     """Check by a χ² test that draws follow a density of one number."""
     quadrature = boxes(density)
-    place, border = (
+    coordinate, border = (
         quadrature.mapping.coordinates(draws)[..., 0],
         quadrature.mapping.coordinates(quadrature.border[1:-1].unsqueeze(-1))[..., 0],
     )
-    box = torch.searchsorted(border.T.contiguous(), place.T.contiguous()).T
+    box = torch.searchsorted(border.T.contiguous(), coordinate.T.contiguous()).T
     middle = quadrature.mass.cumsum(0) - quadrature.mass / 2
     cell = (CELLS * middle / quadrature.mass.sum(0)).long().clamp(0, CELLS - 1)
     expected = torch.zeros(CELLS, len(quadrature.mapping.mode), dtype=torch.float64).scatter_add_(
         0, cell, quadrature.mass
     )
-    count = torch.zeros_like(expected).scatter_add_(0, cell.gather(0, box), torch.ones_like(place))
+    count = torch.zeros_like(expected).scatter_add_(0, cell.gather(0, box), torch.ones_like(coordinate))
     worst.finite(f"{prefix}draws", draws)
     _chi_square(DRAWS * expected, count, worst, prefix)
 
@@ -313,7 +313,7 @@ def _chi_square(expected: Tensor, count: Tensor, worst: Worst, prefix: str) -> N
     worst.record(normal, lambda at: f"{prefix}{worst.row(at[0])}, {freedom[at].item()} degrees of freedom")
 
 
-def independent(density: Distribution, worst: Worst) -> None:
+def draws_are_independent(density: Distribution, worst: Worst) -> None:
     """Check that a draw is independent of the previous draw and of the draw of the next batch row.
 
     The error is the correlation of their signs about the median, in standard errors.
@@ -577,7 +577,7 @@ CHECKS = (
     Property("integral by draws", 6.0, integral_by_draws, "scales"),
     Property("samples follow log_prob", 5.0, samples_follow_log_prob, "scales"),
     Property("samples follow marginals", 5.0, samples_follow_marginals, "scales"),
-    Property("draws are independent", 6.0, independent, "own"),
+    Property("draws are independent", 6.0, draws_are_independent, "own"),
     Property("2π-periodic", 1e-13, periodic, "own"),
     Property("entropy", 5.0, entropy, "scales"),
     Property("mode", 0.05, mode_is_highest, "scales"),

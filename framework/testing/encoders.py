@@ -157,15 +157,15 @@ def _all_image_parts(make: Make, batch: Tensor, worst: Worst) -> None:
     }
     for row in {0, height // 2} if height > 1 else {0}:
         for column in {0, width // 2} if width > 1 else {0}:
-            place = slice(row, row + -(-height // 2)), slice(column, column + -(-width // 2))
-            parts[f"the quarter from {row}, {column}"] = (whole, *place)
+            region = slice(row, row + -(-height // 2)), slice(column, column + -(-width // 2))
+            parts[f"the quarter from {row}, {column}"] = (whole, *region)
     generator = torch.Generator().manual_seed(SEED + 1)
     other = torch.rand(batch.shape, generator=generator)
     with torch.no_grad():
         original = encoder(batch)
-        for part_name, place in parts.items():
+        for part_name, region in parts.items():
             changed = batch.clone()
-            changed[(whole, *place)] = other[(whole, *place)]
+            changed[(whole, *region)] = other[(whole, *region)]
             worst.count(torch.equal(encoder(changed), original), f"{part_name} does not affect the features")
 
 

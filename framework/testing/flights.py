@@ -42,10 +42,10 @@ def simulate_windows(
         START + random.normal(size=(count, 9)) * [0.1, 0.05, 0.05, 0.3, 0.3, 0.2, 40, 40, 40]
     )
     times = STEP * torch.arange(55, dtype=torch.float64).expand(count, -1)
-    places = simulate(states, times, Constants())[..., :3]
-    observed = places[:, :20] + SIGMA * torch.from_numpy(random.normal(size=(count, 20, 3)))
+    positions = simulate(states, times, Constants())[..., :3]
+    observed = positions[:, :20] + SIGMA * torch.from_numpy(random.normal(size=(count, 20, 3)))
     present = torch.from_numpy(random.random((count, 20, 1)) > 0.1)
     if outliers:
         observed = observed + (torch.from_numpy(random.random((count, 20, 1))) < 0.1) * 0.4
     frames = torch.cat([times[:, :20, None] - times[:, 19:20, None], observed, torch.ones(count, 20, 1)], -1)
-    return frames * present, places[:, 20:], states
+    return frames * present, positions[:, 20:], states

@@ -132,7 +132,7 @@ def _directions(argument: Tensor, raw: bool, size: float, number: int) -> Iterat
         )
 
 
-def proper(subject: HeadSubject, worst: Worst) -> None:
+def mean_gradient_is_zero(subject: HeadSubject, worst: Worst) -> None:
     """Check that the mean gradient of the loss over draws from the density is 0; the error is in standard errors.
 
     This holds for every proper score (Gneiting & Raftery 2007). The standard error includes a term for values that are

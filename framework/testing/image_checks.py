@@ -90,7 +90,7 @@ def depth(renderer: Renderer, worst: Worst) -> None:
         )
 
 
-def several(renderer: Renderer, worst: Worst) -> None:
+def scene_batches(renderer: Renderer, worst: Worst) -> None:
     """Check that scenes of different sizes give the same images in a batch as one by one.
 
     Check also that faces may have any integer type, that a scene is unchanged after it was drawn, and that the results

@@ -64,10 +64,10 @@ def count_samples(density: Distribution, borders: list[Tensor], samples: Tensor)
     sides = [len(border) - 1 for border in borders]
     cell = torch.zeros(samples.shape[:-1], dtype=torch.int64)
     for number, (border, side) in enumerate(zip(borders, sides, strict=True)):
-        place = samples[..., number].double()
+        coordinate = samples[..., number].double()
         if isinstance(density.support, Circular):
-            place = torch.remainder(place + math.pi, 2 * math.pi) - math.pi
-        cell = cell * side + torch.bucketize(place.contiguous(), border[1:-1])
+            coordinate = torch.remainder(coordinate + math.pi, 2 * math.pi) - math.pi
+        cell = cell * side + torch.bucketize(coordinate.contiguous(), border[1:-1])
     counts = torch.zeros(math.prod(sides), *batch, dtype=torch.float64)
     counts.scatter_add_(0, cell, torch.ones_like(cell, dtype=torch.float64))
     return counts.reshape(*sides, *batch)

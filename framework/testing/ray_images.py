@@ -59,7 +59,7 @@ def cast_image(scene: Scene) -> RayImage:
 def _nearest_faces(scene: Scene, down: float, across: float) -> tuple[Tensor, Tensor, Tensor]:
     """Return index, depth and corner weights of the nearest face at every pixel.
 
-    The rays start `down` and `across` pixels from the centres of the pixels.
+    The rays pass the image `down` and `across` pixels from the centres of the pixels.
     """
     camera = scene.camera
     row, column = torch.meshgrid(

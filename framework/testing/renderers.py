@@ -17,7 +17,7 @@ from framework.testing.image_checks import (
     depth,
     draws_points,
     points,
-    several,
+    scene_batches,
     visibility,
 )
 from framework.testing.rows import RendererRow
@@ -49,7 +49,7 @@ def examine_renderer(row: RendererRow, build: Make) -> Iterator[Finding]:
         "colours": (2e-3, colors),
         "visible faces": (0.0, visibility),
         "depth, relative": (1e-3, depth),
-        "several scenes": (0.0, several),
+        "several scenes": (0.0, scene_batches),
         "points": (0.0, points),
     }
     renderer = build()
