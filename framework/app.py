@@ -52,9 +52,9 @@ def _run() -> None:
             "`python -P -m framework`."
         )
     if sys.argv[1:] == ["mode=plugins"]:  # needs no config, so it makes no run folder
-        from framework.modes.plugins import show
+        from framework.modes.plugins import print_plugins
 
-        show()
+        print_plugins()
         return
     from framework.configuration.command_line import command_line
     from framework.configuration.composition import folder, help_text, plain, register

@@ -66,11 +66,11 @@ def test_it_is_the_model_that_was_trained_with_the_wrappers(framework: Framework
     twice = framework(
         "mode=calibrate", f"checkpoint={done.folder}", "uncertainty=[temperature]", *QUIET, folder="twice"
     )
-    assert twice.code == 2 and "is wrapped in temperature + conformal already" in twice.out
+    assert twice.code == 2 and "is already wrapped in temperature + conformal" in twice.out
     drops = framework(
         "mode=calibrate", f"checkpoint={done.folder}", "uncertainty=[platt]", *QUIET, folder="drops"
     )
-    assert drops.code == 2 and "uncertainty=platt is put around a model that predicts sets" in drops.out
+    assert drops.code == 2 and "uncertainty=platt would be put around a model that predicts sets" in drops.out
     other = ("mode=calibrate", f"checkpoint={plain.folder}", "uncertainty=[temperature]")
     for change, sentence in (
         ("data=dial", "trained on"),
@@ -111,14 +111,14 @@ class Twice(Uncertainty):
 
 
 @pytest.mark.parametrize(
-    "settings, sentence", [({}, "wraps 2 models"), ({"copies": 1, "learns": True}, "has weights of its own")]
+    "settings, sentence", [({}, "wraps 2 models"), ({"copies": 1, "learns": True}, "has trainable weights")]
 )
 def test_what_has_to_be_trained_is_refused(
     settings: dict[str, Any], sentence: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(calibrate, "build", lambda group, part, model, target: Twice(model, **settings))
     with pytest.raises(ConfigError, match=sentence):
-        calibrate.around_trained(Plain(CLASSES).eval(), [{"name": "twice"}], CLASSES, torch.zeros(2, LENGTH))
+        calibrate.wrap_trained(Plain(CLASSES).eval(), [{"name": "twice"}], CLASSES, torch.zeros(2, LENGTH))
 
 
 def test_fixed_encoders_stay_in_front() -> None:
@@ -131,7 +131,7 @@ def test_fixed_encoders_stay_in_front() -> None:
     plain = Plain(REAL)
     front = FrozenFrontEnd([Doubled()], plain)
     inputs = torch.randn(5, LENGTH)
-    found = calibrate.around_trained(front.eval(), [schema.resolve("uncertainty", "conformal")], REAL, inputs)
+    found = calibrate.wrap_trained(front.eval(), [schema.resolve("uncertainty", "conformal")], REAL, inputs)
     assert isinstance(found, FrozenFrontEnd)
     assert value_set(found(inputs)) is not None
     assert torch.equal(found(inputs).mean, front(inputs).mean)

@@ -10,7 +10,7 @@ import pytest
 from framework.configuration.schema import build, resolve
 from framework.configuration.settings import Settings
 from framework.errors import ConfigError, DataError
-from framework.modes.encode import collected, describe, encode, share
+from framework.modes.encode import collect_files, describe, encode, parts_of_job
 from framework.storage import progress
 from tests.conftest import Done, Framework
 
@@ -43,7 +43,7 @@ def alone(root, name):
 def test_rows_of_the_parts_are_the_files_by_name(root, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(progress, "QUIET_TIME", 0.0)
     monkeypatch.setattr(progress, "REPORT_INTERVAL", 0.0)
-    collection = collected(root, tmp_path / "features", 4)
+    collection = collect_files(root, tmp_path / "features", 4)
     describe(collection, CONFIG)
     assert encode(collection, CONFIG, range(3), SETTINGS) == 3
     assert re.findall(r"encoding: (\d+) of 11 files", capsys.readouterr().err) == ["3", "4", "7", "8", "11"]
@@ -56,20 +56,20 @@ def test_rows_of_the_parts_are_the_files_by_name(root, tmp_path, monkeypatch, ca
 
 
 def test_a_stopped_job_goes_on_and_jobs_share_the_parts(root, tmp_path):
-    collection = collected(root, tmp_path / "features", 2)
+    collection = collect_files(root, tmp_path / "features", 2)
     describe(collection, CONFIG)
-    assert [list(share(6, f"{job}/4")) for job in (1, 2, 3, 4)] == [[0, 4], [1, 5], [2], [3]]
+    assert [list(parts_of_job(6, f"{job}/4")) for job in (1, 2, 3, 4)] == [[0, 4], [1, 5], [2], [3]]
     broken = collection.files(4)[1]
     content = broken.read_bytes()
     broken.write_bytes(b"no array")
     with pytest.raises(DataError, match=broken.name):
-        encode(collection, CONFIG, share(6, "1/2"), SETTINGS)
+        encode(collection, CONFIG, parts_of_job(6, "1/2"), SETTINGS)
     assert collection.missing() == [1, 3, 4, 5]  # parts before it are kept
     first = collection.path(0).stat().st_mtime_ns
     broken.write_bytes(content)
     describe(collection, CONFIG)
-    assert encode(collection, CONFIG, share(6, "1/2"), SETTINGS) == 1
-    assert encode(collection, CONFIG, share(6, "2/2"), SETTINGS) == 3
+    assert encode(collection, CONFIG, parts_of_job(6, "1/2"), SETTINGS) == 1
+    assert encode(collection, CONFIG, parts_of_job(6, "2/2"), SETTINGS) == 3
     assert collection.missing() == []
     assert collection.path(0).stat().st_mtime_ns == first
     assert encode(collection, CONFIG, range(6), SETTINGS) == 0
@@ -78,7 +78,7 @@ def test_a_stopped_job_goes_on_and_jobs_share_the_parts(root, tmp_path):
 
 @pytest.mark.parametrize("change", ["part", "encoder", "files"])
 def test_parts_of_something_else_are_not_added_to(root, tmp_path, change):
-    describe(collected(root, tmp_path / "features", 2), CONFIG)
+    describe(collect_files(root, tmp_path / "features", 2), CONFIG)
     config, part = CONFIG, 2
     if change == "part":
         part = 3
@@ -87,19 +87,19 @@ def test_parts_of_something_else_are_not_added_to(root, tmp_path, change):
     else:
         np.save(root / "a" / "more.npy", np.zeros((4, 3)))
     with pytest.raises(ConfigError, match=rf"says {change} = .* something else"):
-        describe(collected(root, tmp_path / "features", part), config)
+        describe(collect_files(root, tmp_path / "features", part), config)
 
 
 def test_what_cannot_be_encoded_is_refused(root, tmp_path):
     with pytest.raises(ConfigError, match="would be read itself"):
-        collected(root, root / "a" / "features", 4)
+        collect_files(root, root / "a" / "features", 4)
     with pytest.raises(DataError, match="no folder that holds files"):
-        collected(tmp_path / "nowhere", tmp_path / "features", 4)
-    with pytest.raises(ConfigError, match="no job 3 of 2; wanted 1/2 to 2/2"):
-        share(6, "3/2")
-    collection = collected(root, tmp_path / "features", 4)
+        collect_files(tmp_path / "nowhere", tmp_path / "features", 4)
+    with pytest.raises(ConfigError, match=r"no job 3 of 2\. Use 1/2 to 2/2"):
+        parts_of_job(6, "3/2")
+    collection = collect_files(root, tmp_path / "features", 4)
     for encoders, told in (
-        ([], "wants an encoder"),
+        ([], "needs an encoder"),
         ([resolve("encoder", {"name": "pointnet"})], "pointnet learns"),
     ):
         (tmp_path / "features").mkdir(exist_ok=True)
@@ -115,7 +115,10 @@ def test_from_the_command_line(framework: Framework, root: Path, tmp_path: Path)
     places = [f"mode.files={root}", "mode.into=features", "mode.part=4"]
     done = call("encoder=[bps]", "encoder.bps.points=20", *places, "mode.share=2/2")
     assert done.code == 0, done.out
-    assert "1 parts written, 0 of this job's 1 were there; 2 of all 3 are missing: features" in done.out
+    assert (
+        "1 parts written, 0 of this job's 1 parts existed already; 2 of all 3 parts are missing in features"
+        in done.out
+    )
     assert np.load(tmp_path / "features" / "part-000001.npy").shape == (4, 20)
     described = json.loads((tmp_path / "features" / "encoding.json").read_text())
     assert described["encoder"][0]["points"] == 20 and described["files"] == 11

@@ -14,7 +14,7 @@ from framework.density_head import DensityHead, Fitted
 from framework.encoder import Encoder
 from framework.errors import CheckpointError, ConfigError, DataError
 from framework.model import FrozenFrontEnd, Model
-from framework.modes.combine import _inner
+from framework.modes.combine import _inner_predictor
 from framework.target import Target
 from framework.training.batches import Batches
 from framework.training.cached_features import LARGEST, CachedFeatures, fits
@@ -184,7 +184,7 @@ def test_a_head_fitted_at_once_gives_no_gradient_to_what_is_before_it():
 def test_runs_on_other_features_do_not_join():
     first, other = (FrozenFrontEnd([Squares(factor)], Model([], Shares())) for factor in (2.0, 3.0))
     whole = FrozenFrontEnd([Squares()], Model([], Shares()))
-    assert _inner(whole, first, 0) is first.predictor
+    assert _inner_predictor(whole, first, 0) is first.predictor
     assert whole.encoders[0].factor == 2.0
     with pytest.raises(CheckpointError, match=r"member 1 .* differ in 0\.factor"):
-        _inner(whole, other, 1)
+        _inner_predictor(whole, other, 1)

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from framework.errors import DataError, escape_undecodable, quote, shorten
 from framework.figures.style import save_figure
 from framework.geometry import meshes
-from framework.modes.encode import collected, describe
+from framework.modes.encode import collect_files, describe
 from framework.reports import table
 from framework.storage.names import as_bytes, path_of, spell_name
 from framework.sweeps import jobs
@@ -56,7 +56,7 @@ def test_a_plain_name_is_spelled_as_it_is() -> None:
 def test_what_is_made_of_a_name_takes_any(name: bytes, tmp_path: Path) -> None:
     text = os.fsdecode(name)
     assert 0 <= meshes.stream(0, text).random() < 1
-    assert jobs.hashed(text, "a") != jobs.hashed("a", text)
+    assert jobs.short_hash(text, "a") != jobs.short_hash("a", text)
     for message in (str(DataError(f"{text}: no")), shorten(text), quote(text)):
         message.encode()
     figure = Figure()
@@ -80,7 +80,7 @@ def clouds(tmp_path: Path) -> Path:
 
 
 def test_encoded_files_are_found_by_the_names_beside_their_features(clouds: Path, tmp_path: Path) -> None:
-    collection = collected(clouds, tmp_path / "features", 100)
+    collection = collect_files(clouds, tmp_path / "features", 100)
     describe(collection, {"data": {}, "encoder": []})
     lines = (tmp_path / "features" / "files.txt").read_text(encoding="utf-8").splitlines()
     assert len(lines) == 2 * len(NAMES)

@@ -41,5 +41,5 @@ def test_a_sweep_refuses_an_incomplete_column_split_before_any_job(tmp_path: Pat
         "data=tabular", f"data.path={tmp_path / 'angles.csv'}", "data.target=y", "encoder=[mlp]",
         "density_head=categorical", "metric=[accuracy]", "logger=none",
     ]  # fmt: skip
-    with pytest.raises(ConfigError, match=r"angles\.csv line 5.*split.* none of the sweep was run"):
+    with pytest.raises(ConfigError, match=r"angles\.csv line 5.*split.* No job of the sweep was run"):
         refuse_mistakes([(overrides, plain(composed(*overrides)))])

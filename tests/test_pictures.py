@@ -599,7 +599,7 @@ def test_a_sweep_is_drawn_as_its_jobs_are_and_names_data_machine_and_what_was_va
     by = ["method", "data", "mlp.widths"]
     for data in (("faces",), ("faces", "cells")):
         some = [row for row in rows if row["data"] in data]
-        (path,) = comparison._picture(aggregate(some, by), some, by, tmp_path)
+        (path,) = comparison._draw_comparison(aggregate(some, by), some, by, tmp_path)
         assert path.name == f"comparison.{suffix}"
         if suffix == "svg":
             said = " ".join(re.findall("<!-- (.*?) -->", path.read_text(encoding="utf-8"), re.S))

@@ -259,7 +259,7 @@ def test_the_same_sweep_again_runs_what_did_not_complete(app: App) -> None:
     assert [app.record(number)["status"] for number in range(3)] == ["completed", "died", "failed"]
     code, output = app("what=ok,once", "x=1")
     assert (code, [app.tries(number) for number in range(3)]) == (0, [1, 2, 1])
-    assert "2 jobs, 1 of them completed earlier" in output
+    assert "2 jobs, 1 of them already completed" in output
     assert app.record(1)["status"] == "completed"
     assert app.record(1)["tries"] == 2
     assert (app.sweep / "1" / "console.log").read_text() == "hello from once\n" * 2
@@ -367,7 +367,7 @@ def test_a_third_signal_kills(app: App) -> None:
     app.until_ready(0)
     for count, number in enumerate((signal.SIGINT, signal.SIGINT, signal.SIGTERM), 1):
         process.send_signal(number)
-        app.until(lambda count=count: app.said().count("told to stop") == count)
+        app.until(lambda count=count: app.said().count("asked to stop") == count)
     assert process.wait(timeout=60) == 130
     assert app.record(0)["error"].startswith("killed by SIGKILL")
 
@@ -429,7 +429,7 @@ def test_a_signal_that_comes_before_a_job_has_begun_reaches_it(tmp_path: Path) -
         app.until((app.folder / "importing").exists)
         app.until(lambda: all(app.record(number)["status"] == "running" for number in range(2)))
         process.send_signal(signal.SIGTERM)
-        app.until(lambda: "told to stop" in app.said())
+        app.until(lambda: "asked to stop" in app.said())
         (app.folder / "signalled").touch()
         assert process.wait(timeout=60) == 128 + signal.SIGTERM
     finally:
@@ -543,7 +543,7 @@ def test_a_folder_that_another_job_has_taken_is_left_to_it(app: App) -> None:
     (app.sweep / "1" / "job.json").write_text(json.dumps(record))
     (app.folder / "release").touch()
     assert process.wait(timeout=60) == 1
-    assert "#1 failed: its folder now is that of the job 'y=3'" in app.said()
+    assert "#1 failed: its folder now belongs to the job 'y=3'" in app.said()
     assert app.record(1) == record
     assert app("what=hold", "x=0,1")[0] == 0
     assert app.record(2)["overrides"] == ["what=hold", "x=1"]

@@ -21,7 +21,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from framework.configuration.composition import folder, register
 from framework.errors import ConfigError
-from framework.modes.combine import found
+from framework.modes.combine import find_members
 from framework.runs.job import find_job_folders
 from framework.sweeps import comparison
 from hydra_plugins.framework_random_search import _best, _draws
@@ -33,12 +33,12 @@ LEARNING_RATE = "optimizer.learning_rate=tag(log,interval(1e-4,1e-2))"
 
 
 def space(*overrides: str) -> dict[str, _draws.Domain]:
-    return _draws.space(OverridesParser.create().parse_overrides(list(overrides)))
+    return _draws.parse_space(OverridesParser.create().parse_overrides(list(overrides)))
 
 
 def drawn(*overrides: str, trials: int = 20, seed: int = 0) -> list[dict[str, str]]:
-    found, _ = _draws.draw(space(*overrides), trials, seed)
-    return [dict(override.split("=", 1) for override in trial) for trial in found]
+    trials_drawn, _ = _draws.draw(space(*overrides), trials, seed)
+    return [dict(override.split("=", 1) for override in trial) for trial in trials_drawn]
 
 
 def column(override: str, trials: int = 400) -> list[str]:
@@ -140,9 +140,9 @@ def test_the_last_override_of_a_key_counts() -> None:
     ("overrides", "message"),
     [
         (["x=1", "~y"], "nothing to search: no override is a sweep. Give one"),
-        (["x=interval(2,2)"], r"x=interval\(2,2\): wanted the smaller end first"),
-        (["x=interval(3.0,2)"], "wanted the smaller end first"),
-        (["x=interval(0,inf)"], "wanted two finite ends"),
+        (["x=interval(2,2)"], r"x=interval\(2,2\): The smaller end must come first"),
+        (["x=interval(3.0,2)"], "The smaller end must come first"),
+        (["x=interval(0,inf)"], "Both ends of the interval must be finite"),
         (["x=interval(0,1)"], r"only whole number in it is 0. Write interval\(0.0,1.0\)"),
         (["x=tag(log,interval(0.0,1))"], "0 has no logarithm. Start above 0"),
         (["x=tag(log,interval(-3,2))"], "-3 has no logarithm"),
@@ -204,8 +204,10 @@ def test_the_experiment_composes_to_the_config_of_the_trial(
     register()
     with initialize_config_dir(str(folder()), version_base="1.3"):
         wanted = composed(*overrides)
-        found, content = _best.experiment(overrides, GlobalHydra.instance().config_loader(), "trial 3")
-        assert found == name
+        name_found, content = _best.build_experiment(
+            overrides, GlobalHydra.instance().config_loader(), "trial 3"
+        )
+        assert name_found == name
         header, command, comment = content.splitlines()[:3]
         assert (header, comment) == ("# @package _global_", "# trial 3")
         assert command.startswith(f"# python -m framework experiment={name}")
@@ -302,7 +304,7 @@ def test_a_search_ranks_its_trials_and_goes_on_where_it_was(tmp_path: Path) -> N
     assert {row["batch_size"] for row in rows[: len(finite)]} == {"32"}
     assert {row["batch_size"] for row in rows[len(finite) :]} == {"8", "16"}
     assert "(did not complete)" in output
-    assert "(its value is nan)" in output
+    assert "(value nan)" in output
 
     best = yaml.safe_load((search.folder / "best.yaml").read_text())
     assert best["defaults"] == [SCVAE]
@@ -336,7 +338,7 @@ def test_a_launcher_that_runs_jobs_in_this_process_will_do(tmp_path: Path) -> No
 
 def trials(folder: Path, *values: float | None, **more: list[float]) -> list[comparison.Trial]:
     """Trials that returned `values` (None: that failed), and measured what `more` holds."""
-    found = []
+    results = []
     for number, value in enumerate(values):
         home = folder / str(number)
         home.mkdir()
@@ -348,8 +350,8 @@ def trials(folder: Path, *values: float | None, **more: list[float]) -> list[com
             "better": {"accuracy": "higher"},
         }
         (home / "results.json").write_text(json.dumps(results))
-        found.append(comparison.Trial(home, [f"+x={number}", "y=1"], value, completed=value is not None))
-    return found
+        results.append(comparison.Trial(home, [f"+x={number}", "y=1"], value, completed=value is not None))
+    return results
 
 
 def ranked(folder: Path) -> list[str]:
@@ -364,9 +366,9 @@ def test_the_best_is_first_and_what_has_no_finite_value_last(
     ranking = comparison.rank(tmp_path, given, ["+x"])
     assert ranked(tmp_path) == ["3", "1", "5", "0", "2", "4"]
     assert ranking.best == given[3]
-    assert ranking.said == "best validation loss (nats): -1.5"
+    assert ranking.summary == "best validation loss (nats): -1.5"
     said = " ".join(capsys.readouterr().out.split())
-    assert "#0 (its value is nan), #2 (did not complete), #4 (its value is inf)" in said
+    assert "#0 (value nan), #2 (did not complete), #4 (value inf)" in said
     assert comparison.rank(tmp_path, given, ["+x"], direction="maximize").best == given[1]
 
 
@@ -384,12 +386,10 @@ def test_a_metric_of_the_results_ranks_its_own_way(
     assert comparison.rank(tmp_path, given, [], "accuracy", "minimize").best == given[0]
     assert comparison.rank(tmp_path, given, [], "parameters").best == given[1], "costs are to be low"
     assert comparison.rank(tmp_path, given, [], "odd", "maximize").best == given[1]
-    with pytest.raises(
-        ConfigError, match=r"does not say which way it is better\. Set hydra\.sweeper\.direction"
-    ):
+    with pytest.raises(ConfigError, match=r"has no known direction\. Set hydra\.sweeper\.direction"):
         comparison.rank(tmp_path, given, [], "odd")
     with pytest.raises(
-        ConfigError, match=r"no trial has it\. Did you mean 'accuracy'\? They have: accuracy, "
+        ConfigError, match=r"no trial has this number\. Did you mean 'accuracy'\? The trials have: accuracy, "
     ):
         comparison.rank(tmp_path, given, [], "acuracy")
 
@@ -469,12 +469,12 @@ def test_a_key_that_varies_within_the_data_is_shown(tmp_path: Path) -> None:
         (["seed=3"], "has nothing to search"),
         (
             ["seed=1,2", "hydra.sweeper.trials=0"],
-            "hydra.sweeper.trials = 0: wanted a whole number of at least 1",
+            "hydra.sweeper.trials = 0, but a whole number of at least 1 is required",
         ),
-        (["seed=1,2", "hydra.sweeper.trials=many"], "hydra.sweeper.trials = 'many': wanted"),
+        (["seed=1,2", "hydra.sweeper.trials=many"], "hydra.sweeper.trials = 'many', but"),
         (["seed=1,2", "hydra.sweeper.seed=-1"], "hydra.sweeper.seed = -1"),
         (["seed=1,2", "hydra.sweeper.direction=minimise"], "Did you mean 'minimize'"),
-        (["seed=interval(5,1)"], "seed=interval(5,1): wanted the smaller end first"),
+        (["seed=interval(5,1)"], "seed=interval(5,1): The smaller end must come first"),
         (["sed=1,2"], "Did you mean 'seed'"),
     ],
 )
@@ -559,9 +559,9 @@ def test_members_are_found_however_deep_the_jobs_of_a_sweep_lie(tmp_path: Path) 
     for name in names[:2]:
         (tmp_path / name / "checkpoints").mkdir()
         (tmp_path / name / "checkpoints" / "model.ckpt").touch()
-    assert found(str(tmp_path)) == [tmp_path / name for name in names[:2]]
-    with pytest.raises(ConfigError, match="gives 0 trained models"):
-        found(str(tmp_path / "experiment=b"))
+    assert find_members(str(tmp_path)) == [tmp_path / name for name in names[:2]]
+    with pytest.raises(ConfigError, match="names 0 trained models"):
+        find_members(str(tmp_path / "experiment=b"))
 
 
 @pytest.mark.parametrize("damage", ["", "{", "[1]", "{}", '{"method": "m", "data": "d"}', None])

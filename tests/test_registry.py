@@ -18,7 +18,7 @@ from framework.configuration.composition import PluginConfigs, register
 from framework.configuration.composition import folder as folder_of_configs
 from framework.configuration.registry import GROUPS, config_folders, find, installed, load, unusable_names
 from framework.errors import ConfigError
-from framework.modes.plugins import describe, show
+from framework.modes.plugins import describe, print_plugins
 from framework.runs.provenance import package_versions
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -76,7 +76,7 @@ def test_one_name_from_several_packages_is_refused_naming_all_and_breaks_only_it
     with pytest.raises(ConfigError, match=r"called 'twim'\. Did you mean 'twin'\? Installed: other\."):
         find("encoder", "twim")
     monkeypatch.setenv("COLUMNS", "400")
-    show()
+    print_plugins()
     listed = capsys.readouterr().out
     for told in ("twin  (refused) Several", "triple  (refused) Several", "other  ", "second-package 1.0"):
         assert told in listed
@@ -100,7 +100,7 @@ def test_what_is_left_of_a_package_disturbs_nobody(
         ConfigError, match=r"'half' \(half:Encoder\) belongs to a package whose METADATA file is missing"
     ):
         load("encoder", "half")
-    show()
+    print_plugins()
 
 
 def test_the_same_entry_seen_twice_is_no_clash(fake: list[EntryPoint]) -> None:
@@ -231,7 +231,7 @@ def test_any_source_is_described_or_called_broken(
     fake.append(entry("odd", "package_odd:C", "framework.encoder", "odd-package"))
     told = describe("encoder", installed("encoder")["odd"])
     assert re.fullmatch(wanted, told.summary), told.summary
-    show()
+    print_plugins()
 
 
 def test_a_class_that_is_not_whole_is_refused(

@@ -341,7 +341,7 @@ def test_a_job_that_says_nonsense_is_left_out_of_the_table(
 ) -> None:
     """Each key of results.json and job.json with values of every kind, or without; nothing steers the terminal."""
     if key.startswith("record "):
-        monkeypatch.setattr(comparison, "_picture", lambda *_: [])  # which no record has part in
+        monkeypatch.setattr(comparison, "_draw_comparison", lambda *_: [])  # which no record has part in
     for value in [*WRONG, "missing"]:
         files = {"results.json": dict(RESULTS), "job.json": dict(RECORD)}
         told = files["job.json" if key.startswith("record ") else "results.json"]

@@ -14,7 +14,7 @@ from framework.configuration.description import Description
 from framework.configuration.schema import build, resolve
 from framework.distributions.density import Mixture
 from framework.errors import CheckpointError, ConfigError, DataError
-from framework.modes.combine import common, found, wrapping
+from framework.modes.combine import common_description, find_members, wrapper_config
 from framework.target import Target
 from tests.conftest import Done, Framework
 
@@ -133,32 +133,32 @@ def described(**changes: Any) -> Description:
         "data": {"name": "d", "seed": 0},
     }
     config |= {key: value for key, value in changes.items() if key in config}
-    found = Description(config, Target("class", ("a", "b")), (2,), (), synthetic=True, path="here")
-    return replace(found, **{key: value for key, value in changes.items() if key not in config})
+    description = Description(config, Target("class", ("a", "b")), (2,), (), synthetic=True, path="here")
+    return replace(description, **{key: value for key, value in changes.items() if key not in config})
 
 
 def test_only_models_that_are_alike_are_joined(tmp_path: Path) -> None:
-    assert common([described(), described(path="there")]).path == "here"
+    assert common_description([described(), described(path="there")]).path == "here"
     with pytest.raises(CheckpointError, match="differ in encoder"):
-        common([described(), described(encoder=[{"name": "mlp"}])])
+        common_description([described(), described(encoder=[{"name": "mlp"}])])
     with pytest.raises(
         CheckpointError, match=r"differ in data\.seed: .* Train the members .* with data\.seed=0 in all"
     ):
-        common([described(), described(data={"name": "d", "seed": 1})])
+        common_description([described(), described(data={"name": "d", "seed": 1})])
     with pytest.raises(CheckpointError, match="differ in input_shape"):
-        common([described(), described(input_shape=(3,))])
+        common_description([described(), described(input_shape=(3,))])
     with pytest.raises(CheckpointError, match="differ in data_state"):
-        common([described(), described(data_state={"mean": [1.0]})])
+        common_description([described(), described(data_state={"mean": [1.0]})])
     for name in ("10", "9"):
         (tmp_path / name / "checkpoints").mkdir(parents=True)
         (tmp_path / name / "checkpoints" / "model.ckpt").touch()
     (tmp_path / "11").mkdir()  # a job that failed left no model
-    assert found(str(tmp_path)) == [tmp_path / "9", tmp_path / "10"]
-    with pytest.raises(ConfigError, match="gives 1 trained models"):
-        found(["alone"])
-    assert wrapping("ensemble", 3) == resolve("uncertainty", {"name": "ensemble", "members": 3})
-    with pytest.raises(ConfigError, match="temperature has no members that could have been trained apart"):
-        wrapping("temperature", 3)
+    assert find_members(str(tmp_path)) == [tmp_path / "9", tmp_path / "10"]
+    with pytest.raises(ConfigError, match="names 1 trained model"):
+        find_members(["alone"])
+    assert wrapper_config("ensemble", 3) == resolve("uncertainty", {"name": "ensemble", "members": 3})
+    with pytest.raises(ConfigError, match="temperature cannot join separately trained models"):
+        wrapper_config("temperature", 3)
 
 
 def chosen(outliers: object, *metrics: str) -> dict[str, object]:

@@ -66,7 +66,7 @@ class ServedModel:
             if ticket is None:
                 raise
             _log.exception("A request could not be answered.")
-            sentence = "The model cannot predict for these inputs. Compare the rows of the request with the training data."
+            sentence = "The model cannot predict for these inputs. Compare the request's rows with the training data."
             reason = error
         if ticket is not None:
             ticket.sentence = ticket.sentence or sentence

@@ -21,7 +21,7 @@ from framework.target import Target
 from framework.uncertainty import SeveralModels
 
 FEW = 2
-"""Number of samples on which wrappers are tried before anything is fitted."""
+"""Number of samples with which wrappers are tried before they are fitted."""
 
 
 class CalibrateOptions(Options):
@@ -35,21 +35,21 @@ def run(config: Config) -> None:
         ConfigError: No wrapper is chosen, or a chosen wrapper must be trained or has been fitted already.
     """
     config.options(CalibrateOptions)
-    wrappers = chosen(config.values.get("uncertainty") or {})
+    wrappers = resolve_wrappers(config.values.get("uncertainty") or {})
     session = for_trained(config)
-    there = [part["name"] for part in session.parts["uncertainty"]]
+    existing = [part["name"] for part in session.parts["uncertainty"]]
     for part in wrappers:
-        if part["name"] in there:
+        if part["name"] in existing:
             raise ConfigError(
-                f"uncertainty={part['name']}: {config.settings.checkpoint} is wrapped in {' + '.join(there)} already, "
-                "and another one around it would fit what was fitted. Give the checkpoint of the model without it, or "
-                "another wrapper."
+                f"uncertainty={part['name']}: {config.settings.checkpoint} is already wrapped in "
+                f"{' + '.join(existing)}, so the same wrapper would be fitted twice. Give the checkpoint of the model "
+                "without this wrapper, or choose another wrapper."
             )
     parts = {**session.parts, "uncertainty": [*session.parts["uncertainty"], *wrappers]}
     method = " + ".join([session.method, *(part["name"] for part in wrappers)])
     splits = session.data.splits()
     inputs = fetch(splits.validation, range(min(FEW, len(splits.validation))))["input"]  # type: ignore[arg-type]
-    predictor = around_trained(session.predictor, wrappers, session.target, inputs)
+    predictor = wrap_trained(session.predictor, wrappers, session.target, inputs)
     session = add_test_parts(replace(session, parts=parts, method=method, predictor=predictor))
     with open_run(session.config) as run:
         session.record(run)
@@ -58,7 +58,7 @@ def run(config: Config) -> None:
         report_test(run, session)
 
 
-def chosen(wrappers: Mapping[str, Any]) -> list[dict[str, Any]]:
+def resolve_wrappers(wrappers: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return the checked wrappers of a config, innermost first.
 
     Raises:
@@ -66,24 +66,24 @@ def chosen(wrappers: Mapping[str, Any]) -> list[dict[str, Any]]:
     """
     if not wrappers:
         raise ConfigError(
-            "mode=calibrate fits wrappers to a trained model, and none is chosen. Give uncertainty=[...], of which "
-            "mode=plugins lists the names."
+            "mode=calibrate fits wrappers to a trained model, but no wrapper is chosen. Add uncertainty=[...]; "
+            "mode=plugins lists the names of wrappers."
         )
-    found = [resolve("uncertainty", part, f"uncertainty.{key}") for key, part in wrappers.items()]
-    for part in found:
+    resolved = [resolve("uncertainty", part, f"uncertainty.{key}") for key, part in wrappers.items()]
+    for part in resolved:
         if issubclass(load("uncertainty", part["name"]), SeveralModels):
             raise ConfigError(
-                f"uncertainty={part['name']} trains several models, and a checkpoint holds one. Train it with "
-                "mode=train, or join models that were trained apart with mode=combine mode.members=[...]."
+                f"uncertainty={part['name']} trains several models, but a checkpoint holds one. Train the wrapper with "
+                "mode=train, or join separately trained models with mode=combine mode.members=[...]."
             )
-    return found
+    return resolved
 
 
 @torch.no_grad()
-def around_trained(
+def wrap_trained(
     predictor: Predictor, wrappers: Sequence[Mapping[str, Any]], target: Target, inputs: Tensor
 ) -> Predictor:
-    """Return a trained predictor in wrappers, behind its fixed encoders, in evaluation mode.
+    """Return a trained predictor inside wrappers, behind its fixed encoders, in evaluation mode.
 
     Args:
         predictor: Trained predictor.
@@ -101,30 +101,29 @@ def around_trained(
     for part in wrappers:
         if value_set(inner(features)) is not None:
             raise ConfigError(
-                f"uncertainty={part['name']} is put around a model that predicts sets which hold a promised share of "
-                "the targets, and would drop them: what was promised of a density is not so of what is made of it. Put "
-                "what makes the sets last, around a model without them."
+                f"uncertainty={part['name']} would be put around a model that predicts sets with a guaranteed "
+                "coverage, and this guarantee would not hold for the changed density. Put the wrapper that predicts "
+                "sets last, around a model without sets."
             )
-        inner = _wrapped(part, inner, target).eval()
+        inner = _wrap(part, inner, target).eval()
     return inner if front is None else FrozenFrontEnd(list(front.encoders), inner).eval()  # type: ignore[arg-type]
 
 
-def _wrapped(part: Mapping[str, Any], inner: Predictor, target: Target) -> Predictor:
-    asked = 0
+def _wrap(part: Mapping[str, Any], inner: Predictor, target: Target) -> Predictor:
+    model_count = 0
 
     def model() -> Predictor:
-        nonlocal asked
-        asked += 1
+        nonlocal model_count
+        model_count += 1
         return inner
 
-    found: Predictor = build("uncertainty", part, model=model, target=target)
-    own = {id(one) for one in found.parameters() if one.requires_grad} - {
-        id(one) for one in inner.parameters()
-    }
-    if asked != 1 or own:
-        does = "has weights of its own that are trained by gradient" if own else f"wraps {asked} models"
+    wrapped: Predictor = build("uncertainty", part, model=model, target=target)
+    own = {id(parameter) for parameter in wrapped.parameters() if parameter.requires_grad}
+    own -= {id(parameter) for parameter in inner.parameters()}
+    if model_count != 1 or own:
+        reason = "has trainable weights" if own else f"wraps {model_count} models"
         raise ConfigError(
-            f"uncertainty={part['name']} {does}, and mode=calibrate only fits what is calibrated on the validation "
-            "split of one trained model. Choose it in mode=train."
+            f"uncertainty={part['name']} {reason}, but mode=calibrate only fits wrappers that are calibrated on the "
+            "validation split of one trained model. Use this wrapper with mode=train."
         )
-    return found
+    return wrapped

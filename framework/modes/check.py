@@ -1,4 +1,4 @@
-"""mode=check: test the contract of installed plugins on stiff and extreme cases, and fail if a plugin breaks it."""
+"""mode=check: test whether plugins satisfy their contract, also in extreme cases, and fail if one does not."""
 
 import math
 import time
@@ -29,8 +29,8 @@ COLUMNS = {
 }
 
 UNCOMPARED = (
-    "rows.py ships no independent log-densities; that log_prob is right stands on the integral, the samples, the "
-    "loss and float32 against float64, which agree with one another also where the parameters mean something else"
+    "rows.py provides no independent log-densities. Only integral, samples, loss and float32 were compared with "
+    "log_prob; they also agree if the head interprets its parameters wrongly"
 )
 
 
@@ -43,36 +43,36 @@ def run(config: Config) -> None:
 
     Raises:
         ConfigError: No plugin with a contract is chosen.
-        ContractBroken: A property does not hold; the table says which one, and in which case.
+        ContractBroken: A property does not hold; the table names the property and the case.
     """
     config.options(Options)
     if config.settings.threads:
         torch.set_num_threads(config.settings.threads)
-    chosen = _chosen(config.values)
+    chosen = _chosen_plugins(config.values)
     if not chosen:
         raise ConfigError(
-            "mode=check needs something to check: name a plugin, e.g. `mode=check density_head=<name>`; "
-            f"there are contracts for {', '.join(CONTRACTS)}. mode=plugins lists what is installed."
+            "mode=check needs a plugin, but none is chosen. Add one, for example `mode=check density_head=<name>`. "
+            f"There are contracts for {', '.join(CONTRACTS)}; mode=plugins lists the installed plugins."
         )
     console, lines, failed = Console(), [], []
     for group, part in chosen:
         plain = {key: value for key, value in part.items() if key != "name"}
-        table, found, broken = examine(contract(group, part["name"], plain), console)
+        table, findings, broken = examine(contract(group, part["name"], plain), console)
         console.print(table)
-        lines += found
+        lines += findings
         failed += broken
     config.folder.mkdir(parents=True, exist_ok=True)
     write_csv(lines, COLUMNS, config.folder / "check.csv")
-    console.print(f"every finding of every row: {config.folder / 'check.csv'}", soft_wrap=True)
+    console.print(f"all findings: {config.folder / 'check.csv'}", soft_wrap=True)
     if failed:
         raise ContractBroken(
             f"{len(failed)} of {len(lines)} checks failed: {', '.join(dict.fromkeys(failed))}. "
-            "The table says where; the base in framework/ says what is promised."
+            "The tables name the cases; the docstring of the base class in framework/ states the contract."
         )
 
 
 def examine(plugin: Contract, console: Console) -> tuple[Table, list[dict[str, object]], list[str]]:
-    """Return the table of one plugin (worst row of each property), all findings, and the names of failed properties."""
+    """Return the table of a plugin (worst case of each property), all findings, and the names of failed properties."""
     start = time.perf_counter()
     worst: dict[str, tuple[Row, Finding]] = {}
     lines: list[dict[str, object]] = []
@@ -90,20 +90,20 @@ def examine(plugin: Contract, console: Console) -> tuple[Table, list[dict[str, o
     return _table(plugin, worst, seconds), lines, failed
 
 
-def _chosen(values: Mapping[str, Any]) -> list[tuple[str, Mapping[str, Any]]]:
-    """Return the registry and the config of every chosen plugin that has a contract."""
-    found = []
+def _chosen_plugins(values: Mapping[str, Any]) -> list[tuple[str, Mapping[str, Any]]]:
+    """Return registry and config of every chosen plugin that has a contract."""
+    plugins = []
     for group in CONTRACTS:
         config = values.get(group)
         if not config:
             continue
         parts = [config] if "name" in config else list(config.values())
-        found += [(group, part) for part in parts]
-    return found
+        plugins += [(group, part) for part in parts]
+    return plugins
 
 
 def _excess(finding: Finding) -> tuple[bool, float]:
-    """Return a sort key that grows with the ratio of the error to its limit; findings that fail come last."""
+    """Return a sort key that increases with the ratio of error to limit; failed findings come last."""
     error = math.inf if math.isnan(finding.error) else finding.error
     return not finding.holds, error / finding.limit if finding.limit > 0 else error
 

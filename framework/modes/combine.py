@@ -38,25 +38,26 @@ def run(config: Config) -> None:
     """Join the members, write checkpoints/model.ckpt for the other modes, and print the table row of its test."""
     options = config.options(CombineOptions)
     console = set_up_process(config.settings)
-    sources = found(options.members)
-    again = flatten(config.settings.stored)
+    sources = find_members(options.members)
+    repeated_paths = flatten(config.settings.stored)
     members = [
-        load_with_description(source, uri=config.settings.logger.uri, paths=again) for source in sources
+        load_with_description(source, uri=config.settings.logger.uri, paths=repeated_paths)
+        for source in sources
     ]
-    described = common([description for _, description in members])
+    shared = common_description([description for _, description in members])
     wrappers = [
-        wrapping(options.wrapper, len(members)),
+        wrapper_config(options.wrapper, len(members)),
         *(
             resolve("uncertainty", part, f"uncertainty.{key}")
             for key, part in (config.values.get("uncertainty") or {}).items()
         ),
     ]
-    parts = {**described.config, "uncertainty": [*described.config["uncertainty"], *wrappers]}
-    method = " + ".join([described.method, *(part["name"] for part in wrappers)]) if described.method else ""
+    parts = {**shared.config, "uncertainty": [*shared.config["uncertainty"], *wrappers]}
+    method = " + ".join([shared.method, *(part["name"] for part in wrappers)]) if shared.method else ""
     session = add_test_parts(
-        for_predictor(config, members[0][0], replace(described, config=parts, method=method), console)
+        for_predictor(config, members[0][0], replace(shared, config=parts, method=method), console)
     )
-    session.predictor = joined(parts, session.data, [member for member, _ in members])
+    session.predictor = build_joined(parts, session.data, [member for member, _ in members])
     with open_run(session.config) as run:
         session.record(run)
         calibrate(session)
@@ -65,11 +66,11 @@ def run(config: Config) -> None:
         report_test(run, session)
 
 
-def found(members: str | Sequence[str]) -> list[str | Path]:
+def find_members(members: str | Sequence[str]) -> list[str | Path]:
     """Return the run folders, checkpoint files or MLflow run ids of the members.
 
-    If `members` is a folder of runs, these are the runs directly in it that hold a trained model, sorted by name. If
-    there are none, they are the jobs at any depth that hold one.
+    If `members` is a folder, these are the runs directly in the folder that contain a trained model, sorted by name,
+    or, if there are none, the jobs with a trained model at any depth.
 
     Raises:
         ConfigError: There are fewer than two members.
@@ -83,46 +84,50 @@ def found(members: str | Sequence[str]) -> list[str | Path]:
         listed = [*(runs or (job for job in find_job_folders(folder) if (job / _MODEL).is_file()))]
     if len(listed) < 2:
         raise ConfigError(
-            f"mode.members = {members!r} gives {len(listed)} trained models; wanted at least two: the folder of "
-            "a sweep (outputs/sweeps/<time>), or a list of run folders, checkpoint files or MLflow run ids."
+            f"mode.members = {members!r} names {len(listed)} trained model{'' if len(listed) == 1 else 's'}, but at "
+            "least two are required. Give the folder of a sweep (outputs/sweeps/<time>), or a list of run folders, "
+            "checkpoint files or MLflow run ids."
         )
     return listed
 
 
-def common(members: Sequence[Description]) -> Description:
+def common_description(members: Sequence[Description]) -> Description:
     """Return the description that all members share.
 
     Raises:
-        CheckpointError: Two members differ in data, parts, target or inputs; the message says in which.
+        CheckpointError: Two members differ in data, parts, target or inputs; the message names the difference.
     """
     first = members[0]
     for other in members[1:]:
-        here, there = other.config["data"], first.config["data"]
-        if differing := sorted(key for key in {*here, *there} if here.get(key) != there.get(key)):
-            wanted = {key: "null" if there.get(key) is None else there[key] for key in differing}
-            fixed = " ".join(f"data.{key}={value}" for key, value in wanted.items())
+        other_data, first_data = other.config["data"], first.config["data"]
+        if differing := sorted(
+            key for key in {*other_data, *first_data} if other_data.get(key) != first_data.get(key)
+        ):
+            values = {key: "null" if first_data.get(key) is None else first_data[key] for key in differing}
+            fixed = " ".join(f"data.{key}={value}" for key, value in values.items())
             raise CheckpointError(
-                f"{other.path} and {first.path} differ in {', '.join(f'data.{key}' for key in differing)}: what is "
-                f"test data of one may have trained the other. Train the members on the same data, with {fixed} in all."
+                f"{other.path} and {first.path} differ in {', '.join(f'data.{key}' for key in differing)}, so one "
+                "may have been trained on test data of the other. Train the members on the same data, with "
+                f"{fixed} in all."
             )
         for key in ("density_head", "encoder", "uncertainty"):
             if other.config[key] != first.config[key]:
                 raise CheckpointError(
                     f"{other.path} and {first.path} differ in {key}: {other.config[key]} and "
-                    f"{first.config[key]}. Members must be alike but for their seed; "
-                    "name those that are one by one in mode.members."
+                    f"{first.config[key]}. Members may differ in their seed only. "
+                    "List members that are alike in mode.members, one by one."
                 )
         for key in ("target", "input_shape", "data_state"):
-            one, two = getattr(other, key), getattr(first, key)
-            if one != two:
+            other_value, first_value = getattr(other, key), getattr(first, key)
+            if other_value != first_value:
                 raise CheckpointError(
-                    f"{other.path} and {first.path} differ in {key}: {str(one)[:200]} and {str(two)[:200]}. "
-                    "Members must have been trained on the same data."
+                    f"{other.path} and {first.path} differ in {key}: {str(other_value)[:200]} and "
+                    f"{str(first_value)[:200]}. Train the members on the same data."
                 )
     return first
 
 
-def wrapping(wrapper: str, count: int) -> dict[str, Any]:
+def wrapper_config(wrapper: str, count: int) -> dict[str, Any]:
     """Return the config of a wrapper around `count` members.
 
     Raises:
@@ -131,25 +136,25 @@ def wrapping(wrapper: str, count: int) -> dict[str, Any]:
     kind = load("uncertainty", wrapper)
     if not issubclass(kind, Joining):
         raise ConfigError(
-            f"mode.wrapper={wrapper} has no members that could have been trained apart. Give a wrapper that has, one "
-            "that derives from framework.uncertainty.Joining."
+            f"mode.wrapper={wrapper} cannot join separately trained models. Choose a wrapper that derives from "
+            "framework.uncertainty.Joining."
         )
     return resolve("uncertainty", {"name": wrapper, **kind.parameters_of(count)}, "mode.wrapper")
 
 
-def joined(config: dict[str, Any], data: Data, members: Sequence[Predictor]) -> Predictor:
-    """Return the predictor of `config`, which contains the wrapper of `wrapping`, with the members joined in it."""
+def build_joined(config: dict[str, Any], data: Data, members: Sequence[Predictor]) -> Predictor:
+    """Build the predictor of `config`, which contains the wrapper of `wrapper_config`, and join the members in it."""
     predictor = build_predictor(config, data.target, data.input_shape, 0, data.columns)
     if isinstance(predictor, FrozenFrontEnd):
-        members = [_inner(predictor, member, index) for index, member in enumerate(members)]
+        members = [_inner_predictor(predictor, member, index) for index, member in enumerate(members)]
     next(module for module in predictor.modules() if isinstance(module, Joining)).join(members)
     return predictor
 
 
-def _inner(whole: FrozenFrontEnd, member: Predictor, index: int) -> Predictor:
-    """Return the part of a member behind its fixed encoders.
+def _inner_predictor(whole: FrozenFrontEnd, member: Predictor, index: int) -> Predictor:
+    """Return the predictor of a member that follows its fixed encoders.
 
-    The encoders must be equal in all members. Those of the first member (`index` 0) are copied into `whole`.
+    The encoders must be equal in all members. The encoders of the first member (`index` 0) are copied into `whole`.
     """
     assert isinstance(member, FrozenFrontEnd)
     state = member.encoders.state_dict()
@@ -158,7 +163,7 @@ def _inner(whole: FrozenFrontEnd, member: Predictor, index: int) -> Predictor:
     for name, tensor in whole.encoders.state_dict().items():
         if not torch.equal(tensor, state[name]):
             raise CheckpointError(
-                f"member {index} was trained on other features than member 0: their encoders differ in {name}. "
-                "Join runs whose encoders were built alike."
+                f"Member {index} was trained on other features than member 0: the encoders of both differ in {name}. "
+                "Join runs with the same encoders."
             )
     return member.predictor

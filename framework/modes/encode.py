@@ -1,4 +1,4 @@
-"""mode=encode: compute the features of very many files in parts, which several jobs can share and a job can resume."""
+"""mode=encode: compute the features of many files in parts; several jobs can share them, and a job can be resumed."""
 
 import hashlib
 import io
@@ -30,11 +30,11 @@ from framework.storage.progress import Work
 from framework.training.batches import Batches
 
 DESCRIPTION, NAMES = "encoding.json", "files.txt"
-"""Files beside the parts: the settings of the computation, and the names of the encoded files, one per line."""
+"""Files in the folder of the parts: settings of the computation, and names of the encoded files, one per line."""
 
 
 class EncodeOptions(Options):
-    """Options of mode=encode: the files to encode, and the folder for the features."""
+    """Options of mode=encode: the files, the folder for the features, files per part, and this job's share of parts."""
 
     files: str
     into: str
@@ -64,7 +64,7 @@ class Collection:
         return -(-len(self.names) // self.part)
 
     def files(self, number: int) -> list[Path]:
-        """Return the files of the part with this number, counted from 0."""
+        """Return the files of part `number`, counted from 0."""
         return [self.root / name for name in self.names[number * self.part : (number + 1) * self.part]]
 
     def path(self, number: int) -> Path:
@@ -77,50 +77,55 @@ class Collection:
 
 
 def run(config: Config) -> None:
-    """Write this job's share of the parts; parts that exist already are left unchanged."""
+    """Write this job's parts; parts that already exist are left unchanged."""
     options = config.options(EncodeOptions)
     console = set_up_process(config.settings)
-    chosen = config.values
+    values = config.values
     parts = {
-        "data": resolve("data", chosen.get("data") or {}),
+        "data": resolve("data", values.get("data") or {}),
         "encoder": [
-            resolve("encoder", part, f"encoder.{key}") for key, part in (chosen.get("encoder") or {}).items()
+            resolve("encoder", part, f"encoder.{key}") for key, part in (values.get("encoder") or {}).items()
         ],
     }
     if not parts["encoder"]:
-        raise ConfigError("mode=encode wants an encoder. Name one; mode=plugins lists them.")
-    collection = collected(Path(options.files).expanduser(), Path(options.into).expanduser(), options.part)
+        raise ConfigError(
+            "mode=encode needs an encoder, but none is chosen. Add encoder=[...]; mode=plugins lists the encoders."
+        )
+    collection = collect_files(
+        Path(options.files).expanduser(), Path(options.into).expanduser(), options.part
+    )
     require_enclosed(collection.into, ConfigError)
     files = [collection.root / name for name in collection.names]
-    kept, bad = select_files(build("data", parts["data"]), files, parts["data"], console)
-    collection = replace(collection, names=[file.relative_to(collection.root).as_posix() for file in kept])
-    mine = share(collection.parts, options.share)
+    readable, unreadable = select_files(build("data", parts["data"]), files, parts["data"], console)
+    collection = replace(
+        collection, names=[file.relative_to(collection.root).as_posix() for file in readable]
+    )
+    mine = parts_of_job(collection.parts, options.share)
     with open_run(config) as run:
         record_citations(run, parts)
         describe(collection, parts)
         try:
             written = encode(collection, parts, mine, config.settings)
         except BaseException:
-            if (
-                len(collection.missing()) == collection.parts
-            ):  # without any part, the description is removed, as another attempt may use other settings
+            # Without any part, remove the description, because another attempt may use other settings.
+            if len(collection.missing()) == collection.parts:
                 for name in (DESCRIPTION, NAMES):
                     (collection.into / name).unlink(missing_ok=True)
             raise
         describe(collection, parts)  # written again if another job failed meanwhile and removed it
-        if bad:
-            left_out = "".join(f"{spell_name(file.relative_to(collection.root))}\n" for file in bad)
+        if unreadable:
+            left_out = "".join(f"{spell_name(file.relative_to(collection.root))}\n" for file in unreadable)
             write_whole(collection.into / UNREADABLE, left_out.encode())
-        left = len(collection.missing())
+        missing = len(collection.missing())
         console.print(
-            f"{written} parts written, {len(mine) - written} of this job's {len(mine)} were there; "
-            f"{left} of all {collection.parts} are missing: {collection.into}",
+            f"{written} parts written, {len(mine) - written} of this job's {len(mine)} parts existed already; "
+            f"{missing} of all {collection.parts} parts are missing in {collection.into}",
             soft_wrap=True,
         )
 
 
-def share(parts: int, which: str) -> range:
-    """Return the parts of a job: for job "2/4", every fourth part from the second on.
+def parts_of_job(parts: int, which: str) -> range:
+    """Return the numbers of a job's parts: for job "2/4", every fourth part from the second on.
 
     Raises:
         ConfigError: The number of the job exceeds the number of jobs.
@@ -128,13 +133,13 @@ def share(parts: int, which: str) -> range:
     number, jobs = map(int, which.split("/"))
     if number > jobs:
         raise ConfigError(
-            f"mode.share={which}: there is no job {number} of {jobs}; wanted 1/{jobs} to {jobs}/{jobs}."
+            f"mode.share={which}: there is no job {number} of {jobs}. Use 1/{jobs} to {jobs}/{jobs}."
         )
     return range(number - 1, parts, jobs)
 
 
-def collected(root: Path, into: Path, part: int) -> Collection:
-    """Return all files of a folder and its subfolders except hidden ones, sorted by name.
+def collect_files(root: Path, into: Path, part: int) -> Collection:
+    """Collect all files of a folder and its subfolders, except hidden ones, sorted by name.
 
     Raises:
         DataError: There are no files.
@@ -142,25 +147,28 @@ def collected(root: Path, into: Path, part: int) -> Collection:
     """
     if into.resolve().is_relative_to(root.resolve()):
         raise ConfigError(
-            f"mode.into={into} lies in mode.files={root}, and would be read itself. Give another folder."
+            f"mode.into={into} lies inside mode.files={root}, so the features would be read as files. Set mode.into "
+            "to a folder outside."
         )
-    found = (path.relative_to(root) for path in root.rglob("*") if path.is_file())
+    paths = (path.relative_to(root) for path in root.rglob("*") if path.is_file())
     names = sorted(
-        path.as_posix() for path in found if not any(piece.startswith(".") for piece in path.parts)
+        path.as_posix() for path in paths if not any(piece.startswith(".") for piece in path.parts)
     )
     if not names:
-        raise DataError(f"mode.files={root} is no folder that holds files. Give the folder to encode.")
+        raise DataError(
+            f"mode.files={root} is no folder with files. Set mode.files to the folder whose files are to be encoded."
+        )
     return Collection(root, names, part, into)
 
 
 def describe(collection: Collection, config: Mapping[str, Any]) -> None:
-    """Write the description of the parts beside them, or check that an existing one is the same.
+    """Write the description of the parts into their folder, or check that an existing description is the same.
 
     Raises:
-        ConfigError: The folder holds parts of other files or settings.
+        ConfigError: The folder contains parts of other files or settings.
     """
     text = "".join(f"{spell_name(name)}\n" for name in collection.names).encode()
-    said = {
+    description = {
         "version": 1,
         **config,
         "part": collection.part,
@@ -170,21 +178,24 @@ def describe(collection: Collection, config: Mapping[str, Any]) -> None:
     collection.into.mkdir(parents=True, exist_ok=True)
     path = collection.into / DESCRIPTION
     if path.is_file():
-        there = read_json(path, "the description of encoded files", "Delete it, or give another mode.into.")
-        for key, value in said.items():
-            if there.get(key) != value:
+        existing = read_json(
+            path, "the description of encoded files", "Delete the file, or set mode.into to another folder."
+        )
+        for key, value in description.items():
+            if existing.get(key) != value:
                 raise ConfigError(
-                    f"{path} says {key} = {there.get(key)}, this job {value}: its parts are of something else. "
-                    "Give the same files and settings, or another mode.into."
+                    f"{path} says {key} = {existing.get(key)}, but this job has {key} = {value}, so the parts in the "
+                    "folder do not belong to this job. Use the same files and settings, or set mode.into to another "
+                    "folder."
                 )
         return
     write_whole(collection.into / NAMES, text)
-    write_whole(path, json.dumps(said, indent=1).encode())
+    write_whole(path, json.dumps(description, indent=1).encode())
 
 
 @torch.no_grad()
 def encode(collection: Collection, config: Mapping[str, Any], mine: Sequence[int], settings: Settings) -> int:
-    """Write the missing parts, and return their number; a part is whole or absent.
+    """Write the missing parts of a job, each atomically, and return their number.
 
     Args:
         collection: Files to encode.
@@ -193,11 +204,13 @@ def encode(collection: Collection, config: Mapping[str, Any], mine: Sequence[int
         settings: Settings of the command.
 
     Raises:
-        ConfigError: An encoder learns, or there is no encoder.
+        ConfigError: An encoder is trained, or there is no encoder.
         DataError: A file cannot be read, or holds several samples; the message names it. Earlier parts are kept.
     """
     if not config["encoder"]:
-        raise ConfigError("mode=encode wants an encoder. Name one; mode=plugins lists them.")
+        raise ConfigError(
+            "mode=encode needs an encoder, but none is chosen. Add encoder=[...]; mode=plugins lists the encoders."
+        )
     data: Data = build("data", config["data"])
     encoders: list[Encoder] = []
     written = 0
@@ -210,42 +223,42 @@ def encode(collection: Collection, config: Mapping[str, Any], mine: Sequence[int
             dataset = data.read(files)
             if len(dataset) != len(files):  # type: ignore[arg-type]
                 raise DataError(
-                    f"{files[0]} … {files[-1]}: {len(files)} files hold {len(dataset)} samples; "  # type: ignore[arg-type]
-                    "mode=encode wants one of each. Split the files."
+                    f"{files[0]} … {files[-1]}: {len(files)} files contain {len(dataset)} samples, but mode=encode "
+                    "needs one sample per file. Split the files."
                 )
             batches = Batches(data, batch_size=settings.batch_size, workers=settings.workers, seed=0)
-            found: list[Tensor] = []
+            part_features: list[Tensor] = []
             for batch in batches.of(dataset):
                 features = batch["input"]
                 if not encoders:
-                    encoders = chain(config["encoder"], tuple(features.shape[1:]), data.columns)
+                    encoders = build_encoders(config["encoder"], tuple(features.shape[1:]), data.columns)
                 for encoder in encoders:
                     features = encoder(features)
-                found.append(features)
+                part_features.append(features)
                 work.advance(len(features))
             content = io.BytesIO()
-            np.save(content, torch.cat(found).numpy(), allow_pickle=False)
+            np.save(content, torch.cat(part_features).numpy(), allow_pickle=False)
             write_whole(collection.path(number), content.getvalue())
             written += 1
     return written
 
 
-def chain(
+def build_encoders(
     parts: Sequence[Mapping[str, Any]], shape: tuple[int, ...], columns: tuple[str, ...]
 ) -> list[Encoder]:
     """Return the encoders, each built for the features that the encoder before it returns.
 
     Raises:
-        ConfigError: An encoder learns, or draws random numbers.
+        ConfigError: An encoder is trained, or uses random numbers.
     """
-    found: list[Encoder] = []
+    encoders: list[Encoder] = []
     for part in parts:
         encoder: Encoder = build("encoder", part, input_shape=shape, input_columns=columns)
         if not encoder.fixed:
             raise ConfigError(
-                f"encoder {part['name']} learns, or draws what it says; mode=encode keeps features that follow from "
-                "the input alone. Leave it out, and train it on the features."
+                f"Encoder {part['name']} is trained or uses random numbers, but mode=encode stores features that "
+                "depend on the input only. Leave this encoder out, and train it on the stored features."
             )
-        found.append(encoder.eval())
+        encoders.append(encoder.eval())
         shape, columns = encoder.output_shape, ()
-    return found
+    return encoders

@@ -20,18 +20,18 @@ from framework.errors import ConfigError, shorten
 def run(config: Config) -> None:
     """Print the list of plugins."""
     config.options(Options)
-    show()
+    print_plugins()
 
 
-def show() -> None:
+def print_plugins() -> None:
     """Print every registry with the name, description, paper and package of each plugin."""
     console = Console(highlight=False)
     for group in GROUPS:
         console.print(Text(group, style="bold"))
         for entry in installed(group).values():
-            told = describe(group, entry)
-            console.print(Padding(Text.assemble((told.name, "cyan"), "  ", told.summary), (0, 0, 0, 2)))
-            source = " · ".join(filter(None, (paper(told.bibtex), told.origin)))
+            plugin = describe(group, entry)
+            console.print(Padding(Text.assemble((plugin.name, "cyan"), "  ", plugin.summary), (0, 0, 0, 2)))
+            source = " · ".join(filter(None, (paper(plugin.bibtex), plugin.origin)))
             console.print(Padding(Text(source, style="dim"), (0, 0, 0, 6)))
         for name, reason in unusable_names(group).items():
             console.print(Padding(Text.assemble((name, "cyan"), f"  (refused) {reason}"), (0, 0, 0, 2)))
@@ -41,19 +41,19 @@ def show() -> None:
 
 def paper(bibtex: str) -> str:
     """Return 'Author et al. 2015, Title' for a BibTeX entry; "" for an entry without an author."""
-    authors = _value(bibtex, "author").split(" and ")
+    authors = _bibtex_value(bibtex, "author").split(" and ")
     if authors == [""]:
         return ""
     first = authors[0].partition(",")[0] if "," in authors[0] else authors[0].split(" ")[-1]
     name = f"{first} et al." if len(authors) > 1 else first
-    return f"{name} {_value(bibtex, 'year')}, {_value(bibtex, 'title')}"
+    return f"{name} {_bibtex_value(bibtex, 'year')}, {_bibtex_value(bibtex, 'title')}"
 
 
-def _value(bibtex: str, key: str) -> str:
-    found = re.search(rf"\b{key}\s*=\s*[{{\"]+(.*?)[}}\"]+\s*,?\s*(?:\n|$)", bibtex, re.DOTALL)
-    if not found:
+def _bibtex_value(bibtex: str, key: str) -> str:
+    match = re.search(rf"\b{key}\s*=\s*[{{\"]+(.*?)[}}\"]+\s*,?\s*(?:\n|$)", bibtex, re.DOTALL)
+    if not match:
         return ""
-    accented = re.sub(r"\\+([\"'`^~])\{?(\w)\}?", _with_accent, " ".join(found.group(1).split()))
+    accented = re.sub(r"\\+([\"'`^~])\{?(\w)\}?", _with_accent, " ".join(match.group(1).split()))
     return re.sub(r"[{}]", "", accented)
 
 
@@ -75,7 +75,7 @@ class Description:
 
 
 def describe(group: str, entry: Entry) -> Description:
-    """Return the description of a plugin: first docstring line and BibTeX of the class that its entry point names."""
+    """Return the description of a plugin: the first docstring line and the BibTeX of the class of its entry point."""
     summary, bibtex = "(source not found)", ""
     module, _, attribute = entry.value.partition(":")
     package, *rest = module.split(".")
@@ -97,8 +97,8 @@ def _docstring_and_bibtex(path: Path, attribute: str) -> tuple[str, str]:
     try:
         tree = ast.parse(path.read_bytes())  # bytes, since the file may declare another encoding
     except SyntaxError as error:
-        place = f" line {error.lineno}" if error.lineno else ""
-        return f"(broken: {path.name}{place} does not parse)", ""
+        location = f" line {error.lineno}" if error.lineno else ""
+        return f"(broken: {path.name}{location} does not parse)", ""
     # the file is unreadable, contains a null byte, or nests too deeply
     except (OSError, ValueError, RecursionError, MemoryError) as error:
         return f"(broken: {path.name} cannot be read: {shorten(error)})", ""
@@ -115,9 +115,11 @@ def _docstring_and_bibtex(path: Path, attribute: str) -> tuple[str, str]:
 
 
 def _text(value: ast.expr, module: ast.Module) -> str:
-    """Return a text that the source gives literally or by a name of the same module; "" if it is computed."""
+    """Return a text that is a literal, or a name of the same module for a literal; "" if the text is computed."""
     if isinstance(value, ast.Name):
         named = (item for item in module.body if isinstance(item, ast.Assign))
-        found = (item.value for item in named if value.id in (getattr(one, "id", "") for one in item.targets))
-        value = next(found, value)
+        constants = (
+            item.value for item in named if value.id in (getattr(target, "id", "") for target in item.targets)
+        )
+        value = next(constants, value)
     return str(value.value) if isinstance(value, ast.Constant) else ""

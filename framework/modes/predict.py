@@ -1,6 +1,6 @@
 """mode=predict: write point predictions and uncertainties for a user's own files or the test split to a CSV file.
 
-Predicted images are written as PNG files beside it, and so are maps if the data set draws them.
+Predicted images, and maps if the data set draws them, are written as files beside the CSV file.
 """
 
 import csv
@@ -60,13 +60,13 @@ def run(config: Config) -> None:
     print_left_out(session.console, "folders", "not looked into", folders)
     if options.interval:
         require_interval(session.target, options.interval, by="mode.interval")
-    bad: list[Path] = []
+    unreadable: list[Path] = []
     if len(files) > 1:
-        files, bad = select_files(session.data, files, session.parts["data"], session.console)
+        files, unreadable = select_files(session.data, files, session.parts["data"], session.console)
     with open_run(session.config) as run:
-        if bad:
+        if unreadable:
             (run.folder / UNREADABLE).write_text(
-                "".join(f"{spell_name(file)}\n" for file in bad), encoding="utf-8"
+                "".join(f"{spell_name(file)}\n" for file in unreadable), encoding="utf-8"
             )
         images = run.folder / "images"
         rows, mapped = predictions(
@@ -81,13 +81,14 @@ def run(config: Config) -> None:
         session.console.print(f"{len(rows)} predictions in {path}", soft_wrap=True)
         if options.interval and any(key.endswith(ERRORS) for key in rows[0]):
             session.console.print(
-                f"ends of intervals are order statistics of {DRAWS:,} draws where their standard error, in columns of "
-                "their own, is not 0: the densities do not know their distribution function.",
+                f"The ends of intervals with a standard error other than 0 are order statistics of {DRAWS:,} random "
+                "values, because the densities have no distribution function. The standard errors are in separate "
+                "columns.",
                 soft_wrap=True,
             )
         if isinstance(session.data, Mapped) and mapped:
-            for written in _maps(session.data, files, mapped, run.folder / "maps"):
-                run.tracker.log_artifact(written, "maps")
+            for map_file in _maps(session.data, files, mapped, run.folder / "maps"):
+                run.tracker.log_artifact(map_file, "maps")
             session.console.print(f"maps in {run.folder / 'maps'}", soft_wrap=True)
 
 
@@ -103,12 +104,12 @@ def predictions(
 ) -> tuple[list[dict[str, str]], list[tuple[Tensor, Tensor]]]:
     """Return the rows of the table, and the tensors for maps.
 
-    A row holds the name of a sample, the point prediction and the density's entropy in nats. It also holds the
-    conformal prediction set, if the model has one, or else the interval of probability `mass`. Standard errors are
-    given if the ends of intervals are estimated from samples. If the data set draws maps of files, the second list
-    holds, for each batch, the point predictions and their standard deviations, each (batch, number).
+    A row has the name of a sample, the point prediction, the density's entropy in nats and the prediction set, or, if
+    the model predicts no sets, the interval of probability `mass`. Standard errors are included if the ends of
+    intervals are estimated from random values. If the data set draws maps of files, the second list has for each batch
+    the point predictions and their standard deviations, each (batch, number).
 
-    Predicted images are written into the folder `images`, and the row names the file.
+    Predicted images are written to the folder `images`, and the row has the name of the file.
     """
     dataset = data.read(files) if files else data.splits().test
     loader = Batches(data, batch_size=BLOCK, workers=settings.workers, seed=settings.seed).of(dataset)
@@ -123,7 +124,7 @@ def predictions(
             mapped.append((prediction.point.cpu(), prediction.deviation().cpu()))
         columns = {**columns, **_intervals(target, prediction, mass)}
         for row in range(len(batch["index"])):
-            values = {key: text(column[row], key) for key, column in columns.items()}
+            values = {key: format_cell(column[row], key) for key, column in columns.items()}
             if target.kind == "class":
                 values = {"class": target.names[int(prediction.point[row])], **values}
             elif target.kind == "image":
@@ -141,7 +142,7 @@ def predictions(
 def _intervals(
     target: Target, prediction: Prediction, mass: float | None
 ) -> Mapping[str, Sequence[Any] | Tensor]:
-    """Return the columns of the density's prediction set or, without a set, of the intervals of a given probability."""
+    """Return the columns of the densities' prediction sets or, without sets, of the intervals of probability `mass`."""
     sets = value_set(prediction.density)
     if sets is None:
         return interval_columns(target, prediction.interval(mass)) if mass else {}
@@ -161,7 +162,7 @@ def _maps(
 
 
 def _names(data: Data, files: Sequence[Path], samples: int) -> list[str]:
-    """Return a name for each sample: its file, with the row if a file holds several, or its place in the test split."""
+    """Return a name for each sample: its file, with the row if a file has several, or its number in the test split."""
     if not files:
         return [f"test {number}" for number in range(samples)]
     if samples == len(files):
@@ -174,10 +175,10 @@ def _names(data: Data, files: Sequence[Path], samples: int) -> list[str]:
     ]
 
 
-def text(value: str | float | Tensor, key: str) -> str:
+def format_cell(value: str | float | Tensor, key: str) -> str:
     """Return the text of a table cell, with 15 significant digits for the ends of intervals and 10 for other numbers.
 
-    In the user's unit a number can be large, and its last digits still matter.
+    The last digits of an end matter even if the number is large in the user's unit.
     """
     if isinstance(value, str):
         return value

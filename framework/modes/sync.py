@@ -1,4 +1,4 @@
-"""mode=sync: send the journal lines that a run could not send while it ran to the tracking store."""
+"""mode=sync: send journal lines to the tracking store that a run could not send itself."""
 
 from pathlib import Path
 
@@ -20,6 +20,7 @@ def run(config: Config) -> None:
     folder = Path(config.options(SyncOptions).run).expanduser()
     if not (folder / "run.json").is_file():
         raise ConfigError(
-            f"mode.run={folder}: {folder / 'run.json'} does not exist. Give the folder of a run."
+            f"mode.run={folder} is no run folder, because {folder / 'run.json'} does not exist. Set mode.run to the "
+            "folder of a run."
         )
     Console().print(f"{sync(folder, config.settings.logger.uri)} journal lines sent from {folder}.")

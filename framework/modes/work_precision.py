@@ -1,4 +1,4 @@
-"""mode=work_precision: measure error against run time along a declared knob of a trained model."""
+"""mode=work_precision: measure error against run time for several values of a trained model's knob."""
 
 from typing import Annotated, Literal
 
@@ -22,7 +22,7 @@ from framework.runs.run import Run, open_run
 from framework.runs.session import Session, for_trained
 
 ERROR, AXIS = "error_nats", "error of the mean log-likelihood (nats, RMS)"
-"""Quantity that is drawn for a knob of a density head if no metrics are named, and the label of its axis."""
+"""Default quantity for a knob of a density head, and the label of its axis."""
 
 
 class WorkPrecisionOptions(Options):
@@ -37,29 +37,29 @@ class WorkPrecisionOptions(Options):
 
 
 def run(config: Config) -> None:
-    """Write work_precision.csv and a figure, and print the table with the points of the Pareto front marked."""
+    """Write work_precision.csv and a figure, and print a table that marks the points of the Pareto front."""
     options = config.options(WorkPrecisionOptions)
     session = for_trained(config)
     with open_run(session.config) as run:
         session.record(run)
-        _run(run, session, options)
+        _measure(run, session, options)
 
 
-def _run(run: Run, session: Session, options: WorkPrecisionOptions) -> None:
+def _measure(run: Run, session: Session, options: WorkPrecisionOptions) -> None:
     from framework.reports.tradeoff_picture import Floor, error_against_run_time
 
     predictor, data, parts, settings = session.predictor, session.data, session.parts, session.settings
     metrics = [metric for metric in build_metrics(parts, session.target) if "outliers" not in metric.splits]
     knob = options.knob or first_knob(predictor)
     owner = knob_owners(predictor, knob)[0]
-    better = _chosen(options.metrics, metrics, own=isinstance(owner, DensityHead))
+    better = _choose_keys(options.metrics, metrics, own=isinstance(owner, DensityHead))
     measured = [key for key in better if key not in reference.COLUMNS]
     compared = len(measured) < len(better)
     _refuse_unmeasured(run.config, bool(measured), compared)
     predictor.to(session.device)
     curve = tradeoff(
         predictor,
-        _kept(session, options.limit),
+        _first_samples(session, options.limit),
         metrics if measured else (),
         knob=knob,
         values=options.values or owner.knobs[knob],
@@ -68,11 +68,11 @@ def _run(run: Run, session: Session, options: WorkPrecisionOptions) -> None:
         repeats=options.repeats,
         seed=settings.seed,
     )
-    found = rows({session.method: curve}, better, synthetic=data.synthetic)
+    table_rows = rows({session.method: curve}, better, synthetic=data.synthetic)
     path = run.folder / "work_precision.csv"
-    write_csv(found, None, path)
+    write_csv(table_rows, None, path)
     run.tracker.log_artifact(path)
-    for row, point in zip(found, curve.points, strict=True):
+    for row, point in zip(table_rows, curve.points, strict=True):
         numbers = {key: value for key, value in point.numbers.items() if key in row}
         numbers["milliseconds"] = point.milliseconds
         run.tracker.log_metrics(
@@ -83,9 +83,9 @@ def _run(run: Run, session: Session, options: WorkPrecisionOptions) -> None:
     floors = {}
     if curve.reference is not None:
         error = curve.reference.standard_error
-        floors[ERROR] = Floor(error, f"below {error:.1g} nats the reference itself is uncertain")
+        floors[ERROR] = Floor(error, f"below {error:.1g} nats, the standard error of the reference")
     figure = error_against_run_time(
-        found,
+        table_rows,
         {key: AXIS if key == ERROR else headings[key] for key in better},
         better,
         title=f"{session.title}: {'metrics' if measured else 'error'} against run time along {knob}",
@@ -93,17 +93,17 @@ def _run(run: Run, session: Session, options: WorkPrecisionOptions) -> None:
         floors=floors,
         machine=f"{machine(curve.device, curve.threads)}, batches of {curve.batch_size}",
     )
-    where = [save_picture(run, figure, "work_precision")] if settings.pictures else []
+    figures = [save_picture(run, figure, "work_precision")] if settings.pictures else []
     columns = {"method": "method", "value": knob, **headings, "milliseconds_per_sample": "ms / sample"}
     for key in better:
         columns[f"{key}_pareto"] = "Pareto" if len(better) == 1 else f"Pareto: {headings[key]}"
     console = session.console
-    console.print(results_table(found, columns, title=f"{session.title}, {curve.samples} test samples"))
-    console.print("\n".join(map(str, [path, *where])), soft_wrap=True, highlight=False)
+    console.print(results_table(table_rows, columns, title=f"{session.title}, {curve.samples} test samples"))
+    console.print("\n".join(map(str, [path, *figures])), soft_wrap=True, highlight=False)
 
 
 def _refuse_unmeasured(config: Config, measured: bool, compared: bool) -> None:
-    """Refuse settings for quantities that are not measured.
+    """Raise an error for settings of quantities that are not measured.
 
     Args:
         config: Config of the command.
@@ -111,26 +111,26 @@ def _refuse_unmeasured(config: Config, measured: bool, compared: bool) -> None:
         compared: Whether the error against a reference is measured.
 
     Raises:
-        ConfigError: There is such a setting; the message names the first.
+        ConfigError: There is such a setting; the message names the first one.
     """
     for key, used, why in (
-        ("metric", measured, f"{ERROR} alone is measured here, unless mode.metrics=[...] names others"),
+        ("metric", measured, f"only {ERROR} is measured here, unless mode.metrics=[...] names metrics"),
         (
             "mode.reference",
             compared,
-            f"only {ERROR}, which mode.metrics may name, is compared with a reference",
+            f"only {ERROR} is compared with a reference, and mode.metrics does not name it",
         ),
     ):
-        given = config.first_override(key)
-        if given and not used:
-            refuse_idle(config.folder, idle_sentence(given, why))
+        override = config.first_override(key)
+        if override and not used:
+            refuse_idle(config.folder, idle_sentence(override, why))
 
 
-def _chosen(names: list[str] | None, metrics: list[Metric], *, own: bool) -> Better:
+def _choose_keys(names: list[str] | None, metrics: list[Metric], *, own: bool) -> Better:
     """Return the keys to measure, each with the direction in which it is better.
 
     Args:
-        names: Requested keys. None selects the error against a reference if `own` is True, and else every metric.
+        names: Requested keys. None selects the error against a reference if `own` is True, and otherwise every metric.
         metrics: Metrics of the session.
         own: Whether the knob belongs to the density head of the model.
 
@@ -145,20 +145,20 @@ def _chosen(names: list[str] | None, metrics: list[Metric], *, own: bool) -> Bet
     for key in keys:
         if key not in known:
             raise ConfigError(
-                f"mode.metrics: no metric gives {key!r} and says which way it is better.{did_you_mean(key, known)} "
-                f"There are: {', '.join(known)}."
+                f"mode.metrics: no metric with a known direction has the key {key!r}.{did_you_mean(key, known)} "
+                f"The keys are {', '.join(known)}."
             )
     if not keys:
-        raise ConfigError("No metric says which way it is better; choose some with metric=[...].")
+        raise ConfigError("No metric has a known direction. Choose metrics that have one with metric=[...].")
     return {key: known[key] for key in keys}
 
 
-def _kept(session: Session, limit: int) -> list[Batch]:
+def _first_samples(session: Session, limit: int) -> list[Batch]:
     """Return the first `limit` test samples, in batches."""
-    kept, seen = [], 0
+    batches, count = [], 0
     for batch in on_device(session.batches().test_dataloader(), session.device):
-        kept.append({name: tensor[: limit - seen] for name, tensor in batch.items()})
-        seen += len(kept[-1]["index"])
-        if seen >= limit:
+        batches.append({name: tensor[: limit - count] for name, tensor in batch.items()})
+        count += len(batches[-1]["index"])
+        if count >= limit:
             break
-    return kept
+    return batches

@@ -1,4 +1,4 @@
-"""Parent run of a sweep, and the table and figure that compare its jobs."""
+"""Parent run of a sweep, and the table and the figure that compare the sweep's jobs."""
 
 import logging
 import math
@@ -30,7 +30,7 @@ from framework.tracking.tracker import MlflowTracker, mlflow_store
 
 _DIRECTIONS: Mapping[str, Literal["higher", "lower"]] = {"minimize": "lower", "maximize": "higher"}
 DESCRIPTION, LONGEST_DESCRIPTION = "mlflow.note.content", 7500
-"""Tag that MLflow shows as a run's description, and the largest number of characters in it."""
+"""Tag that MLflow shows as a run's description, and the largest number of characters of a description."""
 RETURNED = "best validation loss (nats)"
 """Name of the value that a training returns to its sweep."""
 _HEADER = ("method", "data", "columns", "better")
@@ -41,7 +41,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Trial:
-    """A job of a search; `value` is the value that it returned, or None if it returned nothing."""
+    """A job of a search; `value` is the value that the job returned, or None if there is none."""
 
     folder: Path
     overrides: list[str]
@@ -51,18 +51,18 @@ class Trial:
 
 @dataclass(frozen=True)
 class Ranking:
-    """The best trial of a search (None if no trial has a finite value), and a line that states its value."""
+    """The best trial of a search, None if no trial has a finite value, and a line that states its value."""
 
     best: Trial | None
-    said: str
+    summary: str
 
 
 def begin(folder: Path, config: Mapping[str, Any]) -> str | None:
-    """Open the parent run of a sweep, and return its id, or None without a tracking store."""
+    """Open the parent run of a sweep and return its id; None if there is no tracking store."""
     logger = config.get("logger") or {}
     if logger.get("name") != "mlflow":
         return None
-    # set if a sweep is repeated in this folder; the earlier one may have been killed
+    # not None if a sweep is repeated in this folder; the earlier sweep may have been killed
     earlier = read_run_info(folder)
     tracker = _parent(folder, config, earlier, store_experiment(config))
     tracker.open()
@@ -78,27 +78,27 @@ def summarise(folder: Path, overrides: Sequence[Sequence[str]], config: Mapping[
     Args:
         folder: Folder of the sweep.
         overrides: Overrides of each job of this command.
-        config: Config of the first job, as for `begin`; the store that it names is the only one that is contacted.
+        config: Config of the first job, as for `begin`; only the store that it names is contacted.
     """
     console = output()
     jobs = find_job_folders(folder)
     for job in jobs:
         if _status(job) == "died" and (job / "run.json").is_file():
-            close_and_send(job, store_of(config))  # a killed process could not close its run
+            close_and_send(job, store_of(config))  # a killed process cannot close its run
     rows = [row for row in map(_row, jobs) if row]
     files: list[Path] = []
-    said = ""
+    summary = ""
     if rows:
-        # rows of another command's jobs in this folder count too: every key that distinguishes rows must be shown
-        everything = [*overrides, *(row["overrides"] for row in rows)]
-        keys = _varied(everything)
-        if _repeated(rows, keys):  # a setting that only some commands give
-            keys = _varied(everything, absent=True)
+        # Jobs of other commands in this folder count too, because every key that distinguishes rows must be shown.
+        all_overrides = [*overrides, *(row["overrides"] for row in rows)]
+        keys = _varied_keys(all_overrides)
+        if _has_repetition(rows, keys):  # some commands do not have the setting
+            keys = _varied_keys(all_overrides, absent=True)
         rows = [{**dict.fromkeys(keys), **row} for row in rows]
         shown = (key for key in keys if key not in ("seed", "experiment") and not _repeats_data(rows, key))
         by = ["method", "data", *shown]
         columns = {key: key.rpartition(".")[2] for key in by} | rows[0]["columns"] | COST_COLUMNS
-        # a column without any number is left out (one that only some classes have, for example)
+        # Columns without any number are left out.
         columns = {
             key: heading for key, heading in columns.items() if any(row.get(key) is not None for row in rows)
         }
@@ -107,10 +107,11 @@ def summarise(folder: Path, overrides: Sequence[Sequence[str]], config: Mapping[
         console.print(results_table(compared, columns, title=f"{len(rows)} runs in {folder}", better=better))
         write_csv(compared, columns, folder / "comparison.csv")
         files.append(folder / "comparison.csv")
-        files.extend(_picture(compared, rows, by, folder))
+        files.extend(_draw_comparison(compared, rows, by, folder))
         console.print(f"comparison: {', '.join(str(file) for file in files)}", soft_wrap=True)
-        said = f"{len(rows)} runs over {', '.join(keys) or 'nothing'}.\n\n{markdown(compared, columns, better=better)}"
-    _close_parent(folder, files, said, config)
+        table = markdown(compared, columns, better=better)
+        summary = f"{len(rows)} runs over {', '.join(keys) or 'nothing'}.\n\n{table}"
+    _close_parent(folder, files, summary, config)
 
 
 def store_of(config: Mapping[str, Any]) -> str | None:
@@ -132,27 +133,27 @@ def rank(
 
     Args:
         folder: Folder of the search.
-        trials: Trials in the order in which they were drawn.
+        trials: Trials, in the order in which they were drawn.
         keys: Overridden keys to show, one column each.
-        metric: Key of results.json; None ranks by the value that the trials returned.
+        metric: Key of results.json by which trials are ranked; None: the value that the trials returned.
         direction: "minimize" or "maximize"; None takes the direction from the metric.
 
     Raises:
         ConfigError: No trial has the metric, or its direction is not known.
     """
     results = {trial.folder: _results(trial.folder) if trial.completed else {} for trial in trials}
-    known = [one for one in results.values() if one]
+    known = [result for result in results.values() if result]
     heading, better = RETURNED, _DIRECTIONS[direction or "minimize"]
     if metric is not None:
-        heading = next((one["columns"][metric] for one in known if metric in one["columns"]), metric)
-        better = _better(metric, known, direction, folder) if known else better
+        heading = next((result["columns"][metric] for result in known if metric in result["columns"]), metric)
+        better = _direction(metric, known, direction, folder) if known else better
     rows = [_trial_row(trial, results[trial.folder], keys, metric) for trial in trials]
     synthetic = any(row["synthetic"] for row in rows)
     sign = 1 if better == "lower" else -1
     ranks = [sign * row["value"] if math.isfinite(row["value"]) else math.inf for row in rows]
-    # stable, so of equal trials the one drawn first comes first
+    # The sort is stable: of equal trials, the one drawn first comes first.
     order = sorted(range(len(rows)), key=ranks.__getitem__)
-    # a failed trial does not say whether its data are synthetic, so it is labelled if any other trial is
+    # A failed trial has no results that say whether its data are synthetic; it is labelled like the others.
     shown = [
         {**row, "synthetic": synthetic if row["synthetic"] is None else row["synthetic"]} for row in rows
     ]
@@ -168,33 +169,33 @@ def rank(
     console.print(results_table(shown, columns, title=title, better={"value": better}))
     write_csv(shown, columns, folder / "ranking.csv")
     last = [
-        f"#{row['trial']} "
-        + (f"(its value is {row['value']:g})" if trial.completed else "(did not complete)")
+        f"#{row['trial']} " + (f"(value {row['value']:g})" if trial.completed else "(did not complete)")
         for trial, row, rank in zip(trials, rows, ranks, strict=True)
         if rank == math.inf
     ]
     if last:
-        console.print(f"last, for want of a finite value: {', '.join(last)}", soft_wrap=True)
+        console.print(f"ranked last, without a finite value: {', '.join(last)}", soft_wrap=True)
     if metric is not None:
         console.print(
-            f"{metric} is of the test split, which now has chosen: its best value is no estimate on new data.",
+            f"{metric} was computed on the test split, which was used to choose the trial, so the best value is no "
+            "estimate for new data.",
             soft_wrap=True,
         )
     if len(last) == len(trials):
         return Ranking(None, "")
     best = rows[order[0]]
-    said = f"{heading}: {best['value']:.6g}" + (" (synthetic data)" if best["synthetic"] else "")
-    return Ranking(trials[order[0]], said)
+    summary = f"{heading}: {best['value']:.6g}" + (" (synthetic data)" if best["synthetic"] else "")
+    return Ranking(trials[order[0]], summary)
 
 
-def close_ranking(folder: Path, said: str, config: Mapping[str, Any]) -> None:
-    """Log the result of a search to the parent run, with `said` as description and `config` as for `begin`."""
+def close_ranking(folder: Path, summary: str, config: Mapping[str, Any]) -> None:
+    """Log the result of a search to the parent run, with the description `summary`; `config` is as for `begin`."""
     paths = (folder / name for name in ("ranking.csv", "best.yaml"))
-    _close_parent(folder, [path for path in paths if path.is_file()], said, config)
+    _close_parent(folder, [path for path in paths if path.is_file()], summary, config)
 
 
 def _results(job: Path) -> dict[str, Any]:
-    """Return the results of a job; log a warning and return an empty dictionary if they cannot be read."""
+    """Return the results of a job; if they cannot be read, log a warning and return an empty dictionary."""
     path = job / "results.json"
     if not path.is_file():
         return {}
@@ -202,34 +203,37 @@ def _results(job: Path) -> dict[str, Any]:
         results = read_json(path, "the results of a job")
         if lacking := [key for key in _HEADER if key not in results]:
             raise DataError(f"{path} lacks {', '.join(lacking)}. {RESTORE}")
-        return _checked(results, path)
+        return _check_results(results, path)
     except DataError as error:
-        _log.warning("The table lacks a job: %s", error)
+        _log.warning("A job is missing in the table: %s", error)
         return {}
 
 
-def _checked(results: Mapping[str, Any], path: Path) -> dict[str, Any]:
-    """Return a job's results with texts that are safe to print, since the file may come from an untrusted source.
+def _check_results(results: Mapping[str, Any], path: Path) -> dict[str, Any]:
+    """Check a job's results, since the file may come from an untrusted source; return them with texts safe to print.
 
     Raises:
-        DataError: A test would not write such results.
+        DataError: A value has a type that no test writes.
     """
     columns, better = results["columns"], results["better"]
-    wanted = {
+    valid = {
         "method": isinstance(results["method"], str),
         "data": isinstance(results["data"], str),
         "seed": isinstance(results.get("seed"), int | str | None)
         and not isinstance(results.get("seed"), bool),
         "device": isinstance(results.get("device"), str | None),
         "threads": type(results.get("threads")) is int or "device" not in results,
-        "columns": isinstance(columns, dict) and all(isinstance(one, str) for one in columns.values()),
-        "better": isinstance(better, dict) and all(one in ("higher", "lower") for one in better.values()),
+        "columns": isinstance(columns, dict)
+        and all(isinstance(heading, str) for heading in columns.values()),
+        "better": isinstance(better, dict) and all(way in ("higher", "lower") for way in better.values()),
         **{key: results[key] is None or is_number(results[key]) for key in COST_COLUMNS if key in results},
     }
     if isinstance(columns, dict):
-        wanted |= {key: results[key] is None or is_number(results[key]) for key in columns if key in results}
-    if wrong := [key for key, right in wanted.items() if not right]:
-        raise DataError(f"{path} says {shorten(wrong[0])} = {quote(results.get(wrong[0]))}. {RESTORE}")
+        valid |= {key: results[key] is None or is_number(results[key]) for key in columns if key in results}
+    if wrong := [key for key, is_valid in valid.items() if not is_valid]:
+        raise DataError(
+            f"{path} has the invalid value {shorten(wrong[0])} = {quote(results.get(wrong[0]))}. {RESTORE}"
+        )
     plain = {key: shorten(value) if isinstance(value, str) else value for key, value in results.items()}
     return {**plain, "columns": {key: shorten(heading) for key, heading in columns.items()}}
 
@@ -237,33 +241,38 @@ def _checked(results: Mapping[str, Any], path: Path) -> dict[str, Any]:
 def _trial_row(
     trial: Trial, results: Mapping[str, Any], keys: Sequence[str], metric: str | None
 ) -> dict[str, Any]:
-    """Return the row of a trial; its value is NaN if it has none, and "synthetic" is None if that is not known."""
-    found = trial.value if metric is None else results.get(metric)
-    given = {key: value for key, _, value in (override.partition("=") for override in trial.overrides)}
+    """Return the row of a trial; "value" is NaN if it has none, and "synthetic" is None if this is not known."""
+    value = trial.value if metric is None else results.get(metric)
+    overridden = {key: text for key, _, text in (override.partition("=") for override in trial.overrides)}
     return {
         "trial": trial.folder.name,
-        "value": float(found) if is_number(found) and trial.completed else math.nan,
-        **{key: given.get(key) for key in keys},
+        "value": float(value) if is_number(value) and trial.completed else math.nan,
+        **{key: overridden.get(key) for key in keys},
         **{key: results.get(key) for key in COST_COLUMNS},
         "synthetic": results.get("synthetic"),
     }
 
 
-def _better(
+def _direction(
     metric: str, results: Sequence[Mapping[str, Any]], direction: str | None, folder: Path
 ) -> Literal["higher", "lower"]:
-    again = f"The same command with hydra.sweep.dir={folder} ranks again and runs nothing twice."
-    numbers = {key: None for one in results for key, value in one.items() if is_number(value)}
+    repeat = (
+        f"The same command with hydra.sweep.dir={folder} ranks the trials again without running them again."
+    )
+    numbers = {key: None for result in results for key, value in result.items() if is_number(value)}
     if metric not in numbers:
         raise ConfigError(
-            f"hydra.sweeper.metric = {metric!r}: no trial has it.{did_you_mean(metric, numbers)} They have: "
-            f"{', '.join(numbers)}; null is the {RETURNED}. {again}"
+            f"hydra.sweeper.metric = {metric!r}: no trial has this number.{did_you_mean(metric, numbers)} The trials "
+            f"have: {', '.join(numbers)}; null stands for the {RETURNED}. {repeat}"
         )
-    ways: Better = {**COST_BETTER, **next((one["better"] for one in results if metric in one["better"]), {})}
+    ways: Better = {
+        **COST_BETTER,
+        **next((result["better"] for result in results if metric in result["better"]), {}),
+    }
     if metric not in ways and direction is None:
         raise ConfigError(
-            f"hydra.sweeper.metric = {metric!r} does not say which way it is better. Set "
-            f"hydra.sweeper.direction to minimize or maximize. {again}"
+            f"hydra.sweeper.metric = {metric!r} has no known direction. Set "
+            f"hydra.sweeper.direction to minimize or maximize. {repeat}"
         )
     return _DIRECTIONS[direction] if direction is not None else ways[metric]
 
@@ -282,46 +291,46 @@ def _row(job: Path) -> dict[str, Any] | None:
     swept = dict(override.lstrip("+~").split("=", 1) for override in overrides if "=" in override)
     row = {**swept, **results, "overrides": overrides, "folder": str(job)}
     if "batch_size" in swept:
-        # in the results, it is the batch size of the cost measurement, which a small test split limits
+        # In the results, batch_size is that of the cost measurement, which a small test split limits.
         row["batch_size"] = swept["batch_size"]
     return row
 
 
-def _varied(overrides: Sequence[Sequence[str]], *, absent: bool = False) -> list[str]:
-    """Return the keys whose values differ between jobs, in order; with `absent`, also keys that only some jobs have."""
-    seen: dict[str, list[str]] = {}
+def _varied_keys(overrides: Sequence[Sequence[str]], *, absent: bool = False) -> list[str]:
+    """Return the keys whose values differ between jobs, in order; with `absent`, also keys that some jobs lack."""
+    values_of: dict[str, list[str]] = {}
     for job in overrides:
         for override in job:
             key, _, value = override.lstrip("+~").partition("=")
-            seen.setdefault(key, []).append(value)
+            values_of.setdefault(key, []).append(value)
     return [
         key
-        for key, values in seen.items()
+        for key, values in values_of.items()
         if len(set(values)) > 1 or (absent and len(values) < len(overrides))
     ]
 
 
-def _repeated(rows: Sequence[Mapping[str, Any]], keys: Sequence[str]) -> bool:
+def _has_repetition(rows: Sequence[Mapping[str, Any]], keys: Sequence[str]) -> bool:
     """Return whether two rows have the same method, data, seed and `keys`."""
-    told = [tuple(row.get(key) for key in ("method", "data", "seed", *keys)) for row in rows]
-    return len(set(told)) < len(told)
+    combinations = [tuple(row.get(key) for key in ("method", "data", "seed", *keys)) for row in rows]
+    return len(set(combinations)) < len(combinations)
 
 
 def _repeats_data(rows: Sequence[Mapping[str, Any]], key: str) -> bool:
-    """Return whether the column `key` varies but is determined by the column `data`."""
+    """Return whether the column `key` has several values, but each value of the column `data` has its own."""
     pairs = {(row["data"], row[key]) for row in rows}
     return len({value for _, value in pairs}) > 1 and len({data for data, _ in pairs}) == len(pairs)
 
 
-def _picture(
+def _draw_comparison(
     compared: Sequence[Mapping[str, Any]], rows: Sequence[Mapping[str, Any]], by: Sequence[str], folder: Path
 ) -> list[Path]:
-    """Draw the first column with a known direction against run time, and return the file; none if a row lacks it.
+    """Draw the first column with a known direction against run time, and return the file; [] if a row lacks a number.
 
     Args:
-        compared: Means of the `rows`, one for each combination of values of the keys `by`.
+        compared: Means of the `rows`, one row for each combination of values of the keys `by`.
         rows: Results of the jobs.
-        by: Keys of method and data, and the keys that were varied.
+        by: "method", "data" and the keys that were varied.
         folder: Folder of the sweep.
     """
     from framework.figures.style import save_figure
@@ -332,25 +341,27 @@ def _picture(
     if key is None or not all(key in row for row in compared) or not all("device" in row for row in rows):
         return []
     method, data, *varied = by
-    said = [
+    names = [
         [row[method], *(f"{name.rpartition('.')[2]}={row[name]}" for name in varied if row[name] is not None)]
         for row in compared
     ]
     several = len({row[data] for row in compared}) > 1
-    about = f"{len({row[data] for row in compared})} data sets" if several else compared[0][data]
+    data_title = f"{len({row[data] for row in compared})} data sets" if several else compared[0][data]
     figure = error_against_run_time(
-        [{**row, "method": ", ".join(words)} for row, words in zip(compared, said, strict=True)],
+        [{**row, "method": ", ".join(words)} for row, words in zip(compared, names, strict=True)],
         {key: headings[key]},
         better,
-        title=f"{about}: {headings[key]} against run time",
+        title=f"{data_title}: {headings[key]} against run time",
         synthetic=any(row.get("synthetic") for row in compared),
         machine="; ".join(dict.fromkeys(machine(row["device"], row["threads"]) for row in rows)),
         group=data if several else None,
     )
     stored = stored_config(Path(rows[0]["folder"]))
-    wanted = stored.get("pictures", True) if isinstance(stored, dict) else True
+    pictures = stored.get("pictures", True) if isinstance(stored, dict) else True
     return [
-        save_figure(figure, folder / "comparison", wanted if wanted in ("png", "pdf", "svg", False) else True)
+        save_figure(
+            figure, folder / "comparison", pictures if pictures in ("png", "pdf", "svg", False) else True
+        )
     ]
 
 
@@ -361,19 +372,19 @@ def _parent(
     return MlflowTracker(
         folder,
         Destination(store_of(config), experiment, f"sweep {folder.name}", run_id=run_id),
-        opening_patience=30.0,  # the jobs need its id
+        opening_patience=30.0,  # the jobs need the run's id
         open_store=mlflow_store(),  # this process also sends the journals of the jobs
     )
 
 
-def _close_parent(folder: Path, files: Sequence[Path], said: str, config: Mapping[str, Any]) -> None:
+def _close_parent(folder: Path, files: Sequence[Path], summary: str, config: Mapping[str, Any]) -> None:
     begun = read_run_info(folder)  # written by `begin` of this command
     if (config.get("logger") or {}).get("name") != "mlflow" or begun is None:
         return
     tracker = _parent(folder, config, begun, begun.experiment)
     tracker.open()
-    if said:  # a text, because metrics of the parent would give charts without a point of any job
-        tracker.set_tags({DESCRIPTION: f"A sweep in `{folder}`: {said}"[:LONGEST_DESCRIPTION]})
+    if summary:  # a text, because a metric of the parent run would be drawn in charts as if it were a job's
+        tracker.set_tags({DESCRIPTION: f"A sweep in `{folder}`: {summary}"[:LONGEST_DESCRIPTION]})
     for file in files:
         tracker.log_artifact(file)
     failed = [job for job in find_job_folders(folder) if _status(job) != "completed"]

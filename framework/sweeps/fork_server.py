@@ -1,4 +1,4 @@
-"""Server process that runs the jobs of a sweep as forks, so that the imports, which take seconds, happen only once.
+"""Server process that runs the jobs of a sweep as forks, so that slow imports happen only once.
 
 Its arguments are the descriptor of a socket, the modules to import, and the target to run: `-m` and a module, or a
 file. A packet on the socket describes a job as JSON (its arguments and its own environment variables), and carries the
@@ -29,7 +29,7 @@ PATIENCE = 0.02
 
 
 @dataclass(frozen=True)
-class Given:
+class ForkJob:
     """Job that a fork runs: its arguments, environment variables, and descriptors of its console and lock."""
 
     arguments: list[str]
@@ -38,16 +38,16 @@ class Given:
     lock: int
 
 
-def serve(channel: socket.socket) -> Given | None:
-    """Fork a process for each requested job; return the job in a fork, and None in the server after the last one."""
+def serve(channel: socket.socket) -> ForkJob | None:
+    """Fork a process for each requested job. Return the job in the fork, and None in the server after the last job."""
     running = set[int]()
     while True:
         if select.select([channel], [], [], PATIENCE if running else None)[0]:
             packet, descriptors, *_ = socket.recv_fds(channel, LARGEST, 2)
             if not packet:
                 return None
-            asked: dict[str, Any] = json.loads(packet)
-            job = Given(asked["arguments"], asked["environment"], *descriptors)
+            request: dict[str, Any] = json.loads(packet)
+            job = ForkJob(request["arguments"], request["environment"], *descriptors)
             end_with_server = end_with_parent()
             pid = os.fork()
             if pid == 0:
@@ -59,17 +59,17 @@ def serve(channel: socket.socket) -> Given | None:
             for descriptor in descriptors:
                 os.close(descriptor)
             running.add(pid)
-            _tell(channel, {"started": pid})
+            _send(channel, {"started": pid})
         for pid in sorted(running):
             ended, status, usage = os.wait4(pid, os.WNOHANG)
             if ended:
                 running.remove(pid)
                 seconds = usage.ru_utime + usage.ru_stime
-                _tell(channel, {"ended": pid, "code": os.waitstatus_to_exitcode(status), "seconds": seconds})
+                _send(channel, {"ended": pid, "code": os.waitstatus_to_exitcode(status), "seconds": seconds})
 
 
-def _become(job: Given) -> None:
-    """Give a fork the streams, environment, arguments and random seed that a separate process would have."""
+def _become(job: ForkJob) -> None:
+    """Set the fork's streams, environment, arguments and random seed to those of a separate process."""
     for number, descriptor in enumerate((os.open(os.devnull, os.O_RDONLY), job.console, job.console)):
         os.dup2(descriptor, number)
     os.close(job.console)
@@ -81,15 +81,15 @@ def _become(job: Given) -> None:
         sys.modules["numpy"].random.seed()
 
 
-def _tell(channel: socket.socket, answer: dict[str, Any]) -> None:
-    with suppress(OSError):  # the other side has closed the socket, which the next packet shows
-        channel.send(json.dumps(answer).encode())
+def _send(channel: socket.socket, message: dict[str, Any]) -> None:
+    with suppress(OSError):  # the other side has closed the socket, which `serve` notices
+        channel.send(json.dumps(message).encode())
 
 
 def main(descriptor: str, modules: str, *target: str) -> None:
-    """Import the modules, serve requests, and run the target in each fork as Python would."""
+    """Import the modules, fork the requested jobs, and run the target in each fork as Python would."""
     channel = socket.socket(fileno=int(descriptor))
-    _tell(channel, {"ready": os.getpid()})
+    _send(channel, {"ready": os.getpid()})
     for name in filter(None, modules.split(",")):
         with suppress(Exception):  # the job itself will report the error
             import_module(name)

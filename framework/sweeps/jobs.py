@@ -1,4 +1,4 @@
-"""Running of a sweep on one machine: one process and one record per job, several at a time; a sweep can be resumed."""
+"""Running of a sweep on one machine, with a process and a record per job, several at a time; a sweep can be resumed."""
 
 import fcntl
 import hashlib
@@ -23,11 +23,11 @@ from framework.storage.files import lacks_locks, warn_unlocked, write_whole
 from framework.storage.names import as_bytes
 from framework.storage.plain_values import plain_numbers
 from framework.storage.reading import translate_errors
-from framework.sweeps.processes import Fresh, Process, Starter
+from framework.sweeps.processes import Process, SeparateProcess, Starter
 from framework.tracking.signals import ENDING, SIGNALS, Stopped, ends_with_parent, handled_signals
 
 COMMAND: Sequence[str] = (sys.executable, "-P", "-m", "framework")
-"""Command of one job, to which its overrides are added. No config can set it, because a config must not run code."""
+"""Command of a job, to which its overrides are added. It is no setting, because a config must not run code."""
 CONSOLE = "console.log"
 LONGEST_VALUE = 4096
 """Largest size, in bytes, of the file with the value that a job returned."""
@@ -39,7 +39,7 @@ log = logging.getLogger(__name__)
 class Job:
     """One job of a sweep.
 
-    The record of a job, job.json, holds number, overrides, key and config as below. It also holds command, pid, tries,
+    The record of a job, job.json, has number, overrides, key and config as below. It also has command, pid, tries,
     started and ended (seconds since 1970, of the last try), processor_seconds, error and status. The processor time
     covers all tries, threads and processes of the job; it is null if the sweep was killed during one of the tries. The
     status is "queued", "running", "completed", "failed" (the job exited with an error) or "died" (it was killed, or
@@ -53,8 +53,8 @@ class Job:
         key: Hash of the overrides, which identifies the job in the sweep.
         config: Hash of the whole composed config, by which a completed job is recognised as up to date.
         attempts: Number of times that this process has started the job.
-        waits: Whether a process of another sweep was seen in its folder.
-        unlocked: Whether its folder is on a file system without locks.
+        waits: Whether a process of another sweep was found in the folder.
+        unlocked: Whether the folder is on a file system without locks.
         record: Content of job.json.
     """
 
@@ -76,17 +76,17 @@ class Job:
 
     @property
     def identity(self) -> dict[str, Any]:
-        """Return the part of the record that never changes."""
+        """Return the entries of the record that never change."""
         return {"key": self.key, "number": self.number, "overrides": self.overrides}
 
     def reread(self) -> bool:
-        """Read the record from disk, where another sweep may have changed it; return False if it is another job's."""
-        found = read_record(self.folder)
-        if found.get("key") == self.key:
-            self.record = found
+        """Read the record, which another sweep may have changed; return False if it now belongs to another job."""
+        record = read_record(self.folder)
+        if record.get("key") == self.key:
+            self.record = record
             return True
-        told = " ".join(map(str, found.get("overrides", ())))
-        error = f"its folder now is that of the job {told!r}; the same sweep again gives it one of its own"
+        overrides = " ".join(map(str, record.get("overrides", ())))
+        error = f"its folder now belongs to the job {overrides!r}; repeat the sweep, and the job gets a new folder"
         self.record = {**self.identity, "status": "failed", "error": error}
         return False
 
@@ -98,45 +98,45 @@ class Job:
     def value(self) -> float | None:
         """Return the value that the job left for the sweeper to minimise (`leave_value`), or None."""
         path = self.folder / VALUE
-        with translate_errors(path, "a number", "Delete it, and the job runs anew."):
+        with translate_errors(path, "a number", "Delete the file, and the job runs again."):
             return (
                 float(plain_numbers(json.loads(read_plain(path, LONGEST_VALUE)))) if path.is_file() else None
             )
 
 
-def hashed(*parts: str) -> str:
-    """Return a short hash (16 hex digits) of texts."""
+def short_hash(*parts: str) -> str:
+    """Return a hash of texts, 16 hexadecimal digits."""
     return hashlib.sha256(as_bytes("\0".join(parts))).hexdigest()[:16]
 
 
-def records(folder: Path) -> dict[str, list[tuple[Path, dict[str, Any]]]]:
-    """Return folder and record of every job of earlier sweeps in `folder`, by key; a key may have several jobs."""
-    found: dict[str, list[tuple[Path, dict[str, Any]]]] = {}
+def find_records(folder: Path) -> dict[str, list[tuple[Path, dict[str, Any]]]]:
+    """Find folder and record of every job of earlier sweeps in `folder`, by key; a key may have several jobs."""
+    records_by_key: dict[str, list[tuple[Path, dict[str, Any]]]] = {}
     for path in find_job_folders(folder):
         record = read_record(path)
-        found.setdefault(str(record.get("key")), []).append((path, record))
-    return found
+        records_by_key.setdefault(str(record.get("key")), []).append((path, record))
+    return records_by_key
 
 
-def free_number(subfolder: Callable[[int], Path], number: int, taken: set[Path]) -> int:
+def free_number(subfolder: Callable[[int], Path], number: int, used: set[Path]) -> int:
     """Return the first number, from `number` on, whose folder belongs to no other job.
 
     Raises:
         ConfigError: `hydra.sweep.subdir` gives two jobs the same folder.
     """
-    for candidate in range(number, number + len(taken) + 1):
-        if subfolder(candidate) not in taken:
+    for candidate in range(number, number + len(used) + 1):
+        if subfolder(candidate) not in used:
             return candidate
     raise ConfigError(
-        f"hydra.sweep.subdir gives two jobs the folder {subfolder(number)}: wanted one for each. "
+        f"hydra.sweep.subdir gives two jobs the folder {subfolder(number)}, but each job needs its own. "
         "Use the default, ${hydra.job.num}."
     )
 
 
 def reserve(jobs: Sequence[Job]) -> None:
-    """Write a record for each job that has none, so that no other sweep in this folder takes its folder.
+    """Write a record for each job that has none, so that no other sweep uses the job's folder.
 
-    The caller must hold the lock of the sweep's folder since before the numbers were chosen.
+    The caller must have acquired the lock of the sweep's folder before it chose the jobs' numbers.
     """
     for job in jobs:
         if not job.record:
@@ -156,10 +156,10 @@ def run(
     retries: int = 0,
     devices: Sequence[str] = (),
     parent: str | None = None,
-    starter: Starter = Fresh,
+    starter: Starter = SeparateProcess,
     store: str | None = None,
 ) -> None:
-    """Run every job that has not completed, and return when all have ended, in whatever way.
+    """Run every job that has not completed, and return when all have ended, successfully or not.
 
     SIGINT, SIGTERM and SIGHUP are passed on to the jobs, which close their runs. A second signal stops the jobs
     immediately, and a third kills them.
@@ -185,7 +185,7 @@ def run(
                 job.update(**job.identity, status="queued", error=None)
             os.close(lock)
     log.info(
-        f"{len(jobs)} jobs, {len(jobs) - len(queue)} of them completed earlier; {at_once} at once with "
+        f"{len(jobs)} jobs, {len(jobs) - len(queue)} of them already completed; {at_once} at a time with "
         f"{max(1, cores() // at_once)} cores each"
     )
     running: list[_Running] = []
@@ -199,8 +199,8 @@ def run(
             if orphaned_at is None and os.getppid() != started_by and ends_with_parent():
                 orphaned_at = time.monotonic()
             if orphaned_at is not None and time.monotonic() - orphaned_at > ENDING:
-                for one in running:
-                    one.process.kill()
+                for active in running:
+                    active.process.kill()
             for _ in range(len(queue)):
                 if received or len(running) == at_once:
                     break
@@ -209,34 +209,34 @@ def run(
                 if lock is None:
                     queue.append(job)
                     continue
-                # another sweep may have run the job while this one waited for the folder
+                # Another sweep may have run the job while this one waited for the folder.
                 if not job.reread() or job.completed:
                     os.close(lock)
                 else:
-                    slot = min(set(range(at_once)) - {one.slot for one in running})
+                    slot = min(set(range(at_once)) - {active.slot for active in running})
                     running.append(
                         _start(job, slot, lock, _environment(at_once, slot, devices, parent), starter)
                     )
-            for one in list(running):
-                code = one.process.poll()
-                if one.job.record["pid"] != one.process.pid:
-                    one.job.update(pid=one.process.pid)
+            for active in list(running):
+                code = active.process.poll()
+                if active.job.record["pid"] != active.process.pid:
+                    active.job.update(pid=active.process.pid)
                 if code is None:
                     continue
-                running.remove(one)
-                _end(one, code)
+                running.remove(active)
+                _end(active, code)
                 if parent is not None:
-                    sending.submit(_sync, one.job.folder, store)
-                if one.job.record["status"] == "died" and one.job.attempts <= retries and not received:
-                    queue.append(one.job)
+                    sending.submit(_sync, active.job.folder, store)
+                if active.job.record["status"] == "died" and active.job.attempts <= retries and not received:
+                    queue.append(active.job)
             time.sleep(0.05)
     if received:
         raise Stopped(received[0])
 
 
 def _sync(folder: Path, store: str | None) -> None:
-    """Send the journal lines that a job has not sent; a job that died is closed and sent by the comparison."""
-    from framework.tracking.ended import sync  # Hydra imports this module at every start
+    """Send the journal lines that a job has not sent; `comparison` closes and sends jobs that died."""
+    from framework.tracking.ended import sync  # imported late: Hydra imports this module at every start
 
     try:
         sync(folder, store)
@@ -255,7 +255,7 @@ def failure(jobs: Sequence[Job]) -> UserError | None:
     ]
     return UserError(
         f"{len(bad)} of {len(jobs)} jobs did not complete:\n" + "\n".join(lines) + "\n"
-        "The same command with hydra.sweep.dir=<folder of this sweep> runs these alone."
+        "To run only these jobs again, repeat the command with hydra.sweep.dir=<folder of this sweep>."
     )
 
 
@@ -268,10 +268,10 @@ class _Running:
 
 
 def _environment(at_once: int, slot: int, devices: Sequence[str], parent: str | None) -> dict[str, str]:
-    # The cores are divided by `at_once` and not by the number of jobs: another number of threads may add numbers in
-    # another order, and a resumed job must give the same bits as an uninterrupted one.
+    # The cores are divided by `at_once`, not by the number of jobs, because results depend on the number of threads in
+    # the last bits, and a resumed job must give the same bits as an uninterrupted one.
     environment = {"OMP_NUM_THREADS": str(max(1, cores() // at_once)), **os.environ}
-    # Printed text must reach the file even if the process is killed.
+    # Printed text must be written to the file even if the process is killed.
     environment |= {"PYTHONUNBUFFERED": "1", "PYTHONFAULTHANDLER": "1"}
     if devices:
         environment["CUDA_VISIBLE_DEVICES"] = devices[slot % len(devices)]
@@ -280,8 +280,8 @@ def _environment(at_once: int, slot: int, devices: Sequence[str], parent: str | 
     return environment
 
 
-def _spent(record: Mapping[str, Any], config: str) -> float | None:
-    """Return the processor seconds of the tries that this one continues; None if the end of one was not observed."""
+def _earlier_seconds(record: Mapping[str, Any], config: str) -> float | None:
+    """Return the processor seconds of the earlier tries of a job; None if the end of one was not observed."""
     if record.get("config") != config:
         return 0.0
     return None if record.get("ended") is None else record.get("processor_seconds")
@@ -294,7 +294,7 @@ def _start(job: Job, slot: int, lock: int, environment: Mapping[str, str], start
         **job.identity,
         status="running",
         tries=job.record.get("tries", 0) + 1,
-        processor_seconds=_spent(job.record, job.config),
+        processor_seconds=_earlier_seconds(job.record, job.config),
         config=job.config,
         command=[*COMMAND, *job.arguments],
         started=time.time(),
@@ -308,12 +308,12 @@ def _start(job: Job, slot: int, lock: int, environment: Mapping[str, str], start
     return _Running(job, process, slot, lock)
 
 
-def _end(one: _Running, code: int) -> None:
+def _end(active: _Running, code: int) -> None:
     """Record the way in which a job ended."""
-    job = one.job
-    one.process.kill()  # ends processes that a killed job left behind, such as data loaders and other ranks
-    if one.process.seconds is None:
-        status, error = "died", "nobody saw how it ended, since the process that it was a fork of died"
+    job = active.job
+    active.process.kill()  # processes that a killed job left behind, such as data loaders and other ranks
+    if active.process.seconds is None:
+        status, error = "died", "its exit code is not known, because its parent process died"
     elif code == 0:
         status, error = "completed", None
     elif code < 0:
@@ -325,10 +325,10 @@ def _end(one: _Running, code: int) -> None:
     else:
         status, error = "failed", f"{_last_line(job.folder / CONSOLE)} (exit code {code})"
     before = job.record["processor_seconds"]
-    seconds = one.process.seconds
-    spent = None if before is None or seconds is None else before + seconds
-    job.update(status=status, error=error, ended=time.time(), processor_seconds=spent)
-    os.close(one.lock)
+    seconds = active.process.seconds
+    processor_seconds = None if before is None or seconds is None else before + seconds
+    job.update(status=status, error=error, ended=time.time(), processor_seconds=processor_seconds)
+    os.close(active.lock)
     log.info(
         f"#{job.number} {status} after {job.record['ended'] - job.record['started']:.1f} s"
         + (f": {error} ({job.folder / CONSOLE})" if error else "")
@@ -344,17 +344,17 @@ def _last_line(console: Path) -> str:
 
 
 def _pass_on(number: int, before: int, running: Sequence[_Running]) -> None:
-    for one in running:
+    for active in running:
         if before < 2:
-            one.process.send(number if before == 0 else signal.SIGTERM)
+            active.process.send(number if before == 0 else signal.SIGTERM)
         else:
-            one.process.kill()
-    log.info(f"{signal.Signals(number).name}: {len(running)} running jobs are told to stop")
+            active.process.kill()
+    log.info(f"{signal.Signals(number).name}: {len(running)} running jobs are asked to stop")
 
 
 @contextmanager
 def _signals() -> Iterator[list[int]]:
-    """Handle signals during the block, and yield the growing list of the received signal numbers."""
+    """Handle signals inside the `with` block, and yield the list of signal numbers, which grows as signals arrive."""
     received: list[int] = []
     numbers = handled_signals()
     before = [signal.signal(number, lambda number, frame: received.append(number)) for number in numbers]
@@ -366,10 +366,10 @@ def _signals() -> Iterator[list[int]]:
 
 
 def _lock(job: Job) -> int | None:
-    """Return a descriptor that locks the job's folder; None if a process of another sweep holds the lock.
+    """Lock the job's folder and return the lock's descriptor; None if a process of another sweep holds the lock.
 
-    A file system without `flock` gets a POSIX record lock, which lasts as long as this process. On a file system
-    without either, a warning is logged.
+    On a file system without `flock` a POSIX record lock is used, which lasts as long as this process. On a file system
+    without both, a warning is logged.
     """
     path = job.folder / ".lock"
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
@@ -381,16 +381,16 @@ def _lock(job: Job) -> int | None:
                 raise
             try:
                 fcntl.lockf(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError as none:
-                if not lacks_locks(none):
+            except OSError as record_error:
+                if not lacks_locks(record_error):
                     raise
                 if not job.attempts and not job.unlocked:
-                    warn_unlocked(path, none)
+                    warn_unlocked(path, record_error)
                 job.unlocked = True
     except (BlockingIOError, PermissionError):
         os.close(descriptor)
         if not job.waits:
-            log.info(f"#{job.number} waits: a process of another sweep is still in {job.folder}")
+            log.info(f"#{job.number} waits, because a process of another sweep still uses {job.folder}")
         job.waits = True
         return None
     return descriptor

@@ -1,4 +1,4 @@
-"""Processes of the jobs of a sweep: a separate one for each, or forks of one that has already imported the modules."""
+"""Processes of a sweep's jobs: separate processes, or forks of a process that has already imported the modules."""
 
 import ctypes
 import json
@@ -18,24 +18,24 @@ from framework.tracking.signals import end_with_parent
 LARGEST = 2**17
 """Largest size, in bytes, of a packet that describes a job."""
 PATIENCE = 60.0
-"""Seconds that the start of a process may take, without its imports."""
+"""Seconds that the start of a process may take, not counting imports."""
 _SERVER = "framework.sweeps.fork_server"
 _SET_CHILD_SUBREAPER = 36  # constant of prctl.h
 
 
 @runtime_checkable
 class Process(Protocol):
-    """Contract of a job that runs or has run.
+    """Protocol of a job's process.
 
     Attributes:
-        seconds: Processor time of all its processes after it has ended; None if its end was not observed.
+        seconds: Processor time of all processes of the job; None before its end, and if the end was not observed.
     """
 
     seconds: float | None
 
     @property
     def pid(self) -> int | None:
-        """Return the id of the first process of its session; None before it is known."""
+        """Return the id of the job's first process; None before it is known."""
         ...
 
     def poll(self) -> int | None:
@@ -46,23 +46,23 @@ class Process(Protocol):
         ...
 
     def send(self, number: int) -> None:
-        """Send a signal to the job's first process, which informs the others."""
+        """Send a signal to the job's first process, which informs the job's other processes."""
         ...
 
     def kill(self) -> None:
-        """Kill all processes of its session."""
+        """Kill all processes of the job's session."""
         ...
 
 
 Starter = Callable[[Sequence[str], Mapping[str, str], int, int], Process]
 """Type of a function that starts a job.
 
-Its arguments are a Python command, the whole environment, the descriptor of the output file, and the descriptor of a
-lock that is held until the last process of the job has ended.
+Its arguments are a Python command, all environment variables, the descriptor of the output file, and the descriptor of
+a lock that is held until the last process of the job has ended.
 """
 
 
-class Fresh:
+class SeparateProcess:
     """Job in a separate process."""
 
     def __init__(
@@ -75,17 +75,17 @@ class Fresh:
             stderr=subprocess.STDOUT,
             env=environment,
             pass_fds=(lock,),
-            start_new_session=True,  # Ctrl-C reaches the sweep only, which passes it on once to each job
+            start_new_session=True,  # Ctrl-C signals only the sweep, which passes the signal on to each job
             preexec_fn=end_with_parent(),
         )
         self.pid = self._process.pid
         self.seconds: float | None = None
 
     def poll(self) -> int | None:
-        before = _of_children()
+        before = _children_seconds()
         code = self._process.poll()
         if self.seconds is None and code is not None:
-            self.seconds = _of_children() - before
+            self.seconds = _children_seconds() - before
         return code
 
     def send(self, number: int) -> None:
@@ -100,9 +100,9 @@ class Fresh:
 class Forks:
     """Starter of jobs as forks of one server process (`fork_server`), which is started with the first job; Linux only.
 
-    A job has everything that a separate process would have, but the modules are already imported. If the server dies,
-    its running jobs are told to end. Later jobs get another server, or separate processes if the first server had not
-    forked any job. Jobs that the dead server had not started yet get separate processes.
+    A fork differs from a separate process only in that the modules are already imported. If the server dies, its
+    running jobs receive a signal to end. Jobs that the server had not started yet get separate processes. Later jobs
+    get another server, or separate processes if the first server had not forked any job.
 
     Args:
         modules: Modules that the server imports.
@@ -111,27 +111,27 @@ class Forks:
     def __init__(self, modules: Sequence[str] = ()) -> None:
         self._modules = modules
         self._server: _Server | None = None
-        self._useless = False
+        self._forking_failed = False
 
     def __call__(
         self, command: Sequence[str], environment: Mapping[str, str], console: int, lock: int
     ) -> Process:
         if self._server is not None and not self._server.alive:
-            self._useless = not self._server.forked
+            self._forking_failed = not self._server.forked
             self.close()
-        if self._useless:
-            return Fresh(command, environment, console, lock)
+        if self._forking_failed:
+            return SeparateProcess(command, environment, console, lock)
         try:
             if self._server is None:
                 self._server = _Server(command, self._modules, environment)
             return self._server.fork(command, environment, console, lock)
         except OSError:
-            # the server did not start, the command exceeds a packet, or too many descriptors are open
-            self._useless = self._server is None
-            return Fresh(command, environment, console, lock)
+            # The server did not start, the command exceeds a packet, or too many descriptors are open.
+            self._forking_failed = self._server is None
+            return SeparateProcess(command, environment, console, lock)
 
     def close(self) -> None:
-        """End the server process; jobs that still run as its forks are told to end."""
+        """End the server process; jobs that still run as its forks receive a signal to end."""
         if self._server is not None:
             self._server.close()
         self._server = None
@@ -144,12 +144,19 @@ class _Server:
         self, command: Sequence[str], modules: Sequence[str], environment: Mapping[str, str]
     ) -> None:
         _adopt_orphans()
-        target = _target(command)
+        target = _target_index(command)
         self._environment = dict(environment)
         self._channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs:
             self._process = subprocess.Popen(
-                [*command[:target], "-m", _SERVER, str(theirs.fileno()), ",".join(modules), *_run(command)],
+                [
+                    *command[:target],
+                    "-m",
+                    _SERVER,
+                    str(theirs.fileno()),
+                    ",".join(modules),
+                    *_run_target(command),
+                ],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 env=environment,
@@ -160,14 +167,14 @@ class _Server:
         self._channel.settimeout(PATIENCE)
         try:
             if not self._channel.recv(LARGEST):
-                raise OSError("it ended")
+                raise OSError("the server process ended at its start")
         except OSError:
             self.close()
             raise
         self._channel.settimeout(None)
         self.alive = True
         self.forked = False
-        self._asked = deque["_Fork"]()
+        self._requested = deque["_Fork"]()
         self._running: dict[int, _Fork] = {}
 
     def fork(
@@ -175,23 +182,23 @@ class _Server:
     ) -> "_Fork":
         """Request a fork for a job; raises OSError if the job does not fit into a packet."""
         own = {key: value for key, value in environment.items() if self._environment.get(key) != value}
-        arguments = command[_target(command) + len(_run(command)) :]
+        arguments = command[_target_index(command) + len(_run_target(command)) :]
         packet = json.dumps({"arguments": arguments, "environment": own}).encode()
         if len(packet) > LARGEST:
-            raise OSError("a packet is smaller")
+            raise OSError("the description of the job exceeds a packet")
         socket.send_fds(self._channel, [packet], [console, lock])
         path = Path(f"/proc/self/fd/{console}").readlink()  # the caller closes the descriptor soon
 
         def fresh() -> Process:
-            with path.open("ab") as again:
-                return Fresh(command, environment, again.fileno(), lock)
+            with path.open("ab") as reopened:
+                return SeparateProcess(command, environment, reopened.fileno(), lock)
 
         job = _Fork(self, fresh)
-        self._asked.append(job)
+        self._requested.append(job)
         return job
 
     def listen(self) -> None:
-        """Read the answers that the server has sent, and pass them to the jobs."""
+        """Read the messages that the server has sent, and pass them to the jobs."""
         while self.alive:
             try:
                 packet = self._channel.recv(LARGEST, socket.MSG_DONTWAIT)
@@ -203,13 +210,13 @@ class _Server:
                 self.alive = False
                 self.close()  # after the server has ended, its jobs are children of this process
                 return
-            answer: dict[str, Any] = json.loads(packet)
-            if "started" in answer:
+            message: dict[str, Any] = json.loads(packet)
+            if "started" in message:
                 self.forked = True
-                self._running[answer["started"]] = self._asked.popleft()
-                self._running[answer["started"]].begin(answer["started"])
+                self._running[message["started"]] = self._requested.popleft()
+                self._running[message["started"]].begin(message["started"])
             else:
-                self._running.pop(answer["ended"]).end(answer["code"], answer["seconds"])
+                self._running.pop(message["ended"]).end(message["code"], message["seconds"])
 
     def close(self) -> None:
         """Close the socket and kill the server."""
@@ -219,25 +226,25 @@ class _Server:
 
 
 class _Fork:
-    """Job that a server was asked to fork; it gets a separate process if the server dies before the fork."""
+    """Job for which a fork was requested; it gets a separate process if the server dies before the fork."""
 
     def __init__(self, server: _Server, fresh: Callable[[], Process]) -> None:
         self._server = server
         self._fresh = fresh
         self._process: Process | None = None
         self._code: int | None = None
-        self._early: list[int] = []
+        self._early_signals: list[int] = []
         self.pid: int | None = None
         self.seconds: float | None = None
 
     def begin(self, pid: int) -> None:
-        """Note that the job was started, and send it the signals that came before."""
+        """Record that the job was started, and send it the signals that were received before."""
         self.pid = pid
-        for number in self._early:
+        for number in self._early_signals:
             self.send(number)
 
     def end(self, code: int, seconds: float) -> None:
-        """Note the exit code and the processor time of the job."""
+        """Record the exit code and the processor time of the job."""
         self._code, self.seconds = code, seconds
 
     def poll(self) -> int | None:
@@ -247,8 +254,8 @@ class _Fork:
         if self._process is not None:
             self._code, self.seconds = self._process.poll(), self._process.seconds
         elif not self._server.alive and self.pid is None:
-            if self._early:
-                self.end(-self._early[0], 0.0)
+            if self._early_signals:
+                self.end(-self._early_signals[0], 0.0)
             else:
                 self._process = self._fresh()
                 self.pid = self._process.pid
@@ -265,7 +272,7 @@ class _Fork:
     def send(self, number: int) -> None:
         self._server.listen()
         if self.pid is None:
-            self._early.append(number)  # the server is still importing
+            self._early_signals.append(number)  # the server is still importing
         elif self._code is None:
             with suppress(ProcessLookupError):
                 os.kill(self.pid, number)
@@ -281,22 +288,22 @@ class _Fork:
 
 
 def _adopt_orphans() -> None:
-    """Make this process the parent of the children of a dead child (Linux), so that it observes their ends."""
+    """Make this process the parent of a dead child's children (Linux), so that it observes their end."""
     ctypes.CDLL(None).prctl(_SET_CHILD_SUBREAPER, 1)
 
 
-def _target(command: Sequence[str]) -> int:
-    """Return the index at which the options of Python end in a Python command."""
+def _target_index(command: Sequence[str]) -> int:
+    """Return the index of the target in a Python command, which follows the interpreter's options."""
     return next(index for index, word in enumerate(command) if index and (word == "-m" or word[0] != "-"))
 
 
-def _run(command: Sequence[str]) -> Sequence[str]:
+def _run_target(command: Sequence[str]) -> Sequence[str]:
     """Return the target of a Python command: `-m` and a module, or a file."""
-    start = _target(command)
+    start = _target_index(command)
     return command[start : start + (2 if command[start] == "-m" else 1)]
 
 
-def _of_children() -> float:
+def _children_seconds() -> float:
     """Return the processor seconds of all ended child processes and their descendants."""
     usage = resource.getrusage(resource.RUSAGE_CHILDREN)
     return usage.ru_utime + usage.ru_stime

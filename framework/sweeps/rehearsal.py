@@ -1,4 +1,4 @@
-"""Check of all jobs of a sweep before any of them runs, in a separate process that may import torch."""
+"""Check of all jobs of a sweep before the first one runs, in a separate process that may import torch."""
 
 import json
 import signal
@@ -31,13 +31,13 @@ def refuse_mistakes(jobs: Sequence[tuple[Sequence[str], Mapping[str, Any]]]) -> 
     ]
     for overrides, values in training:
         try:
-            Config.of(values, Path(), overrides)  # this part needs no separate process
+            Config.of(values, Path(), overrides)  # this check needs no separate process
             require_read("train", overrides)
         except UserError as error:
-            raise ConfigError(_told(overrides, str(error))) from error
+            raise ConfigError(_name_job(overrides, str(error))) from error
     if not training:
         return
-    done = subprocess.run(
+    result = subprocess.run(
         COMMAND,
         input=json.dumps(training),
         capture_output=True,
@@ -45,26 +45,26 @@ def refuse_mistakes(jobs: Sequence[tuple[Sequence[str], Mapping[str, Any]]]) -> 
         check=False,
         preexec_fn=end_with_parent(signal.SIGKILL),
     )
-    if done.returncode == 2:
-        raise ConfigError(done.stdout)
+    if result.returncode == 2:
+        raise ConfigError(result.stdout)
     # any other failure is reported by the jobs themselves
 
 
-def _told(overrides: Sequence[str], message: str) -> str:
-    return f"{message} That is the job {' '.join(overrides)}; none of the sweep was run."
+def _name_job(overrides: Sequence[str], message: str) -> str:
+    return f"{message} This is the error of the job {' '.join(overrides)}. No job of the sweep was run."
 
 
 def main() -> None:
-    """Read jobs from standard input; print the first mistake, if any, and then exit with 2."""
-    looked_at: set[str] = set()
+    """Read jobs from standard input, and check them; print the first mistake and exit with code 2."""
+    checked_data: set[str] = set()
     for overrides, values in json.load(sys.stdin):
         try:
             parts = Config.of(values, Path(), overrides).parts
-            if repr(parts["data"]) not in looked_at:
-                looked_at.add(repr(parts["data"]))
+            if repr(parts["data"]) not in checked_data:
+                checked_data.add(repr(parts["data"]))
                 build_data(parts).check_files()
         except UserError as error:
-            sys.stdout.write(_told(overrides, str(error)))
+            sys.stdout.write(_name_job(overrides, str(error)))
             sys.exit(2)
 
 

@@ -21,7 +21,7 @@ from framework.errors import ConfigError
 from framework.storage.enclosed import require_enclosed
 from framework.storage.files import hold_lock
 from framework.sweeps import jobs as sweep
-from framework.sweeps.processes import Forks, Fresh, Starter
+from framework.sweeps.processes import Forks, SeparateProcess, Starter
 
 _OF_THE_SWEEP = (
     "hydra/launcher",
@@ -39,11 +39,11 @@ class PoolLauncher(Launcher):
     """Launcher that runs each job of a multirun as its own process, several at once; see `framework.sweeps.jobs`.
 
     Args:
-        jobs: number of jobs that run at once; None for half the cores.
-        retries: how often a job that was killed is started again (it resumes from its checkpoint).
-        devices: CUDA devices to assign, one to each running job, e.g. [0, 1]; None shows all devices to all jobs.
-        fork: whether jobs are forks of one process that has already imported what their modes need, which would take
-            each job seconds; None forks on Linux if there are several jobs. A job is its own process either way.
+        jobs: number of jobs that run at once; None: half the number of cores.
+        retries: number of times that a killed job is started again; it resumes from its checkpoint.
+        devices: CUDA devices to assign, one to each running job, such as [0, 1]; None: every job sees all devices.
+        fork: whether jobs are forks of one process that has already imported the modules of their modes, which saves
+            seconds per job; None: fork on Linux if there are several jobs. Every job has its own process in both cases.
     """
 
     def __init__(
@@ -61,42 +61,40 @@ class PoolLauncher(Launcher):
         self.parent: str | None = None
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
-        """Keep the sweep's configuration, and refuse a sweep folder that is not enclosed."""
+        """Store the sweep's configuration, and raise an error if the sweep's folder is not enclosed."""
         self.loader = hydra_context.config_loader
         self.config = config
         require_enclosed(Path(str(config.hydra.sweep.dir)))  # before Hydra writes multirun.yaml into it
 
     def launch(self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int) -> Sequence[JobReturn]:
-        """Run the jobs and return their results; some sweepers call this once for each batch of jobs."""
-        from framework.sweeps import (
-            comparison,
-            rehearsal,
-        )  # imported late: Hydra imports this module at every start
+        """Run the jobs and return their results; some sweepers call this method once for each batch of jobs."""
+        # imported late: Hydra imports this module at every start
+        from framework.sweeps import comparison, rehearsal
 
         setup_globals()
         hydra = self.config.hydra
         configure_log(hydra.hydra_logging, hydra.verbose)
         folder = Path(str(hydra.sweep.dir)).absolute()
         if not job_overrides:
-            _leave_nothing(folder)
-            swept = [one for one in hydra.overrides.task if one.endswith(")")]
+            _remove_empty_sweep(folder)
+            swept = [override for override in hydra.overrides.task if override.endswith(")")]
             raise ConfigError(
-                f"{' '.join(swept) or 'The sweep'} has no value, so there is no job. Give a range that holds a number, "
-                "or a glob that fits a name."
+                f"{' '.join(swept) or 'The sweep'} has no value, so there is no job. Give a range that contains a "
+                "number, or a glob that matches a name."
             )
         configs = [self.loader.load_sweep_config(self.config, list(overrides)) for overrides in job_overrides]
-        # number the jobs for the rehearsal, which runs before the lock because it takes long and other sweeps wait
+        # Number the jobs for the rehearsal. It runs before the lock is acquired, because it takes long and others wait.
         for index, config in enumerate(configs, initial_job_idx):
-            _place(folder, config, index)
+            _job_folder(folder, config, index)
         try:
-            values = [_plain(config, folder) for config in configs]
+            values = [_plain_values(config, folder) for config in configs]
             rehearsal.refuse_mistakes(list(zip(job_overrides, values, strict=True)))
             folder.mkdir(parents=True, exist_ok=True)
             with hold_lock(folder / _LOCK):  # another sweep may begin in this folder
                 jobs = self._jobs(folder, configs, job_overrides, initial_job_idx)
                 sweep.reserve(jobs)
         except ConfigError:
-            _leave_nothing(folder)
+            _remove_empty_sweep(folder)
             raise
         if not self.launched:
             self.parent = comparison.begin(folder, values[0])
@@ -115,7 +113,7 @@ class PoolLauncher(Launcher):
         finally:
             comparison.summarise(folder, self.launched, values[0])
         failure = sweep.failure(jobs)
-        return [_returned(job, failure) for job in jobs]
+        return [_job_return(job, failure) for job in jobs]
 
     @contextmanager
     def _starter(self, jobs: Sequence[sweep.Job], values: Sequence[Mapping[str, Any]]) -> Iterator[Starter]:
@@ -123,9 +121,9 @@ class PoolLauncher(Launcher):
 
         several = sum(not job.completed for job in jobs) > 1
         if not (several and sys.platform == "linux" if self.fork is None else self.fork):
-            yield Fresh
+            yield SeparateProcess
             return
-        modes = {(one.get("mode") or {}).get("name") for one in values} & set(MODES)
+        modes = {(config.get("mode") or {}).get("name") for config in values} & set(MODES)
         forks = Forks([_COMPOSING, *sorted(f"framework.modes.{name}" for name in modes)])
         try:
             yield forks
@@ -135,72 +133,76 @@ class PoolLauncher(Launcher):
     def _jobs(
         self, folder: Path, configs: Sequence[DictConfig], job_overrides: Sequence[Sequence[str]], first: int
     ) -> list[sweep.Job]:
-        known = sweep.records(folder)
-        taken = {path for earlier in known.values() for path, _ in earlier}
+        known = sweep.find_records(folder)
+        used = {path for earlier in known.values() for path, _ in earlier}
         jobs = []
-        for index, (config, given) in enumerate(zip(configs, job_overrides, strict=True), first):
-            overrides = list(filter_overrides(given))
-            key = sweep.hashed(*sorted(overrides))
+        for index, (config, arguments) in enumerate(zip(configs, job_overrides, strict=True), first):
+            overrides = list(filter_overrides(arguments))
+            key = sweep.short_hash(*sorted(overrides))
             if known.get(key):
                 path, record = known[key].pop(0)
                 number = record["number"]
             else:
-                place = partial(_place, folder, config)
-                number, record = sweep.free_number(place, index, taken), {}
-                path = place(number)
-            taken.add(path)
+                folder_of = partial(_job_folder, folder, config)
+                number, record = sweep.free_number(folder_of, index, used), {}
+                path = folder_of(number)
+            used.add(path)
             jobs.append(
                 sweep.Job(
                     number=number,
                     overrides=overrides,
                     arguments=[
-                        *self._passed_on(),
-                        *given,
+                        *self._shared_arguments(),
+                        *arguments,
                         f"hydra.job.num={number}",
                         f"hydra.run.dir={in_quotes(str(path))}",
                     ],
                     folder=path,
                     key=key,
-                    config=sweep.hashed(OmegaConf.to_yaml(_without_hydra(config))),
+                    config=sweep.short_hash(OmegaConf.to_yaml(_without_hydra(config))),
                     record=record,
                 )
             )
         return jobs
 
-    def _passed_on(self) -> list[str]:
-        """Return the other arguments of the sweep's command line that a job needs to compose the same configuration."""
+    def _shared_arguments(self) -> list[str]:
+        """Return the other arguments of the sweep's command from which a job composes its config."""
         hydra = self.config.hydra
-        given: Any = OmegaConf.to_container(hydra.overrides.hydra, resolve=False)
+        hydra_overrides: Any = OmegaConf.to_container(hydra.overrides.hydra, resolve=False)
         folders = [
             source.path for source in hydra.runtime.config_sources if source.provider == "command-line"
         ]
-        return [  # options first: Hydra takes overrides in one piece only
+        return [  # options first, because Hydra accepts overrides only without options between them
             f"--config-name={hydra.job.config_name}",
             *(f"--config-dir={folder}" for folder in folders),
-            *(override for override in given if not override.startswith(_OF_THE_SWEEP)),
+            *(override for override in hydra_overrides if not override.startswith(_OF_THE_SWEEP)),
             "hydra.mode=RUN",
         ]
 
 
-def _leave_nothing(folder: Path) -> None:
-    """Remove the folder of a sweep that never began, if it holds only the command that Hydra wrote into it."""
-    left = list(folder.glob("*"))
-    if {file.name for file in left} <= {"multirun.yaml", _LOCK}:
-        for file in left:
+def _remove_empty_sweep(folder: Path) -> None:
+    """Remove the folder of a sweep that never began, if it contains only the files of Hydra and of the lock."""
+    files = list(folder.glob("*"))
+    if {file.name for file in files} <= {"multirun.yaml", _LOCK}:
+        for file in files:
             file.unlink()
-        with suppress(OSError):  # another sweep may begin in it
+        with suppress(OSError):  # another sweep may begin in the folder
             folder.rmdir()
 
 
-def _returned(job: sweep.Job, failure: Exception | None) -> JobReturn:
+def _job_return(job: sweep.Job, failure: Exception | None) -> JobReturn:
     status = JobStatus.COMPLETED if job.completed else JobStatus.FAILED
-    found = JobReturn(overrides=job.overrides, working_dir=str(job.folder), status=status)
-    found.return_value = job.value() if job.completed else failure
-    return found
+    job_return = JobReturn(overrides=job.overrides, working_dir=str(job.folder), status=status)
+    job_return.return_value = job.value() if job.completed else failure
+    return job_return
 
 
-def _place(folder: Path, config: DictConfig, number: int) -> Path:
-    with read_write(config), read_write(config.hydra), open_dict(config):  # `_plain` has closed the inner one
+def _job_folder(folder: Path, config: DictConfig, number: int) -> Path:
+    with (
+        read_write(config),
+        read_write(config.hydra),
+        open_dict(config),
+    ):  # `_plain_values` closes the inner config
         config.hydra.job.num = number
         config.hydra.job.id = str(number)
     return folder / str(config.hydra.sweep.subdir)
@@ -210,8 +212,8 @@ def _without_hydra(config: DictConfig) -> DictConfig:
     return OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
 
 
-def _plain(config: DictConfig, folder: Path) -> dict[str, Any]:
-    """Return a job's configuration as plain values, as the job itself will see it except for its folder."""
+def _plain_values(config: DictConfig, folder: Path) -> dict[str, Any]:
+    """Return a job's configuration as plain values; it equals that of the job itself except for its folder."""
     with read_write(config), read_write(config.hydra), open_dict(config):
         config.hydra.runtime.output_dir = str(folder)
     before = HydraConfig.instance().cfg

@@ -26,15 +26,15 @@ log = logging.getLogger(__name__)
 class RandomSearch(Sweeper):
     """Sweeper that draws trials at random, runs and ranks them all, and writes the best as an experiment.
 
-    A draw is a function of (seed, number of the trial, key) alone: more trials, or another parameter, do not change the
-    existing draws. [Bergstra & Bengio, JMLR 13, 2012]
+    A drawn value is a function of (seed, number of the trial, key) only, so more trials or another parameter do not
+    change the values of existing trials. [Bergstra & Bengio, JMLR 13, 2012]
 
     Args:
-        trials: number of different trials; a space that holds fewer is run whole.
+        trials: number of different trials; if the space has fewer points, all of them are run.
         seed: seed of the draws.
-        metric: a key of results.json; None for the value that a job returns, the best validation loss in nats.
-        direction: "minimize" or "maximize"; None for the direction that the metric itself declares.
-        params: sweeps by key, in Hydra's grammar; a sweep on the command line replaces that of its key.
+        metric: a key of results.json; None: the value that a job returns, the best validation loss in nats.
+        direction: "minimize" or "maximize"; None: the direction that the metric declares.
+        params: sweeps by key, in Hydra's grammar; a sweep of the same key on the command line takes precedence.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class RandomSearch(Sweeper):
         self.params = dict(params or {})
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
-        """Keep the configuration, and make the launcher that it chooses."""
+        """Store the configuration, and create the launcher that it chooses."""
         self.hydra_context = hydra_context
         self.config = config
         self.launcher = Plugins.instance().instantiate_launcher(
@@ -63,8 +63,8 @@ class RandomSearch(Sweeper):
         """Draw the trials, run them, rank them, and return their results.
 
         Raises:
-            ConfigError: the search makes no sense; this is raised before anything runs.
-            Exception: the error of a failed job; this is raised after all jobs.
+            ConfigError: a setting or a sweep is invalid; raised before any job runs.
+            Exception: the error of a failed job; raised after all jobs have ended.
         """
         from hydra_plugins.framework_random_search import _draws
 
@@ -73,19 +73,19 @@ class RandomSearch(Sweeper):
         assert self.hydra_context is not None
         self._check()
         parser = OverridesParser.create(config_loader=self.hydra_context.config_loader)
-        given = [*(f"{key}={value}" for key, value in self.params.items()), *arguments]
-        space = _draws.space(parser.parse_overrides(given))
-        drawn, repeated = _draws.draw(space, self.trials, self.seed)
-        log.info(_draws.described(space, len(drawn), self.trials, repeated))
+        overrides = [*(f"{key}={value}" for key, value in self.params.items()), *arguments]
+        space = _draws.parse_space(parser.parse_overrides(overrides))
+        drawn_trials, repeated = _draws.draw(space, self.trials, self.seed)
+        log.info(_draws.describe(space, len(drawn_trials), self.trials, repeated))
         folder = Path(str(self.config.hydra.sweep.dir))
         folder.mkdir(parents=True, exist_ok=True)
         OmegaConf.save(self.config, folder / "multirun.yaml")
-        self.validate_batch_is_legal(drawn)
-        # launch all trials in one batch, so that a launcher that runs several at once is always busy
-        returned = self.launcher.launch(drawn, initial_job_idx=0)
+        self.validate_batch_is_legal(drawn_trials)
+        # All trials are launched in one batch, so that a launcher that runs several at once is always busy.
+        returned = self.launcher.launch(drawn_trials, initial_job_idx=0)
         self._rank(folder, space, returned, self.hydra_context.config_loader)
-        for one in returned:
-            _ = one.return_value  # raises what a job failed with
+        for result in returned:
+            _ = result.return_value  # raises the error of a failed job
         return [returned]
 
     def _check(self) -> None:
@@ -93,11 +93,11 @@ class RandomSearch(Sweeper):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or value < least:
                 raise ConfigError(
-                    f"hydra.sweeper.{name} = {value!r}: wanted a whole number of at least {least}."
+                    f"hydra.sweeper.{name} = {value!r}, but a whole number of at least {least} is required."
                 )
         if self.direction not in (None, *DIRECTIONS):
             raise ConfigError(
-                f"hydra.sweeper.direction = {self.direction!r}: wanted minimize, maximize or null."
+                f"hydra.sweeper.direction = {self.direction!r}, but must be minimize, maximize or null."
                 f"{did_you_mean(str(self.direction), DIRECTIONS)}"
             )
 
@@ -109,26 +109,31 @@ class RandomSearch(Sweeper):
 
         trials = [
             comparison.Trial(
-                folder=_folder(one),
-                overrides=list(one.overrides or ()),
-                value=one.return_value if one.status == JobStatus.COMPLETED else None,
-                completed=one.status == JobStatus.COMPLETED,
+                folder=_folder(result),
+                overrides=list(result.overrides or ()),
+                value=result.return_value if result.status == JobStatus.COMPLETED else None,
+                completed=result.status == JobStatus.COMPLETED,
             )
-            for one in returned
+            for result in returned
         ]
         varied = [key for key, domain in space.items() if domain.size > 1]
         ranking = comparison.rank(folder, trials, varied, self.metric, self.direction)
-        found = "no trial has a finite value"
+        summary = "no trial has a finite value"
         if ranking.best is not None:
-            found = f"{ranking.said}; trial {ranking.best.folder.name} of {len(trials)} (seed {self.seed})"
-            _best.write(folder, ranking.best.overrides, loader, found)
+            summary = (
+                f"{ranking.summary}; trial {ranking.best.folder.name} of {len(trials)} (seed {self.seed})"
+            )
+            _best.write_best(folder, ranking.best.overrides, loader, summary)
         assert self.config is not None
         logger = {"logger": OmegaConf.to_container(self.config.logger)}
-        comparison.close_ranking(folder, f"a random search of {len(trials)} trials; {found}", logger)
+        comparison.close_ranking(folder, f"a random search of {len(trials)} trials; {summary}", logger)
 
 
-def _folder(one: JobReturn) -> Path:
-    """Return a job's folder; if a launcher ran the job in this process, `working_dir` is where it was started."""
-    if one.hydra_cfg is not None:
-        return Path(str(one.hydra_cfg.hydra.runtime.output_dir))
-    return Path(str(one.working_dir))
+def _folder(result: JobReturn) -> Path:
+    """Return a job's folder.
+
+    If a launcher ran the job in this process, `working_dir` is not the job's folder, but the folder of the command.
+    """
+    if result.hydra_cfg is not None:
+        return Path(str(result.hydra_cfg.hydra.runtime.output_dir))
+    return Path(str(result.working_dir))

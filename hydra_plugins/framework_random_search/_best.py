@@ -14,12 +14,12 @@ from rich.console import Console
 from framework.storage.files import write_whole
 
 OF_THE_RUN = ("logger", "mode", "debug", "threads", "workers", "resume")
-"""Keys that say how a trial was run, not what it was; they stay on the command line."""
+"""Keys that do not change the results of a trial; they stay on the command line."""
 
 
-def write(folder: Path, overrides: Sequence[str], loader: ConfigLoader, found: str) -> None:
-    """Write best.yaml into `folder`, and a copy by which `--config-dir=<folder>` finds it as an experiment."""
-    name, content = experiment(overrides, loader, found)
+def write_best(folder: Path, overrides: Sequence[str], loader: ConfigLoader, origin: str) -> None:
+    """Write best.yaml to `folder`, and a copy that Hydra finds as an experiment with `--config-dir=<folder>`."""
+    name, content = build_experiment(overrides, loader, origin)
     path = folder / "best.yaml"
     write_whole(path, content.encode())
     for old in (folder / "experiment").rglob("*.yaml"):  # files of an earlier search in this folder
@@ -37,46 +37,52 @@ def write(folder: Path, overrides: Sequence[str], loader: ConfigLoader, found: s
 
 
 AFTER = ("preset", "debug")
-"""Groups that config.yaml composes after the experiment, which cannot override them but can hold one of them."""
+"""Groups that config.yaml composes after the experiment; an experiment cannot override them, but can include them."""
 
 
-def experiment(overrides: Sequence[str], loader: ConfigLoader, found: str) -> tuple[str, str]:
+def build_experiment(overrides: Sequence[str], loader: ConfigLoader, origin: str) -> tuple[str, str]:
     """Return name and content of an experiment that has the same effect as `overrides`.
 
     Args:
         overrides: overrides of one job, without sweeps.
         loader: Hydra's configuration loader, which knows the config groups.
-        found: a line that says where the experiment comes from.
+        origin: a line that says where the experiment comes from.
     """
     base: str | None = None
     added: list[Any] = []
     chosen: list[Any] = []
     values = OmegaConf.create({})
-    kept: list[str] = []
-    for text, one in zip(overrides, OverridesParser.create().parse_overrides(list(overrides)), strict=True):
-        key, value = one.key_or_group, one.value()
+    remaining: list[str] = []
+    for text, override in zip(
+        overrides, OverridesParser.create().parse_overrides(list(overrides)), strict=True
+    ):
+        key, value = override.key_or_group, override.value()
         if key == "experiment":
             base = None if value is None else str(value)
-        elif key.partition(".")[0] in OF_THE_RUN or _only_on_a_command_line(one):
-            kept.append(text)
+        elif key.partition(".")[0] in OF_THE_RUN or _only_on_a_command_line(override):
+            remaining.append(text)
         elif key in AFTER:
             added.append({f"/{key}@_global_": value})
         elif not isinstance(value, dict) and loader.get_group_options(key, results_filter=None):
-            (added if one.is_add() else chosen).append(
-                {f"{'' if one.is_add() else 'override '}/{key}": value}
+            (added if override.is_add() else chosen).append(
+                {f"{'' if override.is_add() else 'override '}/{key}": value}
             )
         else:
             OmegaConf.update(values, key, value, merge=True, force_add=True)
     name = f"{base}_best" if base else "best"
-    # The base is named as a group with its own package: Hydra would look for the defaults of a plain name beside
-    # it, and would take plain "experiment" for the choice on the command line.
+    # The base is named as a group with its own package. For a plain name, Hydra would look for its defaults in the same
+    # folder, and it would interpret plain "experiment" as the choice on the command line.
     defaults = [*([{"/experiment@_global_": base}] if base else []), *added, *chosen]
     body = OmegaConf.create({"defaults": defaults} if defaults else {})
     body.update(values)
-    command = shlex.join(["python", "-m", "framework", f"experiment={name}", *kept])
-    return name, f"# @package _global_\n# {command}\n# {found}\n{OmegaConf.to_yaml(body)}"
+    command = shlex.join(["python", "-m", "framework", f"experiment={name}", *remaining])
+    return name, f"# @package _global_\n# {command}\n# {origin}\n{OmegaConf.to_yaml(body)}"
 
 
-def _only_on_a_command_line(one: Override) -> bool:
-    """Return whether an experiment file cannot express it: a deletion, a moved package or an item of a list."""
-    return one.is_delete() or one.package is not None or any(map(str.isdigit, one.key_or_group.split(".")))
+def _only_on_a_command_line(override: Override) -> bool:
+    """Return whether an experiment file cannot express an override: a deletion, another package, or a list item."""
+    return (
+        override.is_delete()
+        or override.package is not None
+        or any(map(str.isdigit, override.key_or_group.split(".")))
+    )

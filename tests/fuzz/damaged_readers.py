@@ -87,12 +87,12 @@ def weight(file: Path) -> object:
 def stored(file: Path) -> object:
     """Everything that is done with a stored config before data is read."""
     (file.parent / "overrides.yaml").write_text("- seed=1\n", encoding="utf-8")
-    values, changed = modes._stored(file.parent, {}, [f"resume={file.parent}"])
+    values, changed = modes._read_stored_run(file.parent, {}, [f"resume={file.parent}"])
     return Config.of(values, file.parent, changed).parts
 
 
 def records(file: Path) -> object:
-    return jobs.records(file.parent)
+    return jobs.find_records(file.parent)
 
 
 def value(file: Path) -> object:
