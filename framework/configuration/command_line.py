@@ -106,7 +106,7 @@ def _nearest_setting(key: str) -> str:
 
 
 def _choose_preset(arguments: list[str]) -> list[str]:
-    """Replace `preset=a` by `preset=a/<experiment>` or `preset=a/<data>` if a folder `a` holds such presets.
+    """Replace `preset=a` by `preset=a/<experiment>` or `preset=a/<data>` if a folder `a` contains such presets.
 
     Raises:
         ConfigError: No preset has that name or fits this data, or a sweep over experiments needs several presets.

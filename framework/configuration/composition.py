@@ -154,11 +154,11 @@ def options(group: str) -> list[str]:
 def describe_error(error: BaseException) -> str | None:
     """Return the message for a composition error of Hydra or OmegaConf, with a remedy; None for any other error."""
     if isinstance(error, MissingConfigException):
-        wanted = error.missing_cfg_file or ""
-        group, _, name = wanted.partition("/")
+        config_name = error.missing_cfg_file or ""
+        group, _, name = config_name.partition("/")
         known = [str(option) for option in error.options or ()] or options(group)
         available = f" Available in {group}: {list_names(name, known)}." if known else ""
-        return f"There is no config {wanted!r}.{did_you_mean(name, known)}{available}"
+        return f"There is no config {config_name!r}.{did_you_mean(name, known)}{available}"
     if isinstance(error, ValueError) and "Config group override must be" in str(error):
         return (
             "A group takes a name; it cannot be set to null, true or a number. Remove a group with `~`, e.g. "

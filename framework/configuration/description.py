@@ -25,7 +25,7 @@ INHERITED = ("seed", "batch_size", "samples", "experiment_name")
 
 @dataclass(frozen=True)
 class Description:
-    """Description of a model in plain values, which every checkpoint holds.
+    """Description of a model in plain values, which every checkpoint contains.
 
     Attributes:
         config: Configs of all parts with every parameter.
@@ -85,7 +85,7 @@ class Description:
         )
 
     def stored(self) -> dict[str, Any]:
-        """Return the description as the plain values that a checkpoint holds."""
+        """Return the description as the plain values that a checkpoint stores."""
         return {
             "format": 1,
             "version": version("robust-visual-learning"),

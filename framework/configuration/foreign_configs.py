@@ -30,7 +30,7 @@ def require_harmless(arguments: Sequence[str], groups: Collection[str]) -> None:
             file can be chosen; the primary config is checked too if the command names it.
 
     Raises:
-        ConfigError: A folder holds links, or it configures Hydra's logging, callbacks, environment or folders, the
+        ConfigError: A folder contains links, or it configures Hydra's logging, callbacks, environment or folders, the
             address of a store, or a mode.
     """
     named, _ = get_args_parser().parse_known_args(list(arguments))

@@ -67,7 +67,7 @@ class _Condition:
 
     Attributes:
         key: Dotted key of the setting.
-        holds: Function that returns whether a config meets the condition.
+        holds: Function that takes a config and returns whether it meets the condition.
         why: Reason why the setting is not read if the condition is not met.
     """
 

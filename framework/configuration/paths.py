@@ -63,7 +63,7 @@ class _Part:
             del self.values[name]
 
     def paths(self) -> Iterator[str]:
-        """Yield the names of the parameters whose value differs from the default and holds a path."""
+        """Yield the names of the parameters whose value differs from the default and contains a path."""
         for name, value in self.values.items():
             if name == "name" or (self.cls and name in parts(self.cls)):
                 continue

@@ -8,9 +8,9 @@ dataclass of keyword-only fields is a *value*: its fields are keys of the config
 constructor receives the dataclass. If the parameter has a default, the fields of that default are the defaults of these
 keys.
 
-A checked config holds plain values only, because checkpoints store it: a path is stored as text, an enum as its value,
-and a pydantic model or a dataclass as a mapping of its fields. `build` reads these values by the annotations again, so
-that the constructor receives values of the annotated types.
+A checked config consists of plain values only, because checkpoints store it: a path is stored as text, an enum as its
+value, and a pydantic model or a dataclass as a mapping of its fields. `build` reads these values by the annotations
+again, so that the constructor receives values of the annotated types.
 """
 
 import inspect

@@ -132,7 +132,7 @@ def _fault(file: BinaryIO) -> str | None:
     if size == 0:
         return "the file is empty"
     file.seek(max(0, size - TRAILER))
-    mark, wanted = file.read(len(MARK)), file.read()
+    mark, stored_digest = file.read(len(MARK)), file.read()
     if mark != MARK:
         return "the file is cut short, or it is no checkpoint of this framework"
     file.seek(0)
@@ -142,7 +142,9 @@ def _fault(file: BinaryIO) -> str | None:
         digest.update(data)
         rest -= len(data)
     return (
-        None if digest.digest() == wanted else "the file is damaged, since its contents fail their checksum"
+        None
+        if digest.digest() == stored_digest
+        else "the file is damaged, since its contents fail their checksum"
     )
 
 

@@ -35,28 +35,28 @@ PlainLoader.add_implicit_resolver("tag:yaml.org,2002:int", _INT, list("-+0123456
 PlainLoader.add_implicit_resolver("tag:yaml.org,2002:float", _FLOAT, list("-+.0123456789"))
 
 
-def read_json(file: Path, wanted: str, remedy: str = RESTORE) -> dict[str, Any]:
+def read_json(file: Path, expected: str, remedy: str = RESTORE) -> dict[str, Any]:
     """Return the object in a JSON file.
 
     Raises:
-        DataError: The file is missing or damaged, or contains something else. The message contains `wanted`, the
-            description of the file, and `remedy`.
+        DataError: The file is missing or damaged, or contains something else. The message contains
+            `expected`, a description of the file, and `remedy`.
     """
-    with translate_errors(file, wanted, remedy):
+    with translate_errors(file, expected, remedy):
         content = json.loads(decode(_content(file, LARGEST_JSON)))
         if not isinstance(content, dict):
             raise ValueError(f"the file contains a {type(content).__name__}, no object")
         return content
 
 
-def read_yaml(file: Path, wanted: str, remedy: str = RESTORE, error: type[UserError] = DataError) -> Any:
+def read_yaml(file: Path, expected: str, remedy: str = RESTORE, error: type[UserError] = DataError) -> Any:
     """Return the values in a YAML file.
 
     Raises:
         error: The file is missing or damaged, or contains a tag that stands for a Python object, or an alias. With
-            aliases, a few lines could stand for more values than any memory holds.
+            aliases, a few lines could mean more values than fit into any memory.
     """
-    with translate_errors(file, wanted, remedy, kind=error):
+    with translate_errors(file, expected, remedy, kind=error):
         text = decode(_content(file, LARGEST_YAML))
         depth = 0
         for event in yaml.parse(text, PlainLoader):

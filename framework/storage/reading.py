@@ -21,7 +21,7 @@ SMALL, MOST_TIMES = limits.UNFOLDED_BYTES, limits.UNFOLDED_TIMES
 
 @contextmanager
 def translate_errors(
-    file: Path, wanted: str, remedy: str = RESTORE, missing: str = "", kind: type[UserError] = DataError
+    file: Path, expected: str, remedy: str = RESTORE, missing: str = "", kind: type[UserError] = DataError
 ) -> Iterator[None]:
     """Convert every exception that a damaged file causes inside the block to an error of class `kind`.
 
@@ -29,7 +29,7 @@ def translate_errors(
 
     Args:
         file: File that is read in the block.
-        wanted: Description of the expected content, such as "a MATLAB file".
+        expected: Description of the expected content, such as "a MATLAB file".
         remedy: Advice for a damaged file.
         missing: End of the message for a missing file, after "no such file; ".
         kind: Class of the error.
@@ -43,10 +43,10 @@ def translate_errors(
     except Exception as error:
         if isinstance(error, FileNotFoundError) and not file.exists():
             raise kind(
-                f"{file}: no such file; {missing or f'expected {wanted}. Correct the path.'}"
+                f"{file}: no such file; {missing or f'expected {expected}. Correct the path.'}"
             ) from None
         why = shorten(error) or type(error).__name__
-        raise kind(f"{file}: cannot be read as {wanted} ({why}). {remedy}") from error
+        raise kind(f"{file}: cannot be read as {expected} ({why}). {remedy}") from error
 
 
 def open_regular(file: Path) -> "Bounded":

@@ -46,11 +46,13 @@ def fill_from_file(network: nn.Module, file: str, ignored: tuple[str, ...], with
         names = ", ".join(sorted(file_weights.keys() - weights.keys()))
         _log.info("The network does not use these weights of %s: %s.", file, names)
     weights = {name.removeprefix(within): tensor for name, tensor in weights.items()}
-    wanted = network.state_dict()
+    network_weights = network.state_dict()
     # Since torch 0.4.1, batch norm counts its batches. Older files lack this count, which nothing reads.
-    counters = {name: tensor for name, tensor in wanted.items() if name.endswith(".num_batches_tracked")}
+    counters = {
+        name: tensor for name, tensor in network_weights.items() if name.endswith(".num_batches_tracked")
+    }
     weights = counters | weights
-    mismatch = describe_mismatch(wanted, weights)
+    mismatch = describe_mismatch(network_weights, weights)
     if mismatch:
         raise CheckpointError(
             f"{file} does not fit {type(network).__name__}: {mismatch} Give a file with the names and shapes of "
@@ -133,7 +135,7 @@ def _first_line(error: Exception) -> str:
 
 
 def describe_mismatch(
-    wanted: Mapping[str, Shaped[Tensor, "..."]],
+    model_weights: Mapping[str, Shaped[Tensor, "..."]],
     file_weights: Mapping[str, Any],
     any_shape: tuple[str, ...] = (),
 ) -> str | None:
@@ -143,14 +145,16 @@ def describe_mismatch(
     would silently drop the imaginary part of a complex number and the upper half of an integer.
 
     Args:
-        wanted: Weights of the model, by name.
+        model_weights: Weights of the model, by name.
         file_weights: Weights of the file, by name.
         any_shape: Prefixes of names whose weights may have any shape or be absent.
     """
-    names = {name for name in (*wanted, *file_weights) if not name.startswith(any_shape)}
-    missing = [name for name in wanted if name in names and name not in file_weights]
-    unexpected = [name for name in file_weights if name in names and name not in wanted]
-    both = [(name, tensor, file_weights[name]) for name, tensor in wanted.items() if name in file_weights]
+    names = {name for name in (*model_weights, *file_weights) if not name.startswith(any_shape)}
+    missing = [name for name in model_weights if name in names and name not in file_weights]
+    unexpected = [name for name in file_weights if name in names and name not in model_weights]
+    both = [
+        (name, tensor, file_weights[name]) for name, tensor in model_weights.items() if name in file_weights
+    ]
     retyped = [
         f"{name} ({_kind(file_tensor)} instead of {_kind(tensor)})"
         for name, tensor, file_tensor in both
@@ -164,10 +168,10 @@ def describe_mismatch(
     parts = [
         f"{len(names)} of {total} {difference}: {_list_names(names)}"
         for names, total, difference in (
-            (missing, len(wanted), "weights are missing"),
+            (missing, len(model_weights), "weights are missing"),
             (unexpected, len(file_weights), "weights of the file are unknown"),
-            (reshaped, len(wanted), "weights have another shape"),
-            (retyped, len(wanted), "weights have numbers of another type"),
+            (reshaped, len(model_weights), "weights have another shape"),
+            (retyped, len(model_weights), "weights have numbers of another type"),
         )
         if names
     ]
@@ -218,9 +222,9 @@ def _bounds_text(bound: float | Tensor) -> str:
     return _list_names([f"{number:.4g}" for number in numbers])
 
 
-def _same_kind(wanted: Tensor, file_tensor: Tensor) -> bool:
-    return wanted.dtype == file_tensor.dtype or (
-        wanted.is_floating_point() and file_tensor.is_floating_point()
+def _same_kind(model_tensor: Tensor, file_tensor: Tensor) -> bool:
+    return model_tensor.dtype == file_tensor.dtype or (
+        model_tensor.is_floating_point() and file_tensor.is_floating_point()
     )
 
 

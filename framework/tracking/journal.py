@@ -59,7 +59,7 @@ class Journal:
         """Number of the newest line; 0 until the file is open for writing."""
         self._lock = threading.RLock()
         self._file = -1  # descriptor of the journal; -1 while it is not open for writing
-        self._owner = -1  # descriptor of the lock file, which holds the number of the writing process
+        self._owner = -1  # descriptor of the lock file, whose content is the number of the writing process
         self._waiting = bytearray()  # bytes for which the disk had no room
         self._place = (0, 0)  # (n, byte offset behind line n) at which the last read ended
         self._rewritten = 0  # how often the file was replaced, which makes earlier offsets invalid

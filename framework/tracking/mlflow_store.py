@@ -90,7 +90,7 @@ class MlflowStore(Store):
         self._files: str | None = run.info.artifact_uri
         self._model_name = re.sub(r"[^\w-]", "_", info.run_name.partition(",")[0])[:_LONGEST_NAME] or "model"
         self._params: dict[str, str] = dict(run.data.params)
-        # The last step of each metric; RunData itself holds only the values.
+        # The last step of each metric; RunData contains only the values.
         self._stored = {metric.key: metric.step for metric in run.to_proto().data.metrics}
         self._renamed: set[str] = set()
 

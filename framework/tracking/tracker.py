@@ -114,8 +114,8 @@ class NoTracker(Tracker):
         self._sidecar: Sidecar | None = None
 
     def open(self) -> None:
-        wanted = RunInfo(None, "", "", "", None, None, uuid.uuid4().hex, time.time(), "RUNNING")
-        self._sidecar = _begin_run(self.folder, self.journal, wanted, self._resumed)
+        info = RunInfo(None, "", "", "", None, None, uuid.uuid4().hex, time.time(), "RUNNING")
+        self._sidecar = _begin_run(self.folder, self.journal, info, self._resumed)
 
     def log_params(self, flat: Mapping[str, object]) -> None:
         """Do nothing, because the config is in the run folder."""
@@ -309,14 +309,14 @@ class MlflowTracker(Tracker):
         return f"{base}/#/experiments/{info.experiment_id}/runs/{info.run_id}" if info.run_id else base
 
 
-def _begin_run(folder: Path, journal: Journal, wanted: RunInfo, resumed: bool | None) -> Sidecar:
+def _begin_run(folder: Path, journal: Journal, new_info: RunInfo, resumed: bool | None) -> Sidecar:
     """Open a run folder for writing, continue the run in it or rename the files of that run, and return its record."""
     earlier = read_run_info(folder)
     journal.open(after=earlier.sent if earlier else 0)
-    if earlier is not None and _continues(earlier, wanted, resumed):
+    if earlier is not None and _continues(earlier, new_info, resumed):
         info = replace(
-            wanted,
-            run_id=wanted.run_id or earlier.run_id,
+            new_info,
+            run_id=new_info.run_id or earlier.run_id,
             key=earlier.key,
             started=earlier.started,
             experiment_id=earlier.experiment_id,
@@ -332,7 +332,7 @@ def _begin_run(folder: Path, journal: Journal, wanted: RunInfo, resumed: bool | 
                 replay_until=earlier.replay_until,
             )
     else:
-        info = wanted
+        info = new_info
         if earlier is not None or journal.last:
             number = next(k for k in range(1, 1 << 30) if not (folder / f"journal.{k}.jsonl").exists())
             if earlier is not None:
@@ -343,11 +343,11 @@ def _begin_run(folder: Path, journal: Journal, wanted: RunInfo, resumed: bool | 
     return sidecar
 
 
-def _continues(earlier: RunInfo, wanted: RunInfo, resumed: bool | None) -> bool:
+def _continues(earlier: RunInfo, new_info: RunInfo, resumed: bool | None) -> bool:
     if resumed is not None:
         return resumed
-    if wanted.run_id is not None:
-        return wanted.run_id == earlier.run_id
+    if new_info.run_id is not None:
+        return new_info.run_id == earlier.run_id
     return earlier.run_id is None and earlier.status != "FINISHED"
 
 
