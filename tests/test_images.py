@@ -146,7 +146,7 @@ def test_damaged_files_are_named(tmp_path: Path, suffix: str) -> None:
             assert str(error).startswith(str(file))
         else:
             assert pixels.shape == (3, 8, 8)  # the damage did not reach the pixels
-    with pytest.raises(DataError, match="no such file; wanted an image"):
+    with pytest.raises(DataError, match="no such file; expected an image"):
         Crop(tmp_path / "none.png", None, 0.0, 8).read()
     with pytest.raises(DataError, match="cannot be read as an image"):
         Crop(tmp_path, None, 0.0, 8).read()

@@ -223,7 +223,7 @@ def _refuse_code_and_passwords(arguments: list[str]) -> None:
 
 
 def _sweep_single_values(arguments: list[str]) -> list[str]:
-    """Return the arguments of a sweep over experiments, with single values written as sweeps over one value.
+    """Replace single values by sweeps over one value, if the command is a sweep over experiments.
 
     Hydra first composes the config from the arguments that are not swept. With `experiment=a,b`, an argument
     `data.x=1` would be applied to a config in which no data is chosen yet.

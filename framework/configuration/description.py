@@ -148,7 +148,7 @@ def stored_shape(stored: Sequence[Any]) -> tuple[int, ...]:
 
 
 def stored_names(stored: Sequence[Any], description: str) -> tuple[str, ...]:
-    """Return the stored names of columns or of a target, which `description` calls by name in messages.
+    """Return the stored names of columns or of a target; `description` is the term for the names in messages.
 
     Raises:
         ValueError: There are too many names, or one is too long.

@@ -303,7 +303,7 @@ def _is_marked_path(annotation: Any) -> bool:
 
 
 def _path_mark(annotation: Any) -> bool | None:
-    """Return whether an annotation says that a text is a path (True), is never a path (False), or neither (None)."""
+    """Return True if an annotation marks a text as a path, False if as no path, and None if the text is not marked."""
     marks = [item.path for item in getattr(annotation, "__metadata__", ()) if isinstance(item, Mark)]
     if isinstance(annotation, type) and issubclass(annotation, PurePath):
         marks.append(True)

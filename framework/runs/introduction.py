@@ -64,7 +64,7 @@ def lines(data: Data) -> list[str]:
 
 
 class Cores(NamedTuple):
-    """The processor cores of a machine.
+    """Processor cores of a machine.
 
     Attributes:
         allowed: Number of cores that this process may use.

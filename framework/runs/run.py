@@ -88,7 +88,7 @@ def stored_config(folder: Path) -> dict[str, Any] | None:
 
 
 def may_resume(config: Config) -> bool:
-    """Return whether the folder contains an unfinished run with this config, and `resume` allows to continue it."""
+    """Return whether the folder contains an unfinished run with this config, and `resume` allows continuing it."""
     earlier = read_run_info(config.folder)
     return (
         earlier is not None

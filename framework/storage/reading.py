@@ -87,7 +87,7 @@ def most_decompressed(size: int) -> int:
 
 
 def require_numbers(numbers: int, small: int, size: int) -> None:
-    """Refuse a file that decompresses to more numbers than `small` and than `size`, its number of bytes.
+    """Refuse a file of `size` bytes that decompresses to more than max(`small`, `size`) numbers.
 
     A number of one byte takes eight bytes in computations, and a file of zeros decompresses to a thousand times its
     size.

@@ -38,7 +38,7 @@ class Line:
 
 
 class Journal:
-    """An append-only file of JSON lines that survives a crash of its process.
+    """Append-only file of JSON lines that survives a crash of its process.
 
     Every line has a number `n`, which grows by one and is never used twice, not even after `drop_after`. It is
     therefore enough to remember up to which number the lines are stored elsewhere. Lines of metrics contain `time`,
