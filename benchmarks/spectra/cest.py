@@ -130,7 +130,7 @@ class Voxels(NamedTuple):
 
 
 def voxels_of(data: CEST, test: dict[str, Tensor]) -> Voxels:
-    wanted = data.wanted
+    wanted = data.parameters
     found = fit(test["input"], torch.tensor(data.offsets, dtype=torch.float64), wanted)
     told = slice(wanted.target_count)
     lower, upper = (torch.tensor(side[told]).double() for side in (wanted.lower, wanted.upper))
@@ -143,7 +143,7 @@ def curves(
     network: Predictor, data: CEST, inputs: Tensor, test: dict[str, Tensor], voxels: Voxels
 ) -> dict[str, list[tuple[float, float, float]]]:
     """Milliseconds a voxel, median error in standard errors, and share within one, of each method's knob."""
-    target = Target("real", data.wanted.target)
+    target = Target("real", data.parameters.target)
 
     def entry(model: Predictor | LorentzianHead) -> tuple[float, float, float]:
         _, spent = timed(lambda: means(model, inputs), len(inputs))
@@ -152,7 +152,9 @@ def curves(
 
     found: dict[str, list[tuple[float, float, float]]] = {"SciPy": []}
     for most in (*STEPS[:-1], 20, None):
-        one = scipys(test["input"][::3].double().numpy(), np.array(data.offsets), data.wanted, TIGHT, most)
+        one = scipys(
+            test["input"][::3].double().numpy(), np.array(data.offsets), data.parameters, TIGHT, most
+        )
         some = Voxels(*(part[::3] for part in voxels))
         found["SciPy"].append((one.milliseconds, some.median(one.parameters), some.within(one.parameters)))
     found["least squares"] = [entry(LorentzianHead(target, steps=steps)) for steps in STEPS]
@@ -178,7 +180,7 @@ def drawn(rows: Sequence[Row]) -> None:
 
 
 def mapped(network: Predictor, data: CEST, file: Path) -> None:
-    volume, names = read_volume(file), data.wanted.target
+    volume, names = read_volume(file), data.parameters.target
     inputs = torch.from_numpy(volume.spectra.astype(np.float32))
     models = {
         "least squares": LorentzianHead(Target("real", names)),
@@ -277,7 +279,7 @@ def main() -> None:
         mixed.append(conformal_coverage(one, *halves(test)))
     density = network(test["input"])
     off = (density.mean.detach().double() - voxels.target).abs()
-    for number, name in enumerate(data.wanted.target):
+    for number, name in enumerate(data.parameters.target):
         told = voxels.determined[:, number]
         ratio = (off / voxels.error)[told, number]
         numbers.append(

@@ -11,7 +11,13 @@ import numpy as np
 from framework.errors import DataError
 from framework.storage.arrays import to_real
 from framework.storage.limits import MOST_OF_SPECTRA
-from framework.storage.reading import translate_errors, inflate, read_bytes, require_numbers, most_decompressed
+from framework.storage.reading import (
+    inflate,
+    most_decompressed,
+    read_bytes,
+    require_numbers,
+    translate_errors,
+)
 from framework.storage.text import decode, require_numbers_in, words_of
 
 PACKED = b"\x1f\x8b"

@@ -202,7 +202,7 @@ def files_of(root: Path) -> dict[str, bytes]:
     [(IDIAP, 40, 42), (TOWNCENTRE, 48, 97), (CAVIAR, 40, 42)],
     ids=lambda x: getattr(x, "name", None),
 )
-def test_generation_is_the_same_to_the_byte_whatever_the_threads(
+def test_generation_is_the_same_to_the_byte_for_any_number_of_threads(
     cache: Path, monkeypatch: pytest.MonkeyPatch, archive: Archive, images: int, files: int
 ) -> None:
     contents = []

@@ -82,10 +82,10 @@ def by_mpmath(point: np.ndarray, noise: float) -> list[mpmath.mpf]:
 def test_densities_and_posterior_agree_with_quadrature_over_the_arc(noise: float) -> None:
     # for small noise only points near the arcs, so that exp does not underflow
     points = np.random.default_rng(0).uniform(-4, 4, (12, 2)) * min(1, 3 * noise)
-    wanted = np.array([by_scipy(point, noise) for point in points])
-    np.testing.assert_allclose(np.exp(log_density(points, noise)), wanted, rtol=1e-10)
+    expected = np.array([by_scipy(point, noise) for point in points])
+    np.testing.assert_allclose(np.exp(log_density(points, noise)), expected, rtol=1e-10)
     np.testing.assert_allclose(
-        posterior(points, noise), wanted / wanted.sum(-1, keepdims=True), rtol=1e-9, atol=1e-300
+        posterior(points, noise), expected / expected.sum(-1, keepdims=True), rtol=1e-9, atol=1e-300
     )
 
 
@@ -96,10 +96,10 @@ def test_logs_keep_their_digits_far_away(noise: float, reach: float) -> None:
     for point, density, odds in zip(
         points, log_density(points, noise), log_posterior(points, noise), strict=True
     ):
-        wanted = by_mpmath(point, noise)
-        np.testing.assert_allclose(density, [float(value) for value in wanted], rtol=1e-12)
+        expected = by_mpmath(point, noise)
+        np.testing.assert_allclose(density, [float(value) for value in expected], rtol=1e-12)
         with mpmath.workdps(60):
-            gap = wanted[1] - wanted[0]
+            gap = expected[1] - expected[0]
             logs = [float(-mpmath.log1p(mpmath.exp(difference))) for difference in (gap, -gap)]
         np.testing.assert_allclose(odds, logs, rtol=1e-10, atol=1e-300)
 
@@ -212,8 +212,8 @@ def test_a_batch_holds_labels_and_the_posterior_of_its_points() -> None:
     assert data.target.names == ("upper", "lower")
     assert batch["input"].dtype == batch["posterior"].dtype == torch.float32
     assert batch["target"].tolist() == [0, 1, 0]
-    wanted = posterior(batch["input"].double().numpy(), 0.2)
-    np.testing.assert_allclose(batch["posterior"], wanted, rtol=1e-6)
+    expected = posterior(batch["input"].double().numpy(), 0.2)
+    np.testing.assert_allclose(batch["posterior"], expected, rtol=1e-6)
 
 
 def test_outliers_lie_far_from_both_moons() -> None:

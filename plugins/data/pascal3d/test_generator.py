@@ -283,7 +283,7 @@ def files_of(root: Path) -> dict[str, bytes]:
     }
 
 
-def test_generation_is_the_same_to_the_byte_whatever_the_threads(
+def test_generation_is_the_same_to_the_byte_for_any_number_of_threads(
     tmp_path: Path, renderer: Renderer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     roots = []

@@ -64,7 +64,7 @@ ROWS = {
             changes={"generator_seed": 1, "data_seed": 1, "future": 5},
         ),
         DataRow(
-            "a folder of one's own",
+            "a user's folder",
             {**SMALL, "stride": 50, "forget": 0.2},
             write=write_csv_folder,
             synthetic=False,

@@ -21,6 +21,7 @@ from plugins.data.tabular.table import (
     Missing,
     Question,
     Table,
+    from_memory,
     load,
     read,
     restore_columns,

@@ -70,8 +70,8 @@ def test_a_table_is_split_and_standardised_by_its_training_rows(tmp_path: Path) 
     columns = np.array([[row, row * row, 7, row / 2 - 3, 20 * row - 360] for row in range(ROWS)])
     trained = columns[rows["train"]]
     for name in SPLITS:
-        wanted = (columns[rows[name]] - trained.mean(0)) / np.where(trained.std(0) > 0, trained.std(0), 1)
-        np.testing.assert_allclose(fields(data, name)["input"], wanted, atol=1e-6)
+        expected = (columns[rows[name]] - trained.mean(0)) / np.where(trained.std(0) > 0, trained.std(0), 1)
+        np.testing.assert_allclose(fields(data, name)["input"], expected, atol=1e-6)
         assert fields(data, name)["target"].tolist() == (rows[name] % 3).tolist()
         assert fields(data, name)["group"].tolist() == [0] * len(rows[name])
     assert data.fingerprint()["constant"] == "same"
@@ -110,8 +110,8 @@ def test_angles_of_many_turns_keep_their_digits(tmp_path: Path) -> None:
     text = "x,angle\n" + "\n".join(f"{row},{360 * 10**9 * (row - 20) + row}" for row in range(40))
     angle = prepared(table(tmp_path, text), target="angle", kind="degrees")
     for name in SPLITS:
-        wanted = torch.deg2rad((fields(angle, name)["line"] - 2).double())
-        np.testing.assert_allclose(fields(angle, name)["target"][:, 0], wanted, atol=1e-6)
+        expected = torch.deg2rad((fields(angle, name)["line"] - 2).double())
+        np.testing.assert_allclose(fields(angle, name)["target"][:, 0], expected, atol=1e-6)
 
 
 def test_splits_and_groups_come_from_columns_of_these_names(tmp_path: Path) -> None:
@@ -123,8 +123,8 @@ def test_splits_and_groups_come_from_columns_of_these_names(tmp_path: Path) -> N
     for index, name in enumerate(SPLITS):
         row = fields(data, name)["line"] - 2
         assert (row % 3 == index).all()
-        wanted = [{"10": 1, "9": 0, "b": 2}[("10", "9", "b")[int(number) % 5 % 3]] for number in row]
-        assert fields(data, name)["group"].tolist() == wanted
+        expected = [{"10": 1, "9": 0, "b": 2}[("10", "9", "b")[int(number) % 5 % 3]] for number in row]
+        assert fields(data, name)["group"].tolist() == expected
 
 
 def test_labels_are_ordered_by_size_where_they_are_numbers(tmp_path: Path) -> None:
