@@ -44,8 +44,8 @@ def draw_cloud(
     depth_range = np.ptp(depth)
     share = ((depth - depth.min()) / depth_range if depth_range > 0 else np.ones_like(depth))[:, None]
     if set(COLOURS) <= set(columns):
-        own = table[:, [list(columns).index(name) for name in COLOURS]].clip(0, 1)
-        colour = 255 * own * (0.6 + 0.4 * share)
+        own_colours = table[:, [list(columns).index(name) for name in COLOURS]].clip(0, 1)
+        colour = 255 * own_colours * (0.6 + 0.4 * share)
     else:
         colour = FAR + (NEAR - FAR) * share
     # Each point covers a disc so large that the sides of a box look closed. The nearest point wins a pixel.

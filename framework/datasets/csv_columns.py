@@ -127,8 +127,8 @@ class Writing:
             f"[{re.escape(GROUPING[self.thousands])}]" if self.thousands else "",
             re.escape(self.sign),
         )
-        whole = rf"\d{{1,3}}(?:{between}\d{{3}})+|\d+" if between else r"\d+"
-        parts = re.fullmatch(rf"([+-]?)({whole})?(?:{sign}(\d*))?((?:[eEdD][+-]?\d+)?)", cell)
+        whole_pattern = rf"\d{{1,3}}(?:{between}\d{{3}})+|\d+" if between else r"\d+"
+        parts = re.fullmatch(rf"([+-]?)({whole_pattern})?(?:{sign}(\d*))?((?:[eEdD][+-]?\d+)?)", cell)
         if parts is None:
             return f"_{cell}" if any(letter.isdigit() for letter in cell) else cell
         digits = re.sub(between, "", parts[2] or "") if between else parts[2] or ""
@@ -431,8 +431,8 @@ def _is_row_count(cells: Sequence[str]) -> bool:
 def _is_distinct_whole(cells: Sequence[str]) -> bool:
     """Return whether all cells are whole numbers and no number occurs twice."""
     values = [text.parse_number(cell) for cell in cells]
-    whole = all(value is not None and math.isfinite(value) and value.is_integer() for value in values)
-    return whole and len(set(values)) == len(values)
+    all_whole = all(value is not None and math.isfinite(value) and value.is_integer() for value in values)
+    return all_whole and len(set(values)) == len(values)
 
 
 def _why_no_numbers(columns: Columns, name: str, setting: str) -> str:
@@ -458,11 +458,13 @@ def _why_no_numbers(columns: Columns, name: str, setting: str) -> str:
     ]
     units = Counter(mend.unit for _, _, mend in words if mend is not None and mend.unit)
     unit = max(units, key=units.__getitem__, default="")
-    wrong = [(cell, line, mend) for cell, line, mend in words if mend is not None and mend.unit in ("", unit)]
-    if wrong and 2 * (plain + len(wrong)) > len(filled):
+    readable = [
+        (cell, line, mend) for cell, line, mend in words if mend is not None and mend.unit in ("", unit)
+    ]
+    if readable and 2 * (plain + len(readable)) > len(filled):
         # Prefer a cell with one reading: 1,5 has one, 1,234 has two.
-        clear = (entry for entry in wrong if len(entry[2].settings) == 1)
-        cell, line, mend = next(clear, wrong[0])
+        clear = (entry for entry in readable if len(entry[2].settings) == 1)
+        cell, line, mend = next(clear, readable[0])
         raise DataError(
             f"{columns.file} line {line}, column {quote(name)}: {quote(cell)} is a number {mend.form}. "
             f"{remedy(mend, columns.writing)} Or list the columns to read in {setting}, without this one."

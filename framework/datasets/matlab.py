@@ -63,22 +63,22 @@ def parse_variables(content: bytes, names: Sequence[str] | None = None) -> dict[
     if version != 0x0100:
         raise ValueError(f"the format version is {version:#06x} instead of 0x0100")
     reader, result = _Reader(order), {}
-    position, left = HEADER_BYTES, most_decompressed(len(content))
+    position, remaining = HEADER_BYTES, most_decompressed(len(content))
     while position < len(content):
         kind, start, position = reader.element(content, position, len(content))
         packed = content[start:position]
-        whole = (
+        element = (
             inflate(packed, NAME_WITHIN, part=True) if kind == COMPRESSED else content[start - 8 : position]
         )
-        name = reader.head(whole, 8, len(whole)).name
+        name = reader.head(element, 8, len(element)).name
         if name and (names is None or name in names):
             if kind == COMPRESSED:
-                whole = inflate(packed, left)
-                left -= len(whole)
-            kind, start, end = reader.element(whole, 0, len(whole))
+                element = inflate(packed, remaining)
+                remaining -= len(element)
+            kind, start, end = reader.element(element, 0, len(element))
             if kind != MATRIX:
                 raise ValueError(f"a variable is stored as an element of type {kind} instead of {MATRIX}")
-            result[name] = reader.array(whole, start, end, 0)
+            result[name] = reader.array(element, start, end, 0)
     return result
 
 

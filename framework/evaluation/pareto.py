@@ -42,8 +42,8 @@ def front(
     if np.isnan(margin[np.ix_(remaining, remaining)]).any():
         return [False] * len(means)
     with np.errstate(invalid="ignore"):  # points with infinite numbers are compared too, and left out below
-        less, faster = (error[:, None] + margin < error), (time[:, None] * (1 + time_noise) < time)
-    beats = (less & ~faster.T) | (faster & ~less.T)
+        lower, faster = (error[:, None] + margin < error), (time[:, None] * (1 + time_noise) < time)
+    beats = (lower & ~faster.T) | (faster & ~lower.T)
     on_front = np.zeros(len(error), bool)
     while remaining.any():
         unbeaten = remaining & ~beats[remaining].any(0)

@@ -64,12 +64,12 @@ def reference_value(log_probs: LogProbs, value: int, seeds: Sequence[int]) -> Re
     """
     per_seed = torch.stack([log_probs(value, seed) for seed in seeds]).double()  # (repeats, samples)
     pooled = torch.logsumexp(per_seed, 0) - math.log(len(seeds))
-    wrong = (~pooled.isfinite()).nonzero()
-    if len(wrong):
+    not_finite = (~pooled.isfinite()).nonzero()
+    if len(not_finite):
         raise ValueError(
-            f"The reference log-likelihood of sample {int(wrong[0])} is {pooled[wrong[0]].item()} "
-            f"({len(wrong)} samples have such a value), but must be finite. Raise the reference value, or correct the "
-            "density head."
+            f"The reference log-likelihood of sample {int(not_finite[0])} is {pooled[not_finite[0]].item()} "
+            f"({len(not_finite)} samples have such a value), but must be finite. Raise the reference value, or "
+            "correct the density head."
         )
     left_out = torch.stack(
         [torch.cat([per_seed[:r], per_seed[r + 1 :]]).logsumexp(0).mean() for r in range(len(seeds))]

@@ -161,14 +161,14 @@ def tradeoff(
     points: list[Point] = []
     with _restore_afterwards(predictor, parts, knob, inputs.device), torch.no_grad():
         # No two estimates share random numbers.
-        *own, last = (
+        *point_seeds, reference_seeds = (
             _seeds(stream, repeats) for stream in np.random.SeedSequence(seed).spawn(len(values) + 1)
         )
         log_probs, reference_result = _log_probs(predictor, all_batches, set_knob), None
         if reference is not None:
-            reference_result = reference_value(log_probs, reference, last)
+            reference_result = reference_value(log_probs, reference, reference_seeds)
         times = run_times(predict, values, inputs.device, calls=timed_calls, budget_seconds=budget_seconds)
-        points_to_measure = list(zip(values, own, times, strict=True))
+        points_to_measure = list(zip(values, point_seeds, times, strict=True))
         for value, seeds, time in track_progress(
             points_to_measure, "measuring errors", len(points_to_measure), f"values of {knob}"
         ):
@@ -239,8 +239,8 @@ def rows(
     for method, curve in curves.items():
         times, repeats = [point.milliseconds for point in curve.points], curve.repeats
         best = {}
-        for key, way in better.items():
-            sign = 1 if way == "lower" else -1
+        for key, direction in better.items():
+            sign = 1 if direction == "lower" else -1
             means = [mean({**point.numbers, "repeats": repeats}, key, repeats) for point in curve.points]
             signed = [replace(value, value=sign * value.value) for value in means]
             best[f"{key}_pareto"] = front(signed, times, TIME_NOISE)

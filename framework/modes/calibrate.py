@@ -118,10 +118,10 @@ def _wrap(part: Mapping[str, Any], inner: Predictor, target: Target) -> Predicto
         return inner
 
     wrapped: Predictor = build("uncertainty", part, model=model, target=target)
-    own = {id(parameter) for parameter in wrapped.parameters() if parameter.requires_grad}
-    own -= {id(parameter) for parameter in inner.parameters()}
-    if model_count != 1 or own:
-        reason = "has trainable weights" if own else f"wraps {model_count} models"
+    trainable = {id(parameter) for parameter in wrapped.parameters() if parameter.requires_grad}
+    trainable -= {id(parameter) for parameter in inner.parameters()}
+    if model_count != 1 or trainable:
+        reason = "has trainable weights" if trainable else f"wraps {model_count} models"
         raise ConfigError(
             f"uncertainty={part['name']} {reason}, but mode=calibrate only fits wrappers that are calibrated on the "
             "validation split of one trained model. Use this wrapper with mode=train."

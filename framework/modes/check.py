@@ -138,11 +138,11 @@ def _table(plugin: Contract, worst: Mapping[str, tuple[Row, Finding]], seconds: 
     }
     for name, reason in left_out.items():
         table.add_row(name, Text(reason, "dim"), "", "", Text("left out", "yellow"))
-    bare = [row.name for row in plugin.rows if isinstance(row, HeadRow) and row.cases is None]
-    if bare:
+    uncompared = [row.name for row in plugin.rows if isinstance(row, HeadRow) and row.cases is None]
+    if uncompared:
         table.add_row(
             "log_prob",
-            Text(f"{', '.join(bare)}: {UNCOMPARED}", "dim"),
+            Text(f"{', '.join(uncompared)}: {UNCOMPARED}", "dim"),
             "",
             "",
             Text("no reference", "yellow"),

@@ -151,16 +151,16 @@ def build_joined(config: dict[str, Any], data: Data, members: Sequence[Predictor
     return predictor
 
 
-def _inner_predictor(whole: FrozenFrontEnd, member: Predictor, index: int) -> Predictor:
+def _inner_predictor(joined: FrozenFrontEnd, member: Predictor, index: int) -> Predictor:
     """Return the predictor of a member that follows its fixed encoders.
 
-    The encoders must be equal in all members. The encoders of the first member (`index` 0) are copied into `whole`.
+    The encoders must be equal in all members. The encoders of the first member (`index` 0) are copied into `joined`.
     """
     assert isinstance(member, FrozenFrontEnd)
     state = member.encoders.state_dict()
     if index == 0:
-        whole.encoders.load_state_dict(state)
-    for name, tensor in whole.encoders.state_dict().items():
+        joined.encoders.load_state_dict(state)
+    for name, tensor in joined.encoders.state_dict().items():
         if not torch.equal(tensor, state[name]):
             raise CheckpointError(
                 f"Member {index} was trained on other features than member 0: the encoders of both differ in {name}. "

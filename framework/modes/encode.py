@@ -100,12 +100,12 @@ def run(config: Config) -> None:
     collection = replace(
         collection, names=[file.relative_to(collection.root).as_posix() for file in readable]
     )
-    mine = parts_of_job(collection.parts, options.share)
+    part_numbers = parts_of_job(collection.parts, options.share)
     with open_run(config) as run:
         record_citations(run, parts)
         describe(collection, parts)
         try:
-            written = encode(collection, parts, mine, config.settings)
+            written = encode(collection, parts, part_numbers, config.settings)
         except BaseException:
             # Without any part, remove the description, because another attempt may use other settings.
             if len(collection.missing()) == collection.parts:
@@ -118,8 +118,8 @@ def run(config: Config) -> None:
             write_whole(collection.into / UNREADABLE, left_out.encode())
         missing = len(collection.missing())
         console.print(
-            f"{written} parts written, {len(mine) - written} of this job's {len(mine)} parts existed already; "
-            f"{missing} of all {collection.parts} parts are missing in {collection.into}",
+            f"{written} parts written, {len(part_numbers) - written} of this job's {len(part_numbers)} parts existed "
+            f"already; {missing} of all {collection.parts} parts are missing in {collection.into}",
             soft_wrap=True,
         )
 
@@ -194,13 +194,15 @@ def describe(collection: Collection, config: Mapping[str, Any]) -> None:
 
 
 @torch.no_grad()
-def encode(collection: Collection, config: Mapping[str, Any], mine: Sequence[int], settings: Settings) -> int:
+def encode(
+    collection: Collection, config: Mapping[str, Any], part_numbers: Sequence[int], settings: Settings
+) -> int:
     """Write the missing parts of a job, each atomically, and return their number.
 
     Args:
         collection: Files to encode.
         config: Resolved configs of the data set and the encoders.
-        mine: Numbers of the parts of this job.
+        part_numbers: Numbers of the parts of this job.
         settings: Settings of the command.
 
     Raises:
@@ -214,8 +216,8 @@ def encode(collection: Collection, config: Mapping[str, Any], mine: Sequence[int
     data: Data = build("data", config["data"])
     encoders: list[Encoder] = []
     written = 0
-    with Work("encoding", sum(len(collection.files(number)) for number in mine), "files") as work:
-        for number in mine:
+    with Work("encoding", sum(len(collection.files(number)) for number in part_numbers), "files") as work:
+        for number in part_numbers:
             files = collection.files(number)
             if collection.path(number).is_file():
                 work.advance(len(files))

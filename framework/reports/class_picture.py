@@ -96,12 +96,12 @@ def _bars(axes: Axes, probability: Float[np.ndarray, "classes"], label: int, nam
     if label not in shown:
         shown[-1] = label
     axes.set(xlim=(0, 1), ylim=(LISTED - 0.5, -0.5))
-    for place, number in enumerate(shown):
-        wrong = place == 0 and number != label
-        color, alpha = (GREEN, 0.5) if number == label else (RED, 0.5) if wrong else (BLUE, 0.3)
-        axes.barh(place, 1.0, height=0.9, color="0.95")
-        axes.barh(place, probability[number], height=0.9, color=color, alpha=alpha)
+    for position, number in enumerate(shown):
+        is_wrong = position == 0 and number != label
+        color, alpha = (GREEN, 0.5) if number == label else (RED, 0.5) if is_wrong else (BLUE, 0.3)
+        axes.barh(position, 1.0, height=0.9, color="0.95")
+        axes.barh(position, probability[number], height=0.9, color=color, alpha=alpha)
         name = names[number] if len(names[number]) <= LONGEST else names[number][: LONGEST - 1] + "…"
         style = {"fontsize": 7, "va": "center", "parse_math": False}
-        axes.text(0.02, place, name, ha="left", **style)
-        axes.text(0.98, place, f"{probability[number]:.2f}", ha="right", **style)
+        axes.text(0.02, position, name, ha="left", **style)
+        axes.text(0.98, position, f"{probability[number]:.2f}", ha="right", **style)

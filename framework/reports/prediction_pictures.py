@@ -143,8 +143,8 @@ def log_density_on_circle(density: Distribution, points: int = 720) -> tuple[Ten
     cell = ((wrap(values).double() + math.pi) / width).round().long() % points
     counts = torch.zeros_like(on_grid).scatter_add_(0, cell, torch.ones_like(cell, dtype=on_grid.dtype))
     # The grid's values are kept unless the random values contradict them, so that tails stay smooth.
-    wrong = unresolved & ((counts - on_grid).abs() > 5 * (on_grid + 1).sqrt())
-    return angles, torch.where(wrong, (counts / (DRAWS * TIMES * width)).log(), log_density.double())
+    contradicted = unresolved & ((counts - on_grid).abs() > 5 * (on_grid + 1).sqrt())
+    return angles, torch.where(contradicted, (counts / (DRAWS * TIMES * width)).log(), log_density.double())
 
 
 def deviation(truth: Tensor, point: Tensor, symmetry: Tensor) -> Tensor:

@@ -205,15 +205,17 @@ def _lines(
     lines = [[Text(_cell(row, key)) for key in columns] for row in rows]
     for index, key in enumerate(columns):
         values = {
-            place: value for place, row in enumerate(rows) if (value := _number(row.get(key))) is not None
+            row_index: value
+            for row_index, row in enumerate(rows)
+            if (value := _number(row.get(key))) is not None
         }
         if key not in better or len(values) < 2:
             continue
-        places = list(values)
-        means = [mean(rows[place], key, rows[place].get("n")) for place in places]
-        for place, best in zip(places, significantly_best(means, better[key]), strict=True):
+        row_indices = list(values)
+        means = [mean(rows[row_index], key, rows[row_index].get("n")) for row_index in row_indices]
+        for row_index, best in zip(row_indices, significantly_best(means, better[key]), strict=True):
             if best:
-                lines[place][index].stylize("bold")
+                lines[row_index][index].stylize("bold")
     heads = [Text(head) for head in columns.values()]
     if origin:
         heads.append(Text("data"))

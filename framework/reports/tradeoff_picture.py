@@ -153,9 +153,9 @@ def _panel(
         for rows in drawn_rows
     ]
     spreads = [np.array([_spread(row, key) for row in rows]) for rows in drawn_rows]
-    everything = np.concatenate([np.zeros((0, 2)), *positions])
-    errors, bars = everything[:, 1], np.concatenate([np.zeros(0), *spreads])
-    first, last = (everything[:, 0].min(), everything[:, 0].max()) if len(everything) else (1.0, 1.0)
+    all_points = np.concatenate([np.zeros((0, 2)), *positions])
+    errors, bars = all_points[:, 1], np.concatenate([np.zeros(0), *spreads])
+    first, last = (all_points[:, 0].min(), all_points[:, 0].max()) if len(all_points) else (1.0, 1.0)
     axes.set_xlim(first / _room(first, last), last * _room(first, last))
     bottom = -math.inf
     if lower and (errors >= 0).all():

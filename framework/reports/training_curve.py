@@ -36,8 +36,8 @@ def training_curve(
     """
     figure = titled_figure((7.0, 4.3), title, synthetic)
     axes = figure.subplots()
-    few = {"marker": "o", "markersize": 3.5} if len(train) < FEW else {}
-    axes.plot(epochs, train, color=BLUE, linewidth=1.2, label="training, single batches", **few)
+    markers = {"marker": "o", "markersize": 3.5} if len(train) < FEW else {}
+    axes.plot(epochs, train, color=BLUE, linewidth=1.2, label="training, single batches", **markers)
     validated = np.array(validation, dtype=np.float64).reshape(-1, 2)
     axes.plot(*validated.T, color=RED, linewidth=1.5, marker="o", markersize=3.5, label="validation")
     values = [value for value in (*train, *validated[:, 1]) if math.isfinite(value)]

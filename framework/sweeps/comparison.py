@@ -225,14 +225,15 @@ def _check_results(results: Mapping[str, Any], path: Path) -> dict[str, Any]:
         "threads": type(results.get("threads")) is int or "device" not in results,
         "columns": isinstance(columns, dict)
         and all(isinstance(heading, str) for heading in columns.values()),
-        "better": isinstance(better, dict) and all(way in ("higher", "lower") for way in better.values()),
+        "better": isinstance(better, dict)
+        and all(direction in ("higher", "lower") for direction in better.values()),
         **{key: results[key] is None or is_number(results[key]) for key in COST_COLUMNS if key in results},
     }
     if isinstance(columns, dict):
         valid |= {key: results[key] is None or is_number(results[key]) for key in columns if key in results}
-    if wrong := [key for key, is_valid in valid.items() if not is_valid]:
+    if invalid := [key for key, is_valid in valid.items() if not is_valid]:
         raise DataError(
-            f"{path} has the invalid value {shorten(wrong[0])} = {quote(results.get(wrong[0]))}. {RESTORE}"
+            f"{path} has the invalid value {shorten(invalid[0])} = {quote(results.get(invalid[0]))}. {RESTORE}"
         )
     plain = {key: shorten(value) if isinstance(value, str) else value for key, value in results.items()}
     return {**plain, "columns": {key: shorten(heading) for key, heading in columns.items()}}

@@ -181,9 +181,11 @@ class _Server:
         self, command: Sequence[str], environment: Mapping[str, str], console: int, lock: int
     ) -> "_Fork":
         """Request a fork for a job; raises OSError if the job does not fit into a packet."""
-        own = {key: value for key, value in environment.items() if self._environment.get(key) != value}
+        changed_variables = {
+            key: value for key, value in environment.items() if self._environment.get(key) != value
+        }
         arguments = command[_target_index(command) + len(_run_target(command)) :]
-        packet = json.dumps({"arguments": arguments, "environment": own}).encode()
+        packet = json.dumps({"arguments": arguments, "environment": changed_variables}).encode()
         if len(packet) > LARGEST:
             raise OSError("the description of the job exceeds a packet")
         socket.send_fds(self._channel, [packet], [console, lock])

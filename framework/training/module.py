@@ -90,8 +90,8 @@ class Training(pl.LightningModule):
         rows = self._share(batch)
         # Count batches, not optimiser steps, which do not advance while gradients are accumulated.
         seed_step(self.seed, self.current_epoch * 1_000_003 + batch_index, "train")
-        own = own_batches(self.learner) if self._orders() > 1 else nullcontext()
-        with WholeBatch(rows) if rows else own, one_pass(self.learner):
+        noise_mode = own_batches(self.learner) if self._orders() > 1 else nullcontext()
+        with WholeBatch(rows) if rows else noise_mode, one_pass(self.learner):
             batch = self.augment(batch)
             losses = self._losses(batch)
             loss = losses.mean()
