@@ -96,7 +96,7 @@ def test_a_folder_may_be_reached_by_a_link_that_the_user_names(tmp_path: Path) -
         with os.fdopen(open_plain(folder / "run.json", os.O_RDWR | os.O_CREAT), "w") as file:
             file.write("{}")
         assert read_plain(folder / "run.json", 2) == b"{}"
-        with pytest.raises(DataError, match=r"2 bytes; wanted 1 at most"):
+        with pytest.raises(DataError, match=r"2 bytes, but at most 1 bytes are read"):
             read_plain(folder / "run.json", 1)
     require_enclosed(tmp_path / "nowhere")
     (tmp_path / "file").touch()
@@ -122,7 +122,7 @@ def test_a_journal_is_bounded_in_size_and_in_lines(tmp_path: Path, monkeypatch: 
     assert path.stat().st_size == 5017
     assert Journal(path).read() == [{"n": 7, "time": 1}]
     os.truncate(path, journals.LARGEST + 1)  # sparse
-    with pytest.raises(DataError, match=r"wanted 1,073,741,824 at most"):
+    with pytest.raises(DataError, match=r"at most 1,073,741,824 are read"):
         Journal(path).open()
 
 

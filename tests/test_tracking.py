@@ -1092,7 +1092,7 @@ def test_a_store_deleted_while_the_run_goes_on_is_made_again_with_everything(
     assert history(folder) == losses(range(20))
     assert client(folder).get_run(identity(folder)).data.params == {"seed": "0"}
     assert status(folder) == "FINISHED"
-    assert f"knows no run {before}" in caplog.text
+    assert f"contains no run {before}" in caplog.text
 
 
 def test_a_new_run_in_a_used_folder_sets_the_old_one_aside(folder: Path) -> None:
