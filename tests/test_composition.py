@@ -335,8 +335,10 @@ def test_any_text_in_quotes_is_read_as_it_stands(text: str) -> None:
 def test_what_cannot_be_read_is_told_in_quotes(framework: Framework) -> None:
     done = framework("mode=test", "checkpoint=runs/x=(1,é/model.ckpt")
     assert done.code == 2
-    assert "If all of it is one text: \"checkpoint='runs" in done.out
-    told = shlex.split(done.out.partition("If all of it is one text: ")[2].strip().removesuffix("."))
+    assert "If the whole value is one text, write \"checkpoint='runs" in done.out
+    told = shlex.split(
+        done.out.partition("If the whole value is one text, write ")[2].strip().removesuffix(".")
+    )
     assert "runs/x=(1,é/model.ckpt is neither a file" in framework("mode=test", *told).out
 
 

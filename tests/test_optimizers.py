@@ -33,7 +33,9 @@ def test_settings_reach_the_optimiser(
     monkeypatch: pytest.MonkeyPatch, name: str, momentum: float | None
 ) -> None:
     if momentum is not None and name != "sgd":
-        with pytest.raises(ValueError, match=f"momentum is a setting of sgd, {name} has none"):
+        with pytest.raises(
+            ValueError, match=f"momentum is a setting of sgd only, and the optimiser is {name}"
+        ):
             OptimizerSettings(name=name, momentum=momentum)
         return
     settings = OptimizerSettings(name=name, learning_rate=0.25, weight_decay=0.5, momentum=momentum)
