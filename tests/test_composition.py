@@ -223,7 +223,7 @@ def test_plural_groups_keep_their_order() -> None:
         (["optimizer.learning_rate=nan"], r"optimizer\.learning_rate = nan"),
         (
             ["optimizer=adam", "+optimizer.momentum=0.9"],
-            r"optimizer = .*momentum is a setting of sgd, adam has none",
+            r"optimizer = .*momentum is a setting of sgd only, and the optimiser is adam",
         ),
         (["optimizer.name=adamm"], r"Did you mean 'r?adamw?'\?"),
         (["trainer.max_epochs=0"], r"trainer\.max_epochs = 0"),

@@ -159,7 +159,7 @@ def test_parts_are_resolved_and_built_with_the_same_context() -> None:
         ({"name": "toy", "others": ["toy", {"name": "toy", "rate": 2}]}, r"encoder\.others\[1\]\.rate = 2"),
         ({"name": "nobody"}, "No encoder is called 'nobody'"),
         ({"width": 3}, r"encoder\.name is missing"),
-        (7, "expected the name of a encoder"),
+        (7, "expected the name of a plugin of the group encoder"),
         ({"name": "toy", "inner": {"_target_": "os.system"}}, "_target_` is refused"),
     ],
 )

@@ -168,8 +168,8 @@ def require_paths(dropped: Mapping[str, Any], groups: Collection[str], source: s
         raise ConfigError(
             f"{shorten(source)} contains a path: {named}. A checkpoint may come from an untrusted source, so its paths "
             f"are used only if you repeat them; another path is allowed too. Add to a command: "
-            f"{' '.join(shell_arguments(needed))}; to a command of a plugin: the same after --path; to framework.load "
-            f"or freeze: paths={{{example}}}."
+            f"{' '.join(shell_arguments(needed))}; to the command of a plugin: the same, each after --path; to the "
+            f"call of framework.load or freeze: paths={{{example}}}."
         )
 
 
@@ -186,7 +186,7 @@ def require_repeated(stored: Mapping[str, Any], repeated: Mapping[str, Any], fol
     """
     for key, value in repeated.items():
         if key not in stored or not _equal(stored[key], value):
-            stored_value = quote(stored[key]) if key in stored else "none"
+            stored_value = quote(stored[key]) if key in stored else "not set"
             raise ConfigError(
                 f"resume={folder} continues that run with its own config, in which {shorten(key)} is {stored_value}. "
                 f"The command gives {quote(value)}, which would change it. Give the same value, or start a new run."

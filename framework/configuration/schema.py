@@ -74,15 +74,16 @@ def resolve(group: str, config: Any, path: str | None = None) -> dict[str, Any]:
         config = {"name": config}
     if not isinstance(config, Mapping):
         raise ConfigError(
-            f"{shorten(path)} = {quote(config)}: expected the name of a {group}, or a mapping with `name` and "
-            "the parameters of the plugin."
+            f"{shorten(path)} = {quote(config)}: expected the name of a plugin of the group {group}, or a mapping "
+            "with `name` and the parameters of the plugin."
         )
     forbid_targets(config, path)
     values = dict(config)
     name = values.pop("name", None)
     if not isinstance(name, str):
         raise ConfigError(
-            f"{shorten(path)}.name is missing. Write the name of a {group} (`mode=plugins` lists all plugins)."
+            f"{shorten(path)}.name is missing. Write the name of a plugin of the group {group} (`mode=plugins` "
+            "lists them)."
         )
     cls = load(group, name)
     checked = _checked_plain_values(cls, values, path)

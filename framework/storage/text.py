@@ -286,5 +286,5 @@ def require_numbers_in(words: Sequence[str], text: str, first: int = 0) -> list[
 def describe_no_number(word: str, where: str = "") -> str:
     """Return the error message for a word that is no number, with a correction if there is one."""
     remedy = suggest_number(word)
-    why = f": a number {remedy.form}; write {remedy.number}" if remedy else ""
+    why = f", which is a number {remedy.form}; write {remedy.number}" if remedy else ""
     return f"expected a number, got {quote(word)}{where}{why}"
