@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 from framework.bodies.body import (
     Body,
     BodyModel,
-    quaternions_less_identity,
+    quaternion_minus_identity,
     sine_over_angle,
-    turns_less_identity,
+    rotation_minus_identity,
     with_joints,
 )
 from framework.errors import ConfigError, DataError
@@ -157,7 +157,7 @@ def test_whole_turns_change_nothing():
 @given(st.lists(st.floats(-1e6, 1e6), min_size=3, max_size=3), st.floats(-160, 0))
 def test_rotations_are_scipys_and_tiny_ones_keep_their_digits(vector, shrink):
     vector = np.array(vector) * 10.0**shrink
-    found = turns_less_identity(torch.from_numpy(vector)).numpy()
+    found = rotation_minus_identity(torch.from_numpy(vector)).numpy()
     size = max(1.0, np.linalg.norm(vector))
     np.testing.assert_allclose(
         found + np.eye(3), Rotation.from_rotvec(vector).as_matrix(), atol=1e-15 * size + 4e-15
@@ -193,7 +193,7 @@ def test_gradients_are_those_of_differences(features, size):
 
 def test_quaternions_have_a_gradient_at_nothing():
     vector = torch.zeros(2, 3, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(quaternions_less_identity, vector)
+    assert torch.autograd.gradcheck(quaternion_minus_identity, vector)
 
 
 def test_joints_that_never_bend_can_be_left_out():
@@ -224,18 +224,18 @@ def test_joints_that_cannot_be_left_out_are_named(names, features, message):
     "changes, message",
     [
         ({"weights": np.ones((17, 6))}, r"those of vertex 0 .* sum to 6"),
-        ({"weights": np.ones((16, 6)) / 6}, r"weights has the shape \(16, 6\); wanted \(17, 6\)"),
+        ({"weights": np.ones((16, 6)) / 6}, r"weights has the shape \(16, 6\); expected \(17, 6\)"),
         ({"template": np.full((17, 3), np.nan)}, "51 numbers of template are not finite"),
-        ({"faces": np.array([[0, 1, 17]])}, "vertices 0 to 17, but there are 0 to 16"),
-        ({"parents": (1, 0, 1, 2, 0, 2)}, "are no tree"),
-        ({"parents": (-1, -1, 1, 2, 0, 2)}, "are no tree"),
-        ({"parents": (1, -1, 3, 2, 0, 2)}, "are no tree"),
-        ({"parents": (1, -1, 1, 2, 0, 6)}, "are no tree"),
+        ({"faces": np.array([[0, 1, 17]])}, "vertices 0 to 17, but the vertices are numbered 0 to 16"),
+        ({"parents": (1, 0, 1, 2, 0, 2)}, "form no tree"),
+        ({"parents": (-1, -1, 1, 2, 0, 2)}, "form no tree"),
+        ({"parents": (1, -1, 3, 2, 0, 2)}, "form no tree"),
+        ({"parents": (1, -1, 1, 2, 0, 6)}, "form no tree"),
         (
             {"pose_shapes": np.zeros((17, 3, 44))},
-            r"pose_shapes has the shape \(17, 3, 44\); wanted \(17, 3, 45\)",
+            r"pose_shapes has the shape \(17, 3, 44\); expected \(17, 3, 45\)",
         ),
-        ({"names": ("a",)}, "1 names for 6 joints"),
+        ({"names": ("a",)}, "has 6 joints, but 1 names"),
     ],
 )
 def test_parts_that_do_not_fit_are_refused(changes, message):
@@ -252,9 +252,9 @@ def test_weights_that_are_rounded_are_made_to_sum_to_1():
 @pytest.mark.parametrize(
     "shape, pose, message",
     [
-        (torch.zeros(2, 4), torch.zeros(2, 6, 3), "wanted .batch, at most 3"),
-        (torch.zeros(2, 3), torch.zeros(3, 6, 3), "wanted .batch, at most 3"),
-        (torch.zeros(2, 3), torch.zeros(2, 5, 3), "wanted .batch, at most 3"),
+        (torch.zeros(2, 4), torch.zeros(2, 6, 3), "expected .batch, at most 3"),
+        (torch.zeros(2, 3), torch.zeros(3, 6, 3), "expected .batch, at most 3"),
+        (torch.zeros(2, 3), torch.zeros(2, 5, 3), "expected .batch, at most 3"),
         (
             torch.zeros(2, 3),
             torch.tensor([0.0, math.nan])[:, None, None].expand(2, 6, 3),

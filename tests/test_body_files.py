@@ -103,25 +103,25 @@ def changed(**changes):
 @pytest.mark.parametrize(
     "content, message",
     [
-        (changed(weights=None, f=None), "weights, f not in it; it holds v_template"),
-        (changed(shapedirs=np.zeros((3, 3, 3))), r"shapedirs \(3, 3, 3\).* do not fit together"),
-        (changed(J_regressor=np.zeros((JOINTS, 3))), r"J_regressor \(4, 3\).* do not fit together"),
-        (changed(v_template=np.full((VERTICES, 3), np.inf)), "v_template is float64 .* not finite"),
-        (changed(weights=np.zeros((VERTICES, JOINTS))), "sum to 0; wanted none below 0"),
+        (changed(weights=None, f=None), "weights, f are missing; the file contains v_template"),
+        (changed(shapedirs=np.zeros((3, 3, 3))), r"do not fit together: .*shapedirs \(3, 3, 3\)"),
+        (changed(J_regressor=np.zeros((JOINTS, 3))), r"do not fit together: .*J_regressor \(4, 3\)"),
+        (changed(v_template=np.full((VERTICES, 3), np.inf)), "v_template has the type float64 .* other than finite numbers"),
+        (changed(weights=np.zeros((VERTICES, JOINTS))), "sum to 0; expected no weight below 0"),
         (changed(posedirs=np.zeros((VERTICES, 3, 7))), r"pose_shapes has the shape \(12, 3, 7\)"),
-        (changed(kintree_table=np.zeros((2, JOINTS), int)), "are no tree"),
-        (changed(f=np.full((2, 3), VERTICES)), "vertices 12 to 12, but there are 0 to 11"),
-        (changed(v_template="text"), "v_template is <U4"),
-        (changed(J_regressor=sparse.csc_matrix((10**6, 10**6))), "too large to be a body's"),
-        (changed(v_template=NESTED), "v_template is list; wanted an array"),
-        (changed(f=(0, 1, 2)), "f is tuple; wanted an array"),
+        (changed(kintree_table=np.zeros((2, JOINTS), int)), "form no tree"),
+        (changed(f=np.full((2, 3), VERTICES)), "vertices 12 to 12, but the vertices are numbered 0 to 11"),
+        (changed(v_template="text"), "v_template has the type <U4"),
+        (changed(J_regressor=sparse.csc_matrix((10**6, 10**6))), "too large for a body model"),
+        (changed(v_template=NESTED), "v_template has the type list; expected an array"),
+        (changed(f=(0, 1, 2)), "f has the type tuple; expected an array"),
         (changed(v_template=np.zeros((0, 3)), shapedirs=np.zeros((0, 3, 10**9))), "do not fit together"),
-        ([1, 2], "holds list"),
+        ([1, 2], "an object of type list"),
         (
             print,
-            "refused as a pickle: it names builtins.print.*nothing in this file was run|__builtin__.print",
+            "the pickle is refused because it names builtins.print.*nothing in this file was run|__builtin__.print",
         ),
-        (changed(shapedirs=np.array([None, 1])), "refused as a pickle"),
+        (changed(shapedirs=np.array([None, 1])), "the pickle is refused"),
     ],
 )
 def test_wrong_files_are_refused(tmp_path, content, message):
@@ -141,9 +141,9 @@ def test_missing_damaged_and_other_files_are_refused(tmp_path, name):
         body_files.read(tmp_path / name)
     file = written(tmp_path, arrays(), name)
     file.write_bytes(file.read_bytes()[:300])
-    with pytest.raises(DataError, match=r"cannot be read|refused as a pickle: it is damaged"):
+    with pytest.raises(DataError, match=r"cannot be read|the pickle is refused because it is damaged"):
         body_files.read(file)
-    with pytest.raises(DataError, match=r"ends in \.npz or \.pkl"):
+    with pytest.raises(DataError, match=r"must end in \.npz or \.pkl"):
         body_files.read(tmp_path / "body.obj")
     (tmp_path / "own.npz").write_bytes(b"PK nothing")
     with pytest.raises(DataError, match="cannot be read as a body"):

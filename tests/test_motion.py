@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from framework.bodies import motion
 from framework.bodies.body import BodyModel
-from framework.bodies.people import chosen_body
+from framework.bodies.people import load_body
 from framework.bodies.poses import skeleton
 from framework.errors import DataError
 from framework.testing.bodies import DOLL
@@ -93,10 +93,10 @@ ROLES = {
 
 @pytest.mark.parametrize("file", [None, DOLL["body"]], ids=["the default body", "the SMPL family"])
 def test_bones_point_where_those_of_the_file_do(file, tmp_path):
-    made, _ = chosen_body(file)
+    made, _ = load_body(file)
     where, model = skeleton(made), BodyModel(made).double()
     offsets, orders, angles = written(tmp_path / "a.bvh", prefix="someone:")
-    found = motion.poses_of(made, motion.read(tmp_path / "a.bvh"), [2, 0])
+    found = motion.transfer_motion(made, motion.read(tmp_path / "a.bvh"), [2, 0])
     joints = model.posed_joints(torch.zeros(2, 1).double(), torch.from_numpy(found)).numpy()
     for row, frame in enumerate((2, 0)):
         wanted = directions(offsets, orders, angles, frame)
@@ -115,11 +115,11 @@ def test_bones_point_where_those_of_the_file_do(file, tmp_path):
 
 
 def test_where_nothing_turns_limbs_point_along_the_offsets_and_the_trunk_is_upright(tmp_path):
-    made, _ = chosen_body(DOLL["body"])
+    made, _ = load_body(DOLL["body"])
     written(tmp_path / "a.bvh")
     still = motion.read(tmp_path / "a.bvh")
     still = still._replace(rotations=np.broadcast_to(np.eye(3), still.rotations.shape))
-    pose, where = motion.poses_of(made, still, [0])[0], skeleton(made)
+    pose, where = motion.transfer_motion(made, still, [0])[0], skeleton(made)
     assert not pose[[where.root, *where.spine, *where.neck, *where.clavicle]].any()
 
 
@@ -136,7 +136,7 @@ def test_the_smallest_turn_also_turns_a_bone_round(one):
 WRONG = {
     "no bvh": (lambda text: "HIERARCHY\n", "MOTION is missing"),
     "two roots": (lambda text: text.replace("JOINT Spine\n", "ROOT Spine\n"), "a single ROOT"),
-    "not closed": (lambda text: text.replace("}\nMOTION", "MOTION"), "not closed"),
+    "not closed": (lambda text: text.replace("}\nMOTION", "MOTION"), "has no end"),
     "a word": (lambda text: text.replace("OFFSET", "OFFSTE", 1), "OFFSTE"),
     "too few numbers": (lambda text: text.rpartition(" ")[0], "channels"),
     "no number": (lambda text: text.replace("MOTION\nFrames: 3", "MOTION\nFrames: 0"), "channels"),
@@ -163,17 +163,17 @@ def test_other_damage_and_other_skeletons_are_told(tmp_path):
     written(tmp_path / "a.bvh")
     found = motion.read(tmp_path / "a.bvh")
     other = found._replace(names=tuple(name.replace("LeftLeg", "Tail") for name in found.names))
-    with pytest.raises(DataError, match="no joint called leftleg or leftlowleg; wanted one"):
-        motion.poses_of(chosen_body(DOLL["body"])[0], other, [0])
+    with pytest.raises(DataError, match="no joint called leftleg or leftlowleg; expected one"):
+        motion.transfer_motion(load_body(DOLL["body"])[0], other, [0])
 
 
 @pytest.mark.skipif("REAL_DATA_ROOT" not in os.environ, reason="REAL_DATA_ROOT is not set")
 def test_a_captured_walk_swings_arms_and_legs_as_the_file_does():
     file = Path(os.environ["REAL_DATA_ROOT"]) / "bodies/cmu_12_01_walk.bvh"
-    made, _ = chosen_body(None)
+    made, _ = load_body(None)
     where, moving = skeleton(made), motion.read(file)
     frames = list(range(100, 500, 4))
-    pose = torch.from_numpy(motion.poses_of(made, moving, frames))
+    pose = torch.from_numpy(motion.transfer_motion(made, moving, frames))
     joints = BodyModel(made).double().posed_joints(torch.zeros(len(frames), 1).double(), pose).numpy()
     for role, name in ((where.wrist, "Hand"), (where.ankle, "Foot")):
         ours = (joints[:, role[0]] - joints[:, role[1]])[:, 2]

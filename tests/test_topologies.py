@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from framework.bodies.decimation import decimated
-from framework.bodies.people import chosen_body
+from framework.bodies.decimation import decimate
+from framework.bodies.people import load_body
 from framework.bodies.topologies import COUNTS, Corners, edges, sheet, split, topology
 from framework.errors import DataError
 
@@ -40,21 +40,21 @@ def pairs_of(corners):
 @pytest.mark.parametrize("count", [200, 100, 50])
 def test_a_decimated_mesh_is_closed_keeps_its_volume_and_its_seams(count):
     points, corners, _ = ball()
-    found = decimated(points, *corners, count)
+    found = decimate(points, *corners, count)
     assert len(found.kept) == count == len(np.unique(found.faces))
     assert np.array_equal(found.kept, np.unique(found.faces))
     volume, whole = assert_closed(points, found.faces), assert_closed(points, corners.faces)
     assert abs(volume / whole - 1) < 12 / count
     # every corner still has a texture coordinate of its vertex, in the chart of its triangle
     assert np.isin(pairs_of(Corners(found.faces, found.uv_faces)), pairs_of(corners)).all()
-    again = decimated(points, *corners, count)
+    again = decimate(points, *corners, count)
     assert all(np.array_equal(one, other) for one, other in zip(found, again, strict=True))
 
 
 def test_more_than_can_go_is_told():
     points, corners, _ = ball(1)
-    with pytest.raises(DataError, match="wanted 1"):
-        decimated(points, *corners, 1)
+    with pytest.raises(DataError, match="cannot be reduced to 1 vertices"):
+        decimate(points, *corners, 1)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.9, 1.0])
@@ -78,7 +78,7 @@ def test_split_edges_leave_no_gap_and_carry_places_along(share):
 
 @pytest.fixture(scope="module")
 def body():
-    return chosen_body(None)[0]
+    return load_body(None)[0]
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +90,7 @@ def surface(body):
 def test_topologies_of_the_default_body(body, surface, name):
     found = topology(body, surface, name)
     assert len(found.rows) == len(np.unique(found.rows)) == COUNTS.get(name, 13_718)
-    fine = surface.carried(body.template.astype(np.float64))
+    fine = surface.interpolate(body.template.astype(np.float64))
     volume = assert_closed(fine[found.rows], found.faces, bodies=4)  # a tongue and two eyes beside the body
     assert volume == pytest.approx(assert_closed(body.template.astype(float), body.faces, bodies=4), rel=3e-3)
     # every corner has a texture coordinate that its vertex has on the finest surface

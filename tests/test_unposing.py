@@ -4,7 +4,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from framework.bodies.body import Body, BodyModel
-from framework.bodies.unposing import SMALLEST, unposed
+from framework.bodies.unposing import SMALLEST, unpose
 
 PARENTS = (1, -1, 1, 2, 0)  # the root is not the first, and a child comes before its parent
 VERTICES = 60
@@ -55,7 +55,7 @@ def test_offsets_are_found_again_and_as_inverted_matrices_find_them(features, si
         model = BodyModel(made).to(dtype)
         given = [torch.as_tensor(values, dtype=dtype) for values in (shape, pose, translation)]
         mesh = model(*given, torch.as_tensor(offsets, dtype=dtype))
-        found = unposed(model, mesh, *given)
+        found = unpose(model, mesh, *given)
         errors = np.abs(found.offsets.numpy() - offsets).max(2)
         upright = ~found.folded.numpy()
         assert (errors[upright] < tolerance).all() and found.offsets.dtype == dtype
@@ -93,7 +93,7 @@ def test_a_joint_folded_over_leaves_finite_offsets_that_show_the_same_mesh(degre
     model, given = folding(degrees)
     smallest = abs(np.cos(np.radians(degrees / 2)))
     apart = 0.03 * torch.randn(1, VERTICES, 3, generator=torch.Generator().manual_seed(0)).double()
-    found = unposed(model, model(*given) + apart, *given)
+    found = unpose(model, model(*given) + apart, *given)
     assert bool(found.folded.all()) == bool(found.folded.any()) == (smallest < SMALLEST)
     lengths, most = found.offsets.norm(dim=2), apart.norm(dim=2)
     assert found.offsets.isfinite().all() and (lengths <= most / SMALLEST * (1 + 1e-9)).all()
@@ -108,7 +108,7 @@ def test_offsets_do_not_jump_where_inverting_ends():
     limit = 2 * np.degrees(np.arccos(SMALLEST))
     before, after = (folding(limit + side) for side in (-1e-6, 1e-6))
     apart = 0.03 * torch.randn(1, VERTICES, 3, generator=torch.Generator().manual_seed(0)).double()
-    one, other = (unposed(model, model(*given) + apart, *given) for model, given in (before, after))
+    one, other = (unpose(model, model(*given) + apart, *given) for model, given in (before, after))
     assert not one.folded.any() and other.folded.all()
     assert (one.offsets - other.offsets).abs().max() < 1e-6
 
@@ -116,7 +116,7 @@ def test_offsets_do_not_jump_where_inverting_ends():
 def test_weights_half_and_half_are_the_worst():
     for share in (0.1, 0.39, 0.41, 0.5, 0.59, 0.61, 0.9):
         model, given = folding(180, share)
-        found = unposed(model, model(*given), *given)
+        found = unpose(model, model(*given), *given)
         # across the axis the blended matrix is (1 - share) - share
         assert bool(found.folded.all()) == (abs(1 - 2 * share) < SMALLEST)
 
@@ -126,4 +126,4 @@ def test_a_mesh_that_is_not_finite_is_refused():
     mesh = model(*given)
     mesh[0, 4, 1] = torch.nan
     with pytest.raises(ValueError, match="not all finite"):
-        unposed(model, mesh, *given)
+        unpose(model, mesh, *given)

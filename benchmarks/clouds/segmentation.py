@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from benchmarks.pages import machine, write_page
 from framework.bodies import poses
 from framework.bodies.body import Body
-from framework.bodies.people import chosen_body
+from framework.bodies.people import load_body
 from framework.configuration.schema import build, resolve
 from framework.figures.style import titled_figure
 from framework.geometry.clouds import sizes
@@ -162,7 +162,7 @@ def main() -> None:
     torch.set_num_threads(1)
     data = build("data", resolve("data", {"name": "registration", "train": TRAIN, "test": TEST}))
     data.prepare()
-    names, vertex_part = parts_of(chosen_body(None)[0])
+    names, vertex_part = parts_of(load_body(None)[0])
     clouds, labels = labelled(data.splits().train, TRAIN, vertex_part)
     held = labelled(data.splits().test, TEST, vertex_part)
     made = prepared(basis("ball_uniform", BASIS, 1.0, 13).float())

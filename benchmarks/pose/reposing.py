@@ -14,10 +14,10 @@ from torch import Tensor
 from benchmarks.pages import machine, write_page
 from framework.bodies import poses
 from framework.bodies.body import BodyModel
-from framework.bodies.people import adults, chosen_body
-from framework.bodies.shape_space import in_few_shapes
-from framework.bodies.topologies import Name, in_topology, topology
-from framework.bodies.unposing import unposed
+from framework.bodies.people import load_body, sample_adults
+from framework.bodies.shape_space import reduce_shapes
+from framework.bodies.topologies import Name, body_in_topology, topology
+from framework.bodies.unposing import unpose
 from framework.datasets.scan_layout import RegisteredMesh
 from plugins.data.human_scans.dressed import Wardrobe
 from plugins.data.human_scans.repose import Subject, subject
@@ -33,8 +33,8 @@ class Truth:
     """People of random shape whose clothes stay the same, whatever they do: drawn from the same numbers again."""
 
     def __init__(self) -> None:
-        self.body, self.traits = chosen_body(None)
-        self.few = in_few_shapes(self.body, self.traits)
+        self.body, self.traits = load_body(None)
+        self.few = reduce_shapes(self.body, self.traits)
         # beside all of the body's coefficients the few, in which shapes are changed
         both = {
             name: np.concatenate([getattr(self.body, name), getattr(self.few, name)], 2)
@@ -47,7 +47,7 @@ class Truth:
 
     def shape(self, random: Generator) -> Tensor:
         assert self.traits is not None
-        found = self.traits.coefficients(torch.from_numpy(adults(self.traits.labels, 1, random)))
+        found = self.traits.coefficients(torch.from_numpy(sample_adults(self.traits.labels, 1, random)))
         return torch.cat([found, torch.zeros(1, self.few.shapes.shape[2])], 1).float()
 
     def pose(self, movements: np.ndarray) -> np.ndarray:
@@ -77,16 +77,16 @@ def told(
 ) -> Tensor:
     """In another pose, where nothing has to be found: with the true pose and shape."""
     surface = truth.wardrobe.sheet
-    model = BodyModel(in_topology(truth.own, surface, topology(truth.body, surface, name))).double()
+    model = BodyModel(body_in_topology(truth.own, surface, topology(truth.body, surface, name))).double()
     before = shape.double(), torch.from_numpy(stood), torch.zeros(1, 3, dtype=torch.float64)
-    back = unposed(model, given.vertices.double()[None], *before)
+    back = unpose(model, given.vertices.double()[None], *before)
     return model(shape.double(), torch.from_numpy(other), None, back.offsets)[0]
 
 
 @torch.no_grad()
 def bare(one: Subject, pose: np.ndarray, change: Tensor | float = 0.0) -> Tensor:
     """The model without the person's offsets."""
-    return one.model(one.found.shape + change, torch.from_numpy(pose))[0]
+    return one.model(one.fit.shape + change, torch.from_numpy(pose))[0]
 
 
 @torch.no_grad()
@@ -107,11 +107,11 @@ def measured(truth: Truth, name: Name) -> dict[str, Tensor]:
         start = time.process_time()
         one = subject(truth.body, truth.few, given, f"person {person}")
         note("seconds", time.process_time() - start)
-        note("fit", 1000 * one.found.error)
+        note("fit", 1000 * one.fit.error)
         joints = truth.model.posed_joints(shape, torch.from_numpy(stood).float())[0]
-        ours = one.model.posed_joints(one.found.shape, one.found.pose)[0] + one.found.translation
+        ours = one.model.posed_joints(one.fit.shape, one.fit.pose)[0] + one.fit.translation
         note("joints", 1000 * (ours - joints).norm(dim=1).mean())
-        back = one.model(*one.found[:3], one.offsets)[0]
+        back = one.model(*one.fit[:3], one.offsets)[0]
         note("back", (back - given.vertices.double()).abs().max())
         note("folded", float(one.folded))
         for number, other in enumerate(others):

@@ -31,7 +31,7 @@ from framework.figures.style import titled_figure
 from framework.geometry.srgb import bytes_from_linear, srgb_from_linear
 from framework.renderer import Renderer, Scene
 from plugins.data.human_scans import flow
-from plugins.data.human_scans.animate import SPEED, data_of, generated, moving
+from plugins.data.human_scans.animate import SPEED, data_of, follow_motion, generated_person
 from plugins.data.human_scans.animation import on_white, orbit, photograph
 
 SUBJECTS = ("test_0000", "test_0003", "test_0005")
@@ -54,7 +54,7 @@ def walk(run: str, file: Path, subject: str) -> tuple[Pictures, list[Scene]]:
     description, _ = read_stored(run)
     data = data_of(description)
     height, width = description.target.size
-    who, moments = moving(generated(data, subject), file, FRAMES, START)
+    who, moments = follow_motion(generated_person(data, subject), file, FRAMES, START)
     cameras = orbit(moments, [AZIMUTH] * FRAMES, (height, width))
     ways = {
         "mesh, 1 sample": rendered("rasterizer"),
@@ -83,7 +83,7 @@ def differences(pictures: Pictures, scenes: list[Scene]) -> tuple[dict[str, list
         place, seen = flow.flow(scenes[one], scenes[other], drawn[one], drawn[other])
         masks.append(seen)
         for name, frames in pictures.items():
-            off = (frames[other] - flow.warped(frames[one], place)).abs().mean(-1)
+            off = (frames[other] - flow.warp(frames[one], place)).abs().mean(-1)
             found[name].append(off.where(seen, math.nan))
         assert seen.any(), f"pair {number}"
     return found, masks

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from benchmarks.pages import machine, read_rows, write_page
 from benchmarks.rendering.rasterizer_growth import milliseconds, slope
-from framework.bodies.people import chosen_body
+from framework.bodies.people import load_body
 from framework.bodies.topologies import Name, sheet, topology
 from framework.configuration.schema import build, resolve
 from framework.encoder import Encoder
@@ -34,10 +34,10 @@ ROUNDS = 3
 
 def person(name: Name) -> Tensor:
     """(points, 6): the default body at rest in a topology, coloured by place, before the canonical camera."""
-    body, _ = chosen_body(None)
+    body, _ = load_body(None)
     whole = sheet(body)
     rows = topology(body, whole, name).rows
-    vertices = torch.from_numpy(whole.carried(body.template.astype(np.float64))[rows]).float()
+    vertices = torch.from_numpy(whole.interpolate(body.template.astype(np.float64))[rows]).float()
     low, high = vertices.min(0).values, vertices.max(0).values
     return torch.cat([in_front(vertices, *SIZE).to_canonical(vertices), (vertices - low) / (high - low)], 1)[
         None

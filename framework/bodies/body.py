@@ -71,24 +71,28 @@ class Body:
             values = getattr(self, name)
             if values.shape != shape:
                 raise DataError(
-                    f"{self.source}: {name} has the shape {values.shape}; wanted {shape} for {vertices} vertices, "
-                    f"{joints} joints and as many shape coefficients as `shapes` has. Restore it from its source."
+                    f"{self.source}: {name} has the shape {values.shape}; expected {shape} for {vertices} vertices, "
+                    f"{joints} joints and as many shape coefficients as `shapes` has. Copy the file again from its "
+                    "source."
                 )
             if not np.isfinite(values).all():
                 raise DataError(
-                    f"{self.source}: {int((~np.isfinite(values)).sum())} numbers of {name} are not finite. Restore it "
-                    "from its source."
+                    f"{self.source}: {int((~np.isfinite(values)).sum())} numbers of {name} are not finite. Copy the "
+                    "file again from its source."
                 )
         if self.names and len(self.names) != joints:
-            raise DataError(f"{self.source}: {len(self.names)} names for {joints} joints; wanted one each.")
+            raise DataError(
+                f"{self.source}: the body has {joints} joints, but {len(self.names)} names; expected one name for each "
+                "joint."
+            )
         self._check_weights()
         self._check_tree()
         if self.uv is not None and self.uv_faces is not None:
             self._check_places(self.uv, self.uv_faces)
         if self.faces.size and not (self.faces.min() >= 0 and self.faces.max() < vertices):
             raise DataError(
-                f"{self.source}: faces name the vertices {self.faces.min()} to {self.faces.max()}, but there are 0 to "
-                f"{vertices - 1}. Restore it from its source."
+                f"{self.source}: the faces refer to the vertices {self.faces.min()} to {self.faces.max()}, but the "
+                f"vertices are numbered 0 to {vertices - 1}. Copy the file again from its source."
             )
 
     def _check_weights(self) -> None:
@@ -96,8 +100,9 @@ class Body:
         if (self.weights < 0).any() or (np.abs(total - 1) > SLACK).any():
             worst = int(np.abs(total[:, 0] - 1).argmax())
             raise DataError(
-                f"{self.source}: skinning weights are from {self.weights.min():g}, and those of vertex {worst} (from "
-                f"0) sum to {total[worst, 0]:g}; wanted none below 0 and sums of 1. Restore it from its source."
+                f"{self.source}: the smallest skinning weight is {self.weights.min():g}, and the weights of vertex "
+                f"{worst} (counted from 0) sum to {total[worst, 0]:g}; expected no weight below 0, and sums of 1. Copy "
+                "the file again from its source."
             )
         if (np.abs(total - 1) > ROUNDING).any():
             object.__setattr__(self, "weights", (self.weights / total).astype(self.weights.dtype))
@@ -107,7 +112,7 @@ class Body:
         if not fits or not np.isfinite(uv).all() or uv_faces.min(initial=0) < 0 or uv_faces.max() >= len(uv):
             raise DataError(
                 f"{self.source}: uv {uv.shape} and uv_faces {uv_faces.shape} do not fit {len(self.faces)} faces, or "
-                "hold numbers that are not finite. Restore it from its source."
+                "hold numbers that are not finite. Copy the file again from its source."
             )
 
     def _check_tree(self) -> None:
@@ -115,27 +120,27 @@ class Body:
         depths = _depths(self.parents)
         if len(roots) != 1 or max(self.parents, default=0) >= len(self.parents) or min(depths) < 0:
             raise DataError(
-                f"{self.source}: the parents {self.parents} of its joints are no tree; wanted one joint without a "
-                "parent, -1, from which every other descends. Restore it from its source."
+                f"{self.source}: the parents {self.parents} of the joints form no tree; expected a single joint "
+                "whose parent is -1, from which all other joints descend. Copy the file again from its source."
             )
 
 
 def _depths(parents: Sequence[int]) -> list[int]:
     """Return the number of steps from each joint up to a root; -1 if no root is reached."""
-    found = []
+    depths = []
     for joint in range(len(parents)):
         depth, at = 0, joint
         while 0 <= parents[at] < len(parents) and depth <= len(parents):
             depth, at = depth + 1, parents[at]
-        found.append(depth if parents[at] < 0 else -1)
-    return found
+        depths.append(depth if parents[at] < 0 else -1)
+    return depths
 
 
 def with_joints(body: Body, names: Sequence[str]) -> Body:
-    """Return the body with these joints alone.
+    """Return a copy of the body that has only these joints.
 
-    The other joints never bend: each moves with the nearest kept joint above it. Poses of the kept joints give the same
-    vertices, for less work. A body with pose shapes is refused, because pose shapes count all joints.
+    Each other joint moves rigidly with its nearest remaining ancestor. Poses of the remaining joints give the same
+    vertices with less computation. A body with pose shapes is refused, because pose shapes refer to all joints.
 
     Raises:
         ConfigError: no joint has such a name, the root is not among them, or the body has pose shapes.
@@ -143,33 +148,33 @@ def with_joints(body: Body, names: Sequence[str]) -> Body:
     for name in names:
         if name not in body.names:
             raise ConfigError(
-                f"{body.source} has no joint {name!r}.{did_you_mean(name, body.names)} Its joints: "
-                f"{', '.join(body.names)}."
+                f"{body.source} has no joint {name!r}.{did_you_mean(name, body.names)} The joints of the "
+                f"body are {', '.join(body.names)}."
             )
-    kept = [joint for joint, name in enumerate(body.names) if name in set(names)]
+    kept_joints = [joint for joint, name in enumerate(body.names) if name in set(names)]
     root = body.parents.index(-1)
-    if root not in kept or body.pose_shapes is not None:
+    if root not in kept_joints or body.pose_shapes is not None:
         raise ConfigError(
-            f"{body.source}: wanted its root {body.names[root]!r} among the joints kept, and a body without pose "
-            "shapes (they count every joint). Keep the root, or all joints."
+            f"{body.source}: joints can be left out only if the root {body.names[root]!r} remains and the body has "
+            "no pose shapes, which refer to all joints. Keep the root, or keep all joints."
         )
-    place = {joint: number for number, joint in enumerate(kept)}
-    weights = np.zeros((len(body.template), len(kept)), body.weights.dtype)
+    place = {joint: number for number, joint in enumerate(kept_joints)}
+    weights = np.zeros((len(body.template), len(kept_joints)), body.weights.dtype)
     for joint in range(len(body.parents)):
         weights[:, place[_kept_above(body.parents, joint, place)]] += body.weights[:, joint]
-    parents = [body.parents[joint] for joint in kept]
+    parents = [body.parents[joint] for joint in kept_joints]
     return replace(
         body,
         weights=weights,
         parents=tuple(-1 if up < 0 else place[_kept_above(body.parents, up, place)] for up in parents),
-        joints=body.joints[kept],
-        joint_shapes=body.joint_shapes[kept],
-        names=tuple(body.names[joint] for joint in kept),
+        joints=body.joints[kept_joints],
+        joint_shapes=body.joint_shapes[kept_joints],
+        names=tuple(body.names[joint] for joint in kept_joints),
     )
 
 
-def _kept_above(parents: Sequence[int], joint: int, kept: dict[int, int]) -> int:
-    while joint not in kept:
+def _kept_above(parents: Sequence[int], joint: int, kept_joints: dict[int, int]) -> int:
+    while joint not in kept_joints:
         joint = parents[joint]
     return joint
 
@@ -177,8 +182,8 @@ def _kept_above(parents: Sequence[int], joint: int, kept: dict[int, int]) -> int
 class BodyModel(nn.Module):
     """Differentiable model that returns the vertices of bodies from shape coefficients and joint rotations, in batches.
 
-    X = W(T + B_S(β) + B_P(θ), J(β), θ) (eq. 7.1, 7.2; Loper et al. 2015). A joint's rotation is relative to its parent,
-    about axes that are those of the world in the rest pose. With a pose of zeros the result is template plus shapes,
+    X = W(T + B_S(β) + B_P(θ), J(β), θ) (eq. 7.1, 7.2; Loper et al. 2015). The rotation of a joint is relative to its
+    parent; in the rest pose its axes are the world axes. With a pose of zeros the result is template plus shapes,
     equal to the last bit if there are no pose shapes.
 
     Args:
@@ -232,19 +237,19 @@ class BodyModel(nn.Module):
         """Return the posed vertices, metres, of the model's dtype.
 
         Args:
-            shape: coefficients β; fewer than the model has are the first of them.
+            shape: coefficients β; if there are fewer than the model has, they are the first ones.
             pose: θ, axis times angle of each joint, radians; angles above 2π are allowed.
             translation: translation of the whole body, metres.
             offsets: displacements of one person's vertices from the model's in the rest pose, metres: clothes, hair.
 
         Raises:
-            ValueError: other shapes, or numbers that are not finite; the message names the first such row.
+            ValueError: the shapes are wrong, or numbers are not finite; the message names the first such row.
         """
         self._check(shape, pose, translation)
         count = shape.shape[1]
         rest = torch.addmm(self.template, shape, self.shapes[:count])
         # rotations in float64, because angles of many turns lose digits otherwise; there are few of them
-        turns = turns_less_identity(pose.double())
+        turns = rotation_minus_identity(pose.double())
         if self.pose_shapes is not None:
             rest = rest + self._features(turns, pose, shape) @ self.pose_shapes
         rest = rest.unflatten(1, (3, -1))
@@ -263,7 +268,7 @@ class BodyModel(nn.Module):
     ) -> Float[Tensor, "batch vertex 3 3"]:
         """Return Σ_j w_j R_j of each vertex, the linear part of its skinning transform (W of eq. 7.1)."""
         self._check(shape, pose, None)
-        blended = self._blended(shape, turns_less_identity(pose.double()))[:, :9]
+        blended = self._blended(shape, rotation_minus_identity(pose.double()))[:, :9]
         return blended.mT.unflatten(2, (3, 3)) + torch.eye(3).to(blended)
 
     def rest_joints(self, shape: Float[Tensor, "batch shape"]) -> Float[Tensor, "batch joint 3"]:
@@ -276,9 +281,9 @@ class BodyModel(nn.Module):
         """Return the positions of the joints in a pose, metres."""
         self._check(shape, pose, None)
         joints = self.rest_joints(shape).double()
-        found = self._transforms(shape, turns_less_identity(pose.double()))
-        moved = torch.einsum("bjmn,bjn->bjm", found[..., :9].unflatten(-1, (3, 3)), joints)
-        return (joints + moved + found[..., 9:]).to(self.template.dtype)
+        transforms = self._transforms(shape, rotation_minus_identity(pose.double()))
+        moved = torch.einsum("bjmn,bjn->bjm", transforms[..., :9].unflatten(-1, (3, 3)), joints)
+        return (joints + moved + transforms[..., 9:]).to(self.template.dtype)
 
     def _blended(self, shape: Tensor, turns: Tensor) -> Float[Tensor, "batch 12 vertex"]:
         """Return Σ_j w_j (R_j - 1, t_j) of each vertex."""
@@ -305,12 +310,12 @@ class BodyModel(nn.Module):
         return torch.cat([torch.stack(rotations, 1).flatten(2), torch.stack(shifts, 1)], -1)
 
     def _features(self, turns: Tensor, pose: Tensor, shape: Tensor) -> Float[Tensor, "batch feature"]:
-        others = [joint for joint, parent in enumerate(self.parents) if parent >= 0]
+        free_joints = [joint for joint, parent in enumerate(self.parents) if parent >= 0]
         if not self.quaternions:
-            return turns[:, others].flatten(1).to(self.template.dtype)
+            return turns[:, free_joints].flatten(1).to(self.template.dtype)
         second = shape[:, 1:2] if shape.shape[1] > 1 else shape.new_zeros(len(shape), 1)
-        found = quaternions_less_identity(pose[:, others].double()).flatten(1)
-        return torch.cat([found.to(shape.dtype), second], 1)
+        features = quaternion_minus_identity(pose[:, free_joints].double()).flatten(1)
+        return torch.cat([features.to(shape.dtype), second], 1)
 
     def _check(self, shape: Tensor, pose: Tensor, translation: Tensor | None) -> None:
         batch, most, joints = len(shape), len(self.shapes), len(self.parents)
@@ -318,14 +323,16 @@ class BodyModel(nn.Module):
         if not fits or (translation is not None and translation.shape != (batch, 3)):
             moved = "" if translation is None else f" and translation {tuple(translation.shape)}"
             raise ValueError(
-                f"shape {tuple(shape.shape)}, pose {tuple(pose.shape)}{moved}; wanted (batch, at most {most}), (batch, "
-                f"{joints}, 3) and (batch, 3)."
+                f"shape {tuple(shape.shape)}, pose {tuple(pose.shape)}{moved}; expected (batch, at most {most}), "
+                f"(batch, {joints}, 3) and (batch, 3)."
             )
         for name, values in (("shape", shape), ("pose", pose), ("translation", translation)):
             # angles whose squares are infinite in float64 are also refused
             if values is not None and not (finite := values.double().square().isfinite()).all():
                 row = int((~finite.flatten(1).all(1)).nonzero()[0])
-                raise ValueError(f"{name} is not finite in batch row {row}; wanted numbers below 1e150.")
+                raise ValueError(
+                    f"{name} is not finite in batch row {row}; expected finite numbers below 1e150."
+                )
 
 
 def _rows(values: np.ndarray) -> np.ndarray:
@@ -333,8 +340,8 @@ def _rows(values: np.ndarray) -> np.ndarray:
     return np.moveaxis(values, 0, 2).transpose(1, 0, 2).reshape(values.shape[2], -1)
 
 
-def turns_less_identity(vectors: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """Return R - 1 of rotations given as axis times angle, radians; tiny angles keep their digits.
+def rotation_minus_identity(vectors: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """Return R - 1 of rotations given as axis times angle, radians, accurate also for tiny angles.
 
     R - 1 = (sin θ / θ) K + ((1 - cos θ) / θ²) K² with K x = v × x (Rodrigues; Murray, Li & Sastry 1994, eq. 2.14).
     """
@@ -347,7 +354,7 @@ def turns_less_identity(vectors: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*b
     return first * cross + half.square() / 2 * (cross @ cross)
 
 
-def quaternions_less_identity(vectors: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4"]:
+def quaternion_minus_identity(vectors: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4"]:
     """Return unit quaternions (x, y, z, w - 1) of rotations given as axis times angle, radians."""
     square = vectors.square().sum(-1, keepdim=True)
     quarter = sine_over_angle(square / 16)
@@ -356,7 +363,7 @@ def quaternions_less_identity(vectors: Float[Tensor, "*batch 3"]) -> Float[Tenso
 
 
 def sine_over_angle(square: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-    """Return sin θ / θ as a function of θ², smooth also at 0."""
+    """Return sin θ / θ as a function of θ²; it is smooth at 0 too."""
     small = square < 1e-2
     root = square.where(~small, 1).sqrt()
     # the series of sin θ / θ; its remainder is below 1e-20 up to θ² = 1e-2

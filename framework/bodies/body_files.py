@@ -1,9 +1,9 @@
-"""Files of body models: the published layout (`v_template`, `shapedirs` and so on) in .npz or .pkl, and our own.
+"""Files of body models: the published layout (`v_template`, `shapedirs` …) in .npz or .pkl, and a layout of our own.
 
 The published models with linear blend skinning use this layout: `v_template` (V, 3), `shapedirs` (V, 3, B),
 `J_regressor` (J, V), `weights` (V, J), `kintree_table` (2, J) whose first row holds parents, `f` (F, 3), and in most
 files `posedirs` (V, 3, 9 (J - 1)), or with 4 (J - 1) + 1 features. Other keys are not read. Pickles are read by
-framework.bodies.restricted_pickle, which runs nothing that a file names.
+framework.bodies.restricted_pickle, which calls no function that a file names.
 """
 
 import math
@@ -24,7 +24,7 @@ from framework.storage.reading import read_bytes, require_numbers, translate_err
 
 NEEDED = ("v_template", "shapedirs", "J_regressor", "weights", "kintree_table", "f")
 OWN = ("template", "faces", "weights", "parents", "joints", "shapes", "joint_shapes")
-WANTED = f"Wanted: {', '.join(NEEDED)}, and posedirs for a body with pose blend shapes, as arrays."
+WANTED = f"Expected: {', '.join(NEEDED)}, and posedirs for a body with pose blend shapes, as arrays."
 
 
 def read(file: Path) -> Body:
@@ -34,19 +34,21 @@ def read(file: Path) -> Body:
         DataError: the file does not exist, has another format, holds something other than arrays and plain values, or
             an array is missing or has another shape. The message names the cause.
     """
-    with translate_errors(file, "a body model", missing="wanted a body model. Mend the path."):
+    with translate_errors(file, "a body model", missing="expected a body model. Correct the path."):
         if file.suffix == ".npz":
             content = read_bytes(file)
-            found = read_npz(content, (*NEEDED, "posedirs"))
-            require_numbers(sum(array.size for array in found.values()), MOST_NUMBERS, len(content))
-            return _body(file, found)
+            arrays = read_npz(content, (*NEEDED, "posedirs"))
+            require_numbers(sum(array.size for array in arrays.values()), MOST_NUMBERS, len(content))
+            return _body(file, arrays)
         if file.suffix == ".pkl":
             return _body(file, _unpickled(file))
-    raise DataError(f"{file}: wanted a body model whose name ends in .npz or .pkl.")
+    raise DataError(
+        f"{file}: the name of a body model's file must end in .npz or .pkl. Rename the file, or choose another one."
+    )
 
 
 def save(body: Body, file: Path) -> None:
-    """Write a body as an .npz of our own layout, whole or not at all."""
+    """Write a body as an .npz file in the project's own layout; the file is complete or absent."""
     arrays = {name: np.asarray(getattr(body, name)) for name in OWN}
     arrays |= {"source": np.array(body.source), "names": np.array(body.names, dtype=np.str_)}
     for name in ("pose_shapes", "uv", "uv_faces"):
@@ -62,7 +64,7 @@ def load(file: Path) -> Body:
     Raises:
         DataError: the file is missing or damaged.
     """
-    with translate_errors(file, "a body", "Delete it: it is made anew."):
+    with translate_errors(file, "a body", "Delete the file: it is generated again."):
         arrays = read_npz(read_bytes(file))
         parents = tuple(int(parent) for parent in arrays.pop("parents"))
         names = tuple(str(name) for name in arrays.pop("names"))
@@ -71,24 +73,26 @@ def load(file: Path) -> Body:
 
 def _unpickled(file: Path) -> Mapping[str, Any]:
     try:
-        found = restricted_pickle.load(read_bytes(file))
+        content = restricted_pickle.load(read_bytes(file))
     except restricted_pickle.PickleRefused as error:
         raise DataError(
-            f"{file}: refused as a pickle: {error}. Only arrays are read from pickles; nothing in this file was run. "
-            f"{WANTED}"
+            f"{file}: the pickle is refused because {error}. Only arrays are read from pickles; nothing in this file "
+            f"was run. {WANTED}"
         ) from error
-    if not isinstance(found, dict):
-        raise DataError(f"{file}: holds {type(found).__name__}. {WANTED}")
-    return found
+    if not isinstance(content, dict):
+        raise DataError(
+            f"{file}: the file contains an object of type {type(content).__name__}, not a dictionary. {WANTED}"
+        )
+    return content
 
 
-def _body(file: Path, found: Mapping[str, Any]) -> Body:
-    missing = [name for name in NEEDED if name not in found]
+def _body(file: Path, content: Mapping[str, Any]) -> Body:
+    missing = [name for name in NEEDED if name not in content]
     if missing:
-        names = shorten(", ".join(map(str, found))) or "nothing"
-        raise DataError(f"{file}: {', '.join(missing)} not in it; it holds {names}. {WANTED}")
-    posedirs = found.get("posedirs")
-    arrays = {name: _numbers(file, name, found[name]) for name in NEEDED}
+        names = shorten(", ".join(map(str, content))) or "nothing"
+        raise DataError(f"{file}: {', '.join(missing)} are missing; the file contains {names}. {WANTED}")
+    posedirs = content.get("posedirs")
+    arrays = {name: _numbers(file, name, content[name]) for name in NEEDED}
     template, shapes, regressor = arrays["v_template"], arrays["shapedirs"], arrays["J_regressor"]
     if shapes.ndim == 2:  # a model with a single coefficient
         shapes = shapes[..., None]
@@ -102,7 +106,7 @@ def _body(file: Path, found: Mapping[str, Any]) -> Body:
         or len(regressor) * math.prod(shapes.shape[1:]) > LARGEST
     ):
         shapes = ", ".join(f"{name} {array.shape}" for name, array in arrays.items())
-        raise DataError(f"{file}: {shapes} do not fit together. {WANTED}")
+        raise DataError(f"{file}: the shapes of the arrays do not fit together: {shapes}. {WANTED}")
     wanted = template.dtype
     return Body(
         source=str(file),
@@ -124,11 +128,12 @@ def _body(file: Path, found: Mapping[str, Any]) -> Body:
 def _numbers(file: Path, name: str, value: Any) -> np.ndarray:
     # lists are refused: nested lists that repeat one another would expand into an array of unlimited size
     if not isinstance(value, np.ndarray | np.generic | int | float | str):
-        raise DataError(f"{file}: {name} is {type(value).__name__}; wanted an array. {WANTED}")
+        raise DataError(f"{file}: {name} has the type {type(value).__name__}; expected an array. {WANTED}")
     array = np.asarray(value)
     if array.dtype.kind not in "iuf" or not np.isfinite(array).all():
         raise DataError(
-            f"{file}: {name} is {array.dtype} {array.shape} with numbers that are not finite, or no numbers. {WANTED}"
+            f"{file}: {name} has the type {array.dtype} and the shape {array.shape}, and it holds something other than "
+            f"finite numbers. {WANTED}"
         )
     if array.dtype.kind == "f":
         return array.astype(np.float32 if array.dtype.itemsize <= 4 else np.float64)

@@ -1,4 +1,4 @@
-"""Decimation of closed meshes: edges collapse onto one of their ends, in order of the change of the surface.
+"""Decimation of closed meshes: edges collapse onto one end, the edge that changes the surface least first.
 
 Quadric error metrics (Garland and Heckbert 1997) with half-edge collapses: the remaining vertices are a subset of the
 mesh's own, and therefore keep their colours, texture coordinates and other attributes.
@@ -19,14 +19,14 @@ TURN = 0.2
 
 
 class Decimated(NamedTuple):
-    """Remaining vertices, and triangles of vertices and of texture coordinates, all in the numbers of the input."""
+    """Remaining vertices, and their triangles and texture triangles, with the numbers of the input."""
 
     kept: Int[np.ndarray, "left"]
     faces: Int[np.ndarray, "triangles 3"]
     uv_faces: Int[np.ndarray, "triangles 3"]
 
 
-def decimated(
+def decimate(
     vertices: Float[np.ndarray, "vertices 3"],
     faces: Int[np.ndarray, "faces 3"],
     uv_faces: Int[np.ndarray, "faces 3"],
@@ -44,8 +44,8 @@ def decimated(
     while left > count:
         if not work.step():
             raise DataError(
-                f"{left} of {len(vertices)} vertices are left and no edge between them can go; wanted {count}. Ask for "
-                "a topology with more vertices."
+                f"The mesh cannot be reduced to {count} vertices: {left} of {len(vertices)} vertices are left, and no "
+                "edge between them can be removed. Choose a topology with more vertices."
             )
         left -= 1
     alive = [face for face in range(len(faces)) if work.corners[face] is not None]
@@ -104,14 +104,14 @@ class _Collapses:
 
     def _places_after(self, v: int, u: int) -> dict[int, int] | None:
         """Return the texture coordinate of u that replaces each of those of v; None if a seam would break."""
-        found: dict[int, int] = {}
+        place_after: dict[int, int] = {}
         for face in self.around[v] & self.around[u]:
             corners, places = self.corners[face] or [], self.places[face]
             at_v, at_u = places[corners.index(v)], places[corners.index(u)]
-            if found.setdefault(at_v, at_u) != at_u:
+            if place_after.setdefault(at_v, at_u) != at_u:
                 return None
         needed = {self.places[face][(self.corners[face] or []).index(v)] for face in self.around[v]}
-        return found if needed <= set(found) else None
+        return place_after if needed <= set(place_after) else None
 
     def _keeps_shape(self, v: int, u: int) -> bool:
         """Return whether the mesh stays a manifold (v and u share exactly two neighbours) and no triangle flips."""
@@ -166,7 +166,7 @@ def _quadrics(vertices: np.ndarray, faces: np.ndarray) -> Float[np.ndarray, "ver
     plane = np.concatenate([normal, -(normal * a).sum(1, keepdims=True)], 1)
     rows, columns = np.triu_indices(4)
     outer = area / 2 * plane[:, rows] * plane[:, columns]
-    found = np.zeros((len(vertices), 10))
+    quadrics = np.zeros((len(vertices), 10))
     for corner in range(3):
-        np.add.at(found, faces[:, corner], outer)
-    return found
+        np.add.at(quadrics, faces[:, corner], outer)
+    return quadrics

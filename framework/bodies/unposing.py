@@ -32,7 +32,7 @@ class Unposed(NamedTuple):
 
 
 @torch.no_grad()
-def unposed(
+def unpose(
     model: BodyModel,
     vertices: Float[Tensor, "batch vertex 3"],
     shape: Float[Tensor, "batch shape"],
@@ -53,11 +53,13 @@ def unposed(
     Raises:
         ValueError: other shapes, or numbers that are not finite.
     """
-    apart = vertices - model(shape, pose, translation)
-    if not apart.isfinite().all():
-        raise ValueError("vertices are not all finite; wanted metres of every vertex.")
+    residuals = vertices - model(shape, pose, translation)
+    if not residuals.isfinite().all():
+        raise ValueError(
+            "the vertices are not all finite; expected finite coordinates of every vertex, metres."
+        )
     left, values, right = torch.linalg.svd(model.skinning(shape, pose).double())
     inverse = torch.where(values < SMALLEST, values / SMALLEST**2, 1 / values.clamp(min=SMALLEST))
-    along = inverse * (left.mT @ apart.double()[..., None])[..., 0]
+    along = inverse * (left.mT @ residuals.double()[..., None])[..., 0]
     offsets = (right.mT @ along[..., None])[..., 0].to(vertices.dtype)
     return Unposed(offsets, values[..., -1] < SMALLEST)

@@ -110,27 +110,28 @@ def read_splits(root: Path) -> dict[str, tuple[str, ...]]:
     """
     if not root.is_dir():
         raise DataError(
-            f"data.root = {root}: no such folder; wanted one with subjects, train.txt, validation.txt and test.txt, or "
-            "null."
+            f"data.root = {root}: no such folder; expected a folder that holds subjects, train.txt, validation.txt and "
+            "test.txt. Set data.root to such a folder, or to null."
         )
-    found: dict[str, tuple[str, ...]] = {}
-    seen: dict[str, Path] = {}
+    names_by_split: dict[str, tuple[str, ...]] = {}
+    list_of_subject: dict[str, Path] = {}
     for split in Splits._fields:
         file = root / f"{split}.txt"
         with translate_errors(file, "names of subjects, a line each"):
             names = [line.strip() for line in lines_of(read_bytes(file)) if line.strip()]
             if not names:
-                raise ValueError("it names nobody")
+                raise ValueError("the list names nobody")
             for name in names:
                 if not NAME.fullmatch(name):
                     raise ValueError(f"{shorten(name)!r} is no name of a folder in {root / 'subjects'}")
-                if name in seen:
+                if name in list_of_subject:
                     raise ValueError(
-                        f"subject {name} is in {seen[name].name} already; wanted each once, in one split"
+                        f"subject {name} is in {list_of_subject[name].name} already; expected each subject once, in "
+                        "one split"
                     )
-                seen[name] = file
-        found[split] = tuple(names)
-    return found
+                list_of_subject[name] = file
+        names_by_split[split] = tuple(names)
+    return names_by_split
 
 
 def read_subject(root: Path, name: str, topology: str) -> Subject:
@@ -142,7 +143,8 @@ def read_subject(root: Path, name: str, topology: str) -> Subject:
     folder = root / "subjects" / name
     if not folder.is_dir():
         raise DataError(
-            f"{folder}: no such folder; wanted the subject {name} there. Restore it, or take it off its list."
+            f"{folder}: no such folder; expected the files of the subject {name}. Copy the folder again from its "
+            "source, or remove the name from its list."
         )
     mesh = read_registration(folder / f"registration_{topology}.ply")
     views = read_cameras(folder / "cameras.json")
@@ -157,17 +159,18 @@ def read_registration(file: Path) -> RegisteredMesh:
     """Read a mesh with one colour per vertex.
 
     Raises:
-        DataError: the file cannot be read, has no faces, or no colours of 0 to 1 (0 to 255 in whole numbers).
+        DataError: the file cannot be read, has no faces, or no colours in [0, 1] (0 to 255 for whole numbers).
     """
-    if not file.exists() and (others := sorted(file.parent.glob("registration_*.ply"))):
-        there = ", ".join(other.stem.removeprefix("registration_") for other in others)
+    if not file.exists() and (files_beside := sorted(file.parent.glob("registration_*.ply"))):
+        topologies = ", ".join(other.stem.removeprefix("registration_") for other in files_beside)
         raise DataError(
-            f"{file}: no such file, but there are those of the topologies {there}. Set data.topology."
+            f"{file}: no such file, but the folder has the topologies {topologies}. Set data.topology to one of these."
         )
     mesh = meshes.read(file)
     if not len(mesh.faces):
         raise DataError(
-            f"{file}: it has no faces; wanted the triangles of a registered mesh. Save it with them."
+            f"{file}: the mesh has no faces; expected the triangles of a registered mesh. Save the mesh with its "
+            "triangles."
         )
     return RegisteredMesh(
         torch.from_numpy(mesh.vertices).float(),
@@ -184,8 +187,8 @@ def vertex_colors(mesh: meshes.Mesh) -> UInt8[np.ndarray, "vertices 3"]:
     """
     if not set(COLOURS) <= set(mesh.columns):
         raise DataError(
-            f"{mesh.source}: its vertices have no colours; wanted red, green and blue of each. Save it with vertex "
-            "colours (a PLY can hold them)."
+            f"{mesh.source}: the vertices have no colours; expected red, green and blue of each vertex. Save the mesh "
+            "with vertex colours, for example as PLY."
         )
     return (mesh.attribute(COLOURS) * 255).round().astype(np.uint8)
 
@@ -196,26 +199,26 @@ def read_cameras(file: Path) -> dict[str, Camera]:
     Raises:
         DataError: the file is missing or damaged, a view is named twice, or the numbers of a view make no camera.
     """
-    found: dict[str, Camera] = {}
+    cameras: dict[str, Camera] = {}
     document = read_json(file, "cameras")
     with translate_errors(file, "cameras"):
         views = document.get("views")
         if not isinstance(views, list) or not views:
-            raise ValueError('wanted {"views": [...]} with one camera or more')
+            raise ValueError('expected {"views": [...]} with one camera or more')
         for number, view in enumerate(views):
             name = view.get("name") if isinstance(view, dict) else None
             if not isinstance(name, str) or not NAME.fullmatch(name):
-                raise ValueError(f"view {number} (from 0) has no name that could be a file's")
-            if name in found:
-                raise ValueError(f"view {name} is there twice")
-            found[name] = _camera(name, view)
-    return found
+                raise ValueError(f"view {number} (from 0) has no name that can be a file name")
+            if name in cameras:
+                raise ValueError(f"view {name} occurs twice")
+            cameras[name] = _camera(name, view)
+    return cameras
 
 
 def _camera(name: str, view: Mapping[str, Any]) -> Camera:
     sizes = [view.get(side) for side in ("height", "width")]
     if not all(type(size) is int and 1 <= size <= images.LONGEST_SIDE for size in sizes):
-        raise ValueError(f"view {name}: height and width are {sizes}; wanted whole numbers of pixels")
+        raise ValueError(f"view {name}: height and width are {sizes}; expected whole numbers of pixels")
     numbers = {}
     for key, shape in (("K", (3, 3)), ("R", (3, 3)), ("t", (3,))):
         try:
@@ -225,11 +228,12 @@ def _camera(name: str, view: Mapping[str, Any]) -> Camera:
         if numbers[key].shape != shape or not np.isfinite(numbers[key]).all():
             raise ValueError(f"view {name}: {key} is no array of {'×'.join(map(str, shape))} finite numbers")
     matrix, rotation, translation = (numbers[key] for key in ("K", "R", "t"))
-    apart = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
-    if not apart < SLACK or np.linalg.det(rotation) < 0:
+    deviation = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+    if not deviation < SLACK or np.linalg.det(rotation) < 0:
         raise ValueError(
-            f"view {name}: R is no rotation (RRᵀ is {apart:.2g} from the identity, determinant "
-            f"{np.linalg.det(rotation):.3g}); wanted that from the world to the camera: x right, y down, z forward"
+            f"view {name}: R is no rotation (RRᵀ differs by {deviation:.2g} from the identity, the determinant is "
+            f"{np.linalg.det(rotation):.3g}); expected the rotation from the world to the camera: x right, y down, z "
+            "forward"
         )
     if (
         not (matrix[0, 0] > 0 and matrix[1, 1] > 0)
@@ -237,8 +241,8 @@ def _camera(name: str, view: Mapping[str, Any]) -> Camera:
         or matrix[2].tolist() != [0, 0, 1]
     ):
         raise ValueError(
-            f"view {name}: K is {matrix.tolist()}; wanted ((fx, 0, cx), (0, fy, cy), (0, 0, 1)) with fx and fy above "
-            "0: pixels without shear"
+            f"view {name}: the camera matrix K is {matrix.tolist()}; expected ((fx, 0, cx), (0, fy, cy), (0, 0, 1)) "
+            "with fx and fy above 0: pixels without shear"
         )
     height, width = (int(size) for size in sizes if size is not None)
     return Camera(
@@ -257,7 +261,7 @@ def _checked_view(folder: Path, name: str, camera: Camera) -> View:
         with images.open_image(file) as image:
             _check_size(file, image, camera)
             if tail(file)[-8:] != PNG_END:
-                raise ValueError("it is cut short, or no PNG")
+                raise ValueError("the file is cut off, or is no PNG file")
     return view
 
 
@@ -272,7 +276,7 @@ def _check_size(file: Path, image: Image.Image, camera: Camera) -> None:
     if image.size != (camera.width, camera.height):
         raise DataError(
             f"{file}: {image.width} × {image.height} pixels, but its camera has {camera.width} × {camera.height}; "
-            "wanted the same. Mend cameras.json, or scale the picture."
+            "expected the same size. Correct cameras.json, or scale the image."
         )
 
 
@@ -282,12 +286,12 @@ def read_photograph(view: View) -> Photograph:
     Raises:
         DataError: a file is damaged, or its size differs from the camera's.
     """
-    found = []
+    arrays_read = []
     for file, channels in ((view.image, 3), (view.mask, 1)):
         with images.open_image(file) as image:
             _check_size(file, image, view.camera)
-            found.append(np.array(images.decode(image, channels, upright=False)))
-    return Photograph(*found)
+            arrays_read.append(np.array(images.decode(image, channels, upright=False)))
+    return Photograph(*arrays_read)
 
 
 def read_places(root: Path, topology: str) -> TexturePlaces:
@@ -299,18 +303,18 @@ def read_places(root: Path, topology: str) -> TexturePlaces:
     file = root / f"topology_{topology}.npz"
     with translate_errors(file, "faces, uv and uv_faces of a topology"):
         arrays = read_npz(read_bytes(file), ("faces", "uv", "uv_faces"))
-        found = TexturePlaces(
+        places = TexturePlaces(
             arrays["faces"].astype(np.int64),
             arrays["uv"].astype(np.float32),
             arrays["uv_faces"].astype(np.int64),
         )
-        fits = found.uv_faces.shape == found.faces.shape == (len(found.faces), 3) and found.uv.shape[1:] == (
-            2,
-        )
-        fits = fits and np.isfinite(found.uv).all()
-        if not fits or found.uv_faces.min() < 0 or found.uv_faces.max() >= len(found.uv):
-            raise ValueError("uv_faces do not fit faces and uv")
-    return found
+        fits = places.uv_faces.shape == places.faces.shape == (len(places.faces), 3) and places.uv.shape[
+            1:
+        ] == (2,)
+        fits = fits and np.isfinite(places.uv).all()
+        if not fits or places.uv_faces.min() < 0 or places.uv_faces.max() >= len(places.uv):
+            raise ValueError("the array uv_faces does not fit faces and uv")
+    return places
 
 
 def read_texture(root: Path, name: str) -> UInt8[np.ndarray, "height width 3"]:
@@ -344,7 +348,7 @@ def write_cameras(file: Path, cameras: Mapping[str, Camera]) -> None:
             }
         )
     if not all(math.isfinite(number) for view in views for row in view["K"] for number in row):
-        raise ValueError("a camera has numbers that are not finite; wanted finite ones.")
+        raise ValueError("a camera has numbers that are not finite; expected finite numbers.")
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text(json.dumps({"views": views}, indent=1) + "\n", encoding="utf-8")
 
@@ -355,9 +359,9 @@ def write_views(folder: Path, cameras: Sequence[Camera], photographs: Sequence[P
     write_cameras(folder / "cameras.json", dict(zip(names, cameras, strict=True)))
     for kind in ("images", "masks"):
         (folder / kind).mkdir()
-    for name, one in zip(names, photographs, strict=True):
-        Image.fromarray(one.pixels).save(folder / "images" / f"{name}.png", compress_level=4)
-        Image.fromarray(one.mask).save(folder / "masks" / f"{name}.png", compress_level=4)
+    for name, photograph in zip(names, photographs, strict=True):
+        Image.fromarray(photograph.pixels).save(folder / "images" / f"{name}.png", compress_level=4)
+        Image.fromarray(photograph.mask).save(folder / "masks" / f"{name}.png", compress_level=4)
 
 
 def write_splits(root: Path, names: Mapping[str, Sequence[str]]) -> None:

@@ -1,4 +1,4 @@
-"""Small bodies for checks of components that read or draw people: a doll, and people of 40 coloured vertices."""
+"""Small bodies for checks of plugins that read or draw people: a doll, and people of 40 coloured vertices."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -46,7 +46,7 @@ def doll() -> dict[str, np.ndarray]:
     }
 
 
-def body_file(folder: Path) -> Mapping[str, str]:
+def write_body_file(folder: Path) -> Mapping[str, str]:
     """Write the doll to a folder, and return the parameter that names its file."""
     np.savez(folder / "doll.npz", **doll())  # type: ignore[arg-type]
     return {"body": str(folder / "doll.npz")}
@@ -54,7 +54,7 @@ def body_file(folder: Path) -> Mapping[str, str]:
 
 def small_body() -> Mapping[str, str]:
     """Return the parameter of the doll's file, in a folder that lasts as long as this process."""
-    return body_file(Path(FOLDER.name))
+    return write_body_file(Path(FOLDER.name))
 
 
 def person(number: int) -> tuple[np.ndarray, np.ndarray]:
@@ -65,17 +65,17 @@ def person(number: int) -> tuple[np.ndarray, np.ndarray]:
     return mesh, mesh[near] + np.random.default_rng(number + 1).normal(0, 0.01, (300, 3))
 
 
-def scanned(folder: Path) -> Mapping[str, str]:
+def write_subjects(folder: Path) -> Mapping[str, str]:
     """Write six subjects of 40 coloured vertices, and return the parameter that names their folder.
 
-    Each has two photographs of 12 × 9 pixels of noise with random masks, and a texture.
+    Each subject has two photographs and masks of 12 × 9 random pixels, and a texture.
     """
     folder.mkdir(exist_ok=True)
     names = {"train": ("ann", "bob", "cleo"), "validation": ("dan",), "test": ("eve", "fay")}
     scan_layout.write_splits(folder, names)
-    for number, name in enumerate(name for some in names.values() for name in some):
+    for number, name in enumerate(name for split_names in names.values() for name in split_names):
         home, random = folder / "subjects" / name, np.random.default_rng(number)
-        scan_layout.write_registration(home / "registration_7k.ply", colored(number))
+        scan_layout.write_registration(home / "registration_7k.ply", colored_mesh(number))
         view = Camera(
             torch.diag(torch.tensor([1.0, -1, -1])),
             torch.tensor([0, 1, 3.0]),
@@ -87,20 +87,20 @@ def scanned(folder: Path) -> Mapping[str, str]:
         scan_layout.write_cameras(
             home / "cameras.json", {"front": view, "near": replace(view, focal=(14.0, 15.0))}
         )
-        for place in ("images/front", "images/near", "masks/front", "masks/near"):
+        for image_name in ("images/front", "images/near", "masks/front", "masks/near"):
             pixels = random.integers(0, 256, (12, 9, 3), np.uint8)
-            file = home / f"{place}.png"
+            file = home / f"{image_name}.png"
             file.parent.mkdir(exist_ok=True)
-            Image.fromarray(pixels if "images" in place else pixels[..., 0]).save(file)
+            Image.fromarray(pixels if "images" in image_name else pixels[..., 0]).save(file)
         Image.fromarray(random.integers(0, 256, (7, 5, 3), np.uint8)).save(home / "texture.png")
-    places = np.random.default_rng(6).random((6, 2), np.float32)
+    uv = np.random.default_rng(6).random((6, 2), np.float32)
     faces = np.array([(0, 1, 2), (2, 1, 3)])
-    np.savez(folder / "topology_7k.npz", faces=faces, uv=places, uv_faces=[(0, 1, 2), (5, 4, 3)])
+    np.savez(folder / "topology_7k.npz", faces=faces, uv=uv, uv_faces=[(0, 1, 2), (5, 4, 3)])
     return {"root": str(folder)}
 
 
-def colored(number: int) -> RegisteredMesh:
-    """Return a person's mesh with random colours."""
+def colored_mesh(number: int) -> RegisteredMesh:
+    """Return the mesh of `person(number)` with random colours."""
     colors = np.random.default_rng(number).integers(0, 256, (40, 3), np.uint8)
     faces = np.array([(0, 1, 2), (2, 1, 3)])
     return RegisteredMesh(

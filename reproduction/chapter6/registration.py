@@ -27,11 +27,11 @@ import framework
 from benchmarks.pages import machine, write_page
 from benchmarks.sweeps import by_the_clock, record, settings
 from benchmarks.timing import milliseconds
-from framework.bodies.default_body import default_body
+from framework.bodies.default_body import load_default_body
 from framework.configuration.schema import build, resolve
 from framework.distributions.protocol import median
 from framework.reports.table import format_number
-from plugins.data.registration.correspond import Registered, answered, model
+from plugins.data.registration.correspond import RegisterScan, model, write_correspondences
 from plugins.data.registration.faust import Challenge
 
 HERE = Path(__file__).parent
@@ -106,7 +106,7 @@ def main(runs: list[Path], scan: Path | None) -> None:
     torch.manual_seed(0)
     data = build("data", resolve("data", {"name": "registration"}))
     data.prepare()
-    _, traits = default_body()
+    _, traits = load_default_body()
     with torch.inference_mode():
         rows, ranks = speeds(data), residuals(data)
     lines = [
@@ -114,8 +114,8 @@ def main(runs: list[Path], scan: Path | None) -> None:
         "",
         machine("torch", "numba"),
         "",
-        f"The default body's vertices are at most {1e6 * traits.apart:.2g} µm from where its package puts them (8 "
-        "bodies of random shape and pose, float32 against float64).",
+        f"The default body's vertices are at most {1e6 * traits.largest_error:.2g} µm from where its package puts them "
+        "(8 bodies of random shape and pose, float32 against float64).",
         "",
         "| one core | ms |",
         "|---|---:|",
@@ -175,7 +175,7 @@ def table_64(runs: list[Path]) -> list[str]:
         registered, generated = model(str(run))
 
         def timed_registered(
-            scan: Path, registered: Registered = registered
+            scan: Path, registered: RegisterScan = registered
         ) -> Float[np.ndarray, "vertex 3"]:
             start = time.process_time()
             found = registered(scan)
@@ -185,7 +185,9 @@ def table_64(runs: list[Path]) -> list[str]:
         experiment = json.loads((run / "results.json").read_text(encoding="utf-8"))["experiment"]
         with tempfile.TemporaryDirectory() as folder:
             for challenge, thesis in THESIS.items():
-                errors = np.array(answered(timed_registered, generated(), challenge, Path(folder)).error_cm)
+                errors = np.array(
+                    write_correspondences(timed_registered, generated(), challenge, Path(folder)).error_cm
+                )
                 spread = errors.std(ddof=1) / len(errors) ** 0.5
                 shown = f"{errors.mean():.2f} ± {spread:.2f} | {errors.max():.2f}"
                 rows.append(f"| `{experiment}` | {challenge} | {len(errors)} | {shown} | {thesis:.2f} |")

@@ -20,14 +20,14 @@ from torch import Tensor
 from benchmarks.pages import machine, write_page
 from benchmarks.rendering.smplpix_flicker import rendered, training
 from framework.bodies import poses
-from framework.bodies.shape_space import in_few_shapes
+from framework.bodies.shape_space import reduce_shapes
 from framework.configuration.loading import read_stored
 from framework.configuration.schema import build, resolve
 from framework.figures.style import titled_figure
 from framework.geometry.camera import Camera
 from framework.geometry.srgb import srgb_from_linear
 from framework.renderer import Renderer, Scene
-from plugins.data.human_scans.animate import data_of, generated
+from plugins.data.human_scans.animate import data_of, generated_person
 from plugins.data.human_scans.animation import Generated, Moment, actor, on_white, orbit, photograph
 from plugins.data.human_scans.data import HumanScans
 from plugins.data.human_scans.repose import shape_change, subject
@@ -86,7 +86,7 @@ def main(runs: Sequence[str]) -> None:
         method = read_stored(run)[0].method
         renderers[NAMES.get(method, method)] = rendered("smplpix", checkpoint=run)
     ways = Ways(renderers, data.renderer, (height, width))
-    people = [generated(data, name) for name in SUBJECTS]
+    people = [generated_person(data, name) for name in SUBJECTS]
     figures = {
         "7_2": ("Figure 7.2: people of the test split", list(seen_from(people, FRONT, ways.size))),
         "7_3": ("Figure 7.3: views all around one of them", list(around(people[1], ways.size))),
@@ -141,7 +141,7 @@ def posed(one: Generated, size: tuple[int, int]) -> Iterator[Shot]:
 
 def shaped(data: HumanScans, one: Generated, size: tuple[int, int]) -> Iterator[Shot]:
     """Pose and shape are found from the registration alone; the photograph is known of the first alone."""
-    few = in_few_shapes(one.crowd.body, one.crowd.traits)
+    few = reduce_shapes(one.crowd.body, one.crowd.traits)
     found = subject(one.crowd.body, few, one.registration, SUBJECTS[1])
     count = few.shapes.shape[-1]
     meshes = {

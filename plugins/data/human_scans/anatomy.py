@@ -1,7 +1,7 @@
 """Anatomical coordinates of each vertex of a person: along an arm or a leg, height on the trunk, position on the head.
 
-All of them are measured on the body's template in its rest pose. Garments, hair and skin of all people in all poses are
-therefore painted and cut by the same few numbers.
+All coordinates are measured on the template of the body in its rest pose. Garments, hair and skin of all people in all
+poses therefore use the same coordinates.
 """
 
 from collections.abc import Callable
@@ -97,22 +97,22 @@ def anatomy(body: Body, carried: Callable[[np.ndarray], np.ndarray]) -> Anatomy:
 def _parts(body: Body, where: Skeleton) -> dict[str, list[int]]:
     """Return the joints of arms, legs and head: the topmost joints of each part and all joints below them."""
     tops = {"arms": where.arm, "legs": where.hip, "head": where.neck[-1:]}
-    found: dict[str, list[int]] = {name: [] for name in tops}
+    joints_of_part: dict[str, list[int]] = {name: [] for name in tops}
     for joint in range(len(body.parents)):
         up = joint
         while up >= 0:
             name = next((name for name, roles in tops.items() if up in roles), None)
             if name is not None:
-                found[name].append(joint)
+                joints_of_part[name].append(joint)
                 break
             up = body.parents[up]
-    return found
+    return joints_of_part
 
 
 def _along(body: Body, chain: list[tuple[int, int]], share: np.ndarray) -> Float[np.ndarray, "vertex"]:
-    """Return metres from the chain's first joint along its bones, on the side of the body to which a vertex belongs."""
+    """Return each vertex's distance, metres, from the first joint along the bones of the chain on its side."""
     place, joints = body.template.astype(np.float64), body.joints.astype(np.float64)
-    found = np.full(len(place), AWAY)
+    distance = np.full(len(place), AWAY)
     for side in (0, 1):
         first, middle, last = (joints[pair[side]] for pair in chain)
         other = joints[chain[0][1 - side]]
@@ -122,8 +122,8 @@ def _along(body: Body, chain: list[tuple[int, int]], share: np.ndarray) -> Float
         after = upper + (place - middle) @ ((last - middle) / lower)
         nearer = _from(place, middle, last) < _from(place, first, middle)
         along = np.where(nearer, np.maximum(after, upper - 0.05), np.minimum(before, upper + 0.05))
-        found = np.where(mine, np.where(share > 0.5, along, np.minimum(along, -0.01)), found)
-    return found
+        distance = np.where(mine, np.where(share > 0.5, along, np.minimum(along, -0.01)), distance)
+    return distance
 
 
 def _from(place: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:

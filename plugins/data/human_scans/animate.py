@@ -51,14 +51,17 @@ def main(arguments: list[str]) -> None:
         "who", nargs="?", help="test subject, or mesh with vertex colours; default: the first subject"
     )
     parser.add_argument(
-        "--motion", type=Path, help="BVH file of a walk, say: for generated people; default: they turn"
+        "--motion", type=Path, help="BVH file of a motion, for generated people; default: the person turns"
     )
-    parser.add_argument("--frames", type=int, default=60, help="pictures; default: 60")
+    parser.add_argument("--frames", type=int, default=60, help="number of frames; default: 60")
     parser.add_argument(
-        "--start", type=float, default=0.0, help="second of the motion at which it begins; default: 0"
+        "--start", type=float, default=0.0, help="time at which the motion begins, seconds; default: 0"
     )
     parser.add_argument(
-        "--azimuth", type=float, default=35.0, help="degrees from the front, of a walk; default: 35"
+        "--azimuth",
+        type=float,
+        default=35.0,
+        help="direction of the camera from the front for a motion, degrees; default: 35",
     )
     parser.add_argument(
         "--out",
@@ -67,20 +70,27 @@ def main(arguments: list[str]) -> None:
         help=f"file: {', '.join(KINDS)}; default: %(default)s",
     )
     add_option(parser)
-    given = parser.parse_intermixed_args(arguments)
-    if given.out.suffix.lower() not in KINDS or given.frames < 1:
+    options = parser.parse_intermixed_args(arguments)
+    if options.out.suffix.lower() not in KINDS or options.frames < 1:
         raise ConfigError(
-            f"--out {given.out} --frames {given.frames}: wanted a {', '.join(KINDS)} and 1 frame or more."
+            f"--out {options.out} --frames {options.frames}: expected a file name that ends in {', '.join(KINDS)}, and "
+            "1 frame or more."
         )
-    sheets = animated(
-        given.run, given.who, given.motion, given.frames, given.start, given.azimuth, parse_paths(given.path)
+    sheets = render_animation(
+        options.run,
+        options.who,
+        options.motion,
+        options.frames,
+        options.start,
+        options.azimuth,
+        parse_paths(options.path),
     )
-    given.out.parent.mkdir(parents=True, exist_ok=True)
-    write(given.out, sheets)
-    sys.stdout.write(f"{given.out}\n")
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    write(options.out, sheets)
+    sys.stdout.write(f"{options.out}\n")
 
 
-def animated(
+def render_animation(
     run: str,
     who: str | None,
     file: Path | None,
@@ -104,8 +114,8 @@ def animated(
     azimuths = turning if file is None else [math.radians(azimuth)] * frames
     height, width = description.target.size
     cameras = orbit(moments, azimuths, (height, width))
-    drawn = columns(shown, moments, cameras, {"mesh": mesh, "SMPLpix": network}, data.renderer)
-    return [side_by_side(pictures, description.synthetic) for pictures in drawn]
+    frame_images = columns(shown, moments, cameras, {"mesh": mesh, "SMPLpix": network}, data.renderer)
+    return [side_by_side(pictures, description.synthetic) for pictures in frame_images]
 
 
 def data_of(description: Description) -> HumanScans:
@@ -113,8 +123,8 @@ def data_of(description: Description) -> HumanScans:
     part = description.config["data"]
     if part["name"] != "human_scans":
         raise ConfigError(
-            f"{description.path} was trained on data {part['name']!r}; wanted a model trained on `human_scans`, which "
-            "paints people."
+            f"{description.path} was trained on data {part['name']!r}; expected a model trained on `human_scans`, "
+            "which renders people. Choose another run."
         )
     require_paths(description.dropped, ("data",), description.path)
     return build("data", resolve("data", part))
@@ -127,49 +137,49 @@ def cast(
     if who is not None and Path(who).suffix:
         registration = read_registration(Path(who))
     elif data.root is None:
-        return moving(generated(data, who), file, frames, start)
+        return follow_motion(generated_person(data, who), file, frames, start)
     else:
         root = Path(data.root).expanduser()
-        name = _chosen(who, read_splits(root)["test"])
+        name = _select_subject(who, read_splits(root)["test"])
         registration = read_registration(root / "subjects" / name / f"registration_{data.topology}.ply")
     if file is not None:
         raise ConfigError(
-            f"--motion {file}: of {who or 'this subject'} only a mesh is known, and not the body in it; wanted a "
-            "person that was generated, a test subject of a run whose data.root is null."
+            f"--motion {file}: the body of {who or 'this subject'} is unknown, because only a mesh is known; "
+            "expected a generated person: a test subject of a run whose data.root is null."
         )
     return actor(registration), [Moment(registration.vertices, None)] * frames
 
 
-def generated(data: HumanScans, who: str | None) -> Generated:
+def generated_person(data: HumanScans, who: str | None) -> Generated:
     """Return a test subject of generated data."""
     crowd = Crowd(data.renderer, data.counts, data.drawing, data.data_seed)
     names = [f"test_{number:04}" for number in range(data.counts["test"])]
-    return Generated(crowd, "test", names.index(_chosen(who, names)), data.topology)  # pyright: ignore[reportArgumentType]
+    return Generated(crowd, "test", names.index(_select_subject(who, names)), data.topology)  # pyright: ignore[reportArgumentType]
 
 
-def moving(
+def follow_motion(
     person: Generated, file: Path | None, frames: int, start: float = 0.0
 ) -> tuple[Actor, list[Moment]]:
     """Return a generated person who follows a motion file at SPEED frames per second, or keeps one pose without it."""
     if file is None:
         return actor(person.registration), [person.first()] * frames
-    found = motion.read(file)
-    numbers = np.round((start + np.arange(frames) / SPEED) / found.seconds).astype(int)
-    if numbers[0] < 0 or numbers[-1] >= len(found.rotations):
+    recorded = motion.read(file)
+    numbers = np.round((start + np.arange(frames) / SPEED) / recorded.seconds).astype(int)
+    if numbers[0] < 0 or numbers[-1] >= len(recorded.rotations):
         raise ConfigError(
-            f"{frames} pictures last {frames / SPEED:g} s; from second {start:g} on {file} has "
-            f"{len(found.rotations) * found.seconds - start:.3g} s. Lower --frames or --start."
+            f"{frames} frames last {frames / SPEED:g} s, but after second {start:g} the motion {file} lasts "
+            f"{len(recorded.rotations) * recorded.seconds - start:.3g} s. Lower --frames or --start."
         )
-    poses = motion.poses_of(person.crowd.body, found, numbers.tolist())
+    poses = motion.transfer_motion(person.crowd.body, recorded, numbers.tolist())
     return actor(person.registration), [person.at(pose) for pose in poses]
 
 
-def _chosen(who: str | None, names: Sequence[str]) -> str:
+def _select_subject(who: str | None, names: Sequence[str]) -> str:
     name = names[0] if who is None else who
     if name not in names:
         raise DataError(
-            f"no test subject is called {name!r}.{did_you_mean(name, names)} There are {', '.join(names)}; a mesh is "
-            "named with its suffix, as ann.ply."
+            f"There is no test subject {name!r}.{did_you_mean(name, names)} The test subjects are {', '.join(names)}. "
+            "The file of a mesh needs its suffix, as in ann.ply."
         )
     return name
 
@@ -200,17 +210,27 @@ def _film(file: Path, frames: Sequence[Image.Image]) -> None:
     program = shutil.which("ffmpeg")
     if program is None:
         raise DataError(
-            f"{file}: an MP4 is made by the program ffmpeg, which is not installed. Install it, or write a .gif or "
-            ".webp."
+            f"{file}: MP4 files are written by the program ffmpeg, which is not installed. Install ffmpeg, or write a "
+            ".gif or .webp file."
         )
     width, height = frames[0].size
-    given = f"-f rawvideo -pix_fmt rgb24 -s {width}x{height} -r {SPEED} -i -"
-    wanted = "-vf pad=ceil(iw/2)*2:ceil(ih/2)*2 -pix_fmt yuv420p"
-    command = [program, "-y", "-loglevel", "error", *given.split(), *wanted.split(), str(file)]
+    input_options = f"-f rawvideo -pix_fmt rgb24 -s {width}x{height} -r {SPEED} -i -"
+    output_options = "-vf pad=ceil(iw/2)*2:ceil(ih/2)*2 -pix_fmt yuv420p"
+    command = [
+        program,
+        "-y",
+        "-loglevel",
+        "error",
+        *input_options.split(),
+        *output_options.split(),
+        str(file),
+    ]
     content = b"".join(np.asarray(frame).tobytes() for frame in frames)
-    done = subprocess.run(command, input=content, capture_output=True, check=False)
-    if done.returncode:
-        raise DataError(f"{file}: ffmpeg could not write it: {done.stderr.decode(errors='replace').strip()}")
+    process = subprocess.run(command, input=content, capture_output=True, check=False)
+    if process.returncode:
+        raise DataError(
+            f"{file}: ffmpeg could not write this file: {process.stderr.decode(errors='replace').strip()}"
+        )
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ from framework.geometry.camera import Camera, canonical_camera
 from framework.geometry.srgb import bytes_from_linear, linear_from_bytes
 from framework.renderer import Renderer, Scene
 from plugins.data.human_scans.dressed import Scan
-from plugins.data.human_scans.photographs import photographed
+from plugins.data.human_scans.photographs import take_photographs
 from plugins.data.human_scans.scan_generator import Crowd
 
 LOOK_DOWN = math.radians(8)
@@ -50,8 +50,8 @@ class Actor:
 class Generated:
     """Person of a generated data set, who can take any pose.
 
-    The registration is the one to the scan in the first pose, reposed: its distances from the body and its colours do
-    not change. The scan is generated anew in each pose, with the same clothes, hair and light, and with the shading of
+    The registration belongs to the scan in the first pose and is reposed: distances from the body and colours do not
+    change. The scan is generated anew in each pose, with the same clothes, hair and light, and with the shading of
     the pose.
 
     Attributes:
@@ -65,8 +65,8 @@ class Generated:
         self._bare = crowd.posed(self.shape, self.stood)
         self.worn = self.wardrobe.clothes(skin, self._random)
         random = copy.deepcopy(self._random)
-        scan, seen = self.wardrobe.scanned(self._bare, self.worn, random)
-        self._registered = self.wardrobe.registered(self._bare, scan, seen, random)
+        scan, visible = self.wardrobe.scan(self._bare, self.worn, random)
+        self._registered = self.wardrobe.register(self._bare, scan, visible, random)
         mesh = crowd.meshes[name]
         self._rows = mesh.rows
         self.registration = RegisteredMesh(
@@ -84,8 +84,8 @@ class Generated:
     def at(self, pose: Float[np.ndarray, "joint 3"]) -> Moment:
         """Return the person in a pose, moved vertically so that the feet are on the floor."""
         bare = self.crowd.posed(self.shape, torch.from_numpy(pose)[None])
-        scan, _ = self.wardrobe.scanned(bare, self.worn, copy.deepcopy(self._random))
-        vertices = self.wardrobe.reposed(self._registered.vertices, self._bare, bare)[self._rows]
+        scan, _ = self.wardrobe.scan(bare, self.worn, copy.deepcopy(self._random))
+        vertices = self.wardrobe.repose(self._registered.vertices, self._bare, bare)[self._rows]
         up = np.array([0.0, self._floor - vertices[:, 1].min(), 0.0])
         moved = Scan(scan.vertices + up, scan.faces, scan.colors)
         return Moment(torch.from_numpy(vertices + up).float(), moved)
@@ -105,7 +105,7 @@ def orbit(moments: Sequence[Moment], azimuths: Sequence[float], size: tuple[int,
         size: (height, width), pixels.
     """
     every = torch.cat(
-        [found.vertices for found in {id(one.vertices): one for one in moments}.values()]
+        [distinct.vertices for distinct in {id(item.vertices): item for item in moments}.values()]
     ).double()
     middle = (every.amin(0) + every.amax(0)) / 2
     plain = canonical_camera(*size)
@@ -113,9 +113,9 @@ def orbit(moments: Sequence[Moment], azimuths: Sequence[float], size: tuple[int,
     steep = torch.tensor(plain.focal, dtype=torch.float64) * 2 / FREE / torch.tensor(size[::-1])
     rotations = [_towards(azimuth) for azimuth in azimuths]
     away = 0.0
-    for rotation in {tuple(one.flatten().tolist()): one for one in rotations}.values():
-        seen = (every - middle) @ rotation.T
-        away = max(away, float((steep * seen[:, :2].abs() - seen[:, 2:]).max()))
+    for rotation in {tuple(item.flatten().tolist()): item for item in rotations}.values():
+        camera_points = (every - middle) @ rotation.T
+        away = max(away, float((steep * camera_points[:, :2].abs() - camera_points[:, 2:]).max()))
     ahead = torch.tensor([0.0, 0.0, away], dtype=torch.float64)
     return [
         Camera(turn.float(), (ahead - turn @ middle).float(), plain.focal, plain.principal, *size)
@@ -138,21 +138,21 @@ def on_white(renderer: Renderer, scene: Scene) -> UInt8[np.ndarray, "height widt
         return bytes_from_linear(renderer(scene)["color"]).numpy()
     assert scene.colors is not None
     cover = torch.ones(len(scene.vertices), 1)  # a fourth channel: share of a pixel that is covered
-    drawn = renderer(Scene(scene.vertices, scene.faces, torch.cat([scene.colors, cover], 1), scene.camera))[
-        "color"
-    ]
-    return bytes_from_linear(drawn[..., :3] + 1 - drawn[..., 3:]).numpy()
+    rendered = renderer(
+        Scene(scene.vertices, scene.faces, torch.cat([scene.colors, cover], 1), scene.camera)
+    )["color"]
+    return bytes_from_linear(rendered[..., :3] + 1 - rendered[..., 3:]).numpy()
 
 
 def photograph(renderer: Renderer, scan: Scan, camera: Camera) -> UInt8[np.ndarray, "height width 3"]:
-    """Return a photograph of the scan as those of the data set, 8-bit sRGB, on white."""
+    """Return a photograph of the scan like those in the data set, 8-bit sRGB, on white."""
     scene = Scene(
         torch.from_numpy(scan.vertices).float(),
         torch.from_numpy(scan.faces),
         torch.from_numpy(scan.colors).float(),
         camera,
     )
-    pixels, mask = photographed(renderer, scene, [camera])[0]
+    pixels, mask = take_photographs(renderer, scene, [camera])[0]
     cover = torch.from_numpy(mask).float()[..., None] / 255
     return bytes_from_linear(linear_from_bytes(torch.from_numpy(pixels)) * cover + 1 - cover).numpy()
 
@@ -167,10 +167,10 @@ def columns(
     """Yield for each frame the image of each renderer by its name, and the "photograph" if the scan is known."""
     for moment, camera in zip(moments, cameras, strict=True):
         scene = actor.scene(moment, camera)
-        found = {name: on_white(renderer, scene) for name, renderer in renderers.items()}
+        images = {name: on_white(renderer, scene) for name, renderer in renderers.items()}
         if moment.scan is not None:
-            found["photograph"] = photograph(camera_of_truth, moment.scan, camera)
-        yield found
+            images["photograph"] = photograph(camera_of_truth, moment.scan, camera)
+        yield images
 
 
 def side_by_side(pictures: Mapping[str, UInt8[np.ndarray, "height width 3"]], synthetic: bool) -> Image.Image:

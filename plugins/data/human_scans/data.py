@@ -47,6 +47,20 @@ class Counts:
     test: Number = 8
 
 
+@dataclass(frozen=True, kw_only=True)
+class Variation:
+    """Random changes of the training images.
+
+    Attributes:
+        mirrored: whether half of the training images are mirrored, points and photograph.
+        recoloured: share of the training images whose red, green and blue are permuted, in points and photograph alike:
+            white light prefers no colour, and clothes have any colour.
+    """
+
+    mirrored: bool = True
+    recoloured: Annotated[float, Field(ge=0, le=1)] = 0.5
+
+
 class HumanScans(Data, SubjectFolder):
     """Photographs of people, each with the mesh registered to the person's scan (thesis §7.3.1, §7.4.1).
 
@@ -63,30 +77,15 @@ class HumanScans(Data, SubjectFolder):
         shows: what the target is: "photograph", or "subject", one number per pixel, 1 where the subject covers half of
             it or more and else 0, for a network that segments (thesis §7.3.1).
         counts, drawing: settings of generated people.
-        data_seed: seed of their draws, independent of the seed of the run.
-        mirrored: whether half of the training images are mirrored, points and photograph.
-        recoloured: share of the training images whose red, green and blue are permuted, in points and photograph alike:
-            white light prefers no colour, and clothes have any colour.
+        variation: random changes of the training images.
+        data_seed: seed of the draws of generated people, independent of the seed of the run.
 
     Raises:
         DataError: a file is missing or damaged, or images differ in size, or meshes in their number of vertices.
         ConfigError: the renderer draws no colours, or the topology is not generated.
     """
 
-    bibtex = """@inproceedings{prokudin2021smplpix,
-  title = {{SMPLpix}: Neural Avatars from {3D} Human Models},
-  author = {Prokudin, Sergey and Black, Michael J. and Romero, Javier},
-  booktitle = {IEEE/CVF Winter Conference on Applications of Computer Vision (WACV)},
-  pages = {1810--1819},
-  year = {2021}
-}
-@inproceedings{bregier2026anny,
-  title = {Human Mesh Modeling for {A}nny {B}ody},
-  author = {Br{\\'e}gier, Romain and Fiche, Gu{\\'e}nol{\\'e} and Bravo-S{\\'a}nchez, Laura and Lucas, Thomas and
-    Armando, Matthieu and Weinzaepfel, Philippe and Rogez, Gr{\\'e}gory and Baradel, Fabien},
-  booktitle = {European Conference on Computer Vision (ECCV)},
-  year = {2026}
-}"""
+    bibtex = "prokudin2021smplpix, bregier2026anny"
     suffixes = tuple(READERS)
     columns = (*XYZ, *COLOURS)
 
@@ -99,13 +98,13 @@ class HumanScans(Data, SubjectFolder):
         shows: Shows = "photograph",
         counts: Counts,
         drawing: Drawing,
+        variation: Variation,
         data_seed: Seed = 0,
-        mirrored: bool = True,
-        recoloured: Annotated[float, Field(ge=0, le=1)] = 0.5,
     ) -> None:
         if "color" not in renderer.channels or renderer.background:
             raise ConfigError(
-                f"data.renderer = {type(renderer).__name__} draws no color on black; choose another renderer."
+                f"data.renderer = {type(renderer).__name__} does not draw the channel color on black. Choose another "
+                "renderer."
             )
         self.renderer = renderer
         self.root = root
@@ -114,8 +113,8 @@ class HumanScans(Data, SubjectFolder):
         self.counts = asdict(counts)
         self.drawing = drawing
         self.data_seed = data_seed
-        self.mirrored, self.recoloured = mirrored, recoloured
-        self.varies = mirrored or recoloured > 0
+        self.variation = variation
+        self.varies = variation.mirrored or variation.recoloured > 0
         self.size = (drawing.height, drawing.width)
 
     @property
@@ -130,7 +129,7 @@ class HumanScans(Data, SubjectFolder):
             if self.topology not in self.drawing.topologies:
                 raise ConfigError(
                     f"data.topology = {self.topology} is not one of data.topologies = "
-                    f"[{', '.join(self.drawing.topologies)}], which are generated. Name it there too."
+                    f"[{', '.join(self.drawing.topologies)}], which are generated. Add the topology to data.topologies."
                 )
             root = scans_root(self.renderer, self.counts, self.drawing, self.data_seed)
         else:
@@ -145,7 +144,7 @@ class HumanScans(Data, SubjectFolder):
             for split, some in names.items()
         }
         every = [subject for some in subjects.values() for subject in some]
-        self.size, points = _common(root, every)
+        self.size, points = _common_size(root, every)
         self.input_shape = (points, len(self.columns))
         channels = COLOURS if self.shows == "photograph" else (self.shows,)
         self.target = Target("image", channels, size=self.size)
@@ -161,11 +160,11 @@ class HumanScans(Data, SubjectFolder):
         The cameras are those of a cameras.json beside the file, else one in front that sees the mesh whole.
         """
         if not files:
-            raise DataError("No file was given; wanted a mesh with vertex colours, or several.")
-        inputs = [points for file in files for points in self._seen(Path(file))]
+            raise DataError("The list of files is empty; expected one or more meshes with vertex colours.")
+        inputs = [points for file in files for points in self._points_from_cameras(Path(file))]
         return Fields(input=clouds.pad(inputs), index=torch.arange(len(inputs)))
 
-    def _seen(self, file: Path) -> list[Float[Tensor, "points 6"]]:
+    def _points_from_cameras(self, file: Path) -> list[Float[Tensor, "points 6"]]:
         mesh = read(file)
         colors = torch.from_numpy(scan_layout.vertex_colors(mesh))
         vertices = torch.from_numpy(mesh.vertices).float()
@@ -183,35 +182,34 @@ class HumanScans(Data, SubjectFolder):
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         if set(state) != {"height", "width"}:
             raise DataError(
-                f"human_scans keeps the size of its images, but was given {', '.join(state) or 'nothing'}. Give the "
-                "data that the model was trained on."
+                f"The stored state of human_scans must hold height and width, but it holds "
+                f"{', '.join(state) or 'nothing'}. Use the data on which the model was trained."
             )
         height, width = state["height"], state["width"]
         whole = type(height) is int and type(width) is int
         if not whole or min(height, width) < 1 or height * width > MOST_INPUT:
             raise DataError(
-                f"human_scans keeps the size of its images, but was given {shorten(height)} by {shorten(width)}; "
-                f"wanted two whole numbers of pixels, {MOST_INPUT:,} in all at most. Load another checkpoint, or train "
-                "anew."
+                f"The stored image size of human_scans is {shorten(height)} by {shorten(width)}; expected two whole "
+                f"numbers whose product is at most {MOST_INPUT:,} pixels. Load another checkpoint, or train again."
             )
         self.size = (height, width)
 
     def augment(self, batch: Batch) -> Batch:
         """Return the batch with random mirroring and permuted colours, drawn for each sample."""
         count = len(batch["input"])
-        mirrored = torch.rand(count) < (0.5 if self.mirrored else 0.0)
+        mirrored = torch.rand(count) < (0.5 if self.variation.mirrored else 0.0)
         orders = torch.rand(count, 3).argsort(1)
-        orders[torch.rand(count) >= self.recoloured] = torch.arange(3)
-        found = dict(batch)
+        orders[torch.rand(count) >= self.variation.recoloured] = torch.arange(3)
+        augmented = dict(batch)
         for name in ("target", "color", "mask"):
             if name in batch:
-                found[name] = _turned(batch[name], mirrored)
+                augmented[name] = _mirror(batch[name], mirrored)
                 if batch[name].shape[-1:] == (3,) and batch[name].dim() == 4:  # silhouettes have no colours
-                    found[name] = _reordered(found[name], orders)
+                    augmented[name] = _permute_colors(augmented[name], orders)
         points = batch["input"].clone()
         points[mirrored.to(points.device), :, 0] *= -1  # the canonical camera's centre is the image's
-        points[..., 3:6] = _reordered(points[..., 3:6], orders)
-        return found | {"input": points}
+        points[..., 3:6] = _permute_colors(points[..., 3:6], orders)
+        return augmented | {"input": points}
 
     def fingerprint(self) -> Mapping[str, str]:
         return {
@@ -246,7 +244,7 @@ class Photographs(Dataset[Batch]):
     def __init__(self, subjects: Sequence[Subject], shows: Shows) -> None:
         self.shows = shows
         self.subjects = list(subjects)
-        self.of = [(number, view) for number, one in enumerate(subjects) for view in one.views]
+        self.of = [(number, view) for number, subject in enumerate(subjects) for view in subject.views]
 
     def __len__(self) -> int:
         return len(self.of)
@@ -282,17 +280,17 @@ def in_front(vertices: Float[Tensor, "vertices 3"], height: int, width: int) -> 
     away = float(torch.stack([extent[1], extent[0] * height / width]).max()) / 0.9 + float(extent[2]) / 2
     rotation = torch.tensor([1.0, -1.0, -1.0]).diag()
     ahead = torch.tensor([0.0, 0.0, max(away, 1e-3)])
-    one = canonical_camera(height, width)
-    return Camera(rotation, ahead - rotation @ middle, one.focal, one.principal, height, width)
+    standard = canonical_camera(height, width)
+    return Camera(rotation, ahead - rotation @ middle, standard.focal, standard.principal, height, width)
 
 
-def _turned(images: Tensor, which: Tensor) -> Tensor:
+def _mirror(images: Tensor, which: Tensor) -> Tensor:
     """Return images (image, height, width, ...), some of them with left and right exchanged."""
     chosen = which.to(images.device).view(-1, *[1] * (images.dim() - 1))
     return torch.where(chosen, images.flip(2), images)
 
 
-def _reordered(colors: Float[Tensor, "batch ... 3"], orders: Tensor) -> Tensor:
+def _permute_colors(colors: Float[Tensor, "batch ... 3"], orders: Tensor) -> Tensor:
     """Return the colours with each sample's three channels permuted by its order."""
     places = orders.to(colors.device).view(-1, *[1] * (colors.dim() - 2), 3)
     return colors.gather(-1, places.expand(colors.shape))
@@ -302,22 +300,24 @@ def _input(vertices: Tensor, colors: Tensor, camera: Camera) -> Float[Tensor, "p
     return torch.cat([camera.to_canonical(vertices), colors.float() / 255], 1)
 
 
-def _common(root: Path, subjects: Sequence[Subject]) -> tuple[tuple[int, int], int]:
+def _common_size(root: Path, subjects: Sequence[Subject]) -> tuple[tuple[int, int], int]:
     """Return the size of all images, and the number of vertices of all meshes."""
     first = subjects[0]
     size = (first.views[0].camera.height, first.views[0].camera.width)
     points = len(first.mesh.vertices)
     for subject in subjects:
         folder = root / "subjects" / subject.name
-        if (found := len(subject.mesh.vertices)) != points:
+        if (other := len(subject.mesh.vertices)) != points:
             raise DataError(
-                f"{folder}: its registration has {found} vertices, that of {first.name} {points}; wanted one topology."
+                f"{folder}: the registration has {other} vertices, but that of {first.name} has {points}; expected the "
+                "same topology for all subjects."
             )
         for view in subject.views:
-            if (found := (view.camera.height, view.camera.width)) != size:
+            if (other := (view.camera.height, view.camera.width)) != size:
                 raise DataError(
-                    f"{folder}: view {view.name} has {found[0]} × {found[1]} pixels, the first of all {size[0]} × "
-                    f"{size[1]} (height × width); wanted one size. Scale the pictures and their K."
+                    f"{folder}: view {view.name} has {other[0]} × {other[1]} pixels, the first image of all has "
+                    f"{size[0]} × {size[1]} (height × width); expected one size. Scale the images and their camera "
+                    "matrices K."
                 )
     return size, points
 

@@ -22,8 +22,8 @@ from plugins.data.human_scans import skins
 from plugins.data.human_scans.anatomy import Anatomy, anatomy
 from plugins.data.human_scans.fabrics import noise
 from plugins.data.human_scans.garments import Skirt, outfit
-from plugins.data.human_scans.hair import Hair, Piece, hair, tied
-from plugins.data.human_scans.hanging import hung
+from plugins.data.human_scans.hair import Hair, Piece, hair, tie_hair
+from plugins.data.human_scans.hanging import hang_skirt
 
 FURTHEST = 0.05
 """Largest distance of a registration from the bare body, metres."""
@@ -47,7 +47,7 @@ class Scan:
 
 
 @dataclass(frozen=True)
-class Registered:
+class RegisteredBody:
     """The smooth body on every vertex of the sheet; each topology uses some of them. Metres, 8-bit sRGB."""
 
     vertices: Float[np.ndarray, "sheet 3"]
@@ -83,13 +83,13 @@ class Wardrobe:
         self.body = body
         self.model = BodyModel(body)
         self.sheet: Sheet = sheet(body, stages)
-        self.anatomy: Anatomy = anatomy(body, self.sheet.carried)
+        self.anatomy: Anatomy = anatomy(body, self.sheet.interpolate)
         self.faces = self.sheet.faces
         self._spread = _spread(self.faces, len(self.anatomy.place))
         self._own_spread = _spread(body.faces, len(body.template))
         self._neighbours = _neighbours(body.faces, len(body.template))
         self.vertices = len(body.template)
-        self.uv = None if body.uv is None else self.sheet.carried_uv(body.uv)
+        self.uv = None if body.uv is None else self.sheet.interpolate_uv(body.uv)
         places = self.sheet.corners[-1].uv_faces
         self._place_of = np.zeros(len(self.anatomy.place), np.int64)
         self._place_of[self.faces.ravel()] = places.ravel()
@@ -101,13 +101,13 @@ class Wardrobe:
         posed: Float[np.ndarray, "vertices 3"],
         skin: UInt8[np.ndarray, "height width 3"] | None,
         random: Generator,
-    ) -> tuple[Scan, Registered]:
+    ) -> tuple[Scan, RegisteredBody]:
         """Return scan and registration of a posed body with random clothes, hair and skin.
 
         `skin` is an image of a skin in the body's texture layout; None: the skin is painted by procedure.
         """
-        scan, seen = self.scanned(posed, self.clothes(skin, random), random)
-        return scan, self.registered(posed, scan, seen, random)
+        scan, visible = self.scan(posed, self.clothes(skin, random), random)
+        return scan, self.register(posed, scan, visible, random)
 
     def clothes(self, skin: UInt8[np.ndarray, "height width 3"] | None, random: Generator) -> Clothes:
         """Return random clothes, hair and skin, which do not depend on the pose."""
@@ -115,11 +115,13 @@ class Wardrobe:
         worn = outfit(where, random)
         grown = hair(where, random)
         if skin is None or self.uv is None:
-            colors = skins.painted(where, random)
+            colors = skins.paint_skin(where, random)
         else:
-            colors = skins.shown(skin, self.uv)[self._place_of]
-            colors = skins.filled(colors, where, self.vertices, self._neighbours.dot, self.sheet.carried)
-            colors = skins.with_eyes(where, colors, random)
+            colors = skins.colors_at(skin, self.uv)[self._place_of]
+            colors = skins.fill_blanks(
+                colors, where, self.vertices, self._neighbours.dot, self.sheet.interpolate
+            )
+            colors = skins.paint_eyes(where, colors, random)
         raised = np.zeros(len(where.place))
         cover = np.zeros(len(where.place))
         for garment in worn.garments:
@@ -129,24 +131,27 @@ class Wardrobe:
         colors = colors + grown.share[:, None] * (grown.colors - colors)
         return Clothes(colors, raised + grown.raised, cover, worn.skirt, grown)
 
-    def scanned(
+    def scan(
         self, posed: Float[np.ndarray, "vertices 3"], worn: Clothes, random: Generator
     ) -> tuple[Scan, Bool[np.ndarray, "points"]]:
         """Return the scan of a dressed person in a pose, and which of its points a scanner sees."""
         where = self.anatomy
-        draped = self.sheet.carried(self._smoothed(posed, worn.cover[: self.vertices]))
+        draped = self.sheet.interpolate(self._smoothed(posed, worn.cover[: self.vertices]))
         vertices = draped + worn.raised[:, None] * self.normals(draped)
         pieces = [Piece(vertices, self.faces, worn.colors)]
         hidden = np.zeros(len(vertices), bool)
         if worn.skirt is not None:
-            held = np.flatnonzero(where.arms[: self.vertices] < 0.3)
-            piece = hung(
-                worn.skirt, vertices[held], np.abs(where.place[held, 1] - where.waist) < 0.03, random
+            trunk_and_legs = np.flatnonzero(where.arms[: self.vertices] < 0.3)
+            piece = hang_skirt(
+                worn.skirt,
+                vertices[trunk_and_legs],
+                np.abs(where.place[trunk_and_legs, 1] - where.waist) < 0.03,
+                random,
             )
             pieces.append(piece)
             low, high = piece.vertices[:, 1].min() + 0.01, piece.vertices[:, 1].max() - 0.01
             hidden = (where.arms < 0.3) & (vertices[:, 1] > low) & (vertices[:, 1] < high)
-        locks = tied(worn.hair.style, worn.hair.color, *self._head(posed), random)
+        locks = tie_hair(worn.hair.style, worn.hair.color, *self._head(posed), random)
         if locks is not None:
             pieces.append(locks)
         light = Light(random)
@@ -160,21 +165,23 @@ class Wardrobe:
             np.concatenate([piece.faces + start for piece, start in zip(pieces, starts, strict=False)]),
             np.concatenate(lit).clip(0, 1),
         )
-        seen = np.concatenate([~hidden, *(np.ones(len(piece.vertices), bool) for piece in pieces[1:])])
-        return scan, seen
+        visible = np.concatenate([~hidden, *(np.ones(len(piece.vertices), bool) for piece in pieces[1:])])
+        return scan, visible
 
     def normals(self, vertices: Float[np.ndarray, "sheet 3"]) -> Float[np.ndarray, "sheet 3"]:
         """Return unit normals of the sheet's vertices, outwards, means over their faces by area."""
         return _unit(self._spread @ _cross(vertices, self.faces))
 
-    def registered(self, posed: np.ndarray, scan: Scan, seen: np.ndarray, random: Generator) -> Registered:
+    def register(
+        self, posed: np.ndarray, scan: Scan, visible: np.ndarray, random: Generator
+    ) -> RegisteredBody:
         """Return the body moved towards the nearest points of the scan, with their colours, as a registration.
 
         Vertices move along their normals, no farther than FURTHEST, and each as its neighbours do. Details thinner than
         some edges (wrinkles, hems), or too far from the body (a wide skirt, a tail of hair), are therefore only in the
         scan.
         """
-        points = scan.vertices[seen]
+        points = scan.vertices[visible]
         tree = KDTree(points, balanced_tree=False, compact_nodes=False)
         outwards = self._outwards(posed)
         moved = np.zeros(len(posed))
@@ -184,11 +191,11 @@ class Wardrobe:
             for _ in range(BLUR):
                 moved = self._neighbours @ moved.clip(-0.01, FURTHEST)
         off = moved + ERROR * noise(self.body.template, 0.25, random)
-        vertices = self.sheet.carried(posed + off[:, None] * outwards)
-        nearest = np.flatnonzero(seen)[tree.query(vertices)[1]]
-        return Registered(vertices, bytes_from_linear(torch.from_numpy(scan.colors[nearest])).numpy())
+        vertices = self.sheet.interpolate(posed + off[:, None] * outwards)
+        nearest = np.flatnonzero(visible)[tree.query(vertices)[1]]
+        return RegisteredBody(vertices, bytes_from_linear(torch.from_numpy(scan.colors[nearest])).numpy())
 
-    def reposed(
+    def repose(
         self,
         registration: Float[np.ndarray, "sheet 3"],
         stood: Float[np.ndarray, "vertices 3"],
@@ -196,7 +203,7 @@ class Wardrobe:
     ) -> Float[np.ndarray, "sheet 3"]:
         """Return a registration of the pose `stood` in another pose, at the same distances along the body's normals."""
         off = ((registration[: self.vertices] - stood) * self._outwards(stood)).sum(1)
-        return self.sheet.carried(posed + off[:, None] * self._outwards(posed))
+        return self.sheet.interpolate(posed + off[:, None] * self._outwards(posed))
 
     def _outwards(self, posed: np.ndarray) -> Float[np.ndarray, "vertices 3"]:
         return _unit(self._own_spread @ _cross(posed, self.body.faces))
@@ -206,11 +213,11 @@ class Wardrobe:
 
         Each step blurs, and then undoes the shrinking that blurring causes (Taubin 1995).
         """
-        found = posed.astype(np.float64)
+        smooth = posed.astype(np.float64)
         for _ in range(12):
             for weight in (0.5, -0.53):
-                found = found + weight * cover[:, None] * (self._neighbours @ found - found)
-        return found
+                smooth = smooth + weight * cover[:, None] * (self._neighbours @ smooth - smooth)
+        return smooth
 
     def _head(self, posed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the affine transform from the template's head to the posed head, and the former's bounding box."""
@@ -218,9 +225,9 @@ class Wardrobe:
         if head.sum() < 4:
             head = np.ones(self.vertices, bool)
         template = self.body.template[head].astype(np.float64)
-        given = np.concatenate([template, np.ones((len(template), 1))], 1)
-        found = np.linalg.lstsq(given, posed[head].astype(np.float64), rcond=None)[0]
-        return found, np.stack([template.min(0), template.max(0)], 1)
+        homogeneous = np.concatenate([template, np.ones((len(template), 1))], 1)
+        transform = np.linalg.lstsq(homogeneous, posed[head].astype(np.float64), rcond=None)[0]
+        return transform, np.stack([template.min(0), template.max(0)], 1)
 
 
 class Light:
@@ -261,7 +268,7 @@ def _spread(faces: np.ndarray, vertices: int) -> csr_matrix:
 
 def _neighbours(faces: np.ndarray, vertices: int) -> csr_matrix:
     """Return the matrix that averages values over every vertex and its neighbours."""
-    (one, other), own = edges(faces)[0].T, np.arange(vertices)
-    rows = np.concatenate([one, other, own])
+    (start, end), own = edges(faces)[0].T, np.arange(vertices)
+    rows = np.concatenate([start, end, own])
     share = 1 / np.bincount(rows, minlength=vertices)
-    return csr_matrix((share[rows], (rows, np.concatenate([other, one, own]))), (vertices, vertices))
+    return csr_matrix((share[rows], (rows, np.concatenate([end, start, own]))), (vertices, vertices))

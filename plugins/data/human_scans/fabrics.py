@@ -45,7 +45,7 @@ def noise(
     direction /= np.linalg.norm(direction, axis=0)
     number = 2 * np.pi / (wavelength * 1.5 ** random.uniform(-1, 1, waves))
     phase = random.uniform(0, 2 * np.pi, waves)
-    return _summed(place, direction * number * np.array(squeezed)[:, None], phase) * (2 / waves) ** 0.5
+    return _sum_waves(place, direction * number * np.array(squeezed)[:, None], phase) * (2 / waves) ** 0.5
 
 
 def folds(
@@ -60,20 +60,20 @@ def folds(
     number = 2 * np.pi / (wavelength * 1.4 ** random.uniform(-1, 1, 5))
     bent = place + 0.2 * wavelength * noise(place, 3 * wavelength, random, waves=5)[:, None]
     phase = random.uniform(0, 2 * np.pi, 5)
-    waves = _summed(bent, direction * number, phase) * 0.63
+    waves = _sum_waves(bent, direction * number, phase) * 0.63
     come_and_go = (0.5 + 0.6 * noise(place, 2.2 * wavelength, random, waves=5)).clip(0, 1.2)
     return (np.exp(0.9 * waves.clip(-2, 1.2)) - 1.2) * 0.6 * come_and_go
 
 
-def _summed(place: np.ndarray, waves: Float[np.ndarray, "3 waves"], phases: np.ndarray) -> np.ndarray:
+def _sum_waves(place: np.ndarray, waves: Float[np.ndarray, "3 waves"], phases: np.ndarray) -> np.ndarray:
     """Return the sum of sine waves; adding them one after the other keeps the arrays in the processor's cache."""
     points = np.ascontiguousarray(place, np.float32)
-    found, one = np.zeros((2, len(points)), np.float32)
+    total, term = np.zeros((2, len(points)), np.float32)
     for wave, phase in zip(waves.T.astype(np.float32), phases.astype(np.float32), strict=True):
-        np.dot(points, wave, out=one)
-        one += phase
-        found += np.sin(one, out=one)
-    return found
+        np.dot(points, wave, out=term)
+        term += phase
+        total += np.sin(term, out=term)
+    return total
 
 
 Pattern = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -123,11 +123,11 @@ def pattern(random: Generator) -> Pattern:
             where = 0.2 + 0.1 * np.sin(330 * across) * np.sin(270 * along + 90 * across)
         else:
             where = np.zeros(len(across))
-        found = first + where[:, None] * (second - first)
+        mixed = first + where[:, None] * (second - first)
         if kind == "check":
             line = _band(along, width, 0.08) + _band(across, width, 0.08)
-            found = np.where(line[:, None] > 0, third, found)
-        return found
+            mixed = np.where(line[:, None] > 0, third, mixed)
+        return mixed
 
     return colors
 

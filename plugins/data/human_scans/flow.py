@@ -14,36 +14,36 @@ CHANNELS = ("face", "barycentric", "depth")
 STEEPEST = 2.0
 """Largest difference in depth of neighbouring pixels of one surface, in widths of a pixel at that depth."""
 
-Drawn = Mapping[str, Tensor]
+Channels = Mapping[str, Tensor]
 
 
 def flow(
-    before: Scene, after: Scene, drawn_before: Drawn, drawn_after: Drawn
+    before: Scene, after: Scene, channels_before: Channels, channels_after: Channels
 ) -> tuple[Float[Tensor, "height width 2"], Bool[Tensor, "height width"]]:
     """Return the optical flow from the second image back to the first, and which points are seen in both.
 
     For each pixel of the second image the flow is the position (column, row), float64, of the same point of the mesh in
     the first. A point is seen in an image if the pixels around it show the mesh at its depth: it lies neither at an
     outline nor behind something. The position of a point that is not seen in both has no meaning. `before` and `after`
-    are scenes of one mesh with the same faces; `drawn_before` and `drawn_after` are their `CHANNELS`.
+    are scenes of one mesh with the same faces; `channels_before` and `channels_after` are their `CHANNELS`.
     """
-    face = drawn_after["face"].long()
+    face = channels_after["face"].long()
     corners = before.vertices.double()[after.faces.long()[face.clamp(min=0)]]
-    weights = drawn_after["barycentric"].double()
+    weights = channels_after["barycentric"].double()
     place, depth = before.camera.project((weights[..., None] * corners).sum(-2))
-    there = drawn_before["depth"].double()
-    height, width = there.shape
+    depth_before = channels_before["depth"].double()
+    height, width = depth_before.shape
     low = place.nan_to_num(-1.0).clamp(-1, max(height, width)).floor().long()
-    depth_after = drawn_after["depth"].double()
-    seen = _inside(depth_after, STEEPEST * depth_after / _focal(after))
+    depth_after = channels_after["depth"].double()
+    visible = _inside(depth_after, STEEPEST * depth_after / _focal(after))
     slack = STEEPEST * depth / _focal(before)
     for right in (0, 1):
         for down in (0, 1):
             column, row = low[..., 0] + right, low[..., 1] + down
             within = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-            near = there[row.clamp(0, height - 1), column.clamp(0, width - 1)]
-            seen &= within & ((near - depth).abs() < slack)
-    return place, seen
+            near = depth_before[row.clamp(0, height - 1), column.clamp(0, width - 1)]
+            visible &= within & ((near - depth).abs() < slack)
+    return place, visible
 
 
 def _focal(scene: Scene) -> float:
@@ -59,16 +59,16 @@ def _inside(
     return depth.isfinite() & ((highest - lowest) < 2 * slack)
 
 
-def warped(
+def warp(
     picture: Float[Tensor, "height width channels"], place: Float[Tensor, "height width 2"]
 ) -> Float[Tensor, "height width channels"]:
     """Return the first image at these positions, interpolated between pixel centres."""
     height, width = picture.shape[:2]
     share = 2 * place / (torch.tensor([width, height]) - 1).clamp(min=1) - 1
-    found = grid_sample(
+    sampled = grid_sample(
         picture.movedim(-1, 0)[None].double(),
         share[None].nan_to_num(-2.0),
         padding_mode="border",
         align_corners=True,
     )
-    return found[0].movedim(0, -1).to(picture.dtype)
+    return sampled[0].movedim(0, -1).to(picture.dtype)

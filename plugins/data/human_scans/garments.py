@@ -111,20 +111,20 @@ def _trousers(body: Anatomy, random: Generator, *, short: bool) -> Garment:
     )
     across, along = _on_legs(body)
     faded = 0.2 * np.exp(-(((body.along_leg - 0.5 * body.knee) / 0.15) ** 2)) * (body.place[:, 2] > 0.03)
-    found = color * (1 + (0.5 if jeans else 0.15) * faded[:, None])
+    cloth_colors = color * (1 + (0.5 if jeans else 0.15) * faded[:, None])
     if not jeans and random.random() < 0.35:
-        found = pattern(random)(across, along)
+        cloth_colors = pattern(random)(across, along)
     outer = (np.abs(body.place[:, 2] - 0.01) < 0.004) & (across > 0.03)
     stitches = np.where(outer, 0.55, 1.0)
     belt = np.abs(body.place[:, 1] - (body.waist - 0.015)) < 0.016
     strap, metal = dye(random) * 0.5, hue(45, 0.4, 0.85)
-    found = found * stitches[:, None]
-    found = np.where(belt[:, None], strap, found)
+    cloth_colors = cloth_colors * stitches[:, None]
+    cloth_colors = np.where(belt[:, None], strap, cloth_colors)
     buckle = belt & (np.abs(body.place[:, 0]) < 0.02) & (body.place[:, 2] > 0.05)
-    found = np.where(buckle[:, None], metal, found)
+    cloth_colors = np.where(buckle[:, None], metal, cloth_colors)
     pocket = np.abs(np.abs(body.place[:, 0]) - 0.09 - 0.4 * (body.place[:, 1] - body.hips)) < 0.004
     pocket &= (np.abs(body.place[:, 1] - body.hips - 0.03) < 0.05) & (body.place[:, 2] > 0.04)
-    found = np.where(pocket[:, None], 0.5 * found, found)
+    cloth_colors = np.where(pocket[:, None], 0.5 * cloth_colors, cloth_colors)
     bends = (
         0.35
         + _near(along, body.knee, 0.12)
@@ -132,7 +132,7 @@ def _trousers(body: Anatomy, random: Generator, *, short: bool) -> Garment:
         + 0.6 * _near(along, 0.0, 0.1)
     )
     wrinkles = (0.25 * loose + 0.0025) * bends * folds(body.place, 0.06, (0.25, 1.0, 0.1), random)
-    return Garment(inside, loose, wrinkles, _worn(body, found, wrinkles, inside, random))
+    return Garment(inside, loose, wrinkles, _add_weave(body, cloth_colors, wrinkles, inside, random))
 
 
 def _leggings(body: Anatomy, random: Generator) -> Garment:
@@ -149,16 +149,16 @@ def _shoes(body: Anatomy, random: Generator) -> Garment:
     inside = np.where(body.legs > 0.5, body.along_leg - (body.ankle - height), -FAR)
     floor = body.place[:, 1].min()
     color, sole = dye(random) * 0.8, hue(40, 0.05, random.choice([0.1, 0.9]))
-    found = np.where((body.place[:, 1] < floor + 0.022)[:, None], sole, color)
+    colors = np.where((body.place[:, 1] < floor + 0.022)[:, None], sole, color)
     if random.random() < 0.5:
         laces = (
             (body.place[:, 2] > 0.06)
             & ((body.place[:, 2] / 0.02) % 1 < 0.4)
             & (body.place[:, 1] > floor + 0.05)
         )
-        found = np.where(laces[:, None], sole, found)
+        colors = np.where(laces[:, None], sole, colors)
     return Garment(
-        inside, 0.011, np.zeros(len(inside)), _worn(body, found, np.zeros(len(inside)), inside, random)
+        inside, 0.011, np.zeros(len(inside)), _add_weave(body, colors, np.zeros(len(inside)), inside, random)
     )
 
 
@@ -178,15 +178,15 @@ def _top(body: Anatomy, random: Generator, kind: str, cloth: Pattern, hem: float
     if kind == "vest":
         inside = np.minimum(inside, cuff + 0.02 - np.where(body.along_arm > -0.5, body.along_arm, -FAR))
     across, along = _on_trunk(body)
-    found = cloth(across, along)
+    colors = cloth(across, along)
     front = body.place[:, 2] > 0.0
     if kind == "blouse" or (kind == "shirt" and random.random() < 0.25):
-        found = _buttoned(body, found, front, random)
+        colors = _add_buttons(body, colors, front, random)
     elif kind == "shirt" and random.random() < 0.55:
-        found = _printed(body, found, front, random)
+        colors = _add_print(body, colors, front, random)
     collar = np.linalg.norm(body.place - body.neck_place, axis=1)
     ribbed = (collar < 0.12) & (inside < 0.02) & (kind != "blouse")
-    found = np.where(ribbed[:, None], 0.7 * found, found)
+    colors = np.where(ribbed[:, None], 0.7 * colors, colors)
     arm = np.where(body.on_arm, body.along_arm, 0)
     bends = (
         0.45 + 0.8 * _near(body.place[:, 1], body.waist, 0.08) + body.on_arm * _near(arm, body.elbow, 0.09)
@@ -200,7 +200,7 @@ def _top(body: Anatomy, random: Generator, kind: str, cloth: Pattern, hem: float
     if hem < body.waist - 0.05:  # the garment hangs loose below the waist
         thickness = thickness + 0.004
         wrinkles = wrinkles + 0.008 * np.exp(-((body.place[:, 1] - hem) / 0.1).clip(0, None)) * ~body.on_arm
-    return Garment(inside, thickness, wrinkles, _worn(body, found, wrinkles, inside, random))
+    return Garment(inside, thickness, wrinkles, _add_weave(body, colors, wrinkles, inside, random))
 
 
 def _jacket(body: Anatomy, random: Generator) -> Garment:
@@ -210,19 +210,19 @@ def _jacket(body: Anatomy, random: Generator) -> Garment:
     slant = open_by + 0.12 * (body.place[:, 1] - hem).clip(0, None) * random.uniform(0, 0.6)
     opening = np.where(body.place[:, 2] > 0.02, np.abs(body.place[:, 0]) - slant, FAR)
     inside = np.where(body.on_arm, inside, np.minimum(inside, opening))
-    found = (
+    colors = (
         pattern(random)(*_on_trunk(body)) if random.random() < 0.3 else np.tile(dye(random), (len(inside), 1))
     )
     pocket = np.abs(body.place[:, 1] - (body.hips + 0.02)) < 0.005
     pocket &= (np.abs(np.abs(body.place[:, 0]) - 0.1) < 0.05) & (body.place[:, 2] > 0)
-    found = np.where(pocket[:, None], 0.4 * found, found)
+    colors = np.where(pocket[:, None], 0.4 * colors, colors)
     arm = np.where(body.on_arm, body.along_arm, 0)
     bends = (
         0.5 + 1.2 * body.on_arm * _near(arm, body.elbow, 0.1) + 0.5 * _near(body.place[:, 1], body.waist, 0.1)
     )
     wrinkles = 0.004 * bends * folds(body.place, 0.08, (0.6, 1.0, 0.0), random)
     return Garment(
-        inside, random.uniform(0.009, 0.018), wrinkles, _worn(body, found, wrinkles, inside, random)
+        inside, random.uniform(0.009, 0.018), wrinkles, _add_weave(body, colors, wrinkles, inside, random)
     )
 
 
@@ -237,16 +237,16 @@ def _trunk(body: Anatomy, hem: float, opening: float) -> Float[np.ndarray, "vert
     return np.minimum(down, neck)
 
 
-def _buttoned(body: Anatomy, found: np.ndarray, front: np.ndarray, random: Generator) -> np.ndarray:
+def _add_buttons(body: Anatomy, colors: np.ndarray, front: np.ndarray, random: Generator) -> np.ndarray:
     placket = front & (np.abs(body.place[:, 0]) < 0.017) & ~body.on_arm
-    found = np.where((placket & (np.abs(body.place[:, 0]) > 0.014))[:, None], 0.5 * found, found)
+    colors = np.where((placket & (np.abs(body.place[:, 0]) > 0.014))[:, None], 0.5 * colors, colors)
     spacing = random.uniform(0.07, 0.1)
     height = (body.place[:, 1] / spacing) % 1 - 0.5
     button = placket & (np.hypot(body.place[:, 0], height * spacing) < 0.007)
-    return np.where(button[:, None], dye(random), found)
+    return np.where(button[:, None], dye(random), colors)
 
 
-def _printed(body: Anatomy, found: np.ndarray, front: np.ndarray, random: Generator) -> np.ndarray:
+def _add_print(body: Anatomy, colors: np.ndarray, front: np.ndarray, random: Generator) -> np.ndarray:
     """Return colours with a print on the chest: a disc, a diamond, a star, or lines like words."""
     x, y = body.place[:, 0], body.place[:, 1] - (body.chest - 0.04)
     size, ink, other = random.uniform(0.05, 0.1), dye(random), dye(random)
@@ -263,17 +263,17 @@ def _printed(body: Anatomy, found: np.ndarray, front: np.ndarray, random: Genera
         shape &= np.sin(400 * x + 9 * np.floor(y / 0.03) ** 2) > -0.5
     shape &= front & ~body.on_arm
     inner = shape & (radius < 0.5 * size) & (kind < 3)
-    return np.where(inner[:, None], other, np.where(shape[:, None], ink, found))
+    return np.where(inner[:, None], other, np.where(shape[:, None], ink, colors))
 
 
-def _worn(
-    body: Anatomy, found: np.ndarray, wrinkles: np.ndarray, inside: np.ndarray, random: Generator
+def _add_weave(
+    body: Anatomy, colors: np.ndarray, wrinkles: np.ndarray, inside: np.ndarray, random: Generator
 ) -> Float[np.ndarray, "vertices 3"]:
     """Return colours with the weave's noise, darker valleys, and stitches along the border."""
     weave = 1 + 0.04 * noise(body.place, 0.008, random) + 0.04 * noise(body.place, 0.05, random)
     depth = 1 + 0.18 * np.tanh(wrinkles / 0.004)
     border = np.where(np.abs(inside - SEAM) < 0.002, 0.75, 1.0)
-    return (found * (weave * depth * border)[:, None]).clip(0.004, 0.95)
+    return (colors * (weave * depth * border)[:, None]).clip(0.004, 0.95)
 
 
 def _on_trunk(body: Anatomy) -> tuple[np.ndarray, np.ndarray]:

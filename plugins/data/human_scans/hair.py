@@ -98,7 +98,7 @@ def _shade(random: Generator) -> Color:
     return hue(40, 0.05, random.uniform(0.5, 0.85))
 
 
-def tied(
+def tie_hair(
     style: Style,
     color: Color,
     head: Float[np.ndarray, "4 3"],

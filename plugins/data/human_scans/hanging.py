@@ -16,21 +16,24 @@ OFF = 0.012
 """Distance of the skirt from the body inside, metres."""
 
 
-def hung(
-    skirt: Skirt, held: Float[np.ndarray, "vertices 3"], top: Bool[np.ndarray, "vertices"], random: Generator
+def hang_skirt(
+    skirt: Skirt,
+    trunk_and_legs: Float[np.ndarray, "vertices 3"],
+    top: Bool[np.ndarray, "vertices"],
+    random: Generator,
 ) -> Piece:
     """Return the mesh of a skirt on a posed body.
 
     `held` are the posed vertices of trunk and legs; `top` says which of them lie at the skirt's upper border.
     """
-    waist = held[top].mean(0)
+    waist = trunk_and_legs[top].mean(0)
     angle = np.linspace(0, 2 * np.pi, AROUND)
     directions = np.stack([np.sin(angle), np.cos(angle)], 1)
     heights = waist[1] - skirt.length * np.linspace(0, 1, RINGS)
-    flat = held[:, [0, 2]] - waist[[0, 2]]
+    flat = trunk_and_legs[:, [0, 2]] - waist[[0, 2]]
     reach = np.zeros((RINGS, AROUND))
     for ring, height in enumerate(heights):
-        near = np.abs(held[:, 1] - height) < SLICE
+        near = np.abs(trunk_and_legs[:, 1] - height) < SLICE
         # the farthest extent of the slice in every direction: at least the outline of a cloth pulled tight around it
         reach[ring] = (flat[near] @ directions.T).max(0) if near.any() else 0.0
     reach = np.maximum(_smooth(reach), 0.0) + OFF

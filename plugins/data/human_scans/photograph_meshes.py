@@ -23,7 +23,7 @@ from framework.geometry.srgb import linear_from_bytes
 from framework.renderer import Renderer, Scene
 from framework.storage.commands import run_command
 from framework.storage.generated import draw_all, ensure_generated
-from plugins.data.human_scans.photographs import photographed, rig
+from plugins.data.human_scans.photographs import place_cameras, take_photographs
 
 Pair = tuple[Path, Path]
 """Paths of a scan and of its registration."""
@@ -39,42 +39,46 @@ def main(arguments: list[str]) -> None:
         prog="python -m plugins.data.human_scans.photograph_meshes", description=__doc__
     )
     parser.add_argument("meshes", type=Path, help="folder with train, validation and test")
-    parser.add_argument("root", type=Path, help="folder to make")
-    parser.add_argument("--views", type=int, default=12, help="photographs of each; default: 12")
+    parser.add_argument("root", type=Path, help="new folder for the data set")
+    parser.add_argument("--views", type=int, default=12, help="photographs of each person; default: 12")
     parser.add_argument(
         "--size", type=int, nargs=2, default=(256, 192), help="height and width; default: 256 192"
     )
-    parser.add_argument("--topology", default="7k", help="the word for data.topology; default: 7k")
-    parser.add_argument("--renderer", default="rasterizer", help="what draws; default: rasterizer")
-    given = parser.parse_args(arguments)
-    renderer: Renderer = build("renderer", resolve("renderer", {"name": given.renderer}))
-    if given.root.exists():
+    parser.add_argument(
+        "--topology", default="7k", help="name of the topology, the value of data.topology; default: 7k"
+    )
+    parser.add_argument(
+        "--renderer", default="rasterizer", help="renderer of the photographs; default: rasterizer"
+    )
+    options = parser.parse_args(arguments)
+    renderer: Renderer = build("renderer", resolve("renderer", {"name": options.renderer}))
+    if options.root.exists():
         raise DataError(
-            f"{given.root} is there already; wanted a folder that is not. Name another, or remove it."
+            f"{options.root} exists already; expected a new folder. Choose another name, or remove the folder."
         )
-    people = pairs(given.meshes)
+    people = pairs(options.meshes)
     count = sum(map(len, people.values()))
     mark = {
-        "photographed": str(given.meshes),
+        "photographed": str(options.meshes),
         "people": count,
-        "views": given.views,
-        "size": list(given.size),
+        "views": options.views,
+        "size": list(options.size),
     }
 
     def write(root: Path) -> None:
         scan_layout.write_splits(root, {split: list(some) for split, some in people.items()})
         everyone = [(name, pair) for some in people.values() for name, pair in some.items()]
 
-        def one(number: int) -> None:
+        def write_numbered(number: int) -> None:
             name, pair = everyone[number]
             write_person(
-                root / "subjects" / name, pair, given.topology, renderer, given.views, tuple(given.size)
+                root / "subjects" / name, pair, options.topology, renderer, options.views, tuple(options.size)
             )
 
-        draw_all(len(everyone), one, "people")
+        draw_all(len(everyone), write_numbered, "people")
 
-    ensure_generated(given.root, mark, write)
-    sys.stdout.write(f"{given.root}: {count} people\n")
+    ensure_generated(options.root, mark, write)
+    sys.stdout.write(f"{options.root}: {count} people\n")
 
 
 def pairs(folder: Path) -> Mapping[str, Mapping[str, Pair]]:
@@ -83,7 +87,7 @@ def pairs(folder: Path) -> Mapping[str, Mapping[str, Pair]]:
     Raises:
         DataError: a split has no scans, a scan no registration, or two people have one name.
     """
-    found: dict[str, dict[str, Pair]] = {}
+    pairs_by_split: dict[str, dict[str, Pair]] = {}
     for split in Splits._fields:
         files = {
             file.stem: file for file in sorted((folder / split).glob("*")) if file.suffix.lower() in READERS
@@ -91,19 +95,23 @@ def pairs(folder: Path) -> Mapping[str, Mapping[str, Pair]]:
         scans = [stem for stem in files if stem.endswith("_scan")]
         if not scans:
             raise DataError(
-                f"{folder / split}: no scan; wanted files like ann_scan.ply and ann_registration.ply there."
+                f"{folder / split}: the folder has no scan; expected files such as ann_scan.ply and "
+                "ann_registration.ply."
             )
-        found[split] = {}
+        pairs_by_split[split] = {}
         for stem in scans:
             name = stem.removesuffix("_scan")
             if f"{name}_registration" not in files:
-                raise DataError(f"{files[stem]}: no registration; wanted {name}_registration.ply beside it.")
-            if any(name in others for others in found.values()):
                 raise DataError(
-                    f"{files[stem]}: {name} is there twice; wanted a name of its own for everybody."
+                    f"{files[stem]}: the registration of this scan is missing; expected {name}_registration.ply beside "
+                    "it."
                 )
-            found[split][name] = files[stem], files[f"{name}_registration"]
-    return found
+            if any(name in earlier for earlier in pairs_by_split.values()):
+                raise DataError(
+                    f"{files[stem]}: the name {name} occurs twice; expected a different name for each person."
+                )
+            pairs_by_split[split][name] = files[stem], files[f"{name}_registration"]
+    return pairs_by_split
 
 
 def write_person(
@@ -119,11 +127,11 @@ def write_person(
             torch.from_numpy(registration.faces),
         ),
     )
-    cameras = rig(scan.vertices, views, size, stream(0, folder.name))
+    cameras = place_cameras(scan.vertices, views, size, stream(0, folder.name))
     colors = linear_from_bytes(torch.from_numpy(np.ascontiguousarray(scan_layout.vertex_colors(scan))))
     faces = torch.from_numpy(scan.faces)
     scene = Scene(torch.from_numpy(scan.vertices).float(), faces, colors, cameras[0])
-    scan_layout.write_views(folder, cameras, photographed(renderer, scene, cameras))
+    scan_layout.write_views(folder, cameras, take_photographs(renderer, scene, cameras))
 
 
 if __name__ == "__main__":

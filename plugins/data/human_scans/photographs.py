@@ -28,7 +28,7 @@ MARGIN = 0.03
 """Smallest share of the image's height and width that stays free on each side."""
 
 
-def rig(
+def place_cameras(
     vertices: Float[np.ndarray, "vertices 3"], count: int, size: tuple[int, int], random: Generator
 ) -> list[Camera]:
     """Return cameras at different positions that see all of a person; if positions are too few, they are used again.
@@ -77,7 +77,7 @@ def _camera(
     )
 
 
-def photographed(renderer: Renderer, scene: Scene, cameras: Sequence[Camera]) -> list[Photograph]:
+def take_photographs(renderer: Renderer, scene: Scene, cameras: Sequence[Camera]) -> list[Photograph]:
     """Return a photograph of the scene, whose colours are red, green and blue, from each camera.
 
     Every pixel is the mean linear RGB of those of its SAMPLES² samples that lie on the subject.
@@ -85,10 +85,13 @@ def photographed(renderer: Renderer, scene: Scene, cameras: Sequence[Camera]) ->
     larger = [
         Scene(scene.vertices, scene.faces, _with_cover(scene.colors), _finer(camera)) for camera in cameras
     ]
-    found = []
+    photographs = []
     for first in range(0, len(larger), TOGETHER):
-        found += [_pooled(drawn["color"]) for drawn in renderer.batch(larger[first : first + TOGETHER])]
-    return found
+        photographs += [
+            _average_samples(channels["color"])
+            for channels in renderer.batch(larger[first : first + TOGETHER])
+        ]
+    return photographs
 
 
 def _with_cover(colors: Tensor | None) -> Float[Tensor, "vertices 4"]:
@@ -111,11 +114,11 @@ def _finer(camera: Camera) -> Camera:
     )
 
 
-def _pooled(drawn: Float[Tensor, "height width 4"]) -> Photograph:
-    found = avg_pool2d(drawn.movedim(-1, 0)[None], SAMPLES)[0].movedim(0, -1)
-    cover = found[..., 3]
+def _average_samples(rendered: Float[Tensor, "height width 4"]) -> Photograph:
+    pooled = avg_pool2d(rendered.movedim(-1, 0)[None], SAMPLES)[0].movedim(0, -1)
+    cover = pooled[..., 3]
     light = torch.where(
-        cover[..., None] > 0, found[..., :3] / cover.clamp(min=1e-6)[..., None], 0.5
+        cover[..., None] > 0, pooled[..., :3] / cover.clamp(min=1e-6)[..., None], 0.5
     )  # grey background
     return Photograph(bytes_from_linear(light).numpy(), (cover * 255).round().byte().numpy())
 
@@ -131,7 +134,7 @@ def texture(
     place = np.stack([uv[:, 0] * side - 0.5, (1 - uv[:, 1]) * side - 0.5, np.ones(len(uv))], 1)
     camera = Camera(torch.eye(3), torch.zeros(3), (1.0, 1.0), (0.0, 0.0), side, side)
     scene = Scene(torch.from_numpy(place).float(), torch.from_numpy(uv_faces), _with_cover(colors), camera)
-    drawn = renderer(scene)["color"]
-    outside = (drawn[..., 3] == 0).numpy()
+    rendered = renderer(scene)["color"]
+    outside = (rendered[..., 3] == 0).numpy()
     row, column = np.asarray(distance_transform_edt(outside, return_distances=False, return_indices=True))
-    return bytes_from_linear(drawn[..., :3] / drawn[..., 3:].clamp(min=1e-6)).numpy()[row, column]
+    return bytes_from_linear(rendered[..., :3] / rendered[..., 3:].clamp(min=1e-6)).numpy()[row, column]

@@ -22,11 +22,11 @@ from torch import Tensor
 
 from framework.bodies import motion, poses
 from framework.bodies.body import Body, BodyModel
-from framework.bodies.people import chosen_body
-from framework.bodies.pose_of_mesh import Found, pose_of
-from framework.bodies.shape_space import in_few_shapes
-from framework.bodies.topologies import in_topology, recognised
-from framework.bodies.unposing import unposed
+from framework.bodies.people import load_body
+from framework.bodies.pose_of_mesh import MeshFit, fit_mesh
+from framework.bodies.shape_space import reduce_shapes
+from framework.bodies.topologies import body_in_topology, recognise_topology
+from framework.bodies.unposing import unpose
 from framework.datasets import scan_layout
 from framework.datasets.scan_layout import RegisteredMesh
 from framework.errors import DataError, did_you_mean
@@ -45,14 +45,14 @@ class Subject:
 
     Attributes:
         model: body model, float64, in the registration's topology.
-        found: pose, shape and translation of the registration.
+        fit: pose, shape and translation of the registration.
         offsets: displacements of its vertices from the model's in the rest pose, metres.
         folded: number of vertices that are the model's own along some direction, see framework.bodies.unposing.
     """
 
     model: BodyModel
     registration: RegisteredMesh
-    found: Found
+    fit: MeshFit
     offsets: Float[Tensor, "1 vertex 3"]
     folded: int
 
@@ -61,8 +61,8 @@ class Subject:
         self, pose: Float[np.ndarray, "joint 3"] | None = None, change: Float[Tensor, "shape"] | None = None
     ) -> RegisteredMesh:
         """Return the person in a pose (None: as registered), with a change of shape coefficients."""
-        shape = self.found.shape if change is None else self.found.shape + change
-        turned = self.found.pose if pose is None else torch.from_numpy(pose)[None]
+        shape = self.fit.shape if change is None else self.fit.shape + change
+        turned = self.fit.pose if pose is None else torch.from_numpy(pose)[None]
         vertices = self.model(shape, turned, offsets=self.offsets)[0]
         vertices -= self.model.posed_joints(shape, turned)[
             0, self.model.parents.index(-1)
@@ -80,12 +80,12 @@ def subject(body: Body, few: Body, registration: RegisteredMesh, source: str) ->
     Raises:
         DataError: the mesh is of another body.
     """
-    surface, mesh = recognised(body, len(registration.vertices), registration.faces.numpy(), source)
-    own = in_topology(few, surface, mesh)
-    found = pose_of(own, registration.vertices)
+    surface, mesh = recognise_topology(body, len(registration.vertices), registration.faces.numpy(), source)
+    own = body_in_topology(few, surface, mesh)
+    fit = fit_mesh(own, registration.vertices)
     model = BodyModel(own).double()
-    back = unposed(model, registration.vertices.double()[None], *found[:3])
-    return Subject(model, registration, found, back.offsets, int(back.folded.sum()))
+    back = unpose(model, registration.vertices.double()[None], *fit[:3])
+    return Subject(model, registration, fit, back.offsets, int(back.folded.sum()))
 
 
 def a_pose_with(changes: str) -> Float[np.ndarray, "1 movement"]:
@@ -95,52 +95,54 @@ def a_pose_with(changes: str) -> Float[np.ndarray, "1 movement"]:
         DataError: no movement has such a name, or an angle is no number.
     """
     ranges = [*poses.CENTRAL.values(), *2 * (*poses.SIDED.values(),)]
-    found = dict(zip(poses.MOVEMENTS, (float(limits[0]) for limits in ranges), strict=True))
-    found |= {f"{side} raise": RAISED for side in ("left", "right")}
+    movements = dict(zip(poses.MOVEMENTS, (float(limits[0]) for limits in ranges), strict=True))
+    movements |= {f"{side} raise": RAISED for side in ("left", "right")}
     for name, degrees in _numbers(changes).items():
-        if name not in found:
+        if name not in movements:
             raise DataError(
-                f"There is no movement {name!r}.{did_you_mean(name, found)} There are {', '.join(found)}."
+                f"There is no movement {name!r}.{did_you_mean(name, movements)} The movements are "
+                f"{', '.join(movements)}."
             )
-        found[name] = degrees
-    return np.array([list(found.values())])
+        movements[name] = degrees
+    return np.array([list(movements.values())])
 
 
 def _numbers(text: str) -> dict[str, float]:
-    found = {}
+    numbers = {}
     for part in text.split(","):
         name, _, number = part.partition("=")
         try:
-            found[name.strip()] = float(number)
+            numbers[name.strip()] = float(number)
         except ValueError:
-            raise DataError(f"{part!r}: wanted a name and a number, as in left elbow=60.") from None
-        if not abs(found[name.strip()]) <= 1e4:
-            raise DataError(f"{part!r}: wanted a number of at most 10000.")
-    return found
+            raise DataError(f"{part!r}: expected a name and a number, as in left elbow=60.") from None
+        if not abs(numbers[name.strip()]) <= 1e4:
+            raise DataError(f"{part!r}: expected a number from -10000 to 10000.")
+    return numbers
 
 
-def asked_poses(body: Body, given: argparse.Namespace) -> Poses:
+def requested_poses(body: Body, options: argparse.Namespace) -> Poses:
     """Return all poses that the arguments ask for."""
     where = poses.skeleton(body)
-    found: Poses = {}
-    for number, changes in enumerate(given.pose):
+    poses_by_name: Poses = {}
+    for number, changes in enumerate(options.pose):
         rest = changes == "rest"
         turned = None if rest else poses.rotations(body, where, a_pose_with(changes))[0]
-        found[f"pose_{number}"] = np.zeros((len(body.parents), 3)) if turned is None else turned
-    if given.random:
-        drawn = poses.draw(given.random, np.random.default_rng(given.seed))
-        turned = poses.rotations(body, where, drawn)
-        found |= {f"random_{number:03}": pose for number, pose in enumerate(turned)}
-    if given.motion is not None:
-        moving = motion.read(given.motion)
-        frames = given.frames or list(range(len(moving.rotations)))
+        poses_by_name[f"pose_{number}"] = np.zeros((len(body.parents), 3)) if turned is None else turned
+    if options.random:
+        random_movements = poses.draw(options.random, np.random.default_rng(options.seed))
+        turned = poses.rotations(body, where, random_movements)
+        poses_by_name |= {f"random_{number:03}": pose for number, pose in enumerate(turned)}
+    if options.motion is not None:
+        moving = motion.read(options.motion)
+        frames = options.frames or list(range(len(moving.rotations)))
         if wrong := [frame for frame in frames if not 0 <= frame < len(moving.rotations)]:
             raise DataError(
-                f"{given.motion}: it has no frame {wrong[0]}; wanted numbers from 0 to {len(moving.rotations) - 1}."
+                f"{options.motion}: the motion has no frame {wrong[0]}; expected numbers from 0 to "
+                f"{len(moving.rotations) - 1}."
             )
-        turned = motion.poses_of(body, moving, frames)
-        found |= {f"frame_{frame:05}": pose for frame, pose in zip(frames, turned, strict=True)}
-    return found
+        turned = motion.transfer_motion(body, moving, frames)
+        poses_by_name |= {f"frame_{frame:05}": pose for frame, pose in zip(frames, turned, strict=True)}
+    return poses_by_name
 
 
 def shape_change(text: str, count: int) -> Float[Tensor, "shape"]:
@@ -149,24 +151,26 @@ def shape_change(text: str, count: int) -> Float[Tensor, "shape"]:
     Raises:
         DataError: the text has another form, or a direction does not exist.
     """
-    found = torch.zeros(count, dtype=torch.float64)
+    coefficients = torch.zeros(count, dtype=torch.float64)
     for name, number in _numbers(text).items():
         if not name.isdecimal() or int(name) >= count:
-            raise DataError(f"--shape {text}: {name!r} is no direction; wanted 0 to {count - 1}, as in 0=-2.")
-        found[int(name)] = number
-    return found
+            raise DataError(
+                f"--shape {text}: {name!r} is no direction; expected a number from 0 to {count - 1}, as in 0=-2."
+            )
+        coefficients[int(name)] = number
+    return coefficients
 
 
 def around(vertices: Float[Tensor, "vertex 3"], views: int, size: tuple[int, int]) -> dict[str, Camera]:
     """Return cameras that see all vertices, at equal angles around the vertical, the first in front."""
-    found = {}
+    cameras = {}
     for view in range(views):
         angle = 2 * math.pi * view / views
         sine, cosine = math.sin(angle), math.cos(angle)
         turn = torch.tensor([[cosine, 0.0, -sine], [0.0, 1.0, 0.0], [sine, 0.0, cosine]])
-        one = in_front(vertices @ turn.T, *size)
-        found[f"{view:03}"] = replace(one, rotation=one.rotation @ turn)
-    return found
+        front_camera = in_front(vertices @ turn.T, *size)
+        cameras[f"{view:03}"] = replace(front_camera, rotation=front_camera.rotation @ turn)
+    return cameras
 
 
 def read(file: Path, topology: str) -> tuple[str, RegisteredMesh]:
@@ -188,46 +192,57 @@ def main(arguments: list[str]) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("registrations", nargs="+", type=Path, help="meshes, or folders of subjects")
-    parser.add_argument("--out", type=Path, required=True, help="folder for what is written")
+    parser.add_argument("--out", type=Path, required=True, help="folder for the meshes and cameras")
     parser.add_argument(
         "--pose", action="append", default=[], help="'rest', or an A-pose with 'left raise=90,right knee=40'"
     )
-    parser.add_argument("--random", type=int, default=0, help="so many random poses")
-    parser.add_argument("--seed", type=int, default=0, help="of random poses; default: 0")
-    parser.add_argument("--motion", type=Path, help="a BVH file")
-    parser.add_argument("--frames", type=int, nargs="+", help="of the motion, from 0; default: all")
+    parser.add_argument("--random", type=int, default=0, help="number of random poses; default: 0")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the random poses; default: 0")
+    parser.add_argument("--motion", type=Path, help="BVH file whose poses are used")
     parser.add_argument(
-        "--shape", action="append", default=[], help="'0=-2': along this direction, in standard deviations"
+        "--frames", type=int, nargs="+", help="numbers of the motion's frames, from 0; default: all"
+    )
+    parser.add_argument(
+        "--shape",
+        action="append",
+        default=[],
+        help="change of shape, as '0=-2': direction and number of standard deviations",
     )
     parser.add_argument("--body", help="file of the body model; default: the default body")
-    parser.add_argument("--topology", default="7k", help="of a subject's folder; default: 7k")
-    parser.add_argument("--views", type=int, default=1, help="cameras around; default: 1")
+    parser.add_argument(
+        "--topology", default="7k", help="topology that is read from the folder of a subject; default: 7k"
+    )
+    parser.add_argument(
+        "--views", type=int, default=1, help="number of cameras around the person; default: 1"
+    )
     parser.add_argument(
         "--size", type=int, nargs=2, default=(256, 192), help="height and width; default: 256 192"
     )
-    given = parser.parse_args(arguments)
-    body, traits = chosen_body(given.body)
-    few = in_few_shapes(body, traits)
-    changes = {f"shape_{text}": shape_change(text, few.shapes.shape[-1]) for text in given.shape}
-    wanted = asked_poses(body, given)
+    options = parser.parse_args(arguments)
+    body, traits = load_body(options.body)
+    few = reduce_shapes(body, traits)
+    changes = {f"shape_{text}": shape_change(text, few.shapes.shape[-1]) for text in options.shape}
+    wanted = requested_poses(body, options)
     written: dict[str, RegisteredMesh] = {}
-    for file in given.registrations:
-        name, registration = read(file, given.topology)
+    for file in options.registrations:
+        name, registration = read(file, options.topology)
         if f"{name}_registration" in written:
-            raise DataError(f"{file}: {name} is there twice; wanted a name of its own for everybody.")
-        one = subject(body, few, registration, str(file))
+            raise DataError(
+                f"{file}: the name {name} occurs twice; expected a different name for each person."
+            )
+        person = subject(body, few, registration, str(file))
         sys.stdout.write(
-            f"{name}: {len(registration.vertices)} vertices, {1000 * one.found.error:.1f} mm from the body in the pose "
-            f"found; {one.folded} folded so far that they were not unposed\n"
+            f"{name}: {len(registration.vertices)} vertices, {1000 * person.fit.error:.1f} mm from the body in the "
+            f"pose found; {person.folded} folded so far that they were not unposed\n"
         )
-        written[f"{name}_registration"] = one.posed()
-        written |= {f"{name}_{pose}": one.posed(turned) for pose, turned in wanted.items()}
-        written |= {f"{name}_{text}": one.posed(change=change) for text, change in changes.items()}
+        written[f"{name}_registration"] = person.posed()
+        written |= {f"{name}_{pose}": person.posed(turned) for pose, turned in wanted.items()}
+        written |= {f"{name}_{text}": person.posed(change=change) for text, change in changes.items()}
     for name, mesh in written.items():
-        scan_layout.write_registration(given.out / f"{name}.ply", mesh)
+        scan_layout.write_registration(options.out / f"{name}.ply", mesh)
     every = torch.cat([mesh.vertices for mesh in written.values()])
-    scan_layout.write_cameras(given.out / "cameras.json", around(every, given.views, tuple(given.size)))
-    sys.stdout.write(f"{given.out}: {len(written)} meshes, {given.views} cameras\n")
+    scan_layout.write_cameras(options.out / "cameras.json", around(every, options.views, tuple(options.size)))
+    sys.stdout.write(f"{options.out}: {len(written)} meshes, {options.views} cameras\n")
 
 
 if __name__ == "__main__":

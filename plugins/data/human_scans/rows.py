@@ -1,10 +1,10 @@
-"""Rows of the contract: photographs of a dressed doll, and a folder of six people."""
+"""Contract-test cases: photographs of a dressed doll, and a folder of six people."""
 
 from collections.abc import Sequence
 from pathlib import Path
 
 from framework.datasets import scan_layout
-from framework.testing.bodies import DOLL, body_file, colored, scanned
+from framework.testing.bodies import DOLL, colored_mesh, write_body_file, write_subjects
 from framework.testing.rows import DAMAGES, DataRow
 
 
@@ -12,7 +12,7 @@ def colored_meshes(folder: Path) -> Sequence[Path]:
     """Write two meshes with vertex colours, and return their paths."""
     files = [folder / "one.ply", folder / "other.ply"]
     for number, file in enumerate(files):
-        scan_layout.write_registration(file, colored(number))
+        scan_layout.write_registration(file, colored_mesh(number))
     return files
 
 
@@ -22,7 +22,7 @@ ROWS = {
         DataRow(
             "a dressed doll",
             {**SMALL, "train": 3, "validation": 1, "test": 2, "height": 24, "width": 18, "texture_side": 0},
-            write=body_file,
+            write=write_body_file,
             synthetic=True,
             files=colored_meshes,
             fragile={"doll.npz": DAMAGES},
@@ -31,7 +31,7 @@ ROWS = {
         DataRow(
             "six people",
             {**SMALL, **DOLL, "train": 1, "validation": 1, "test": 1, "height": 12, "width": 9},
-            write=scanned,
+            write=write_subjects,
             synthetic=False,
             files=colored_meshes,
             fragile={
@@ -52,7 +52,7 @@ ROWS = {
                 "width": 9,
                 "shows": "subject",
             },
-            write=scanned,
+            write=write_subjects,
             synthetic=False,
             files=colored_meshes,
         ),

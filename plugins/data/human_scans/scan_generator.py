@@ -16,7 +16,7 @@ from pydantic import Field
 from torch import Tensor
 
 from framework.bodies import poses
-from framework.bodies.people import adults, chosen_body
+from framework.bodies.people import load_body, sample_adults
 from framework.bodies.topologies import Name, Topology, topology
 from framework.configuration.paths import FilePath
 from framework.datasets import scan_layout
@@ -28,7 +28,7 @@ from framework.storage import cache
 from framework.storage.generated import draw_all, ensure_generated
 from plugins.data.human_scans import skins
 from plugins.data.human_scans.dressed import Wardrobe
-from plugins.data.human_scans.photographs import photographed, rig, texture
+from plugins.data.human_scans.photographs import place_cameras, take_photographs, texture
 
 VERSION = 1
 """Version of the random draws; any change of them takes a new number."""
@@ -36,7 +36,7 @@ SPLITS = ("train", "validation", "test")
 CALM = 0.4
 """Spread of the movements of people who stand still in an A-pose, as a share of the usual spread."""
 RAISED = 38.0
-"""Angle of the arms of an A-pose from hanging, degrees."""
+"""Angle between the arms of an A-pose and hanging arms, degrees."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,8 +89,8 @@ class Crowd:
 
     def __init__(self, renderer: Renderer, counts: Mapping[str, int], drawing: Drawing, seed: int) -> None:
         self.renderer, self.counts, self.drawing, self.seed = renderer, dict(counts), drawing, seed
-        self.body, self.traits = chosen_body(drawing.body)
-        self.skins = _shared_out(drawing.skins, self.body.uv is not None)
+        self.body, self.traits = load_body(drawing.body)
+        self.skins = _split_skins(drawing.skins, self.body.uv is not None)
         # body and skins are identified by their content, not by their paths
         settings = {key: value for key, value in asdict(drawing).items() if key not in ("skins", "body")}
         self.mark = {
@@ -132,7 +132,9 @@ class Crowd:
         folder = root / "subjects" / _name(split, number)
         shape, pose, skin, random = self.person(split, number)
         scan, registered = self.wardrobe.dress(self.posed(shape, pose), skin, random)
-        views = rig(scan.vertices, self.drawing.views, (self.drawing.height, self.drawing.width), random)
+        views = place_cameras(
+            scan.vertices, self.drawing.views, (self.drawing.height, self.drawing.width), random
+        )
         for name, mesh in self.meshes.items():
             scan_layout.write_registration(
                 folder / f"registration_{name}.ply",
@@ -148,7 +150,7 @@ class Crowd:
             torch.from_numpy(scan.colors).float(),
             views[0],
         )
-        scan_layout.write_views(folder, views, photographed(self.renderer, scene, views))
+        scan_layout.write_views(folder, views, take_photographs(self.renderer, scene, views))
         if self.drawing.texture_side and self.wardrobe.uv is not None:
             faces = self.wardrobe.sheet.corners[-1].uv_faces
             colors = linear_from_bytes(torch.from_numpy(registered.colors[self.wardrobe.vertex_of_place]))
@@ -156,7 +158,7 @@ class Crowd:
             Image.fromarray(pixels).save(folder / "texture.png")
 
     def person(self, split: str, number: int) -> Person:
-        """Return a person before dressing."""
+        """Return the shape, the pose and the skin of a person, without clothes."""
         random = np.random.default_rng([self.seed, SPLITS.index(split), number])
         skin = None
         if some := self.skins[SPLITS.index(split)]:
@@ -164,7 +166,7 @@ class Crowd:
         if self.traits is None:
             shape = torch.from_numpy(random.normal(0, 1, (1, min(10, self.body.shapes.shape[2]))))
         else:
-            shape = self.traits.coefficients(torch.from_numpy(adults(self.traits.labels, 1, random)))
+            shape = self.traits.coefficients(torch.from_numpy(sample_adults(self.traits.labels, 1, random)))
         anyhow = split == "test" and random.random() < self.drawing.posed
         movements = poses.draw(1, random) if anyhow else a_pose(random)
         pose = poses.rotations(self.body, poses.skeleton(self.body), movements)
@@ -180,7 +182,7 @@ class Crowd:
 
 
 def a_pose(random: Generator) -> Float[np.ndarray, "1 movement"]:
-    """Return movements, degrees, of a person who stands to be scanned: arms off the body, nearly still."""
+    """Return movements, degrees, of a person who stands nearly still in an A-pose, with the arms away from the body."""
     ranges = [*poses.CENTRAL.values(), *2 * (*poses.SIDED.values(),)]
     usual, spread, least, most = np.array(ranges, float).T
     usual = np.where(np.char.endswith(np.array(poses.MOVEMENTS), "raise"), RAISED, usual)
@@ -191,7 +193,7 @@ def _name(split: str, number: int) -> str:
     return f"{split}_{number:04}"
 
 
-def _shared_out(folder: str | None, has_places: bool) -> list[list[Path]]:
+def _split_skins(folder: str | None, has_places: bool) -> list[list[Path]]:
     """Return the skins of each split: a quarter for test and an eighth for validation, at least one each.
 
     All others are for training.
@@ -200,15 +202,17 @@ def _shared_out(folder: str | None, has_places: bool) -> list[list[Path]]:
         return [[], [], []]
     if not has_places:
         raise ConfigError(
-            "data.skins are for bodies with texture places, as the default body. Leave out data.skins or data.body."
+            "data.skins needs a body with texture coordinates, such as the default body. Leave out data.skins or "
+            "data.body."
         )
-    found = skins.files(Path(folder).expanduser())
-    if len(found) < 3:
+    files = skins.files(Path(folder).expanduser())
+    if len(files) < 3:
         raise ConfigError(
-            f"data.skins = {folder} holds {len(found)} skins; wanted three at least, one for each split."
+            f"data.skins = {folder} holds {len(files)} skins; expected three at least, one for each split. Add images, "
+            "or set data.skins to null."
         )
-    order = [found[place] for place in np.random.default_rng(0).permutation(len(found))]
-    test, validation = max(len(found) // 4, 1), max(len(found) // 8, 1)
+    order = [files[place] for place in np.random.default_rng(0).permutation(len(files))]
+    test, validation = max(len(files) // 4, 1), max(len(files) // 8, 1)
     return [order[test + validation :], order[test : test + validation], order[:test]]
 
 

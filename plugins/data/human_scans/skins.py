@@ -24,13 +24,13 @@ def files(folder: Path) -> list[Path]:
     Raises:
         DataError: the folder does not exist, or has no PNG.
     """
-    found = sorted(folder.glob("*.png"))
-    if not found:
+    images_found = sorted(folder.glob("*.png"))
+    if not images_found:
         raise DataError(
-            f"data.skins = {folder}: no PNG there; wanted a folder of skins in the default body's texture layout, or "
-            "null."
+            f"data.skins = {folder}: the folder holds no PNG file; expected images of skin in the texture layout of "
+            "the default body. Set data.skins to such a folder, or to null."
         )
-    return found
+    return images_found
 
 
 def content(file: Path) -> bytes:
@@ -39,7 +39,7 @@ def content(file: Path) -> bytes:
     Raises:
         DataError: the file is missing, or is no regular file.
     """
-    with translate_errors(file, "a picture of skin"):
+    with translate_errors(file, "an image of skin"):
         return read_bytes(file)
 
 
@@ -53,7 +53,7 @@ def read(file: Path) -> UInt8[np.ndarray, "height width 3"]:
         return np.array(images.decode(image, 3, upright=False))
 
 
-def shown(
+def colors_at(
     pixels: UInt8[np.ndarray, "height width 3"], uv: Float[np.ndarray, "places 2"]
 ) -> Float[np.ndarray, "places 3"]:
     """Return the linear RGB of a skin at texture coordinates, v upwards, interpolated between texels."""
@@ -73,7 +73,7 @@ BLANK = 128
 """Red, green and blue of unpainted texels, which garments are expected to cover."""
 
 
-def filled(
+def fill_blanks(
     colors: Float[np.ndarray, "vertices 3"], body: Anatomy, count: int, average: Carry, carried: Carry
 ) -> Float[np.ndarray, "vertices 3"]:
     """Return the linear RGB of a skin at all vertices, with blank vertices filled.
@@ -83,7 +83,7 @@ def filled(
     Args:
         colors: linear RGB of all vertices.
         body: anatomy of all vertices.
-        count: number of the body's own vertices, which are the first of `colors`.
+        count: number of vertices of the unsplit body, which are the first of `colors`.
         average: function from values of these to their means over neighbours.
         carried: function that interpolates values of these to all vertices.
     """
@@ -101,12 +101,12 @@ def filled(
     return np.where((blank | near)[:, None], carried(own), colors)
 
 
-def painted(body: Anatomy, random: Generator) -> Float[np.ndarray, "vertices 3"]:
+def paint_skin(body: Anatomy, random: Generator) -> Float[np.ndarray, "vertices 3"]:
     """Return the linear RGB of every vertex of a random skin with a face."""
     tone = _tone(random)
     spots = 1 + 0.05 * noise(body.place, 0.03, random) + 0.03 * noise(body.place, 0.01, random)
-    found = tone * spots[:, None]
-    return _with_face(body, found, tone, random) if (body.head > 0.5).any() else found
+    colors = tone * spots[:, None]
+    return _paint_face(body, colors, tone, random) if (body.head > 0.5).any() else colors
 
 
 def _tone(random: Generator) -> Color:
@@ -114,7 +114,7 @@ def _tone(random: Generator) -> Color:
     return hue(24 - 5 * depth, 0.3 + 0.35 * depth, 0.95 - 0.6 * depth)
 
 
-def _with_face(body: Anatomy, found: np.ndarray, tone: Color, random: Generator) -> np.ndarray:
+def _paint_face(body: Anatomy, colors: np.ndarray, tone: Color, random: Generator) -> np.ndarray:
     """Return colours with lips, cheeks, brows, eyes and shade around them, at their positions on the head."""
     x, y, z = body.on_head.T
     face = (body.head > 0.5) & (z > 0.35)
@@ -128,19 +128,19 @@ def _with_face(body: Anatomy, found: np.ndarray, tone: Color, random: Generator)
     sockets = blot((0.36, 0.485), 0.2, 0.045)
     brow = face & (np.abs(y - 0.56 + 0.25 * (side - 0.36) ** 2) < 0.014) & (np.abs(side - 0.36) < 0.22)
     stubble = (random.random() < 0.25) * face * ((y < 0.28) & (side < 0.75)) * (1 - lips)
-    found = found * (1 - 0.25 * sockets)[:, None]
-    found = found + (np.array([0.12, 0.0, 0.0]) * tone)[None] * cheeks[:, None]
-    found = found * (1 - 0.7 * lips[:, None] * (1 - np.array([0.85, 0.4, 0.42])))
-    found = np.where(brow[:, None], 0.25 * tone, found)
-    return with_eyes(body, found * (1 - 0.5 * stubble)[:, None], random)
+    colors = colors * (1 - 0.25 * sockets)[:, None]
+    colors = colors + (np.array([0.12, 0.0, 0.0]) * tone)[None] * cheeks[:, None]
+    colors = colors * (1 - 0.7 * lips[:, None] * (1 - np.array([0.85, 0.4, 0.42])))
+    colors = np.where(brow[:, None], 0.25 * tone, colors)
+    return paint_eyes(body, colors * (1 - 0.5 * stubble)[:, None], random)
 
 
-def with_eyes(body: Anatomy, found: np.ndarray, random: Generator) -> Float[np.ndarray, "vertices 3"]:
+def paint_eyes(body: Anatomy, colors: np.ndarray, random: Generator) -> Float[np.ndarray, "vertices 3"]:
     """Return colours with the white, the iris and the pupil of both eyes, at their positions on the head."""
     x, y, z = body.on_head.T
     face = (body.head > 0.5) & (z > 0.35)
     away = (np.abs(x) - 0.355, y - 0.482)
     colour = hue(random.choice([25.0, 30.0, 205.0, 110.0]), 0.5, random.uniform(0.2, 0.5)) * 0.6
     for wide, high, paint in ((0.13, 0.022, 0.7), (0.055, 0.024, colour), (0.02, 0.009, 0.01)):
-        found = np.where((face & (np.hypot(away[0] / wide, away[1] / high) < 1))[:, None], paint, found)
-    return found
+        colors = np.where((face & (np.hypot(away[0] / wide, away[1] / high) < 1))[:, None], paint, colors)
+    return colors

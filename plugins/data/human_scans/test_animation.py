@@ -17,7 +17,7 @@ from framework.geometry.camera import canonical_camera
 from framework.geometry.srgb import bytes_from_linear
 from framework.renderer import Scene
 from framework.target import Target
-from framework.testing.bodies import DOLL, colored
+from framework.testing.bodies import DOLL, colored_mesh
 from framework.testing.contract import contract
 from framework.testing.scenes import sphere
 from plugins.data.human_scans import animate, animation, flow
@@ -83,11 +83,11 @@ def test_a_warped_picture_agrees_where_a_textured_body_turns_and_does_not_where_
     drawn = [RENDERER(scene, ("color", *flow.CHANNELS)) for scene in (before, after)]
     where, seen = flow.flow(before, after, *drawn)
     assert seen.float().mean() > 0.2
-    off = (flow.warped(drawn[0]["color"], where) - drawn[1]["color"])[seen].abs()
+    off = (flow.warp(drawn[0]["color"], where) - drawn[1]["color"])[seen].abs()
     still = (drawn[0]["color"] - drawn[1]["color"])[seen].abs()
     assert off.mean() < 0.004 < 0.05 < still.mean()
     brighter = RENDERER(replace(after, colors=colors + 0.1), ("color",))["color"]
-    change = (brighter - flow.warped(drawn[0]["color"], where))[seen].mean()
+    change = (brighter - flow.warp(drawn[0]["color"], where))[seen].mean()
     assert change == pytest.approx(0.1, abs=0.002)
 
 
@@ -151,7 +151,7 @@ def data():
 
 @pytest.fixture(scope="module")
 def person(data):
-    return animate.generated(data, "test_0000")
+    return animate.generated_person(data, "test_0000")
 
 
 def test_a_generated_person_is_the_data_sets_and_moves(data, person, tmp_path):
@@ -246,7 +246,7 @@ def test_a_film_needs_its_program_and_people_who_are_there(data, tmp_path, monke
     with pytest.raises(DataError, match="Did you mean 'test_000"):
         animate.cast(data, "test_000", None, 2)
     mesh = tmp_path / "own.ply"
-    scan_layout.write_registration(mesh, colored(0))
+    scan_layout.write_registration(mesh, colored_mesh(0))
     shown, moments = animate.cast(data, str(mesh), None, 2)
     assert len(moments) == 2 and len(shown.colors) == 40
     with pytest.raises(ConfigError, match="only a mesh is known"):

@@ -6,7 +6,7 @@ import torch
 from framework.configuration.schema import build, resolve
 from framework.datasets import scan_layout
 from framework.errors import DataError
-from framework.testing.bodies import colored
+from framework.testing.bodies import colored_mesh
 from plugins.data.human_scans import photograph_meshes
 from plugins.data.human_scans.rows import SMALL
 
@@ -18,8 +18,10 @@ def given(tmp_path):
     folder = tmp_path / "given"
     for split, names in {"train": ("ann", "bob"), "validation": ("dan",), "test": ("eve",)}.items():
         for number, name in enumerate(names):
-            scan_layout.write_registration(folder / split / f"{name}_scan.ply", colored(number))
-            scan_layout.write_registration(folder / split / f"{name}_registration.ply", colored(number + 5))
+            scan_layout.write_registration(folder / split / f"{name}_scan.ply", colored_mesh(number))
+            scan_layout.write_registration(
+                folder / split / f"{name}_registration.ply", colored_mesh(number + 5)
+            )
     return folder
 
 
@@ -34,23 +36,25 @@ def test_meshes_become_a_root(given, tmp_path, capsys):
     assert found.synthetic and found.size == (20, 16)
     assert [len(split) for split in found.splits()] == [6, 3, 3]
     read = scan_layout.read_subject(root, "bob", "mine").mesh
-    assert torch.equal(read.vertices, colored(6).vertices) and torch.equal(read.colors, colored(6).colors)
-    with pytest.raises(DataError, match="is there already"):
+    assert torch.equal(read.vertices, colored_mesh(6).vertices) and torch.equal(
+        read.colors, colored_mesh(6).colors
+    )
+    with pytest.raises(DataError, match="exists already"):
         photograph_meshes.main([str(given), str(root), *SMALLER])
 
 
 WRONG = {
     "no registration": (
         lambda folder: (folder / "train/bob_registration.ply").unlink(),
-        "bob_scan.ply: no registration",
+        "bob_scan.ply: the registration of this scan is missing",
     ),
-    "no scans": (lambda folder: shutil.rmtree(folder / "test"), "test: no scan"),
+    "no scans": (lambda folder: shutil.rmtree(folder / "test"), "test: the folder has no scan"),
     "twice": (
         lambda folder: [
             shutil.copy(folder / f"train/ann_{what}.ply", folder / "test")
             for what in ("scan", "registration")
         ],
-        "ann is there twice",
+        "the name ann occurs twice",
     ),
     "no mesh": (lambda folder: (folder / "validation/dan_scan.ply").write_text("dan"), "dan_scan.ply"),
 }

@@ -9,28 +9,28 @@ from scipy.spatial.transform import Rotation
 
 from framework.bodies import poses
 from framework.bodies.body import BodyModel
-from framework.bodies.people import adults, chosen_body
-from framework.bodies.pose_of_mesh import pose_of
-from framework.bodies.shape_space import COUNT, in_few_shapes
-from framework.bodies.topologies import COUNTS, in_topology, recognised, sheet, topology
+from framework.bodies.people import load_body, sample_adults
+from framework.bodies.pose_of_mesh import fit_mesh
+from framework.bodies.shape_space import COUNT, reduce_shapes
+from framework.bodies.topologies import COUNTS, body_in_topology, recognise_topology, sheet, topology
 from framework.configuration.schema import build, resolve
 from framework.datasets import scan_layout
 from framework.datasets.scan_layout import RegisteredMesh
 from framework.errors import DataError
 from framework.geometry import meshes
-from framework.testing.bodies import DOLL, colored
+from framework.testing.bodies import DOLL, colored_mesh
 from plugins.data.human_scans import repose
 from plugins.data.human_scans.rows import SMALL
 
 
 @pytest.fixture(scope="module")
 def doll():
-    return chosen_body(DOLL["body"])[0]
+    return load_body(DOLL["body"])[0]
 
 
 @pytest.fixture(scope="module")
 def default():
-    return chosen_body(None)
+    return load_body(None)
 
 
 @pytest.mark.parametrize("size", [0.1, 0.6, 1.5])
@@ -42,7 +42,7 @@ def test_any_pose_and_shape_is_found_from_the_vertices_alone(doll, size, number)
     shape, place = (torch.from_numpy(random.normal(size=(1, count))) for count in (4, 3))
     model = BodyModel(doll).double()
     mesh = model(shape, pose, place)[0]
-    found = pose_of(doll, mesh, usual=0.0)
+    found = fit_mesh(doll, mesh, usual=0.0)
     assert found.error < 1e-6
     torch.testing.assert_close(model(*found[:3])[0], mesh, atol=1e-6, rtol=0)
     torch.testing.assert_close(found.shape, shape, atol=1e-5, rtol=0)
@@ -53,23 +53,23 @@ def test_any_pose_and_shape_is_found_from_the_vertices_alone(doll, size, number)
 def test_what_is_usual_shares_a_bend_and_counts_less_the_better_the_mesh_fits(doll):
     mesh = BodyModel(doll).double()(torch.full((1, 4), 3.0).double(), torch.zeros(1, 22, 3).double())[0]
     free, usual, strict = (
-        float(pose_of(doll, mesh, usual=share).shape.abs().max()) for share in (0.0, 1.0, 100.0)
+        float(fit_mesh(doll, mesh, usual=share).shape.abs().max()) for share in (0.0, 1.0, 100.0)
     )
     assert strict < usual < free and free == pytest.approx(3.0, abs=1e-5)
     for wrong in (mesh[:-1], mesh.clone().fill_(torch.nan)):
         with pytest.raises(DataError, match="wanted the 132 of"):
-            pose_of(doll, wrong)
+            fit_mesh(doll, wrong)
 
 
 def test_few_shapes_are_the_principal_components_of_adults(default):
     body, traits = default
-    few = in_few_shapes(body, traits)
+    few = reduce_shapes(body, traits)
     directions = few.shapes.reshape(-1, COUNT).astype(float)
     sizes = np.linalg.norm(directions, axis=0)
     assert (np.diff(sizes) < 0).all()
     np.testing.assert_allclose(directions.T @ directions, np.diag(sizes**2), atol=1e-4 * sizes[0] ** 2)
     values = traits.coefficients(
-        torch.from_numpy(adults(traits.labels, 100, np.random.default_rng(3)))
+        torch.from_numpy(sample_adults(traits.labels, 100, np.random.default_rng(3)))
     ).numpy()
     apart = np.stack([(body.template + body.shapes @ one - few.template).ravel() for one in values])
     found = np.linalg.lstsq(directions, apart.T, rcond=None)[0]
@@ -88,7 +88,7 @@ def test_vertices_of_a_topology_bend_with_the_body(doll, default, name):
     for body, tolerance in ((doll, 1e-12), (replace(default[0], **FEWER), 1e-6)):
         surface = sheet(body)
         mesh = topology(body, surface, name)
-        own = in_topology(body, *recognised(body, len(mesh.rows), mesh.faces, "a mesh"))
+        own = body_in_topology(body, *recognise_topology(body, len(mesh.rows), mesh.faces, "a mesh"))
         assert own.template.shape == (len(mesh.rows), 3) and np.array_equal(own.faces, mesh.faces)
         if body is not doll and name in COUNTS:
             assert len(own.template) == COUNTS[name]
@@ -98,7 +98,7 @@ def test_vertices_of_a_topology_bend_with_the_body(doll, default, name):
         )
         shape = torch.zeros(1, 0)
         whole, some = (BodyModel(one).double()(shape.double(), pose)[0].numpy() for one in (body, own))
-        apart = np.linalg.norm(some - surface.carried(whole)[mesh.rows], axis=1)
+        apart = np.linalg.norm(some - surface.interpolate(whole)[mesh.rows], axis=1)
         assert apart[mesh.rows < len(body.template)].max() < tolerance
         assert np.quantile(apart, 0.99) < 0.002 and apart.max() < 0.01
 
@@ -106,23 +106,23 @@ def test_vertices_of_a_topology_bend_with_the_body(doll, default, name):
 def test_meshes_of_other_bodies_are_told(doll):
     mesh = topology(doll, sheet(doll), "14k")
     with pytest.raises(DataError, match=r"no mesh of .* has 131 vertices; it has 132"):
-        recognised(doll, 131, mesh.faces, "one.ply")
+        recognise_topology(doll, 131, mesh.faces, "one.ply")
     with pytest.raises(DataError, match="but other triangles"):
-        recognised(doll, 132, np.flip(mesh.faces + 1, 0) % 132, "one.ply")
+        recognise_topology(doll, 132, np.flip(mesh.faces + 1, 0) % 132, "one.ply")
 
 
 def test_somebody_posed_anew_is_as_in_that_pose_and_reshaped_as_of_that_shape(default):
     """Compare with the body's own skinning of clothes that are up to two centimetres outwards in the rest pose."""
     body, traits = default
-    few = in_few_shapes(body, traits)
+    few = reduce_shapes(body, traits)
     surface = sheet(body, 0)
     mesh = topology(body, surface, "7k")
-    whole, own = (BodyModel(in_topology(one, surface, mesh)).double() for one in (body, few))
+    whole, own = (BodyModel(body_in_topology(one, surface, mesh)).double() for one in (body, few))
     rest = whole.template.unflatten(0, (3, -1)).T
     outwards = trimesh.Trimesh(rest, mesh.faces, process=False).vertex_normals
     clothes = (0.01 + 0.01 * torch.sin(9 * rest[:, :1])) * torch.tensor(outwards)[None]
     random = np.random.default_rng(5)
-    shape = traits.coefficients(torch.from_numpy(adults(traits.labels, 1, random))).double()
+    shape = traits.coefficients(torch.from_numpy(sample_adults(traits.labels, 1, random))).double()
     before, after = (
         torch.from_numpy(poses.rotations(body, poses.skeleton(body), moved))
         for moved in (repose.a_pose_with("yaw=170,right knee=30"), poses.draw(1, random))
@@ -134,12 +134,12 @@ def test_somebody_posed_anew_is_as_in_that_pose_and_reshaped_as_of_that_shape(de
         torch.from_numpy(mesh.faces),
     )
     one = repose.subject(body, few, given, "somebody")
-    assert one.folded == 0 and one.found.error < 0.015
-    back = own(one.found.shape, one.found.pose, one.found.translation, one.offsets)[0]
+    assert one.folded == 0 and one.fit.error < 0.015
+    back = own(one.fit.shape, one.fit.pose, one.fit.translation, one.offsets)[0]
     torch.testing.assert_close(back, given.vertices.double(), atol=1e-6, rtol=0)
     taller = torch.zeros(COUNT).double()
     taller[0] = 2.0
-    step = torch.from_numpy(in_topology(few, surface, mesh).shapes[..., 0]).double()
+    step = torch.from_numpy(body_in_topology(few, surface, mesh).shapes[..., 0]).double()
     joints = torch.from_numpy(few.joint_shapes[..., 0]).double()
     for found, truth in (
         (one.posed(after[0].numpy()), whole(shape, after, None, clothes)[0]),
@@ -215,19 +215,19 @@ def test_what_is_written_is_read_by_the_data_set_and_seen_whole(doll, tmp_path, 
 
 WRONG = {
     "no movement": (["--pose", "left elbw=3"], "no movement 'left elbw'. Did you mean 'left elbow'"),
-    "no number": (["--pose", "left elbow"], "wanted a name and a number"),
-    "infinite": (["--pose", "left elbow=inf"], "at most 10000"),
-    "no direction": (["--shape", "4=1"], "'4' is no direction; wanted 0 to 3"),
+    "no number": (["--pose", "left elbow"], "expected a name and a number"),
+    "infinite": (["--pose", "left elbow=inf"], "from -10000 to 10000"),
+    "no direction": (["--shape", "4=1"], "'4' is no direction; expected a number from 0 to 3"),
     "no file": (["--motion", "none.bvh"], "none.bvh: no such file"),
     "another body": ([], "no mesh of .* has 40 vertices"),
-    "twice": (["ann"], "ann is there twice"),
+    "twice": (["ann"], "the name ann occurs twice"),
 }
 
 
 @pytest.mark.parametrize("more, words", WRONG.values(), ids=WRONG)
 def test_what_is_wrong_is_said_and_nothing_is_written(more, words, doll, tmp_path):
     registered(tmp_path / "ann", doll)
-    scan_layout.write_registration(tmp_path / "other.ply", colored(0))
+    scan_layout.write_registration(tmp_path / "other.ply", colored_mesh(0))
     people = [tmp_path / ("ann" if more else "other.ply")]
     people += [tmp_path / more.pop()] if more == ["ann"] else []
     arguments = ["--body", DOLL["body"], "--topology", "mine", "--out", str(tmp_path / "out"), *more]

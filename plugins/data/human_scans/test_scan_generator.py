@@ -6,7 +6,7 @@ import pytest
 import torch
 from PIL import Image
 
-from framework.bodies.people import chosen_body
+from framework.bodies.people import load_body
 from framework.configuration.schema import build, resolve
 from framework.datasets import scan_layout
 from framework.errors import ConfigError, DataError
@@ -18,7 +18,7 @@ from framework.testing.bodies import DOLL
 from framework.testing.data_folders import damage
 from framework.testing.rows import DAMAGES
 from plugins.data.human_scans import photographs, scan_generator, skins
-from plugins.data.human_scans.data import Counts, HumanScans, photograph
+from plugins.data.human_scans.data import Counts, HumanScans, Variation, photograph
 from plugins.data.human_scans.dressed import ERROR, FURTHEST, Wardrobe
 from plugins.data.human_scans.rows import SMALL
 
@@ -27,7 +27,7 @@ RENDERER = build("renderer", resolve("renderer", {"name": "rasterizer"}))
 
 @pytest.fixture(scope="module")
 def wardrobe():
-    return Wardrobe(chosen_body(None)[0], stages=1)
+    return Wardrobe(load_body(None)[0], stages=1)
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +42,7 @@ def dressed(wardrobe, posed):
 
 
 def test_registrations_are_near_the_body_and_scans_are_not_registrations(wardrobe, posed, dressed):
-    bare = wardrobe.sheet.carried(posed)
+    bare = wardrobe.sheet.interpolate(posed)
     gaps = []
     for scan, found in dressed:
         assert np.isfinite(scan.vertices).all() and scan.faces.max() < len(scan.vertices)
@@ -88,9 +88,9 @@ def test_blank_parts_of_a_skin_take_the_tone_of_the_face(wardrobe, posed):
             80,
         )
     vertices = wardrobe.sheet
-    shown = skins.shown(pixels, wardrobe.uv)[wardrobe._place_of]
-    found = skins.filled(
-        shown, wardrobe.anatomy, wardrobe.vertices, wardrobe._neighbours.dot, vertices.carried
+    shown = skins.colors_at(pixels, wardrobe.uv)[wardrobe._place_of]
+    found = skins.fill_blanks(
+        shown, wardrobe.anatomy, wardrobe.vertices, wardrobe._neighbours.dot, vertices.interpolate
     )
     grey = float(linear_from_bytes(torch.tensor(skins.BLANK, dtype=torch.uint8)))
     assert (np.abs(shown - grey).max(1) < 0.002).mean() > 0.3
@@ -104,7 +104,7 @@ def test_a_texture_holds_the_colours_of_its_places(wardrobe, dressed):
     faces = wardrobe.sheet.corners[-1].uv_faces
     pixels = photographs.texture(RENDERER, wardrobe.uv, faces, colors, 512)
     used = np.unique(faces)
-    found = skins.shown(pixels, wardrobe.uv)[used]
+    found = skins.colors_at(pixels, wardrobe.uv)[used]
     assert np.quantile(np.abs(found - colors.numpy()[used]).max(1), 0.9) < 0.05
 
 
@@ -113,7 +113,7 @@ def test_photographs_show_a_point_where_its_camera_says(number):
     """Compare the centroid of a 12 cm ball's mask with the projection of its centre."""
     random = np.random.default_rng(number)
     people = random.normal(0, 0.4, (500, 3)) * [0.5, 1, 0.5] + random.normal(0, 1, 3)
-    camera = photographs.rig(people, 5, (60, 48), random)[number]
+    camera = photographs.place_cameras(people, 5, (60, 48), random)[number]
     centre = people[0]
     steps = np.linspace(0, np.pi, 40)
     turn, tilt = (grid.ravel() for grid in np.meshgrid(2 * steps, steps))
@@ -123,7 +123,7 @@ def test_photographs_show_a_point_where_its_camera_says(number):
     corner = (40 * np.arange(39)[:, None] + np.arange(39)).ravel()
     faces = np.concatenate([corner[:, None] + half for half in ((0, 1, 40), (1, 41, 40))])
     scene = Scene(torch.from_numpy(ball).float(), torch.from_numpy(faces), torch.ones(len(ball), 3), camera)
-    (found,) = photographs.photographed(RENDERER, scene, [camera])
+    (found,) = photographs.take_photographs(RENDERER, scene, [camera])
     cover = found.mask.astype(float)
     row, column = (np.average(place, weights=cover) for place in np.indices(cover.shape))
     pixel, depth = camera.project(torch.from_numpy(centre)[None])
@@ -137,7 +137,7 @@ def test_the_rig_sees_everybody_whole_from_different_places(number):
     random = np.random.default_rng(number)
     people = random.normal(0, 1, (300, 3)) * 10 ** random.uniform(-1, 0.5, 3) + random.normal(0, 3, 3)
     size = (64, 48) if number % 2 else (48, 64)
-    cameras = photographs.rig(people, 12, size, random)
+    cameras = photographs.place_cameras(people, 12, size, random)
     for camera in cameras:
         pixel, depth = camera.project(torch.from_numpy(people))
         assert (depth > 0).all()
@@ -236,7 +236,9 @@ def test_a_renderer_that_smooths_edges_itself_draws_nearly_the_same():
     camera = Camera(torch.eye(3), torch.zeros(3), (40.0, 40.0), (2.0, 2.0), 24, 24)
     scene = Scene(corners, torch.tensor([[0, 1, 2]]), torch.tensor([[0.2, 0.5, 0.9]]).expand(3, 3), camera)
     smooth = build("renderer", resolve("renderer", {"name": "rasterizer", "supersampling": 3}))
-    one, other = (photographs.photographed(renderer, scene, [camera])[0] for renderer in (RENDERER, smooth))
+    one, other = (
+        photographs.take_photographs(renderer, scene, [camera])[0] for renderer in (RENDERER, smooth)
+    )
     assert np.abs(one.mask.astype(int) - other.mask).max() < 30
     both = (one.mask > 0) & (other.mask > 0)
     assert both.sum() > 50 and np.abs(one.pixels[both].astype(int) - other.pixels[both]).max() <= 1
@@ -245,15 +247,15 @@ def test_a_renderer_that_smooths_edges_itself_draws_nearly_the_same():
 def test_skins_are_worn_in_one_split_each(tmp_path):
     for number in range(16):
         Image.new("RGB", (8, 8), (number, 0, 0)).save(tmp_path / f"{number:02}.png")
-    parts = scan_generator._shared_out(str(tmp_path), True)
+    parts = scan_generator._split_skins(str(tmp_path), True)
     assert [len(some) for some in parts] == [10, 2, 4]
     assert len({file for some in parts for file in some}) == 16
-    with pytest.raises(ConfigError, match=r"data\.skins are for bodies with texture places"):
-        scan_generator._shared_out(str(tmp_path), False)
+    with pytest.raises(ConfigError, match=r"data\.skins needs a body with texture coordinates"):
+        scan_generator._split_skins(str(tmp_path), False)
     for file in sorted(tmp_path.iterdir())[2:]:
         file.unlink()
-    with pytest.raises(ConfigError, match="holds 2 skins; wanted three"):
-        scan_generator._shared_out(str(tmp_path), True)
+    with pytest.raises(ConfigError, match="holds 2 skins; expected three"):
+        scan_generator._split_skins(str(tmp_path), True)
 
 
 def test_a_skin_that_is_no_file_gets_a_sentence(tmp_path):
@@ -281,5 +283,9 @@ def test_photographs_want_a_renderer_that_tells_the_subject_from_the_ground():
         channels = frozenset({"depth"})
 
     for renderer in (OnWhite(), Colourless()):
-        with pytest.raises(ConfigError, match=f"{type(renderer).__name__} draws no color on black"):
-            HumanScans(renderer=renderer, counts=Counts(), drawing=scan_generator.Drawing())
+        with pytest.raises(
+            ConfigError, match=f"{type(renderer).__name__} does not draw the channel color on black"
+        ):
+            HumanScans(
+                renderer=renderer, counts=Counts(), drawing=scan_generator.Drawing(), variation=Variation()
+            )

@@ -12,7 +12,7 @@ from framework.configuration.schema import build, resolve
 from framework.datasets import scan_layout
 from framework.errors import DataError
 from framework.geometry.srgb import linear_from_srgb
-from framework.testing.bodies import DOLL, colored, scanned
+from framework.testing.bodies import DOLL, colored_mesh, write_subjects
 from framework.testing.data_folders import damage
 from framework.testing.rows import DAMAGES
 from plugins.data.human_scans.rows import SMALL
@@ -34,7 +34,7 @@ def data(root, **config):
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     root = tmp_path_factory.mktemp("scans")
-    scanned(root)
+    write_subjects(root)
     return root
 
 
@@ -68,7 +68,7 @@ def listed(name, text):
 
 
 def larger_mesh(root):
-    more = colored(0)
+    more = colored_mesh(0)
     vertices = torch.cat([more.vertices, more.vertices[:1]])
     colors = torch.cat([more.colors, more.colors[:1]])
     mesh = scan_layout.RegisteredMesh(vertices, colors, more.faces)
@@ -103,7 +103,7 @@ def resized(place):
 
 
 WRONG = {
-    "named twice": (camera(lambda views: views.append(views[0])), "view front is there twice"),
+    "named twice": (camera(lambda views: views.append(views[0])), "view front occurs twice"),
     "no name": (camera(lambda views: views[0].pop("name")), "has no name"),
     "name of another folder": (camera(lambda views: views[0].update(name="../near")), "has no name"),
     "not a number": (camera(lambda views: views[0]["t"].__setitem__(1, float("nan"))), "finite"),
@@ -126,8 +126,8 @@ WRONG = {
     "nobody": (listed("validation.txt", "\n"), "names nobody"),
     "a path": (listed("test.txt", "../eve\n"), "no name of a folder"),
     "two in a line": (listed("test.txt", "eve\x0bzoe\n"), "no name of a folder"),
-    "a stranger": (listed("test.txt", "zoe\n"), "no such folder; wanted the subject zoe"),
-    "another mesh": (larger_mesh, "has 41 vertices, that of"),
+    "a stranger": (listed("test.txt", "zoe\n"), "no such folder; expected the files of the subject zoe"),
+    "another mesh": (larger_mesh, "has 41 vertices, but that of"),
     "no colours": (without("colours"), "have no colours"),
     "no faces": (without("faces"), "has no faces"),
 }
@@ -150,12 +150,12 @@ def test_images_of_two_sizes_are_refused(root):
 
 
 def test_another_topology_is_named(whole):
-    with pytest.raises(DataError, match=r"those of the topologies 7k\. Set data\.topology"):
+    with pytest.raises(DataError, match=r"the folder has the topologies 7k\. Set data\.topology"):
         data(whole, topology="27k").prepare()
 
 
 def test_what_is_written_is_read(tmp_path):
-    mesh = colored(3)
+    mesh = colored_mesh(3)
     scan_layout.write_registration(tmp_path / "registration_7k.ply", mesh)
     found = scan_layout.read_registration(tmp_path / "registration_7k.ply")
     for name in ("vertices", "colors", "faces"):
@@ -199,7 +199,7 @@ def test_inputs_keep_their_pixels_in_the_canonical_camera(whole):
     prepared.prepare()
     view = json.loads((whole / "subjects/ann/cameras.json").read_text())["views"][1]
     matrix, rotation, shift = (np.array(view[key]) for key in ("K", "R", "t"))
-    mesh = colored(0)
+    mesh = colored_mesh(0)
     seen = (matrix @ (rotation @ mesh.vertices.double().numpy().T + shift[:, None])).T
     given = prepared.splits().train[1]["input"].double().numpy()
     height, width = prepared.size
@@ -215,7 +215,7 @@ def test_own_meshes_are_seen_whole_or_by_their_own_cameras(whole, tmp_path):
     )
     random = np.random.default_rng(0)
     for number in range(20):
-        mesh = colored(number)
+        mesh = colored_mesh(number)
         vertices = mesh.vertices * torch.from_numpy(10 ** random.uniform(-2, 1, 3)).float() + 5
         file = tmp_path / f"{number}.ply"
         scan_layout.write_registration(file, scan_layout.RegisteredMesh(vertices, mesh.colors, mesh.faces))

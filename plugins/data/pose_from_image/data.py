@@ -57,7 +57,7 @@ class Apart:
 
 
 class PoseFromImage(Data):
-    """Synthetic images of one body each; the target is the body's position, pose and shape.
+    """Synthetic images that show one body each; the target is the body's position, pose and shape.
 
     An input is (4, height, width): red, green, blue, linear and black beyond the body, and the share of each pixel that
     the body covers. Targets are the parameters of a `ParametricBody`; 0 is the nominal position, pose and shape. A
@@ -68,7 +68,7 @@ class PoseFromImage(Data):
     Args:
         renderer: draws the images.
         counts: numbers of images of the splits.
-        apart: distance of the bodies from the nominal one.
+        displacement: distance of the bodies from the nominal one.
         height, width: pixels, multiples of 4.
         body: file of a body model of the SMPL family (.npz, .pkl); None: the default body, extracted on first use.
         data_seed: seed of the draws, independent of the seed of the run.
@@ -78,13 +78,7 @@ class PoseFromImage(Data):
         ConfigError: the renderer draws no colours.
     """
 
-    bibtex = """@inproceedings{bregier2026anny,
-  title = {Human Mesh Modeling for {A}nny {B}ody},
-  author = {Br{\\'e}gier, Romain and Fiche, Gu{\\'e}nol{\\'e} and Bravo-S{\\'a}nchez, Laura and Lucas, Thomas and
-    Armando, Matthieu and Weinzaepfel, Philippe and Rogez, Gr{\\'e}gory and Baradel, Fabien},
-  booktitle = {European Conference on Computer Vision (ECCV)},
-  year = {2026}
-}"""
+    bibtex = "bregier2026anny"
     suffixes = (".png",)
     varies = False
 
@@ -93,7 +87,7 @@ class PoseFromImage(Data):
         *,
         renderer: Renderer = "rasterizer",  # pyright: ignore[reportArgumentType]  # built by the framework
         counts: Counts,
-        apart: Apart,
+        displacement: Apart,
         height: ImageSide = 128,
         width: ImageSide = 96,
         body: FilePath | None = None,
@@ -101,11 +95,12 @@ class PoseFromImage(Data):
     ) -> None:
         if "color" not in renderer.channels or renderer.background:
             raise ConfigError(
-                f"data.renderer = {type(renderer).__name__} draws no color on black; choose another renderer."
+                f"data.renderer = {type(renderer).__name__} does not draw the channel color on black. Choose another "
+                "renderer."
             )
         self.renderer = renderer
         self.counts = asdict(counts)
-        self.apart = apart
+        self.displacement = displacement
         self.input_shape = (4, height, width)
         self.body = body
         self.data_seed = data_seed
@@ -120,7 +115,7 @@ class PoseFromImage(Data):
         self.synthetic = True
         self.skipped = 0
         camera = self.body_model.camera(*self.input_shape[1:])
-        numbers = [self._drawn(split) for split in range(len(self.counts))]
+        numbers = [self._draw_parameters(split) for split in range(len(self.counts))]
         self._splits = Splits(*(Poses(self.body_model, self.renderer, camera, some) for some in numbers))
 
     def splits(self) -> Splits:
@@ -128,29 +123,29 @@ class PoseFromImage(Data):
 
     def _spread(self) -> Float[np.ndarray, "number"]:
         """Return the standard deviation of each parameter; for movements, before they are clipped to their limits."""
-        spread, apart = self.body_model.spread.numpy().copy(), self.apart
+        spread, displacement = self.body_model.spread.numpy().copy(), self.displacement
         shape = 6 + len(self.body_model.slots)
-        spread[:3], spread[3:6] = math.radians(apart.turned_deg) / 3**0.5, apart.moved / 3**0.5
-        spread[6:shape] *= apart.pose_spread
-        spread[shape:] *= apart.shape_spread
+        spread[:3], spread[3:6] = math.radians(displacement.turned_deg) / 3**0.5, displacement.moved / 3**0.5
+        spread[6:shape] *= displacement.pose_spread
+        spread[shape:] *= displacement.shape_spread
         return spread
 
-    def _drawn(self, split: int) -> Float[Tensor, "sample number"]:
+    def _draw_parameters(self, split: int) -> Float[Tensor, "sample number"]:
         random = np.random.default_rng((self.data_seed, split))
         count = self.counts[Splits._fields[split]]
-        found = random.normal(0, 1, (count, len(self.body_model.names)))
+        parameters = random.normal(0, 1, (count, len(self.body_model.names)))
         for columns, length in (
-            (slice(0, 3), math.radians(self.apart.turned_deg)),
-            (slice(3, 6), self.apart.moved),
+            (slice(0, 3), math.radians(self.displacement.turned_deg)),
+            (slice(3, 6), self.displacement.moved),
         ):
-            found[:, columns] *= length / np.linalg.norm(found[:, columns], axis=1, keepdims=True)
-        found[:, 6:] *= self._spread()[6:]
+            parameters[:, columns] *= length / np.linalg.norm(parameters[:, columns], axis=1, keepdims=True)
+        parameters[:, 6:] *= self._spread()[6:]
         least, most = self.body_model.limits.numpy().T
-        return torch.from_numpy(found.clip(least, most))
+        return torch.from_numpy(parameters.clip(least, most))
 
     def read(self, files: Sequence[Path]) -> Dataset[Batch]:
         if not files:
-            raise DataError("No file was given; wanted the picture of a body, or several.")
+            raise DataError("The list of files is empty; expected one or more images of a body.")
         pictures = torch.stack([self._picture_of(Path(file)) for file in files])
         return Fields(input=pictures, index=torch.arange(len(files)))
 
@@ -159,8 +154,9 @@ class PoseFromImage(Data):
         with open_image(file) as image:
             if not has_alpha(image) or image.size != (width, height):
                 raise DataError(
-                    f"{file}: {image.width} × {image.height} pixels, mode {image.mode}; wanted {width} × {height} and "
-                    "an alpha channel that says how much of a pixel is body. Cut the body out and scale the picture."
+                    f"{file}: {image.width} × {image.height} pixels, mode {image.mode}; expected {width} × {height} "
+                    "and an alpha channel that holds the share of each pixel that the body covers. Cut out the body "
+                    "and scale the image."
                 )
             stored = torch.from_numpy(np.array(decode(image, 4, upright=False)))
         cover = stored[..., 3:].float() / 255
@@ -179,7 +175,7 @@ class PoseFromImage(Data):
             "version": f"pose_from_image {VERSION}",
             "body": self.body_model.source,
             "renderer": f"{type(self.renderer).__module__}.{type(self.renderer).__qualname__}",
-            "apart": str(self.apart),
+            "apart": str(self.displacement),
             "size": "×".join(map(str, self.input_shape[1:])),
             "data_seed": str(self.data_seed),
             **{name: str(count) for name, count in self.counts.items()},

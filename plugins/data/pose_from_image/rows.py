@@ -1,4 +1,4 @@
-"""Rows of the contract: images of a doll."""
+"""Contract-test cases: images of a doll."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from framework.testing.bodies import body_file
+from framework.testing.bodies import write_body_file
 from framework.testing.rows import DAMAGES, DataRow
 
 
@@ -24,7 +24,7 @@ ROWS = {
         DataRow(
             "a doll",
             {"renderer": "rasterizer", "train": 3, "validation": 2, "test": 3, "height": 16, "width": 12},
-            write=body_file,
+            write=write_body_file,
             synthetic=True,
             files=cut_out,
             fragile={"doll.npz": DAMAGES},

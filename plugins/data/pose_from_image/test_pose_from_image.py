@@ -51,7 +51,7 @@ def test_own_pictures_are_read_and_others_refused(data, tmp_path):
     )
     for name, other in {"rgb.png": pixels[..., :3], "small.png": pixels[:20]}.items():
         Image.fromarray(np.ascontiguousarray(other)).save(tmp_path / name)
-        with pytest.raises(DataError, match=rf"{name}.*wanted 40 × 48 and an alpha channel"):
+        with pytest.raises(DataError, match=rf"{name}.*expected 40 × 48 and an alpha channel"):
             data.read([tmp_path / name])
 
 
@@ -60,5 +60,7 @@ def test_images_want_a_renderer_that_tells_the_body_from_the_ground():
     on_white = type("OnWhite", (rasterizer,), {"background": 1.0})
     colourless = type("Colourless", (rasterizer,), {"channels": frozenset({"depth"})})
     for renderer in (on_white(), colourless()):
-        with pytest.raises(ConfigError, match=f"{type(renderer).__name__} draws no color on black"):
-            PoseFromImage(renderer=renderer, counts=Counts(), apart=Apart())
+        with pytest.raises(
+            ConfigError, match=f"{type(renderer).__name__} does not draw the channel color on black"
+        ):
+            PoseFromImage(renderer=renderer, counts=Counts(), displacement=Apart())

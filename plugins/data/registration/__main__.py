@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from framework.bodies.people import chosen_body
+from framework.bodies.people import load_body
 from framework.configuration.loading import load_with_description
 from framework.configuration.paths import add_option, parse_paths, require_paths
 from framework.configuration.schema import build, resolve
@@ -30,12 +30,12 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("checkpoint", help="run folder, checkpoint file or MLflow run id")
     parser.add_argument("scans", nargs="+", type=Path, help="meshes or clouds, metres, y up, facing z")
     parser.add_argument(
-        "--folder", type=Path, default=Path("outputs"), help="where to write; default: outputs"
+        "--folder", type=Path, default=Path("outputs"), help="folder for the results; default: outputs"
     )
     add_option(parser)
-    given = parser.parse_intermixed_args(arguments)
-    given.folder.mkdir(parents=True, exist_ok=True)
-    for file in register(given.checkpoint, given.scans, given.folder, parse_paths(given.path)):
+    options = parser.parse_intermixed_args(arguments)
+    options.folder.mkdir(parents=True, exist_ok=True)
+    for file in register(options.checkpoint, options.scans, options.folder, parse_paths(options.path)):
         sys.stdout.write(f"{file}\n")
 
 
@@ -51,12 +51,12 @@ def register(
     part = description.config["data"]
     if part["name"] != "registration":
         raise ConfigError(
-            f"{checkpoint} was trained on data {part['name']!r}; wanted a model trained on `registration`, which says "
-            "what body its vertices are of."
+            f"{checkpoint} was trained on data {part['name']!r}; expected a model trained on `registration`, whose "
+            "settings name the body. Choose another checkpoint."
         )
     require_paths(description.dropped, ("data",), description.path)
     data: Registration = build("data", resolve("data", part))
-    faces = chosen_body(data.body)[0].faces
+    faces = load_body(data.body)[0].faces
     written = []
     for scan in scans:
         batch = data.user_batch(scan)
@@ -66,8 +66,8 @@ def register(
         cloud = denormalise_clouds(batch["input"], *place)[0, : int(sizes(batch["input"]))].numpy()
         stem = folder / f"{scan.stem}_registered"
         write_ply(stem.with_suffix(".ply"), vertices, faces, cloud)
-        drawn = figure(vertices, faces, cloud, f"Mesh registered to {scan.name}")
-        written += [stem.with_suffix(".ply"), save_figure(drawn, stem, True)]
+        distance_figure = figure(vertices, faces, cloud, f"Mesh registered to {scan.name}")
+        written += [stem.with_suffix(".ply"), save_figure(distance_figure, stem, True)]
     return written
 
 

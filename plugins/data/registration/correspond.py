@@ -29,11 +29,11 @@ from framework.storage.generated import read_mark
 from plugins.data.registration.faust import CHALLENGES, Challenge, pairs, test_registration, test_scan
 from plugins.data.registration.faust_generator import people_root
 
-Registered = Callable[[Path], Float[np.ndarray, "vertex 3"]]
+RegisterScan = Callable[[Path], Float[np.ndarray, "vertex 3"]]
 """Function from a scan's file to the vertices registered to it, metres."""
 
 
-class Answered(NamedTuple):
+class ChallengeResult(NamedTuple):
     """Result of one challenge.
 
     Attributes:
@@ -48,7 +48,7 @@ class Answered(NamedTuple):
 
 
 def main(arguments: list[str]) -> None:
-    """Write `<out>/intra.zip` and `inter.zip`; print errors if the truth is known.
+    """Write `<out>/intra.zip` and `inter.zip`; print errors if the true correspondences are known.
 
     Raises:
         UserError: the checkpoint is of another data set, or a file cannot be read.
@@ -57,24 +57,26 @@ def main(arguments: list[str]) -> None:
         prog="python -m plugins.data.registration.correspond", description=__doc__
     )
     parser.add_argument("checkpoint", help="run folder, checkpoint file or MLflow run id")
-    parser.add_argument("root", nargs="?", help="the folder that holds FAUST's `test`; none: generated")
+    parser.add_argument(
+        "root", nargs="?", help="folder that holds the folder `test` of FAUST; default: generated people"
+    )
     parser.add_argument("--out", type=Path, default=Path("outputs/faust"), help="default: outputs/faust")
     add_option(parser)
-    given = parser.parse_intermixed_args(arguments)
-    registered, generated = model(given.checkpoint, parse_paths(given.path))
-    folder = generated() if given.root is None else Path(given.root).expanduser()
+    options = parser.parse_intermixed_args(arguments)
+    registered, generated = model(options.checkpoint, parse_paths(options.path))
+    folder = generated() if options.root is None else Path(options.root).expanduser()
     marked = "" if read_mark(folder) is None else " (synthetic)"
     for challenge in CHALLENGES:
-        found = answered(registered, folder, challenge, given.out)
-        error = "not available, FAUST keeps its registrations to itself"
-        if found.error_cm:
+        result = write_correspondences(registered, folder, challenge, options.out)
+        error = "unknown, because FAUST does not publish the registrations of its test scans"
+        if result.error_cm:
             error = (
-                f"{np.mean(found.error_cm):.2f} cm, of the worst pair {max(found.error_cm):.2f} cm{marked}"
+                f"{np.mean(result.error_cm):.2f} cm, of the worst pair {max(result.error_cm):.2f} cm{marked}"
             )
-        sys.stdout.write(f"{challenge}: {found.pairs} pairs in {found.file}; error {error}\n")
+        sys.stdout.write(f"{challenge}: {result.pairs} pairs in {result.file}; error {error}\n")
 
 
-def model(checkpoint: str, paths: Mapping[str, str] | None = None) -> tuple[Registered, Callable[[], Path]]:
+def model(checkpoint: str, paths: Mapping[str, str] | None = None) -> tuple[RegisterScan, Callable[[], Path]]:
     """Return the registration function of a trained model, and a function that returns the root of generated people.
 
     The second function generates people of the model's body in FAUST's layout on its first call. `checkpoint` and
@@ -87,8 +89,8 @@ def model(checkpoint: str, paths: Mapping[str, str] | None = None) -> tuple[Regi
     part = description.config["data"]
     if part["name"] not in ("registration", "faust"):
         raise ConfigError(
-            f"{checkpoint} was trained on data {part['name']!r}; wanted a model trained on `registration` or `faust`, "
-            "whose target is a mesh."
+            f"{checkpoint} was trained on data {part['name']!r}; expected a model trained on `registration` or "
+            "`faust`, whose target is a mesh. Choose another checkpoint."
         )
     data: Data = build("data", resolve("data", part))
 
@@ -105,7 +107,9 @@ def model(checkpoint: str, paths: Mapping[str, str] | None = None) -> tuple[Regi
     return registered, generated
 
 
-def answered(registered: Registered, root: Path, challenge: Challenge, out: Path) -> Answered:
+def write_correspondences(
+    registered: RegisterScan, root: Path, challenge: Challenge, out: Path
+) -> ChallengeResult:
     """Compute the correspondences of every pair through registered meshes, and write them to `<out>/<challenge>.zip`.
 
     A vertex of the first scan is mapped to the nearest vertex of the mesh registered to it, and from there to the
@@ -116,27 +120,27 @@ def answered(registered: Registered, root: Path, challenge: Challenge, out: Path
         DataError: the challenge has no pairs, or a scan cannot be read.
     """
     mesh_of = cache(registered)
-    given = pairs(root, challenge)
+    scan_pairs = pairs(root, challenge)
     out.mkdir(parents=True, exist_ok=True)
     file, errors = out / f"{challenge}.zip", []
     with ZipFile(file, "w", ZIP_DEFLATED) as archive:
-        for pair in given:
-            first, second = (mesh_of(test_scan(root, one)) for one in pair)
-            thought = second[_nearest(first, read(test_scan(root, pair.first)).vertices)]
-            lines = [f"{x:.6f} {y:.6f} {z:.6f}\n" for x, y, z in thought.tolist()]
+        for pair in scan_pairs:
+            first, second = (mesh_of(test_scan(root, number)) for number in pair)
+            corresponding = second[_nearest(first, read(test_scan(root, pair.first)).vertices)]
+            lines = [f"{x:.6f} {y:.6f} {z:.6f}\n" for x, y, z in corresponding.tolist()]
             archive.writestr(f"{pair}.txt", "".join(lines))
-            truths = [test_registration(root, one) for one in pair]
+            truths = [test_registration(root, number) for number in pair]
             if all(truth.is_file() for truth in truths):
-                here, there = (read(truth).vertices for truth in truths)
-                gap = np.linalg.norm(second[_nearest(first, here)] - there, axis=1)
+                first_true, second_true = (read(truth).vertices for truth in truths)
+                gap = np.linalg.norm(second[_nearest(first, first_true)] - second_true, axis=1)
                 errors.append(100 * float(gap.mean()))
-    return Answered(file, len(given), errors)
+    return ChallengeResult(file, len(scan_pairs), errors)
 
 
 def _nearest(vertices: np.ndarray, points: np.ndarray) -> Int[np.ndarray, "points"]:
     """Return the number of the vertex nearest to each point."""
-    reference, asked = (torch.from_numpy(part).float()[None] for part in (vertices, points))
-    return nearest(reference, asked).index[0].numpy()
+    reference, queries = (torch.from_numpy(part).float()[None] for part in (vertices, points))
+    return nearest(reference, queries).index[0].numpy()
 
 
 if __name__ == "__main__":

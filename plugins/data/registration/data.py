@@ -12,7 +12,7 @@ from pydantic import Field
 from torch import Tensor
 
 from framework.bodies.body import BodyModel
-from framework.bodies.people import People, chosen_body
+from framework.bodies.people import People, load_body
 from framework.configuration.paths import FilePath
 from framework.data import Splits
 from framework.datasets.fields import Fields
@@ -20,9 +20,9 @@ from framework.errors import DataError
 from framework.geometry import clouds
 from framework.geometry.meshes import read, stream
 from framework.storage.generated import read_mark
-from plugins.data.registration.faust import SUBJECTS, Scan, registered, scans
+from plugins.data.registration.faust import SUBJECTS, Scan, read_registration, scans
 from plugins.data.registration.faust_generator import people_root
-from plugins.data.registration.scanned_bodies import Bodies, normalised, target_of
+from plugins.data.registration.scanned_bodies import Bodies, normalise_scans, target_of
 from plugins.data.registration.scanner import KINDS, Kinds, Scanner
 from plugins.data.registration.scans import Scans
 
@@ -46,7 +46,7 @@ class Sizes:
 class Registration(Bodies):
     """Synthetic scans of people of random shape and pose; the target is every vertex of the body (thesis §6.5.2).
 
-    A body is drawn (people; adults of random traits), posed by linear blend skinning and scanned (scanner). Nothing is
+    A random adult is sampled (people), posed by linear blend skinning and scanned (scanner). Nothing is
     stored: a sample is a function of (`data_seed`, split, number), computed when it is fetched.
 
     Args:
@@ -60,19 +60,7 @@ class Registration(Bodies):
         DataError: the body is not available or cannot be read.
     """
 
-    bibtex = """@inproceedings{prokudin2019efficient,
-  title = {Efficient Learning on Point Clouds with Basis Point Sets},
-  author = {Prokudin, Sergey and Lassner, Christoph and Romero, Javier},
-  booktitle = {IEEE/CVF International Conference on Computer Vision (ICCV)},
-  year = {2019}
-}
-@inproceedings{bregier2026anny,
-  title = {Human Mesh Modeling for {A}nny {B}ody},
-  author = {Br{\\'e}gier, Romain and Fiche, Gu{\\'e}nol{\\'e} and Bravo-S{\\'a}nchez, Laura and Lucas, Thomas and
-    Armando, Matthieu and Weinzaepfel, Philippe and Rogez, Gr{\\'e}gory and Baradel, Fabien},
-  booktitle = {European Conference on Computer Vision (ECCV)},
-  year = {2026}
-}"""
+    bibtex = "prokudin2019efficient, bregier2026anny"
 
     def __init__(
         self,
@@ -92,17 +80,17 @@ class Registration(Bodies):
         self.data_seed = data_seed
 
     def prepare(self) -> None:
-        self.people = People(*chosen_body(self.body), self.shape_spread)
+        self.people = People(*load_body(self.body), self.shape_spread)
         self.model = BodyModel(self.people.body)
         self.target = target_of(len(self.people.body.template))
         self.input_shape = (self.scanner.points, 3)
         self.groups = KINDS
         self.synthetic = True
         self.skipped = 0
-        self._scans = [self._drawn(split) for split in range(len(self.sizes))]
+        self._scans = [self._draw_split(split) for split in range(len(self.sizes))]
         self._splits = Splits(*self._scans)
 
-    def _drawn(self, split: int) -> Scans:
+    def _draw_split(self, split: int) -> Scans:
         name, seed = Splits._fields[split], (self.data_seed, split)
         random = np.random.default_rng(seed)
         people = self.people.draw(self.sizes[name], random)
@@ -149,12 +137,7 @@ class Faust(Bodies):
             different meshes, or a split has no scans.
     """
 
-    bibtex = """@inproceedings{bogo2014faust,
-  title = {{FAUST}: Dataset and Evaluation for {3D} Mesh Registration},
-  author = {Bogo, Federica and Romero, Javier and Loper, Matthew and Black, Michael J.},
-  booktitle = {IEEE Conference on Computer Vision and Pattern Recognition (CVPR)},
-  year = {2014}
-}"""
+    bibtex = "bogo2014faust"
 
     def __init__(
         self,
@@ -173,8 +156,8 @@ class Faust(Bodies):
 
     def prepare(self) -> None:
         folder = people_root(self.body) if self.root is None else Path(self.root).expanduser()
-        found = scans(folder)
-        first, self.faces = registered(found[0])
+        scans_found = scans(folder)
+        first, self.faces = read_registration(scans_found[0])
         self.target = target_of(len(first))
         self.input_shape = (self.points, 3)
         self.groups = ("scans",)
@@ -183,29 +166,30 @@ class Faust(Bodies):
         validation, test = self.people
         if both := validation & test:
             raise DataError(
-                f"data.validation and data.test both name the people {sorted(both)}; wanted each in one."
+                f"data.validation and data.test both name the people {sorted(both)}; expected each person in one "
+                "split. Change one of the two lists."
             )
-        there = {scan.subject for scan in found}
-        people = (there - validation - test, validation, test)
+        subjects = {scan.subject for scan in scans_found}
+        people = (subjects - validation - test, validation, test)
         for name, some in zip(Splits._fields, people, strict=True):
-            if not some & there:
+            if not some & subjects:
                 raise DataError(
-                    f"{folder}: no scan for the {name} split; its people are {sorted(there)}. Set data.validation and "
-                    "data.test so that every split has one."
+                    f"{folder}: there is no scan for the {name} split; the folder has the people {sorted(subjects)}. "
+                    "Set data.validation and data.test so that every split has a scan."
                 )
         self._digest = hashlib.sha256()
-        tables = ([scan for scan in found if scan.subject in some] for some in people)
+        tables = ([scan for scan in scans_found if scan.subject in some] for some in people)
         self._splits = Splits(*(self._table(some, len(first)) for some in tables))
 
     def _table(self, some: Sequence[Scan], vertices: int) -> Fields:
         inputs, targets = [], []
         for scan in some:
-            mesh, _ = registered(scan, vertices)
+            mesh, _ = read_registration(scan, vertices)
             inputs.append(self.cloud(scan.scan))
             targets.append(torch.from_numpy(mesh).float())
             self._digest.update(f"{scan.number}".encode() + mesh.tobytes())
         return Fields(
-            **normalised(clouds.pad(inputs), torch.stack(targets)),
+            **normalise_scans(clouds.pad(inputs), torch.stack(targets)),
             subject=torch.tensor([scan.subject for scan in some]),
             group=torch.zeros(len(some), dtype=torch.int64),
             index=torch.arange(len(some)),
@@ -215,8 +199,8 @@ class Faust(Bodies):
         """Return points of a scan, without replacement if there are enough; its name and the seed decide which."""
         vertices = read(file).vertices
         if len(vertices) > self.points:
-            kept = stream(self.data_seed, file.name).choice(len(vertices), self.points, replace=False)
-            vertices = vertices[np.sort(kept)]
+            chosen = stream(self.data_seed, file.name).choice(len(vertices), self.points, replace=False)
+            vertices = vertices[np.sort(chosen)]
         return torch.from_numpy(vertices).float()
 
     def fingerprint(self) -> Mapping[str, str]:

@@ -18,14 +18,14 @@ TEST = 200
 Challenge = Literal["intra", "inter"]
 CHALLENGES: tuple[Challenge, ...] = ("intra", "inter")
 WANTED = (
-    "Wanted: the folder that holds training/scans/tr_scan_000.ply and training/registrations/tr_reg_000.ply to "
+    "Expected: a folder that holds training/scans/tr_scan_000.ply and training/registrations/tr_reg_000.ply to "
     "tr_scan_099.ply and tr_reg_099.ply."
 )
 
 
 @dataclass(frozen=True)
 class Scan:
-    """One training scan, 0 to 99: person number // 10 in pose number % 10."""
+    """Training scan with a number from 0 to 99, which shows the person number // 10 in the pose number % 10."""
 
     number: int
     scan: Path
@@ -79,21 +79,28 @@ def pairs(folder: Path, challenge: Challenge) -> list[Pair]:
         DataError: the list does not exist, a line is no pair, or a scan of a pair does not exist.
     """
     file = pairs_file(folder, challenge)
-    with translate_errors(file, "pairs of a challenge", "Wanted: two test scans a line, such as 000_001."):
+    with translate_errors(file, "pairs of a challenge", "Expected: two test scans a line, such as 000_001."):
         lines = decode(read_bytes(file)).split()
-    found = []
+    scan_pairs = []
     for number, line in enumerate(lines, 1):
         match = re.fullmatch(r"(\d{3})_(\d{3})", line)
         if match is None:
-            raise DataError(f"{file}, pair {number}: {line[:40]!r}; wanted two test scans, such as 000_001.")
+            raise DataError(
+                f"{file}, pair {number}: got {line[:40]!r}; expected two test scans, such as 000_001."
+            )
         pair = Pair(*map(int, match.groups()))
-        for one in pair:
-            if not test_scan(folder, one).is_file():
-                raise DataError(f"{file}, pair {number}: {test_scan(folder, one)} is not there.")
-        found.append(pair)
-    if not found:
-        raise DataError(f"{file} holds no pair.")
-    return found
+        for scan_number in pair:
+            if not test_scan(folder, scan_number).is_file():
+                raise DataError(
+                    f"{file}, pair {number}: the file {test_scan(folder, scan_number)} does not exist. Copy it from "
+                    "its source."
+                )
+        scan_pairs.append(pair)
+    if not scan_pairs:
+        raise DataError(
+            f"{file}: the list contains no pair; expected two test scans a line, such as 000_001."
+        )
+    return scan_pairs
 
 
 def scans(folder: Path) -> list[Scan]:
@@ -102,30 +109,30 @@ def scans(folder: Path) -> list[Scan]:
     Raises:
         DataError: the folder has another layout, or a scan or a registration is missing.
     """
-    found = []
+    complete = []
     for number in range(SUBJECTS * POSES):
         pair = Scan(number, training_scan(folder, number), training_registration(folder, number))
-        there = pair.scan.is_file(), pair.registration.is_file()
-        if any(there) and not all(there):
-            missing = pair.registration if there[0] else pair.scan
-            raise DataError(f"{missing} is not available, but the other of its pair is. {WANTED}")
-        if all(there):
-            found.append(pair)
-    if not found:
-        raise DataError(f"data.root = {folder}: FAUST is not available there. {WANTED}")
-    return found
+        exist = pair.scan.is_file(), pair.registration.is_file()
+        if any(exist) and not all(exist):
+            missing = pair.registration if exist[0] else pair.scan
+            raise DataError(f"{missing} is missing, but the other file of the pair exists. {WANTED}")
+        if all(exist):
+            complete.append(pair)
+    if not complete:
+        raise DataError(f"data.root = {folder}: this folder does not hold FAUST. {WANTED}")
+    return complete
 
 
-def registered(scan: Scan, vertices: int | None = None) -> tuple[np.ndarray, np.ndarray]:
+def read_registration(scan: Scan, vertices: int | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Return the vertices, metres, and the faces of a scan's registration.
 
     Raises:
-        DataError: the file cannot be read, or has another number of vertices than wanted.
+        DataError: the file cannot be read, or has another number of vertices than expected.
     """
     mesh = read(scan.registration)
     if vertices not in (None, len(mesh.vertices)):
         raise DataError(
-            f"{scan.registration}: {len(mesh.vertices)} vertices, the first registration has {vertices}; wanted one "
-            "mesh throughout. Restore it from its source."
+            f"{scan.registration}: {len(mesh.vertices)} vertices, the first registration has {vertices}; expected "
+            "the same mesh in all files. Copy the file again from its source."
         )
     return mesh.vertices, mesh.faces

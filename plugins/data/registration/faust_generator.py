@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from framework.bodies import poses
 from framework.bodies.body import BodyModel
-from framework.bodies.people import People, chosen_body
+from framework.bodies.people import People, load_body
 from framework.geometry.meshes import Mesh
 from framework.geometry.ply_writer import write_ply
 from framework.storage import cache
@@ -38,7 +38,7 @@ def people_root(body: str | None) -> Path:
     Raises:
         DataError: the body is not available or cannot be read.
     """
-    people = People(*chosen_body(body), spread=1.0)
+    people = People(*load_body(body), spread=1.0)
     digest = hashlib.sha256(people.body.template.tobytes() + people.body.faces.tobytes()).hexdigest()[:16]
     mark = {"faust": VERSION, "seed": SEED, "scanner": str(SCANNER), "kinds": str(SHARES), "body": digest}
     root = cache.folder("faust") / hashlib.sha256(repr(sorted(mark.items())).encode()).hexdigest()[:16]
@@ -53,23 +53,23 @@ def _write(folder: Path, people: People) -> None:
     turned = poses.rotations(people.body, poses.skeleton(people.body), movements)
     pose = torch.from_numpy(turned.astype(people.body.template.dtype))
 
-    def drawn(person: int, stance: int) -> Float[np.ndarray, "vertex 3"]:
+    def pose_person(person: int, stance: int) -> Float[np.ndarray, "vertex 3"]:
         with torch.no_grad():
             return model(shape[person : person + 1], pose[stance : stance + 1])[0].numpy()
 
     def write(number: int) -> None:
         person, stance = divmod(number, POSES + TEST_POSES)
-        vertices = drawn(person, stance)
+        vertices = pose_person(person, stance)
         own = np.random.default_rng([SEED, number])
         kind = KINDS[own.choice(len(KINDS), p=SHARES.shares())]
-        seen = scan(Mesh("person", vertices.astype(float), people.body.faces), kind, SCANNER, own)
+        points = scan(Mesh("person", vertices.astype(float), people.body.faces), kind, SCANNER, own)
         if stance < POSES:
             place, registration = faust.training_scan, faust.training_registration
             number = person * POSES + stance
         else:
             place, registration = faust.test_scan, faust.test_registration
             number = person * TEST_POSES + stance - POSES
-        write_ply(place(folder, number), seen.astype(np.float32), NO_FACES)
+        write_ply(place(folder, number), points.astype(np.float32), NO_FACES)
         write_ply(registration(folder, number), vertices, people.body.faces)
 
     draw_all(SUBJECTS * (POSES + TEST_POSES), write, "people in FAUST's layout")
@@ -81,10 +81,12 @@ def _write(folder: Path, people: People) -> None:
 
 
 def _pairs(same: bool) -> list[Pair]:
-    """Return pairs of two poses of one person, or of two poses of two people who follow one another."""
-    found = []
+    """Return pairs of two poses of one person, or of two poses of two successive people."""
+    scan_pairs = []
     for person in range(SUBJECTS):
         other = person if same else (person + 1) % SUBJECTS
         for stance in range(TEST_POSES):
-            found.append(Pair(person * TEST_POSES + stance, other * TEST_POSES + (stance + 1) % TEST_POSES))
-    return found
+            scan_pairs.append(
+                Pair(person * TEST_POSES + stance, other * TEST_POSES + (stance + 1) % TEST_POSES)
+            )
+    return scan_pairs

@@ -48,9 +48,9 @@ def distances(
     point, column = np.nonzero(candidates >= 0)
     triangles = vertices[faces[candidates[point, column]]]
     closest = trimesh.triangles.closest_point(triangles, cloud[point])
-    found = np.full(len(cloud), np.inf)
-    np.minimum.at(found, point, np.linalg.norm(closest - cloud[point], axis=1))
-    return found
+    shortest = np.full(len(cloud), np.inf)
+    np.minimum.at(shortest, point, np.linalg.norm(closest - cloud[point], axis=1))
+    return shortest
 
 
 def figure(
@@ -62,29 +62,31 @@ def figure(
     """Return a figure of the panels with axes in metres, and of the scan's distances from the mesh, millimetres."""
     millimetres = 1e3 * distances(vertices, faces, cloud)
     far = np.quantile(millimetres, 0.95)
-    told = f"its points lie {millimetres.mean():.1f} mm off on average, 95 % within {far:.1f} mm"
+    summary = f"its points lie {millimetres.mean():.1f} mm off on average, 95 % within {far:.1f} mm"
     scale = Normalize(0, max(far, 1e-3))
     colours = colormaps[DISTANCES](scale(millimetres))[:, :3]
     middle, reach = _frame(vertices, cloud)
-    drawn = titled_figure((11.5, 6.2), f"{title}; {told}", False)
-    grid = drawn.subplots(2, 4, sharey=True)
+    figure_drawn = titled_figure((11.5, 6.2), f"{title}; {summary}", False)
+    grid = figure_drawn.subplots(2, 4, sharey=True)
     heads = ("scan", "registered mesh", "both", "distance from the mesh")
     for axes, head in zip(grid[0], heads, strict=True):
         axes.set_title(head, fontsize=10)
     side, height, depth = (middle[axis] + reach * np.array([-0.5, 0.5]) for axis in range(3))
     # in the view from the left, the front is at the left
     across = (("front: x (m)", side), ("left side: z (m)", depth[::-1]))
-    for row, (label, ends), images in zip(grid, across, panels(vertices, faces, cloud, colours), strict=True):
+    for row, (label, ends), images in zip(
+        grid, across, render_panels(vertices, faces, cloud, colours), strict=True
+    ):
         for axes, image in zip(row, images, strict=True):
             axes.imshow(image, extent=(*ends, *height))
             axes.set_xlabel(label)
         row[0].set_ylabel("y (m)")
-    bar = drawn.colorbar(ScalarMappable(scale, DISTANCES), ax=grid[:, 3], extend="max", shrink=0.7)
+    bar = figure_drawn.colorbar(ScalarMappable(scale, DISTANCES), ax=grid[:, 3], extend="max", shrink=0.7)
     bar.set_label("distance of a scan's point from the mesh (mm)")
-    return drawn
+    return figure_drawn
 
 
-def panels(
+def render_panels(
     vertices: Float[np.ndarray, "vertex 3"],
     faces: Int[np.ndarray, "face 3"],
     cloud: Float[np.ndarray, "points 3"],
@@ -101,11 +103,16 @@ def panels(
         flip = 1 if right == 0 else -1  # in the view from the left, the front is to the viewer's left
         frame = np.zeros((3, 3))
         frame[0, right], frame[1, 1], frame[2, towards] = flip, 1, 1
-        seen = (vertices - middle) @ frame.T / reach
+        mesh_points = (vertices - middle) @ frame.T / reach
         points = (cloud - middle) @ frame.T / reach
         blue = np.broadcast_to(SCAN, points.shape)
-        parts = ((None, points, blue), (seen, None, blue), (seen, points, blue), (None, points, colours))
-        views.append([_drawn(*part, faces, height) for part in parts])
+        parts = (
+            (None, points, blue),
+            (mesh_points, None, blue),
+            (mesh_points, points, blue),
+            (None, points, colours),
+        )
+        views.append([_render(*part, faces, height) for part in parts])
     return np.array(views)
 
 
@@ -116,7 +123,7 @@ def _frame(vertices: np.ndarray, cloud: np.ndarray) -> tuple[np.ndarray, float]:
     return (low + high) / 2, 1.06 * max(float((high - low).max()), 1e-9)
 
 
-def _drawn(
+def _render(
     vertices: np.ndarray | None, points: np.ndarray | None, colours: np.ndarray, faces: np.ndarray, side: int
 ) -> UInt8[np.ndarray, "side side 3"]:
     """Return an image of mesh and points: x right, y up, z to the viewer, all coordinates within ±0.5.
@@ -131,8 +138,8 @@ def _drawn(
         place = _pixels(points[:, :2], side)
         order = np.argsort(points[:, 2], kind="stable")  # the nearest last
         row, column, near = *place[order].T, points[order, 2]
-        seen = near >= depth[row, column] - 0.01  # a scan's noise moves points a little under the surface
-        image[row[seen], column[seen]] = colours[order[seen]]
+        visible = near >= depth[row, column] - 0.01  # a scan's noise moves points a little under the surface
+        image[row[visible], column[visible]] = colours[order[visible]]
     return _bytes(image)
 
 
@@ -145,8 +152,8 @@ def _draw_mesh(vertices: np.ndarray, faces: np.ndarray, image: np.ndarray, depth
     corners = vertices[faces]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(normal, axis=1)
-    kept = (length > 0) & (normal[:, 2] > 0)
-    corners, facing = corners[kept], normal[kept, 2] / length[kept]
+    facing_viewer = (length > 0) & (normal[:, 2] > 0)
+    corners, facing = corners[facing_viewer], normal[facing_viewer, 2] / length[facing_viewer]
     size = np.abs(corners - np.roll(corners, 1, 1))[..., :2].max((1, 2)) * side
     for steps in np.unique(np.ceil(size).astype(int) + 1):
         some = np.ceil(size).astype(int) + 1 == steps

@@ -1,11 +1,11 @@
-"""Rows of the contract: scans of a doll, and a few people in FAUST's layout."""
+"""Contract-test cases: scans of a doll, and a few people in FAUST's layout."""
 
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
-from framework.testing.bodies import DOLL, body_file, person
+from framework.testing.bodies import DOLL, person, write_body_file
 from framework.testing.rows import DAMAGES, DataRow
 from framework.testing.sample_files import meshes, write_ply
 
@@ -25,7 +25,7 @@ ROWS = {
         DataRow(
             "a doll",
             {"train": 12, "validation": 4, "test": 9, "points": 200},
-            write=body_file,
+            write=write_body_file,
             synthetic=True,
             files=meshes,
             fragile={"doll.npz": DAMAGES},

@@ -13,7 +13,7 @@ from torch.utils.data import Dataset
 
 from framework.data import Batch, Data, Frame, Splits, as_inputs
 from framework.datasets import cloud_picture
-from framework.datasets.fields import Fields
+from framework.datasets.fields import Fields, fetch
 from framework.errors import DataError
 from framework.geometry import clouds
 from framework.geometry.mesh_files import XYZ
@@ -36,7 +36,7 @@ class Bodies(Data):
 
     @abstractmethod
     def cloud(self, file: Path) -> Float[Tensor, "points 3"]:
-        """Return the points of a scan that a model reads, metres, float32.
+        """Return the points of a scan as the input of a model, metres, float32.
 
         Raises:
             DataError: the file cannot be read.
@@ -47,17 +47,17 @@ class Bodies(Data):
 
     def read(self, files: Sequence[Path]) -> Dataset[Batch]:
         if not files:
-            raise DataError("No file was given; wanted the scan of a body, or several.")
-        found = clouds.pad([self.cloud(file) for file in files])
-        return Fields(**normalised(found), index=torch.arange(len(files)))
+            raise DataError("The list of files is empty; expected one or more scans of bodies.")
+        padded = clouds.pad([self.cloud(file) for file in files])
+        return Fields(**normalise_scans(padded), index=torch.arange(len(files)))
 
     def user_batch(self, user_data: Any) -> Batch:
         """Return the batch of scans in metres: files, or an array of one cloud or of a batch, padded with NaN."""
         files = [user_data] if isinstance(user_data, str | Path) else user_data
         if isinstance(files, Sequence) and files and all(isinstance(file, str | Path) for file in files):
-            return fetched(self.read([Path(file) for file in files]), range(len(files)))
+            return fetch(self.read([Path(file) for file in files]), range(len(files)))
         clouds = as_inputs(user_data, self.input_shape)
-        found = normalised(clouds if clouds.is_floating_point() else clouds.double())
+        found = normalise_scans(clouds if clouds.is_floating_point() else clouds.double())
         return {**found, "input": found["input"].float()}
 
     def inputs(self, user_data: Any) -> Tensor:
@@ -81,13 +81,13 @@ def target_of(vertices: int) -> Target:
     return Target("real", tuple(f"{axis}{vertex}" for vertex in range(vertices) for axis in XYZ))
 
 
-def normalised(
+def normalise_scans(
     batch: Float[Tensor, "batch points columns"], vertices: Float[Tensor, "batch vertex 3"] | None = None
 ) -> Batch:
     """Return the fields "input", "centre" and "scale" of clouds in metres, and "target" of vertices in metres."""
-    found = clouds.normalise_clouds(batch[..., :3], "robust")
-    centre, scale = found.centre.float(), found.scale.float()
-    fields = {"input": found.clouds, "centre": centre, "scale": scale}
+    normalised_clouds = clouds.normalise_clouds(batch[..., :3], "robust")
+    centre, scale = normalised_clouds.centre.float(), normalised_clouds.scale.float()
+    fields = {"input": normalised_clouds.clouds, "centre": centre, "scale": scale}
     if vertices is not None:
         fields["target"] = ((vertices - centre[:, None]) / scale[:, None, None]).flatten(1)
     return fields

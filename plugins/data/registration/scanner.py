@@ -23,9 +23,9 @@ class Scanner:
 
     Attributes:
         points: total number of points of the surface and of other objects; fewer if parts are missing.
-        noise: largest standard deviation of every coordinate, metres; each scan has its own, uniform below.
+        noise: largest standard deviation of every coordinate, metres; that of a scan is drawn uniformly below it.
         cut: largest share of the points that is missing behind a plane or within a ball.
-        strangers: largest share of the points that are not the body's.
+        strangers: largest share of the points that do not belong to the body.
     """
 
     points: Annotated[int, Field(ge=100, le=1_000_000)] = 10_000
@@ -36,15 +36,15 @@ class Scanner:
 
 @dataclass(frozen=True, kw_only=True)
 class Kinds:
-    """Shares of the scans with missing parts and with points that are not the body's; all others are whole."""
+    """Shares of the scans with missing parts and with points of other objects; all other scans are complete."""
 
     partial: Share = 0.2
     outliers: Share = 0.2
 
     def shares(self) -> Float[np.ndarray, "kind"]:
         """Return the share of each kind of scan; their sum is 1."""
-        found = (1 - min(1, self.partial + self.outliers), self.partial, self.outliers)
-        return np.array(found) / sum(found)
+        parts = (1 - min(1, self.partial + self.outliers), self.partial, self.outliers)
+        return np.array(parts) / sum(parts)
 
 
 def scan(mesh: Mesh, kind: Kind, scanner: Scanner, random: Generator) -> Float[np.ndarray, "points 3"]:
@@ -54,11 +54,11 @@ def scan(mesh: Mesh, kind: Kind, scanner: Scanner, random: Generator) -> Float[n
     height (what an arm occludes is not removed). "outliers" adds a patch of floor and points anywhere around.
     """
     stranger = int(scanner.strangers * scanner.points * random.random()) if kind == "outliers" else 0
-    drawn = sample(mesh, scanner.points - stranger, random)
-    points = drawn.points
+    surface_sample = sample(mesh, scanner.points - stranger, random)
+    points = surface_sample.points
     if kind == "partial":
         hidden = (_behind_plane, _within_ball, _facing_away)[random.integers(3)]
-        points = points[~hidden(mesh, drawn.points, drawn.face, scanner.cut, random)]
+        points = points[~hidden(mesh, surface_sample.points, surface_sample.face, scanner.cut, random)]
     points = points + random.normal(0, scanner.noise * random.random(), points.shape)
     if stranger:
         points = np.concatenate([points, strangers(mesh.vertices, stranger, random)])

@@ -8,11 +8,11 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from framework.bodies.body import BodyModel
-from framework.bodies.people import Drawn
+from framework.bodies.people import BodyParameters
 from framework.data import Batch
 from framework.geometry import clouds
 from framework.geometry.meshes import Mesh
-from plugins.data.registration.scanned_bodies import normalised
+from plugins.data.registration.scanned_bodies import normalise_scans
 from plugins.data.registration.scanner import KINDS, Scanner, scan
 
 
@@ -29,7 +29,7 @@ class Scans(Dataset[Batch]):
     def __init__(
         self,
         model: BodyModel,
-        people: Drawn,
+        people: BodyParameters,
         kind: Tensor,
         scanner: Scanner,
         seed: tuple[int, int],
@@ -53,15 +53,17 @@ class Scans(Dataset[Batch]):
         chosen = torch.tensor(list(indices), dtype=torch.int64)
         vertices = self.model(self.shape[chosen], self.pose[chosen])
         faces = self.model.faces.numpy()
-        seen = [
+        points_of_scans = [
             scan(
-                Mesh(f"body {index}", one.double().numpy(), faces),
+                Mesh(f"body {index}", body_vertices.double().numpy(), faces),
                 KINDS[int(self.kind[index])],
                 self.scanner,
                 np.random.default_rng([*self.seed, index]),
             )
-            for index, one in zip(indices, vertices, strict=True)
+            for index, body_vertices in zip(indices, vertices, strict=True)
         ]
-        fields = normalised(clouds.pad([torch.from_numpy(points).float() for points in seen]), vertices)
+        fields = normalise_scans(
+            clouds.pad([torch.from_numpy(points).float() for points in points_of_scans]), vertices
+        )
         fields["target"] = fields["target"].to(self.precision)
         return {**fields, "group": self.kind[chosen], "index": chosen}

@@ -11,7 +11,7 @@ from framework.geometry.meshes import read
 from framework.testing.bodies import person, small_body
 from framework.testing.sample_files import write_ply
 from plugins.data.registration import faust
-from plugins.data.registration.correspond import answered
+from plugins.data.registration.correspond import write_correspondences
 from plugins.data.registration.faust_generator import people_root
 from plugins.data.registration.rows import people
 
@@ -74,14 +74,14 @@ def test_a_generated_layout_says_so(root, tmp_path):
 
 
 def test_what_is_not_there_is_said(root, tmp_path):
-    with pytest.raises(DataError, match="FAUST is not available there"):
+    with pytest.raises(DataError, match="this folder does not hold FAUST"):
         data(tmp_path).prepare()
     mesh, scan = person(0)
     write_ply(tmp_path / "training/scans/tr_scan_004.ply", scan, NO_FACES)
-    with pytest.raises(DataError, match=r"tr_reg_004\.ply is not available"):
+    with pytest.raises(DataError, match=r"tr_reg_004\.ply is missing"):
         data(tmp_path).prepare()
     write_ply(tmp_path / "training/registrations/tr_reg_004.ply", mesh, NO_FACES)
-    with pytest.raises(DataError, match=r"no scan for the validation split; its people are \[0\]"):
+    with pytest.raises(DataError, match=r"no scan for the validation split; the folder has the people \[0\]"):
         data(tmp_path).prepare()
     for number in (70, 80):
         write_ply(tmp_path / f"training/scans/tr_scan_{number:03}.ply", scan, NO_FACES)
@@ -119,7 +119,7 @@ def test_challenges_are_answered_as_they_ask(generated, tmp_path, challenge):
         truth = read(faust.test_registration(generated, int(scan.stem[-3:]))).vertices
         return truth + np.array([off, 0, 0])
 
-    found = answered(registered, generated, challenge, tmp_path)
+    found = write_correspondences(registered, generated, challenge, tmp_path)
     assert found.pairs == 30 and max(found.error_cm) < 1e-3
     with ZipFile(found.file) as archive:
         asked = faust.pairs(generated, challenge)
@@ -129,7 +129,7 @@ def test_challenges_are_answered_as_they_ask(generated, tmp_path, challenge):
     mesh = read(faust.test_registration(generated, asked[0].second)).vertices
     gap = np.linalg.norm(places[:200, None] - mesh, axis=-1)
     assert gap.min(1).max() < 1e-5  # a vertex of the mesh on the second scan
-    off = answered(lambda scan: registered(scan, 0.07), generated, challenge, tmp_path)
+    off = write_correspondences(lambda scan: registered(scan, 0.07), generated, challenge, tmp_path)
     # the error is 7 cm, or less if a point of the first scan is mapped to a neighbour that is nearer
     assert all(error > 4 for error in off.error_cm)
 

@@ -15,14 +15,14 @@ from framework.configuration.schema import build, resolve
 from framework.errors import ConfigError, DataError
 from framework.geometry.clouds import denormalise_clouds, sizes
 from framework.geometry.meshes import Mesh, read
-from framework.testing.bodies import JOINTS, body_file, doll
-from plugins.data.registration.result import SCAN, SKIN, distances, figure, panels, write_ply
+from framework.testing.bodies import JOINTS, doll, write_body_file
+from plugins.data.registration.result import SCAN, SKIN, distances, figure, render_panels, write_ply
 from plugins.data.registration.scanner import KINDS, Scanner, scan, strangers
 
 
 @pytest.fixture(scope="module")
 def file(tmp_path_factory):
-    return Path(body_file(tmp_path_factory.mktemp("body"))["body"])
+    return Path(write_body_file(tmp_path_factory.mktemp("body"))["body"])
 
 
 def data(file, **config):
@@ -126,7 +126,7 @@ def test_bodies_that_poses_cannot_move_are_refused(file, tmp_path):
         "kintree_table": np.array([[-1, 0, 1], [0, 1, 2]]),
     }
     np.savez(tmp_path / "few.npz", **few)
-    with pytest.raises(DataError, match="has 3 joints; wanted 22 at least"):
+    with pytest.raises(DataError, match="has 3 joints; expected 22 at least"):
         prepared(tmp_path / "few.npz")
 
 
@@ -162,7 +162,7 @@ def test_the_panels_show_the_front_and_the_left_side():
     faces = np.array([(0, 1, 2), (0, 2, 3), (1, 4, 5), (1, 5, 2)])
     cloud = np.array([(0.5, 0.5, 1.0), (-0.5, -0.5, -1.0)])
     red = np.array([(1.0, 0.0, 0.0)] * 2)
-    drawn = panels(vertices, faces, cloud, red, height=100)
+    drawn = render_panels(vertices, faces, cloud, red, height=100)
     assert drawn.shape == (2, 4, 100, 100, 3)
     skin, blue = ((255 * np.array(color)).round() for color in (SKIN, SCAN))
     front, left = drawn[:, 2].astype(float)

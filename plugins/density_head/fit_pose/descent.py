@@ -62,7 +62,7 @@ LONGEST = (0.2, 0.08)
 SHORTER, TRIES = 0.4, 6
 """Factor by which a step that raises the loss is shortened, and the largest number of trials."""
 CONVERGED, IN_A_ROW = 5e-4, 3
-"""Relative decrease of the loss below which a step is small, and number of small steps in a row that end a stage."""
+"""Relative decrease of the loss below which a step is small, and number of consecutive small steps that end a stage."""
 
 
 class Descent:
@@ -95,7 +95,7 @@ class Descent:
         )
 
     def __call__(self, picture: Float[Tensor, "height width 4"]) -> BodyFit:
-        """Return the best fit of all starts; an image's fit depends on nothing but the image."""
+        """Return the best fit of all starts; the fit depends only on the image."""
         began = time.process_time()
         random = torch.Generator().manual_seed(0)
         best = self._once(picture, torch.zeros_like(self.stiffness), STAGES, began)
@@ -116,8 +116,8 @@ class Descent:
         numbers, path = start, []
         loss = 0.0
         for stage in stages:
-            camera = smaller(self.camera, stage.part)
-            aim = blurred(reduced(picture, stage.part), stage.blur)
+            camera = reduce_camera(self.camera, stage.part)
+            aim = blur(reduce_image(picture, stage.part), stage.blur)
 
             def look(
                 at: Tensor, stage: Stage = stage, camera: Camera = camera, aim: Tensor = aim
@@ -133,10 +133,10 @@ class Descent:
                 length = min(1.0, 1 / float((direction.abs() / self.longest).max()))
                 lower = False
                 for _ in range(TRIES):
-                    there = self._limited(numbers + length * direction)
-                    found, along = look(there)
-                    curvature = updated(curvature, there - numbers, along - slope)
-                    if lower := found < loss:
+                    candidate = self._limited(numbers + length * direction)
+                    candidate_loss, along = look(candidate)
+                    curvature = update_hessian(curvature, candidate - numbers, along - slope)
+                    if lower := candidate_loss < loss:
                         break
                     length *= SHORTER
                 if not lower and age == 0:
@@ -144,8 +144,8 @@ class Descent:
                 age = age + 1 if lower else AFRESH
                 if not lower:
                     continue
-                small = small + 1 if loss - found < CONVERGED * loss else 0
-                numbers, loss, slope = there, found, along
+                small = small + 1 if loss - candidate_loss < CONVERGED * loss else 0
+                numbers, loss, slope = candidate, candidate_loss, along
                 path.append(torch.cat([numbers.new_tensor([loss, time.process_time() - began]), numbers]))
                 if small == IN_A_ROW:
                     break
@@ -158,11 +158,11 @@ class Descent:
     ) -> tuple[float, Float[Tensor, "number"]]:
         """Return the loss of a stage and its gradient."""
         with torch.enable_grad():
-            given = numbers.detach().requires_grad_()
-            drawn = self.renderer(scene_of(self.body_model, given, camera))["color"]
-            loss = (blurred(drawn, stage.blur) - aim).square().sum().double() * stage.part**2
-            loss = loss + stage.pull * (given.square() * self.stiffness).sum()
-            (slope,) = torch.autograd.grad(loss, given)
+            variable = numbers.detach().requires_grad_()
+            rendered = self.renderer(scene_of(self.body_model, variable, camera))["color"]
+            loss = (blur(rendered, stage.blur) - aim).square().sum().double() * stage.part**2
+            loss = loss + stage.pull * (variable.square() * self.stiffness).sum()
+            (slope,) = torch.autograd.grad(loss, variable)
         return float(loss.detach()), slope
 
     def _limited(self, numbers: Tensor) -> Tensor:
@@ -175,15 +175,15 @@ class Descent:
         It is twice the sum of outer products of the derivatives of the stage's blurred pixels.
         """
         slopes = self._flow(numbers, stage)
-        found = 2 * stage.part**2 * (slopes.T @ slopes).double() + (2 * stage.pull * self.stiffness).diag()
-        return found + (DAMPING * found.diag() + LEAST).diag()
+        hessian = 2 * stage.part**2 * (slopes.T @ slopes).double() + (2 * stage.pull * self.stiffness).diag()
+        return hessian + (DAMPING * hessian.diag() + LEAST).diag()
 
     @torch.no_grad()
     def _flow(self, numbers: Tensor, stage: Stage) -> Float[Tensor, "pixel number"]:
         """Return the derivatives of every colour of a stage's pixels by every parameter, from the optical flow."""
         camera, body_model = self.camera, self.body_model
-        drawn = self.renderer(scene_of(body_model, numbers, camera), ("color", "face"))
-        color, face = drawn["color"], drawn["face"].numpy()
+        rendered = self.renderer(scene_of(body_model, numbers, camera), ("color", "face"))
+        color, face = rendered["color"], rendered["face"].numpy()
         height, width = camera.height // stage.part, camera.width // stage.part
         if (face < 0).all():
             return color.new_zeros(height * width * 4, len(numbers))
@@ -201,20 +201,20 @@ class Descent:
         place = (row // stage.part) * width + column // stage.part
         small = color.new_zeros(height * width, flow[0].numel())
         small.index_add_(0, place, flow.flatten(1) / stage.part**2)
-        return blurred(small.view(height, width, -1), stage.blur).reshape(-1, len(numbers))
+        return blur(small.view(height, width, -1), stage.blur).reshape(-1, len(numbers))
 
     def _motion(self, numbers: Tensor, vertex: Tensor) -> Float[Tensor, "vertex 2 number"]:
         """Return the derivatives of the pixel coordinates of some vertices by every parameter."""
         camera = self.camera
         rotation = camera.rotation
-        seen = self.body_model.placed(numbers, vertex) @ rotation.T + camera.translation
-        along = torch.einsum("ab,vbp->vap", rotation, self.body_model.slopes(numbers, vertex))
+        camera_points = self.body_model.vertices(numbers, vertex) @ rotation.T + camera.translation
+        along = torch.einsum("ab,vbp->vap", rotation, self.body_model.derivatives(numbers, vertex))
         focal = torch.as_tensor(camera.focal)[:, None]
-        part = (seen[:, :2] / seen[:, 2:])[..., None]
-        return focal * (along[:, :2] - part * along[:, 2:]) / seen[:, 2:, None]
+        part = (camera_points[:, :2] / camera_points[:, 2:])[..., None]
+        return focal * (along[:, :2] - part * along[:, 2:]) / camera_points[:, 2:, None]
 
 
-def updated(
+def update_hessian(
     curvature: Float[Tensor, "number number"], step: Float[Tensor, "number"], change: Float[Tensor, "number"]
 ) -> Float[Tensor, "number number"]:
     """Return the Hessian approximation after a step; `change` is that of the gradient. It stays positive definite."""
@@ -222,16 +222,16 @@ def updated(
     square = float(step @ expected)
     if not square > 0:
         return curvature
-    seen = float(step @ change)
-    if seen < 0.2 * square:
-        share = 0.8 * square / (square - seen)
+    measured = float(step @ change)
+    if measured < 0.2 * square:
+        share = 0.8 * square / (square - measured)
         change = share * change + (1 - share) * expected
     return (
         curvature - torch.outer(expected, expected) / square + torch.outer(change, change) / (step @ change)
     )
 
 
-def smaller(camera: Camera, part: int) -> Camera:
+def reduce_camera(camera: Camera, part: int) -> Camera:
     """Return a camera of the same view whose pixels are each the mean of part × part pixels."""
     (x, y), (column, row) = camera.focal, camera.principal
     return replace(
@@ -243,14 +243,14 @@ def smaller(camera: Camera, part: int) -> Camera:
     )
 
 
-def reduced(
+def reduce_image(
     picture: Float[Tensor, "height width channels"], part: int
 ) -> Float[Tensor, "_height _width channels"]:
     """Return the means of part × part pixels."""
     return avg_pool2d(picture.movedim(-1, 0), part).movedim(0, -1)
 
 
-def blurred(
+def blur(
     picture: Float[Tensor, "height width channels"], deviation: float
 ) -> Float[Tensor, "height width channels"]:
     """Return the image convolved with a Gaussian that is cut at three standard deviations; `deviation` is in pixels.
@@ -258,14 +258,16 @@ def blurred(
     The image is taken to be black beyond its border.
     """
     height, width, _ = picture.shape
-    rows = (gaussian(height, deviation) @ picture.flatten(1)).view_as(picture)
-    return gaussian(width, deviation) @ rows
+    rows = (gaussian_matrix(height, deviation) @ picture.flatten(1)).view_as(picture)
+    return gaussian_matrix(width, deviation) @ rows
 
 
 @cache
-def gaussian(length: int, deviation: float) -> Float[Tensor, "length length"]:
+def gaussian_matrix(length: int, deviation: float) -> Float[Tensor, "length length"]:
     """Return the convolution of this many pixels as a matrix, which is faster than a convolution for few pixels."""
-    apart = torch.arange(length)[:, None] - torch.arange(length)
-    weights = (-0.5 * (apart / deviation).square()).exp().where(apart.abs() <= round(3 * deviation), 0.0)
+    distance = torch.arange(length)[:, None] - torch.arange(length)
+    weights = (
+        (-0.5 * (distance / deviation).square()).exp().where(distance.abs() <= round(3 * deviation), 0.0)
+    )
     reach = torch.arange(-round(3 * deviation), round(3 * deviation) + 1)
     return weights / (-0.5 * (reach / deviation).square()).exp().sum()

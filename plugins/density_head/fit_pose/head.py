@@ -1,4 +1,4 @@
-"""Density head `fit_pose`: fits a body to the image itself."""
+"""Density head `fit_pose`: fit of a body to the image that the head reads."""
 
 from collections.abc import Mapping
 from typing import Annotated, ClassVar
@@ -25,7 +25,7 @@ FLOOR, WIDEST = 1e-5, 1e9
 SLACK = 1e-3
 """Largest excess of an image's values over [0, 1]."""
 NEEDED = frozenset(("vertices",))
-"""Inputs in which a renderer must be differentiable."""
+"""Parts of a scene in which the renderer must be differentiable."""
 
 
 class FitPoseHead(DensityHead, Fitted):
@@ -53,13 +53,7 @@ class FitPoseHead(DensityHead, Fitted):
     """
 
     knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {"steps": (1, 3, 10, 30)}
-    bibtex = """@article{lucas1981iterative,
-  author = {Lucas, Bruce D. and Kanade, Takeo},
-  title = {An iterative image registration technique with an application to stereo vision},
-  journal = {International Joint Conference on Artificial Intelligence},
-  pages = {674--679},
-  year = {1981}
-}"""
+    bibtex = "lucas1981iterative"
 
     prior: Tensor
     spread: Tensor
@@ -81,12 +75,12 @@ class FitPoseHead(DensityHead, Fitted):
         if missing := NEEDED - renderer.differentiable or {"color", "face"} - renderer.channels:
             raise ConfigError(
                 f"density_head.renderer = {type(renderer).__name__} has no gradient in, or does not draw, "
-                f"{' and '.join(sorted(missing))}; wanted one to descend by. Choose another renderer."
+                f"{' and '.join(sorted(missing))}; the fit needs both. Choose another renderer."
             )
         self.body_model = parametric_body(body)
         if target.names != self.body_model.names:
             raise ConfigError(
-                f"density_head fit_pose fits {self.body_model.source}, whose numbers are "
+                f"density_head fit_pose fits {self.body_model.source}, whose parameters are "
                 f"{', '.join(self.body_model.names)}; the data's are {target.listed_names}. Choose "
                 "data=pose_from_image, with the same body for both."
             )
@@ -155,8 +149,8 @@ class FitPoseHead(DensityHead, Fitted):
         return self.prior if fit is None else self.spread[int(self._agrees(fit))]
 
     def _rows(self, rows: list[Tensor], raw: Tensor) -> Float[Tensor, "*batch number"]:
-        found = torch.stack(rows) if rows else self.prior.new_zeros(0, len(self.prior))
-        return found.to(raw).reshape(*raw.shape[:-1], len(self.prior))
+        stacked = torch.stack(rows) if rows else self.prior.new_zeros(0, len(self.prior))
+        return stacked.to(raw).reshape(*raw.shape[:-1], len(self.prior))
 
 
 def is_picture(picture: Float[Tensor, "4 height width"]) -> bool:

@@ -1,4 +1,4 @@
-"""Rows of the contract: the pose of a doll."""
+"""Contract-test cases: the pose of a doll."""
 
 from framework.bodies.parametric import parametric_body
 from framework.target import Target

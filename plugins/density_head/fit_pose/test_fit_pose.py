@@ -17,10 +17,10 @@ from plugins.density_head.fit_pose.descent import (
     STAGES,
     Descent,
     Stage,
-    blurred,
-    reduced,
-    smaller,
-    updated,
+    blur,
+    reduce_camera,
+    reduce_image,
+    update_hessian,
 )
 
 SIZE = {"height": 48, "width": 40}
@@ -68,8 +68,8 @@ def test_a_smaller_picture_is_the_mean_of_the_pixels(body_model):
     """Check that 1/part of the pixels with part times the samples has the same samples, and so the same numbers."""
     camera, fine = body_model.camera(**SIZE), renderer(supersampling=8)
     whole = renderer(supersampling=2)(scene_of(body_model, numbers(body_model), camera))["color"]
-    drawn = fine(scene_of(body_model, numbers(body_model), smaller(camera, 4)))["color"]
-    torch.testing.assert_close(drawn, reduced(whole, 4), atol=1e-5, rtol=0)
+    drawn = fine(scene_of(body_model, numbers(body_model), reduce_camera(camera, 4)))["color"]
+    torch.testing.assert_close(drawn, reduce_image(whole, 4), atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize("deviation", [0.7, 1.0, 2.0])
@@ -81,7 +81,7 @@ def test_blur_is_a_gaussian(deviation):
         mode="constant",
         radius=(*2 * [round(3 * deviation)], 0),
     )
-    np.testing.assert_allclose(blurred(picture, deviation).numpy(), wanted, atol=1e-6)
+    np.testing.assert_allclose(blur(picture, deviation).numpy(), wanted, atol=1e-6)
 
 
 def test_the_gradient_is_that_of_the_loss(body_model):
@@ -93,8 +93,8 @@ def test_the_gradient_is_that_of_the_loss(body_model):
         Descent(body_model, drawing, camera, steps=1, restarts=0, enough=1e-3)
         for drawing in (renderer(), fine)
     ]
-    aims = blurred(reduced(aim, stage.part), stage.blur)
-    view = smaller(camera, stage.part)
+    aims = blur(reduce_image(aim, stage.part), stage.blur)
+    view = reduce_camera(camera, stage.part)
     _, slope = descents[0]._loss(at, stage, view, aims)
     wanted = torch.zeros_like(at)
     for column, step in enumerate(body_model.spread * 0.1):
@@ -121,10 +121,10 @@ def test_an_update_keeps_the_curvature_positive_and_learns_a_quadratic():
     wanted = root @ root.T + torch.eye(5)
     found = torch.eye(5, dtype=torch.float64)
     for direction in torch.linalg.eigh(wanted).eigenvectors.T:
-        found = updated(found, direction, wanted @ direction)
+        found = update_hessian(found, direction, wanted @ direction)
     torch.testing.assert_close(found, wanted)
     for _ in range(20):
-        found = updated(found, *torch.from_numpy(random.normal(0, 1, (2, 5))))
+        found = update_hessian(found, *torch.from_numpy(random.normal(0, 1, (2, 5))))
         assert torch.linalg.eigvalsh(found).min() > 0
 
 

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor
 
-from framework.bodies.people import chosen_body
+from framework.bodies.people import load_body
 from framework.bodies.topologies import Name, sheet, topology
 from framework.configuration.paths import FilePath
 from framework.data import Data
@@ -54,8 +54,8 @@ class Picture:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Registered:
-    """Mesh whose vertices the points are; the settings are those of the same names of the data."""
+class MeshSettings:
+    """Mesh whose vertices are the input; the settings have the names and meanings of those of the data."""
 
     topology: Name = "7k"
     root: FilePath | None = None
@@ -74,7 +74,7 @@ class Rasterised(Encoder):
     Args:
         input_shape: (points, columns).
         input_columns: names of the columns, if the data name them.
-        renderer: draws the mesh.
+        renderer: renderer that draws the mesh.
         textures: the `human_scans` with the textures of all subjects that occur; None: vertex colours are drawn.
         picture, mesh: settings of the image and of the mesh.
 
@@ -85,12 +85,7 @@ class Rasterised(Encoder):
     """
 
     fixed = True
-    bibtex = """@inproceedings{kato2018neural,
-  author = {Kato, Hiroharu and Ushiku, Yoshitaka and Harada, Tatsuya},
-  title = {Neural {3D} mesh renderer},
-  booktitle = {Conference on Computer Vision and Pattern Recognition},
-  year = {2018}
-}"""
+    bibtex = "kato2018neural"
 
     def __init__(
         self,
@@ -100,27 +95,28 @@ class Rasterised(Encoder):
         renderer: Renderer = "rasterizer",  # pyright: ignore[reportArgumentType]  # built by the framework
         textures: Data | None = None,
         picture: Picture,
-        mesh: Registered,
+        mesh: MeshSettings,
     ) -> None:
         super().__init__()
         if len(input_shape) != 2 or input_shape[1] < len(COLUMNS) or input_columns[:6] not in ((), COLUMNS):
             raise ConfigError(
-                f"encoder rasterised got inputs of shape {input_shape}; wanted (points, columns) whose first six "
+                f"encoder rasterised got inputs of shape {input_shape}; expected (points, columns) whose first six "
                 f"columns are {', '.join(COLUMNS)}. Choose data=human_scans, or another encoder."
             )
         if textures is not None and not isinstance(textures, SubjectFolder):
             raise ConfigError(
-                f"encoder.rasterised.textures = {type(textures).__name__} has none; wanted human_scans, say ${{data}}."
+                f"encoder.rasterised.textures = {type(textures).__name__} has no textures; expected human_scans, for "
+                f"example ${{data}}."
             )
         if missing := {"color", "depth", *(["uv"] if textures else [])} - renderer.channels:
             raise ConfigError(
-                f"encoder.rasterised.renderer = {type(renderer).__name__} draws no {' and '.join(sorted(missing))}; "
-                "choose another renderer."
+                f"encoder.rasterised.renderer = {type(renderer).__name__} does not draw the channels "
+                f"{' and '.join(sorted(missing))}. Choose another renderer."
             )
         if not picture.nearest < picture.farthest:
             raise ConfigError(
-                f"encoder rasterised got nearest={picture.nearest:g} and farthest={picture.farthest:g}; wanted nearest "
-                "below farthest, metres from the camera."
+                f"encoder rasterised got nearest={picture.nearest:g} and farthest={picture.farthest:g}; expected "
+                "nearest below farthest, metres from the camera."
             )
         self.renderer = renderer
         self.people, self.topology = textures, mesh.topology
@@ -136,21 +132,21 @@ class Rasterised(Encoder):
         sizes(inputs)  # refuses inputs that are no clouds
         if len(inputs) and inputs.shape[1] <= int(self.faces.max()):
             raise DataError(
-                f"A mesh of {inputs.shape[1]} vertices came; the topology has {int(self.faces.max()) + 1}. Set "
-                "encoder.rasterised.topology to that of the data."
+                f"Got a mesh of {inputs.shape[1]} vertices, but the topology has {int(self.faces.max()) + 1} vertices. "
+                "Set encoder.rasterised.topology to the topology of the data."
             )
         scenes = [self._scene(cloud, row) for row, cloud in enumerate(inputs.cpu())]
         channels = ("color", "depth") if self.depth else ("color",)
-        drawn = self.renderer.batch(scenes, channels)
-        found = inputs.new_empty(len(inputs), *self.output_shape)
-        for picture, one in zip(found, drawn, strict=True):
-            light, cover = one["color"][..., :3], one["color"][..., 3:]
+        rendered = self.renderer.batch(scenes, channels)
+        features = inputs.new_empty(len(inputs), *self.output_shape)
+        for picture, channel_images in zip(features, rendered, strict=True):
+            light, cover = channel_images["color"][..., :3], channel_images["color"][..., 3:]
             shown = 1 - cover if self.ground else srgb_from_linear(light + (1 - cover))
             picture[: shown.shape[-1]] = shown.movedim(-1, 0)
             if self.depth:
                 nearest, farthest = self.limits
-                picture[-1] = ((one["depth"] - nearest) / (farthest - nearest)).clamp(0, 1)
-        return found
+                picture[-1] = ((channel_images["depth"] - nearest) / (farthest - nearest)).clamp(0, 1)
+        return features
 
     def _scene(self, cloud: Float[Tensor, "points columns"], row: int) -> Scene:
         """Return the scene of a cloud; a fourth colour channel of 1 renders as the share of a pixel that is covered."""
@@ -164,14 +160,14 @@ class Rasterised(Encoder):
         return Scene(vertices, self.faces, None, self.camera, self.textures.of(colors, row))
 
 
-def faces_of(mesh: Registered) -> Tensor:
+def faces_of(mesh: MeshSettings) -> Tensor:
     """Return the triangles of a topology: of generated people, or of the first registration in a folder.
 
     Raises:
         DataError: the body, or the folder's meshes, are not available.
     """
     if mesh.root is None:
-        chosen, _ = chosen_body(mesh.body)
+        chosen, _ = load_body(mesh.body)
         return torch.from_numpy(topology(chosen, sheet(chosen), mesh.topology).faces.copy()).int()
     folder = Path(mesh.root).expanduser()
     subject = scan_layout.read_splits(folder)["train"][0]

@@ -1,21 +1,23 @@
-"""Rows of the contract: rendered images of a doll, and of people with textures."""
+"""Contract-test cases: rendered images of a doll, and of people with textures."""
 
 from pathlib import Path
 
 import torch
 
-from framework.testing.bodies import DOLL, FOLDER, colored, scanned
+from framework.testing.bodies import DOLL, FOLDER, colored_mesh, write_subjects
 from framework.testing.rows import EncoderRow
 
 
-def seen(count: int) -> torch.Tensor:
-    """Return inputs of `count` subjects, in turn, 3 m in front of the camera."""
-    people = [colored(number % 6) for number in range(count)]
-    clouds = [torch.cat([one.vertices * 2 + torch.tensor([0, -2, 3]), one.colors / 255], 1) for one in people]
+def inputs_of(count: int) -> torch.Tensor:
+    """Return inputs of `count` subjects, cycling through six people, 3 m in front of the camera."""
+    people = [colored_mesh(number % 6) for number in range(count)]
+    clouds = [
+        torch.cat([mesh.vertices * 2 + torch.tensor([0, -2, 3]), mesh.colors / 255], 1) for mesh in people
+    ]
     return torch.stack(clouds) if clouds else torch.empty(0, 40, 6)
 
 
-SCANNED = scanned(Path(FOLDER.name) / "scans")
+SCANNED = write_subjects(Path(FOLDER.name) / "scans")
 ROWS = {
     "rasterised": (
         EncoderRow("a doll", (132, 6), {**DOLL, "renderer": "rasterizer", "height": 16, "width": 12}),
@@ -37,7 +39,7 @@ ROWS = {
             leave_out={
                 "finite on extreme inputs": "of constant colours there is nobody; test_textures.py has others"
             },
-            inputs=seen,
+            inputs=inputs_of,
         ),
         EncoderRow(
             "a doll, its silhouette",

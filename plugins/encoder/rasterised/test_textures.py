@@ -13,10 +13,10 @@ from framework.configuration.schema import build, resolve
 from framework.datasets import scan_layout
 from framework.datasets.scan_layout import RegisteredMesh
 from framework.errors import ConfigError, DataError
-from framework.testing.bodies import colored, scanned
+from framework.testing.bodies import colored_mesh, write_subjects
 from framework.testing.data_folders import damage
 from framework.testing.rows import DAMAGES
-from plugins.encoder.rasterised.rows import seen
+from plugins.encoder.rasterised.rows import inputs_of
 
 HEIGHT, WIDTH, SAMPLES = 24, 18, 4
 PEOPLE = ("ann", "bob", "cleo", "dan", "eve", "fay")
@@ -37,7 +37,7 @@ def encoder(root, height=HEIGHT, width=WIDTH, **config):
 
 @pytest.fixture
 def root(tmp_path):
-    scanned(tmp_path / "scans")
+    write_subjects(tmp_path / "scans")
     return tmp_path / "scans"
 
 
@@ -142,7 +142,7 @@ def test_a_textured_mesh_is_what_a_ray_through_every_sample_sees(root, times):
 
 
 def test_everybody_wears_their_own_texture_however_lists_are_ordered(root):
-    inputs = seen(6)
+    inputs = inputs_of(6)
     before = encoder(root)(inputs)
     assert all(not torch.equal(before[0], other) for other in before[1:])
     scan_layout.write_splits(
@@ -157,11 +157,11 @@ def test_everybody_wears_their_own_texture_however_lists_are_ordered(root):
 
 @pytest.mark.parametrize("kind", [{}, {"textures": None}], ids=["texture", "colours"])
 def test_meshes_are_drawn_on_the_cpu_wherever_the_model_is(root, kind):
-    assert torch.equal(encoder(root, **kind).to("meta")(seen(2)), encoder(root, **kind)(seen(2)))
+    assert torch.equal(encoder(root, **kind).to("meta")(inputs_of(2)), encoder(root, **kind)(inputs_of(2)))
 
 
 def test_a_stranger_is_refused_by_the_row(root):
-    inputs = seen(3)
+    inputs = inputs_of(3)
     inputs[2, 7, 4] = (inputs[2, 7, 4] + 1 / 255) % 1
     with pytest.raises(
         DataError, match=r"Row 2 of the batch has the vertex colours of no subject in .*scans;"
@@ -170,12 +170,12 @@ def test_a_stranger_is_refused_by_the_row(root):
 
 
 def test_extreme_vertices_leave_a_finite_picture(root):
-    made, inputs = encoder(root), seen(1)
+    made, inputs = encoder(root), inputs_of(1)
     for spoilt in (1e30, -1e30, 1e-30, 0.0, -5.0):
         inputs[0, :3, 2] = spoilt
         assert made(inputs).isfinite().all()
-    padded = torch.cat([seen(1), torch.full((1, 3, 6), math.nan)], 1)
-    assert torch.equal(made(padded), made(seen(1)))
+    padded = torch.cat([inputs_of(1), torch.full((1, 3, 6), math.nan)], 1)
+    assert torch.equal(made(padded), made(inputs_of(1)))
 
 
 def places(**change):
@@ -190,7 +190,7 @@ def places(**change):
 
 def alike(root):
     for name in ("ann", "dan"):
-        scan_layout.write_registration(root / f"subjects/{name}/registration_7k.ply", colored(2))
+        scan_layout.write_registration(root / f"subjects/{name}/registration_7k.ply", colored_mesh(2))
 
 
 def gone(root):
@@ -207,11 +207,17 @@ WRONG = {
         )
         for kind in DAMAGES
     },
-    "another mesh's": (places(faces=lambda faces: faces[::-1]), "are not the 2 of the registered meshes"),
-    "fewer faces": (places(faces=lambda faces: faces[:1], uv_faces=lambda faces: faces[:1]), "its 1 faces"),
-    "no such place": (places(uv_faces=lambda faces: faces + 1), "do not fit"),
+    "another mesh's": (
+        places(faces=lambda faces: faces[::-1]),
+        "are not the 2 faces of the registered meshes",
+    ),
+    "fewer faces": (
+        places(faces=lambda faces: faces[:1], uv_faces=lambda faces: faces[:1]),
+        "the 1 faces in",
+    ),
+    "no such place": (places(uv_faces=lambda faces: faces + 1), "does not fit"),
     "in space": (places(uv=lambda uv: np.pad(uv, ((0, 0), (0, 1)))), "topology_7k.npz"),
-    "nowhere": (places(uv=lambda uv: uv * np.nan), "do not fit"),
+    "nowhere": (places(uv=lambda uv: uv * np.nan), "does not fit"),
     "colours of another": (alike, "have the same vertex colours"),
     "gone": (gone, "no such folder"),
 }
@@ -222,16 +228,16 @@ def test_what_is_wrong_is_said(root, spoil, words):
     made = encoder(root)  # built before the fault, as in a model that is loaded later
     spoil(root)
     with pytest.raises(DataError) as caught:
-        made(seen(1))
+        made(inputs_of(1))
     said = " ".join(str(caught.value).split())
     assert words in said and str(root) in said
 
 
 def test_what_lacks_textures_is_refused(root, monkeypatch):
-    with pytest.raises(ConfigError, match="wanted human_scans"):
+    with pytest.raises(ConfigError, match="expected human_scans"):
         encoder(root, textures={"name": "registration"})
     renderer = type(build("renderer", resolve("renderer", "rasterizer")))
     monkeypatch.setattr(renderer, "channels", renderer.channels - {"uv"})
-    with pytest.raises(ConfigError, match="draws no uv"):
+    with pytest.raises(ConfigError, match="does not draw the channels uv"):
         encoder(root)
     encoder(root, textures=None)

@@ -20,7 +20,7 @@ KEPT = 16
 
 
 class Textures:
-    """Textures by the colours of the registered vertices, which identify a subject.
+    """Textures that are looked up by the colours of the registered vertices, which identify a subject.
 
     A texture is therefore never drawn on another subject, even if the lists have another order or the folder is another
     one. An unknown subject is refused.
@@ -39,15 +39,16 @@ class Textures:
     def __init__(self, root: Path, topology: str, faces: Int[Tensor, "faces 3"], longest: int) -> None:
         if not root.is_dir():
             raise DataError(
-                f"{root}: no such folder; wanted that of the subjects whose textures are laid on. Bring it back "
-                "(generated people: mode=test with this checkpoint makes them again), or draw vertex colours: "
-                "smplpix/rasterised."
+                f"{root}: no such folder; expected the folder of the subjects, which holds the textures. Copy it again "
+                "from its source (people are generated again by mode=test with this checkpoint), or use vertex "
+                "colours: smplpix/rasterised."
             )
         places = scan_layout.read_places(root, topology)
         if places.faces.shape != tuple(faces.shape) or (places.faces != faces.numpy()).any():
             raise DataError(
-                f"{root / f'topology_{topology}.npz'}: its {len(places.faces)} faces are not the {len(faces)} of the "
-                f"registered meshes; wanted those of registration_{topology}.ply, in their order. Write it anew."
+                f"{root / f'topology_{topology}.npz'}: the {len(places.faces)} faces in this file are not the "
+                f"{len(faces)} faces of the registered meshes; expected the faces of registration_{topology}.ply in "
+                "the same order. Write the file again."
             )
         self.root, self.longest = root, longest
         self.uv, self.uv_faces = torch.from_numpy(places.uv), torch.from_numpy(places.uv_faces)
@@ -57,8 +58,8 @@ class Textures:
             file = folder / "texture.png"
             if not file.is_file():
                 raise DataError(
-                    f"{file}: no such file; wanted the texture of each subject. Add it (generated people: "
-                    "data.texture_side above 0), or draw vertex colours: smplpix/rasterised."
+                    f"{file}: no such file; expected the texture of this subject. Add the file (for generated people: "
+                    "set data.texture_side above 0), or use vertex colours: smplpix/rasterised."
                 )
             registration = scan_layout.read_registration(folder / f"registration_{topology}.ply")
             self.vertices = len(registration.vertices)
@@ -66,7 +67,7 @@ class Textures:
             if other != file and read_bytes(other) != read_bytes(file):
                 raise DataError(
                     f"{file.parent} and {other.parent} have the same vertex colours, by which textures are found, but "
-                    "other textures; wanted the colours of each one's own scan."
+                    "different textures. Give each subject the colours of its own scan."
                 )
 
     def of(self, colors: Float[Tensor, "points 3"], row: int) -> Texture:
@@ -83,8 +84,8 @@ class Textures:
         file = self.files.get(_known_by(numbers.to(torch.uint8)))
         if file is None:
             raise DataError(
-                f"Row {row} of the batch has the vertex colours of no subject in {self.root}; wanted those of one, "
-                "whose texture is laid on: other meshes have none. Give registrations of that folder, or draw vertex "
+                f"Row {row} of the batch has the vertex colours of no subject in {self.root}; expected the colours of "
+                "a subject, because other meshes have no texture. Use registrations of that folder, or use vertex "
                 "colours: smplpix/rasterised."
             )
         return Texture((_light(file, self.longest),), self.uv, self.uv_faces)

@@ -1,4 +1,4 @@
-"""Errors of a body's rotation and translation, and what the figure shows of a fitted image."""
+"""Errors of a body's rotation and translation, and the content of the figure for one image."""
 
 from typing import NamedTuple
 
@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from framework.bodies.body import turns_less_identity
+from framework.bodies.body import rotation_minus_identity
 from framework.geometry.rotation import geodesic_distance
 
 NEAR = (2.0, 1.0)
@@ -31,13 +31,13 @@ class FittedImage(NamedTuple):
 
 
 def place_errors(
-    found: Float[Tensor, "*batch number"], wanted: Float[Tensor, "*#batch number"]
+    predicted: Float[Tensor, "*batch number"], true: Float[Tensor, "*#batch number"]
 ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
     """Return the degrees between two rotations and the centimetres between two translations, float64."""
-    found, wanted = found.double(), wanted.double().expand_as(found)
-    one, other = (
-        turns_less_identity(numbers[..., :3]) + torch.eye(3, dtype=torch.float64, device=numbers.device)
-        for numbers in (found, wanted)
+    predicted, true = predicted.double(), true.double().expand_as(predicted)
+    predicted_rotation, true_rotation = (
+        rotation_minus_identity(numbers[..., :3]) + torch.eye(3, dtype=torch.float64, device=numbers.device)
+        for numbers in (predicted, true)
     )
-    apart = torch.linalg.vector_norm(found[..., 3:6] - wanted[..., 3:6], dim=-1)
-    return torch.rad2deg(geodesic_distance(one, other)), 100 * apart
+    distance = torch.linalg.vector_norm(predicted[..., 3:6] - true[..., 3:6], dim=-1)
+    return torch.rad2deg(geodesic_distance(predicted_rotation, true_rotation)), 100 * distance

@@ -13,24 +13,24 @@ from framework.geometry.srgb import bytes_from_linear
 from plugins.metric.pose_error.errors import FittedImage
 
 
-def descents(samples: Mapping[str, FittedImage], title: str, *, synthetic: bool) -> Figure:
+def draw_descents(samples: Mapping[str, FittedImage], title: str, *, synthetic: bool) -> Figure:
     """Return a figure with a row for each sample: start, target, end, their difference, and errors against steps."""
     figure = titled_figure((11.0, 3.2 * len(samples)), title, synthetic)
     axes = figure.subplots(len(samples), 5, squeeze=False, width_ratios=(1, 1, 1, 1, 2.2))
     for row, (name, sample) in zip(axes, samples.items(), strict=True):
         gap = (sample.end - sample.target).abs()
         images = {"start": sample.start, "target": sample.target, "end": sample.end, "|end - target|": gap}
-        for axis, (what, image) in zip(row, images.items(), strict=False):
+        for axis, (label, image) in zip(row, images.items(), strict=False):
             axis.imshow(bytes_from_linear(image).numpy())
-            axis.set_title(what)
+            axis.set_title(label)
             axis.set_axis_off()
         row[0].set_title(f"{name}: start")
         row[2].set_title(f"end: {sample.degrees:.2g}°, {sample.centimetres:.2g} cm")
-        error_curves(row[4], sample.path)
+        draw_error_curves(row[4], sample.path)
     return figure
 
 
-def error_curves(axis: Axes, path: Float[Tensor, "step 4"]) -> None:
+def draw_error_curves(axis: Axes, path: Float[Tensor, "step 4"]) -> None:
     """Plot the errors in degrees and centimetres after each step."""
     for column, (name, colour, near) in enumerate(
         (("rotation, degrees", COLOURS[0], 2.0), ("translation, cm", COLOURS[1], 1.0)), start=2
@@ -44,11 +44,11 @@ def error_curves(axis: Axes, path: Float[Tensor, "step 4"]) -> None:
     axis.grid(color=GREY, alpha=0.2)
 
 
-def errors(found: Float[Tensor, "sample 2"], title: str, *, synthetic: bool) -> Figure:
+def draw_errors(degrees_and_centimetres: Float[Tensor, "sample 2"], title: str, *, synthetic: bool) -> Figure:
     """Return a figure of both errors of every sample, for predictions without a descent to show."""
     figure = titled_figure((5.0, 4.2), title, synthetic)
     axis = figure.subplots()
-    degrees, centimetres = found.clamp(min=1e-3).T
+    degrees, centimetres = degrees_and_centimetres.clamp(min=1e-3).T
     axis.loglog(degrees, centimetres, "o", color=COLOURS[0], alpha=0.6)
     axis.set_xlabel("rotation, degrees")
     axis.set_ylabel("translation, cm")

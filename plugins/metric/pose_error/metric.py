@@ -23,21 +23,14 @@ class PoseError(Metric, HasFigure):
     """Errors of a body's rotation (geodesic, degrees) and translation (cm), and the share within 2° and 1 cm.
 
     Medians, 95th percentiles and worst cases are reported, because a descent either succeeds or ends in another
-    minimum. If the density holds its descent (`fit_pose`), the figure shows start, target and end of the best, the
-    middle and the worst sample, and the errors against steps and time.
+    minimum. If the density stores its descent (`fit_pose`), the figure shows start, target and end of the best, the
+    median and the worst sample, and the errors against steps and time.
 
     Raises:
         ConfigError: the target does not begin with a rotation and a translation.
     """
 
-    bibtex = """@article{huynh2009metrics,
-  author = {Huynh, Du Q.},
-  title = {Metrics for {3D} rotations: comparison and analysis},
-  journal = {Journal of Mathematical Imaging and Vision},
-  volume = {35},
-  pages = {155--164},
-  year = {2009}
-}"""
+    bibtex = "huynh2009metrics"
     columns: ClassVar[dict[str, str]] = {
         "rotation_median_deg": "rotation °",
         "translation_median_cm": "translation cm",
@@ -56,26 +49,26 @@ class PoseError(Metric, HasFigure):
         target.require("real", by="metric pose_error")
         if target.names[:6] != PLACE:
             raise ConfigError(
-                f"metric pose_error reads {', '.join(PLACE)}, but the target is {target.listed_names}. Choose "
-                "data=pose_from_image, or leave this metric out."
+                f"metric pose_error requires a target that begins with {', '.join(PLACE)}, but the target is "
+                f"{target.listed_names}. Choose data=pose_from_image, or leave this metric out."
             )
         self.add_state("errors", [], dist_reduce_fx="cat")
-        self.shown: list[FittedImage] = []
+        self.fitted_images: list[FittedImage] = []
 
     def update(self, prediction: Prediction) -> None:
         if len(prediction.target) == 0:
             return
         assert isinstance(self.errors, list)
-        found = torch.stack(place_errors(prediction.point, prediction.target), -1)
-        self.errors.append(found)
+        pairs = torch.stack(place_errors(prediction.point, prediction.target), -1)
+        self.errors.append(pairs)
         density = prediction.density
         if isinstance(density, PosedBodyDensity) and "color" in prediction.batch:
-            self.shown += [
-                _shown(density, prediction, row, errors) for row, errors in enumerate(found.tolist())
+            self.fitted_images += [
+                _fitted_image(density, prediction, row, errors) for row, errors in enumerate(pairs.tolist())
             ]
 
     def compute(self) -> dict[str, Tensor]:
-        degrees, centimetres = self._seen().T
+        degrees, centimetres = self._all_errors().T
         if not len(degrees):
             return {name: torch.tensor(torch.nan, dtype=torch.float64) for name in _KEYS}
         near = (degrees <= NEAR[0]) & (centimetres <= NEAR[1])
@@ -84,24 +77,26 @@ class PoseError(Metric, HasFigure):
 
     def reset(self) -> None:
         Metric.reset(self)
-        self.shown = []
+        self.fitted_images = []
 
     def figure(self, title: str, *, synthetic: bool) -> "Figure":
-        from plugins.metric.pose_error.figure import descents, errors
+        from plugins.metric.pose_error.figure import draw_descents, draw_errors
 
-        if not self.shown:
-            return errors(self._seen(), title, synthetic=synthetic)
-        order = sorted(self.shown, key=lambda one: max(one.degrees / NEAR[0], one.centimetres / NEAR[1]))
+        if not self.fitted_images:
+            return draw_errors(self._all_errors(), title, synthetic=synthetic)
+        order = sorted(
+            self.fitted_images, key=lambda sample: max(sample.degrees / NEAR[0], sample.centimetres / NEAR[1])
+        )
         names = {"best": order[0], "middle": order[len(order) // 2], "worst": order[-1]}
-        return descents(names, title, synthetic=synthetic)
+        return draw_descents(names, title, synthetic=synthetic)
 
-    def _seen(self) -> Float[Tensor, "sample 2"]:
+    def _all_errors(self) -> Float[Tensor, "sample 2"]:
         return dim_zero_cat(self.errors) if len(self.errors) else torch.empty(0, 2, dtype=torch.float64)
 
 
 _KEYS = (
-    *(f"rotation_{what}_deg" for what in ("median", "95", "worst")),
-    *(f"translation_{what}_cm" for what in ("median", "95", "worst")),
+    *(f"rotation_{statistic}_deg" for statistic in ("median", "95", "worst")),
+    *(f"translation_{statistic}_cm" for statistic in ("median", "95", "worst")),
     "found",
 )
 
@@ -111,14 +106,16 @@ def quantile(values: Float[Tensor, "sample"]) -> Float[Tensor, "3"]:
     return torch.quantile(values, values.new_tensor([0.5, 0.95, 1.0]))
 
 
-def _shown(density: PosedBodyDensity, prediction: Prediction, row: int, errors: list[float]) -> FittedImage:
+def _fitted_image(
+    density: PosedBodyDensity, prediction: Prediction, row: int, errors: list[float]
+) -> FittedImage:
     fit = density.fits[row]
     nominal = scene_of(density.body_model, torch.zeros(density.event_shape), density.camera)
     end = scene_of(density.body_model, density.mean[row], density.camera)
-    start, found = (image["color"][..., :3] for image in density.renderer.batch([nominal, end]))
+    start, end_image = (image["color"][..., :3] for image in density.renderer.batch([nominal, end]))
     path = torch.zeros(0, 4, dtype=torch.float64)
     if fit is not None and len(fit.path):
         path = torch.stack(
             [*fit.path[:, :2].T, *place_errors(fit.path[:, 2:], prediction.target[row].cpu())], -1
         )
-    return FittedImage(start, prediction.batch["color"][row].cpu(), found, errors[0], errors[1], path)
+    return FittedImage(start, prediction.batch["color"][row].cpu(), end_image, errors[0], errors[1], path)

@@ -26,9 +26,9 @@ def data():
         **SIZE,
         **DOLL,
     }
-    found = build("data", resolve("data", config))
-    found.prepare()
-    return found
+    data_module = build("data", resolve("data", config))
+    data_module.prepare()
+    return data_module
 
 
 def head(target, **config):
@@ -38,37 +38,37 @@ def head(target, **config):
 
 def test_place_errors_against_scipy():
     random = np.random.default_rng(0)
-    one, other = random.normal(0, 1, (2, 20, 8))
-    degrees, centimetres = place_errors(torch.from_numpy(one), torch.from_numpy(other))
-    between = Rotation.from_rotvec(one[:, :3]).inv() * Rotation.from_rotvec(other[:, :3])
+    predicted, true = random.normal(0, 1, (2, 20, 8))
+    degrees, centimetres = place_errors(torch.from_numpy(predicted), torch.from_numpy(true))
+    between = Rotation.from_rotvec(predicted[:, :3]).inv() * Rotation.from_rotvec(true[:, :3])
     np.testing.assert_allclose(degrees, np.degrees(between.magnitude()), rtol=1e-9)
-    np.testing.assert_allclose(centimetres, 100 * np.linalg.norm(one[:, 3:6] - other[:, 3:6], axis=1))
+    np.testing.assert_allclose(centimetres, 100 * np.linalg.norm(predicted[:, 3:6] - true[:, 3:6], axis=1))
 
 
-def test_the_metric_sees_what_arrived(data):
+def test_the_metric_evaluates_fitted_images(data):
     metric = build("metric", resolve("metric", {"name": "pose_error"}), target=data.target)
     batch = data.splits().test.__getitems__(range(3))
     metric.update(Prediction(head(data.target, steps=1, restarts=0)(batch["input"].flatten(1)), batch))
-    found = metric.compute()
+    results = metric.compute()
     degrees, _ = place_errors(torch.zeros(30), batch["target"][0])
     assert float(degrees) == pytest.approx(30, abs=1e-4)
-    assert float(found["rotation_worst_deg"]) >= float(found["rotation_median_deg"])
-    assert 0 <= found["found"] <= 1 and len(metric.shown) == 3
+    assert float(results["rotation_worst_deg"]) >= float(results["rotation_median_deg"])
+    assert 0 <= results["found"] <= 1 and len(metric.fitted_images) == 3
     figure = metric.figure("three dolls", synthetic=True)
     assert len(figure.axes) == 15
     metric.reset()
-    assert not metric.shown
+    assert not metric.fitted_images
 
 
-def test_the_metric_draws_densities_that_do_not_say_how_they_were_found(data):
+def test_the_metric_draws_densities_without_a_descent(data):
     metric = build("metric", resolve("metric", {"name": "pose_error"}), target=data.target)
     batch = data.splits().test.__getitems__(range(3))
-    there = Independent(Normal(batch["target"], torch.full_like(batch["target"], 1e-6)), 1)
-    metric.update(Prediction(there, batch))
+    narrow = Independent(Normal(batch["target"], torch.full_like(batch["target"], 1e-6)), 1)
+    metric.update(Prediction(narrow, batch))
     assert metric.compute()["found"] == 1
     assert len(metric.figure("found", synthetic=True).axes) == 1
 
 
-def test_a_target_without_rotation_and_translation_is_refused():
-    with pytest.raises(ConfigError, match="pose_error reads rotation_x"):
+def test_a_target_without_rotation_and_translation_raises_an_error():
+    with pytest.raises(ConfigError, match="pose_error requires a target that begins with rotation_x"):
         build("metric", resolve("metric", {"name": "pose_error"}), target=Target("real", ("x", "y")))
