@@ -9,12 +9,12 @@ from scipy.spatial.transform import Rotation
 from framework.bodies import body_files, poses
 from framework.bodies.body import Body, BodyModel
 from framework.errors import DataError
-from framework.testing.bodies import JOINTS, body_file
+from framework.testing.bodies import JOINTS, write_body_file
 
 
 @pytest.fixture(scope="module")
 def file(tmp_path_factory):
-    return Path(body_file(tmp_path_factory.mktemp("body"))["body"])
+    return Path(write_body_file(tmp_path_factory.mktemp("body"))["body"])
 
 
 def angles(**movements):
