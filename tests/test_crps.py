@@ -19,7 +19,7 @@ from framework.distributions.density import Mixture
 from framework.distributions.protocol import marginal
 from framework.target import Target
 from framework.testing.metrics import Cardioid
-from plugins.metric.crps.score import crps, fair, mean_angular_distance, mean_distance
+from plugins.metric.crps.score import crps, fair_estimate, mean_angular_distance, mean_distance
 
 WIDE = torch.float64
 
@@ -254,14 +254,14 @@ def test_the_fair_estimate_is_unbiased_and_tells_its_error():
     torch.manual_seed(6)
     wanted = exact(normal([[0.0]], [[1.0]]), torch.tensor([[0.7]], dtype=WIDE)).item()
     drawn = torch.randn(16, 20_000, dtype=WIDE)  # two draws a part: where an unfair estimate is off by a half
-    found = fair(drawn, torch.full((20_000,), 0.7, dtype=WIDE), circular=False)
+    found = fair_estimate(drawn, torch.full((20_000,), 0.7, dtype=WIDE), circular=False)
     spread = found.mean.std() / 20_000**0.5
     assert abs(found.mean.mean().item() - wanted) < 4 * spread
     assert found.error.square().mean().sqrt().item() == pytest.approx(found.mean.std().item(), rel=0.02)
     angle = about_zero(2.0)
     at = torch.tensor([[0.7]], dtype=WIDE)
     drawn = angle.sample((16, 20_000))[..., 0, 0]
-    found = fair(drawn, at[0].expand(20_000), circular=True)
+    found = fair_estimate(drawn, at[0].expand(20_000), circular=True)
     assert abs(found.mean.mean() - exact(angle, at)[0]) < 4 * found.mean.std() / 20_000**0.5
 
 

@@ -32,8 +32,8 @@ from framework.figures.style import COLOURS, MARKERS, save_figure, titled_figure
 from framework.flights.frames import PARTS
 from framework.prediction import Prediction
 from framework.reports.table import Row, write_csv
-from plugins.metric.flight_error.figure import bundle, landing_places
-from plugins.metric.flight_error.landing import Shown
+from plugins.metric.flight_error.figure import draw_flight, draw_landing_places
+from plugins.metric.flight_error.landing import ShownFlight
 from plugins.metric.flight_error.metric import DRAWS, FlightError
 
 HERE = Path(__file__).resolve()
@@ -250,9 +250,9 @@ def bundles(found: dict[str, Measured]) -> None:
     first = None
     for place, (method, one) in enumerate(found.items(), 1):
         space: Any = figure.add_subplot(2, len(found), place, projection="3d")
-        shown: list[Shown] = [one.metric.shown[number] for number in BUNDLES]
+        shown: list[ShownFlight] = [one.metric.shown[number] for number in BUNDLES]
         for flight, color in zip(shown, COLOURS, strict=False):
-            bundle(space, flight, color)
+            draw_flight(space, flight, color)
         space.set(xlabel="x (m)", ylabel="y (m)", zlabel="z (m)")
         space.set_box_aspect((1, 2.2, 0.9), zoom=0.95)
         space.set(xlim=(-0.2, 1.0), ylim=(-4, 0.2), zlim=(-1.1, -0.2), xticks=[0, 0.8], yticks=[-3, -1])
@@ -260,7 +260,7 @@ def bundles(found: dict[str, Measured]) -> None:
         space.set_title(f"{METHODS[method]}: seen (dots), true (black), drawn (thin)", fontsize=9)
         axes = figure.add_subplot(2, len(found), len(found) + place, sharex=first, sharey=first)
         first = first or axes
-        landing_places(axes, shown, one.metric.height)
+        draw_landing_places(axes, shown, one.metric.height)
         axes.set_aspect("equal", adjustable="box")
     figure.savefig(HERE.with_name("ball_flights_bundle.png"), dpi=110)
 

@@ -14,7 +14,7 @@ from framework.target import Target
 class Accuracy(Metric):
     """Share of samples whose most likely class is the true one (thesis Table 2.1), with its standard error.
 
-    If several classes are equally likely, the first of them is taken.
+    If several classes are equally likely, the first of them is the prediction.
 
     Raises:
         ConfigError: the target is not a class.
@@ -22,13 +22,7 @@ class Accuracy(Metric):
         DataError: a label is not a class of the target.
     """
 
-    bibtex = """@book{hastie2009elements,
-  author    = {Hastie, Trevor and Tibshirani, Robert and Friedman, Jerome},
-  title     = {The Elements of Statistical Learning},
-  edition   = {2nd},
-  publisher = {Springer},
-  year      = {2009}
-}"""
+    bibtex = "hastie2009elements"
     columns: ClassVar[dict[str, str]] = {"accuracy": "accuracy"}
     better: ClassVar[dict[str, Literal["higher", "lower"]]] = {"accuracy": "higher"}
     count: Tensor

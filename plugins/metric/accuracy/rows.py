@@ -1,4 +1,4 @@
-"""Rows of the contract: targets of two and of five classes."""
+"""Contract-test cases: targets of two and of five classes."""
 
 from framework.target import Target
 from framework.testing.rows import MetricRow

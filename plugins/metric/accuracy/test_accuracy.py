@@ -25,7 +25,7 @@ def prediction(logits, label):
     return Prediction(Categorical(logits=logits, validate_args=False), {"target": torch.as_tensor(label)})
 
 
-def measured(logits, label):
+def compute_metric(logits, label):
     metric = build("metric", resolve("metric", "accuracy"), target=classes(logits.shape[-1]))
     metric.update(prediction(logits, label))
     return {name: value.item() for name, value in metric.compute().items()}
@@ -33,23 +33,23 @@ def measured(logits, label):
 
 @settings(deadline=None, max_examples=80)
 @given(st.data(), st.integers(2, 10), st.integers(1, 25), st.sampled_from([torch.float32, torch.float64]))
-def test_is_sklearns_with_ties_for_the_first_class(data, count, samples, dtype):
-    logit = st.sampled_from([0.0, 1.0, -2.0, 1e4, -1e4])  # few values, so that many are equal
+def test_accuracy_equals_sklearns_with_ties_for_the_first_class(data, count, samples, dtype):
+    logit = st.sampled_from([0.0, 1.0, -2.0, 1e4, -1e4])  # few values, so that ties are frequent
     row = st.lists(logit, min_size=count, max_size=count)
     logits = np.array(data.draw(st.lists(row, min_size=samples, max_size=samples)))
     label = data.draw(st.lists(st.integers(0, count - 1), min_size=samples, max_size=samples))
-    found = measured(torch.tensor(logits, dtype=dtype), label)
-    predicted = logits.argmax(-1)  # NumPy's first
-    assert found["accuracy"] == pytest.approx(accuracy_score(label, predicted), abs=1e-15)
+    actual = compute_metric(torch.tensor(logits, dtype=dtype), label)
+    predicted = logits.argmax(-1)  # NumPy returns the first of equal values
+    assert actual["accuracy"] == pytest.approx(accuracy_score(label, predicted), abs=1e-15)
     if samples > 1:
         wanted = sem((predicted == np.array(label)).astype(float))
-        assert found["accuracy_sem"] == pytest.approx(wanted, abs=1e-14)
+        assert actual["accuracy_sem"] == pytest.approx(wanted, abs=1e-14)
     else:
-        assert math.isnan(found["accuracy_sem"])
+        assert math.isnan(actual["accuracy_sem"])
 
 
-def test_the_likeliest_class_of_a_mixture_is_that_of_averaged_probabilities():
-    # both components are sure of different classes, and agree on 0.45 for a third
+def test_the_prediction_of_a_mixture_has_the_largest_averaged_probability():
+    # the components prefer different classes, but both give a third class 0.45
     probabilities = torch.tensor([[[0.5, 0.05, 0.45], [0.05, 0.5, 0.45]]])
     density = Mixture(torch.zeros(1, 2), Categorical(logits=probabilities.log()))
     metric = Accuracy(classes(3))
@@ -59,20 +59,22 @@ def test_the_likeliest_class_of_a_mixture_is_that_of_averaged_probabilities():
 
 def test_one_class_batches_and_probabilities_of_zero_and_one():
     certain = torch.tensor([[0.0, -torch.inf]]).expand(8, 2)
-    assert measured(certain, [0] * 8) == {"accuracy": 1.0, "accuracy_sem": 0.0}
-    assert measured(certain, [1] * 8) == {"accuracy": 0.0, "accuracy_sem": 0.0}
+    assert compute_metric(certain, [0] * 8) == {"accuracy": 1.0, "accuracy_sem": 0.0}
+    assert compute_metric(certain, [1] * 8) == {"accuracy": 0.0, "accuracy_sem": 0.0}
 
 
-def test_nothing_seen_is_nan():
-    assert all(math.isnan(value) for value in measured(torch.zeros(0, 3), np.zeros(0, dtype=int)).values())
+def test_no_samples_give_nan():
+    assert all(
+        math.isnan(value) for value in compute_metric(torch.zeros(0, 3), np.zeros(0, dtype=int)).values()
+    )
 
 
-def test_nan_labels_and_densities_that_cannot_be_judged_are_named():
+def test_nan_wrong_labels_and_wrong_densities_raise_a_clear_message():
     with pytest.raises(UserError, match="1 of 2 predicted distributions over classes"):
-        measured(torch.tensor([[0.0, 1.0], [0.0, torch.nan]]), [0, 1])
+        compute_metric(torch.tensor([[0.0, 1.0], [0.0, torch.nan]]), [0, 1])
     with pytest.raises(DataError, match="row 1 is 2, but class indices go from 0 to 1"):
-        measured(torch.zeros(2, 2), [0, 2])
-    with pytest.raises(UserError, match="does not list classes"):
+        compute_metric(torch.zeros(2, 2), [0, 2])
+    with pytest.raises(UserError, match="is no density over classes"):
         real = Independent(Normal(torch.zeros(3, 1), 1.0), 1)
         Accuracy(classes(2)).update(Prediction(real, {"target": torch.zeros(3, dtype=torch.int64)}))
     with pytest.raises(ConfigError, match="metric accuracy describes targets of kind 'class'"):

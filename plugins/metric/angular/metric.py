@@ -13,24 +13,18 @@ from framework.metric import Mean, Metric
 from framework.prediction import Prediction
 from framework.target import Target
 
-BEYER = """@inproceedings{beyer2015biternion,
-  author    = {Beyer, Lucas and Hermans, Alexander and Leibe, Bastian},
-  title     = {Biternion Nets: Continuous Head Pose Regression from Discrete Training Labels},
-  booktitle = {German Conference on Pattern Recognition},
-  pages     = {157--168},
-  year      = {2015}
-}"""
+BEYER = "beyer2015biternion"
 
 
 class MeanAngularDeviation(Mean):
     """Mean absolute angular deviation (MAAD) of the point prediction, degrees, with its standard error.
 
-    `maad_deg` takes the mean over the angles of a sample first, so that its standard error counts samples;
-    `maad_<angle>_deg` is the deviation of one angle. The point prediction is the one that minimises this loss (thesis
-    eq. 3.23 and 3.24).
+    `maad_deg` is the mean over samples of the mean over a sample's angles, and its standard error is over samples.
+    `maad_<angle>_deg` is the mean deviation of one angle. The point prediction minimises this loss (thesis eq. 3.23 and
+    3.24).
 
     Raises:
-        ConfigError: the target is not made of angles.
+        ConfigError: the target does not consist of angles.
     """
 
     bibtex = BEYER
@@ -44,24 +38,25 @@ class MeanAngularDeviation(Mean):
         self.start(len(self.names))
 
     def update(self, prediction: Prediction) -> None:
-        each = deviations(prediction) * (180 / math.pi)
-        self.add_samples(torch.cat([each.mean(-1, keepdim=True), each], -1))
+        deviation_deg = deviations(prediction) * (180 / math.pi)
+        self.add_samples(torch.cat([deviation_deg.mean(-1, keepdim=True), deviation_deg], -1))
 
     def compute(self) -> dict[str, Tensor]:
         mean, error = self.mean_and_error()
-        found: dict[str, Tensor] = {}
+        results: dict[str, Tensor] = {}
         for index, name in enumerate(self.names):
-            found[name] = mean[index]
-            found[f"{name}_sem"] = error[index]
-        return found
+            results[name] = mean[index]
+            results[f"{name}_sem"] = error[index]
+        return results
 
 
 class MedianAngularDeviation(Metric):
-    """Median absolute angular deviation of the point prediction, degrees: half of the samples stay below it.
+    """Median absolute angular deviation of the point prediction, degrees.
 
-    For several angles a sample's deviation is their mean, as in `angular_deviation`. The median of an even number is
-    the mean of the middle two. The median shows how accurate a method is on its good samples. The mean deviation of a
-    density with two modes half a turn apart instead mostly shows how often the point prediction took the wrong mode.
+    For several angles, the deviation of a sample is the mean over its angles, as in `angular_deviation`. The median of
+    an even number of values is the mean of the middle two. The median shows how accurate a method is on its better half
+    of the samples. In contrast, if densities have two opposite modes, the mean deviation mostly shows how often the
+    point prediction chose the wrong mode.
 
     Raises:
         ConfigError: the target is not made of angles.
@@ -82,12 +77,14 @@ class MedianAngularDeviation(Metric):
         self.deviations.append(deviations(prediction).mean(-1))
 
     def compute(self) -> dict[str, Tensor]:
-        found = dim_zero_cat(self.deviations) if len(self.deviations) else torch.empty(0, dtype=torch.float64)
-        median = found.quantile(0.5) if len(found) else found.new_tensor(torch.nan)
+        collected = (
+            dim_zero_cat(self.deviations) if len(self.deviations) else torch.empty(0, dtype=torch.float64)
+        )
+        median = collected.quantile(0.5) if len(collected) else collected.new_tensor(torch.nan)
         return {"median_deviation_deg": median * (180 / math.pi)}
 
 
 def deviations(prediction: Prediction) -> Float[Tensor, "batch angle"]:
-    """Return the shorter angular distance from the point prediction to the target, radians, float64."""
-    # convert to float64 before the difference: float32 angles far from 0 are coarse
+    """Return the angular distance between point prediction and target, at most π, radians, float64."""
+    # convert to float64 before the difference, because float32 resolves large angles poorly
     return angular_distance(prediction.point.double(), prediction.target.double())

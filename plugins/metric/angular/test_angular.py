@@ -22,7 +22,7 @@ def prediction(point, target, dtype=torch.float64):
     )
 
 
-def measured(target, *batches, dtype=torch.float64):
+def compute_metric(target, *batches, dtype=torch.float64):
     metric = MeanAngularDeviation(target)
     for point, true in batches:
         metric.update(prediction(point, true, dtype))
@@ -30,7 +30,7 @@ def measured(target, *batches, dtype=torch.float64):
 
 
 def loop(point, target):
-    """Return deviations in degrees by the shorter of the two ways round, one number at a time."""
+    """Return angular deviations in degrees, at most 180, one number at a time."""
     rows = []
     for predicted, true in zip(point, target, strict=True):
         row = []
@@ -42,18 +42,18 @@ def loop(point, target):
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_agrees_with_a_loop(dtype):
+def test_results_agree_with_a_loop(dtype):
     generator = np.random.default_rng(0)
     point, target = generator.uniform(-9, 9, (2, 150, 3)).astype(str(dtype).removeprefix("torch."))
     metric = build("metric", resolve("metric", "angular_deviation"), target=THREE)
     metric.update(prediction(point, target, dtype))
-    found = metric.compute()
+    actual = metric.compute()
     expected = loop(point, target)
-    assert found["maad_deg"].item() == pytest.approx(expected.mean(), abs=1e-9)
-    assert found["maad_deg_sem"].item() == pytest.approx(sem(expected.mean(1)), abs=1e-9)
+    assert actual["maad_deg"].item() == pytest.approx(expected.mean(), abs=1e-9)
+    assert actual["maad_deg_sem"].item() == pytest.approx(sem(expected.mean(1)), abs=1e-9)
     for index, name in enumerate(THREE.names):
-        assert found[f"maad_{name}_deg"].item() == pytest.approx(expected[:, index].mean(), abs=1e-9)
-        assert found[f"maad_{name}_deg_sem"].item() == pytest.approx(sem(expected[:, index]), abs=1e-9)
+        assert actual[f"maad_{name}_deg"].item() == pytest.approx(expected[:, index].mean(), abs=1e-9)
+        assert actual[f"maad_{name}_deg_sem"].item() == pytest.approx(sem(expected[:, index]), abs=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -67,31 +67,31 @@ def test_agrees_with_a_loop(dtype):
         (1.0, 1.0, 0),
     ],
 )
-def test_the_shorter_way_round(point, target, deviation):
-    found = measured(ONE, ([[point]], [[target]]))
-    assert found["maad_deg"] == pytest.approx(deviation, abs=1e-7)
-    assert found["maad_azimuth_deg"] == found["maad_deg"]
+def test_the_deviation_is_the_shorter_way_around_the_circle(point, target, deviation):
+    actual = compute_metric(ONE, ([[point]], [[target]]))
+    assert actual["maad_deg"] == pytest.approx(deviation, abs=1e-7)
+    assert actual["maad_azimuth_deg"] == actual["maad_deg"]
 
 
-def test_nothing_seen_is_nan_and_one_sample_has_no_error():
-    empty = measured(ONE, (np.zeros((0, 1)), np.zeros((0, 1))))
+def test_no_samples_give_nan_and_one_sample_has_no_standard_error():
+    empty = compute_metric(ONE, (np.zeros((0, 1)), np.zeros((0, 1))))
     assert all(np.isnan(value) for value in empty.values())
-    one = measured(ONE, ([[0.5]], [[0.0]]))
-    assert one["maad_deg"] == pytest.approx(math.degrees(0.5))
-    assert np.isnan(one["maad_deg_sem"])
+    single_sample = compute_metric(ONE, ([[0.5]], [[0.0]]))
+    assert single_sample["maad_deg"] == pytest.approx(math.degrees(0.5))
+    assert np.isnan(single_sample["maad_deg_sem"])
 
 
-def test_equal_deviations_have_no_spread():
-    assert measured(ONE, (np.full((50, 1), 0.1), np.zeros((50, 1))))["maad_deg_sem"] == pytest.approx(
+def test_equal_deviations_have_no_standard_error():
+    assert compute_metric(ONE, (np.full((50, 1), 0.1), np.zeros((50, 1))))["maad_deg_sem"] == pytest.approx(
         0, abs=1e-6
     )
 
 
-def test_a_prediction_that_is_not_a_number_is_not_hidden():
-    assert np.isnan(measured(ONE, ([[np.nan], [0.0]], [[0.0], [0.0]]))["maad_deg"])
+def test_a_nan_prediction_gives_nan():
+    assert np.isnan(compute_metric(ONE, ([[np.nan], [0.0]], [[0.0], [0.0]]))["maad_deg"])
 
 
-def test_merged_halves_are_the_whole():
+def test_merged_states_equal_the_state_of_all_samples():
     generator = np.random.default_rng(1)
     point, target = generator.uniform(-4, 4, (2, 40, 3))
     first, second, whole = (MeanAngularDeviation(THREE) for _ in range(3))
@@ -119,6 +119,6 @@ def test_the_median_agrees_with_numpy(count, angles):
 @pytest.mark.parametrize(
     "kind, name", [(MeanAngularDeviation, "angular_deviation"), (MedianAngularDeviation, "median_deviation")]
 )
-def test_refuses_targets_that_are_not_angles(kind, name):
+def test_targets_that_are_not_angles_raise_an_error(kind, name):
     with pytest.raises(ConfigError, match=f"{name} describes targets of kind 'angle'"):
         kind(Target("real", ("x",)))

@@ -1,4 +1,4 @@
-"""Rows of the contract: eq. 2.26 for two classes, Brier's own sum for more classes."""
+"""Contract-test cases: eq. 2.26 for two classes, Brier's own sum for more classes."""
 
 from framework.target import Target
 from framework.testing.rows import MetricRow

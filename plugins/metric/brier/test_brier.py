@@ -22,7 +22,7 @@ def classes(count):
     return Target("class", tuple(f"class {k}" for k in range(count)))
 
 
-def measured(logits, label, parts=1):
+def compute_metric(logits, label, parts=1):
     metric = build("metric", resolve("metric", "brier"), target=classes(logits.shape[-1]))
     label = torch.as_tensor(label)
     for index in torch.arange(len(label)).chunk(parts):
@@ -33,40 +33,40 @@ def measured(logits, label, parts=1):
 
 @settings(deadline=None, max_examples=80)
 @given(st.data(), st.integers(2, 10), st.integers(1, 25), st.sampled_from([torch.float32, torch.float64]))
-def test_is_sklearns_and_its_error_scipys(data, count, samples, dtype):
-    # logits of 1e4 are shifted to 0 at the top before they become float32, as heads do it
+def test_score_equals_sklearns_and_standard_error_scipys(data, count, samples, dtype):
+    # logits are shifted to a maximum of 0 before conversion to float32, as in density heads
     logit = st.sampled_from([0.0, 1.0, -1e4, -800.0]) | st.floats(-30, 0)
     row = st.lists(logit, min_size=count, max_size=count)
     logits = np.array(data.draw(st.lists(row, min_size=samples, max_size=samples)))
     label = data.draw(st.lists(st.integers(0, count - 1), min_size=samples, max_size=samples))
-    found = measured(torch.tensor(logits, dtype=dtype), label, parts=data.draw(st.integers(1, 3)))
+    actual = compute_metric(torch.tensor(logits, dtype=dtype), label, parts=data.draw(st.integers(1, 3)))
     probability = special.softmax(logits.astype(str(dtype).removeprefix("torch.")).astype(float), -1)
     tolerance = 1e-6 if dtype == torch.float32 else 1e-12
-    if count == 2:  # eq. 2.26, the positive class alone
+    if count == 2:  # eq. 2.26 uses only the positive class
         wanted = brier_score_loss(label, probability[:, 1], labels=[0, 1], pos_label=1)
     else:
         wanted = brier_score_loss(label, probability, labels=range(count), scale_by_half=False)
-    assert found["brier"] == pytest.approx(wanted, abs=tolerance)
+    assert actual["brier"] == pytest.approx(wanted, abs=tolerance)
     error = np.square(probability - np.eye(count)[label])
-    each = error[:, 1] if count == 2 else error.sum(-1)
-    if samples > 1:  # the root doubles the rounding of a spread of nothing: 1e-16 becomes 1e-8
-        assert found["brier_sem"] == pytest.approx(sem(each), abs=max(tolerance, 2e-8))
+    scores = error[:, 1] if count == 2 else error.sum(-1)
+    if samples > 1:  # the root turns rounding errors of 1e-16 into 1e-8
+        assert actual["brier_sem"] == pytest.approx(sem(scores), abs=max(tolerance, 2e-8))
     else:
-        assert math.isnan(found["brier_sem"])
+        assert math.isnan(actual["brier_sem"])
 
 
 @pytest.mark.parametrize("size", [1e4, 1e30])
 @pytest.mark.parametrize("count", [2, 3])
-def test_certain_predictions_reach_both_ends(size, count):
+def test_certain_predictions_give_the_lowest_or_highest_score(size, count):
     logits = torch.zeros(5, count)
     logits[:, 1] = size
     most = 1.0 if count == 2 else 2.0
-    assert measured(logits, [1] * 5) == {"brier": 0.0, "brier_sem": 0.0}
-    assert measured(logits, [0] * 5) == {"brier": most, "brier_sem": 0.0}
+    assert compute_metric(logits, [1] * 5) == {"brier": 0.0, "brier_sem": 0.0}
+    assert compute_metric(logits, [0] * 5) == {"brier": most, "brier_sem": 0.0}
 
 
-def test_a_mixture_is_judged_by_averaged_probabilities():
-    # two certain members that disagree are one half, not one or the other
+def test_a_mixture_is_evaluated_with_averaged_probabilities():
+    # two certain members that disagree give a probability of one half
     logits = torch.tensor([[[1e4, 0.0], [0.0, 1e4]]])
     metric = Brier(classes(2))
     metric.update(
@@ -75,14 +75,16 @@ def test_a_mixture_is_judged_by_averaged_probabilities():
     assert metric.compute()["brier"].item() == pytest.approx(0.25, abs=1e-7)
 
 
-def test_nothing_seen_is_nan():
-    assert all(math.isnan(value) for value in measured(torch.zeros(0, 3), np.zeros(0, dtype=int)).values())
+def test_no_samples_give_nan():
+    assert all(
+        math.isnan(value) for value in compute_metric(torch.zeros(0, 3), np.zeros(0, dtype=int)).values()
+    )
 
 
-def test_nan_labels_and_targets_that_cannot_be_judged_are_named():
+def test_nan_wrong_labels_and_wrong_targets_raise_a_clear_message():
     with pytest.raises(UserError, match="2 of 2 predicted distributions over classes"):
-        measured(torch.full((2, 2), torch.nan), [0, 1])
+        compute_metric(torch.full((2, 2), torch.nan), [0, 1])
     with pytest.raises(DataError, match="row 0 is 3, but class indices go from 0 to 2"):
-        measured(torch.zeros(1, 3), [3])
+        compute_metric(torch.zeros(1, 3), [3])
     with pytest.raises(ConfigError, match="metric brier describes targets of kind 'class'"):
         Brier(Target("real", ("x",)))

@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 NEAR = 2.0**-20
-"""Difference of confidences that count as equal where bins are chosen.
+"""Largest difference of confidences that count as equal for the choice of bins.
 
-The same probability in float32 differs by a few times 2^-24 from one device to another.
+The same probability in float32 may differ by a few times 2^-24 between devices.
 """
 
 
@@ -29,26 +29,24 @@ class CalibrationError(Metric, HasFigure):
     """Difference between confidence and the share of right predictions in bins of confidence (thesis eq. 2.28-2.31).
 
     - `ece`: expected calibration error in bins of equal width.
-    - `ece_positive`: for two classes, the error in bins of equal width of p(y = 1) against y = 1, whatever
-      `probability` is. This is eq. 2.28-2.29 to the letter: a class predicted with probability 0.9 and one with 0.1 do
-      not share a bin.
-    - `ece_equal_mass`: error in bins of equally many samples; confidences within 2^-20 of each other share a bin,
-      whatever their order.
-    - `mce`: the largest gap of a bin of equal width that is not empty.
-    - `squared_ce_debiased`: the squared calibration error in bins of equal mass, less the part that chance adds to it;
-      the result may be negative. Bins of one sample do not allow the correction and are left out; NaN where all are
-      left out.
-    - `ece_debiased`: its root, 0 where it is negative.
+    - `ece_positive`: only for two classes, the error of p(y = 1) against y = 1 in bins of equal width, independent of
+      `probability`. This is exactly eq. 2.28-2.29: predictions of p(y = 1) = 0.9 and 0.1 do not share a bin.
+    - `ece_equal_mass`: error in bins with equal numbers of samples; confidences within 2^-20 of each other share a bin.
+    - `mce`: the largest difference in a nonempty bin of equal width.
+    - `squared_ce_debiased`: the squared calibration error in bins of equal mass, minus the part that chance adds; the
+      result may be negative. Bins with one sample are left out, because they do not allow this correction; the result
+      is NaN if all bins are left out.
+    - `ece_debiased`: root of `squared_ce_debiased`, or 0 if that is negative.
 
-    Each is NaN where nothing was seen. A confidence of 1, which the half-open intervals of eq. 2.28 would leave out,
-    belongs to the last bin. A confidence that misses the lower edge of a bin by 2^-21 or less belongs to that bin.
-    These rules only choose the bins: the sums are of the unchanged confidences.
+    A result is NaN if there was no sample. A confidence of 1, which the half-open intervals of eq. 2.28 would leave
+    out, belongs to the last bin. A confidence that misses the lower edge of a bin by 2^-21 or less belongs to this bin.
+    These rules affect only the choice of bins: the sums use the unchanged confidences.
 
     Args:
         bins: number of bins, L of eq. 2.31, for both kinds of bins.
-        probability: the probability that is binned. "predicted" is the largest class probability, compared with whether
-            that class is right, the first of equally likely ones (Guo et al. 2017). "positive" is p(y = 1) of two
-            classes, compared with y = 1, as in eq. 2.28-2.29.
+        probability: probability that serves as the confidence. "predicted" is the largest class probability (of equally
+            likely classes, the first), compared with whether that class is right (Guo et al. 2017). "positive" is
+            p(y = 1) of two classes, compared with y = 1, as in eq. 2.28-2.29.
 
     Raises:
         ConfigError: the target is not a class, or `probability` is "positive" and there are more than two classes.
@@ -56,19 +54,7 @@ class CalibrationError(Metric, HasFigure):
         DataError: a label is not a class of the data set.
     """
 
-    bibtex = """@inproceedings{guo2017calibration,
-  author    = {Guo, Chuan and Pleiss, Geoff and Sun, Yu and Weinberger, Kilian Q.},
-  title     = {On Calibration of Modern Neural Networks},
-  booktitle = {International Conference on Machine Learning},
-  pages     = {1321--1330},
-  year      = {2017}
-}
-@inproceedings{kumar2019verified,
-  author    = {Kumar, Ananya and Liang, Percy and Ma, Tengyu},
-  title     = {Verified Uncertainty Calibration},
-  booktitle = {Advances in Neural Information Processing Systems},
-  year      = {2019}
-}"""
+    bibtex = "guo2017calibration, kumar2019verified"
     columns: ClassVar[dict[str, str]] = {"ece": "ECE", "ece_equal_mass": "ECE (equal mass)"}
     better: ClassVar[dict[str, Literal["higher", "lower"]]] = {"ece": "lower", "ece_equal_mass": "lower"}
     figure_name = "reliability"
@@ -85,12 +71,12 @@ class CalibrationError(Metric, HasFigure):
         target.require("class", by="metric calibration_error")
         if probability == "positive" and len(target.names) != 2:
             raise ConfigError(
-                "metric calibration_error with probability=positive reads p(y = 1) of two classes; this data set has "
+                "metric calibration_error with probability=positive requires two classes, but this data set has "
                 f"{len(target.names)}: {target.listed_names}. Choose probability=predicted."
             )
         self.names = target.names
-        self.two = len(target.names) == 2
-        if self.two:
+        self.two_classes = len(target.names) == 2
+        if self.two_classes:
             self.columns = {  # pyright: ignore[reportAttributeAccessIssue]  # of two classes alone
                 "ece": "ECE",
                 "ece_positive": f"ECE of p({target.names[1]})",
@@ -99,7 +85,7 @@ class CalibrationError(Metric, HasFigure):
             self.better = dict.fromkeys(self.columns, "lower")  # pyright: ignore[reportAttributeAccessIssue]
         self.bins = bins
         self.positive = probability == "positive"
-        # (confidence, right) of each sample, for two classes also (p(y = 1), y): bins of equal mass need all samples
+        # (confidence, right) of each sample, for two classes also (p(y = 1), y); bins of equal mass require all samples
         self.add_state("samples", [], dist_reduce_fx="cat")
 
     def update(self, prediction: Prediction) -> None:
@@ -111,17 +97,21 @@ class CalibrationError(Metric, HasFigure):
             confidence, predicted = probability.max(-1)
             right = predicted == label
         assert isinstance(self.samples, list)
-        positive = [probability[:, 1], (label == 1).double()] if self.two else []
+        positive = [probability[:, 1], (label == 1).double()] if self.two_classes else []
         self.samples.append(torch.stack([confidence, right.double(), *positive], -1))
 
     def compute(self) -> dict[str, Tensor]:
-        confidence, right = self._seen()
-        width = self._of_equal_width(confidence, right)
-        mass = in_bins(confidence, right, equal_mass(confidence, self.bins), self.bins)
+        confidence, right = self._collect_samples()
+        width = self._equal_width_bins(confidence, right)
+        mass = sum_by_bin(confidence, right, equal_mass(confidence, self.bins), self.bins)
         squared = squared_error_debiased(mass)
         return {
             "ece": expected_error(width),
-            **({"ece_positive": expected_error(self._of_equal_width(*self._seen(2)))} if self.two else {}),
+            **(
+                {"ece_positive": expected_error(self._equal_width_bins(*self._collect_samples(2)))}
+                if self.two_classes
+                else {}
+            ),
             "ece_equal_mass": expected_error(mass),
             "mce": largest_error(width),
             "ece_debiased": squared.clamp(min=0).sqrt(),
@@ -131,8 +121,8 @@ class CalibrationError(Metric, HasFigure):
     def figure(self, title: str, *, synthetic: bool) -> "Figure":
         from plugins.metric.calibration_error.picture import reliability
 
-        confidence, right = self._seen()
-        bins = self._of_equal_width(confidence, right)
+        confidence, right = self._collect_samples()
+        bins = self._equal_width_bins(confidence, right)
         return reliability(
             bins.count.cpu().numpy(),
             bins.confidence.cpu().numpy(),
@@ -145,13 +135,13 @@ class CalibrationError(Metric, HasFigure):
             least=0.0 if self.positive or len(self.names) < 2 else 1 / len(self.names),
         )
 
-    def _of_equal_width(self, confidence: Tensor, right: Tensor) -> "Bins":
-        return in_bins(confidence, right, equal_width(confidence, self.bins), self.bins)
+    def _equal_width_bins(self, confidence: Tensor, right: Tensor) -> "Bins":
+        return sum_by_bin(confidence, right, equal_width(confidence, self.bins), self.bins)
 
-    def _seen(self, first: int = 0) -> tuple[Float64[Tensor, "sample"], Float64[Tensor, "sample"]]:
-        """Return the confidences in ascending order, and which are right.
+    def _collect_samples(self, first: int = 0) -> tuple[Float64[Tensor, "sample"], Float64[Tensor, "sample"]]:
+        """Return the confidences in ascending order, and whether each prediction is right (0 or 1).
 
-        The order makes sums independent of the order in which samples came.
+        Sorting makes sums independent of the order of the samples. `first` is the column of the confidences.
         """
         samples = dim_zero_cat(self.samples) if len(self.samples) else torch.zeros(0, 4, dtype=torch.float64)
         confidence, order = samples[:, first].contiguous().sort()
@@ -160,59 +150,65 @@ class CalibrationError(Metric, HasFigure):
 
 @dataclass(frozen=True)
 class Bins:
-    """Number of samples of each bin (|B_l|), the sum of their confidences, and the number that are right; float64."""
+    """Sums over the samples of each bin, float64.
+
+    Attributes:
+        count: number of samples, |B_l|.
+        confidence: sum of the confidences.
+        right: number of right predictions.
+    """
 
     count: Float64[Tensor, "bin"]
     confidence: Float64[Tensor, "bin"]
     right: Float64[Tensor, "bin"]
 
     @property
-    def seen(self) -> "Bins":
+    def nonempty(self) -> "Bins":
         """Bins that are not empty."""
         return self.with_at_least(1)
 
     def with_at_least(self, samples: int) -> "Bins":
         """Return the bins that have at least the given number of samples."""
-        kept = self.count >= samples
-        return Bins(self.count[kept], self.confidence[kept], self.right[kept])
+        large_enough = self.count >= samples
+        return Bins(self.count[large_enough], self.confidence[large_enough], self.right[large_enough])
 
 
 def equal_width(confidence: Float64[Tensor, "sample"], bins: int) -> Int[Tensor, "sample"]:
-    """Return bin l - 1 where (l - 1)/L ≤ confidence < l/L (eq. 2.28), edges lowered by NEAR/2; the last bin for 1."""
+    """Return index l - 1 of the bin (l - 1)/L ≤ confidence < l/L (eq. 2.28), with edges lowered by NEAR/2.
+
+    A confidence of 1 belongs to the last bin.
+    """
     edges = torch.arange(1, bins, dtype=torch.float64, device=confidence.device) / bins
     return torch.bucketize(confidence, edges - NEAR / 2, right=True)
 
 
 def equal_mass(confidence: Float64[Tensor, "sample"], bins: int) -> Int[Tensor, "sample"]:
-    """Return the bin of each sample, with sample counts as equal as possible (Nguyen & O'Connor 2015).
+    """Return the index of the bin of each sample, with sample counts as equal as possible (Nguyen & O'Connor 2015).
 
-    Confidences of one group of `least_of_near` stay together.
-
-    With n samples in order of confidence, the sample of rank r = 0, 1, ... belongs to bin ⌊L (r + ½) / n⌋, and equal
-    samples belong to the bin of their middle.
+    With n samples in order of confidence, the sample of rank r = 0, 1, ... belongs to bin ⌊L (r + ½) / n⌋. Confidences
+    that `group_near_confidences` puts into one group all belong to the bin of their middle rank.
 
     Args:
         confidence: confidences in any order.
         bins: number of bins L.
     """
-    confidence = least_of_near(confidence)
+    confidence = group_near_confidences(confidence)
     ordered = confidence.sort().values
     first = torch.searchsorted(ordered, confidence)
     after = torch.searchsorted(ordered, confidence, right=True)
-    # the middle rank r is (first + after - 1) / 2, and r + ½ is (first + after) / 2: integers avoid rounding
+    # the middle rank is r = (first + after - 1) / 2, so r + ½ = (first + after) / 2; integers avoid rounding
     return bins * (first + after) // (2 * max(1, len(confidence)))
 
 
-def least_of_near(confidence: Float64[Tensor, "sample"]) -> Float64[Tensor, "sample"]:
-    """Return, for each sample, the least confidence of its group.
+def group_near_confidences(confidence: Float64[Tensor, "sample"]) -> Float64[Tensor, "sample"]:
+    """Return, for each sample, the smallest confidence of its group.
 
-    Groups are formed from below: a group is the least confidence that is in no group yet, with all confidences up to
-    NEAR above it. Rounding to a grid instead would separate equal confidences that lie near the middle between two grid
-    points.
+    Groups are formed from below: a group consists of the smallest confidence that has no group yet, and of all
+    confidences up to NEAR above it. Rounding to a grid instead could separate nearly equal confidences.
     """
     ordered, order = confidence.sort()
     count = len(ordered)
-    # `end` is where a group that began at each place would end; groups begin where jumps from the first one lead
+    # end[i] is the end of a group that begins at i; following `end` from 0 gives the beginnings of all groups
     end = torch.searchsorted(ordered, ordered + NEAR, right=True)
     end = torch.cat([end, end.new_full((1,), count)])
     begins = torch.zeros_like(end, dtype=torch.bool)
@@ -226,13 +222,13 @@ def least_of_near(confidence: Float64[Tensor, "sample"]) -> Float64[Tensor, "sam
     return torch.empty_like(confidence).scatter_(0, order, least)
 
 
-def in_bins(
+def sum_by_bin(
     confidence: Float64[Tensor, "sample"],
     right: Float64[Tensor, "sample"],
     index: Int[Tensor, "sample"],
     bins: int,
 ) -> Bins:
-    """Return counts and sums by bin, where `index` is the bin of each sample."""
+    """Return counts and sums for each bin; `index` is the bin of each sample."""
     columns = torch.stack([torch.ones_like(right), confidence, right], -1)
     return Bins(*columns.new_zeros(bins, 3).index_add_(0, index, columns).unbind(-1))
 
@@ -246,18 +242,18 @@ def expected_error(bins: Bins) -> Float64[Tensor, ""]:
 
 
 def largest_error(bins: Bins) -> Float64[Tensor, ""]:
-    """Return max_l |conf(B_l) - acc(B_l)| over bins with samples (Guo et al. 2017, eq. 5); NaN without samples."""
-    seen = bins.seen
-    gaps = (seen.confidence - seen.right).abs() / seen.count
+    """Return max_l |conf(B_l) - acc(B_l)| over nonempty bins (Guo et al. 2017, eq. 5); NaN without samples."""
+    nonempty = bins.nonempty
+    gaps = (nonempty.confidence - nonempty.right).abs() / nonempty.count
     return gaps.max() if len(gaps) else gaps.new_tensor(torch.nan)
 
 
 def squared_error_debiased(bins: Bins) -> Float64[Tensor, ""]:
-    """Return Σ_l |B_l|/Q [(conf - acc)² - acc (1 - acc) / (|B_l| - 1)], over bins of two samples or more.
+    """Return Σ_l |B_l|/Q [(conf - acc)² - acc (1 - acc) / (|B_l| - 1)], over bins of at least two samples.
 
-    This is the plug-in squared error less an unbiased estimate of the variance of acc, which it contains (Bröcker 2012;
-    Kumar et al. 2019, §5). It is unbiased where the confidences of a bin are equal; where they differ, it is too low by
-    about their variance over |B_l|.
+    This is the squared error minus an unbiased estimate of the variance of acc, which the squared error contains
+    (Bröcker 2012; Kumar et al. 2019, §5). The result is unbiased if the confidences within a bin are equal. If they
+    differ, it is too low by about their variance over |B_l|.
     """
     several = bins.with_at_least(2)
     confidence, right = several.confidence / several.count, several.right / several.count

@@ -9,7 +9,7 @@ from framework.figures.style import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, titl
 
 Numbers = Float[np.ndarray, "bin"]
 QUANTILE = 1.959963984540054
-"""Quantile of the standard normal at 97.5 %; bars of this many standard errors hold 95 %."""
+"""97.5 % quantile of the standard normal distribution."""
 
 
 def reliability(
@@ -23,17 +23,19 @@ def reliability(
     synthetic: bool,
     least: float = 0.0,
 ) -> Figure:
-    """Return a figure with the histogram of confidences above and the reliability curve below; empty bins stay blank.
+    """Return a figure with the histogram of confidences above and the reliability curve below.
+
+    Empty bins stay blank.
 
     Args:
         count: number of samples of each bin of equal width.
         confidence: sum of the confidences of each bin.
-        right: number of right samples of each bin.
-        confidence_label: name of the axis of confidence.
-        accuracy_label: name of the axis of the share that is right.
+        right: number of right predictions of each bin.
+        confidence_label: label of the confidence axis.
+        accuracy_label: label of the axis of the share of right predictions.
         title: title of the figure.
-        synthetic: whether the data are synthetic, which the figure then says.
-        least: the lowest confidence that is possible, where the axis begins.
+        synthetic: whether the data are synthetic; the title then says so.
+        least: lowest possible confidence, at which the axis begins.
     """
     figure = titled_figure((5.8, 7.6), title, synthetic)
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(2, 5))
@@ -46,9 +48,7 @@ def reliability(
         axes.set_axisbelow(True)
         axes.spines[["top", "right"]].set_visible(False)
     if count.sum() == 0:
-        below.text(
-            0.5, 0.5, "no sample seen", transform=below.transAxes, ha="center", va="center", color=GREY
-        )
+        below.text(0.5, 0.5, "no samples", transform=below.transAxes, ha="center", va="center", color=GREY)
         return figure
     _histogram(above, count, confidence.sum(), right.sum(), accuracy_label)
     _curve(below, count, confidence, right)
@@ -66,37 +66,37 @@ def _histogram(axes: Axes, count: Numbers, confidence: float, right: float, accu
         f"mean confidence {confidence / total:.3f}": (confidence / total, RED, "--"),
         f"{accuracy_label} {right / total:.3f}": (right / total, GREEN, "-"),
     }
-    for label, (place, colour, style) in lines.items():
-        # without clipping, a line at 0 or 1 is drawn in full width
-        axes.axvline(place, color=colour, linestyle=style, linewidth=1.8, label=label, clip_on=False)
+    for label, (position, colour, style) in lines.items():
+        # without clipping, a line at 0 or 1 keeps its full width
+        axes.axvline(position, color=colour, linestyle=style, linewidth=1.8, label=label, clip_on=False)
     legend = axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=2, fontsize=8, frameon=False)
     for text in legend.get_texts():
         text.set_parse_math(False)
 
 
 def _curve(axes: Axes, count: Numbers, confidence: Numbers, right: Numbers) -> None:
-    seen = count > 0
+    nonempty = count > 0
     width = 1 / len(count)
-    left = (np.arange(len(count)) * width)[seen]
-    number = count[seen]
-    stated, found = confidence[seen] / number, right[seen] / number
-    lower = np.minimum(stated, found)
+    left = (np.arange(len(count)) * width)[nonempty]
+    number = count[nonempty]
+    stated, accuracy = confidence[nonempty] / number, right[nonempty] / number
+    lower = np.minimum(stated, accuracy)
     axes.bar(left, lower, width, align="edge", color=BLUE, alpha=0.6, edgecolor="white")
     for label, gap, colour in (
-        ("gap: stated above what was found", stated - found, ORANGE),
-        ("gap: stated below what was found", found - stated, PURPLE),
+        ("gap: confidence above accuracy", stated - accuracy, ORANGE),
+        ("gap: confidence below accuracy", accuracy - stated, PURPLE),
     ):
         style = {"align": "edge", "color": colour, "alpha": 0.45, "edgecolor": "white", "hatch": "///"}
         axes.bar(left, np.maximum(gap, 0), width, lower, label=label, **style)
-    low, high = wilson(right[seen], number)
-    # put the marker at the mean confidence of the bin, so that a calibrated bin touches the diagonal
+    low, high = wilson(right[nonempty], number)
+    # markers stand at the mean confidence of the bin, so that a calibrated bin lies on the diagonal
     bars = {"linestyle": "", "marker": "o", "markersize": 3.5, "color": "black", "capsize": 2.5}
     axes.errorbar(
         stated,
-        found,
-        [np.maximum(found - low, 0), np.maximum(high - found, 0)],
+        accuracy,
+        [np.maximum(accuracy - low, 0), np.maximum(high - accuracy, 0)],
         elinewidth=1,
-        label="found, with its 95 % interval",
+        label="accuracy, with 95 % interval",
         clip_on=False,
         **bars,
     )
@@ -108,7 +108,7 @@ def _curve(axes: Axes, count: Numbers, confidence: Numbers, right: Numbers) -> N
 
 
 def wilson(right: Numbers, count: Numbers) -> tuple[Numbers, Numbers]:
-    """Return the ends of the 95 % score interval of a share (Wilson 1927), also for none or all of few samples."""
+    """Return both ends of the 95 % score interval of a share (Wilson 1927), also valid for shares of 0 and 1."""
     share, spread = right / count, QUANTILE**2 / count
     centre = (share + spread / 2) / (1 + spread)
     half = np.sqrt(spread * (share * (1 - share) + spread / 4)) / (1 + spread)

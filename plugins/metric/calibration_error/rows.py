@@ -1,4 +1,4 @@
-"""Rows of the contract: confidence in the predicted class, and in the positive class."""
+"""Contract-test cases: confidence in the predicted class, and in the positive class."""
 
 from framework.target import Target
 from framework.testing.rows import MetricRow
@@ -6,7 +6,8 @@ from framework.testing.rows import MetricRow
 TWO = Target("class", ("off", "on"))
 
 OF_SHARES = {
-    "perfect beats random": "one bin of p(y = 1) compares the shares of the classes, which both have right"
+    "perfect beats random": "a single bin of p(y = 1) compares only class frequencies, which both predictions have "
+    "right"
 }
 ROWS = {
     "calibration_error": (

@@ -24,19 +24,19 @@ from plugins.metric.calibration_error.picture import reliability, wilson
 TWO = Target("class", ("off", "on"))
 
 
-def predicted(probability, label, dtype=torch.float64):
+def make_prediction(probability, label, dtype=torch.float64):
     """Return a batch with these class probabilities."""
     logits = torch.as_tensor(np.asarray(probability), dtype=dtype).log()
     return Prediction(Categorical(logits=logits, validate_args=False), {"target": torch.as_tensor(label)})
 
 
-def positive(probability):
-    """Return both classes' probabilities from the second one's."""
+def with_complement(probability):
+    """Return the probabilities of both classes from that of the second class."""
     probability = np.asarray(probability, dtype=float)
     return np.stack([1 - probability, probability], -1)
 
 
-def measured(*batches, target=TWO, **config):
+def compute_metric(*batches, target=TWO, **config):
     metric = build("metric", resolve("metric", {"name": "calibration_error", **config}), target=target)
     for batch in batches:
         metric.update(batch)
@@ -44,10 +44,11 @@ def measured(*batches, target=TWO, **config):
 
 
 def loop_width(confidence, right, bins):
-    """Return [(count, mean confidence, accuracy)] of the bins of eq. 2.28, with edges slightly lower and the last one
-    closed.
+    """Return [(count, mean confidence, accuracy)] for the bins of eq. 2.28.
+
+    The edges are slightly lowered, and the last bin is closed.
     """
-    found = []
+    bins_with_samples = []
     for number in range(bins):
         last = number == bins - 1
         inside = [
@@ -56,13 +57,16 @@ def loop_width(confidence, right, bins):
             if (number == 0 or number / bins - NEAR / 2 <= c) and (last or c < (number + 1) / bins - NEAR / 2)
         ]
         if inside:
-            found.append((len(inside), np.mean([c for c, _ in inside]), np.mean([r for _, r in inside])))
-    return found
+            bins_with_samples.append(
+                (len(inside), np.mean([c for c, _ in inside]), np.mean([r for _, r in inside]))
+            )
+    return bins_with_samples
 
 
 def loop_mass(confidence, right, bins):
-    """Return [(count, mean confidence, accuracy)] of bins of equal mass; a group of near confidences goes to its
-    middle's bin.
+    """Return [(count, mean confidence, accuracy)] for bins of equal mass.
+
+    A group of nearly equal confidences belongs to the bin of its middle rank.
     """
     groups = []
     for pair in sorted(zip(confidence, right, strict=True)):
@@ -78,47 +82,52 @@ def loop_mass(confidence, right, bins):
     return [(len(p), np.mean([c for c, _ in p]), np.mean([r for _, r in p])) for p in inside if p]
 
 
-def expected(found):
-    total = sum(count for count, *_ in found)
-    return sum(count / total * abs(confidence - accuracy) for count, confidence, accuracy in found)
+def expected_error(bins):
+    total = sum(count for count, *_ in bins)
+    return sum(count / total * abs(confidence - accuracy) for count, confidence, accuracy in bins)
 
 
-def debiased(found):
-    several = [row for row in found if row[0] > 1]
+def debiased_error(bins):
+    several = [row for row in bins if row[0] > 1]
     total = sum(count for count, *_ in several)
     if not several:
         return math.nan
     return sum(n / total * ((c - a) ** 2 - a * (1 - a) / (n - 1)) for n, c, a in several)
 
 
-def agree(found, confidence, right, bins, tolerance):
+def check_results(actual, confidence, right, bins, tolerance):
     width, mass = loop_width(confidence, right, bins), loop_mass(confidence, right, bins)
-    assert found["ece"] == pytest.approx(expected(width), abs=tolerance)
-    assert found["ece_equal_mass"] == pytest.approx(expected(mass), abs=tolerance)
-    assert found["mce"] == pytest.approx(max(abs(c - a) for _, c, a in width), abs=tolerance)
-    squared = debiased(mass)
-    assert found["squared_ce_debiased"] == pytest.approx(squared, abs=tolerance, nan_ok=True)
-    root = math.nan if math.isnan(squared) else math.sqrt(max(0, found["squared_ce_debiased"]))
-    assert found["ece_debiased"] == pytest.approx(root, abs=1e-12, nan_ok=True)
+    assert actual["ece"] == pytest.approx(expected_error(width), abs=tolerance)
+    assert actual["ece_equal_mass"] == pytest.approx(expected_error(mass), abs=tolerance)
+    assert actual["mce"] == pytest.approx(max(abs(c - a) for _, c, a in width), abs=tolerance)
+    squared = debiased_error(mass)
+    assert actual["squared_ce_debiased"] == pytest.approx(squared, abs=tolerance, nan_ok=True)
+    root = math.nan if math.isnan(squared) else math.sqrt(max(0, actual["squared_ce_debiased"]))
+    assert actual["ece_debiased"] == pytest.approx(root, abs=1e-12, nan_ok=True)
 
 
 @settings(deadline=None, max_examples=150)
 @given(st.data(), st.integers(1, 40), st.integers(1, 20))
 def test_positive_agrees_with_loops(data, samples, bins):
-    # edges of bins, both ends, ties and anything between
+    # edges of bins, 0 and 1, ties, and any other values
     number = st.integers(0, bins).map(lambda k: k / bins) | st.sampled_from([0.0, 0.5, 1.0]) | st.floats(0, 1)
     probability = np.array(data.draw(st.lists(number, min_size=samples, max_size=samples)))
     label = np.array(data.draw(st.lists(st.integers(0, 1), min_size=samples, max_size=samples)))
     cut = data.draw(st.integers(0, samples))
-    batch = [predicted(positive(probability[part]), label[part]) for part in (slice(cut), slice(cut, None))]
-    found = measured(*batch, bins=bins, probability="positive")
-    # what the density gives back: log and exp move a number off the edge of a bin by one rounding
-    seen = class_probabilities(predicted(positive(probability), label).density)[:, 1]
-    np.testing.assert_allclose(seen, probability, atol=1e-15)
-    agree(found, seen.tolist(), label.tolist(), bins, 1e-12)
-    assert found["ece_positive"] == found["ece"]
-    other = measured(*batch, bins=bins)
-    assert other["ece_positive"] == found["ece"], "eq. 2.28-2.29, whatever else is binned"
+    batch = [
+        make_prediction(with_complement(probability[part]), label[part])
+        for part in (slice(cut), slice(cut, None))
+    ]
+    actual = compute_metric(*batch, bins=bins, probability="positive")
+    # log and exp in the density may move a probability off the edge of a bin
+    probability_of_second = class_probabilities(make_prediction(with_complement(probability), label).density)[
+        :, 1
+    ]
+    np.testing.assert_allclose(probability_of_second, probability, atol=1e-15)
+    check_results(actual, probability_of_second.tolist(), label.tolist(), bins, 1e-12)
+    assert actual["ece_positive"] == actual["ece"]
+    other = compute_metric(*batch, bins=bins)
+    assert other["ece_positive"] == actual["ece"], "eq. 2.28-2.29, whatever else is binned"
 
 
 @settings(deadline=None, max_examples=100)
@@ -130,12 +139,12 @@ def test_predicted_agrees_with_loops(data, count, samples, dtype):
     label = data.draw(st.lists(st.integers(0, count - 1), min_size=samples, max_size=samples))
     target = Target("class", tuple(str(k) for k in range(count)))
     density = Categorical(logits=logits.log_softmax(-1), validate_args=False)
-    found = measured(Prediction(density, {"target": torch.tensor(label)}), target=target, bins=7)
+    actual = compute_metric(Prediction(density, {"target": torch.tensor(label)}), target=target, bins=7)
     probability = class_probabilities(density).numpy()
     np.testing.assert_allclose(probability, special.softmax(logits.double().numpy(), -1), atol=1e-6)
-    right = probability.argmax(-1) == np.array(label)  # NumPy's first of equally likely ones
-    agree(found, probability.max(-1).tolist(), right.tolist(), 7, 1e-12)
-    assert ("ece_positive" in found) == (count == 2)
+    right = probability.argmax(-1) == np.array(label)  # NumPy returns the first of equal values
+    check_results(actual, probability.max(-1).tolist(), right.tolist(), 7, 1e-12)
+    assert ("ece_positive" in actual) == (count == 2)
 
 
 @pytest.mark.parametrize("bins", [*range(1, 31), 100, 1000])
@@ -154,25 +163,34 @@ def test_bins_of_equal_mass_differ_by_one_sample_at_most(bins):
         index = equal_mass(confidence[order], bins)
         sizes = torch.bincount(index, minlength=bins)
         assert sizes.max() - sizes.min() <= 1
-        assert torch.equal(index[order.argsort()], index.sort().values)  # a higher confidence, no lower bin
+        assert torch.equal(
+            index[order.argsort()], index.sort().values
+        )  # a higher confidence never belongs to a lower bin
 
 
 def test_equal_confidences_share_a_bin_in_any_order():
     generator = np.random.default_rng(0)
     probability = generator.choice([0.2, 0.4, 0.4000001, 0.9], 60)
     label = generator.integers(2, size=60)
-    wanted = measured(predicted(positive(probability), label), bins=4, probability="positive")
+    wanted = compute_metric(
+        make_prediction(with_complement(probability), label), bins=4, probability="positive"
+    )
     for seed in range(20):
         order = np.random.default_rng(seed).permutation(60)
-        batches = [predicted(positive(probability[part]), label[part]) for part in np.array_split(order, 7)]
-        assert measured(*batches, bins=4, probability="positive") == pytest.approx(wanted, abs=1e-13)
+        batches = [
+            make_prediction(with_complement(probability[part]), label[part])
+            for part in np.array_split(order, 7)
+        ]
+        assert compute_metric(*batches, bins=4, probability="positive") == pytest.approx(wanted, abs=1e-13)
 
 
 @pytest.mark.parametrize("bins", [1, 7, 10, 15, 100])
 @pytest.mark.parametrize("parts", [2, 10, 100, 125])
-def test_confidences_that_a_device_rounds_otherwise_stay_in_their_bins(parts, bins):
+def test_confidences_stay_in_their_bins_under_device_rounding(parts, bins):
     generator = torch.Generator().manual_seed(parts)
-    share = torch.randint(parts + 1, (3000,), generator=generator) / parts  # votes of trees, float32
+    share = (
+        torch.randint(parts + 1, (3000,), generator=generator) / parts
+    )  # such as shares of votes of trees, float32
     last_digit = torch.randint(-1, 2, share.shape, generator=generator).float()
     near = torch.nextafter(share, share + last_digit).clamp(0, 1).double()
     assert (near != share.double()).any()
@@ -180,22 +198,26 @@ def test_confidences_that_a_device_rounds_otherwise_stay_in_their_bins(parts, bi
         assert torch.equal(choose(near, bins), choose(share.double(), bins))
 
 
-def test_a_model_that_is_right_as_often_as_it_says_has_no_error():
+def test_a_calibrated_model_has_no_error():
     probability = np.repeat([0.25, 0.5, 0.75], 40)
     label = np.concatenate([np.arange(40) < 10, np.arange(40) < 20, np.arange(40) < 30]).astype(int)
-    found = measured(predicted(positive(probability), label), probability="positive", bins=4)
-    assert found["ece"] == pytest.approx(0, abs=1e-15) and found["mce"] == pytest.approx(0, abs=1e-15)
-    assert found["squared_ce_debiased"] < 0 and found["ece_debiased"] == 0
+    actual = compute_metric(
+        make_prediction(with_complement(probability), label), probability="positive", bins=4
+    )
+    assert actual["ece"] == pytest.approx(0, abs=1e-15) and actual["mce"] == pytest.approx(0, abs=1e-15)
+    assert actual["squared_ce_debiased"] < 0 and actual["ece_debiased"] == 0
 
 
-def test_debiased_is_unbiased_over_every_outcome_where_the_plain_one_is_not():
+def test_the_debiased_error_is_unbiased_over_all_outcomes():
     stated, true = np.array([0.3] * 4 + [0.8] * 4), np.array([0.3] * 4 + [0.6] * 4)
     mean = plain = 0.0
     for outcome in itertools.product([0, 1], repeat=8):
         label = np.array(outcome)
         chance = np.where(label == 1, true, 1 - true).prod()
-        found = measured(predicted(positive(stated), label), bins=2, probability="positive")
-        mean += chance * found["squared_ce_debiased"]
+        actual = compute_metric(
+            make_prediction(with_complement(stated), label), bins=2, probability="positive"
+        )
+        mean += chance * actual["squared_ce_debiased"]
         plain += chance * np.mean(
             [
                 (s.mean() - y.mean()) ** 2
@@ -207,39 +229,42 @@ def test_debiased_is_unbiased_over_every_outcome_where_the_plain_one_is_not():
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_certainty_falls_into_the_last_bin(dtype):
+def test_a_confidence_of_one_belongs_to_the_last_bin(dtype):
     logits = torch.tensor([[1e4, -1e4]] * 4, dtype=dtype)
     batch = Prediction(Categorical(logits=logits), {"target": torch.tensor([0, 0, 0, 1])})
-    found = measured(batch)
-    assert found["ece"] == found["ece_equal_mass"] == found["mce"] == 0.25
-    assert found["squared_ce_debiased"] == pytest.approx(0.0625 - 0.75 * 0.25 / 3)
-    found = measured(batch, probability="positive")
-    assert found["ece"] == 0.25
+    actual = compute_metric(batch)
+    assert actual["ece"] == actual["ece_equal_mass"] == actual["mce"] == 0.25
+    assert actual["squared_ce_debiased"] == pytest.approx(0.0625 - 0.75 * 0.25 / 3)
+    actual = compute_metric(batch, probability="positive")
+    assert actual["ece"] == 0.25
 
 
-def test_one_sample_and_none():
-    one = measured(predicted([[0.25, 0.75]], [0]))
-    assert one["ece"] == one["ece_equal_mass"] == one["mce"] == pytest.approx(0.75)
-    assert math.isnan(one["ece_debiased"]) and math.isnan(one["squared_ce_debiased"])
+def test_results_for_one_sample_and_for_none():
+    single_sample = compute_metric(make_prediction([[0.25, 0.75]], [0]))
+    assert (
+        single_sample["ece"] == single_sample["ece_equal_mass"] == single_sample["mce"] == pytest.approx(0.75)
+    )
+    assert math.isnan(single_sample["ece_debiased"]) and math.isnan(single_sample["squared_ce_debiased"])
     assert all(
-        math.isnan(value) for value in measured(predicted(np.zeros((0, 2)), np.zeros(0, int))).values()
+        math.isnan(value)
+        for value in compute_metric(make_prediction(np.zeros((0, 2)), np.zeros(0, int))).values()
     )
 
 
-def test_two_processes_are_the_whole():
+def test_two_processes_give_the_results_of_all_samples():
     generator = np.random.default_rng(0)
-    probability, label = positive(generator.uniform(size=30)), generator.integers(2, size=30)
+    probability, label = with_complement(generator.uniform(size=30)), generator.integers(2, size=30)
     first, second = CalibrationError(TWO), CalibrationError(TWO)
-    first.update(predicted(probability[:11], label[:11]))
-    first.update(predicted(probability[11:15], label[11:15]))
-    second.update(predicted(probability[15:], label[15:]))
+    first.update(make_prediction(probability[:11], label[:11]))
+    first.update(make_prediction(probability[11:15], label[11:15]))
+    second.update(make_prediction(probability[15:], label[15:]))
     first.dist_sync_fn = lambda state, group=None: [state, second.samples[0]]
     first.distributed_available_fn = lambda: True
-    found = {name: value.item() for name, value in first.compute().items()}
-    assert found == pytest.approx(measured(predicted(probability, label)), abs=1e-14)
+    actual = {name: value.item() for name, value in first.compute().items()}
+    assert actual == pytest.approx(compute_metric(make_prediction(probability, label)), abs=1e-14)
 
 
-def test_what_cannot_be_judged_is_refused():
+def test_unsuitable_targets_and_settings_raise_an_error():
     with pytest.raises(ConfigError, match=r"has 3: a, b, c\. Choose probability=predicted"):
         CalibrationError(Target("class", ("a", "b", "c")), probability="positive")
     with pytest.raises(ConfigError, match="metric calibration_error describes targets of kind 'class'"):
@@ -247,19 +272,19 @@ def test_what_cannot_be_judged_is_refused():
     with pytest.raises(ConfigError, match="bins = 0"):
         resolve("metric", {"name": "calibration_error", "bins": 0})
     with pytest.raises(UserError, match="1 of 1 predicted distributions over classes"):
-        measured(predicted([[np.nan, 0.5]], [0]))
+        compute_metric(make_prediction([[np.nan, 0.5]], [0]))
     with pytest.raises(DataError, match="row 0 is 2"):
-        measured(predicted([[0.5, 0.5]], [2]))
+        compute_metric(make_prediction([[0.5, 0.5]], [2]))
 
 
 def bars(axes):
     return [patch for patch in axes.patches if isinstance(patch, Rectangle) and patch.get_height() > 0]
 
 
-def test_the_picture_shows_what_was_seen():
+def test_the_figure_shows_the_samples():
     metric = CalibrationError(TWO, bins=10)
-    # 30 at 0.62 of which 12 are right, 10 at 0.98 all right
-    metric.update(predicted([[0.38, 0.62]] * 30 + [[0.98, 0.02]] * 10, [1] * 12 + [0] * 28))
+    # 30 samples at 0.62, 12 of them right; 10 samples at 0.98, all right
+    metric.update(make_prediction([[0.38, 0.62]] * 30 + [[0.98, 0.02]] * 10, [1] * 12 + [0] * 28))
     assert isinstance(metric, HasFigure)
     figure = metric.figure("moons/$nothing$", synthetic=True)
     figure.draw_without_rendering()
@@ -269,18 +294,20 @@ def test_the_picture_shows_what_was_seen():
     assert shown == [(0.6, 0.75), (0.9, 0.25)]
     labels = [text.get_text() for text in above.get_legend().get_texts()]
     assert labels == ["mean confidence 0.710", "accuracy 0.550"]
-    found = sorted((round(bar.get_x(), 9), round(bar.get_y(), 9), bar.get_height()) for bar in bars(below))
-    # up to the lower of accuracy and confidence, and the gap on it
-    assert [(x, y) for x, y, _ in found] == [(0.6, 0.0), (0.6, 0.4), (0.9, 0.0), (0.9, 0.98)]
-    assert [height for *_, height in found] == pytest.approx([0.4, 0.22, 0.98, 0.02])
+    actual = sorted((round(bar.get_x(), 9), round(bar.get_y(), 9), bar.get_height()) for bar in bars(below))
+    # a bar up to the lower of accuracy and confidence, and the gap on top of it
+    assert [(x, y) for x, y, _ in actual] == [(0.6, 0.0), (0.6, 0.4), (0.9, 0.0), (0.9, 0.98)]
+    assert [height for *_, height in actual] == pytest.approx([0.4, 0.22, 0.98, 0.02])
     assert "ECE 0.170 in 10 bins\n40 samples" in [text.get_text() for text in below.texts]
     assert below.get_xlabel() == "confidence in the predicted class"
-    assert above.get_xlim() == below.get_xlim() == (0.5, 1.0)  # of two classes none is predicted with less
+    assert (
+        above.get_xlim() == below.get_xlim() == (0.5, 1.0)
+    )  # the confidence for two classes is at least 0.5
 
 
-def test_the_picture_of_the_positive_class_names_it():
+def test_the_figure_of_the_positive_class_names_it():
     metric = CalibrationError(Target("class", ("off", "on_$")), probability="positive")
-    metric.update(predicted([[0.3, 0.7]], [1]))
+    metric.update(make_prediction([[0.3, 0.7]], [1]))
     figure = metric.figure("real", synthetic=False)
     figure.draw_without_rendering()
     assert (figure.axes[1].get_xlabel(), figure.axes[1].get_ylabel()) == ("p(on_$)", "share of on_$")
@@ -288,14 +315,14 @@ def test_the_picture_of_the_positive_class_names_it():
     assert figure.get_suptitle() == "real"
 
 
-def test_the_picture_of_nothing_says_so():
+def test_the_figure_without_samples_says_so():
     figure = CalibrationError(TWO).figure("empty", synthetic=False)
     figure.draw_without_rendering()
-    assert [text.get_text() for text in figure.axes[1].texts] == ["no sample seen"]
+    assert [text.get_text() for text in figure.axes[1].texts] == ["no samples"]
     assert not bars(figure.axes[0])
 
 
-def test_every_bin_full_or_none_right_can_be_drawn():
+def test_full_bins_and_bins_without_right_predictions_can_be_drawn():
     count = np.full(15, 3.0)
     for right in (np.zeros(15), count):
         figure = reliability(
@@ -306,7 +333,7 @@ def test_every_bin_full_or_none_right_can_be_drawn():
 
 
 @pytest.mark.parametrize("right, count", [(0, 1), (1, 1), (3, 7), (40, 40), (0, 1000), (123, 4567)])
-def test_wilson_is_scipys(right, count):
+def test_wilson_intervals_equal_scipys(right, count):
     low, high = wilson(np.array([float(right)]), np.array([float(count)]))
     wanted = binomtest(right, count).proportion_ci(0.95, "wilson")
     assert low[0] == pytest.approx(wanted.low, abs=1e-12)

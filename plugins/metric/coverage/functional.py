@@ -1,4 +1,4 @@
-"""Highest-density region with the target on its border, and size of the highest-density region of a given mass."""
+"""Mass of the highest-density region that ends at the target, and size of the region of a given mass."""
 
 import math
 from collections.abc import Callable
@@ -15,24 +15,25 @@ from framework.distributions.class_probabilities import class_probabilities, req
 from framework.distributions.protocol import mahalanobis, normals
 
 EQUAL = {torch.float32: 1e-6, torch.float64: 1e-12}
-"""Relative difference below which densities count as equal, by number type; rounding must not decide on a plateau."""
+"""Relative difference below which densities count as equal, by number type, so that rounding decides no tie."""
 FINER = 8
-"""Number of angles on which regions are cut out, per angle at which the density is evaluated."""
+"""Number of grid points for regions, per point at which the density is evaluated."""
 BLOCK = 2**18
-"""Number of angles that are processed at once: large enough to make calls cheap, small enough for a cache."""
+"""Number of angles that are processed at once: enough to make calls cheap, few enough for the processor's cache."""
 HALVINGS = 40
-"""Bisection steps within the cell in which a border lies; they locate it to 1e-12 of the cell."""
+"""Number of bisection steps inside a cell; they locate a border to 1e-12 of the cell."""
 SECANTS = 2
-"""Secant steps to the level of a region of a given mass; the grid brackets the level to some ten per cent."""
+"""Number of secant steps to the level of a region of a given mass; the grid brackets the level to about 10 %."""
 
 
 class Border(NamedTuple):
-    """Masses and size of highest-density regions, one for each item, (batch,), float64.
+    """Masses and size of the highest-density regions of each item, (batch,), float64.
 
     Attributes:
-        low, high: mass that is strictly denser than the target, and mass that is at least as dense. Where the truth is
-            drawn from the density, a number drawn uniformly between the two is uniform on [0, 1].
-        size: size of the highest-density region with the given mass, in labels, radians or the unit of the real; NaN
+        low: mass of all values that are strictly denser than the target.
+        high: mass of all values that are at least as dense as the target. If the target is drawn from the density, a
+            number drawn uniformly between `low` and `high` is uniform on [0, 1].
+        size: size of the highest-density region with the given mass, in labels, radians or the unit of the target; NaN
             for a target of several numbers.
     """
 
@@ -44,9 +45,9 @@ class Border(NamedTuple):
 def border(density: Distribution, value: Tensor, mass: float, samples: int) -> Border:
     """Return the masses and the size of highest-density regions.
 
-    The result is exact for classes, for normals, and for an angle that a grid resolves; otherwise it is estimated from
-    `samples` draws. The target's rank among draws is as random as the draws are; still it is uniform where the density
-    is the true one.
+    The result is exact for classes, for normals, and for an angle whose density a grid resolves. Otherwise it is
+    estimated from the rank of the target among `samples` draws. This rank depends on the draws, but it is exactly
+    uniform if the density is the true one.
 
     Args:
         density: batch_shape (batch,).
@@ -55,18 +56,18 @@ def border(density: Distribution, value: Tensor, mass: float, samples: int) -> B
         samples: number of draws.
     """
     if density.has_enumerate_support:
-        return of_classes(density, value, mass)
-    one = tuple(density.event_shape) == (1,)
-    if one and isinstance(density.support, Circular):
-        seen = circular_moments(density)
-        found = of_angle(seen, density.log_prob(value), mass)
-        if bool(seen.resolved.all()):
-            return found
-        drawn = of_draws(density, value, mass, samples)
-        return Border(*(torch.where(seen.resolved, a, b) for a, b in zip(found, drawn, strict=True)))
+        return class_border(density, value, mass)
+    single_number = tuple(density.event_shape) == (1,)
+    if single_number and isinstance(density.support, Circular):
+        moments = circular_moments(density)
+        exact = angle_border(moments, density.log_prob(value), mass)
+        if bool(moments.resolved.all()):
+            return exact
+        sampled = sampled_border(density, value, mass, samples)
+        return Border(*(torch.where(moments.resolved, a, b) for a, b in zip(exact, sampled, strict=True)))
     distance = mahalanobis(density, value)
     if distance is None:
-        return of_draws(density, value, mass, samples)
+        return sampled_border(density, value, mass, samples)
     # the squared Mahalanobis distance of draws of a normal is χ² with one degree of freedom for each number
     inside = torch.special.gammainc(torch.full_like(distance, density.event_shape[0] / 2), distance / 2)
     known = normals(density)
@@ -76,69 +77,78 @@ def border(density: Distribution, value: Tensor, mass: float, samples: int) -> B
     return Border(inside, inside, 2 * quantile.to(inside) * known.scale.squeeze(-1))
 
 
-def of_classes(density: Distribution, value: Int[Tensor, "batch"], mass: float) -> Border:
-    """Return the result for classes by enumeration; the last label counts in the size only by its needed part."""
+def class_border(density: Distribution, value: Int[Tensor, "batch"], mass: float) -> Border:
+    """Return the result for classes by enumeration; only the required part of the last label counts in the size."""
     probability = class_probabilities(density).T
     at = probability.gather(0, require_labels(value.long(), len(probability)).unsqueeze(0))
     equal = EQUAL[torch.float32]
     low = _sum_where(probability > at * (1 + equal), probability)
     high = _sum_where(probability >= at * (1 - equal), probability)
-    return Border(low, high, _counted(probability, mass))
+    return Border(low, high, _count_cells(probability, mass))
 
 
-def of_angle(seen: CircularMoments, log_prob: Float[Tensor, "batch"], mass: float) -> Border:
-    """Return the result for an angle by cubic interpolation of density and slope on a finer grid than the moments'."""
-    rows = max(1, BLOCK // (2 * FINER * len(seen.moments)))
-    parts = zip(seen.moments.split(rows, 1), seen.resolved.split(rows), log_prob.split(rows), strict=True)
-    found = [_of_angle(CircularMoments(moments, known), at, mass) for moments, known, at in parts]
-    return Border(*(torch.cat(numbers) for numbers in zip(*found, strict=True)))
+def angle_border(moments: CircularMoments, log_prob: Float[Tensor, "batch"], mass: float) -> Border:
+    """Return the result for an angle by cubic interpolation of the density and its slope on a fine grid."""
+    rows = max(1, BLOCK // (2 * FINER * len(moments.moments)))
+    parts = zip(
+        moments.moments.split(rows, 1), moments.resolved.split(rows), log_prob.split(rows), strict=True
+    )
+    borders = [
+        _angle_border_of_part(CircularMoments(moment_part, known), at, mass)
+        for moment_part, known, at in parts
+    ]
+    return Border(*(torch.cat(numbers) for numbers in zip(*borders, strict=True)))
 
 
-def _of_angle(seen: CircularMoments, log_prob: Float[Tensor, "batch"], mass: float) -> Border:
-    cubic = Cubic.of(seen)
+def _angle_border_of_part(moments: CircularMoments, log_prob: Float[Tensor, "batch"], mass: float) -> Border:
+    cubic = Cubic.of(moments)
     level, equal = log_prob.double().exp(), EQUAL[log_prob.dtype]
     low, _ = cubic.above(level)
     high = low.clone()
-    # on a plateau or at a mode rounding would decide: take both masses with a tolerance
+    # on a plateau or at a mode, rounding would decide; therefore compute both masses with a tolerance
     flat = ((cubic.density - level).abs() <= equal * level).any(0) | (level >= cubic.density.amax(0))
     if bool(flat.any()):
-        here = cubic.rows(flat)
-        low[flat], high[flat] = (here.above(level[flat] * factor)[0] for factor in (1 + equal, 1 - equal))
-    missing = log_prob.isnan() | seen.moments[0].isnan()
-    found = (low.clamp(0, 1), high.clamp(0, 1), cubic.size(mass))
-    return Border(*(torch.where(missing, torch.nan, number) for number in found))
+        flat_items = cubic.rows(flat)
+        low[flat], high[flat] = (
+            flat_items.above(level[flat] * factor)[0] for factor in (1 + equal, 1 - equal)
+        )
+    missing = log_prob.isnan() | moments.moments[0].isnan()
+    border = (low.clamp(0, 1), high.clamp(0, 1), cubic.size(mass))
+    return Border(*(torch.where(missing, torch.nan, number) for number in border))
 
 
 class Cubic(NamedTuple):
-    """Density on the circle as a cubic Hermite polynomial in each grid cell; its error is of the cell's fourth power.
+    """Density on the circle as a cubic Hermite polynomial in each grid cell.
+
+    The error is proportional to the fourth power of the cell width.
 
     Attributes:
         density: density at the points of the grid, (point, batch), per radian.
-        slope: derivative at each point times the width of a cell.
+        slope: derivative at each point, times the width of a cell.
     """
 
     density: Float[Tensor, "point batch"]
     slope: Float[Tensor, "point batch"]
 
     @classmethod
-    def of(cls, seen: CircularMoments) -> "Cubic":
-        """Return the cubic through density and slope of the given moments."""
-        density = seen.density(FINER)
-        return cls(density, seen.density(FINER, slope=True) * (2 * math.pi / len(density)))
+    def of(cls, moments: CircularMoments) -> "Cubic":
+        """Return the polynomials through density and slope of the given moments."""
+        density = moments.density(FINER)
+        return cls(density, moments.density(FINER, slope=True) * (2 * math.pi / len(density)))
 
     def rows(self, chosen: Tensor) -> "Cubic":
-        """Return the densities of the chosen items of the batch."""
+        """Return the polynomials of the chosen items of the batch."""
         return Cubic(self.density[:, chosen], self.slope[:, chosen])
 
     def above(self, level: Float[Tensor, "batch"]) -> tuple[Float[Tensor, "batch"], Float[Tensor, "batch"]]:
-        """Return the mass where the density is at least the level, and the length of that region, radians."""
+        """Return the mass of the region in which the density is at least the level, and its length in radians."""
         left, right = self.density, self.density.roll(-1, 0)
         rise, fall = self.slope, self.slope.roll(-1, 0)
         first, second = left >= level, right >= level
         whole = first & second
         mass = torch.where(whole, (left + right) / 2 + (rise - fall) / 12, 0.0).sum(0)
         length = whole.sum(0).double()
-        # cells with one border, and cells whose extremum may cross the level although neither end does
+        # cells with one border, and cells that may hold two borders because the extremum inside may cross the level
         for chosen, turning in (
             (first ^ second, False),
             ((rise > 0) & (fall < 0) & ~first & ~second, True),
@@ -148,7 +158,7 @@ class Cubic(NamedTuple):
             if len(cell) == 0:
                 continue
             ends = torch.stack([table[cell, item] for table in (left, right, rise, fall)])
-            more, longer = _part(ends, level[item], turning=turning)
+            more, longer = _border_part(ends, level[item], turning=turning)
             mass.index_add_(0, item, more)
             length.index_add_(0, item, longer)
         step = 2 * math.pi / len(self.density)
@@ -157,39 +167,39 @@ class Cubic(NamedTuple):
     def size(self, mass: float) -> Float[Tensor, "batch"]:
         """Return the length of the highest-density region of the given mass, radians.
 
-        The level is interpolated between two levels that the grid's points suggest, and this bracket is narrowed. The
-        mass that is then still missing is divided by the level, because the mass grows by the level times the growth of
-        the length.
+        The grid points give two levels that bracket the level of the region; secant steps narrow this bracket. The mass
+        that is still missing then is divided by the level, because the mass grows by the level times the growth of the
+        length.
         """
         step = 2 * math.pi / len(self.density)
         ordered = self.density.clamp(min=0).sort(0, descending=True).values
-        kept = ((ordered.cumsum(0) * step) < mass).sum(0, keepdim=True).clamp(max=len(ordered) - 1)
+        cell_count = ((ordered.cumsum(0) * step) < mass).sum(0, keepdim=True).clamp(max=len(ordered) - 1)
         lowest = torch.finfo(torch.float64).tiny
         high, low = (
-            ordered.gather(0, (kept + places).clamp(0, len(ordered) - 1)).squeeze(0).clamp(min=lowest)
-            for places in (-4, 4)
+            ordered.gather(0, (cell_count + offset).clamp(0, len(ordered) - 1)).squeeze(0).clamp(min=lowest)
+            for offset in (-4, 4)
         )
         more, less = self.above(low)[0], self.above(high)[0]
-        level, found, length = high, less, torch.zeros_like(less)
+        level, mass_above, length = high, less, torch.zeros_like(less)
         for _ in range(SECANTS):
             share = torch.where(more > less, (mass - less) / (more - less), 0.0).clamp(0, 1)
             level = high + share * (low - high)
-            found, length = self.above(level)
-            enough = found >= mass
-            low, more = torch.where(enough, level, low), torch.where(enough, found, more)
-            high, less = torch.where(enough, high, level), torch.where(enough, less, found)
-        return length + (mass - found) / level
+            mass_above, length = self.above(level)
+            enough = mass_above >= mass
+            low, more = torch.where(enough, level, low), torch.where(enough, mass_above, more)
+            high, less = torch.where(enough, high, level), torch.where(enough, less, mass_above)
+        return length + (mass - mass_above) / level
 
 
-def _part(
+def _border_part(
     ends: Float[Tensor, "4 cell"], level: Float[Tensor, "cell"], *, turning: bool
 ) -> tuple[Float[Tensor, "cell"], Float[Tensor, "cell"]]:
-    """Return the mass and length above the level in cells with a border, in cells, less what has been counted already.
+    """Return the corrections of mass and length, in units of cells, for cells that a border crosses.
 
     Args:
         ends: density at the left and right end, slopes at the left and right end.
-        level: density of the border.
-        turning: whether the cell may hold two borders, one on each side of a turning point; otherwise it holds one.
+        level: density at the border.
+        turning: whether the cell may hold two borders, one on each side of an extremum; otherwise it holds one.
     """
     left, right, rise, fall = ends
     square, cube = 3 * (right - left) - 2 * rise - fall, 2 * (left - right) + rise + fall
@@ -200,22 +210,25 @@ def _part(
     def until(at: Tensor) -> Tensor:
         return at * (left + at * (rise / 2 + at * (square / 3 + at * cube / 4)))
 
-    zero, one = torch.zeros_like(left), torch.ones_like(left)
+    zeros, ones = torch.zeros_like(left), torch.ones_like(left)
     if not turning:
-        border = _root(height, zero, one)
+        border = _root(height, zeros, ones)
         falling = left >= level
-        mass = torch.where(falling, until(border), until(one) - until(border))
+        mass = torch.where(falling, until(border), until(ones) - until(border))
         return mass, torch.where(falling, border, 1 - border)
-    top = _root(lambda at: rise + at * (2 * square + 3 * at * cube), zero, one)
-    before, after = _root(height, zero, top), _root(height, top, one)
-    beyond = height(top).sign() != height(zero).sign()
-    # a hump is added; a dip, whose cell was counted whole, is taken off again
-    sign = torch.where(beyond, -height(zero).sign(), 0.0)
+    top = _root(lambda at: rise + at * (2 * square + 3 * at * cube), zeros, ones)
+    before, after = _root(height, zeros, top), _root(height, top, ones)
+    beyond = height(top).sign() != height(zeros).sign()
+    # add a maximum above the level; subtract a minimum below the level, whose cell was counted completely
+    sign = torch.where(beyond, -height(zeros).sign(), 0.0)
     return sign * (until(after) - until(before)), sign * (after - before)
 
 
 def _root(function: Callable[[Tensor], Tensor], low: Tensor, high: Tensor) -> Tensor:
-    """Return the place where a function changes its sign, by bisection; any place in between if it does not."""
+    """Return the point between `low` and `high` at which a function changes its sign, by bisection.
+
+    The result is arbitrary if the sign does not change.
+    """
     start = function(low).sign()
     for _ in range(HALVINGS):
         middle = (low + high) / 2
@@ -224,17 +237,20 @@ def _root(function: Callable[[Tensor], Tensor], low: Tensor, high: Tensor) -> Te
     return (low + high) / 2
 
 
-def of_draws(density: Distribution, value: Tensor, mass: float, samples: int) -> Border:
-    """Return the result by the target's rank among draws; the size of one number's region is E[1{p(X) ≥ t} / p(X)]."""
-    drawn = density.sample(torch.Size((samples,)))
-    log_prob, at = density.log_prob(drawn).double(), density.log_prob(value).double()
+def sampled_border(density: Distribution, value: Tensor, mass: float, samples: int) -> Border:
+    """Return the result from the rank of the target's density among the densities of draws.
+
+    The size of a region of one number is estimated as E[1{p(X) ≥ t} / p(X)].
+    """
+    draws = density.sample(torch.Size((samples,)))
+    log_prob, at = density.log_prob(draws).double(), density.log_prob(value).double()
     equal = EQUAL[torch.float32]
     low = (log_prob > at + equal).double().sum(0) / (samples + 1)
     high = ((log_prob >= at - equal).double().sum(0) + 1) / (samples + 1)
     size = torch.full_like(low, torch.nan)
     if tuple(density.event_shape) == (1,):
-        kept = max(1, round(mass * samples))
-        size = (-log_prob.sort(0, descending=True).values[:kept]).exp().sum(0) / samples
+        inside_count = max(1, round(mass * samples))
+        size = (-log_prob.sort(0, descending=True).values[:inside_count]).exp().sum(0) / samples
     missing = log_prob.isnan().any(0) | at.isnan()
     return Border(*(torch.where(missing, torch.nan, number) for number in (low, high, size)))
 
@@ -243,18 +259,20 @@ def _sum_where(chosen: Tensor, probability: Tensor) -> Tensor:
     return torch.where(chosen, probability, 0.0).sum(0).clamp(max=1)
 
 
-def _counted(mass: Float[Tensor, "cell batch"], wanted: float) -> Float[Tensor, "batch"]:
-    """Return how many cells hold the mass `wanted`, taking the heaviest first and a part of the last one."""
+def _count_cells(mass: Float[Tensor, "cell batch"], wanted: float) -> Float[Tensor, "batch"]:
+    """Return the number of cells that hold the mass `wanted`, heaviest first, with a fraction of the last cell."""
     ordered = mass.sort(0, descending=True).values
     before = ordered.cumsum(0) - ordered
     share = torch.where(ordered > 0, (wanted - before) / ordered, 0.0)
     return share.clamp(0, 1).sum(0)
 
 
-def covered(low: Tensor, high: Tensor, levels: Float[Tensor, "level"]) -> Float[Tensor, "batch level"]:
+def coverage_probability(
+    low: Tensor, high: Tensor, levels: Float[Tensor, "level"]
+) -> Float[Tensor, "batch level"]:
     """Return the probability that a number drawn uniformly between low and high is at most each level.
 
-    Ties are therefore broken without drawing (the nonrandomized transform of Czado, Gneiting & Held 2009, eq. 2).
+    This breaks ties without random numbers (nonrandomized transform of Czado, Gneiting & Held 2009, eq. 2).
     """
     low, high = low.unsqueeze(-1), high.unsqueeze(-1)
     width = high - low

@@ -11,13 +11,13 @@ from framework.distributions.checks import refuse_nan
 from framework.metric import HasFigure, Metric
 from framework.prediction import Prediction
 from framework.target import Target
-from plugins.metric.coverage.functional import border, covered
+from plugins.metric.coverage.functional import border, coverage_probability
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 LEVELS = 19
-"""Nominal masses 0.05, 0.10, ..., 0.95."""
+"""Number of nominal masses 0.05, 0.10, ..., 0.95."""
 REGION = 0.9
 """Mass of the region whose size is reported."""
 
@@ -25,36 +25,28 @@ REGION = 0.9
 class Coverage(Metric, HasFigure):
     """Share of targets that lie in the highest-density regions of given masses.
 
-    The mass h(x, y) of all values that are at least as dense as the target is uniform on [0, 1] where the densities are
-    the true ones. This holds for targets of every kind: classes, reals, angles, rotations.
+    If the densities are the true ones, the mass h(x, y) of all values that are at least as dense as the target is
+    uniform on [0, 1]. This holds for every kind of target: classes, real numbers, angles, rotations.
 
     - `coverage_50`, `coverage_90`: share of targets within the regions of mass 0.5 and 0.9.
     - `coverage_error`: mean |share - mass| over the masses 0.05, 0.10, ..., 0.95.
     - `region_90_labels`, `region_90_deg` or `region_90` (in the unit of the target): mean size of the region of mass
-      0.9, for classes, one angle and one real. Of two forecasters with the right coverage, the one with smaller regions
-      is better.
+      0.9, for classes, one angle and one real number. Of two models with the right coverage, the one with smaller
+      regions is better.
 
-    Where many values are equally dense, as classes often are, h is any number between two masses; a target then counts
-    with the probability that a number drawn uniformly between them lies below the level.
+    If many values are equally dense, as classes often are, h is any number between two masses. A target then counts
+    with the probability that a number drawn uniformly between these masses lies below the level.
 
     Args:
-        samples: draws for a density whose regions are not known: several angles, rotations, mixtures over reals. Each
-            needs log_prob of that many values.
+        samples: number of draws for a density whose regions are not known: several angles, rotations, mixtures over
+            real numbers. For each sample, log_prob is evaluated at all draws.
 
     Raises:
-        UserError: densities are NaN; the message says how many.
+        UserError: densities are NaN.
         DataError: a target is not a class of the data set.
     """
 
-    bibtex = """@article{hyndman1996computing,
-  author  = {Hyndman, Rob J.},
-  title   = {Computing and Graphing Highest Density Regions},
-  journal = {The American Statistician},
-  volume  = {50},
-  number  = {2},
-  pages   = {120--126},
-  year    = {1996}
-}"""
+    bibtex = "hyndman1996computing"
     columns: ClassVar[dict[str, str]] = {
         "coverage_50": "cover 50 %",
         "coverage_90": "cover 90 %",
@@ -85,20 +77,20 @@ class Coverage(Metric, HasFigure):
         target = prediction.target
         if len(target) == 0:
             return
-        found = border(prediction.density, target, REGION, self.samples)
-        refuse_nan(found.low + found.high, "masses of regions")
+        result = border(prediction.density, target, REGION, self.samples)
+        refuse_nan(result.low + result.high, "masses of regions")
         self.count += len(target)
-        self.inside += covered(found.low, found.high, self._levels()).sum(0)
-        self.size += self.factor * found.size.sum()
+        self.inside += coverage_probability(result.low, result.high, self._levels()).sum(0)
+        self.size += self.factor * result.size.sum()
 
     def compute(self) -> dict[str, Tensor]:
         share = self.inside / self.count
-        found = {
+        results = {
             "coverage_50": share[9],
             "coverage_90": share[17],
             "coverage_error": (share - self._levels()).abs().mean(),
         }
-        return found if self.unit is None else found | {self.unit: self.size / self.count}
+        return results if self.unit is None else results | {self.unit: self.size / self.count}
 
     def figure(self, title: str, *, synthetic: bool) -> "Figure":
         from plugins.metric.coverage.picture import curve

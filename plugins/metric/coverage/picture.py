@@ -8,23 +8,23 @@ from framework.figures.style import BLUE, GREY, titled_figure
 
 
 def curve(levels: np.ndarray, share: np.ndarray, count: int, title: str, *, synthetic: bool) -> Figure:
-    """Return a figure of the share of targets within highest-density regions of each mass, with a calibrated band.
+    """Return a figure of the share of targets within highest-density regions against the mass of the regions.
 
-    The band holds 95 % of calibrated forecasters.
+    A band contains the share at each mass with probability 0.95 if the densities are calibrated.
 
     Args:
         levels: masses, ascending in (0, 1).
-        share: share of targets in the region of each mass; NaN, which is not drawn, if there were no targets.
+        share: share of targets in the region of each mass; NaN (not drawn) if there were no targets.
         count: number of targets.
         title: title of the figure.
-        synthetic: whether the data are synthetic, which the figure then says.
+        synthetic: whether the data are synthetic; the title then says so.
     """
     figure = titled_figure((5.0, 5.0), title, synthetic)
     axes = figure.subplots()
     whole = np.concatenate([[0.0], levels, [1.0]])
     if count:
         low, high = binom.ppf([[0.025], [0.975]], count, whole) / count
-        axes.fill_between(whole, low, high, color="0.87", lw=0, label="95 % of calibrated forecasters")
+        axes.fill_between(whole, low, high, color="0.87", lw=0, label="95 % band if calibrated")
     axes.plot([0, 1], [0, 1], color=GREY, ls=":", label="calibrated")
     axes.plot(levels, share, color=BLUE, marker="o", markersize=4, clip_on=False, label="targets")
     axes.set(xlim=(0, 1), ylim=(0, 1), aspect="equal")

@@ -1,14 +1,15 @@
-"""Rows of the contract: targets of every kind."""
+"""Contract-test cases: targets of every kind."""
 
 from framework.target import Target
 from framework.testing.rows import MetricRow
 
 TOO_BROAD = {
-    "perfect beats random": "a fixed density about each target is too broad, as badly calibrated as one about elsewhere"
+    "perfect beats random": "a fixed density around each target is too broad, and as badly calibrated as a density "
+    "around another value"
 }
-DRAWN = dict.fromkeys(
+RANDOM_RANKS = dict.fromkeys(
     ("batches do not matter", "order does not matter", "states merge", "reset and copy"),
-    "ranks among draws of the joint density of three angles, which differ from batch to batch",
+    "the result depends on draws of the joint density of three angles, which differ between batches",
 )
 ROWS = {
     "coverage": (
@@ -21,7 +22,7 @@ ROWS = {
             "three angles",
             Target("angle", ("azimuth", "elevation", "tilt")),
             {"samples": 50},
-            leave_out=TOO_BROAD | DRAWN,
+            leave_out=TOO_BROAD | RANDOM_RANKS,
         ),
     )
 }

@@ -18,31 +18,22 @@ from plugins.metric.crps.score import REPLICATES, crps
 class CRPS(Mean):
     """Continuous ranked probability score (CRPS): a proper scoring rule in the unit of the target; lower is better.
 
-    `crps` of reals, or `crps_deg` of angles in degrees, is the mean over the numbers of a sample, each under its
-    marginal density, and then over samples; it has a standard error. `crps_<name>` is the score of one number where
-    there are several. For a density that is a point mass the score is the absolute deviation of that point.
+    `crps` of real numbers, or `crps_deg` of angles in degrees, is the mean over the numbers of a sample, each under its
+    marginal density, and then over samples, with a standard error. `crps_<name>` is the score of one number of a target
+    with several. For a point mass, the score is the absolute deviation of the point.
 
-    Where a score had to be estimated from draws (`score.py`), `crps_mc_error` is the standard error of `crps` that is
-    due to the sampling alone.
+    If scores are estimated from draws (`score.py`), `crps_mc_error` is the standard error of `crps` that is due to the
+    draws only.
 
     Args:
-        samples: draws for a density that has no exact score.
+        samples: number of draws for a density without an exact score.
 
     Raises:
-        ConfigError: the target is made of classes.
-        UserError: scores are NaN; the message says how many.
+        ConfigError: the target is a class.
+        UserError: scores are NaN.
     """
 
-    bibtex = """@article{grimit2006continuous,
-  author  = {Grimit, Eric P. and Gneiting, Tilmann and Berrocal, Veronica J. and Johnson, Nicholas A.},
-  title   = {The Continuous Ranked Probability Score for Circular Variables and its Application to Mesoscale Forecast
-             Ensemble Verification},
-  journal = {Quarterly Journal of the Royal Meteorological Society},
-  volume  = {132},
-  number  = {621C},
-  pages   = {2925--2942},
-  year    = {2006}
-}"""
+    bibtex = "grimit2006continuous"
     columns: ClassVar[dict[str, str]] = {"crps": "CRPS"}
     better: ClassVar[dict[str, Literal["higher", "lower"]]] = {"crps": "lower"}
     variance: Tensor
@@ -53,8 +44,8 @@ class CRPS(Mean):
         super().__init__()
         if target.kind == "class":
             raise ConfigError(
-                "crps measures distances, and classes have none between them (this data set's: "
-                f"{target.listed_names}). Leave this metric out; `brier` is the like of it for classes."
+                "metric crps measures distances, but there is no distance between classes (this data set's classes: "
+                f"{target.listed_names}). Leave this metric out; for classes, use `brier`."
             )
         self.samples = samples
         self.unit = "_deg" if target.kind == "angle" else ""
@@ -74,9 +65,9 @@ class CRPS(Mean):
             crps(prediction.marginal(index), target[:, index : index + 1], self.samples)
             for index in range(len(self.names))
         ]
-        each = self.factor * torch.stack([score.mean for score in scores], -1)
+        scores_by_number = self.factor * torch.stack([score.mean for score in scores], -1)
         error = self.factor * torch.stack([score.error for score in scores], -1)
-        score = torch.cat([each.mean(-1, keepdim=True), each], -1)
+        score = torch.cat([scores_by_number.mean(-1, keepdim=True), scores_by_number], -1)
         refuse_nan(score[:, 0], "scores")
         self.add_samples(score)
         # the draws of the marginals are independent: variances add
@@ -84,11 +75,11 @@ class CRPS(Mean):
 
     def compute(self) -> dict[str, Tensor]:
         mean, error = self.mean_and_error()
-        found = {f"crps{self.unit}": mean[0], f"crps{self.unit}_sem": error[0]}
+        results = {f"crps{self.unit}": mean[0], f"crps{self.unit}_sem": error[0]}
         if len(self.names) > 1:
             for index, name in enumerate(self.names, start=1):
-                found[f"crps_{name}{self.unit}"] = mean[index]
-                found[f"crps_{name}{self.unit}_sem"] = error[index]
+                results[f"crps_{name}{self.unit}"] = mean[index]
+                results[f"crps_{name}{self.unit}_sem"] = error[index]
         if self.variance > 0:
-            found[f"crps{self.unit}_mc_error"] = self.variance.sqrt() / self.count
-        return found
+            results[f"crps{self.unit}_mc_error"] = self.variance.sqrt() / self.count
+        return results

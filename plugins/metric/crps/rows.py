@@ -1,4 +1,4 @@
-"""Rows of the contract: targets of one and of several reals and angles."""
+"""Contract-test cases: targets of one and of several real numbers and angles."""
 
 from framework.target import Target
 from framework.testing.rows import MetricRow

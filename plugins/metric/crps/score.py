@@ -1,4 +1,4 @@
-"""Continuous ranked probability score of densities of one real or one angle; a density may register its own formula."""
+"""Continuous ranked probability score of one real number or one angle; a density may register its own formula."""
 
 import math
 from functools import singledispatch
@@ -15,9 +15,9 @@ from framework.distributions.density import CHUNK
 from framework.distributions.protocol import Normals, normals
 
 MOST = 1024
-"""Largest number of components of a mixture of normals whose pairs are summed; beyond it, draws are cheaper."""
+"""Largest number of components of a mixture of normals for which all pairs are summed; for more, draws are cheaper."""
 REPLICATES = 8
-"""Number of independent parts of the draws, from whose spread the error of an estimate is taken."""
+"""Number of independent parts of the draws; their spread gives the error of an estimate."""
 
 
 class Score(NamedTuple):
@@ -25,7 +25,7 @@ class Score(NamedTuple):
 
     Attributes:
         mean: the score.
-        error: its standard error by sampling; 0 if the score is exact.
+        error: standard error of the score due to draws; 0 if the score is exact.
     """
 
     mean: Tensor
@@ -34,42 +34,42 @@ class Score(NamedTuple):
 
 @singledispatch
 def crps(density: Distribution, value: Tensor, samples: int) -> Score:
-    """Return E|X - y| - ½ E|X - X'| (Gneiting & Raftery 2007, eq. 21); 0 is best, |X - y| for a point mass.
+    """Return the score E|X - y| - ½ E|X - X'| (Gneiting & Raftery 2007, eq. 21); lower is better, 0 is best.
 
-    For an angle the distance is the angular one (Grimit, Gneiting, Berrocal & Johnson 2006, eq. 5). The score is exact
-    for mixtures of up to MOST normals and for angles that a grid resolves (`circular_moments`). Otherwise it is the
-    fair (unbiased) estimate from `samples` draws, in `REPLICATES` parts whose spread gives its error.
+    For an angle, the distance is the angular distance (Grimit, Gneiting, Berrocal & Johnson 2006, eq. 5). The score is
+    exact for mixtures of up to `MOST` normals, and for angles whose density a grid resolves (`circular_moments`).
+    Otherwise it is the unbiased estimate from `samples` draws, in `REPLICATES` parts whose spread gives the error.
 
     Args:
-        density: density of one real or one angle, event_shape (1,).
+        density: density of one real number or one angle, event_shape (1,).
         value: (*batch, 1).
-        samples: number of draws, 2 · REPLICATES or more.
+        samples: number of draws, at least 2 · REPLICATES.
     """
     at = value.double().squeeze(-1)
     if isinstance(density.support, Circular):
-        seen = circular_moments(density)
-        exact = (seen.distance(at) - seen.spread / 2).clamp(min=0)
-        if bool(seen.resolved.all()):
+        moments = circular_moments(density)
+        exact = (moments.distance(at) - moments.spread / 2).clamp(min=0)
+        if bool(moments.resolved.all()):
             return Score(exact, torch.zeros_like(exact))
-        drawn = fair(_draws(density, samples), at, circular=True)
-        return Score(*(torch.where(seen.resolved, a, b) for a, b in zip((exact, 0.0), drawn, strict=True)))
+        draws = fair_estimate(_draws(density, samples), at, circular=True)
+        return Score(*(torch.where(moments.resolved, a, b) for a, b in zip((exact, 0.0), draws, strict=True)))
     known = normals(density)
     if known is not None and known.mean.shape[-1] <= MOST:
-        exact = of_normals(known, at)
+        exact = normal_mixture_score(known, at)
         return Score(exact, torch.zeros_like(exact))
-    return fair(_draws(density, samples), at, circular=False)
+    return fair_estimate(_draws(density, samples), at, circular=False)
 
 
 def _draws(density: Distribution, samples: int) -> Tensor:
     return density.sample(torch.Size((samples,))).double().squeeze(-1)
 
 
-def of_normals(density: Normals, value: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+def normal_mixture_score(density: Normals, value: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     """Return the score of a mixture of K normals in closed form (Grimit et al. 2006, eq. 8), in O(K²)."""
     weights = density.log_weights.exp()
     to_value = _weighted(weights, absolute_mean(value.unsqueeze(-1) - density.mean, density.scale)).sum(-1)
     if density.mean.shape[-1] == 1:
-        # E|X - X'| = 2σ/√π in closed form, so that a large mean costs no digits
+        # E|X - X'| = 2σ/√π in closed form, which keeps all digits for a large mean
         return (to_value - density.scale.squeeze(-1) / math.sqrt(math.pi)).clamp(min=0)
     count = density.mean.shape[-1]
     rows = [number.flatten(0, -2) for number in (weights, density.mean, density.scale)]
@@ -80,10 +80,10 @@ def of_normals(density: Normals, value: Float[Tensor, "*batch"]) -> Float[Tensor
 
 def _between(weights: Tensor, mean: Tensor, scale: Tensor) -> Tensor:
     """Return ΣΣ w_i w_j E|X_i - X_j|; each argument is (rows, component)."""
-    apart = mean.unsqueeze(-1) - mean.unsqueeze(-2)
+    difference = mean.unsqueeze(-1) - mean.unsqueeze(-2)
     both = torch.hypot(scale.unsqueeze(-1), scale.unsqueeze(-2))
     pairs = weights.unsqueeze(-1) * weights.unsqueeze(-2)
-    return _weighted(pairs, absolute_mean(apart, both)).sum((-2, -1))
+    return _weighted(pairs, absolute_mean(difference, both)).sum((-2, -1))
 
 
 def _weighted(weights: Tensor, numbers: Tensor) -> Tensor:
@@ -92,44 +92,47 @@ def _weighted(weights: Tensor, numbers: Tensor) -> Tensor:
 
 
 def absolute_mean(mean: Tensor, scale: Tensor) -> Tensor:
-    """Return E|Z| for Z ~ N(μ, σ²): 2σφ(μ/σ) + μ(2Φ(μ/σ) - 1) (Grimit et al. 2006, after eq. 8); |μ| where σ = 0."""
+    """Return E|Z| for Z ~ N(μ, σ²): 2σφ(μ/σ) + μ(2Φ(μ/σ) - 1) (Grimit et al. 2006, after eq. 8); |μ| if σ = 0."""
     standard = torch.where(mean == 0, mean, mean / scale)
     bell = torch.exp(-standard.square() / 2) * math.sqrt(2 / math.pi)
     return scale * bell + mean * torch.erf(standard / math.sqrt(2))
 
 
-def fair(drawn: Float[Tensor, "samples *batch"], value: Float[Tensor, "*batch"], *, circular: bool) -> Score:
-    """Return the mean of the unbiased estimates from REPLICATES parts of the draws, and its standard error."""
-    size = len(drawn) // REPLICATES
-    parts = drawn[: size * REPLICATES].unflatten(0, (REPLICATES, size)).transpose(0, 1)
+def fair_estimate(
+    draws: Float[Tensor, "samples *batch"], value: Float[Tensor, "*batch"], *, circular: bool
+) -> Score:
+    """Return the mean of unbiased estimates from `REPLICATES` parts of the draws, and its standard error."""
+    size = len(draws) // REPLICATES
+    parts = draws[: size * REPLICATES].unflatten(0, (REPLICATES, size)).transpose(0, 1)
     if circular:
-        each = angular_distance(parts, value).mean(0) - mean_angular_distance(parts) / 2
+        estimates = angular_distance(parts, value).mean(0) - mean_angular_distance(parts) / 2
     else:
-        each = (parts - value).abs().mean(0) - mean_distance(parts) / 2
-    return Score(each.mean(0), each.std(0) / math.sqrt(REPLICATES))
+        estimates = (parts - value).abs().mean(0) - mean_distance(parts) / 2
+    return Score(estimates.mean(0), estimates.std(0) / math.sqrt(REPLICATES))
 
 
-def mean_distance(drawn: Float[Tensor, "samples *batch"]) -> Float[Tensor, "*batch"]:
-    """Return the mean distance over all pairs of reals, in O(S log S)."""
-    count = len(drawn)
-    ordered = (drawn - drawn[0]).sort(0).values  # relative to one draw, so that a large mean costs no digits
+def mean_distance(draws: Float[Tensor, "samples *batch"]) -> Float[Tensor, "*batch"]:
+    """Return the mean distance over all pairs of S real numbers, in O(S log S)."""
+    count = len(draws)
+    # relative to one draw, which keeps all digits for a large mean
+    ordered = (draws - draws[0]).sort(0).values
     # Σ_{i<j} (x_j - x_i): the i-th is subtracted S-1-i times and added i times
-    factor = 2 * torch.arange(count, dtype=drawn.dtype, device=drawn.device) - (count - 1)
-    total = (factor.reshape(-1, *(1,) * (drawn.dim() - 1)) * ordered).sum(0)
+    factor = 2 * torch.arange(count, dtype=draws.dtype, device=draws.device) - (count - 1)
+    total = (factor.reshape(-1, *(1,) * (draws.dim() - 1)) * ordered).sum(0)
     return total * 2 / (count * (count - 1))
 
 
-def mean_angular_distance(drawn: Float[Tensor, "samples *batch"]) -> Float[Tensor, "*batch"]:
-    """Return the mean angular distance over all pairs of angles, radians, in O(S log S).
+def mean_angular_distance(draws: Float[Tensor, "samples *batch"]) -> Float[Tensor, "*batch"]:
+    """Return the mean angular distance over all pairs of S angles, radians, in O(S log S).
 
-    The distance of two angles is the measure of the diameters, at t in [0, π), that separate them. If n(t) angles are
-    on one side of a diameter, n (S - n) pairs are separated, and n changes by one at each angle modulo π.
+    The distance of two angles is the measure of all diameters t in [0, π) that separate them. If n(t) angles are on one
+    side of a diameter, n (S - n) pairs are separated. n(t) changes by one at each angle modulo π.
     """
-    count = len(drawn)
-    angle = wrap(drawn)
-    place, order = torch.remainder(angle, math.pi).sort(0)
+    count = len(draws)
+    angle = wrap(draws)
+    position, order = torch.remainder(angle, math.pi).sort(0)
     upper = (angle >= 0).gather(0, order)  # on the side (t, t + π) of the diameter at t = 0
-    # passing an angle of that side removes it from the side; passing an antipode adds one
+    # at an angle of this side the count decreases by one; at the antipode of another angle it increases by one
     side = upper.sum(0) + torch.where(upper, -1, 1).cumsum(0)
-    gap = torch.cat([place[1:], place[:1] + math.pi]) - place
+    gap = torch.cat([position[1:], position[:1] + math.pi]) - position
     return (side * (count - side) * gap).sum(0) * 2 / (count * (count - 1))

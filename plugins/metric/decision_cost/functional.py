@@ -1,4 +1,4 @@
-"""Decisions under a density: the action of least expected cost."""
+"""Decisions under a density: the action with the lowest expected cost."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -14,18 +14,17 @@ from framework.distributions.circular_moments import circular_moments
 from framework.distributions.protocol import arc_length, arc_probability, cdf
 
 NOTHING = 1e-9
-"""Threshold below which the mass of an arc from a grid is rounding: it counts as 0, also at infinite cost.
-"""
+"""Threshold below which the mass of an arc that was computed on a grid is rounding error and counts as 0."""
 
 
 def decide(expected: Float[Tensor, "*batch action"]) -> Int[Tensor, "*batch"]:
-    """Return the index of the action of least expected cost, the first one of equals.
+    """Return the index of the action with the lowest expected cost, the first of several equal ones.
 
     Raises:
-        UserError: costs are NaN, so that no decision is possible; the message says how many.
+        UserError: expected costs are NaN.
     """
     refuse_nan(expected.amax(-1).reshape(-1), "expected costs")
-    # argmin may return any one of equal costs
+    # argmin may return any of several equal costs
     least = expected == expected.amin(-1, keepdim=True)
     return least.int().argmax(-1)
 
@@ -33,7 +32,7 @@ def decide(expected: Float[Tensor, "*batch action"]) -> Int[Tensor, "*batch"]:
 def expected_costs(
     probability: Float[Tensor, "*batch truth"], costs: Float[Tensor, "truth action"]
 ) -> Float[Tensor, "*batch action"]:
-    """Return Σ_truth p(truth) cost(truth, action), float64; a truth of probability 0 adds 0, even at infinite cost."""
+    """Return Σ_truth p(truth) cost(truth, action), float64; probability 0 times an infinite cost is 0."""
     probability = probability.double().unsqueeze(-1)
     return torch.where(probability == 0, 0.0, probability * costs.double()).sum(-2)
 
@@ -45,29 +44,31 @@ def decide_by_draws(
     actions: Sequence[str],
     samples: int = 1000,
 ) -> tuple[Int[Tensor, "*batch"], Float[Tensor, "*batch action"]]:
-    """Return the decisions under any cost function, and the expected costs: means over `samples` draws of the density.
+    """Return the best action under any cost function, and the expected costs: means over draws of the density.
 
     Args:
-        density: a density of any kind, batch_shape (*batch).
+        density: density of any kind, batch_shape (*batch).
         cost: (action, targets of shape (samples, *batch, *event)) → costs (samples, *batch). Angles are radians.
         actions: names of the actions.
         samples: number of draws.
 
     Raises:
-        ValueError: there are no actions or no samples, or the costs have another shape.
+        ValueError: there are no actions or no samples, or the costs have a wrong shape.
     """
     if not actions or samples < 1:
-        raise ValueError(f"wanted an action and a sample at least, got {len(actions)} and {samples}.")
-    drawn = density.sample(torch.Size((samples,)))
-    wanted = (samples, *density.batch_shape)
+        raise ValueError(f"got {len(actions)} actions and {samples} samples, expected at least one of each.")
+    draws = density.sample(torch.Size((samples,)))
+    expected_shape = (samples, *density.batch_shape)
     columns = []
     for action in actions:
-        found = cost(action, drawn)
-        if tuple(found.shape) != wanted:
+        draw_costs = cost(action, draws)
+        if tuple(draw_costs.shape) != expected_shape:
             raise ValueError(
-                f"cost({action!r}, targets) came with shape {tuple(found.shape)}; wanted {wanted}, one cost a target."
+                f"cost({action!r}, targets) returned the shape {tuple(draw_costs.shape)}, expected {expected_shape}: "
+                "one cost per "
+                "target."
             )
-        columns.append(found.double().mean(0))
+        columns.append(draw_costs.double().mean(0))
     expected = torch.stack(columns, -1)
     return decide(expected), expected
 
@@ -75,25 +76,25 @@ def decide_by_draws(
 def region_probabilities(
     density: Distribution, edges: Float[Tensor, "edge"], samples: int
 ) -> Float[Tensor, "batch region"]:
-    """Return the masses of the regions into which edges cut a line or a circle, float64; see `regions`.
+    """Return the probabilities of the regions into which edges divide a line or a circle (see `regions`), float64.
 
-    The masses are exact where `protocol.cdf`, `protocol.arc_probability` or `circular_moments` are exact;
-    otherwise they are shares of `samples` draws.
+    The probabilities are exact if `protocol.cdf`, `protocol.arc_probability` or `circular_moments` is exact; otherwise
+    they are shares of `samples` draws.
 
     Args:
-        density: density of one real or one angle, batch_shape (batch,).
-        edges: edges in ascending order; for an angle in radians, within one turn.
+        density: density of one real number or one angle, batch_shape (batch,).
+        edges: edges in ascending order; for an angle, in radians and within one turn.
         samples: number of draws.
     """
     around = isinstance(density.support, Circular)
-    found = _arcs(density, edges) if around else _intervals(density, edges)
-    if found is not None and not bool(found.isinf().any()):
-        return found
-    drawn = density.sample(torch.Size((samples,))).squeeze(-1)
+    probabilities = _arcs(density, edges) if around else _intervals(density, edges)
+    if probabilities is not None and not bool(probabilities.isinf().any()):
+        return probabilities
+    draws = density.sample(torch.Size((samples,))).squeeze(-1)
     count = len(edges) if around else len(edges) + 1
-    where = torch.nn.functional.one_hot(regions(drawn, edges, around=around), count)
-    shares = torch.where(drawn.isnan().any(0).unsqueeze(-1), torch.nan, where.double().mean(0))
-    return shares if found is None else torch.where(found.isinf(), shares, found)
+    where = torch.nn.functional.one_hot(regions(draws, edges, around=around), count)
+    shares = torch.where(draws.isnan().any(0).unsqueeze(-1), torch.nan, where.double().mean(0))
+    return shares if probabilities is None else torch.where(probabilities.isinf(), shares, probabilities)
 
 
 def regions(value: Tensor, edges: Float[Tensor, "edge"], *, around: bool) -> Int[Tensor, "*shape"]:
@@ -104,7 +105,7 @@ def regions(value: Tensor, edges: Float[Tensor, "edge"], *, around: bool) -> Int
     """
     if not around:
         return torch.bucketize(value.double().contiguous(), edges, right=True)
-    # an angle that was set to an edge may lie below that edge after rounding to float32
+    # an angle at an edge may lie below this edge after rounding to float32
     ahead = torch.remainder(arc_length(edges[0], value) + 1e-7, 2 * math.pi)
     return torch.bucketize(ahead, edges - edges[0] + 1e-12, right=True) - 1
 
@@ -119,7 +120,7 @@ def _intervals(density: Distribution, edges: Tensor) -> Tensor | None:
 
 
 def _arcs(density: Distribution, edges: Tensor) -> Tensor:
-    """Return the masses of the arcs; infinite where a density is too narrow for the grid."""
+    """Return the probabilities of the arcs; infinite for densities that are too narrow for the grid."""
     shape = torch.Size((len(edges), *density.batch_shape))
     start, end = (
         e.reshape(-1, *(1,) * len(density.batch_shape)).expand(shape) for e in (edges, edges.roll(-1))
@@ -127,7 +128,7 @@ def _arcs(density: Distribution, edges: Tensor) -> Tensor:
     known = arc_probability(density, start.unsqueeze(-1), end.unsqueeze(-1))
     if known is not None:
         return known.movedim(0, -1)
-    seen = circular_moments(density)
-    found = seen.arc_probability(start, end)
-    found = torch.where(found < NOTHING, 0.0, found)
-    return torch.where(seen.resolved, found, torch.inf).movedim(0, -1)
+    moments = circular_moments(density)
+    probabilities = moments.arc_probability(start, end)
+    probabilities = torch.where(probabilities < NOTHING, 0.0, probabilities)
+    return torch.where(moments.resolved, probabilities, torch.inf).movedim(0, -1)

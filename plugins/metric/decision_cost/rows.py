@@ -1,4 +1,4 @@
-"""Rows of the contract: classes, with more actions than classes too; reals; and angles, alone and one of three."""
+"""Contract-test cases: classes (also with more actions than classes), real numbers, one angle, one of three angles."""
 
 import math
 

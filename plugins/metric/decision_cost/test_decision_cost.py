@@ -30,7 +30,7 @@ ANGLE = Target("angle", ("azimuth",))
 REAL = Target("real", ("height",))
 
 
-def measured(target, density, value, **config):
+def compute_metric(target, density, value, **config):
     metric = build("metric", resolve("metric", {"name": "decision_cost", **config}), target=target)
     for part in torch.arange(len(value)).split(5):
         metric.update(Prediction(density(part), {"target": value[part]}))
@@ -42,21 +42,21 @@ COSTS = st.one_of(st.floats(0, 10), st.sampled_from([0.0, 1e30, 1e-30, -5.0, mat
 
 @settings(deadline=None, max_examples=80)
 @given(st.lists(st.lists(COSTS, min_size=3, max_size=3), min_size=4, max_size=4), st.data())
-def test_expected_costs_and_decisions_by_a_loop(columns, data):
+def test_expected_costs_and_decisions_equal_a_loop(columns, data):
     table = [list(row) for row in zip(*columns, strict=True)]  # 3 truths × 4 actions
     counts = data.draw(st.lists(st.integers(0, 3), min_size=3, max_size=3).filter(any))
     probability = [count / sum(counts) for count in counts]
     wanted = [
         sum(p * table[truth][action] for truth, p in enumerate(probability) if p > 0) for action in range(4)
     ]
-    found = expected_costs(torch.tensor([probability], dtype=WIDE), torch.tensor(table, dtype=WIDE))
-    np.testing.assert_allclose(found[0].numpy(), wanted, rtol=1e-12)
-    chosen = decide(found)[0].item()
-    assert found[0, chosen] == found[0].min()
-    assert not any(found[0, before] == found[0, chosen] for before in range(chosen))
+    actual = expected_costs(torch.tensor([probability], dtype=WIDE), torch.tensor(table, dtype=WIDE))
+    np.testing.assert_allclose(actual[0].numpy(), wanted, rtol=1e-12)
+    chosen = decide(actual)[0].item()
+    assert actual[0, chosen] == actual[0].min()
+    assert not any(actual[0, before] == actual[0, chosen] for before in range(chosen))
 
 
-def test_the_first_of_equals_is_taken_and_a_forbidden_action_never_while_another_is_allowed():
+def test_the_first_of_equal_actions_is_chosen_and_forbidden_ones_are_avoided():
     assert decide(torch.tensor([[2.0, 1.0, 1.0], [math.inf, 1e30, math.inf], [math.inf] * 3])).tolist() == [
         1,
         1,
@@ -67,77 +67,80 @@ def test_the_first_of_equals_is_taken_and_a_forbidden_action_never_while_another
         decide(torch.tensor([[1.0, 2.0], [math.nan, 0.0]]))
 
 
-def test_of_classes_everything_by_hand():
+def test_results_for_classes_equal_a_computation_by_hand():
     probability = torch.tensor([[1.0, 0, 0], [0.7, 0.3, 0], [0.1, 0.5, 0.4], [0.3, 0.4, 0.3], [0, 0, 1.0]])
     label = torch.tensor([0, 1, 2, 0, 2])
     # go costs (0, 1e3, inf), slow down (1, 0, 1), stop (5, 1, 0), ask (2, 2, 2)
-    found = measured(THREE, lambda part: Categorical(probs=probability[part].double()), label, **ASK)
-    # go; slow down (0.7); slow down (0.5); slow down (0.6); stop. float64 holds p = 0 for 2e-16, which inf forbids
-    assert found["share_go"] == 0.0
+    actual = compute_metric(THREE, lambda part: Categorical(probs=probability[part].double()), label, **ASK)
+    # go; slow down (0.7); slow down (0.5); slow down (0.6); stop. torch replaces p = 0 by 2e-16, so an infinite cost
+    # excludes the action
+    assert actual["share_go"] == 0.0
     sure = [[1.0, 0, 0], [0.7, 0.3, 0], [0.1, 0.5, 0.4], [0.3, 0.4, 0.3], [0, 0, 1.0]]
     logits = torch.tensor(sure, dtype=WIDE).log()
-    found = measured(THREE, lambda part: Categorical(logits=logits[part], validate_args=False), label, **ASK)
-    assert found["decision_cost"] == pytest.approx((0 + 0 + 1 + 1 + 0) / 5)
-    assert found["decision_cost_fixed"] == pytest.approx(
+    actual = compute_metric(
+        THREE, lambda part: Categorical(logits=logits[part], validate_args=False), label, **ASK
+    )
+    assert actual["decision_cost"] == pytest.approx((0 + 0 + 1 + 1 + 0) / 5)
+    assert actual["decision_cost_fixed"] == pytest.approx(
         min(4, (1 + 0 + 1 + 1 + 1) / 5, (5 + 1 + 0 + 5 + 0) / 5, 2)
     )
-    assert found["decision_cost_oracle"] == 0.0
+    assert actual["decision_cost_oracle"] == 0.0
     shares = {"share_go": 0.2, "share_slow_down": 0.6, "share_stop": 0.2, "share_ask_a_person": 0.0}
-    assert {name: found[name] for name in shares} == pytest.approx(shares)
+    assert {name: actual[name] for name in shares} == pytest.approx(shares)
 
 
 def test_the_default_costs_are_the_error_rate_of_the_mode():
     torch.manual_seed(0)
     logits, label = torch.randn(60, 3), torch.randint(3, (60,))
-    found = measured(THREE, lambda part: Categorical(logits=logits[part]), label)
-    assert found["decision_cost"] == pytest.approx((logits.argmax(-1) != label).double().mean().item())
-    assert found["decision_cost_fixed"] == pytest.approx(1 - torch.bincount(label).max().item() / 60)
-    assert {name for name in found if name.startswith("share")} == {"share_empty", "share_far", "share_near"}
+    actual = compute_metric(THREE, lambda part: Categorical(logits=logits[part]), label)
+    assert actual["decision_cost"] == pytest.approx((logits.argmax(-1) != label).double().mean().item())
+    assert actual["decision_cost_fixed"] == pytest.approx(1 - torch.bincount(label).max().item() / 60)
+    assert {name for name in actual if name.startswith("share")} == {"share_empty", "share_far", "share_near"}
 
 
-def test_a_huge_cost_decides_however_small_its_probability():
+def test_a_huge_cost_decides_at_any_probability():
     table = [[0.0, 1.0], [1e30, 0.0]]
     logits = torch.tensor([[0.0, -60.0], [0.0, -80.0]], dtype=WIDE)  # 1e30 · e^-60 = 8.8e3, e^-80: 1.8e-5
-    found = expected_costs(logits.softmax(-1), torch.tensor(table, dtype=WIDE))
-    np.testing.assert_allclose(found[:, 0].numpy(), 1e30 * np.exp([-60.0, -80.0]), rtol=1e-10)
-    assert decide(found).tolist() == [1, 0]
+    actual = expected_costs(logits.softmax(-1), torch.tensor(table, dtype=WIDE))
+    np.testing.assert_allclose(actual[:, 0].numpy(), 1e30 * np.exp([-60.0, -80.0]), rtol=1e-10)
+    assert decide(actual).tolist() == [1, 0]
 
 
 @pytest.mark.parametrize("dtype, tolerance", [(torch.float32, 1e-6), (WIDE, 1e-13)])
-def test_masses_of_intervals_are_scipys(dtype, tolerance):
+def test_masses_of_intervals_equal_scipys(dtype, tolerance):
     torch.manual_seed(1)
     mean = torch.randn(5, 2, 1, dtype=dtype)
     density = Mixture(torch.zeros(5, 2, dtype=dtype), Independent(Normal(mean, torch.ones_like(mean)), 1))
     edges = torch.tensor([-1.0, 0.5, 2.0], dtype=WIDE)
     below = stats.norm.cdf(edges.numpy() - mean.double().numpy()).mean(1)
     wanted = np.diff(np.pad(below, ((0, 0), (1, 1)), constant_values=((0, 0), (0, 1))), axis=1)
-    found = region_probabilities(density, edges, 10)
-    np.testing.assert_allclose(found.numpy(), wanted, atol=tolerance)
+    actual = region_probabilities(density, edges, 10)
+    np.testing.assert_allclose(actual.numpy(), wanted, atol=tolerance)
     assert regions(torch.tensor([-9.0, -1.0, 0.0, 0.5, 9.0]), edges, around=False).tolist() == [0, 1, 1, 2, 3]
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, WIDE])
-def test_masses_of_arcs_are_those_of_the_closed_form(dtype):
+def test_masses_of_arcs_equal_the_closed_form(dtype):
     place = torch.linspace(-9, 9, 11, dtype=dtype)[:, None]
     edges = torch.tensor([-45.0, 45.0, 135.0, 225.0], dtype=WIDE).deg2rad()
 
     def below(x):  # ∫ (1 + cos)/2π
         return (x + np.sin(x)) / (2 * np.pi)
 
-    apart = edges.numpy() - place.double().numpy()
-    wanted = below(apart + np.pi / 2) - below(apart)
-    found = region_probabilities(Cardioid(place), edges, 10)
-    np.testing.assert_allclose(found.numpy(), wanted, atol=1e-6 if dtype == torch.float32 else 1e-12)
+    difference = edges.numpy() - place.double().numpy()
+    wanted = below(difference + np.pi / 2) - below(difference)
+    actual = region_probabilities(Cardioid(place), edges, 10)
+    np.testing.assert_allclose(actual.numpy(), wanted, atol=1e-6 if dtype == torch.float32 else 1e-12)
 
 
 def test_an_edge_belongs_to_the_region_that_begins_there():
     edges = torch.tensor([-45.0, 45.0, 135.0, 225.0], dtype=WIDE).deg2rad()
     for dtype in (torch.float32, WIDE):
         at = torch.tensor([-45.0, 45.0, 135.0, 225.0, -135.0, 0.0, 359.0, -46.0, 44.9], dtype=WIDE).deg2rad()
-        found = regions(at.to(dtype), edges, around=True).tolist()
-        assert found == [0, 1, 2, 3, 3, 0, 0, 3, 0]
+        actual = regions(at.to(dtype), edges, around=True).tolist()
+        assert actual == [0, 1, 2, 3, 3, 0, 0, 3, 0]
     turned = regions(at + 20 * math.pi, edges, around=True).tolist()
-    assert turned == found
+    assert turned == actual
 
 
 def test_narrow_densities_act_as_points():
@@ -149,39 +152,39 @@ def test_narrow_densities_act_as_points():
     ):
         head = build("density_head", resolve("density_head", config), target=ANGLE).double()
         torch.manual_seed(2)
-        found = region_probabilities(head(raw), edges, 500)
-        np.testing.assert_allclose(found[:3].numpy(), np.eye(4)[[0, 2, 1]], atol=1e-5)
-        np.testing.assert_allclose(found.sum(-1).numpy(), 1, atol=1e-9)
+        actual = region_probabilities(head(raw), edges, 500)
+        np.testing.assert_allclose(actual[:3].numpy(), np.eye(4)[[0, 2, 1]], atol=1e-5)
+        np.testing.assert_allclose(actual.sum(-1).numpy(), 1, atol=1e-9)
 
 
-def test_unknown_reals_are_drawn_from():
+def test_unknown_densities_of_real_numbers_are_estimated_from_draws():
     half = Independent(HalfNormal(torch.ones(3, 1, dtype=WIDE)), 1)
     torch.manual_seed(3)
-    found = region_probabilities(half, torch.tensor([0.5, 1.0], dtype=WIDE), 20_000)
+    actual = region_probabilities(half, torch.tensor([0.5, 1.0], dtype=WIDE), 20_000)
     low, high = stats.halfnorm.cdf([0.5, 1.0])
-    np.testing.assert_allclose(found.numpy(), [[low, high - low, 1 - high]] * 3, atol=4 * 0.5 / 20_000**0.5)
+    np.testing.assert_allclose(actual.numpy(), [[low, high - low, 1 - high]] * 3, atol=4 * 0.5 / 20_000**0.5)
 
 
-def test_of_an_angle_acting_on_densities_is_paid_by_the_truth():
+def test_decisions_for_an_angle_cost_what_the_true_angle_says():
     torch.manual_seed(4)
     place = torch.randn(40, 1) * 3
     value = Cardioid(place).sample()
     table = [[0.0, 2.0, 1.0], [3.0, 0.0, 1.0]]
     config = {"costs": table, "actions": ["drive", "brake", "ask"], "edges_deg": [-90.0, 90.0]}
-    found = measured(ANGLE, lambda part: Cardioid(place[part]), value, **config)
+    actual = compute_metric(ANGLE, lambda part: Cardioid(place[part]), value, **config)
     front = 0.5 + np.cos(place.double().numpy()[:, 0]) / np.pi  # mass of the cardioid within 90° of 0
     expected = front[:, None] * table[0] + (1 - front)[:, None] * table[1]
     chosen = expected.argmin(1)
     truth = (np.cos(value.double().numpy()[:, 0]) < 0).astype(int)
     paid = np.array(table)[truth]
-    assert found["decision_cost"] == pytest.approx(paid[np.arange(40), chosen].mean())
-    assert found["decision_cost_fixed"] == pytest.approx(paid.mean(0).min())
-    assert found["decision_cost_oracle"] == pytest.approx(paid.min(1).mean())
-    assert found["share_ask"] == pytest.approx((chosen == 2).mean())
+    assert actual["decision_cost"] == pytest.approx(paid[np.arange(40), chosen].mean())
+    assert actual["decision_cost_fixed"] == pytest.approx(paid.mean(0).min())
+    assert actual["decision_cost_oracle"] == pytest.approx(paid.min(1).mean())
+    assert actual["share_ask"] == pytest.approx((chosen == 2).mean())
     assert len(set(chosen)) == 3
 
 
-def test_any_cost_function_by_draws():
+def test_any_cost_function_can_be_evaluated_by_draws():
     # steering by θ costs 1 - cos(θ - φ): of draws from a cardioid about μ, 1 - cos(θ - μ)/2
     density = Cardioid(torch.tensor([[0.1], [1.6], [3.0]], dtype=WIDE))
     steer = {"ahead": 0.0, "left": math.pi / 2, "back": math.pi}
@@ -192,9 +195,9 @@ def test_any_cost_function_by_draws():
     wanted = 1 - np.cos(np.array([[0.1], [1.6], [3.0]]) - np.array(list(steer.values()))) / 2
     np.testing.assert_allclose(expected.numpy(), wanted, atol=4 / 20_000**0.5)
     assert chosen.tolist() == [0, 1, 2]
-    with pytest.raises(ValueError, match=r"came with shape \(10, 3, 1\); wanted \(10, 3\)"):
+    with pytest.raises(ValueError, match=r"returned the shape \(10, 3, 1\), expected \(10, 3\)"):
         decide_by_draws(density, lambda action, target: target, ["ahead"], 10)
-    with pytest.raises(ValueError, match="wanted an action"):
+    with pytest.raises(ValueError, match="got 0 actions and 10 samples"):
         decide_by_draws(density, lambda action, target: target, [], 10)
 
 
@@ -204,50 +207,50 @@ def test_any_cost_function_by_draws():
         (
             THREE,
             {"costs": [[0.0, 1.0]]},
-            r"rows of \[2\] numbers; wanted 3 rows, one for each of empty, far, near",
+            r"rows of \[2\] numbers, expected 3 rows \(one for each of empty, far, near\)",
         ),
-        (THREE, {"costs": [[0.0], [1.0, 2.0], [1.0]]}, "as many numbers as there are actions"),
-        (THREE, {"costs": [[0.0, 1.0]] * 3}, "wanted 2 names, one for each column"),
-        (THREE, {"costs": [[0.0, 1.0]] * 3, "actions": ["a b", "a  b"]}, "wanted names that differ"),
-        (THREE, {"costs": [[math.nan] * 3] * 3}, "wanted numbers, or .inf for a forbidden action"),
-        (THREE, {"costs": [[-math.inf] * 3] * 3}, "wanted numbers"),
+        (THREE, {"costs": [[0.0], [1.0, 2.0], [1.0]]}, "with one number per action"),
+        (THREE, {"costs": [[0.0, 1.0]] * 3}, "expected 2 names, one for each column"),
+        (THREE, {"costs": [[0.0, 1.0]] * 3, "actions": ["a b", "a  b"]}, "the names of actions must differ"),
+        (THREE, {"costs": [[math.nan] * 3] * 3}, "expected numbers, or .inf for a forbidden action"),
+        (THREE, {"costs": [[-math.inf] * 3] * 3}, "expected numbers"),
         (
             THREE,
             {"costs": [[1.0] * 3, [math.inf] * 3, [1.0] * 3]},
-            "every action is forbidden where far is true",
+            "forbids every action if far is true",
         ),
-        (THREE, {"edges": [0.0]}, "are cut by nothing: classes are the rows already"),
+        (THREE, {"edges": [0.0]}, "targets of kind 'class' need no edges"),
         (THREE, {"number": "x"}, "target is one class"),
-        (REAL, {}, r"decision_cost.edges = None: .* such as \[0.0\]"),
-        (REAL, {"edges_deg": [0.0, 90.0]}, "of kind 'real' are cut by edges"),
+        (REAL, {}, r"got decision_cost.edges = None, .* such as \[0.0\]"),
+        (REAL, {"edges_deg": [0.0, 90.0]}, "of kind 'real' use edges"),
         (REAL, {"edges": [1.0, 1.0]}, "in ascending order"),
-        (REAL, {"edges": [math.nan]}, "wanted finite numbers"),
+        (REAL, {"edges": [math.nan]}, "expected finite numbers"),
         (ANGLE, {"edges_deg": [0.0]}, "2 or more edges"),
         (ANGLE, {"edges_deg": [0.0, 360.0]}, "within one turn"),
-        (Target("real", ("x", "y")), {"edges": [0.0]}, "Name one of: x, y"),
+        (Target("real", ("x", "y")), {"edges": [0.0]}, "Set decision_cost.number to one of: x, y"),
         (Target("real", ("width", "y")), {"edges": [0.0], "number": "widht"}, "Did you mean 'width'"),
     ],
 )
-def test_tables_that_do_not_fit_are_refused(target, config, message):
+def test_tables_that_do_not_fit_raise_an_error(target, config, message):
     with pytest.raises(ConfigError, match=message):
         build("metric", resolve("metric", {"name": "decision_cost", **config}), target=target)
 
 
-def test_nan_and_labels_that_do_not_exist_are_named():
+def test_nan_and_wrong_labels_raise_a_clear_message():
     with pytest.raises(UserError, match="1 of 1 expected costs"):
-        measured(
+        compute_metric(
             ANGLE, lambda part: Cardioid(torch.tensor([[math.nan]])), torch.zeros(1, 1), edges_deg=[0.0, 90.0]
         )
     nothing = Independent(
         Normal(torch.tensor([[math.nan]]), 1.0, validate_args=False), 1, validate_args=False
     )
     with pytest.raises(UserError, match="1 of 1 expected costs"):
-        measured(REAL, lambda part: nothing, torch.zeros(1, 1), edges=[0.0])
+        compute_metric(REAL, lambda part: nothing, torch.zeros(1, 1), edges=[0.0])
     with pytest.raises(DataError, match="is 3, but class indices go from 0 to 2"):
-        measured(THREE, lambda part: Categorical(logits=torch.zeros(1, 3)), torch.tensor([3]))
+        compute_metric(THREE, lambda part: Categorical(logits=torch.zeros(1, 3)), torch.tensor([3]))
 
 
-def test_nothing_seen_has_no_cost_but_names_its_actions():
+def test_actions_are_named_without_samples():
     metric = DecisionCost(REAL, edges=[-1.0, 2.5])
     assert metric.actions == ["below_-1", "-1_to_2.5", "above_2.5"]
     assert DecisionCost(ANGLE, edges_deg=[-90.0, 90.0]).actions == ["-90_to_90_deg", "90_to_-90_deg"]

@@ -1,1 +1,1 @@
-"""Mean absolute and root mean square errors of reals."""
+"""Mean absolute and root mean square errors of real-valued targets."""

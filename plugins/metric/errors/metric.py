@@ -1,4 +1,4 @@
-"""Errors of the point prediction of reals, in the unit of the target."""
+"""Errors of the point prediction of real-valued targets, in the unit of the target."""
 
 from abc import abstractmethod
 from typing import ClassVar, Literal, final
@@ -12,14 +12,14 @@ from framework.prediction import Prediction
 from framework.target import Target
 
 FIRST = 6
-"""Largest number of reals for which the error of each is reported too; of more reals only the mean is reported."""
+"""Largest number of target numbers for which the error of each is reported; for more, only the mean is reported."""
 
 
 class Errors(Mean):
-    """Base class of errors: the mean of a power of each number's error, for all numbers together and for each.
+    """Base class of errors that are a mean power of the error, over all numbers of the target and for each number.
 
     Raises:
-        ConfigError: the target is not made of reals.
+        ConfigError: the target is not real-valued.
     """
 
     bibtex = ""
@@ -33,29 +33,29 @@ class Errors(Mean):
 
     @abstractmethod
     def power(self, error: Float[Tensor, "batch number"]) -> Float[Tensor, "batch number"]:
-        """Return the power of the error whose mean is taken."""
+        """Return the power of the error, such as its square."""
 
     @abstractmethod
     def result(self, mean: Tensor, error: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the reported number and its standard error, from the mean of the powers and its standard error."""
+        """Return the reported result and its standard error, from the mean power and its standard error."""
 
     def update(self, prediction: Prediction) -> None:
         # convert to float64 first, so that the difference is not rounded to float32
-        each = self.power(prediction.point.double() - prediction.target.double())
-        self.add_samples(torch.cat([each.mean(-1, keepdim=True), each[:, : len(self.names) - 1]], -1))
+        powers = self.power(prediction.point.double() - prediction.target.double())
+        self.add_samples(torch.cat([powers.mean(-1, keepdim=True), powers[:, : len(self.names) - 1]], -1))
 
     def compute(self) -> dict[str, Tensor]:
-        found: dict[str, Tensor] = {}
+        results: dict[str, Tensor] = {}
         for name, mean, error in zip(self.names, *self.mean_and_error(), strict=True):
-            found[name], found[f"{name}_sem"] = self.result(mean, error)
-        return found
+            results[name], results[f"{name}_sem"] = self.result(mean, error)
+        return results
 
 
 @final
 class MeanAbsoluteError(Errors):
     """Mean absolute error of the point prediction in the target's unit, with its standard error over samples.
 
-    For several reals, `mae` is the mean over them and `mae_<name>` the error of one real.
+    For a target of several numbers, `mae` is the mean over all numbers, and `mae_<name>` is the error of one number.
     """
 
     key = "mae"
@@ -73,8 +73,8 @@ class MeanAbsoluteError(Errors):
 class RootMeanSquareError(Errors):
     """Root of the mean squared error of the point prediction in the target's unit, with its standard error.
 
-    For several reals, `rmse` is the root of the mean over them and `rmse_<name>` the error of one real. The standard
-    error is that of the mean square s², divided by 2 s (delta method).
+    For a target of several numbers, `rmse` is over all numbers, and `rmse_<name>` is the error of one number. The
+    standard error is the standard error of the mean square, divided by twice the root (delta method).
     """
 
     key = "rmse"
@@ -86,11 +86,11 @@ class RootMeanSquareError(Errors):
 
     def result(self, mean: Tensor, error: Tensor) -> tuple[Tensor, Tensor]:
         root = mean.sqrt()
-        # if every error is 0, so is its standard error; do not divide by 0
+        # if all errors are 0, the standard error is 0 too; do not divide by 0
         return root, torch.where(root == 0, error, error / (2 * root))
 
 
 def names(metric: str, target: Target) -> list[str]:
-    """Return the names of the results: of all numbers together, then of each where there are 2 to FIRST numbers."""
+    """Return the names of the results: over all numbers, and then of each number if there are 2 to `FIRST` numbers."""
     several = target.names if 1 < len(target.names) <= FIRST else ()
     return [metric, *(f"{metric}_{name}" for name in several)]

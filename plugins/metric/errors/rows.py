@@ -1,4 +1,4 @@
-"""Rows of the contract: targets of one and of three reals."""
+"""Contract-test cases: targets of one and of three real numbers."""
 
 from framework.target import Target
 from framework.testing.rows import MetricRow

@@ -1,4 +1,4 @@
-"""Tests of errors of reals against plain NumPy, and of their standard errors against a spread over repetitions."""
+"""Tests of errors of real numbers, compared with NumPy, and of standard errors, compared with repetitions."""
 
 import numpy as np
 import pytest
@@ -26,16 +26,16 @@ def computed(name: str, residual: np.ndarray, location: float = 0.0) -> dict[str
 
 @pytest.mark.parametrize("location", [0.0, 1e6, -1e12])
 @pytest.mark.parametrize("name", KINDS)
-def test_errors_are_numpys(name: str, location: float) -> None:
+def test_errors_equal_numpys(name: str, location: float) -> None:
     residual = np.random.default_rng(0).normal(size=(100, 2)) * [1.0, 1e3]
-    residual = (location + residual) - location  # as the sum holds it
-    found = computed(name, residual, location)
+    residual = (location + residual) - location  # rounded like the sum
+    actual = computed(name, residual, location)
     power = {"mae": lambda some: np.abs(some).mean(), "rmse": lambda some: np.sqrt(np.square(some).mean())}[
         name
     ]
-    assert found[name] == pytest.approx(power(residual), rel=1e-12)
-    assert found[f"{name}_x"] == pytest.approx(power(residual[:, 0]), rel=1e-12)
-    assert found[f"{name}_y"] == pytest.approx(power(residual[:, 1]), rel=1e-12)
+    assert actual[name] == pytest.approx(power(residual), rel=1e-12)
+    assert actual[f"{name}_x"] == pytest.approx(power(residual[:, 0]), rel=1e-12)
+    assert actual[f"{name}_y"] == pytest.approx(power(residual[:, 1]), rel=1e-12)
 
 
 @pytest.mark.parametrize("name", KINDS)
@@ -43,12 +43,11 @@ def test_the_standard_error_is_the_spread_over_repetitions(name: str) -> None:
     random = np.random.default_rng(1)
     runs = [computed(name, random.standard_t(8, size=(400, 2))) for _ in range(300)]
     spread = np.std([run[name] for run in runs])
-    assert np.mean([run[f"{name}_sem"] for run in runs]) == pytest.approx(
-        spread, rel=0.13
-    )  # three deviations of it
+    # three times the standard deviation of this spread
+    assert np.mean([run[f"{name}_sem"] for run in runs]) == pytest.approx(spread, rel=0.13)
 
 
-def test_no_error_has_no_error() -> None:
+def test_perfect_predictions_have_no_standard_error() -> None:
     assert computed("rmse", np.zeros((9, 2))) == dict.fromkeys(
         ["rmse", "rmse_sem", "rmse_x", "rmse_x_sem", "rmse_y", "rmse_y_sem"], 0.0
     )

@@ -1,4 +1,4 @@
-"""Places where paths come down through a plane, and how well drawn paths predict the true place."""
+"""Landing places, at which paths come down through a plane, and accuracy of sampled landing places."""
 
 from typing import NamedTuple
 
@@ -9,8 +9,14 @@ from torch import Tensor
 from framework.flights.frames import PARTS
 
 
-class Shown(NamedTuple):
-    """One prediction that the figure shows, metres: seen positions that were read (frame, 3), true future, draws."""
+class ShownFlight(NamedTuple):
+    """One prediction that the figure shows, metres.
+
+    Attributes:
+        read: observed positions.
+        future: true future positions.
+        draws: sampled future positions.
+    """
 
     read: Float[Tensor, "frame 3"]
     future: Float[Tensor, "time 3"]
@@ -18,19 +24,22 @@ class Shown(NamedTuple):
 
 
 def last_seen(inputs: Tensor | None, truth: Float[Tensor, "batch time 3"]) -> Float[Tensor, "batch 3"]:
-    """Return where the ball was seen last, metres; NaN where inputs lack the fields `PARTS` or never saw the ball."""
+    """Return the last observed position of the ball, metres.
+
+    The result is NaN if the inputs lack the fields `PARTS`, or if the ball was never observed.
+    """
     nowhere = torch.full_like(truth[:, 0], torch.nan)
     if inputs is None or inputs.dim() != 2 or inputs.shape[1] % len(PARTS):
         return nowhere
     frames = inputs.to(truth).unflatten(-1, (-1, len(PARTS)))
-    seen = frames[..., 4] > 0.5
-    latest = frames[..., 0].where(seen, -torch.inf).argmax(-1)
+    visible = frames[..., 4] > 0.5
+    latest = frames[..., 0].where(visible, -torch.inf).argmax(-1)
     places = frames[torch.arange(len(frames), device=frames.device), latest, 1:4]
-    return places.where(seen.any(-1, keepdim=True), nowhere)
+    return places.where(visible.any(-1, keepdim=True), nowhere)
 
 
 def from_start(start: Float[Tensor, "batch 3"], path: Float[Tensor, "*draw batch time 3"]) -> Tensor:
-    """Return the path with the start put before its first place."""
+    """Return the path with the start as an additional first position."""
     first = start.expand(*path.shape[:-3], -1, -1).unsqueeze(-2)
     return torch.cat([first.to(path), path], -2)
 
@@ -38,47 +47,53 @@ def from_start(start: Float[Tensor, "batch 3"], path: Float[Tensor, "*draw batch
 def crossing(
     path: Float[Tensor, "*batch time 3"], height: float
 ) -> tuple[Float[Tensor, "*batch 2"], Bool[Tensor, "*batch"]]:
-    """Return x and y where a path first comes down through a plane, linear between two frames; and whether it does."""
+    """Return the landing place (x, y) of a path, interpolated between two frames, and whether the path lands.
+
+    A path lands where it first comes down through the plane at `height`.
+    """
     z = path[..., 2]
     down = (z[..., :-1] > height) & (z[..., 1:] <= height)
     first = down.double().argmax(-1, keepdim=True)
     above, below = z[..., :-1].gather(-1, first), z[..., 1:].gather(-1, first)
     share = ((above - height) / (above - below)).clamp(0, 1).nan_to_num(0.0)
     index = first.unsqueeze(-1).expand(*first.shape, 2)
-    here, there = (
+    before, after = (
         path[..., :-1, :2].gather(-2, index).squeeze(-2),
         path[..., 1:, :2].gather(-2, index).squeeze(-2),
     )
-    return here + share * (there - here), down.any(-1)
+    return before + share * (after - before), down.any(-1)
 
 
 def landings(
     draws: Float[Tensor, "draw batch time 3"], truth: Float[Tensor, "batch time 3"], height: float
 ) -> Float[Tensor, "4"]:
-    """Return sums over the windows whose truth lands: their number, CRPS (m), number inside the ellipse, shares missed.
+    """Return sums over the windows whose true path lands.
+
+    The sums are: number of windows, CRPS (m), number of true places inside the ellipse, share of draws that do not
+        land.
 
     The CRPS of draws x_i is mean |x_i - y| - 1/2 mean |x_i - x_j|, i ≠ j (Gneiting & Raftery 2007, eq. 21). The ellipse
     holds 90 % of a normal with the mean and covariance of the draws: (y - m)ᵀ C⁻¹ (y - m) ≤ χ²(0.9) = 4.605.
     """
     place, lands = crossing(truth, height)
-    drawn, there = crossing(draws, height)
-    enough = lands & (there.sum(0) >= 10)
-    found = truth.new_zeros(4, dtype=torch.float64)
-    found[0] = lands.sum()
+    points, lands_there = crossing(draws, height)
+    enough = lands & (lands_there.sum(0) >= 10)
+    sums = truth.new_zeros(4, dtype=torch.float64)
+    sums[0] = lands.sum()
     for row in lands.nonzero()[:, 0].tolist():
-        found[3] += 1 - there[:, row].double().mean()
+        sums[3] += 1 - lands_there[:, row].double().mean()
         if not enough[row]:
-            # too few draws land: take the mean distance of the draws' last places instead
-            found[1] += (draws[:, row, -1, :2] - place[row]).abs().mean()
+            # too few draws land: use the mean distance of the last positions of the draws instead
+            sums[1] += (draws[:, row, -1, :2] - place[row]).abs().mean()
             continue
-        points = drawn[there[:, row], row]
-        count = len(points)
-        ordered = points.sort(0).values
-        weights = 2 * torch.arange(1, count + 1, dtype=torch.float64, device=points.device) - count - 1
+        landed = points[lands_there[:, row], row]
+        count = len(landed)
+        ordered = landed.sort(0).values
+        weights = 2 * torch.arange(1, count + 1, dtype=torch.float64, device=landed.device) - count - 1
         between = (weights.unsqueeze(-1) * ordered).sum(0) / (count * (count - 1))
-        found[1] += ((points - place[row]).abs().mean(0) - between).mean()
-        middle = points.mean(0)
-        covariance = torch.cov(points.T) + 1e-12 * torch.eye(2, dtype=points.dtype, device=points.device)
-        apart = place[row] - middle
-        found[2] += (apart @ torch.linalg.solve(covariance, apart) <= 4.605).double()
-    return found
+        sums[1] += ((landed - place[row]).abs().mean(0) - between).mean()
+        middle = landed.mean(0)
+        covariance = torch.cov(landed.T) + 1e-12 * torch.eye(2, dtype=landed.dtype, device=landed.device)
+        offset = place[row] - middle
+        sums[2] += (offset @ torch.linalg.solve(covariance, offset) <= 4.605).double()
+    return sums

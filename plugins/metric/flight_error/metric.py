@@ -11,13 +11,13 @@ from framework.flights.frames import PARTS, future_frames
 from framework.metric import HasFigure, Metric
 from framework.prediction import Prediction
 from framework.target import Target
-from plugins.metric.flight_error.landing import Shown, from_start, landings, last_seen
+from plugins.metric.flight_error.landing import ShownFlight, from_start, landings, last_seen
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DRAWS = 199
-"""Number of draws of each density; the truth has one of 200 ranks among them, of which the middle 180 are 90 %."""
+"""Number of draws of each density; the target has one of 200 ranks among them, and the middle 180 are 90 %."""
 SHOWN = 8
 """Largest number of predictions that the figure shows."""
 
@@ -26,29 +26,21 @@ class FlightError(Metric, HasFigure):
     """Distance between predicted and true positions, centimetres, against time into the future (thesis Figure 4.3).
 
     - `error_cm`, `error_near_cm`, `error_far_cm`: mean error of the point prediction over all predicted frames, at the
-      first frame, and at the last. The true positions are the batch's "truth" where there is one (a simulated flight
-      without noise).
+      first frame, and at the last. The true positions are the batch field "truth" (a simulated flight without noise) if
+      there is one, else the target.
     - `interval_90`: share of the recorded coordinates within the middle 90 % of their draws.
-    - `landing_crps_cm`: continuous ranked probability score of the place where the ball comes down through the plane at
-      `height`, mean of x and y. `landing_cover_90`: share of the true places within the ellipse that holds 90 % of the
-      drawn ones. `landing_missed`: share of the draws that do not come down there. All three are over windows whose
-      true flight comes down through the plane. Flights begin where the ball was seen last: it may come down before the
-      first predicted frame.
+    - `landing_crps_cm`: continuous ranked probability score of the landing place, at which the ball comes down through
+      the plane at `height`; mean of x and y. `landing_cover_90`: share of true places within the ellipse that contains
+      90 % of the sampled places. `landing_missed`: share of the draws that do not land. All three are over windows
+      whose true flight lands. Flights begin at the last observed position, so the ball may land before the first
+      predicted frame.
 
     Args:
-        height: height of that plane, m. It should be somewhat above the table, so that no bounce lies between two
+        height: height of the plane, m. It should be somewhat above the table, so that no bounce lies between two
             frames.
     """
 
-    bibtex = """@article{gomez2020real,
-  author  = {Gomez-Gonzalez, Sebastian and Prokudin, Sergey and Sch{\\"o}lkopf, Bernhard and Peters, Jan},
-  title   = {Real Time Trajectory Prediction Using Deep Conditional Generative Models},
-  journal = {IEEE Robotics and Automation Letters},
-  volume  = {5},
-  number  = {2},
-  pages   = {970--976},
-  year    = {2020}
-}"""
+    bibtex = "gomez2020real"
     columns: ClassVar[dict[str, str]] = {
         "error_cm": "error cm",
         "error_far_cm": "error at the end cm",
@@ -75,26 +67,26 @@ class FlightError(Metric, HasFigure):
         self.moments = [float(name.partition("_")[2].removesuffix("ms")) for name in target.names[::3]]
         self.height = height
         zero = torch.zeros((), dtype=torch.float64)
-        each = torch.zeros(self.future, dtype=torch.float64)
+        per_frame = torch.zeros(self.future, dtype=torch.float64)
         self.add_state("count", zero, dist_reduce_fx="sum")
         for name in ("distance", "squares", "inside"):
-            self.add_state(name, each.clone(), dist_reduce_fx="sum")
+            self.add_state(name, per_frame.clone(), dist_reduce_fx="sum")
         self.add_state("landing", torch.zeros(4, dtype=torch.float64), dist_reduce_fx="sum")
-        self.shown: list[Shown] = []
+        self.shown: list[ShownFlight] = []
 
     def update(self, prediction: Prediction) -> None:
         recorded = prediction.target.double()
         if not len(recorded):
             return
         truth = prediction.batch.get("truth", recorded).double().unflatten(-1, (self.future, 3))
-        apart = 100 * (prediction.point.double().unflatten(-1, (self.future, 3)) - truth).norm(dim=-1)
-        drawn = prediction.density.sample(torch.Size((DRAWS,))).double()
-        rank = (drawn < recorded).sum(0).unflatten(-1, (self.future, 3))
+        distances = 100 * (prediction.point.double().unflatten(-1, (self.future, 3)) - truth).norm(dim=-1)
+        samples = prediction.density.sample(torch.Size((DRAWS,))).double()
+        rank = (samples < recorded).sum(0).unflatten(-1, (self.future, 3))
         self.count += len(recorded)
-        self.distance += apart.sum(0)
-        self.squares += apart.square().sum(0)
+        self.distance += distances.sum(0)
+        self.squares += distances.square().sum(0)
         self.inside += ((rank >= 10) & (rank < 190)).double().mean(-1).sum(0)
-        draws = drawn.unflatten(-1, (self.future, 3))
+        draws = samples.unflatten(-1, (self.future, 3))
         start = last_seen(prediction.batch.get("input"), truth)
         self.landing += landings(from_start(start, draws), from_start(start, truth), self.height)
         if len(self.shown) < SHOWN:
@@ -103,16 +95,16 @@ class FlightError(Metric, HasFigure):
     def compute(self) -> dict[str, Tensor]:
         mean = self.distance / self.count
         spread = (self.squares[-1] / self.count - mean[-1].square()).clamp(min=0)
-        there = self.landing[0]
+        landing_count = self.landing[0]
         return {
             "error_cm": mean.mean(),
             "error_near_cm": mean[0],
             "error_far_cm": mean[-1],
             "error_far_cm_sem": (spread / (self.count - 1).clamp(min=0)).sqrt(),
             "interval_90": (self.inside / self.count).mean(),
-            "landing_crps_cm": 100 * self.landing[1] / there,
-            "landing_cover_90": self.landing[2] / there,
-            "landing_missed": self.landing[3] / there,
+            "landing_crps_cm": 100 * self.landing[1] / landing_count,
+            "landing_cover_90": self.landing[2] / landing_count,
+            "landing_missed": self.landing[3] / landing_count,
         }
 
     @property
@@ -125,9 +117,9 @@ class FlightError(Metric, HasFigure):
         self.shown = []
 
     def figure(self, title: str, *, synthetic: bool) -> "Figure":
-        from plugins.metric.flight_error.figure import flights
+        from plugins.metric.flight_error.figure import flight_figure
 
-        return flights(
+        return flight_figure(
             self.moments, self.growth.cpu().numpy(), self.shown, self.height, title, synthetic=synthetic
         )
 
@@ -144,4 +136,4 @@ class FlightError(Metric, HasFigure):
         for row in rows:
             frames = inputs[row].double().unflatten(-1, (-1, len(PARTS)))
             read = frames[frames[:, 4] > 0.5][:, 1:4]
-            self.shown.append(Shown(read.cpu(), truth[row].cpu(), draws[:, row].cpu()))
+            self.shown.append(ShownFlight(read.cpu(), truth[row].cpu(), draws[:, row].cpu()))

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from framework.configuration.paths import FilePath
 from framework.errors import DataError
-from plugins.metric.images.metric import compared
+from plugins.metric.images.metric import encode_colors
 from plugins.metric.images.per_image import PerImage
 from plugins.metric.images.perceptual import LEAST_SIDE, Backbone, Distance
 
@@ -16,31 +16,24 @@ from plugins.metric.images.perceptual import LEAST_SIDE, Backbone, Distance
 class LPIPS(PerImage):
     """Learned perceptual distance of each image (Zhang et al. 2018, version 0.1), as a mean over images.
 
-    It is computed in float32 from colours as 8-bit files hold them, but not rounded. For `lpips_masked`, everything
-    outside of the true mask is made white in both images; an image with an empty mask has no such number and does not
-    count.
+    The distance is computed in float32 from sRGB colours that are not rounded to 8 bits. For `lpips_masked`, all pixels
+    outside of the true mask are white in both images; images with an empty mask do not count.
 
-    The networks were trained on photographs, and their weights are not shipped. Without a file of weights there is no
-    number, and the table says "not available"; random weights are never used.
+    The networks were trained on photographs, and their weights are not part of this project. Without a file of weights
+    the result is NaN ("not available" in tables); random weights are never used.
 
     Args:
-        backbone: "alex", which the authors recommend for comparing methods and which papers report; or "vgg".
-        weights: a local file of the backbone in torchvision's format: alexnet-owt-7be5be79.pth, vgg16-397923af.pth.
-        masked: also compute the distance inside the true mask, which batches must then have.
+        backbone: "alex", which the authors recommend for comparisons and which papers report; or "vgg".
+        weights: local file of the backbone in torchvision's format: alexnet-owt-7be5be79.pth or vgg16-397923af.pth.
+        masked: also compute the distance inside the true mask; batches must then have the field "mask".
 
     Raises:
         ConfigError: the file of weights does not exist.
         CheckpointError: the file holds the weights of another network.
-        DataError: images do not have three colours, or are smaller than 31 ("vgg": 16) pixels a side.
+        DataError: images do not have three channels, or a side has fewer than 31 ("vgg": 16) pixels.
     """
 
-    bibtex = """@inproceedings{zhang2018unreasonable,
-  author    = {Zhang, Richard and Isola, Phillip and Efros, Alexei A. and Shechtman, Eli and Wang, Oliver},
-  title     = {The Unreasonable Effectiveness of Deep Features as a Perceptual Metric},
-  booktitle = {IEEE/CVF Conference on Computer Vision and Pattern Recognition (CVPR)},
-  pages     = {586--595},
-  year      = {2018}
-}"""
+    bibtex = "zhang2018unreasonable"
     reads: ClassVar[frozenset[str]] = frozenset({"color"})
     columns: ClassVar[dict[str, str]] = {"lpips": "LPIPS", "lpips_masked": "inside"}
     better: ClassVar[dict[str, Literal["higher", "lower"]]] = dict.fromkeys(columns, "lower")
@@ -60,17 +53,18 @@ class LPIPS(PerImage):
         height, width, number = true.shape
         if number != 3 or min(height, width) < self.least:
             raise DataError(
-                f"images of {height} × {width} pixels and {number} colours came; wanted 3 colours and {self.least} "
-                "pixels a side, which the network of LPIPS reads. Choose larger images, or leave this metric out."
+                f"got images of {height} × {width} pixels with {number} channels, but the network of LPIPS requires 3 "
+                "channels "
+                f"and sides of at least {self.least} pixels. Choose larger images, or leave this metric out."
             )
-        one, other = (compared(image, "srgb").float() for image in (predicted, true))
-        found = [self._apart(one, other)]
+        first, second = (encode_colors(image, "srgb").float() for image in (predicted, true))
+        distances = [self._distance_between(first, second)]
         if mask is not None:
             outside = ~mask[..., None]
-            inside = self._apart(one.masked_fill(outside, 1), other.masked_fill(outside, 1))
-            found.append(inside if mask.any() else inside.new_full((), math.nan))
-        return found
+            inside = self._distance_between(first.masked_fill(outside, 1), second.masked_fill(outside, 1))
+            distances.append(inside if mask.any() else inside.new_full((), math.nan))
+        return distances
 
-    def _apart(self, one: Tensor, other: Tensor) -> Float[Tensor, ""]:
+    def _distance_between(self, first: Tensor, second: Tensor) -> Float[Tensor, ""]:
         assert self.distance is not None
-        return self.distance(one.movedim(-1, 0)[None], other.movedim(-1, 0)[None])[0]
+        return self.distance(first.movedim(-1, 0)[None], second.movedim(-1, 0)[None])[0]

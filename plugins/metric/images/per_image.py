@@ -1,4 +1,4 @@
-"""Base class of metrics over single images: numbers of each image, their means, and a figure of some images."""
+"""Base class of metrics that evaluate single images: results of each image, their means, and a figure of examples."""
 
 import math
 from abc import abstractmethod
@@ -18,24 +18,24 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 KEPT = 8
-"""Number of random images that are kept beside the worst and the best; the one closest to the median is shown."""
+"""Number of random images that are kept besides the worst and the best; the one closest to the median is shown."""
 
 
 class PerImage(Metric, HasFigure):
-    """Base class of metrics that judge images one by one, in the one channel that `reads` names.
+    """Base class of metrics that evaluate images one by one, in the channel that `reads` names.
 
-    `judge` returns the numbers of one image; images are ranked by the first number. A number is NaN where an image has
-    none; mean and standard error are over the other images. The numbers of all images are held until the end, and at
-    most KEPT + 2 images. Images are judged one by one, so that the batch size changes neither a bit of the result nor
-    the memory that is needed.
+    `judge` returns the numbers of one image; images are ranked by the first number. A number is NaN if it is not
+    defined for an image; mean and standard error are over the other images. The metric keeps the numbers of all images,
+    and at most KEPT + 2 images. Images are evaluated one by one, so that the batch size changes neither the result nor
+    the required memory.
 
     Raises:
-        DataError: a batch has no true image, or images do not fit or hold NaN.
+        DataError: a batch has no true image; or predicted and true images do not fit together, or contain NaN.
     """
 
     keys: tuple[str, ...]
     masked: bool
-    """Flag that `judge` is given the true masks."""
+    """Whether `judge` receives the true masks."""
     numbers: list[Tensor]
     pairs: list[Tensor]
     facts: list[Tensor]
@@ -44,13 +44,13 @@ class PerImage(Metric, HasFigure):
         """Declare the metric's states; the constructor of a subclass calls this method.
 
         Args:
-            keys: names of the numbers that `judge` returns, in its order.
-            masked: whether `judge` is given the true masks.
+            keys: names of the numbers that `judge` returns, in the same order.
+            masked: whether `judge` receives the true masks.
         """
         self.keys, self.masked = keys, masked
         self.columns = {key: heading for key, heading in self.columns.items() if key in keys}  # type: ignore[misc]
         self.better = {key: way for key, way in self.better.items() if key in keys}  # type: ignore[misc]
-        # shapes: numbers (image, key); each kept pair (1, predicted or true, height, width[, number]); its facts (1, 2)
+        # shapes: numbers (image, key); stored pair (1, predicted or true, height, width[, channel]); its facts (1, 2)
         for name in ("numbers", "pairs", "facts"):
             self.add_state(name, [], dist_reduce_fx="cat")
 
@@ -59,7 +59,7 @@ class PerImage(Metric, HasFigure):
         """Return the numbers of one image, in the order of the keys.
 
         Args:
-            predicted: the predicted image, (height, width[, number]).
+            predicted: the predicted image, (height, width[, channel]).
             true: the true image, of the same shape.
             mask: the true mask, (height, width); None unless `masked`.
         """
@@ -67,39 +67,43 @@ class PerImage(Metric, HasFigure):
     def update(self, prediction: Prediction) -> None:
         channel, name = self._channel, type(self).__name__
         predicted, true = prediction.image(channel), prediction.true_image(channel)
-        require(channel, predicted, true, name)
+        check_images(channel, predicted, true, name)
         masks: list[Tensor | None] = [None] * len(true)
         if self.masked:
             if "mask" not in prediction.batch:
                 raise DataError(
-                    f"{name} looks inside the true mask too, but batches have only {', '.join(prediction.batch)}. Set "
-                    "its `masked` to false, or choose data that give a mask."
+                    f"metric {name} with `masked: true` requires the batch field 'mask', but the batches have only "
+                    f"{', '.join(prediction.batch)}. Set `masked` to false, or choose data with masks."
                 )
             mask = prediction.true_image("mask")
             if mask.dtype != torch.bool or mask.shape != true.shape[:3]:
-                raise DataError(f"the true masks are {told(mask)}; wanted bool {tuple(true.shape[:3])}.")
+                raise DataError(
+                    f"the true masks are {describe_tensor(mask)}, expected bool {tuple(true.shape[:3])}."
+                )
             masks = list(mask)
         if len(true) == 0:
             return
-        each = [torch.stack(self.judge(*one)) for one in zip(predicted, true, masks, strict=True)]
-        numbers = torch.stack(each).double()
+        image_numbers = [
+            torch.stack(self.judge(*inputs)) for inputs in zip(predicted, true, masks, strict=True)
+        ]
+        numbers = torch.stack(image_numbers).double()
         self.numbers.append(numbers)
         facts = torch.stack([numbers[:, 0], prediction.batch["index"].double()], -1)
         self._keep([*self.facts, *facts.split(1)], predicted, true)
 
     def _keep(self, facts: list[Tensor], predicted: Tensor, true: Tensor) -> None:
-        """Choose the images to hold, among those held before and those of a batch, whose facts come last in `facts`."""
+        """Choose the images to keep among stored images and those of a batch, whose facts are the last in `facts`."""
         old, pairs = len(self.pairs), []
-        stay = kept(torch.cat(facts))
-        for place in stay:
-            if place < old:
-                pairs.append(self.pairs[place])
+        stay = choose_images(torch.cat(facts))
+        for row in stay:
+            if row < old:
+                pairs.append(self.pairs[row])
             else:
-                pair = torch.stack([predicted[place - old], true[place - old]])
+                pair = torch.stack([predicted[row - old], true[row - old]])
                 pairs.append(
                     (bytes_from_linear(pair.float()) if self._channel == "color" else pair).unsqueeze(0)
                 )
-        self.pairs, self.facts = pairs, [facts[place] for place in stay]
+        self.pairs, self.facts = pairs, [facts[row] for row in stay]
 
     @property
     def _channel(self) -> str:
@@ -107,13 +111,13 @@ class PerImage(Metric, HasFigure):
         return channel
 
     def compute(self) -> dict[str, Tensor]:
-        seen = dim_zero_cat(self.numbers) if len(self.numbers) else torch.zeros(0, len(self.keys)).double()
-        found: dict[str, Tensor] = {}
-        for key, column in zip(self.keys, seen.T, strict=True):
+        numbers = dim_zero_cat(self.numbers) if len(self.numbers) else torch.zeros(0, len(self.keys)).double()
+        results: dict[str, Tensor] = {}
+        for key, column in zip(self.keys, numbers.T, strict=True):
             known = column[~column.isnan()]
             error = known.std() / math.sqrt(len(known)) if len(known) > 1 else known.new_tensor(math.nan)
-            found |= {key: known.mean(), f"{key}_sem": error}
-        return found
+            results |= {key: known.mean(), f"{key}_sem": error}
+        return results
 
     def figure(self, title: str, *, synthetic: bool) -> "Figure":
         from plugins.metric.images.picture import sheet
@@ -125,47 +129,51 @@ class PerImage(Metric, HasFigure):
         if len(score):
             mean, error = (float(self.compute()[name]) for name in (key, f"{key}_sem"))
             summary = f"{heading}: {mean:.3g} ± {error:.2g}, mean and standard error of {len(score)} images"
-            facts, pairs = dim_zero_cat(self.facts).cpu(), [one for part in self.pairs for one in part.cpu()]
-            order = sorted(range(len(facts)), key=lambda place: facts[place].tolist())
-            middle = min(order, key=lambda place: abs(float(facts[place, 0] - score.median())))
+            facts, pairs = (
+                dim_zero_cat(self.facts).cpu(),
+                [pair for part in self.pairs for pair in part.cpu()],
+            )
+            order = sorted(range(len(facts)), key=lambda row: facts[row].tolist())
+            middle = min(order, key=lambda row: abs(float(facts[row, 0] - score.median())))
             ends = order if self.better[key] == "higher" else order[::-1]
-            for name, place in {"worst": ends[0], "near the median": middle, "best": ends[-1]}.items():
-                value, index = facts[place].tolist()
-                shown[f"{name}: image {index:.0f}\n{heading}: {value:.3g}"] = pairs[place].numpy()
+            for name, row in {"worst": ends[0], "near the median": middle, "best": ends[-1]}.items():
+                value, index = facts[row].tolist()
+                shown[f"{name}: image {index:.0f}\n{heading}: {value:.3g}"] = pairs[row].numpy()
         return sheet(self._channel, shown, title, summary, synthetic=synthetic)
 
 
-def kept(facts: Float[Tensor, "image 2"]) -> list[int]:
-    """Return the places of the images that may have to be shown, in ascending order.
+def choose_images(facts: Float[Tensor, "image 2"]) -> list[int]:
+    """Return the rows of the images that the figure may show, in ascending order.
 
-    They are the image with the lowest score, that with the highest, and KEPT images at random; the choice does not
-    depend on the order of the images. Images without a score (NaN) are left out.
+    These are the images with the lowest and the highest score, and KEPT random images. The choice does not depend on
+    the order of the images. Images without a score (NaN) are left out.
 
     Args:
-        facts: score and index of each image.
+        facts: score and data set index of each image.
     """
-    told = facts.tolist()
-    known = sorted((place for place, (score, _) in enumerate(told) if score == score), key=told.__getitem__)
+    rows = facts.tolist()
+    known = sorted((row for row, (score, _) in enumerate(rows) if score == score), key=rows.__getitem__)
     # Knuth's multiplicative hash
-    random = sorted(known, key=lambda place: int(told[place][1]) * 2654435761 % 2**32)
+    random = sorted(known, key=lambda row: int(rows[row][1]) * 2654435761 % 2**32)
     return sorted({*known[:1], *known[-1:], *random[:KEPT]})
 
 
-def require(channel: str, predicted: Tensor, true: Tensor, by: str) -> None:
-    """Refuse images that cannot be compared.
+def check_images(channel: str, predicted: Tensor, true: Tensor, by: str) -> None:
+    """Check that predicted and true images can be compared.
 
     Raises:
-        DataError: shapes or number types do not fit, or the images hold NaN or infinite numbers (+inf is allowed in
+        DataError: shapes or number types do not fit, or the images contain NaN or infinite numbers (+inf is allowed for
             depths).
     """
     dimensions = 4 if channel == "color" else 3
-    wanted = "(batch, height, width, number)" if channel == "color" else "(batch, height, width)"
-    typed = all((one.dtype == torch.bool) == (channel == "mask") for one in (predicted, true))
+    shape = "(batch, height, width, channel)" if channel == "color" else "(batch, height, width)"
+    typed = all((image.dtype == torch.bool) == (channel == "mask") for image in (predicted, true))
     typed &= channel == "mask" or (predicted.is_floating_point() and true.is_floating_point())
     if predicted.shape != true.shape or predicted.dim() != dimensions or not typed:
         raise DataError(
-            f"{by} got predicted {channel!r} {told(predicted)} and true ones {told(true)}; wanted two of one shape "
-            f"{wanted}, {'bool' if channel == 'mask' else 'of real numbers (light, not 8-bit)'}."
+            f"metric {by} got predicted {channel!r} of {describe_tensor(predicted)} and true {channel!r} of "
+            f"{describe_tensor(true)}, expected the same shape {shape} for both, "
+            f"{'of type bool' if channel == 'mask' else 'of floating-point numbers (linear RGB, not 8-bit)'}."
         )
     for whose, image in {"predicted": predicted, "true": true}.items():
         # the background of a depth image is +inf; linear RGB may be any finite number
@@ -173,12 +181,13 @@ def require(channel: str, predicted: Tensor, true: Tensor, by: str) -> None:
         if wrong.any():
             first = int(wrong.flatten(1).any(1).nonzero()[0])
             raise DataError(
-                f"{by} got {int(wrong.sum())} numbers of {whose} {channel!r} that are NaN or infinite, the first in "
-                f"row {first} of the batch; wanted finite ones{' or +inf' if channel == 'depth' else ''}. A mean "
-                "over the others would hide it."
+                f"metric {by} got {int(wrong.sum())} numbers of {whose} {channel!r} that are NaN or infinite, the "
+                "first in "
+                f"row {first} of the batch. Only finite numbers{' or +inf' if channel == 'depth' else ''} are allowed, "
+                "because a mean over the other numbers would hide the fault."
             )
 
 
-def told(image: Tensor) -> str:
-    """Return number type and shape of an image, for a message."""
+def describe_tensor(image: Tensor) -> str:
+    """Return number type and shape of an image as text for a message."""
     return f"{str(image.dtype).removeprefix('torch.')} {tuple(image.shape)}"

@@ -1,4 +1,4 @@
-"""Distance of two images in the features of an image classification network (Zhang et al. 2018)."""
+"""Distance of two images in the feature space of an image classification network (Zhang et al. 2018)."""
 
 from pathlib import Path
 from typing import Literal
@@ -12,24 +12,24 @@ from framework.storage.weights import fill_from_file, read_weights
 
 Backbone = Literal["alex", "vgg"]
 TAPS = {"alex": (1, 4, 7, 9, 11), "vgg": (3, 8, 15, 22, 29)}
-"""Indices of the layers whose outputs are compared: AlexNet after every convolution, VGG16 the last of each size."""
+"""Indices of the compared layers: in AlexNet after each convolution, in VGG16 the last layer of each size."""
 LEAST_SIDE = {"alex": 31, "vgg": 16}
-"""Side, in pixels, of the smallest images for which the last of these layers has an output."""
+"""Smallest side, pixels, of images for which the last compared layer has an output."""
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 """Mean and standard deviation of ImageNet for images in [-1, 1], by which the authors' scaling layer normalises."""
 
 
 class Distance(nn.Module):
-    """LPIPS distance (Zhang et al. 2018, eq. 1) with the authors' weights, version 0.1, which torchmetrics ships.
+    """LPIPS distance (Zhang et al. 2018, eq. 1) with the authors' weights, version 0.1, which are part of torchmetrics.
 
     Args:
         backbone: AlexNet, or VGG16.
-        weights: the user's file of the backbone trained on ImageNet, with torchvision's names, either of all layers or
-            of the features alone; no such file is shipped.
+        weights: file of the backbone trained on ImageNet, with torchvision's names, of all layers or only the features;
+            the user must provide this file.
 
     Raises:
         ConfigError: the file does not exist.
-        CheckpointError: the file cannot be read, or is of another network.
+        CheckpointError: the file cannot be read, or belongs to another network.
     """
 
     shift: Tensor
@@ -41,9 +41,9 @@ class Distance(nn.Module):
         self.taps = TAPS[backbone]
         fill_from_file(self.features, weights, ignored=("classifier.",), within="features.")
         bundled = Path(torchmetrics.__file__).parent / "functional/image/lpips_models" / f"{backbone}.pth"
-        found = read_weights(str(bundled))
-        # the heads weigh squares: they are the squares of the w of eq. 1
-        heads = [found[f"lin{number}.model.1.weight"] for number in range(len(self.taps))]
+        bundled_weights = read_weights(str(bundled))
+        # these weights multiply squares, so they are the squares of w in eq. 1
+        heads = [bundled_weights[f"lin{number}.model.1.weight"] for number in range(len(self.taps))]
         self.heads = nn.ParameterList(heads)
         self.register_buffer("shift", torch.tensor(SHIFT).view(3, 1, 1))
         self.register_buffer("scale", torch.tensor(SCALE).view(3, 1, 1))
@@ -58,22 +58,24 @@ class Distance(nn.Module):
         """Return the distance of each pair of images.
 
         Args:
-            predicted: colours in [0, 1] as files hold them, not linear RGB.
-            true: colours of the true images, likewise.
+            predicted: sRGB colours in [0, 1].
+            true: sRGB colours of the true images.
         """
         maps = (2 * torch.cat([predicted, true]) - 1 - self.shift) / self.scale
         total = maps.new_zeros(len(predicted))
         heads = iter(self.heads)
-        for place, layer in enumerate(self.features):
+        for index, layer in enumerate(self.features):
             maps = layer(maps)
-            if place in self.taps:
-                one, other = _of_length_one(maps).chunk(2)
-                total = total + ((one - other).square() * next(heads)).sum(1).mean((1, 2))
+            if index in self.taps:
+                predicted_features, true_features = _normalise_channels(maps).chunk(2)
+                total = total + ((predicted_features - true_features).square() * next(heads)).sum(1).mean(
+                    (1, 2)
+                )
         return total
 
 
-def _of_length_one(maps: Float[Tensor, "batch channel height width"]) -> Tensor:
-    return maps / (maps.norm(dim=1, keepdim=True) + 1e-10)  # features that are all 0 stay 0
+def _normalise_channels(maps: Float[Tensor, "batch channel height width"]) -> Tensor:
+    return maps / (maps.norm(dim=1, keepdim=True) + 1e-10)  # a zero vector stays zero
 
 
 class AlexNet(nn.Sequential):
@@ -97,7 +99,7 @@ class AlexNet(nn.Sequential):
 
 
 class VGG16(nn.Sequential):
-    """Convolutions of configuration D (Simonyan & Zisserman 2015), numbered as in torchvision, as far as compared."""
+    """Convolutions of VGG configuration D (Simonyan & Zisserman 2015), numbered as in torchvision."""
 
     def __init__(self) -> None:
         layers: list[nn.Module] = []

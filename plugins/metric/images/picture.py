@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from framework.figures.style import BLUE, GREY, RED, titled_figure
 
 NOTHING = "0.85"
-"""Grey of pixels where nothing is seen."""
+"""Grey of background pixels in depth images."""
 ALONE = "0.35"
 WIDTH = 2.6
 """Width of a panel, inches."""
@@ -23,11 +23,11 @@ def sheet(
     """Return a figure with one row of panels for each pair of images, and the summary below them.
 
     Args:
-        channel: "color" (8-bit), "mask" or "depth" (metres, infinite where nothing is seen).
-        pairs: caption → predicted and true image, (2, height, width[, number]); empty if no image was seen.
+        channel: "color" (8-bit), "mask" or "depth" (metres, infinite for background).
+        pairs: caption → predicted and true image, (2, height, width[, channel]); empty if there was no image.
         title: title of the figure.
-        summary: the line below the panels.
-        synthetic: whether the data are synthetic, which the figure then says.
+        summary: text below the panels.
+        synthetic: whether the data are synthetic; the title then says so.
     """
     if not pairs:
         figure = titled_figure((5.0, 1.6), title, synthetic)
@@ -51,11 +51,11 @@ def sheet(
 
 def _colours(line: list[Axes], predicted: np.ndarray, true: np.ndarray) -> None:
     for axes, image in zip(line, (true, predicted), strict=False):
-        # an image of three channels is shown as red, green and blue; of any other the first channel, in grey
+        # three channels are shown as red, green and blue; of any other number only the first, in grey
         axes.imshow(image if image.shape[-1] == 3 else image[..., 0], cmap="gray", vmin=0, vmax=255)
     gap = np.abs(predicted.astype(float) - true.astype(float)).mean(-1)
     shown = line[2].imshow(gap, cmap="magma", vmin=0, vmax=max(gap.max(), 1))
-    _bar(line[2:], shown, "mean |difference|\nof 8-bit numbers")
+    _bar(line[2:], shown, "mean |difference|\nof 8-bit values")
 
 
 def _masks(line: list[Axes], predicted: np.ndarray, true: np.ndarray) -> None:
@@ -63,15 +63,17 @@ def _masks(line: list[Axes], predicted: np.ndarray, true: np.ndarray) -> None:
         axes.imshow(image, cmap=ListedColormap(["white", GREY]), vmin=0, vmax=1)
     colours = np.array([to_rgb(colour) for colour in ("white", BLUE, RED, GREY)])
     line[2].imshow(colours[true.astype(int) + 2 * predicted.astype(int)])
-    for place, (text, colour) in enumerate({"only true": BLUE, "only predicted": RED, "both": GREY}.items()):
+    for line_number, (text, colour) in enumerate(
+        {"only true": BLUE, "only predicted": RED, "both": GREY}.items()
+    ):
         line[2].annotate(
-            text, (1.03, 0.95 - 0.14 * place), xycoords="axes fraction", color=colour, fontsize=8
+            text, (1.03, 0.95 - 0.14 * line_number), xycoords="axes fraction", color=colour, fontsize=8
         )
 
 
 def _depths(line: list[Axes], predicted: np.ndarray, true: np.ndarray) -> None:
-    seen = np.concatenate([part[np.isfinite(part)] for part in (true, predicted)])
-    near, far = (seen.min(), seen.max()) if seen.size else (0.0, 1.0)
+    finite_depths = np.concatenate([part[np.isfinite(part)] for part in (true, predicted)])
+    near, far = (finite_depths.min(), finite_depths.max()) if finite_depths.size else (0.0, 1.0)
     for axes, image in zip(line, (true, predicted), strict=False):
         axes.set_facecolor(NOTHING)
         shown = axes.imshow(_known(image), cmap="viridis_r", vmin=near, vmax=far)
@@ -82,7 +84,7 @@ def _depths(line: list[Axes], predicted: np.ndarray, true: np.ndarray) -> None:
     line[2].set_facecolor(NOTHING)
     alone = np.isfinite(predicted) ^ np.isfinite(true)
     line[2].imshow(np.ma.masked_equal(alone, False), cmap=ListedColormap([ALONE]))
-    line[2].set_xlabel("dark: only one sees something", fontsize=8)
+    line[2].set_xlabel("dark: only one has a depth", fontsize=8)
     shown = line[2].imshow(_known(gap), cmap="RdBu_r", vmin=-most, vmax=most)
     _bar(line[2:], shown, "predicted - true, metres")
 

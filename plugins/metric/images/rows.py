@@ -1,4 +1,4 @@
-"""Rows of the contract: images of balls."""
+"""Contract-test cases: images of balls."""
 
 from framework.target import Target
 from framework.testing.rows import MetricRow
@@ -24,7 +24,9 @@ ROWS = {
         MetricRow(
             "without weights",
             PLACE,
-            leave_out={"named numbers": "all are NaN: no weights are shipped; test_lpips.py has drawn some"},
+            leave_out={
+                "named numbers": "all results are NaN without weights; test_lpips.py uses random weights"
+            },
         ),
     ),
     "silhouette_iou": (MetricRow("balls", PLACE), MetricRow("images of one row", PLACE, size=(1, 40))),

@@ -15,11 +15,11 @@ from framework.configuration.schema import build, resolve
 from framework.distributions.protocol import Estimate, estimate, exact_estimate
 from framework.errors import UserError
 from framework.prediction import Prediction
-from plugins.metric.log_likelihood.metric import LogLikelihood, merged_moments, moments_of
+from plugins.metric.log_likelihood.metric import LogLikelihood, compute_moments, merge_moments
 
 
-class Known(Distribution):
-    """Density whose log-likelihoods are given."""
+class KnownLikelihood(Distribution):
+    """Density with given log-likelihoods."""
 
     arg_constraints = {}  # noqa: RUF012 - as torch has it
 
@@ -31,22 +31,22 @@ class Known(Distribution):
         return self.values
 
 
-estimate.register(Known, exact_estimate)
+estimate.register(KnownLikelihood, exact_estimate)
 
 
-class Untold(Known):
-    """Density whose log-likelihoods are given, but which has not declared whether log_prob draws."""
+class UndeclaredLikelihood(KnownLikelihood):
+    """Density with given log-likelihoods that does not declare whether log_prob draws samples."""
 
 
-estimate.register(Untold, estimate.dispatch(Distribution))
+estimate.register(UndeclaredLikelihood, estimate.dispatch(Distribution))
 
 
-class Drawn(Known):
+class SampledLikelihood(KnownLikelihood):
     """Density whose log-likelihoods are estimates, with standard errors 0.1, 0.2, ... from 10, 20, ... samples."""
 
 
 @estimate.register
-def _(density: Drawn, value):
+def _(density: SampledLikelihood, value):
     number = torch.arange(1, len(density.values) + 1)
     error = 0.1 * number.double()
     return Estimate(density.values, density.values + error.square() / 2, error, 10 * number, number == 2)
@@ -54,10 +54,10 @@ def _(density: Drawn, value):
 
 def prediction(values, dtype=torch.float64):
     log_prob = torch.as_tensor(values, dtype=dtype)
-    return Prediction(Known(log_prob), {"target": torch.zeros(len(log_prob), 1)})
+    return Prediction(KnownLikelihood(log_prob), {"target": torch.zeros(len(log_prob), 1)})
 
 
-def measured(*batches, dtype=torch.float64):
+def compute_metric(*batches, dtype=torch.float64):
     metric = LogLikelihood()
     for batch in batches:
         metric.update(prediction(batch, dtype))
@@ -65,7 +65,7 @@ def measured(*batches, dtype=torch.float64):
 
 
 @pytest.mark.parametrize("dtype, tolerance", [(torch.float32, 1e-6), (torch.float64, 1e-14)])
-def test_mean_and_standard_error_are_scipys(dtype, tolerance):
+def test_mean_and_standard_error_equal_scipys(dtype, tolerance):
     generator = np.random.default_rng(0)
     target, loc, scale = generator.normal(size=(3, 200, 1))
     scale = np.exp(scale)
@@ -73,10 +73,10 @@ def test_mean_and_standard_error_are_scipys(dtype, tolerance):
     density = Independent(Normal(torch.tensor(loc, dtype=dtype), torch.tensor(scale, dtype=dtype)), 1)
     metric = build("metric", resolve("metric", "log_likelihood"))
     metric.update(Prediction(density, {"target": torch.tensor(target, dtype=dtype)}))
-    found = metric.compute()
-    assert found["log_likelihood"].dtype == torch.float64
-    assert found["log_likelihood"].item() == pytest.approx(expected.mean(), rel=tolerance)
-    assert found["log_likelihood_sem"].item() == pytest.approx(sem(expected), rel=tolerance * 10)
+    actual = metric.compute()
+    assert actual["log_likelihood"].dtype == torch.float64
+    assert actual["log_likelihood"].item() == pytest.approx(expected.mean(), rel=tolerance)
+    assert actual["log_likelihood_sem"].item() == pytest.approx(sem(expected), rel=tolerance * 10)
 
 
 @settings(deadline=None, max_examples=60)
@@ -85,35 +85,37 @@ def test_mean_and_standard_error_are_scipys(dtype, tolerance):
         st.lists(st.floats(-1e6, 1e3, allow_subnormal=False), max_size=5), min_size=1, max_size=6
     ).filter(lambda batches: sum(map(len, batches)) > 1)
 )
-def test_any_batches_give_the_numbers_of_the_whole(batches):
+def test_results_do_not_depend_on_the_batches(batches):
     values = [value for batch in batches for value in batch]
-    found = measured(*batches)
-    assert found["log_likelihood"] == pytest.approx(statistics.fmean(values), rel=1e-12, abs=1e-9)
-    error = statistics.stdev(values) / len(values) ** 0.5  # statistics computes in exact fractions
-    assert found["log_likelihood_sem"] == pytest.approx(error, rel=1e-9, abs=1e-9)
+    actual = compute_metric(*batches)
+    assert actual["log_likelihood"] == pytest.approx(statistics.fmean(values), rel=1e-12, abs=1e-9)
+    error = (
+        statistics.stdev(values) / len(values) ** 0.5
+    )  # the module statistics computes with exact fractions
+    assert actual["log_likelihood_sem"] == pytest.approx(error, rel=1e-9, abs=1e-9)
 
 
 def test_a_large_mean_does_not_hide_a_small_spread():
     values = [-1e9 + offset for offset in (0.0, 0.25, 0.5, 0.75)] * 25
     error = statistics.stdev(values) / 10
-    assert measured(values[:3], values[3:50], values[50:])["log_likelihood_sem"] == pytest.approx(
+    assert compute_metric(values[:3], values[3:50], values[50:])["log_likelihood_sem"] == pytest.approx(
         error, rel=1e-6
     )
 
 
-def test_nothing_seen_is_nan_and_one_sample_has_no_error():
-    assert all(np.isnan(value) for value in measured([]).values())
-    one = measured([], [-2.5], [])
-    assert one["log_likelihood"] == -2.5
-    assert np.isnan(one["log_likelihood_sem"])
+def test_no_samples_give_nan_and_one_sample_has_no_standard_error():
+    assert all(np.isnan(value) for value in compute_metric([]).values())
+    single_sample = compute_metric([], [-2.5], [])
+    assert single_sample["log_likelihood"] == -2.5
+    assert np.isnan(single_sample["log_likelihood_sem"])
 
 
 def test_an_impossible_target_makes_the_mean_minus_infinity():
-    assert measured([-1.0, -np.inf], [-2.0], [-np.inf])["log_likelihood"] == -np.inf
-    assert np.isnan(measured([-1.0], [np.nan], [-2.0])["log_likelihood"])
+    assert compute_metric([-1.0, -np.inf], [-2.0], [-np.inf])["log_likelihood"] == -np.inf
+    assert np.isnan(compute_metric([-1.0], [np.nan], [-2.0])["log_likelihood"])
 
 
-def halves():
+def split_and_whole():
     generator = torch.Generator().manual_seed(1)
     values = torch.randn(37, generator=generator, dtype=torch.float64) * 3 - 1e5
     first, second, whole = LogLikelihood(), LogLikelihood(), LogLikelihood()
@@ -123,16 +125,16 @@ def halves():
     return first, second, whole.compute()
 
 
-def test_merged_halves_are_the_whole():
-    first, second, whole = halves()
+def test_merged_states_equal_the_state_of_all_samples():
+    first, second, whole = split_and_whole()
     first.merge_state(second)
     for name, value in first.compute().items():
         torch.testing.assert_close(value, whole[name], rtol=1e-12, atol=0)
 
 
-def test_two_processes_are_the_whole():
-    first, second, whole = halves()
-    idle = LogLikelihood()  # a process that saw no sample
+def test_two_processes_give_the_results_of_all_samples():
+    first, second, whole = split_and_whole()
+    idle = LogLikelihood()  # a process without samples
 
     def gather(state, group=None):
         name = "moments" if len(state) == 3 else "sampling"
@@ -143,62 +145,64 @@ def test_two_processes_are_the_whole():
         torch.testing.assert_close(value, whole[name], rtol=1e-12, atol=0)
 
 
-def test_reset_forgets_and_a_copy_keeps():
+def test_reset_clears_the_metric_but_not_its_copy():
     metric = LogLikelihood()
     metric.update(prediction([1.0, 2.0]))
-    kept = copy.deepcopy(metric)
+    copied = copy.deepcopy(metric)
     metric.reset()
     metric.update(prediction([5.0, 7.0]))
     assert metric.compute()["log_likelihood"] == 6.0
-    assert kept.compute()["log_likelihood"] == 1.5
+    assert copied.compute()["log_likelihood"] == 1.5
 
 
 def test_moments_of_parts_in_any_order():
-    parts = torch.stack([moments_of(torch.randn(size, dtype=torch.float64)) for size in (3, 0, 1, 20)])
-    torch.testing.assert_close(merged_moments(parts), merged_moments(parts.flip(0)))
+    parts = torch.stack([compute_moments(torch.randn(size, dtype=torch.float64)) for size in (3, 0, 1, 20)])
+    torch.testing.assert_close(merge_moments(parts), merge_moments(parts.flip(0)))
 
 
-def drawn(values):
+def predict_sampled(values):
     log_prob = torch.tensor(values, dtype=torch.float64)
-    return Prediction(Drawn(log_prob), {"target": torch.zeros(len(values), 1)})
+    return Prediction(SampledLikelihood(log_prob), {"target": torch.zeros(len(values), 1)})
 
 
-def test_exact_densities_have_nothing_more_to_say():
-    assert set(measured([1.0, 2.0])) == {"log_likelihood", "log_likelihood_sem"}
+def test_exact_densities_report_no_sampling_error():
+    assert set(compute_metric([1.0, 2.0])) == {"log_likelihood", "log_likelihood_sem"}
 
 
-def test_a_density_that_has_not_said_whether_it_draws_has_an_error_that_is_not_known():
+def test_undeclared_densities_report_a_nan_sampling_error():
     metric, negative = LogLikelihood(), build("metric", resolve("metric", "nll"))
     for values in ([1.0, 2.0], [6.0]):
         log_prob = torch.tensor(values, dtype=torch.float64)
-        for one in (metric, negative):
-            one.update(Prediction(Untold(log_prob), {"target": torch.zeros(len(log_prob), 1)}))
-    found = metric.compute()
-    assert found["log_likelihood"] == 3 and negative.compute()["nll"] == -3
-    assert set(found) == {"log_likelihood", "log_likelihood_sem", "log_likelihood_mc_error"}
-    assert found["log_likelihood_mc_error"].isnan() and negative.compute()["nll_mc_error"].isnan()
+        for either_metric in (metric, negative):
+            either_metric.update(
+                Prediction(UndeclaredLikelihood(log_prob), {"target": torch.zeros(len(log_prob), 1)})
+            )
+    actual = metric.compute()
+    assert actual["log_likelihood"] == 3 and negative.compute()["nll"] == -3
+    assert set(actual) == {"log_likelihood", "log_likelihood_sem", "log_likelihood_mc_error"}
+    assert actual["log_likelihood_mc_error"].isnan() and negative.compute()["nll_mc_error"].isnan()
 
 
-def test_estimates_tell_their_error_and_their_samples():
+def test_estimates_report_their_error_and_their_samples():
     metric = LogLikelihood()
     for values in ([1.0, 2.0, 6.0], [], [3.0]):
-        metric.update(drawn(values))
-    found = {name: value.item() for name, value in metric.compute().items()}
-    assert found["log_likelihood"] == 3.0
+        metric.update(predict_sampled(values))
+    actual = {name: value.item() for name, value in metric.compute().items()}
+    assert actual["log_likelihood"] == 3.0
     squares = [0.01, 0.04, 0.09, 0.01]
-    assert found["log_likelihood_debiased"] == pytest.approx(3 + sum(squares) / 8)
-    assert found["log_likelihood_mc_error"] == pytest.approx(sum(squares) ** 0.5 / 4)
-    assert found["samples_mean"] == pytest.approx((10 + 20 + 30 + 10) / 4)
-    assert found["samples_max"] == 30
-    assert found["items_above_tolerance"] == 1
+    assert actual["log_likelihood_debiased"] == pytest.approx(3 + sum(squares) / 8)
+    assert actual["log_likelihood_mc_error"] == pytest.approx(sum(squares) ** 0.5 / 4)
+    assert actual["samples_mean"] == pytest.approx((10 + 20 + 30 + 10) / 4)
+    assert actual["samples_max"] == 30
+    assert actual["items_above_tolerance"] == 1
 
 
-def test_estimates_of_merged_halves_are_those_of_the_whole():
+def test_merged_estimates_equal_those_of_all_samples():
     first, second, whole = LogLikelihood(), LogLikelihood(), LogLikelihood()
-    first.update(drawn([1.0, -1e3]))
-    second.update(drawn([2.0, -3.0, 5.0]))
+    first.update(predict_sampled([1.0, -1e3]))
+    second.update(predict_sampled([2.0, -3.0, 5.0]))
     for values in ([1.0, -1e3], [2.0, -3.0, 5.0]):
-        whole.update(drawn(values))
+        whole.update(predict_sampled(values))
     first.merge_state(second)
     for name, value in first.compute().items():
         torch.testing.assert_close(value, whole.compute()[name], rtol=1e-12, atol=0)
@@ -213,51 +217,51 @@ def negative(*batches):
 
 @pytest.mark.parametrize("dtype, tolerance", [(torch.float32, 1e-6), (torch.float64, 1e-13)])
 @pytest.mark.parametrize("classes", [2, 7])
-def test_nll_of_classes_is_sklearns_log_loss(dtype, tolerance, classes):
+def test_nll_of_classes_equals_sklearns_log_loss(dtype, tolerance, classes):
     generator = np.random.default_rng(0)
     logits = torch.tensor(3 * generator.normal(size=(90, classes)), dtype=dtype)
     label = generator.integers(classes, size=90)
-    found = negative(Prediction(Categorical(logits=logits), {"target": torch.tensor(label)}))
+    actual = negative(Prediction(Categorical(logits=logits), {"target": torch.tensor(label)}))
     probability = special.softmax(logits.double().numpy(), -1)
     probability /= probability.sum(-1, keepdims=True)
-    assert found["nll"] == pytest.approx(log_loss(label, probability, labels=range(classes)), rel=tolerance)
-    assert found["nll_sem"] == pytest.approx(sem(-np.log(probability[np.arange(90), label])), rel=1e-6)
+    assert actual["nll"] == pytest.approx(log_loss(label, probability, labels=range(classes)), rel=tolerance)
+    assert actual["nll_sem"] == pytest.approx(sem(-np.log(probability[np.arange(90), label])), rel=1e-6)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_nll_of_logits_of_ten_thousand(dtype):
     logits = torch.tensor([[1e4, -1e4], [-1e4, 1e4]], dtype=dtype)
-    found = negative(Prediction(Categorical(logits=logits), {"target": torch.tensor([0, 0])}))
-    assert found == {"nll": 1e4, "nll_sem": 1e4}
+    actual = negative(Prediction(Categorical(logits=logits), {"target": torch.tensor([0, 0])}))
+    assert actual == {"nll": 1e4, "nll_sem": 1e4}
 
 
 def test_nll_is_the_negative_of_the_log_likelihood_with_the_same_error():
     values = [1.0, -2.0, 6.5, -1e3]
-    found, positive = (
+    actual, positive = (
         negative(prediction(values[:3]), prediction([]), prediction(values[3:])),
-        measured(values),
+        compute_metric(values),
     )
-    assert found["nll"] == -positive["log_likelihood"]
-    assert found["nll_sem"] == pytest.approx(positive["log_likelihood_sem"], rel=1e-14)
+    assert actual["nll"] == -positive["log_likelihood"]
+    assert actual["nll_sem"] == pytest.approx(positive["log_likelihood_sem"], rel=1e-14)
 
 
-def test_nll_of_the_certain_is_zero_without_a_sign_and_of_the_impossible_infinite():
+def test_nll_of_certain_predictions_is_zero_and_of_impossible_targets_infinite():
     assert str(negative(prediction([0.0, 0.0]))["nll"]) == "0.0"
     assert negative(prediction([-1.0, -np.inf]))["nll"] == np.inf
     assert all(np.isnan(value) for value in negative(prediction([])).values())
 
 
-def test_nll_names_nan():
+def test_nan_log_likelihoods_raise_a_clear_message():
     with pytest.raises(
         UserError, match=r"2 of 3 log-likelihoods of the targets in this batch are NaN.* row 0"
     ):
         negative(prediction([np.nan, 1.0, np.nan]))
 
 
-def test_nll_of_estimates_has_the_bias_the_other_way_round():
-    found = negative(drawn([1.0, 2.0, 6.0]), drawn([]), drawn([3.0]))
+def test_nll_of_estimates_has_the_opposite_bias():
+    actual = negative(predict_sampled([1.0, 2.0, 6.0]), predict_sampled([]), predict_sampled([3.0]))
     squares = [0.01, 0.04, 0.09, 0.01]
-    assert found["nll"] == -3.0
-    assert found["nll_debiased"] == pytest.approx(-3 - sum(squares) / 8)
-    assert found["nll_mc_error"] == pytest.approx(sum(squares) ** 0.5 / 4)
-    assert (found["samples_max"], found["items_above_tolerance"]) == (30, 1)
+    assert actual["nll"] == -3.0
+    assert actual["nll_debiased"] == pytest.approx(-3 - sum(squares) / 8)
+    assert actual["nll_mc_error"] == pytest.approx(sum(squares) ** 0.5 / 4)
+    assert (actual["samples_max"], actual["items_above_tolerance"]) == (30, 1)

@@ -1,1 +1,1 @@
-"""Behaviour of a model on outliers, which belong to none of its training classes."""
+"""Entropy on outliers, and separation of outliers from the test split."""

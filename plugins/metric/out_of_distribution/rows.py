@@ -1,4 +1,4 @@
-"""Rows of the contract: both scores, on classes, reals and angles."""
+"""Contract-test cases: both scores, for classes, real numbers and angles."""
 
 from framework.target import Target
 from framework.testing.rows import MetricRow

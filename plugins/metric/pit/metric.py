@@ -1,4 +1,4 @@
-"""Calibration of reals and angles by the probability integral transform."""
+"""Calibration of densities of real numbers and angles by the probability integral transform."""
 
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
@@ -19,38 +19,28 @@ if TYPE_CHECKING:
 
 
 class PIT(Metric, HasFigure):
-    """Probability integral transform (PIT) F(y) of each number of the target.
-
-    It is uniform if forecasts are calibrated.
+    """Probability integral transform (PIT) F(y) of each number of the target; uniform for calibrated densities.
 
     - `pit_ks`: largest distance of the distribution of F(y) from uniform (Kolmogorov-Smirnov), in [0, 1].
     - `pit_cvm`: mean squared distance of the distribution of F(y) from uniform (Cramér-von Mises).
-    - `pit_mean`: mean of F(y). It is ½ where forecasts are unbiased and higher where targets lie above the forecasts.
-    - `pit_spread`: 12 times the mean square of F(y) - ½. It is 1 where forecasts are calibrated, above 1 where
-      densities are too narrow, and below 1 where they are too broad.
+    - `pit_mean`: mean of F(y). It is ½ for unbiased densities, and higher if the targets lie above the densities.
+    - `pit_spread`: 12 times the mean square of F(y) - ½. It is 1 for calibrated densities, above 1 for densities that
+      are too narrow, and below 1 for densities that are too broad.
 
-    Each number of a target is transformed by its marginal density, and the transforms of all numbers are pooled. Angles
-    are counted from the antipode of the density's mean direction, counter-clockwise. The figure is the histogram of
-    F(y) with the band that holds each bin of a calibrated forecaster with probability 0.95.
+    Each number of a target is transformed by its marginal density, and the transforms of all numbers are pooled. For
+    angles, F(y) is the mass from the antipode of the density's mean direction counter-clockwise to y. The figure is the
+    histogram of F(y), with a band that contains each bin with probability 0.95 if the densities are calibrated.
 
     Args:
         bins: number of bins of the histogram.
-        samples: draws for a density whose distribution function is not known.
+        samples: number of draws for a density whose distribution function is not known.
 
     Raises:
         ConfigError: the target is made of classes.
-        UserError: transforms are NaN; the message says how many.
+        UserError: transforms are NaN.
     """
 
-    bibtex = """@article{diebold1998evaluating,
-  author  = {Diebold, Francis X. and Gunther, Todd A. and Tay, Anthony S.},
-  title   = {Evaluating Density Forecasts with Applications to Financial Risk Management},
-  journal = {International Economic Review},
-  volume  = {39},
-  number  = {4},
-  pages   = {863--883},
-  year    = {1998}
-}"""
+    bibtex = "diebold1998evaluating"
     columns: ClassVar[dict[str, str]] = {"pit_ks": "PIT KS"}
     better: ClassVar[dict[str, Literal["higher", "lower"]]] = {"pit_ks": "lower"}
     figure_name: ClassVar[str] = "pit"
@@ -66,8 +56,8 @@ class PIT(Metric, HasFigure):
         super().__init__()
         if target.kind == "class":
             raise ConfigError(
-                "pit asks which share of a density lies below the target, and classes have no order (this data "
-                f"set's: {target.listed_names}). Leave this metric out; `coverage` judges classes too."
+                "metric pit measures the probability below the target, but classes have no order (this data set's "
+                f"classes: {target.listed_names}). Leave this metric out; `coverage` also evaluates classes."
             )
         self.numbers = len(target.names)
         self.bins = bins
@@ -81,11 +71,11 @@ class PIT(Metric, HasFigure):
         assert isinstance(self.values, list)
         for index in range(self.numbers):
             at = target[:, index : index + 1]
-            found = transform(prediction.marginal(index), at, self.samples)
-            self.values.append(refuse_nan(found, "transforms"))
+            transforms = transform(prediction.marginal(index), at, self.samples)
+            self.values.append(refuse_nan(transforms, "transforms"))
 
     def compute(self) -> dict[str, Tensor]:
-        values = self._seen()
+        values = self._collect_values()
         return {
             "pit_ks": kolmogorov_smirnov(values),
             "pit_cvm": cramer_von_mises(values),
@@ -96,7 +86,9 @@ class PIT(Metric, HasFigure):
     def figure(self, title: str, *, synthetic: bool) -> "Figure":
         from plugins.metric.pit.picture import histogram
 
-        return histogram(self._seen().cpu().numpy(), self.bins, self.numbers, title, synthetic=synthetic)
+        return histogram(
+            self._collect_values().cpu().numpy(), self.bins, self.numbers, title, synthetic=synthetic
+        )
 
-    def _seen(self) -> Tensor:
+    def _collect_values(self) -> Tensor:
         return dim_zero_cat(self.values) if len(self.values) else torch.empty(0, dtype=torch.float64)

@@ -8,14 +8,14 @@ from framework.figures.style import BLUE, GREY, titled_figure
 
 
 def histogram(values: np.ndarray, bins: int, numbers: int, title: str, *, synthetic: bool) -> Figure:
-    """Return the histogram of F(y), scaled so that a calibrated forecaster's density is 1.
+    """Return the histogram of F(y), scaled so that its expected height is 1 for calibrated densities.
 
     Args:
         values: F(y), (count,).
         bins: number of bins of equal width.
-        numbers: how many numbers of a target are pooled in `values`.
+        numbers: number of target numbers per sample that are pooled in `values`.
         title: title of the figure.
-        synthetic: whether the data are synthetic, which the figure then says.
+        synthetic: whether the data are synthetic; the title then says so.
     """
     figure = titled_figure((6.0, 4.2), title, synthetic)
     axes = figure.subplots()
@@ -23,7 +23,7 @@ def histogram(values: np.ndarray, bins: int, numbers: int, title: str, *, synthe
     height, edges = np.histogram(values, bins=bins, range=(0.0, 1.0))
     if count:
         low, high = binom.ppf([0.025, 0.975], count, 1 / bins) * bins / count
-        label = "95 % of a calibrated forecaster's bins"
+        label = "95 % of bins if calibrated"
         axes.axhspan(low, high, color="0.87", zorder=0, label=label)
         axes.stairs(height * bins / count, edges, fill=True, color=BLUE, alpha=0.6, label="targets")
     axes.axhline(1.0, color=GREY, ls=":", label="uniform")

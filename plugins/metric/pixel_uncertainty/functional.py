@@ -1,4 +1,4 @@
-"""Coverage of central intervals of an image's numbers, and rank correlation of errors with predicted scales."""
+"""Coverage of central intervals of the values of an image, and rank correlation of errors with predicted scales."""
 
 from typing import NamedTuple
 
@@ -12,9 +12,9 @@ from framework.errors import UserError
 
 
 class Transform(NamedTuple):
-    """F just below and just above each stored number, (*batch, *event), float64.
+    """F at both ends of the interval that is rounded to each stored value, (*batch, *event), float64.
 
-    The probability integral transform of a rounded number is any number between the two.
+    The probability integral transform of a rounded value is any number between `low` and `high`.
     """
 
     low: Tensor
@@ -22,41 +22,41 @@ class Transform(NamedTuple):
 
 
 def transform(density: Distribution, value: Tensor, steps: int) -> Transform:
-    """Return the distribution function at both ends of the interval that is rounded to each stored number.
+    """Return the distribution function at both ends of the interval that is rounded to each stored value.
 
-    A stored number stands for all numbers that are rounded to it: half a step to either side, and everything beyond at
-    0 and 1.
+    A stored value stands for all values that are rounded to it: half a step to either side; a stored 0 or 1 also stands
+    for all values below or above.
 
     Args:
-        density: a density whose distribution function is known for each number.
+        density: density whose distribution function is known for each value.
         value: (*batch, *event), in [0, 1].
-        steps: number of steps of the stored numbers between 0 and 1; 0 if nothing was rounded.
+        steps: number of steps between the stored values 0 and 1; 0 if nothing was rounded.
 
     Raises:
-        UserError: the density knows no distribution function of each number.
+        UserError: the density has no distribution function for each value.
     """
     value = value.double()
     half = 0.5 / steps if steps else 0.0
     low, high = (marginal_cdfs(density, value + side) for side in (-half, half))
     if low is None or high is None:
         raise UserError(
-            f"{type(density).__name__} over {tuple(density.event_shape)} knows no distribution function of each of its "
-            "numbers. Register one with `framework.distributions.protocol.marginal_cdfs.register`, or leave out "
-            "this metric."
+            f"{type(density).__name__} over {tuple(density.event_shape)} has no distribution function for each of its "
+            "values. Register one with `framework.distributions.protocol.marginal_cdfs.register`, or leave this "
+            "metric out."
         )
     if steps:
         low, high = low.masked_fill(value < half, 0.0), high.masked_fill(value > 1 - half, 1.0)
     return Transform(low, high)
 
 
-def coverage(found: Transform, levels: Float[Tensor, "level"]) -> Float[Tensor, "level"]:
-    """Return the share of the numbers in their central intervals of each mass; NaN without numbers.
+def coverage(transforms: Transform, levels: Float[Tensor, "level"]) -> Float[Tensor, "level"]:
+    """Return the share of the values that lie in their central intervals of each mass; NaN without values.
 
-    A number counts with the probability that a number drawn uniformly between `low` and `high` lies in the interval of
-    transforms (1 ± level) / 2. Nothing need be drawn (the nonrandomized transform of Czado, Gneiting & Held 2009, eq.
-    2), and where the densities are those of the truth before it was rounded, the share is the level.
+    A value counts with the probability that a number drawn uniformly between `low` and `high` lies between
+    (1 - level) / 2 and (1 + level) / 2. This needs no random numbers (nonrandomized transform of Czado, Gneiting & Held
+    2009, eq. 2). The expected share equals the level if the densities are those of the true values before rounding.
     """
-    low, high = (part.flatten() for part in found)
+    low, high = (part.flatten() for part in transforms)
     width = high - low
     shares = []
     for level in levels.tolist():
@@ -67,9 +67,9 @@ def coverage(found: Transform, levels: Float[Tensor, "level"]) -> Float[Tensor, 
     return torch.stack(shares)
 
 
-def rank_correlation(one: Float[Tensor, "count"], other: Tensor) -> Float[Tensor, ""]:
-    """Return Spearman's correlation: Pearson's of the ranks, ties sharing their mean; NaN where one is constant."""
-    first, second = (part - part.mean() for part in (ranks(one), ranks(other)))
+def rank_correlation(first_values: Float[Tensor, "count"], second_values: Tensor) -> Float[Tensor, ""]:
+    """Return Spearman's rank correlation; ties share their mean rank. NaN if all values of an argument are equal."""
+    first, second = (part - part.mean() for part in (ranks(first_values), ranks(second_values)))
     return (first * second).sum() / (first.square().sum() * second.square().sum()).sqrt()
 
 

@@ -25,14 +25,14 @@ def sheet(
     All errors share one colour bar, and all scales share another.
 
     Args:
-        panels: caption → (height, width, 2 · number + 2): truth, point prediction, error and scale of each pixel.
+        panels: caption → (height, width, 2 · channel + 2): truth, point prediction, error and scale of each pixel.
         levels: masses, ascending in (0, 1).
-        shares: region → share of numbers in the intervals of those masses.
+        shares: region → share of values in the intervals of these masses.
         count: number of images.
         title: title of the figure.
-        synthetic: whether the data are synthetic, which the figure then says.
+        synthetic: whether the data are synthetic; the title then says so.
     """
-    tall = [min(WIDTH * one.shape[0] / one.shape[1], 2 * WIDTH) for one in panels.values()]
+    tall = [min(WIDTH * panel.shape[0] / panel.shape[1], 2 * WIDTH) for panel in panels.values()]
     below = 3.2
     figure = titled_figure((4 * WIDTH + 1.2, sum(tall) + below + 0.9), title, synthetic)
     top, bottom = figure.subfigures(2, 1, squeeze=False, height_ratios=[max(sum(tall), 0.1), below]).flat
@@ -46,7 +46,7 @@ def sheet(
         axes.plot(levels, share, color=colour, marker="o", markersize=3, label=region)
     axes.axvline(0.9, color=RED, lw=0.7, ls=":")
     axes.set(xlim=(0, 1), ylim=(0, 1), aspect="equal")
-    axes.set(xlabel="mass of the central interval", ylabel="share of numbers in it")
+    axes.set(xlabel="mass of the central interval", ylabel="share of values in it")
     axes.text(0.04, 0.93, "too broad", color=GREY, fontsize=8, va="top")
     axes.text(0.97, 0.04, "too narrow", color=GREY, fontsize=8, ha="right")
     axes.grid(alpha=0.3)
@@ -64,17 +64,17 @@ def _images(figure: SubFigure, panels: Mapping[str, np.ndarray], tall: list[floa
         grid[0], ("true", "predicted", "mean |error|", "predicted standard deviation"), strict=True
     ):
         axes.set_title(heading, fontsize=10)
-    for column, place in ((2, -2), (3, -1)):
-        # the bar ends at a percentile: if it reached a few extreme pixels, all others would be dark
-        most = max(float(np.percentile(np.stack([one[..., place] for one in every]), 99.5)), 1e-3)
-        for axes, one in zip(grid[:, column], every, strict=True):
-            shown = axes.imshow(one[..., place], cmap="magma", vmin=0, vmax=most)
+    for column, channel in ((2, -2), (3, -1)):
+        # the colour bar ends at a percentile, because a few extreme pixels would make all others dark
+        most = max(float(np.percentile(np.stack([panel[..., channel] for panel in every]), 99.5)), 1e-3)
+        for axes, panel in zip(grid[:, column], every, strict=True):
+            shown = axes.imshow(panel[..., channel], cmap="magma", vmin=0, vmax=most)
         bar = figure.colorbar(shown, ax=list(grid[:, column]), location="bottom", extend="max", shrink=0.9)
         bar.ax.tick_params(labelsize=7)
-    for line, (caption, one) in zip(grid, panels.items(), strict=True):
-        number = one.shape[-1] // 2 - 1
-        for axes, image in zip(line, (one[..., :number], one[..., number : 2 * number]), strict=False):
-            # an image that does not have three channels is shown by its first channel, in grey
+    for line, (caption, panel) in zip(grid, panels.items(), strict=True):
+        number = panel.shape[-1] // 2 - 1
+        for axes, image in zip(line, (panel[..., :number], panel[..., number : 2 * number]), strict=False):
+            # three channels are shown as red, green and blue; of any other number only the first, in grey
             picture = image.clip(0, 1) if number == 3 else image[..., 0]
             axes.imshow(picture, cmap="gray", vmin=0, vmax=1)
         line[0].set_ylabel(caption, fontsize=9)

@@ -9,7 +9,7 @@ COLOURED = Target("image", ("red", "green", "blue"), size=(6, 5))
 
 
 def masks(count: int) -> torch.Tensor:
-    """Return a different mask for each image; the last one is empty."""
+    """Return different masks for `count` images; the last mask is empty."""
     mask = torch.arange(30).view(6, 5) % (2 + torch.arange(count).view(-1, 1, 1) % 3) == 0
     return mask & (torch.arange(count) < count - 1).view(-1, 1, 1)
 

@@ -1,4 +1,4 @@
-"""Coverage, size and emptiness of prediction sets."""
+"""Coverage and size of prediction sets, and share of empty sets."""
 
 import math
 from typing import ClassVar, Literal
@@ -17,21 +17,16 @@ class PredictionSetMetric(Metric):
     """Coverage and mean size of the predicted sets, and the share of empty sets.
 
     - `set_coverage`: share of targets in their sets, with its standard error; 1 - miscoverage is best.
-    - `set_size`: mean number of labels; for reals the mean length or volume in the target's unit; for several angles
-      the mean volume in radians to the power of their number. For one angle it is `set_size_deg`, the mean length of
-      the arcs in degrees. It is infinite where a set is unbounded.
-    - `set_empty`: share of empty sets. An empty set says that the input is unlike the calibration data.
+    - `set_size`: mean number of labels; for real numbers, the mean length or volume in the target's unit; for several
+      angles, the mean volume in radians to the power of their number. For one angle, the result is `set_size_deg`, the
+      mean length of the arcs in degrees. It is infinite if a set is unbounded.
+    - `set_empty`: share of empty sets. An empty set shows that the input is unlike the calibration data.
 
     Raises:
-        UserError: the predicted densities have no sets, or are NaN (the message names the samples).
+        UserError: the predicted densities have no sets, or are NaN.
     """
 
-    bibtex = """@book{vovk2005algorithmic,
-  author    = {Vovk, Vladimir and Gammerman, Alexander and Shafer, Glenn},
-  title     = {Algorithmic Learning in a Random World},
-  publisher = {Springer},
-  year      = {2005}
-}"""
+    bibtex = "vovk2005algorithmic"
     columns: ClassVar[dict[str, str]] = {}
     better: ClassVar[dict[str, Literal["higher", "lower"]]] = {}
     count: Tensor
@@ -59,8 +54,9 @@ class PredictionSetMetric(Metric):
         sets = value_set(prediction.density)
         if sets is None:
             raise UserError(
-                f"prediction_set judges sets, but the model predicts a {type(prediction.density).__name__}, which has "
-                "none. Put conformal last among the wrappers, uncertainty=[..., conformal], or leave this metric out."
+                f"metric prediction_set requires prediction sets, but the model predicts a "
+                f"{type(prediction.density).__name__}, which has none. Add conformal as the last wrapper, "
+                "uncertainty=[..., conformal], or leave this metric out."
             )
         size = prediction.set_size(sets)
         broken = (size.isnan() | prediction.log_prob.isnan()).nonzero().flatten()
@@ -68,8 +64,9 @@ class PredictionSetMetric(Metric):
             index = prediction.batch.get("index")
             names = broken if index is None else index[broken]
             raise UserError(
-                f"The densities of samples {names[:10].tolist()} are NaN and have no set. Look at these samples and at "
-                "the training, which may have diverged."
+                f"The densities of samples {names[:10].tolist()} are NaN and have no set. Check these samples, and "
+                "check "
+                "whether the training diverged."
             )
         self.count += len(size)
         self.covered += sets.contains(prediction.target).sum()

@@ -1,12 +1,12 @@
-"""Rows of the contract.
+"""Contract-test cases.
 
-The contract's densities have no sets: test_prediction_set_metric.py runs the checks that need them, on sets.
+The densities of the contract tests have no prediction sets. test_prediction_set_metric.py runs the checks on sets.
 """
 
 from framework.target import Target
 from framework.testing.rows import MetricRow
 
-NO_SET = "it judges sets, which the contract's densities have none of; its own test runs this check on sets"
+NO_SET = "the densities of the contract tests have no prediction sets; the metric's own test runs this check on sets"
 CHECKS = (
     "named numbers",
     "batches do not matter",

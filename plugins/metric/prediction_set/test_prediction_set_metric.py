@@ -28,71 +28,77 @@ def metric(target):
     return build("metric", resolve("metric", "prediction_set"), target=target)
 
 
-def judged(target, density, threshold, labels, score="density", **fields):
-    found = metric(target)
+def evaluate(target, density, threshold, labels, score="density", **fields):
+    actual = metric(target)
     sets = PredictionSet(density, torch.tensor(threshold, dtype=torch.float64), score)
-    found.update(Prediction(sets, {"target": labels, **fields}))
-    return {name: value.item() for name, value in found.compute().items()}
+    actual.update(Prediction(sets, {"target": labels, **fields}))
+    return {name: value.item() for name, value in actual.compute().items()}
 
 
 @pytest.mark.parametrize("target", [CLASSES, ANGLE, REAL], ids=lambda target: target.kind)
-def test_the_contract_holds_on_sets(target, monkeypatch):
-    """Check sets of level 1.7 nats for every density, so that their sizes differ where the densities do."""
-    plain = metrics.density_about
+def test_the_contract_tests_pass_on_sets(target, monkeypatch):
+    """Check sets of level 1.7 nats for every density, so that sizes differ between densities."""
+    plain = metrics.simplest_density
 
     def with_sets(target, place, *more):
         return PredictionSet(plain(target, place, *more), torch.tensor(1.7, dtype=torch.float64), "density")
 
-    monkeypatch.setattr(metrics, "density_about", with_sets)
-    # a set says how sure a model is, not whether it is right: of equal densities it is equally large
+    monkeypatch.setattr(metrics, "simplest_density", with_sets)
+    # equal densities have sets of equal size, whether the prediction is right or not
     equal = {"perfect beats random": "sizes do not depend on the target"}
     require(*metrics.examine_metric(MetricRow("sets", target, leave_out=equal), lambda: metric(target)))
 
 
-def test_of_classes_by_a_loop():
+def test_sets_of_classes_equal_a_loop():
     torch.manual_seed(0)
     density = Categorical(logits=2 * torch.randn(200, 3).double(), validate_args=False)
     label = torch.randint(3, (200,))
-    found = judged(CLASSES, density, 0.7, label)
-    held = size = empty = 0
+    actual = evaluate(CLASSES, density, 0.7, label)
+    covered_count = size = empty = 0
     for row, true in zip(density.probs.tolist(), label.tolist(), strict=True):
-        kept = [index for index, share in enumerate(row) if -math.log(share) <= 0.7]
-        held, size, empty = held + (true in kept), size + len(kept), empty + (not kept)
-    assert found["set_coverage"] == held / 200 and found["set_size"] == size / 200
-    assert found["set_empty"] == empty / 200 and empty > 0
-    wanted = np.std(np.r_[np.ones(held), np.zeros(200 - held)], ddof=1) / 200**0.5
-    assert found["set_coverage_sem"] == pytest.approx(wanted)
+        labels_in_set = [index for index, share in enumerate(row) if -math.log(share) <= 0.7]
+        covered_count, size, empty = (
+            covered_count + (true in labels_in_set),
+            size + len(labels_in_set),
+            empty + (not labels_in_set),
+        )
+    assert actual["set_coverage"] == covered_count / 200 and actual["set_size"] == size / 200
+    assert actual["set_empty"] == empty / 200 and empty > 0
+    wanted = np.std(np.r_[np.ones(covered_count), np.zeros(200 - covered_count)], ddof=1) / 200**0.5
+    assert actual["set_coverage_sem"] == pytest.approx(wanted)
 
 
-def test_of_one_angle_in_degrees_and_of_one_real():
+def test_sets_of_one_angle_and_of_one_real_number():
     kind = type(build("density_head", resolve("density_head", "von_mises"), target=ANGLE)(torch.zeros(1, 3)))
     density = kind(torch.zeros(2, 1).double(), torch.tensor([[4.0], [900.0]]).double())
-    found = judged(ANGLE, density, math.log(10), torch.tensor([[0.01], [1.0]]).double(), "mass")
+    actual = evaluate(ANGLE, density, math.log(10), torch.tensor([[0.01], [1.0]]).double(), "mass")
     arcs = [math.degrees(2 * stats.vonmises.ppf(0.95, kappa)) for kappa in (4, 900)]
-    assert found["set_size_deg"] == pytest.approx(np.mean(arcs), rel=2e-3) and found["set_coverage"] == 0.5
-    assert "set_size" not in found and metric(ANGLE).columns["set_size_deg"] == "set size °"
+    assert actual["set_size_deg"] == pytest.approx(np.mean(arcs), rel=2e-3) and actual["set_coverage"] == 0.5
+    assert "set_size" not in actual and metric(ANGLE).columns["set_size_deg"] == "set size °"
     normal = MultivariateNormal(torch.zeros(3, 1).double(), torch.eye(1).double(), validate_args=False)
-    level = 0.5 * math.log(2 * math.pi) + 2.0  # log p has fallen by 2 nats at ±2
-    found = judged(REAL, normal, level, torch.tensor([[1.9], [-1.9], [2.1]]).double())
-    assert found["set_size"] == pytest.approx(4) and found["set_coverage"] == pytest.approx(2 / 3)
-    everything = judged(REAL, normal, math.inf, torch.zeros(3, 1).double())
+    level = 0.5 * math.log(2 * math.pi) + 2.0  # log p is 2 nats below its maximum at ±2
+    actual = evaluate(REAL, normal, level, torch.tensor([[1.9], [-1.9], [2.1]]).double())
+    assert actual["set_size"] == pytest.approx(4) and actual["set_coverage"] == pytest.approx(2 / 3)
+    everything = evaluate(REAL, normal, math.inf, torch.zeros(3, 1).double())
     assert everything["set_size"] == math.inf and everything["set_coverage"] == 1
 
 
-def test_of_several_numbers():
+def test_sets_of_several_numbers():
     plane = Target("real", ("x", "y"))
     normal = MultivariateNormal(torch.zeros(50, 2).double(), torch.eye(2).double(), validate_args=False)
     torch.manual_seed(1)
-    found = judged(plane, normal, math.log(2 * math.pi) + 1.0, torch.zeros(50, 2).double())
-    assert found["set_size"] == pytest.approx(2 * math.pi, rel=0.03)  # of the circle of radius √2
-    assert found["set_coverage"] == 1 and found["set_empty"] == 0
+    actual = evaluate(plane, normal, math.log(2 * math.pi) + 1.0, torch.zeros(50, 2).double())
+    assert actual["set_size"] == pytest.approx(2 * math.pi, rel=0.03)  # area of a circle of radius √2
+    assert actual["set_coverage"] == 1 and actual["set_empty"] == 0
 
 
-def test_densities_without_sets_and_nan_get_a_sentence():
+def test_densities_without_sets_and_nan_raise_a_clear_message():
     density = Categorical(logits=torch.zeros(2, 3), validate_args=False)
-    with pytest.raises(UserError, match=r"predicts a Categorical, which has none\. Put conformal last"):
+    with pytest.raises(
+        UserError, match=r"predicts a Categorical, which has none\. Add conformal as the last"
+    ):
         metric(CLASSES).update(Prediction(density, {"target": torch.zeros(2, dtype=torch.int64)}))
     broken = Categorical(logits=torch.tensor([[0.0, 1, 2], [math.nan] * 3]), validate_args=False)
     with pytest.raises(UserError, match=r"densities of samples \[41\] are NaN"):
         label, index = torch.zeros(2, dtype=torch.int64), torch.tensor([40, 41])
-        judged(CLASSES, broken, 1.0, label, index=index)
+        evaluate(CLASSES, broken, 1.0, label, index=index)

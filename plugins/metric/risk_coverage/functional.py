@@ -10,8 +10,8 @@ from torch import Tensor
 def curve(confidence: Float[Tensor, "count"], risk: Float[Tensor, "count"]) -> Float[Tensor, "count"]:
     """Return the mean risk of the k most confident predictions, k = 1 ... n, averaged over the orders of ties.
 
-    If a run of ties starts after a samples of summed risk A and has mean risk g, any j of the run have summed risk j·g
-    in expectation; the mean risk of the first a + j is then (A + j·g)/(a + j).
+    If a group of ties with mean risk g follows a samples with total risk A, any j samples of the group have the
+    expected total risk j·g. The mean risk of the first a + j samples is then (A + j·g)/(a + j).
     """
     count = len(risk)
     risk = risk.double()
@@ -30,9 +30,12 @@ def area(curve: Float[Tensor, "count"]) -> Float[Tensor, ""]:
 
 
 def at_coverage(curve: Float[Tensor, "count"], coverage: float) -> Float[Tensor, ""]:
-    """Return the risk of the smallest number of predictions that is at least the given share; NaN if there are none."""
+    """Return the risk at a coverage, for the smallest number of predictions that is at least this share.
+
+    The result is NaN without predictions.
+    """
     if len(curve) == 0:
         return curve.new_tensor(torch.nan)
-    # 0.95 · 20 must give 19, although 0.95 has no exact binary fraction
-    kept = math.ceil(coverage * len(curve) - 1e-9)
-    return curve[max(kept, 1) - 1]
+    # 0.95 · 20 must give 19, although 0.95 is not exact in binary
+    kept_count = math.ceil(coverage * len(curve) - 1e-9)
+    return curve[max(kept_count, 1) - 1]

@@ -29,37 +29,25 @@ RISKS = {
 class RiskCoverage(Metric, HasFigure):
     """Error of the most confident share of predictions, against that share.
 
-    The risk is the error rate for classes, the mean absolute error for reals (in their unit, over the numbers of a
-    target), and the mean angular deviation in degrees for angles, for which the keys end in `_deg`.
+    The risk is the error rate for classes, the mean absolute error over the numbers of a target for real numbers (in
+    their unit), and the mean angular deviation in degrees for angles, for which the keys end in `_deg`.
 
     - `aurc`: area under the curve, the mean risk over all shares.
-    - `e_aurc`: the part of it that a perfect order of confidence would save; 0 where the mistakes are the least
-      confident.
+    - `e_aurc`: `aurc` minus the area for a perfect order of confidence; 0 if all mistakes are less confident than all
+      successes.
     - `risk_80`, `risk_95`: risk of the most confident 80 % and 95 %.
 
-    Equally confident predictions count by their mean risk, so that their order has no effect.
+    Equally confident predictions count with their mean risk, so that their order has no effect.
 
     Args:
         confidence: "entropy" for minus the predictive entropy; "mode" for the (log-)probability of the mode.
 
     Raises:
         ConfigError: the targets are images.
-        UserError: confidences or errors are NaN; the message says how many.
+        UserError: confidences or errors are NaN.
     """
 
-    bibtex = """@inproceedings{geifman2017selective,
-  author    = {Geifman, Yonatan and El-Yaniv, Ran},
-  title     = {Selective Classification for Deep Neural Networks},
-  booktitle = {Advances in Neural Information Processing Systems},
-  volume    = {30},
-  year      = {2017}
-}
-@inproceedings{geifman2019bias,
-  author    = {Geifman, Yonatan and Uziel, Guy and El-Yaniv, Ran},
-  title     = {Bias-Reduced Uncertainty Estimation for Deep Neural Classifiers},
-  booktitle = {International Conference on Learning Representations},
-  year      = {2019}
-}"""
+    bibtex = "geifman2017selective, geifman2019bias"
     columns: ClassVar[dict[str, str]] = {"aurc": "AURC", "risk_80": "risk at 80 %"}
     better: ClassVar[dict[str, Literal["higher", "lower"]]] = {"aurc": "lower", "risk_80": "lower"}
     figure_name: ClassVar[str] = "risk_coverage"
@@ -72,8 +60,9 @@ class RiskCoverage(Metric, HasFigure):
         self.confidence = confidence
         if target.kind not in RISKS:
             raise ConfigError(
-                f"metric risk_coverage knows no error of targets of kind {target.kind!r} ({target.listed_names}): "
-                f"wanted {', '.join(RISKS)}. Leave it out."
+                f"metric risk_coverage has no error for targets of kind {target.kind!r} ({target.listed_names}), only "
+                "for "
+                f"{', '.join(RISKS)}. Leave this metric out."
             )
         self.unit, self.risk_name = RISKS[target.kind]
         if target.kind == "angle":
@@ -93,20 +82,20 @@ class RiskCoverage(Metric, HasFigure):
         self.risks.append(refuse_nan(self._risk(prediction), "errors"))
 
     def compute(self) -> dict[str, Tensor]:
-        confidence, risk = self._seen()
-        kept = curve(confidence, risk)
-        found = {
-            "aurc": area(kept),
-            "e_aurc": area(kept) - area(curve(-risk, risk)),
-            "risk_80": at_coverage(kept, 0.8),
-            "risk_95": at_coverage(kept, 0.95),
+        confidence, risk = self._collect()
+        own_curve = curve(confidence, risk)
+        results = {
+            "aurc": area(own_curve),
+            "e_aurc": area(own_curve) - area(curve(-risk, risk)),
+            "risk_80": at_coverage(own_curve, 0.8),
+            "risk_95": at_coverage(own_curve, 0.95),
         }
-        return {f"{name}{self.unit}": value for name, value in found.items()}
+        return {f"{name}{self.unit}": value for name, value in results.items()}
 
     def figure(self, title: str, *, synthetic: bool) -> "Figure":
         from plugins.metric.risk_coverage.picture import risk_coverage
 
-        confidence, risk = self._seen()
+        confidence, risk = self._collect()
         lines = (curve(confidence, risk), curve(-risk, risk))
         own, oracle = (line.cpu().numpy() for line in lines)
         return risk_coverage(own, oracle, self.risk_name, title, synthetic=synthetic)
@@ -124,7 +113,7 @@ class RiskCoverage(Metric, HasFigure):
             return angular_distance(point.double(), target.double()).mean(-1) * (180 / math.pi)
         return (point.double() - target.double()).abs().mean(-1)
 
-    def _seen(self) -> tuple[Tensor, Tensor]:
+    def _collect(self) -> tuple[Tensor, Tensor]:
         if not len(self.risks):
             return torch.empty(0, dtype=torch.float64), torch.empty(0, dtype=torch.float64)
         return dim_zero_cat(self.confidences), dim_zero_cat(self.risks)

@@ -13,10 +13,10 @@ def risk_coverage(
 
     Args:
         own: mean risk of the k most confident predictions, k = 1 ... n.
-        oracle: mean risk of the k predictions of least risk, k = 1 ... n.
+        oracle: mean risk of the k predictions with the lowest risk, k = 1 ... n.
         risk_name: label of the risk axis, with its unit.
         title: title of the figure.
-        synthetic: whether the data are synthetic, which the figure then says.
+        synthetic: whether the data are synthetic; the title then says so.
     """
     figure = titled_figure((6.0, 4.4), title, synthetic)
     axes = figure.subplots()

@@ -1,4 +1,4 @@
-"""Rows of the contract: targets of classes, reals and angles, with both confidences."""
+"""Contract-test cases: classes, real numbers and angles, with both confidences."""
 
 from framework.target import Target
 from framework.testing.rows import MetricRow

@@ -21,7 +21,7 @@ CLASSES = Target("class", ("a", "b", "c"))
 ANGLES = Target("angle", ("azimuth", "tilt"))
 
 
-def measured(target, density, value, **config):
+def compute_metric(target, density, value, **config):
     metric = build("metric", resolve("metric", {"name": "risk_coverage", **config}), target=target)
     metric.update(Prediction(density, {"target": value}))
     return metric, {name: number.item() for name, number in metric.compute().items()}
@@ -36,17 +36,17 @@ def test_ties_are_averaged_over_every_order(pairs):
         for order in itertools.permutations(range(len(risk)))
         if (np.diff(confidence[list(order)]) <= 0).all()
     ]
-    found = curve(torch.tensor(confidence), torch.tensor(risk))
-    np.testing.assert_allclose(found.numpy(), np.mean(curves, 0), rtol=1e-12, atol=1e-12)
-    assert area(found).item() == pytest.approx(np.mean(curves), rel=1e-12, abs=1e-12)
+    actual = curve(torch.tensor(confidence), torch.tensor(risk))
+    np.testing.assert_allclose(actual.numpy(), np.mean(curves, 0), rtol=1e-12, atol=1e-12)
+    assert area(actual).item() == pytest.approx(np.mean(curves), rel=1e-12, abs=1e-12)
 
 
 @pytest.mark.parametrize(
-    "count, coverage, kept",
+    "count, coverage, kept_count",
     [(20, 0.95, 19), (10, 0.8, 8), (3, 0.8, 3), (7, 0.95, 7), (1, 0.8, 1), (100, 0.95, 95)],
 )
-def test_the_fewest_that_are_such_a_share(count, coverage, kept):
-    assert at_coverage(torch.arange(1.0, count + 1), coverage).item() == kept
+def test_coverage_is_rounded_up_to_whole_predictions(count, coverage, kept_count):
+    assert at_coverage(torch.arange(1.0, count + 1), coverage).item() == kept_count
     assert at_coverage(torch.empty(0), coverage).isnan()
 
 
@@ -57,76 +57,78 @@ def test_extreme_confidences_keep_their_order():
 
 
 @pytest.mark.parametrize("confidence", ["entropy", "mode"])
-def test_classes_by_hand(confidence):
+def test_results_for_classes_equal_a_computation_by_hand(confidence):
     logits = torch.tensor([[4.0, 0, 0], [3.0, 0, 0], [2.0, 0, 0], [1.0, 0, 0], [1e4, -1e4, -1e4]])
     label = torch.tensor([0, 1, 0, 2, 0])
-    _, found = measured(CLASSES, Categorical(logits=logits.log_softmax(-1)), label, confidence=confidence)
+    _, actual = compute_metric(
+        CLASSES, Categorical(logits=logits.log_softmax(-1)), label, confidence=confidence
+    )
     # errors in order of confidence: 0 0 1 0 1
-    kept = np.array([0, 0, 1 / 3, 1 / 4, 2 / 5])
+    own_curve = np.array([0, 0, 1 / 3, 1 / 4, 2 / 5])
     best = np.array([0, 0, 0, 1 / 4, 2 / 5])
-    assert found["aurc"] == pytest.approx(kept.mean(), rel=1e-12)
-    assert found["e_aurc"] == pytest.approx((kept - best).mean(), rel=1e-12)
-    assert found["risk_80"] == pytest.approx(1 / 4, rel=1e-12)
-    assert found["risk_95"] == pytest.approx(2 / 5, rel=1e-12)
+    assert actual["aurc"] == pytest.approx(own_curve.mean(), rel=1e-12)
+    assert actual["e_aurc"] == pytest.approx((own_curve - best).mean(), rel=1e-12)
+    assert actual["risk_80"] == pytest.approx(1 / 4, rel=1e-12)
+    assert actual["risk_95"] == pytest.approx(2 / 5, rel=1e-12)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, WIDE])
-def test_reals_by_their_spread(dtype):
+def test_results_for_real_numbers_equal_numpy(dtype):
     generator = np.random.default_rng(0)
     scale = np.exp(generator.normal(size=(300, 2)))
     value = scale * generator.normal(size=(300, 2))
     density = Independent(Normal(torch.zeros(300, 2, dtype=dtype), torch.tensor(scale, dtype=dtype)), 1)
-    # the median of a density that has not told it is drawn: here it is told
+    # set the point prediction, because the median of this density would be estimated from draws
     density = Prediction(density, {"target": torch.tensor(value, dtype=dtype)})
     density.point = torch.zeros(300, 2, dtype=dtype)
     metric = RiskCoverage(Target("real", ("x", "y")))
     metric.update(density)
-    found = metric.compute()
+    actual = metric.compute()
     order = np.argsort(np.log(scale).sum(1))
     risk = np.abs(value).mean(1)
-    kept, best = (np.cumsum(r) / np.arange(1, 301) for r in (risk[order], np.sort(risk)))
+    own_curve, best = (np.cumsum(r) / np.arange(1, 301) for r in (risk[order], np.sort(risk)))
     tolerance = 1e-6 if dtype == torch.float32 else 1e-12
-    assert found["aurc"].item() == pytest.approx(kept.mean(), rel=tolerance)
-    assert found["e_aurc"].item() == pytest.approx(kept.mean() - best.mean(), rel=10 * tolerance)
-    assert found["risk_80"].item() == pytest.approx(kept[239], rel=tolerance)
-    assert kept[239] < risk.mean()
+    assert actual["aurc"].item() == pytest.approx(own_curve.mean(), rel=tolerance)
+    assert actual["e_aurc"].item() == pytest.approx(own_curve.mean() - best.mean(), rel=10 * tolerance)
+    assert actual["risk_80"].item() == pytest.approx(own_curve[239], rel=tolerance)
+    assert own_curve[239] < risk.mean()
 
 
-def test_angles_are_told_in_degrees_and_equal_confidence_is_a_random_order():
+def test_angles_are_reported_in_degrees_and_ties_are_averaged():
     place = torch.zeros(4, 2, dtype=WIDE)
-    apart = torch.tensor([[0.1, 0.3], [-0.2, 2 * math.pi], [math.pi, math.pi], [0.0, 0.0]], dtype=WIDE)
-    metric, found = measured(ANGLES, Cardioid(place), place + apart)
+    difference = torch.tensor([[0.1, 0.3], [-0.2, 2 * math.pi], [math.pi, math.pi], [0.0, 0.0]], dtype=WIDE)
+    metric, actual = compute_metric(ANGLES, Cardioid(place), place + difference)
     mean = math.degrees((0.2 + 0.1 + math.pi + 0) / 4)
-    assert found["aurc_deg"] == pytest.approx(mean)
-    assert found["risk_80_deg"] == pytest.approx(mean)
+    assert actual["aurc_deg"] == pytest.approx(mean)
+    assert actual["risk_80_deg"] == pytest.approx(mean)
     assert metric.columns == {"aurc_deg": "AURC °", "risk_80_deg": "risk at 80 % °"}
     assert set(metric.better) == set(metric.columns)
 
 
-def test_perfect_confidence_leaves_nothing_to_save():
+def test_perfect_confidence_has_no_excess_area():
     logits = torch.tensor([[5.0, 0, 0]] * 7 + [[1.0, 0, 0]] * 3)
-    _, found = measured(CLASSES, Categorical(logits=logits), torch.tensor([0] * 7 + [1] * 3))
-    assert found["e_aurc"] == pytest.approx(0, abs=1e-15)
-    assert found["aurc"] == pytest.approx((1 / 8 + 2 / 9 + 3 / 10) / 10)
-    _, all_wrong = measured(CLASSES, Categorical(logits=logits), torch.ones(10, dtype=torch.int64))
+    _, actual = compute_metric(CLASSES, Categorical(logits=logits), torch.tensor([0] * 7 + [1] * 3))
+    assert actual["e_aurc"] == pytest.approx(0, abs=1e-15)
+    assert actual["aurc"] == pytest.approx((1 / 8 + 2 / 9 + 3 / 10) / 10)
+    _, all_wrong = compute_metric(CLASSES, Categorical(logits=logits), torch.ones(10, dtype=torch.int64))
     assert (all_wrong["aurc"], all_wrong["e_aurc"]) == (1.0, 0.0)
 
 
-def test_the_picture_shows_own_oracle_and_random_order():
+def test_the_figure_shows_own_oracle_and_random_order():
     torch.manual_seed(0)
     density = Categorical(logits=torch.randn(50, 3))
-    metric, found = measured(CLASSES, density, density.sample())
+    metric, actual = compute_metric(CLASSES, density, density.sample())
     axes = metric.figure("one/two", synthetic=True).axes[0]
     own, oracle, random = axes.lines
-    assert np.mean(own.get_ydata()) == pytest.approx(found["aurc"])
-    assert np.mean(own.get_ydata() - oracle.get_ydata()) == pytest.approx(found["e_aurc"])
+    assert np.mean(own.get_ydata()) == pytest.approx(actual["aurc"])
+    assert np.mean(own.get_ydata() - oracle.get_ydata()) == pytest.approx(actual["e_aurc"])
     assert random.get_ydata()[0] == own.get_ydata()[-1] == oracle.get_ydata()[-1]
     RiskCoverage(CLASSES).figure("nothing seen", synthetic=False)
 
 
-def test_nan_is_named():
+def test_nan_raises_a_clear_message():
     with pytest.raises(UserError, match="1 of 1 errors in this batch are NaN"):
-        measured(ANGLES, Cardioid(torch.tensor([[math.nan, 0.0]])), torch.zeros(1, 2))
+        compute_metric(ANGLES, Cardioid(torch.tensor([[math.nan, 0.0]])), torch.zeros(1, 2))
     density = Categorical(logits=torch.tensor([[0.0, 0.0, 0.0], [math.nan, 0.0, 0.0]]), validate_args=False)
     with pytest.raises(UserError, match="1 of 2 confidences in this batch are NaN, the first in row 1"):
-        measured(CLASSES, density, torch.zeros(2, dtype=torch.int64))
+        compute_metric(CLASSES, density, torch.zeros(2, dtype=torch.int64))

@@ -16,44 +16,38 @@ from framework.metric import Metric
 from framework.prediction import Prediction
 from framework.target import Target
 
-CHUNK = 16  # azimuths evaluated at once: CHUNK × batch × components numbers should stay in the cache
+CHUNK = 16  # azimuths that are evaluated at once: CHUNK × batch × components numbers should fit the processor's cache
 
 
 class TruePosterior(Metric):
     """Agreement of the predicted azimuth density with the known symmetry of the object.
 
-    The metric reads the batch field "symmetry", int64. It is 1 for an object without symmetry. It is n ≥ 2 where the
-    azimuth is known only up to 2π/n, so that the true posterior has n modes, at the annotated azimuth + 2πk/n, of mass
-    1/n each. It is 0 where the object looks the same from all sides and the true posterior is uniform.
+    The metric reads the batch field "symmetry", int64. The value 1 means no symmetry. A value n ≥ 2 means that the
+    azimuth is known only up to 2π/n; the true posterior then has n modes at the annotated azimuth + 2πk/n, each of mass
+    1/n. The value 0 means that the object looks the same from all sides; the true posterior is then uniform.
 
     - `azimuth_entropy`: mean entropy of the azimuth, nats, over all samples.
-    - `mode_mass_<k>_of_<n>`: mass within ±π/(2n) of mode k, mean over the samples with n modes; 1/n is best.
-    - `mode_mass_min`: the smallest of those means. It is near 0 when a mode is missed; 1/(largest n) is best.
-    - `uniform_gap`: log 2π minus the entropy, nats, mean over the samples with symmetry 0; 0 is best.
+    - `mode_mass_<k>_of_<n>`: mass within ±π/(2n) of mode k, mean over the samples with n modes; best: 1/n.
+    - `mode_mass_min`: the smallest of these means, near 0 if the density misses a mode; best: 1/(largest n).
+    - `uniform_gap`: log 2π minus the entropy, nats, mean over the samples with symmetry 0; best: 0.
 
-    Each result is NaN where no sample has the symmetry that it is about. Integrals are sums over `points` equally
-    spaced azimuths, so a sample costs that many evaluations of the azimuth marginal, and none of the other angles. A
-    density that is too narrow for the grid (its sum there is not 1 within 1e-4) is judged from `prediction.samples`
-    draws.
+    A result is NaN if no sample has the symmetry to which the result refers. Integrals are sums over `points` equally
+    spaced azimuths: each sample costs `points` evaluations of the azimuth marginal. A density that is too narrow for
+        the
+    grid (its sum on the grid is not 1 within 1e-4) is evaluated from `prediction.samples` draws instead.
 
     Args:
-        target: a target with an angle called azimuth.
+        target: a target that contains an angle named "azimuth".
         points: number of azimuths on the grid; the grid resolves concentrations up to points²/40.
-        largest_symmetry: the largest n that is accepted in the field "symmetry".
+        largest_symmetry: largest n that is allowed in the field "symmetry".
 
     Raises:
         ConfigError: the target has no azimuth; or, at the first update, the data have no field "symmetry".
         DataError: a symmetry is below 0 or above `largest_symmetry`.
-        UserError: entropies are NaN; the message says how many.
+        UserError: entropies are NaN.
     """
 
-    bibtex = """@inproceedings{prokudin2018deep,
-  author    = {Prokudin, Sergey and Gehler, Peter and Nowozin, Sebastian},
-  title     = {Deep Directional Statistics: Pose Estimation with Uncertainty Quantification},
-  booktitle = {European Conference on Computer Vision (ECCV)},
-  pages     = {534--551},
-  year      = {2018}
-}"""
+    bibtex = "prokudin2018deep"
     columns: ClassVar[dict[str, str]] = {
         "azimuth_entropy": "azimuth entropy",
         "mode_mass_min": "least mode mass",
@@ -79,7 +73,7 @@ class TruePosterior(Metric):
         super().__init__()
         if target.kind != "angle" or "azimuth" not in target.names:
             raise ConfigError(
-                "true_posterior judges the angle called azimuth; this data set's targets are of kind "
+                "metric true_posterior requires an angle named azimuth, but this data set's targets are of kind "
                 f"{target.kind!r}: {target.listed_names}. Leave this metric out."
             )
         self.azimuth = target.names.index("azimuth")
@@ -111,7 +105,7 @@ class TruePosterior(Metric):
         self.mass.index_add_(0, symmetry, mass)
 
     def compute(self) -> dict[str, Tensor]:
-        found = {
+        results = {
             "azimuth_entropy": self.entropy / self.count,
             "mode_mass_min": self.entropy.new_tensor(torch.nan),
             "uniform_gap": self.gap / self.samples_with[0],
@@ -123,22 +117,23 @@ class TruePosterior(Metric):
             for mode in range(modes)
         }
         if means:
-            found["mode_mass_min"] = torch.stack(list(means.values())).min()
-        return found | means
+            results["mode_mass_min"] = torch.stack(list(means.values())).min()
+        return results | means
 
     def _symmetry(self, prediction: Prediction) -> Int[Tensor, "batch"]:
         if "symmetry" not in prediction.batch:
             raise ConfigError(
-                'true_posterior needs the batch field "symmetry", but this data set records no symmetry of '
-                f"its objects (its fields: {', '.join(prediction.batch)}). Leave this metric out, or choose "
-                "data that does."
+                'metric true_posterior requires the batch field "symmetry", but this data set records no symmetry of '
+                f"its objects (fields: {', '.join(prediction.batch)}). Leave this metric out, or choose a data set "
+                "with "
+                "this field."
             )
         symmetry = prediction.batch["symmetry"].long()
         wrong = (symmetry < 0) | (symmetry > self.largest)
         if wrong.any():
             raise DataError(
-                f"true_posterior got the symmetry {int(symmetry[wrong][0])}; wanted 0 (continuous), 1 (none) "
-                f"or the number of modes, up to largest_symmetry={self.largest}. Mend the data, or raise "
+                f"metric true_posterior got the symmetry {int(symmetry[wrong][0])}, expected 0 (continuous), 1 (none) "
+                f"or the number of modes up to largest_symmetry={self.largest}. Correct the data, or increase "
                 "largest_symmetry."
             )
         return symmetry
@@ -154,8 +149,8 @@ def entropy_and_mode_mass(
 ) -> tuple[Float[Tensor, "batch"], Float[Tensor, "batch modes"]]:
     """Return the entropy (nats) of a density of one angle, and its mass within ±π/(2n) of azimuth + 2πk/n, k < n.
 
-    Both are integrated by the trapezium rule on the circle. A grid cell that is cut by a window's edge counts with the
-    part inside.
+    Both integrals use the trapezium rule on the circle. A grid cell that the edge of a window cuts counts with the part
+    inside the window.
     """
     step = 2 * math.pi / points
     # the grid starts at the annotated azimuth, so that windows and modes lie at the same grid points for every sample
@@ -170,25 +165,27 @@ def entropy_and_mode_mass(
     mass = _mass_by_mode(relative.unsqueeze(-1).expand_as(weight), weight / total, symmetry, modes, step)
     narrow = ~((total - 1).abs() < 1e-4)
     if narrow.any():
-        drawn = density.sample(torch.Size((samples,)))
-        away = wrap(drawn.squeeze(-1).double() - azimuth.double())
-        even = torch.full_like(away, 1 / samples)
-        entropy = torch.where(narrow, -density.log_prob(drawn).double().mean(0), entropy)
-        mass = torch.where(narrow.unsqueeze(-1), _mass_by_mode(away, even, symmetry, modes, 0.0), mass)
+        draws = density.sample(torch.Size((samples,)))
+        offset = wrap(draws.squeeze(-1).double() - azimuth.double())
+        equal_weights = torch.full_like(offset, 1 / samples)
+        entropy = torch.where(narrow, -density.log_prob(draws).double().mean(0), entropy)
+        mass = torch.where(
+            narrow.unsqueeze(-1), _mass_by_mode(offset, equal_weights, symmetry, modes, 0.0), mass
+        )
     return entropy, mass
 
 
 def _mass_by_mode(
-    away: Float[Tensor, "points batch"],
+    offset: Float[Tensor, "points batch"],
     weight: Float[Tensor, "points batch"],
     symmetry: Int[Tensor, "batch"],
     modes: int,
     step: float,
 ) -> Float[Tensor, "batch modes"]:
     count = symmetry.clamp(min=1)
-    turn = 2 * math.pi
-    nearest = (away * count / turn).round()
-    distance = (away - nearest * turn / count).abs()
+    circle = 2 * math.pi
+    nearest = (offset * count / circle).round()
+    distance = (offset - nearest * circle / count).abs()
     half_width = math.pi / (2 * count)
     if step > 0:
         inside = ((half_width - distance) / step + 0.5).clamp(0, 1)

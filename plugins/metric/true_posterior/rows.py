@@ -1,4 +1,4 @@
-"""Rows of the contract: objects without symmetry, with twofold symmetry and with full symmetry."""
+"""Contract-test cases: objects without symmetry, with twofold symmetry and with full symmetry."""
 
 import torch
 from torch import Tensor
@@ -8,12 +8,12 @@ from framework.testing.rows import MetricRow
 
 
 def symmetry(count: int) -> Tensor:
-    """Return the symmetries 0, 1, 2 in turn."""
+    """Return the symmetries 0, 1, 2, 0, 1, 2, ... of `count` samples."""
     return torch.arange(count) % 3
 
 
 ONE_MODE = {
-    "perfect beats random": "a density about the target alone misses the other modes of a symmetric object"
+    "perfect beats random": "a density with a single mode at the target misses the other modes of a symmetric object"
 }
 ROWS = {
     "true_posterior": tuple(

@@ -23,7 +23,7 @@ TURN = 2 * math.pi
 
 
 class Modes(Distribution):
-    """Density with von Mises components of equal weight in the first angle; no other angle may be read."""
+    """Density with von Mises components of equal weight in the first angle; other angles must not be evaluated."""
 
     arg_constraints = {}  # noqa: RUF012 - as torch has it
     support = circular
@@ -35,13 +35,13 @@ class Modes(Distribution):
 
     def log_prob(self, value):
         assert self.event_shape == (1,)
-        each = self.components.log_prob(value)  # (..., batch, K)
-        return each.logsumexp(-1) - math.log(self.modes.shape[-1])
+        component_log_prob = self.components.log_prob(value)  # (..., batch, K)
+        return component_log_prob.logsumexp(-1) - math.log(self.modes.shape[-1])
 
     def sample(self, sample_shape=()):
         which = Categorical(logits=torch.zeros_like(self.modes)).sample(sample_shape)
-        drawn = self.components.sample(sample_shape)
-        return drawn.gather(-1, which.unsqueeze(-1))
+        draws = self.components.sample(sample_shape)
+        return draws.gather(-1, which.unsqueeze(-1))
 
 
 @marginal.register
@@ -56,7 +56,7 @@ def prediction(modes, concentration, azimuth, symmetry, dtype=torch.float64, **b
     return Prediction(density, {"target": target, "symmetry": torch.as_tensor(symmetry), **batch})
 
 
-def measured(*predictions, **config):
+def compute_metric(*predictions, **config):
     metric = build("metric", resolve("metric", {"name": "true_posterior", **config}), target=TARGET)
     for item in predictions:
         metric.update(item)
@@ -81,21 +81,21 @@ def quadrature(modes, concentration, azimuth, symmetry):
 
 @pytest.mark.parametrize("dtype, tolerance", [(torch.float32, 2e-5), (torch.float64, 2e-5)])
 @pytest.mark.parametrize("concentration", [0.01, 3.0, 200.0])
-def test_agrees_with_quadrature(dtype, tolerance, concentration):
+def test_results_agree_with_quadrature(dtype, tolerance, concentration):
     modes = np.array([[0.3, 2.0], [-3.1, 3.1], [1.0, 1.0 + math.pi], [0.5, -0.5]])
     azimuth, symmetry = np.array([0.4, 3.0, 1.1, -0.6]), [2, 3, 4, 0]
     metric = TruePosterior(TARGET)
     metric.update(prediction(modes, concentration, azimuth, symmetry, dtype))
-    found = metric.compute()
+    actual = metric.compute()
     samples = zip(modes, azimuth, symmetry, strict=True)
     rows = [quadrature(mode, concentration, true, count) for mode, true, count in samples]
-    assert found["azimuth_entropy"].item() == pytest.approx(np.mean([row[0] for row in rows]), abs=tolerance)
-    assert found["uniform_gap"].item() == pytest.approx(math.log(TURN) - rows[3][0], abs=tolerance)
+    assert actual["azimuth_entropy"].item() == pytest.approx(np.mean([row[0] for row in rows]), abs=tolerance)
+    assert actual["uniform_gap"].item() == pytest.approx(math.log(TURN) - rows[3][0], abs=tolerance)
     for (_, masses), count in zip(rows[:3], symmetry, strict=False):
         for k, mass in enumerate(masses):
-            assert found[f"mode_mass_{k}_of_{count}"].item() == pytest.approx(mass, abs=tolerance)
+            assert actual[f"mode_mass_{k}_of_{count}"].item() == pytest.approx(mass, abs=tolerance)
     least = min(min(row[1]) for row in rows[:3])
-    assert found["mode_mass_min"].item() == pytest.approx(least, abs=tolerance)
+    assert actual["mode_mass_min"].item() == pytest.approx(least, abs=tolerance)
 
 
 @pytest.mark.parametrize("azimuth_deg", [0, 1, 90, 179.99, 180, 359, -721])
@@ -103,44 +103,44 @@ def test_agrees_with_quadrature(dtype, tolerance, concentration):
 def test_the_true_posterior_has_all_modes_wherever_it_lies(azimuth_deg, modes):
     azimuth = math.radians(azimuth_deg)
     centres = [[azimuth + TURN * k / modes for k in range(modes)]]
-    found = measured(prediction(centres, 5e4, [azimuth], [modes]), largest_symmetry=36, points=1440)
-    assert found["mode_mass_min"] == pytest.approx(1 / modes, rel=1e-6)
-    assert found["azimuth_entropy"] == pytest.approx(vonmises.entropy(5e4) + math.log(modes), abs=1e-5)
+    actual = compute_metric(prediction(centres, 5e4, [azimuth], [modes]), largest_symmetry=36, points=1440)
+    assert actual["mode_mass_min"] == pytest.approx(1 / modes, rel=1e-6)
+    assert actual["azimuth_entropy"] == pytest.approx(vonmises.entropy(5e4) + math.log(modes), abs=1e-5)
 
 
 def test_359_degrees_is_next_to_1_degree():
-    found = measured(prediction([[math.radians(359)]], 1e4, [math.radians(1)], [2]))
-    assert found["mode_mass_0_of_2"] == pytest.approx(1, abs=1e-6)
-    assert found["mode_mass_1_of_2"] == pytest.approx(0, abs=1e-6)
+    actual = compute_metric(prediction([[math.radians(359)]], 1e4, [math.radians(1)], [2]))
+    assert actual["mode_mass_0_of_2"] == pytest.approx(1, abs=1e-6)
+    assert actual["mode_mass_1_of_2"] == pytest.approx(0, abs=1e-6)
 
 
-def test_a_missed_mode_shows_and_is_averaged_before_the_smallest_is_taken():
+def test_a_missed_mode_lowers_the_smallest_mean_mass():
     azimuth = torch.zeros(10)
     centres = torch.zeros(10, 1)
-    centres[:3] = math.pi  # the one predicted mode is at k = 1 for three samples in ten
-    found = measured(prediction(centres, 1e3, azimuth, torch.full((10,), 2)))
-    assert found["mode_mass_0_of_2"] == pytest.approx(0.7, abs=1e-6)
-    assert found["mode_mass_min"] == pytest.approx(0.3, abs=1e-6)
+    centres[:3] = math.pi  # for 3 of 10 samples, the only predicted mode is k = 1
+    actual = compute_metric(prediction(centres, 1e3, azimuth, torch.full((10,), 2)))
+    assert actual["mode_mass_0_of_2"] == pytest.approx(0.7, abs=1e-6)
+    assert actual["mode_mass_min"] == pytest.approx(0.3, abs=1e-6)
 
 
 def test_a_uniform_density_has_no_gap():
-    found = measured(prediction([[1.0]], 1e-30, [2.0], [0]))
-    assert found["uniform_gap"] == pytest.approx(0, abs=1e-6)
-    assert found["azimuth_entropy"] == pytest.approx(uniform.entropy(0, TURN), abs=1e-6)
+    actual = compute_metric(prediction([[1.0]], 1e-30, [2.0], [0]))
+    assert actual["uniform_gap"] == pytest.approx(0, abs=1e-6)
+    assert actual["azimuth_entropy"] == pytest.approx(uniform.entropy(0, TURN), abs=1e-6)
 
 
 @pytest.mark.parametrize("concentration", [1e6, 1e7])
-def test_a_density_between_the_grid_points_is_drawn_from(concentration):
+def test_a_density_between_the_grid_points_is_evaluated_from_draws(concentration):
     torch.manual_seed(0)
     azimuth = 0.4
-    off = azimuth + 0.5 * TURN / 720  # half way between two points of a coarse grid
-    found = measured(
+    off = azimuth + 0.5 * TURN / 720  # halfway between two points of a coarse grid
+    actual = compute_metric(
         prediction([[off, off + math.pi]] * 40, concentration, [azimuth] * 40, [2] * 40), points=720
     )
-    # 40 × 1000 draws: standard error 0.0025 of the mass, 0.0035 nats of the entropy, five of each
-    assert found["mode_mass_min"] == pytest.approx(0.5, abs=0.0125)
+    # 40 × 1000 draws: standard error 0.0025 (mass) and 0.0035 nats (entropy); five times each
+    assert actual["mode_mass_min"] == pytest.approx(0.5, abs=0.0125)
     exact = 0.5 * (1 + math.log(TURN / concentration)) + math.log(2)
-    assert found["azimuth_entropy"] == pytest.approx(exact, abs=0.0175)
+    assert actual["azimuth_entropy"] == pytest.approx(exact, abs=0.0175)
 
 
 @settings(deadline=None, max_examples=60)
@@ -170,17 +170,17 @@ def test_only_the_azimuth_marginal_is_read():
     assert metric.compute()["azimuth_entropy"].item() == pytest.approx(vonmises.entropy(4.0), abs=1e-5)
 
 
-def test_nothing_seen_is_nan():
-    empty = measured(prediction(np.zeros((0, 2)), 1.0, np.zeros(0), np.zeros(0, dtype=np.int64)))
+def test_no_samples_give_nan():
+    empty = compute_metric(prediction(np.zeros((0, 2)), 1.0, np.zeros(0), np.zeros(0, dtype=np.int64)))
     assert empty.keys() == {"azimuth_entropy", "mode_mass_min", "uniform_gap"}
     assert all(np.isnan(value) for value in empty.values())
-    unsymmetric = measured(prediction([[0.0]], 1.0, [0.0], [1]))
+    unsymmetric = compute_metric(prediction([[0.0]], 1.0, [0.0], [1]))
     assert not np.isnan(unsymmetric["azimuth_entropy"])
     assert np.isnan(unsymmetric["mode_mass_min"])
     assert np.isnan(unsymmetric["uniform_gap"])
 
 
-def test_merged_halves_are_the_whole():
+def test_merged_states_equal_the_state_of_all_samples():
     generator = np.random.default_rng(0)
     modes, azimuth = generator.uniform(-3, 3, (20, 2)), generator.uniform(-3, 3, 20)
     symmetry = generator.integers(0, 4, 20)
@@ -190,25 +190,25 @@ def test_merged_halves_are_the_whole():
     whole.update(prediction(modes, 8.0, azimuth, symmetry))
     first.merge_state(second)
     expected = whole.compute()
-    found = first.compute()
-    assert found.keys() == expected.keys()
-    for name, value in found.items():
+    actual = first.compute()
+    assert actual.keys() == expected.keys()
+    for name, value in actual.items():
         torch.testing.assert_close(value, expected[name], rtol=1e-12, atol=1e-12)
 
 
-def test_says_when_the_data_records_no_symmetry():
+def test_data_without_symmetry_raise_an_error():
     density = Modes(torch.zeros(3, 1), 1.0)
     with pytest.raises(ConfigError, match="records no symmetry of its objects"):
         TruePosterior(TARGET).update(Prediction(density, {"target": torch.zeros(3, 1)}))
 
 
 @pytest.mark.parametrize("symmetry", [-1, 17])
-def test_refuses_a_symmetry_out_of_range(symmetry):
+def test_a_symmetry_out_of_range_raises_an_error(symmetry):
     with pytest.raises(DataError, match=f"got the symmetry {symmetry}"):
         TruePosterior(TARGET).update(prediction([[0.0]], 1.0, [0.0], [symmetry]))
 
 
 @pytest.mark.parametrize("target", [Target("angle", ("pan",)), Target("real", ("azimuth",))])
-def test_refuses_targets_without_an_azimuth(target):
-    with pytest.raises(ConfigError, match="judges the angle called azimuth"):
+def test_targets_without_an_azimuth_raise_an_error(target):
+    with pytest.raises(ConfigError, match="requires an angle named azimuth"):
         TruePosterior(target)

@@ -1,1 +1,1 @@
-"""Distances of predicted vertices from the true ones, and errors of the correspondences that predicted meshes give."""
+"""Distances between predicted and true vertices, and errors of correspondences through predicted meshes."""

@@ -10,9 +10,9 @@ from framework.geometry.nearest import nearest
 
 
 class Correspondence(NamedTuple):
-    """Mean errors in centimetres over pairs of different scans: of one person (intra) and of two people (inter).
+    """Mean errors in centimetres over pairs of different scans, of the same person (intra) and of two people (inter).
 
-    Each is NaN where there is no such pair.
+    A mean is NaN if there is no such pair.
     """
 
     intra_cm: Tensor
@@ -26,24 +26,24 @@ def correspondence(
 ) -> Correspondence:
     """Return the errors of the correspondences between all ordered pairs of scans.
 
-    A point of one scan is assigned to the nearest vertex of the template registered to that scan. Its predicted place
-    on the other scan is the same vertex of the template registered to the other scan. The error is the distance from
-    that predicted place to the true one (Bogo et al. 2014, §5; thesis §6.5.2).
+    A point of one scan is assigned to the nearest vertex of the template registered to that scan. Its predicted
+    position on the other scan is the same vertex of the template registered to the other scan. The error is the
+    distance from the predicted position to the true position (Bogo et al. 2014, §5; thesis §6.5.2).
 
     Args:
         truth: points that correspond across scans, metres: vertices of the true registrations, which lie on the scans.
-        registered: predicted meshes, metres, all of one topology, which may be any.
+        registered: predicted meshes, metres, which all have the same topology.
         subject: number of the person on each scan.
     """
-    place = nearest(registered.float(), truth.float()).index
+    vertex = nearest(registered.float(), truth.float()).index
     total, count = torch.zeros(2, dtype=torch.float64), torch.zeros(2, dtype=torch.float64)
-    for one in range(len(truth)):
-        # (scan, point, 3): places of those vertices on the template of every scan
-        thought = registered[:, place[one]].double()
-        error = 100 * torch.linalg.vector_norm(thought - truth.double(), dim=-1).mean(1)
+    for scan in range(len(truth)):
+        # (scan, point, 3): positions of these vertices on the template of every scan
+        predicted_points = registered[:, vertex[scan]].double()
+        error = 100 * torch.linalg.vector_norm(predicted_points - truth.double(), dim=-1).mean(1)
         for kind, same in enumerate((True, False)):
-            others = (subject == subject[one]) == same
-            others[one] = False
-            total[kind] += error[others].sum()
-            count[kind] += others.sum()
+            other_scans = (subject == subject[scan]) == same
+            other_scans[scan] = False
+            total[kind] += error[other_scans].sum()
+            count[kind] += other_scans.sum()
     return Correspondence(*(total / count))

@@ -16,22 +16,17 @@ from framework.target import Target
 from plugins.metric.vertices.correspondence import correspondence
 
 BINS, LOWEST, HIGHEST = 2_000, 1e-4, 1e4
-"""Number of bins and limits (centimetres) of the histogram of distances: equal steps of the logarithm, 0.9 % each."""
-FAUST = """@inproceedings{bogo2014faust,
-  title = {{FAUST}: Dataset and Evaluation for {3D} Mesh Registration},
-  author = {Bogo, Federica and Romero, Javier and Loper, Matthew and Black, Michael J.},
-  booktitle = {IEEE Conference on Computer Vision and Pattern Recognition (CVPR)},
-  year = {2014}
-}"""
+"""Number of bins and limits (centimetres) of the histogram of distances; each bin is 0.9 % wide."""
+FAUST = "bogo2014faust"
 
 
 class VertexError(Mean):
     """Euclidean distance between predicted and true vertices, centimetres (thesis §6.5.2).
 
-    The target is x, y, z of each vertex in turn. The batch field "scale" (batch,), in metres per unit of the target,
-    converts distances to centimetres. Each body's mean over its vertices is averaged over bodies and has a standard
-    error over bodies. Median and 95th percentile are over all vertices of all bodies; they come from a histogram and
-    are therefore exact to 1 %.
+    The target holds x, y, z of the first vertex, then of the second, and so on. The batch field "scale" (batch,), in
+    metres per unit of the target, converts distances to centimetres. The reported mean is the mean over bodies of the
+    mean over a body's vertices; its standard error is over bodies. Median and 95th percentile are over all vertices of
+    all bodies. They are computed from a histogram and are therefore exact to 1 %.
 
     Raises:
         ConfigError: the target is not made of vertices.
@@ -70,10 +65,10 @@ class VertexError(Mean):
 
 
 class CorrespondenceError(Metric):
-    """Error of correspondences through predicted meshes, cm, over all ordered pairs of test scans (Table 6.4).
+    """Error of correspondences through predicted meshes, centimetres, over all ordered pairs of test scans (Table 6.4).
 
-    `intra_cm` is the mean over pairs of scans of one person, `inter_cm` over pairs of two people. The target is the
-    true registration. The metric holds every predicted and true mesh until the end.
+    `intra_cm` is the mean over pairs of scans of the same person, `inter_cm` over pairs of scans of two people. The
+    target is the true registration. The metric holds every predicted and true mesh until the end.
 
     Raises:
         ConfigError: the target is not made of vertices.
@@ -94,12 +89,12 @@ class CorrespondenceError(Metric):
             self.add_state(name, [], dist_reduce_fx="cat")
 
     def update(self, prediction: Prediction) -> None:
-        wanted = {
+        meanings = {
             "centre": "metres",
             "scale": "metres per unit of the target",
-            "subject": "who each scan is of",
+            "subject": "number of the person on each scan",
         }
-        centre, scale, subject = fields(prediction, "correspondence", wanted)
+        centre, scale, subject = fields(prediction, "correspondence", meanings)
         for name, mesh in (("registered", prediction.point), ("truth", prediction.target)):
             getattr(self, name).append(denormalise_clouds(mesh.unflatten(1, (-1, 3)), centre, scale))
         self.subject.append(subject)
@@ -112,37 +107,37 @@ class CorrespondenceError(Metric):
 
 
 def require_vertices(target: Target, name: str) -> None:
-    """Refuse a target that is not x, y, z of every vertex.
+    """Check that a target can hold x, y, z of every vertex.
 
     Raises:
-        ConfigError: the target is not of reals, or their number is not a multiple of 3.
+        ConfigError: the target is not real-valued, or its number of values is not a multiple of 3.
     """
     target.require("real", by=f"metric {name}")
     if len(target.names) % 3:
         raise ConfigError(
-            f"metric {name} reads x, y, z of every vertex, but the target has {len(target.names)} numbers. "
+            f"metric {name} requires x, y, z of every vertex, but the target has {len(target.names)} numbers. "
             "Choose data whose target is a mesh, or leave this metric out."
         )
 
 
-def fields(prediction: Prediction, name: str, wanted: Mapping[str, str]) -> list[Tensor]:
-    """Return the batch fields that a metric reads, in the order of `wanted`.
+def fields(prediction: Prediction, name: str, meanings: Mapping[str, str]) -> list[Tensor]:
+    """Return the batch fields that a metric reads, in the order of `meanings`.
 
     Args:
         prediction: the prediction whose batch is read.
         name: name of the metric, for the message.
-        wanted: field name → its meaning, for the message.
+        meanings: field name → its meaning, for the message.
 
     Raises:
-        DataError: the batch has no such field.
+        DataError: the batch lacks a field.
     """
-    for field, meaning in wanted.items():
+    for field, meaning in meanings.items():
         if field not in prediction.batch:
             raise DataError(
-                f"metric {name} reads {field!r}, {meaning}, which this data set does not give. Choose data that has "
-                "it (faust), or leave this metric out."
+                f"metric {name} requires the batch field {field!r} ({meaning}), which this data set does not provide. "
+                "Choose data with this field (such as faust), or leave this metric out."
             )
-    return [prediction.batch[field] for field in wanted]
+    return [prediction.batch[field] for field in meanings]
 
 
 def distances(
@@ -156,17 +151,17 @@ def distances(
 def bins(distance: Float[Tensor, "batch vertex"]) -> Tensor:
     """Return the histogram bin of each distance.
 
-    Distances beyond the limits of the histogram are counted in its first or last bin, NaN in the last.
+    Distances beyond the limits of the histogram belong to its first or last bin; NaN belongs to the last bin.
     """
-    place = (distance.clamp(min=LOWEST) / LOWEST).log() * (
+    position = (distance.clamp(min=LOWEST) / LOWEST).log() * (
         BINS / torch.tensor(HIGHEST / LOWEST).double().log()
     )
-    return place.nan_to_num(BINS).clamp(0, BINS - 1).long()
+    return position.nan_to_num(BINS).clamp(0, BINS - 1).long()
 
 
 def quantile(histogram: Float[Tensor, "bins"], share: float) -> Float[Tensor, ""]:
-    """Return the middle of the bin that reaches the cumulated share; 0 for the first bin, NaN of an empty histogram."""
+    """Return the middle of the bin that reaches the cumulated share; 0 for the first bin, NaN if all are empty."""
     total = histogram.sum()
-    place = torch.searchsorted(histogram.cumsum(0), share * total).clamp(max=BINS - 1)
-    middle = LOWEST * (HIGHEST / LOWEST) ** ((place.double() + 0.5) / BINS)
-    return torch.where(total > 0, middle.where(place > 0, 0), torch.nan)
+    index = torch.searchsorted(histogram.cumsum(0), share * total).clamp(max=BINS - 1)
+    middle = LOWEST * (HIGHEST / LOWEST) ** ((index.double() + 0.5) / BINS)
+    return torch.where(total > 0, middle.where(index > 0, 0), torch.nan)

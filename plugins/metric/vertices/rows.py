@@ -1,4 +1,4 @@
-"""Rows of the contract: meshes of one vertex, of four, and of five vertices in scans of three people."""
+"""Contract-test cases: meshes of one, four and five vertices; the latter in scans of three people."""
 
 import torch
 from torch import Tensor
@@ -8,12 +8,12 @@ from framework.testing.rows import MetricRow
 
 
 def mesh(vertices: int) -> Target:
-    """Return the target that holds the coordinates of so many vertices."""
+    """Return a target with the coordinates of `vertices` vertices."""
     return Target("real", tuple(f"{axis}{vertex}" for vertex in range(vertices) for axis in "xyz"))
 
 
 def scales(count: int) -> Tensor:
-    """Return a different scale for each sample."""
+    """Return different scales for `count` samples."""
     return torch.linspace(0.5, 1.5, count)
 
 

@@ -24,16 +24,10 @@ class Viewpoint(Metric):
     middle two.
 
     Raises:
-        ConfigError: the target is not the three angles azimuth, elevation and tilt.
+        ConfigError: the target does not consist of the angles azimuth, elevation and tilt.
     """
 
-    bibtex = """@inproceedings{tulsiani2015viewpoints,
-  author    = {Tulsiani, Shubham and Malik, Jitendra},
-  title     = {Viewpoints and Keypoints},
-  booktitle = {Proceedings of the IEEE Conference on Computer Vision and Pattern Recognition},
-  pages     = {1510--1519},
-  year      = {2015}
-}"""
+    bibtex = "tulsiani2015viewpoints"
     columns: ClassVar[dict[str, str]] = {"acc_pi_6": "Acc π/6", "mederr_deg": "MedErr °"}
     better: ClassVar[dict[str, Literal["higher", "lower"]]] = {"acc_pi_6": "higher", "mederr_deg": "lower"}
     errors: list[Tensor] | Tensor
@@ -42,15 +36,15 @@ class Viewpoint(Metric):
         super().__init__()
         if target.kind != "angle" or sorted(target.names) != sorted(ANGLES):
             raise ConfigError(
-                f"viewpoint compares rotations given by the three angles {', '.join(ANGLES)}; this data "
+                f"metric viewpoint requires the three angles {', '.join(ANGLES)}, but this data "
                 f"set's targets are of kind {target.kind!r}: {target.listed_names}. "
-                "Leave this metric out; `angular_deviation` judges any angles."
+                "Leave this metric out; `angular_deviation` evaluates any angles."
             )
         self.order = [target.names.index(name) for name in ANGLES]
         self.add_state("errors", [], dist_reduce_fx="cat")
 
     def update(self, prediction: Prediction) -> None:
-        # float64: near a half turn, float32 rotation matrices resolve no more than 0.02°
+        # float64, because near half a turn float32 rotation matrices resolve only 0.02°
         true = viewpoint_rotation(prediction.target[:, self.order].double())
         predicted = viewpoint_rotation(prediction.point[:, self.order].double())
         assert isinstance(self.errors, list)
@@ -65,7 +59,7 @@ class Viewpoint(Metric):
 
 
 def _median(values: Tensor) -> Tensor:
-    """Return the median, the mean of the middle two for an even count; NaN without values or where one value is NaN."""
+    """Return the median (of an even count, the mean of the middle two); NaN without values or if a value is NaN."""
     if len(values) == 0 or values.isnan().any():
         return values.new_tensor(torch.nan)
     ordered, count = values.sort().values, len(values)

@@ -23,7 +23,7 @@ def prediction(point, target, dtype=torch.float64):
     )
 
 
-def measured(point, target, dtype=torch.float64):
+def compute_metric(point, target, dtype=torch.float64):
     metric = Viewpoint(TARGET)
     metric.update(prediction(point, target, dtype))
     return {name: value.item() for name, value in metric.compute().items()}
@@ -45,9 +45,9 @@ viewpoints = st.tuples(angle, angle, angle)
 
 @settings(deadline=None, max_examples=200)
 @given(viewpoints, viewpoints)
-def test_error_is_scipys_angle(point, target):
+def test_the_error_equals_scipys_angle(point, target):
     expected = math.degrees(scipy_distance([point], [target])[0])
-    assert measured([point], [target])["mederr_deg"] == pytest.approx(expected, abs=math.degrees(1e-6))
+    assert compute_metric([point], [target])["mederr_deg"] == pytest.approx(expected, abs=math.degrees(1e-6))
 
 
 @pytest.mark.parametrize("gap", [0.0, 1e-12, 1e-8, 1e-5, 0.1])
@@ -55,32 +55,32 @@ def test_error_is_scipys_angle(point, target):
 def test_error_is_right_to_1e_6_radians_near_0_and_a_half_turn(gap, about):
     generator = np.random.default_rng(2)
     for target in generator.uniform(-math.pi, math.pi, (20, 3)):
-        # A turn of the azimuth turns the object about its own axis by exactly that much.
+        # a change of the azimuth rotates the object around its own axis by the same angle
         point = target + np.array([about - gap, 0, 0])
-        found = math.radians(measured(point[None], target[None])["mederr_deg"])
-        assert found == pytest.approx(abs(about - gap), abs=1e-6)
-        assert found == pytest.approx(scipy_distance([point], [target])[0], abs=1e-6)
+        actual = math.radians(compute_metric(point[None], target[None])["mederr_deg"])
+        assert actual == pytest.approx(abs(about - gap), abs=1e-6)
+        assert actual == pytest.approx(scipy_distance([point], [target])[0], abs=1e-6)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("count", [1, 2, 101, 200])
-def test_accuracy_and_median_are_numpys(dtype, count):
+def test_accuracy_and_median_equal_numpys(dtype, count):
     generator = np.random.default_rng(count)
     target = generator.uniform(-math.pi, math.pi, (count, 3)).astype(str(dtype).removeprefix("torch."))
     point = target + generator.normal(0, 0.4, (count, 3)).astype(target.dtype)
     metric = build("metric", resolve("metric", "viewpoint"), target=TARGET)
     metric.update(prediction(point, target, dtype))
-    found = metric.compute()
+    actual = metric.compute()
     errors = scipy_distance(point, target)
-    assert found["acc_pi_6"].item() == np.mean(errors < math.pi / 6)
-    assert found["mederr_deg"].item() == pytest.approx(math.degrees(np.median(errors)), abs=1e-6)
+    assert actual["acc_pi_6"].item() == np.mean(errors < math.pi / 6)
+    assert actual["mederr_deg"].item() == pytest.approx(math.degrees(np.median(errors)), abs=1e-6)
 
 
 def test_359_degrees_is_next_to_1_degree():
     point, target = np.radians([[359, 20, 359]]), np.radians([[1, 20, 359]])
-    found = measured(point, target)
-    assert found["mederr_deg"] == pytest.approx(2, abs=1e-9)
-    assert found["acc_pi_6"] == 1
+    actual = compute_metric(point, target)
+    assert actual["mederr_deg"] == pytest.approx(2, abs=1e-9)
+    assert actual["acc_pi_6"] == 1
 
 
 def test_the_order_of_the_angles_does_not_matter():
@@ -88,21 +88,21 @@ def test_the_order_of_the_angles_does_not_matter():
     point, target = generator.uniform(-3, 3, (2, 9, 3))
     swapped = Viewpoint(Target("angle", ("tilt", "azimuth", "elevation")))
     swapped.update(prediction(point[:, [2, 0, 1]], target[:, [2, 0, 1]]))
-    assert swapped.compute()["mederr_deg"].item() == measured(point, target)["mederr_deg"]
+    assert swapped.compute()["mederr_deg"].item() == compute_metric(point, target)["mederr_deg"]
 
 
-def test_nothing_seen_is_nan():
+def test_no_samples_give_nan():
     empty = np.zeros((0, 3))
-    assert all(np.isnan(value) for value in measured(empty, empty).values())
+    assert all(np.isnan(value) for value in compute_metric(empty, empty).values())
 
 
-def test_a_prediction_that_is_not_a_number_is_not_hidden():
-    found = measured([[np.nan, 0, 0], [0, 0, 0], [0, 0, 0]], np.zeros((3, 3)))
-    assert np.isnan(found["mederr_deg"])
-    assert found["acc_pi_6"] == pytest.approx(2 / 3)
+def test_a_nan_prediction_gives_nan():
+    actual = compute_metric([[np.nan, 0, 0], [0, 0, 0], [0, 0, 0]], np.zeros((3, 3)))
+    assert np.isnan(actual["mederr_deg"])
+    assert actual["acc_pi_6"] == pytest.approx(2 / 3)
 
 
-def test_merged_halves_are_the_whole():
+def test_merged_states_equal_the_state_of_all_samples():
     generator = np.random.default_rng(4)
     point, target = generator.uniform(-1, 1, (2, 31, 3))
     first, second, whole = (Viewpoint(TARGET) for _ in range(3))
@@ -113,7 +113,7 @@ def test_merged_halves_are_the_whole():
     assert first.compute() == whole.compute()
 
 
-def test_two_processes_are_the_whole():
+def test_two_processes_give_the_results_of_all_samples():
     generator = np.random.default_rng(5)
     point, target = generator.uniform(-1, 1, (2, 31, 3))
     first, second, whole = (Viewpoint(TARGET) for _ in range(3))
@@ -121,8 +121,8 @@ def test_two_processes_are_the_whole():
         first.update(prediction(point[rows], target[rows]))
     second.update(prediction(point[12:], target[12:]))
     whole.update(prediction(point, target))
-    others = torch.cat(second.errors)
-    first.dist_sync_fn = lambda state, group=None: [state, others]
+    other_errors = torch.cat(second.errors)
+    first.dist_sync_fn = lambda state, group=None: [state, other_errors]
     first.distributed_available_fn = lambda: True
     assert first.compute() == whole.compute()
 
@@ -135,6 +135,6 @@ def test_two_processes_are_the_whole():
         Target("real", ("azimuth", "elevation", "tilt")),
     ],
 )
-def test_refuses_anything_but_the_three_angles(target):
+def test_other_targets_than_the_three_angles_raise_an_error(target):
     with pytest.raises(ConfigError, match="three angles azimuth, elevation, tilt"):
         Viewpoint(target)

@@ -308,7 +308,7 @@ def make_camera(options: argparse.Namespace, sphere: turntable.BoundingSphere, u
 
 
 def check_size(camera: Camera, options: argparse.Namespace, out: Path) -> None:
-    """Refuse an image that is too large, or whose size its file format cannot hold."""
+    """Check that the image is not too large, and that its file format supports its size."""
     samples = camera.height * camera.width * options.supersampling**2
     if samples > MOST_SAMPLES:
         raise ConfigError(

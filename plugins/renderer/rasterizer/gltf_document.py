@@ -130,9 +130,9 @@ class Document:
             values = self._elements(described["bufferView"], described, count, width, kind).copy()
         if "sparse" in described:
             sparse = described["sparse"]
-            changed, places = whole_number(sparse["count"]), sparse["indices"]
-            order = np.dtype(NUMBERS[places["componentType"]])
-            rows = self._elements(places["bufferView"], places, changed, 1, order)[:, 0]
+            changed, indices = whole_number(sparse["count"]), sparse["indices"]
+            order = np.dtype(NUMBERS[indices["componentType"]])
+            rows = self._elements(indices["bufferView"], indices, changed, 1, order)[:, 0]
             values[rows] = self._elements(
                 sparse["values"]["bufferView"], sparse["values"], changed, width, kind
             )
@@ -184,7 +184,7 @@ def open_document(file: Path) -> Document:
 
 def _split_chunks(content: bytes) -> tuple[bytes, bytes | None]:
     """Return the description and the binary part of a .glb file (section 4.4)."""
-    version, length = (int.from_bytes(content[place : place + 4], "little") for place in (4, 8))
+    version, length = (int.from_bytes(content[offset : offset + 4], "little") for offset in (4, 8))
     if version != 2 or length > len(content):
         raise ValueError(
             f"the header declares version {version} and {length} bytes, and the file has {len(content)} bytes; "
@@ -192,14 +192,14 @@ def _split_chunks(content: bytes) -> tuple[bytes, bytes | None]:
             "the complete file are required"
         )
     chunks: dict[bytes, bytes] = {}
-    place = 12
-    while place + 8 <= length:
-        size = int.from_bytes(content[place : place + 4], "little")
-        kind = content[place + 4 : place + 8]
-        if place + 8 + size > length:
+    offset = 12
+    while offset + 8 <= length:
+        size = int.from_bytes(content[offset : offset + 4], "little")
+        kind = content[offset + 4 : offset + 8]
+        if offset + 8 + size > length:
             raise ValueError("a chunk continues beyond the end of the file")
-        chunks.setdefault(kind, content[place + 8 : place + 8 + size])
-        place += 8 + size
+        chunks.setdefault(kind, content[offset + 8 : offset + 8 + size])
+        offset += 8 + size
     if b"JSON" not in chunks:
         raise ValueError("the file has no JSON description")
     return chunks[b"JSON"], chunks.get(b"BIN\0")

@@ -136,8 +136,8 @@ def _find_wrap(parts: Sequence[Part]) -> Wrap:
     for part in parts:
         if part.uv is None or part.image is None:
             continue
-        places = part.uv[np.unique(part.faces if part.corners is None else part.corners)]
-        beyond = np.any((places < -EDGE) | (places > 1 + EDGE), axis=0)
+        used_uv = part.uv[np.unique(part.faces if part.corners is None else part.corners)]
+        beyond = np.any((used_uv < -EDGE) | (used_uv > 1 + EDGE), axis=0)
         stated.update(part.wraps)
         needed.update(wrap for wrap, reaches in zip(part.wraps, beyond, strict=True) if reaches)
     if len(needed) > 1:
@@ -240,7 +240,8 @@ def find_beside(folder: Path, name: str, content: str, notes: list[str]) -> Path
         file = resolve_beside(folder, base_name) if base_name.strip(".") else None
         if file is None or not file.exists():
             notes.append(
-                f"the {content} in another folder, {shorten(name)}, which is not read; the scene is drawn without."
+                f"the {content} in another folder, {shorten(name)}, which is not read; the scene is drawn without "
+                "this file."
             )
             return None
         notes.append(
@@ -253,6 +254,6 @@ def find_beside(folder: Path, name: str, content: str, notes: list[str]) -> Path
         return file
     noun, _, verb = content.rpartition(" ")
     notes.append(
-        f"the {noun} {shorten(name)} {verb} missing in the scene's folder; the scene is drawn without."
+        f"the {noun} {shorten(name)} {verb} missing in the scene's folder; the scene is drawn without this file."
     )
     return None

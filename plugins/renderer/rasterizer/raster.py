@@ -73,8 +73,7 @@ def is_out_of_view(vertices, rotation, translation, focal, principal, near, heig
             if value > high[axis]:
                 high[axis] = value
     for plane in range(5):
-        # a plane is given by weights of the camera coordinates (x, y, z) and an offset; the sum is >= 0 for visible
-        # points
+        # a plane is given by weights of the camera coordinates (x, y, z) and an offset; visible points give >= 0
         x = y = offset = 0.0
         if plane == 0:
             z, offset = 1.0, -near
@@ -282,8 +281,8 @@ def rasterise(
             start2 += row2
         if farthest is not None and written > 0:
             update_tiles(farthest, empty, changed, pixels, written, depth)
-    for place, count in ((DRAWN, drawn_faces), (BEHIND, behind), (FLAT, flat), (BACK, back)):
-        counts[place] += count
+    for outcome, count in ((DRAWN, drawn_faces), (BEHIND, behind), (FLAT, flat), (BACK, back)):
+        counts[outcome] += count
     counts[OUTSIDE] += outside
     counts[HIDDEN] += hidden
     return box_top, box_bottom, box_left, box_right

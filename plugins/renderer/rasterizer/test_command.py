@@ -100,9 +100,7 @@ def test_a_texture_is_drawn_upright_and_in_its_colours(tmp_path: Path, name: str
     assert np.abs(texel_centres - four).max() <= 1
 
 
-def test_edges_are_blended_in_light_and_transparent_pictures_know_their_share(
-    cube: Path, tmp_path: Path
-) -> None:
+def test_edges_are_blended_in_linear_rgb_and_alpha_is_coverage(cube: Path, tmp_path: Path) -> None:
     """Compare a transparent image, composited over a background, with an image that is drawn with this background."""
     options = ("--azimuth", "40", "--elevation", "30", "--supersampling", "4")
     clear = np.asarray(run_command(cube, tmp_path, *options, "--background", "transparent"))
@@ -117,7 +115,7 @@ def test_edges_are_blended_in_light_and_transparent_pictures_know_their_share(
         assert float((light - opaque).abs().max()) < 0.02
 
 
-def test_depth_mask_and_face_hold_what_the_renderer_says(cube: Path, tmp_path: Path) -> None:
+def test_depth_mask_and_face_files_hold_the_channels_of_the_renderer(cube: Path, tmp_path: Path) -> None:
     options = ("--azimuth", "0", "--elevation", "0", "--distance", "4", "--channel")
     exact = run_command(cube, tmp_path, *options, "depth", name="one.npy")
     assert exact.dtype == np.float32 and exact.shape == (40, 48) and abs(exact[20, 24] - 3) < 1e-6
@@ -132,7 +130,7 @@ def test_depth_mask_and_face_hold_what_the_renderer_says(cube: Path, tmp_path: P
         run_command(cube, tmp_path, "--distance", "200", "--channel", "depth", "--fov", "1")
 
 
-def test_channels_become_whole_numbers_as_they_say() -> None:
+def test_channels_are_encoded_as_documented() -> None:
     directions = torch.tensor([[[0.0, 0, 1], [-1, 0, 0], [0, 0, 0]]])
     assert pictures.normal_image(directions).tolist() == [[[128, 128, 255], [0, 128, 128], [0, 0, 0]]]
     assert pictures.uv_image(torch.tensor([[[0.2, 1.6], [-0.2, 0.0]]])).tolist() == [
@@ -167,7 +165,7 @@ def test_a_sphere_of_one_colour_is_lit_from_the_camera(tmp_path: Path) -> None:
     assert (np.sum(normals * ball.vertices[ball.faces.ravel()], 1) > 0.9999).all()
 
 
-def test_the_camera_is_that_of_look_from_and_sees_all_of_the_subject() -> None:
+def test_the_camera_equals_look_from_and_shows_the_whole_subject() -> None:
     """Check cameras around any centre, and that the sphere just fits into images of any shape."""
     random = np.random.default_rng(0)
     for _ in range(10):
@@ -208,7 +206,7 @@ def test_a_turntable_is_a_whole_turn_in_equal_steps(up: turntable.Axis) -> None:
 
 
 @pytest.mark.parametrize("suffix", ["json", "yaml"])
-def test_an_exact_camera_sees_points_where_its_formula_says(cube: Path, tmp_path: Path, suffix: str) -> None:
+def test_a_camera_file_projects_points_by_its_formula(cube: Path, tmp_path: Path, suffix: str) -> None:
     values = {"K": [[60, 0, 20.5], [0, 55, 18], [0, 0, 1]], "R": [[1, 0, 0], [0, -1, 0], [0, 0, -1]]}
     values |= {"t": [-5.2, 6.1, 14], "size": [44, 40]}
     file = tmp_path / f"camera.{suffix}"
@@ -241,7 +239,9 @@ def test_an_exact_camera_sees_points_where_its_formula_says(cube: Path, tmp_path
         ),
     ],
 )
-def test_a_bad_camera_gets_its_sentence(tmp_path: Path, change: dict[str, Any], sentence: str) -> None:
+def test_a_bad_camera_file_raises_a_clear_message(
+    tmp_path: Path, change: dict[str, Any], sentence: str
+) -> None:
     values = {"K": np.eye(3).tolist(), "R": np.eye(3).tolist(), "t": [0, 0, 1], "size": [4, 4]}
     for file in (tmp_path / "camera.json", tmp_path / "camera.yaml"):
         file.write_text(json.dumps(values))
@@ -254,7 +254,7 @@ def test_a_bad_camera_gets_its_sentence(tmp_path: Path, change: dict[str, Any], 
         assert sentence in str(caught.value) and str(file) in str(caught.value)
 
 
-def test_a_gif_has_its_frames_and_begins_with_the_picture(cube: Path, tmp_path: Path) -> None:
+def test_a_gif_has_all_frames_and_begins_with_the_still_image(cube: Path, tmp_path: Path) -> None:
     film = run_command(cube, tmp_path, "--turntable", "5", "--rate", "20", name="one.gif")
     assert (
         film.n_frames == 5
@@ -276,7 +276,7 @@ def write_ffmpeg(folder: Path, text: str) -> None:
     file.chmod(file.stat().st_mode | stat.S_IXUSR)
 
 
-def test_a_film_is_what_ffmpeg_makes_of_the_frames(
+def test_ffmpeg_receives_the_frames_of_a_video(
     cube: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Replace ffmpeg by a program that stores its input, by a program that fails, and by no program."""
@@ -331,7 +331,7 @@ def test_a_film_is_what_ffmpeg_makes_of_the_frames(
         (["--camera", "cube.ply"], "Give a file whose name ends in .json or .yaml"),
     ],
 )  # fmt: skip
-def test_every_mistake_gets_one_sentence_and_leaves_nothing(
+def test_every_mistake_raises_one_line_and_leaves_no_file(
     cube: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: list[str], sentence: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -341,7 +341,7 @@ def test_every_mistake_gets_one_sentence_and_leaves_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_command_says_where_it_wrote_and_its_report_on_request(
+def test_the_command_prints_the_path_and_the_report_on_request(
     cube: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -352,7 +352,7 @@ def test_the_command_says_where_it_wrote_and_its_report_on_request(
     assert "ms per frame (median of 1)" in report and len(report.splitlines()) <= 2
 
 
-def test_extreme_subjects_are_drawn_or_get_a_sentence(
+def test_extreme_subjects_are_drawn_or_raise_a_clear_message(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Check that the image does not depend on the size and position of the subject, up to a limit."""
@@ -377,7 +377,7 @@ def test_extreme_subjects_are_drawn_or_get_a_sentence(
     assert "flat.off: no face of the scene is visible in the last image." in capsys.readouterr().err
 
 
-def test_as_a_program_it_ends_with_a_sentence_and_no_stack_trace(cube: Path, tmp_path: Path) -> None:
+def test_the_program_ends_with_a_message_and_no_stack_trace(cube: Path, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(NotADirectoryError):
         main([str(cube), "--size", "9x9", "--out", str(tmp_path / "file" / "inner" / "one.png")])
@@ -390,7 +390,7 @@ def test_as_a_program_it_ends_with_a_sentence_and_no_stack_trace(cube: Path, tmp
     )
 
 
-def test_the_same_mesh_as_obj_and_glb_is_the_same_picture(tmp_path: Path) -> None:
+def test_the_same_mesh_as_obj_and_glb_gives_the_same_image(tmp_path: Path) -> None:
     mesh = trimesh.creation.box((1, 2, 3))
     mesh.unmerge_vertices()
     uv = np.random.default_rng(2).uniform(0, 1, (len(mesh.vertices), 2))

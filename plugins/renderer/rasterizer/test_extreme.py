@@ -199,7 +199,7 @@ def random_scene(seed: int) -> Scene:
 
 @settings(deadline=None, max_examples=150, derandomize=True)
 @given(st.integers(0, 2**32 - 1), st.sampled_from(KINDS), st.sampled_from([1.0, 1e-30, 1e20]))
-def test_wild_scenes_have_finite_pictures_and_gradients(seed: int, gradient: Gradient, scale: float) -> None:
+def test_random_scenes_have_finite_images_and_gradients(seed: int, gradient: Gradient, scale: float) -> None:
     for kind in TYPES:
         assert not find_bad_gradients(random_scene(seed), Rasterizer(gradient=gradient), kind, scale), kind
 
@@ -212,9 +212,7 @@ def test_wild_scenes_have_finite_pictures_and_gradients(seed: int, gradient: Gra
         for number, kind in enumerate(KINDS)
     ],
 )
-def test_a_face_whose_corners_are_1e30_away_fills_the_image_whatever_is_asked(
-    quarter: int, gradient: Gradient
-) -> None:
+def test_a_face_whose_corners_are_1e30_away_fills_the_image(quarter: int, gradient: Gradient) -> None:
     """Check also faces with two corners so far below or right of the image that no integer holds their row."""
     turn = np.linalg.matrix_power(np.array([[0, -1.0, 0], [1, 0, 0], [0, 0, 1]]), quarter)
     corners = np.array([[-1, -1, 0], [1, -1.5, 0], [0, 1, 0]]) * 1e30 @ turn.T + [0, 0, 2]

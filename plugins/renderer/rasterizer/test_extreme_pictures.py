@@ -36,7 +36,7 @@ SAVINGS = get_args(Saving)
     st.sets(st.sampled_from(SAVINGS)),
     st.sets(st.sampled_from(EVERY), min_size=1),
 )
-def test_each_face_is_counted_once_and_savings_change_no_bit_however_wild_the_scene(
+def test_each_face_is_counted_once_and_savings_change_no_bit_in_random_scenes(
     seed: int, cull: bool, savings: set[Saving], channels: set[str]
 ) -> None:
     """Check that a second image, which reuses what has not changed, has the same report."""
@@ -81,9 +81,7 @@ def with_number(scene: Scene, where: str, number: float) -> Scene:
 @pytest.mark.parametrize(
     "where", ["vertices", "colors", "uv", "texels", "rotation", "translation", "focal", "principal", "near"]
 )
-def test_what_is_not_finite_is_refused_or_disturbs_only_the_faces_that_have_it(
-    where: str, number: float
-) -> None:
+def test_non_finite_numbers_raise_an_error_or_affect_only_their_own_faces(where: str, number: float) -> None:
     first = [[-0.4, -0.3, 1.0], [0.3, -0.35, 1], [0, 0.3, 1]]
     scene = make_scene([*first, *crossing()[:27] + np.array([0, 0, 0.5])], ahead(24, 32, focal=20.0))
     bad = with_number(scene, where, number)
@@ -112,7 +110,7 @@ def test_what_is_not_finite_is_refused_or_disturbs_only_the_faces_that_have_it(
     assert not Rasterizer()(away)["color"].any()
 
 
-def test_a_face_seen_edge_on_shows_nothing_and_one_nearly_so_no_hole() -> None:
+def test_a_face_seen_edge_on_is_invisible_and_nearly_edge_on_faces_leave_no_hole() -> None:
     vertices = [[0, -1, 1.0], [0, 1, 1], [0, 0, 3], [-1, 0, 1], [1, 0, 1], [0, 0, 4]]
     assert not Rasterizer()(make_scene(vertices, ahead()), ("mask",))["mask"].any()
     for lift in 10.0 ** np.arange(-12, 0):
@@ -122,7 +120,7 @@ def test_a_face_seen_edge_on_shows_nothing_and_one_nearly_so_no_hole() -> None:
         assert channels["mask"].all()
 
 
-def test_planes_that_pass_through_one_another_show_the_nearer() -> None:
+def test_intersecting_planes_show_the_nearer_one() -> None:
     camera = ahead(40, 50, focal=32.0)
     corners = [
         [-9, -9, 5.0],
@@ -155,7 +153,7 @@ def test_a_vertex_on_the_plane_of_the_camera_hides_no_part_of_its_face(depth: fl
     assert torch.allclose(channels, true, rtol=1e-3)
 
 
-def test_of_a_million_faces_in_one_pixel_the_nearest_is_seen() -> None:
+def test_the_nearest_of_a_million_faces_in_one_pixel_is_visible() -> None:
     random = np.random.default_rng(0)
     depth = random.permutation(np.linspace(1, 2, 1_000_000))
     shape = np.array([[-0.02, -0.02], [0.02, -0.02], [0, 0.03]])  # a third of a pixel
@@ -180,7 +178,7 @@ def test_gradients_of_a_hundred_thousand_faces_in_one_pixel_are_finite(gradient:
     )
 
 
-def test_a_picture_does_not_depend_on_the_unit_of_length_or_on_how_long_the_lens_is() -> None:
+def test_an_image_does_not_depend_on_the_unit_of_length_or_the_focal_length() -> None:
     """Check focal lengths from 0.001 to 1,000,000 pixels, with all depths scaled by the same factor."""
     pixels = crossing()
     pictures = []
@@ -196,7 +194,7 @@ def test_a_picture_does_not_depend_on_the_unit_of_length_or_on_how_long_the_lens
         assert all(torch.equal(channels[name], pictures[0][name]) for name in channels)
 
 
-def test_millimetres_are_seen_a_million_metres_from_the_origin() -> None:
+def test_millimetres_are_resolved_a_million_metres_from_the_origin() -> None:
     """Check vertices and camera in float64; float32 would only resolve 6 cm at this distance."""
     far = torch.tensor([1e6, -1e6, 1e6], dtype=torch.float64)
     turn = torch.linalg.qr(
@@ -236,7 +234,7 @@ def test_the_largest_images() -> None:
 
 
 @pytest.mark.parametrize("gradient", KINDS)
-def test_of_nothing_at_all_comes_the_background_and_no_slope(gradient: Gradient) -> None:
+def test_empty_scenes_give_the_background_and_no_gradient(gradient: Gradient) -> None:
     for name in ("no faces", "behind", "degenerate", "all in one point"):
         scene = SCENES[name]()
         if name == "degenerate":
@@ -256,7 +254,7 @@ def test_of_nothing_at_all_comes_the_background_and_no_slope(gradient: Gradient)
 
 
 @pytest.mark.parametrize("gradient", KINDS)
-def test_slopes_do_not_depend_on_how_long_the_lens_is(gradient: Gradient) -> None:
+def test_gradients_do_not_depend_on_the_focal_length(gradient: Gradient) -> None:
     """Check that gradients do not change by a bit if depths grow with the focal length.
 
     With `boundary`, this holds for focal lengths from 512 pixels, at which all surfaces of this scene count as

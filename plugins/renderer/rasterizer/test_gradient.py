@@ -117,7 +117,7 @@ def scene(
 
 
 @pytest.mark.slow
-def test_gradients_are_those_of_differences_of_supersampled_pictures() -> None:
+def test_gradients_equal_differences_of_supersampled_images() -> None:
     """Compare gradients with differences of supersampled images, by cosine and length over all parameters of a kind.
 
     The loss is the squared error against another pose, over four views. The parameters are 8 deformations, colours, the
@@ -173,7 +173,7 @@ def test_gradients_are_those_of_differences_of_supersampled_pictures() -> None:
 
 
 @pytest.mark.parametrize("behind", [False, True])
-def test_inside_a_face_slopes_are_those_of_the_plane(behind: bool) -> None:
+def test_gradients_inside_a_face_equal_those_of_the_plane(behind: bool) -> None:
     """Compare gradients of colour and depth with respect to every parameter with autograd through rays and planes.
 
     Only pixels inside of the face are compared, also for a face that the near plane cuts.
@@ -215,7 +215,7 @@ def test_inside_a_face_slopes_are_those_of_the_plane(behind: bool) -> None:
         )
 
 
-def test_inside_a_face_slopes_are_those_of_differences() -> None:
+def test_gradients_inside_a_face_equal_differences() -> None:
     """Compare gradients of colour and depth with central differences of the image itself.
 
     All numbers of a scene are varied whose single face covers all pixels.
@@ -291,7 +291,7 @@ def test_gradients_of_extreme_scenes_are_finite(gradient: Gradient) -> None:
 
 
 @pytest.mark.parametrize("gradient", ["boundary", "nmr", "soft"])
-def test_a_depths_gradient_does_not_depend_on_what_else_is_asked(gradient: Gradient) -> None:
+def test_the_gradient_of_depth_does_not_depend_on_other_channels(gradient: Gradient) -> None:
     vertices, faces, colors = blob(12)
     gradients = []
     for channels in (("depth",), ("depth", "mask"), ("color", "depth"), ("face", "depth")):
@@ -306,7 +306,7 @@ def test_a_depths_gradient_does_not_depend_on_what_else_is_asked(gradient: Gradi
         torch.testing.assert_close(other, gradients[0], rtol=1e-9, atol=1e-9)
 
 
-def test_what_nobody_differentiates_costs_nothing() -> None:
+def test_only_requested_gradients_are_tracked() -> None:
     vertices, faces, colors = blob(8)
     channels = Rasterizer()(Scene(vertices, faces, colors, camera()), ("color", "depth", "face", "mask"))
     assert not any(value.requires_grad for value in channels.values())

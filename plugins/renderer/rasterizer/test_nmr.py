@@ -86,7 +86,7 @@ def definition_gradient(places, faces, face, color, slopes) -> np.ndarray:
 
 @pytest.mark.parametrize("whole", [False, True])
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 4))])
-def test_it_is_the_papers_sum_over_pixels_and_edges(seed: int, whole: bool) -> None:
+def test_the_gradient_equals_the_papers_sum_over_pixels_and_edges(seed: int, whole: bool) -> None:
     """Check overlapping faces, including faces seen from behind and faces beyond the image.
 
     With `whole`, corners lie on pixels and edges lie along lines of pixels.
@@ -124,7 +124,7 @@ def test_it_is_the_papers_sum_over_pixels_and_edges(seed: int, whole: bool) -> N
     torch.testing.assert_close(lens.grad, lens_again.grad, rtol=1e-6, atol=1e-6)
 
 
-def test_colors_and_depths_are_led_back_as_within_faces() -> None:
+def test_gradients_of_colors_and_depths_equal_those_of_interior() -> None:
     vertices, faces, colors = blob(12)
     slopes, down = torch.rand(72, 88, 3), torch.rand(72, 88)
     gradients = {}
@@ -138,7 +138,7 @@ def test_colors_and_depths_are_led_back_as_within_faces() -> None:
     assert all(torch.equal(*pair) for pair in zip(gradients["interior"], gradients["nmr"], strict=True))
 
 
-def test_it_reaches_a_target_that_the_face_does_not_touch() -> None:
+def test_the_gradient_points_to_a_target_that_the_face_does_not_touch() -> None:
     """Check that descent leads to the target on the right, at which the gradient of moving edges is nearly 0."""
     eye = torch.eye(3)
     pose = Camera(eye, torch.zeros(3), (20.0, 20.0), (19.5, 9.5), 20, 40)

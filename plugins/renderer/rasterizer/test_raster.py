@@ -135,7 +135,7 @@ def slivers(draw):
 
 @hypothesis_settings
 @given(st.one_of(soups(subpixels=1e6), slivers()))
-def test_what_a_face_shows_is_interpolated_between_corners_that_are_not_rounded(scene):
+def test_colour_and_depth_are_interpolated_between_unrounded_corners(scene):
     """Check that the weights give the point of the face at the pixel centre, with its colour and depth.
 
     For pixels that are covered only because of rounding, they give the nearest point of the face.
@@ -159,7 +159,7 @@ def test_what_a_face_shows_is_interpolated_between_corners_that_are_not_rounded(
 
 @hypothesis_settings
 @given(soups(subpixels=1e6))
-def test_off_the_grid_coverage_is_that_of_the_triangle_up_to_half_a_subpixel(scene):
+def test_coverage_off_the_grid_is_right_up_to_half_a_subpixel(scene):
     hits, margins, _, _ = trace_rays(scene)
     for index in range(len(scene.faces)):
         alone = draw(replace(scene, faces=scene.faces[index : index + 1]), ("mask",))["mask"]
@@ -180,7 +180,7 @@ def coverage(vertices, faces, camera):
 
 @hypothesis_settings
 @given(st.integers(0, 2**32 - 1), st.sampled_from([1, 2, 16, 1000]))
-def test_neighbours_share_no_pixel_and_leave_none_out(seed, subpixels):
+def test_neighbouring_faces_share_no_pixel_and_leave_no_gap(seed, subpixels):
     rng = np.random.default_rng(seed)
     camera = ahead(12, 15)
     # On a coarse grid most edges run through pixel centres; the corners lie outside the image.
@@ -209,7 +209,7 @@ def test_fans_are_watertight_however_far_their_rims_reach(seed, spokes):
 
 @hypothesis_settings
 @given(st.integers(0, 2**32 - 1))
-def test_far_edges_through_pixel_centres_are_decided_once(seed):
+def test_pixel_centres_on_far_edges_belong_to_one_face(seed):
     rng = np.random.default_rng(seed)
     camera = ahead(9, 11)
     compass = np.array([(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)])
@@ -270,7 +270,7 @@ def test_a_triangle_that_reaches_far_out_of_the_image_keeps_its_plane():
 
 
 @pytest.mark.parametrize("order", list(permutations(range(3))))
-def test_of_equal_surfaces_the_lower_face_index_wins_whatever_the_order_of_its_corners(order):
+def test_the_lower_index_of_equal_faces_wins_for_any_order_of_corners(order):
     rng = np.random.default_rng(5)
     camera = ahead(40, 40)
     count = 400
@@ -316,7 +316,7 @@ def test_ties_and_culling_hold_however_far_a_triangle_reaches(reach):
 
 @hypothesis_settings
 @given(st.integers(0, 2**32 - 1), st.integers(0, 2**23 - 1), st.sampled_from([1, 1e8]))
-def test_of_overlapping_surfaces_at_one_depth_the_lower_index_wins(seed, step, reach):
+def test_the_lower_index_of_overlapping_faces_at_equal_depth_wins(seed, step, reach):
     rng = np.random.default_rng(seed)
     camera = ahead(12, 12)
     depth = 1 + step / 2**23 + 2.0**-24  # halfway between two float32 numbers
@@ -345,9 +345,7 @@ numbers = st.one_of(
     st.integers(1, 9),
     st.booleans(),
 )
-def test_wild_coordinates_draw_only_what_may_be_drawn_and_disturb_nothing_else(
-    world, seed, height, width, cull
-):
+def test_wild_coordinates_affect_only_their_own_faces(world, seed, height, width, cull):
     rng = np.random.default_rng(seed)
     camera = ahead(height, width)
     world[rng.random(len(world)) < 0.6, 2] = 1.5
@@ -380,7 +378,7 @@ def triangle(camera, z=1.0):
     ("vertex", "value"),
     [(0, math.nan), (1, math.inf), (2, -math.inf), (0, 3.3e38)],
 )
-def test_a_triangle_with_one_corner_that_cannot_be_drawn_is_left_out(vertex, value):
+def test_a_triangle_with_a_non_finite_or_too_distant_corner_is_left_out(vertex, value):
     scene = triangle(ahead(9, 9))
     assert draw(scene)["mask"].any()
     scene.vertices[vertex, 2] = value
@@ -404,7 +402,7 @@ def cut_soups(draw):
 
 @hypothesis_settings
 @given(cut_soups())
-def test_what_the_near_plane_cuts_is_drawn_as_far_as_it_is_in_front(scene):
+def test_the_part_of_a_face_in_front_of_the_near_plane_is_drawn(scene):
     """Compare triangles that have corners behind the camera with rays through pixel centres."""
     hits, margins, depths, weights = trace_rays(scene)
     near = scene.camera.near
@@ -433,7 +431,7 @@ def test_what_the_near_plane_cuts_is_drawn_as_far_as_it_is_in_front(scene):
     assert np.allclose(got["color"][shown & partly], colors[shown & partly], rtol=0, atol=1e-6)
 
 
-def test_the_near_plane_itself_is_seen():
+def test_a_face_on_the_near_plane_is_visible():
     assert draw(triangle(ahead(9, 9, near=1.0)))["mask"].any()
     assert not draw(triangle(ahead(9, 9, near=1.0), z=1 - 2**-20))["mask"].any()
 
@@ -471,7 +469,7 @@ def portrait(subdivisions=3, **changes):
     "requested", [(name,) for name in ALL] + [("depth", "mask"), {"color", "mask"}, ("face",) * 2, ()]
 )
 @pytest.mark.parametrize("cull", [False, True])
-def test_each_channel_is_the_same_alone_and_only_what_is_asked_is_drawn(requested, cull):
+def test_each_channel_is_the_same_alone_and_only_requested_channels_are_drawn(requested, cull):
     together, alone = draw(portrait(), ALL, cull), draw(portrait(), requested, cull)
     assert set(alone) == set(requested)
     assert are_equal(alone, {name: together[name] for name in alone})
@@ -479,7 +477,7 @@ def test_each_channel_is_the_same_alone_and_only_what_is_asked_is_drawn(requeste
     assert all(value.dtype == kinds[name] for name, value in alone.items())
 
 
-def test_colours_are_shaded_only_when_asked(monkeypatch):
+def test_colours_are_computed_only_on_request(monkeypatch):
     shaded = []
     monkeypatch.setattr(shading, "shade", lambda *arguments: shaded.append(arguments[-2:]))
     draw(portrait(), ("depth", "face", "mask"))
@@ -489,7 +487,7 @@ def test_colours_are_shaded_only_when_asked(monkeypatch):
 
 
 @pytest.mark.parametrize("angle", np.linspace(0, 6, 7))
-def test_of_a_closed_mesh_culling_changes_no_silhouette_and_hardly_a_pixel(angle):
+def test_culling_of_a_closed_mesh_keeps_the_silhouette_and_nearly_all_pixels(angle):
     # a closed mesh stays closed after rounding: equally many front and back faces cover each pixel
     scene = portrait()
     scene = replace(scene, camera=look_from(angle, angle / 4 - 0.7, angle, 1.5, 0.8, (120, 110)))
@@ -505,7 +503,7 @@ def test_of_a_closed_mesh_culling_changes_no_silhouette_and_hardly_a_pixel(angle
     assert (facing[visible_faces] > -1e-4 * np.linalg.norm(normals[visible_faces], axis=1)).all()
 
 
-def test_from_inside_a_closed_mesh_fills_the_image():
+def test_a_closed_mesh_fills_the_image_of_a_camera_inside():
     scene = portrait(translation=torch.tensor([0.05, -0.03, 0.1]))
     whole = draw(scene, ALL)
     assert whole["mask"].all()
@@ -528,7 +526,7 @@ def test_a_scene_out_of_view_costs_no_projection_and_gives_the_background(where,
 
 @hypothesis_settings
 @given(st.integers(0, 2**32 - 1), st.sampled_from([1e-3, 1.0, 1e20]))
-def test_the_test_of_the_whole_scene_hides_nothing(seed, size):
+def test_the_view_test_of_the_whole_scene_loses_no_face(seed, size):
     rng = np.random.default_rng(seed)
     vertices = torch.tensor(rng.normal(0, size, (12, 3)) + rng.normal(0, 2, 3))
     camera = replace(ahead(8, 8), translation=torch.tensor(rng.normal(0, 2, 3)))
@@ -547,7 +545,7 @@ def test_empty_scenes_give_the_background():
         assert got["color"].shape == (4, 5, 3) and not got["color"].any() and not got["mask"].any()
 
 
-def test_calls_leave_nothing_behind_and_repeat_to_the_bit():
+def test_calls_are_independent_and_repeat_to_the_bit():
     renderer = Rasterizer()
     scenes = [portrait(), triangle(ahead(9, 9)), portrait(translation=torch.tensor([3.0, 0, 2])), portrait(2)]
     fresh = [draw(scene) for scene in scenes]
@@ -610,7 +608,7 @@ IMPLEMENTATIONS = pytest.mark.parametrize("implementation", [Rasterizer.__call__
         ({"colors": None}, '"color" requires a scene with colours'),
     ],
 )
-def test_what_does_not_fit_is_refused_with_a_sentence(change, sentence, implementation):
+def test_inputs_that_do_not_fit_raise_a_clear_message(change, sentence, implementation):
     scene = portrait()
     for name, value in change.items():
         object.__setattr__(scene, name, value)  # bypasses the type checks of the tests
@@ -622,13 +620,13 @@ def test_what_does_not_fit_is_refused_with_a_sentence(change, sentence, implemen
             implementation(Rasterizer(), scene, channels)
 
 
-def test_what_lies_elsewhere_is_refused():
+def test_tensors_on_another_device_raise_an_error():
     with pytest.raises(ValueError, match="vertices is on meta, but rasterizer draws on the CPU"):
         Rasterizer()(replace(portrait(), vertices=torch.zeros(642, 3, device="meta")), ALL)
 
 
 @IMPLEMENTATIONS
-def test_wrong_indices_are_refused_out_of_view_too(implementation):
+def test_wrong_indices_raise_an_error_even_out_of_view(implementation):
     scene = portrait(translation=torch.tensor([0.0, 0, -5]))
     with pytest.raises(ValueError, match="expected 0 to 641"):
         implementation(Rasterizer(), replace(scene, faces=scene.faces + 1), ("mask",))
@@ -648,7 +646,7 @@ LENSES |= {f"a tensor of {shape}": torch.full(shape, 8.0) for shape in ((), (0,)
 @pytest.mark.parametrize("learned", [False, True])
 @pytest.mark.parametrize("name", ["focal", "principal"])
 @pytest.mark.parametrize("lens", LENSES)
-def test_a_lens_that_is_not_two_numbers_is_refused(lens, name, learned, implementation):
+def test_a_lens_that_is_not_two_numbers_raises_an_error(lens, name, learned, implementation):
     scene = portrait()
     if learned:
         scene = replace(scene, vertices=scene.vertices.clone().requires_grad_())
@@ -675,7 +673,7 @@ def test_a_lens_that_is_not_two_numbers_is_refused(lens, name, learned, implemen
         ),
     ],
 )
-def test_a_camera_that_cannot_be_is_refused(change, sentence, implementation):
+def test_an_impossible_camera_raises_an_error(change, sentence, implementation):
     scene = portrait()
     for name, value in change.items():
         object.__setattr__(scene.camera, name, value)  # bypasses the type checks of the tests
@@ -691,12 +689,12 @@ def test_a_camera_that_cannot_be_is_refused(change, sentence, implementation):
         ("mask", "a collection of names is required"),
     ],
 )
-def test_unknown_channels_are_refused(channels, sentence):
+def test_unknown_channels_raise_an_error(channels, sentence):
     with pytest.raises(ValueError, match=re.escape(sentence)):
         Rasterizer()(portrait(), channels)
 
 
-def test_it_is_built_by_name():
+def test_the_renderer_is_built_by_both_names():
     for name in ("rasterizer", "zbuffer"):  # old checkpoints contain the earlier name zbuffer
         renderer = build("renderer", resolve("renderer", {"name": name, "cull": True}))
         assert isinstance(renderer, Rasterizer) and renderer.cull

@@ -20,7 +20,7 @@ EXACT = ("face", "mask", "normal")
 
 @settings(deadline=None, max_examples=25, derandomize=True)
 @given(st.integers(0, 2**32 - 1), st.booleans(), st.sampled_from([1, 3]))
-def test_pictures_are_those_of_plain_torch(seed: int, cull: bool, supersampling: int) -> None:
+def test_images_equal_those_of_plain_torch(seed: int, cull: bool, supersampling: int) -> None:
     """Compare scenes without faces that the near plane cuts, because plain torch leaves these out."""
     random = np.random.default_rng(seed)
     scene = random_bodies(distant_camera(float(random.uniform(5, 9)), (40, 50)), random)
@@ -39,7 +39,7 @@ def test_pictures_are_those_of_plain_torch(seed: int, cull: bool, supersampling:
         torch.testing.assert_close(compiled[name], plain[name], rtol=1e-5, atol=1e-5)
 
 
-def test_a_few_faces_at_a_time_are_as_all_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_drawing_in_groups_equals_drawing_all_faces_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = random_bodies(distant_camera(), np.random.default_rng(3))
     whole = Rasterizer().on_device(scene, EVERY)
     monkeypatch.setattr(reference, "PAIRS", 500)
@@ -47,7 +47,7 @@ def test_a_few_faces_at_a_time_are_as_all_at_once(monkeypatch: pytest.MonkeyPatc
     assert all(torch.equal(whole[name], parts[name]) for name in EVERY)
 
 
-def test_slopes_within_faces_are_those_of_plain_torch() -> None:
+def test_gradients_within_faces_equal_those_of_plain_torch() -> None:
     vertices, faces, colors = blob(12)
     scene = Scene(vertices, faces, colors, distant_camera())
     renderer = Rasterizer(gradient="interior")
@@ -72,7 +72,7 @@ def test_empty_scenes_are_background(name: str) -> None:
         assert torch.equal(renderer.on_device(scene, (name,))[name], renderer(scene, (name,))[name])
 
 
-def test_what_plain_torch_cannot_do_is_refused() -> None:
+def test_features_that_plain_torch_lacks_raise_an_error() -> None:
     vertices, faces, colors = blob(4)
     scene = Scene(vertices, faces, colors, distant_camera())
     with pytest.raises(ValueError, match="Choose gradient=interior, or move the scene to the CPU"):

@@ -65,7 +65,7 @@ def test_savings_change_no_bit(seed: int, cull: bool) -> None:
 
 @settings(deadline=None, max_examples=15, derandomize=True)
 @given(st.integers(0, 2**32 - 1))
-def test_one_renderer_draws_what_a_new_one_draws_whatever_came_before(seed: int) -> None:
+def test_a_reused_renderer_draws_the_same_as_a_new_one(seed: int) -> None:
     """Draw scenes that change in one part at a time, also in place and without torch's version counter noticing."""
     random = np.random.default_rng(seed)
     renderer = Rasterizer(savings=SAVINGS)
@@ -96,7 +96,7 @@ def test_one_renderer_draws_what_a_new_one_draws_whatever_came_before(seed: int)
             picture.numpy()[...] = 7  # the caller may change the results
 
 
-def test_what_did_not_change_is_not_computed_again() -> None:
+def test_unchanged_results_are_not_computed_again() -> None:
     scene = random_bodies(distant_camera(), np.random.default_rng(0))
     renderer = Rasterizer()
     renderer(scene, ("color",))
@@ -139,7 +139,7 @@ def count_outcomes(scene: Scene, cull: bool) -> dict[str, int]:
 
 @pytest.mark.parametrize("cull", [False, True])
 @pytest.mark.parametrize("shift", [0.0, 0.8, 3.0])
-def test_the_report_is_what_brute_force_counts(cull: bool, shift: float) -> None:
+def test_the_report_equals_brute_force_counts(cull: bool, shift: float) -> None:
     vertices, faces, colors = blob(12)
     degenerate = torch.cat([faces, faces[:5, [0, 0, 1]]])
     camera = replace(
@@ -193,7 +193,7 @@ def test_faces_out_of_view_behind_and_hidden_are_counted() -> None:
     assert are_equal(close(under, ("face",)), Rasterizer(savings=())(under, ("face",)))
 
 
-def test_blended_pictures_report_what_became_of_every_face() -> None:
+def test_soft_images_report_the_outcome_of_every_face() -> None:
     vertices, faces, colors = blob(12)
     scene = Scene(vertices, torch.cat([faces, faces[:5, [0, 0, 1]]]), colors, distant_camera())
     for cull in (False, True):
@@ -210,7 +210,7 @@ def test_blended_pictures_report_what_became_of_every_face() -> None:
 
 
 @pytest.mark.parametrize("name", ["vertices", "colors"])
-def test_a_gradient_of_what_was_changed_since_is_refused(name: str) -> None:
+def test_a_gradient_of_inputs_changed_in_place_raises_an_error(name: str) -> None:
     """Check that torch raises an error for such a gradient, as for its own functions.
 
     Torch also raises an error for a second backward pass after the first has freed its data.
@@ -230,7 +230,7 @@ def test_a_gradient_of_what_was_changed_since_is_refused(name: str) -> None:
         again.backward()
 
 
-def test_pictures_in_one_graph_keep_what_their_gradients_read() -> None:
+def test_images_in_one_graph_keep_the_data_of_their_gradients() -> None:
     """Check that one backward pass over several views gives the sum of their gradients."""
     vertices, faces, colors = blob(8)
     views = [distant_camera(azimuth=azimuth) for azimuth in (0.1, 1.7, 3.1, 4.4)]
@@ -256,7 +256,7 @@ def test_pictures_in_one_graph_keep_what_their_gradients_read() -> None:
 @pytest.mark.parametrize(
     "threads", [pytest.param(1, marks=pytest.mark.slow), 2, pytest.param(3, marks=pytest.mark.slow)]
 )
-def test_a_batch_is_its_scenes_side_by_side(threads: int) -> None:
+def test_a_batch_equals_its_scenes_one_by_one(threads: int) -> None:
     """Check scenes of different sizes and meshes, with and without gradients."""
     random = np.random.default_rng(1)
     scenes = [
@@ -288,7 +288,7 @@ def test_a_batch_is_its_scenes_side_by_side(threads: int) -> None:
         assert torch.equal(batch_gradient, single_gradient)
 
 
-def test_after_the_first_picture_nothing_is_allocated_but_pictures() -> None:
+def test_after_the_first_image_only_images_are_allocated() -> None:
     """Check this with and without gradients, and that deleted images leave no memory behind."""
     vertices, faces, colors = blob(40)
     scene = Scene(vertices, faces, colors, distant_camera(size=(300, 300)))
@@ -315,7 +315,7 @@ def test_after_the_first_picture_nothing_is_allocated_but_pictures() -> None:
 
 
 @pytest.mark.parametrize("gradient", get_args(Gradient))
-def test_a_picture_of_27_thousand_vertices_and_its_gradient_take_less_than_64_mib(gradient: Gradient) -> None:
+def test_an_image_of_27_thousand_vertices_and_its_gradient_take_less_than_64_mib(gradient: Gradient) -> None:
     """Measure the memory of NumPy arrays; benchmarks/rendering/rasterizer_memory.md measures that of a process."""
     vertices, faces, colors = blob(117)
     assert len(vertices) > 27_554
@@ -329,7 +329,7 @@ def test_a_picture_of_27_thousand_vertices_and_its_gradient_take_less_than_64_mi
     assert peak < 64 * 2**20
 
 
-def test_what_waits_for_the_next_picture_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_memory_kept_between_images_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     vertices, faces, colors = blob(8)
     scene = Scene(vertices, faces, colors, distant_camera(size=(200, 200)))
     renderer = Rasterizer()

@@ -120,7 +120,7 @@ def test_colours_are_multiplied_in_linear_light(tmp_path: Path, width: int, kind
     np.testing.assert_allclose(subject.scene.texture.images[0], to_linear(FOUR), atol=1e-6)
 
 
-def test_what_has_no_colour_is_grey_and_what_has_one_is_lit_alike(tmp_path: Path) -> None:
+def test_parts_without_colour_are_grey_and_parts_of_one_colour_are_shaded(tmp_path: Path) -> None:
     content, arrays = textured_square()
     del content["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"]
     for factor, wanted in ((None, [parts.GREY] * 3), ([0.1, 0.2, 0.3, 0.5], [0.1, 0.2, 0.3])):
@@ -131,7 +131,7 @@ def test_what_has_no_colour_is_grey_and_what_has_one_is_lit_alike(tmp_path: Path
         np.testing.assert_allclose(subject.scene.colors, np.tile(wanted, (4, 1)), atol=1e-6)
 
 
-def test_nodes_stand_where_trimesh_puts_them(tmp_path: Path) -> None:
+def test_nodes_are_placed_as_by_trimesh(tmp_path: Path) -> None:
     """Compare trees of rotated, scaled and mirrored nodes: corners and orientation of faces."""
     random = np.random.default_rng(0)
     for _ in range(5):
@@ -166,9 +166,7 @@ def test_nodes_stand_where_trimesh_puts_them(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("mode", "order"), [(4, [0, 1, 2, 0, 2, 3]), (5, [0, 1, 3, 2]), (6, [0, 1, 2, 3])])
-def test_strips_and_fans_are_the_triangles_that_they_stand_for(
-    tmp_path: Path, mode: int, order: list[int]
-) -> None:
+def test_strips_and_fans_are_converted_to_triangles(tmp_path: Path, mode: int, order: list[int]) -> None:
     """Check that all faces face z; vertices and texture coordinates are interleaved, and one vertex is sparse."""
     content, arrays = textured_square()
     content["meshes"][0]["primitives"][0]["mode"] = mode
@@ -198,7 +196,7 @@ def test_strips_and_fans_are_the_triangles_that_they_stand_for(
     np.testing.assert_allclose(scene.texture.uv, np.stack([UV[:, 0], 1 - UV[:, 1]], 1))
 
 
-def test_a_skin_is_shown_as_its_joints_stand(tmp_path: Path) -> None:
+def test_a_skin_follows_its_joints(tmp_path: Path) -> None:
     random = np.random.default_rng(1)
     inverse, weights = random.normal(size=(2, 4, 4)), random.uniform(0.1, 1, (4, 4))
     inverse[:, 3] = [0, 0, 0, 1]
@@ -263,7 +261,7 @@ NUMBERS = {"repeat": 10497, "clamp": 33071, "mirror": 33648}
         (["mirror", "clamp"], 3, None),
     ],
 )
-def test_what_lies_beyond_a_texture_is_told(
+def test_the_wrap_rule_of_a_texture_is_read(
     tmp_path: Path, samplers: list[str | None], reach: int, wanted: str | None
 ) -> None:
     """Check that a scene has one wrap rule, and that textures need none if all uv lie inside."""
@@ -346,9 +344,7 @@ PICTURES = ("a#b.png", "#c.png", "d #2.png")
 @pytest.mark.parametrize("end", ["\n", "\r\n"])
 @pytest.mark.parametrize("before", ["", " ", "\t"])
 @pytest.mark.parametrize("library", LIBRARIES)
-def test_names_may_hold_what_begins_a_comment_elsewhere(
-    tmp_path: Path, library: str, before: str, end: str
-) -> None:
+def test_names_may_contain_the_comment_sign(tmp_path: Path, library: str, before: str, end: str) -> None:
     """Check a triangle of each material in files with comments: colours as trimesh reads them, textures as written."""
     random = np.random.default_rng(0)
     behind = "# a comment" if before else ""  # trimesh supports neither such comments nor leading blanks
@@ -389,7 +385,7 @@ def test_names_may_hold_what_begins_a_comment_elsewhere(
 
 
 @pytest.mark.parametrize("binary", [False, True])
-def test_ply_colours_are_light_and_its_texture_is_found(tmp_path: Path, binary: bool) -> None:
+def test_ply_colours_become_linear_rgb_and_the_texture_is_found(tmp_path: Path, binary: bool) -> None:
     colors = np.array([[255, 128, 0, 255], [12, 55, 99, 255], [1, 2, 3, 255], [200, 100, 50, 255]], np.uint8)
     mesh = trimesh.Trimesh(CORNERS, ORDER.reshape(2, 3), vertex_colors=colors, process=False)
     mesh.export(tmp_path / "one.ply", encoding="binary" if binary else "ascii")
@@ -424,7 +420,7 @@ def write_formats(folder: Path, name: str) -> list[Path]:
     return [*files, folder / "one.obj", folder / "one.ply"]
 
 
-def test_names_that_are_not_utf8_lead_to_their_files(tmp_path: Path) -> None:
+def test_texture_names_that_are_not_utf8_are_found(tmp_path: Path) -> None:
     (tmp_path / os.fsdecode(b"caf\xe9.png")).write_bytes(png(FOUR))
     for file in write_formats(tmp_path, "caf%E9.png"):
         if file.suffix in (".obj", ".ply"):
@@ -447,7 +443,7 @@ def test_no_file_outside_of_the_folder_is_read(tmp_path: Path, name: str) -> Non
         subject = read(file)
         assert subject.scene.texture is None
         assert subject.notes == (
-            f"the texture is in another folder, {name}, which is not read; the scene is drawn without.",
+            f"the texture is in another folder, {name}, which is not read; the scene is drawn without this file.",
         )
     for file in write_formats(folder, "link"):
         with pytest.raises(
@@ -475,7 +471,7 @@ def test_no_file_outside_of_the_folder_is_read(tmp_path: Path, name: str) -> Non
         )
     ],
 )
-def test_of_a_place_elsewhere_the_file_beside_is_taken(tmp_path: Path, name: str) -> None:
+def test_a_path_in_another_folder_is_replaced_by_the_file_beside_the_scene(tmp_path: Path, name: str) -> None:
     (tmp_path / "t.png").write_bytes(png(FOUR))
     (tmp_path / "one.mtl").write_bytes(b"newmtl red\nmap_Kd t.png")
     for file in write_formats(tmp_path, name):
@@ -495,12 +491,12 @@ def test_of_a_place_elsewhere_the_file_beside_is_taken(tmp_path: Path, name: str
     )
 
 
-def test_a_missing_texture_is_noted_alike_by_every_format(tmp_path: Path) -> None:
+def test_every_format_notes_a_missing_texture_in_the_same_words(tmp_path: Path) -> None:
     for file in write_formats(tmp_path, "sub/gone.png"):
         subject = read(file)
         assert subject.scene.texture is None
         assert subject.notes == (
-            "the texture sub/gone.png is missing in the scene's folder; the scene is drawn without.",
+            "the texture sub/gone.png is missing in the scene's folder; the scene is drawn without this file.",
         )
     (tmp_path / "sub").mkdir()
     (tmp_path / "sub" / "gone.png").write_bytes(png(FOUR))
@@ -531,13 +527,13 @@ LEFT_OUT: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
 
 
 @pytest.mark.parametrize("kind", LEFT_OUT)
-def test_what_a_scene_leaves_out_is_said(tmp_path: Path, kind: str) -> None:
+def test_elements_that_a_scene_leaves_out_are_noted(tmp_path: Path, kind: str) -> None:
     change, note = LEFT_OUT[kind]
     assert not read(write_scene(tmp_path, *textured_square())).notes
     assert read(write_scene(tmp_path, *textured_square(), change=change)).notes == (note,)
 
 
-def test_textures_have_a_bound_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_total_size_of_textures_is_limited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     content, arrays = textured_square()
     file = write_scene(tmp_path, content, arrays)
     monkeypatch.setattr(parts, "MOST_TEXELS", 3)
@@ -589,7 +585,7 @@ def test_textures_have_a_bound_together(tmp_path: Path, monkeypatch: pytest.Monk
         ),
     ],
 )
-def test_a_bad_gltf_gets_its_sentence(
+def test_a_bad_gltf_raises_a_clear_message(
     tmp_path: Path, change: Callable[[dict[str, Any]], object], sentence: str
 ) -> None:
     for name in ("one.glb", "one.gltf"):
@@ -599,7 +595,7 @@ def test_a_bad_gltf_gets_its_sentence(
         assert str(caught.value).startswith(f"{file}: ") and sentence in str(caught.value)
 
 
-def test_every_damage_of_length_is_refused(tmp_path: Path) -> None:
+def test_truncated_files_raise_an_error(tmp_path: Path) -> None:
     """Check that a .glb cut anywhere is refused; `tests/fuzz/fuzz.py` tests other damage."""
     whole = glb(*quad())
     file = tmp_path / "one.glb"
@@ -609,7 +605,7 @@ def test_every_damage_of_length_is_refused(tmp_path: Path) -> None:
             read(file)
 
 
-def test_what_cannot_be_a_scene_gets_its_sentence(tmp_path: Path) -> None:
+def test_files_that_are_no_scene_raise_a_clear_message(tmp_path: Path) -> None:
     (tmp_path / "chair.glb").mkdir()
     (tmp_path / "points.ply").write_bytes(trimesh.PointCloud(CORNERS).export(file_type="ply"))
     for name, sentence in (

@@ -98,7 +98,7 @@ def draw_soft(parts: list[np.ndarray], settings: DrawingSettings) -> np.ndarray:
 
 @pytest.mark.parametrize("knobs", KNOBS)
 @pytest.mark.parametrize("cull", [False, True])
-def test_picture_and_slopes_are_the_formulas(knobs: tuple[float, float], cull: bool) -> None:
+def test_image_and_gradients_equal_the_formulas(knobs: tuple[float, float], cull: bool) -> None:
     for seed in range(3):
         parts, faces = random_inputs(seed)
         copies = [part.clone().requires_grad_() for part in parts]
@@ -121,7 +121,7 @@ def test_picture_and_slopes_are_the_formulas(knobs: tuple[float, float], cull: b
 
 
 @pytest.mark.parametrize("knobs", KNOBS)
-def test_slopes_are_differences_of_the_picture(knobs: tuple[float, float]) -> None:
+def test_gradients_equal_differences_of_the_image(knobs: tuple[float, float]) -> None:
     """Compare gradients in every number of the scene with central differences, to 1e-4 of the largest gradient."""
     parts, faces = random_inputs(5)
     arrays, settings = [part.numpy() for part in parts], soft_settings(faces, False, *knobs)
@@ -143,7 +143,7 @@ def test_slopes_are_differences_of_the_picture(knobs: tuple[float, float]) -> No
         np.testing.assert_allclose(got, wanted, rtol=0, atol=1e-4 * np.abs(wanted).max())
 
 
-def test_without_blur_it_is_the_hard_picture_and_says_so_at_any_size() -> None:
+def test_without_blur_the_soft_image_equals_the_hard_image() -> None:
     """Check pixels away from edges for small σ, and that the meaning of σ does not depend on the number of pixels."""
     vertices, faces, colors = blob(16)
     scene = Scene(vertices, faces, colors, camera())
@@ -159,7 +159,7 @@ def test_without_blur_it_is_the_hard_picture_and_says_so_at_any_size() -> None:
     assert (once - often).abs().mean() < 0.01 < (once - hard["color"]).abs().mean()
 
 
-def test_what_is_out_of_view_by_less_than_the_blur_is_seen() -> None:
+def test_a_face_out_of_view_by_less_than_the_blur_is_visible() -> None:
     corners = torch.tensor([[-0.3, -0.3, 1.0], [-0.3, 0.3, 1], [-0.51, 0, 1]]) - torch.tensor([0.25, 0, 0])
     pose = Camera(torch.eye(3), torch.zeros(3), (20.0, 20.0), (9.5, 9.5), 20, 20)
     scene = Scene(corners, torch.tensor([[0, 1, 2]]), torch.ones(3, 1), pose)

@@ -39,9 +39,7 @@ def sample_by_torch(image: Tensor, uv: Tensor, wrap: Wrap) -> Tensor:
 
 @pytest.mark.parametrize("kind", [torch.float32, torch.float64])
 @pytest.mark.parametrize("wrap", ["repeat", "clamp", "mirror"])
-def test_colours_and_slopes_are_those_of_sampling_at_the_places_that_faces_show(
-    wrap: Wrap, kind: torch.dtype
-) -> None:
+def test_colours_and_gradients_equal_those_of_torch_sampling(wrap: Wrap, kind: torch.dtype) -> None:
     scene = textured_body(kind, wrap)
     assert scene.texture is not None
     image, uv = scene.texture.images[0].clone().requires_grad_(), scene.texture.uv.clone().requires_grad_()
@@ -63,7 +61,7 @@ def test_colours_and_slopes_are_those_of_sampling_at_the_places_that_faces_show(
         assert (gradient - expected_gradient).norm() < limit * expected_gradient.norm()
 
 
-def test_the_texel_that_a_place_lies_in_is_shown_where_it_is_not_smooth() -> None:
+def test_the_nearest_texel_is_shown_without_smoothing() -> None:
     scene = textured_body(smooth=False)
     assert scene.texture is not None
     channels = Rasterizer()(scene, ("color", "uv", "mask"))
@@ -76,7 +74,7 @@ def test_the_texel_that_a_place_lies_in_is_shown_where_it_is_not_smooth() -> Non
     assert near[channels["mask"]].float().mean() < 0.01
 
 
-def test_joined_subjects_show_what_each_shows_alone() -> None:
+def test_joined_subjects_look_the_same_as_alone() -> None:
     """Check subjects with textures, colours, both or neither; each keeps its own image, whatever the order."""
     textured = textured_body()
     assert textured.texture is not None
@@ -104,7 +102,7 @@ def test_joined_subjects_show_what_each_shows_alone() -> None:
 
 
 @pytest.mark.parametrize(("colored", "textured"), list(itertools.product([False, True], repeat=2))[1:])
-def test_joining_keeps_what_subjects_have(colored: bool, textured: bool) -> None:
+def test_joining_keeps_colours_and_textures(colored: bool, textured: bool) -> None:
     vertices, faces, colors = blob(4)
     plain = Scene(vertices, faces, colors if colored else None, camera())
     scene = join_scenes([plain, replace(plain, texture=textured_body().texture if textured else None), plain])
@@ -120,7 +118,7 @@ WHOLE = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64)
 @pytest.mark.parametrize("count", [100, 300, 40_000])
 @pytest.mark.parametrize("textured", list(itertools.product([False, True], repeat=2)), ids=str)
 @pytest.mark.parametrize(("kind", "other"), list(itertools.product(WHOLE, repeat=2)), ids=str)
-def test_joined_indices_are_those_of_int64_whatever_types_came(
+def test_joined_indices_are_right_for_all_index_types(
     kind: torch.dtype, other: torch.dtype, textured: tuple[bool, bool], count: int
 ) -> None:
     """Join many vertices, texture coordinates and images with few, so that indices exceed the smaller types."""
@@ -162,7 +160,7 @@ def test_joined_indices_are_those_of_int64_whatever_types_came(
     assert merged.texture.shown is not None and merged.texture.shown.tolist() == shown
 
 
-def test_subjects_of_other_channels_are_not_joined() -> None:
+def test_subjects_that_do_not_fit_together_are_not_joined() -> None:
     vertices, faces, colors = blob(4)
     with pytest.raises(ValueError, match="1 and 3 channels; expected the same number"):
         join_scenes([Scene(vertices, faces, colors[:, :1], camera()), textured_body()])
@@ -200,7 +198,7 @@ def test_subjects_of_other_channels_are_not_joined() -> None:
         ({"wrap": "around"}, "'around', expected one of repeat"),
     ],
 )
-def test_a_texture_that_does_not_fit_is_refused_with_a_sentence(
+def test_a_texture_that_does_not_fit_raises_a_clear_message(
     change: dict[str, object],
     sentence: str,
     implementation: Callable[[Rasterizer, Scene, Sequence[str]], dict[str, Tensor]],
@@ -221,7 +219,7 @@ def test_a_texture_that_does_not_fit_is_refused_with_a_sentence(
     }  # these channels do not read the texture
 
 
-def test_the_blended_picture_refuses_textures() -> None:
+def test_soft_images_do_not_support_textures() -> None:
     with pytest.raises(ValueError, match="gradient=soft draws only colours of vertices"):
         Rasterizer(gradient="soft")(textured_body())
     assert Rasterizer(gradient="soft")(textured_body(), ("mask", "uv"))["mask"].any()

@@ -71,7 +71,7 @@ def network_input(scene):
 
 @pytest.mark.parametrize("size", [SIZE, OTHER])
 @pytest.mark.parametrize("members", [1, 3])
-def test_it_draws_what_the_loaded_run_predicts(encoders, size, members, tmp_path):
+def test_the_image_equals_the_prediction_of_the_loaded_run(encoders, size, members, tmp_path):
     wrapped = {"uncertainty": [{"name": "ensemble", "members": members}]} if members > 1 else {}
     points = len(MESH.vertices)
     paths = own_paths(encoders)
@@ -95,7 +95,7 @@ def test_it_draws_what_the_loaded_run_predicts(encoders, size, members, tmp_path
         assert image.max() - image.min() > 0.01 and image.shape == (*size, 3)
 
 
-def test_a_camera_anywhere_sees_what_the_canonical_one_sees(tmp_path):
+def test_any_camera_gives_the_image_of_the_canonical_camera(tmp_path):
     smplpix = renderer(write_checkpoint(tmp_path / "run.ckpt", ENCODERS["projection, slim"], SIZE))
     scene = replace(MESH, vertices=MESH.vertices.double(), camera=distant_camera(SIZE))
     pixels, depth = scene.camera.project(scene.vertices)
@@ -111,7 +111,7 @@ def test_a_camera_anywhere_sees_what_the_canonical_one_sees(tmp_path):
     torch.testing.assert_close(image, canonical_image, rtol=0, atol=1e-5)
 
 
-def test_what_must_not_be_seen_is_not(tmp_path):
+def test_invisible_vertices_have_no_effect(tmp_path):
     smplpix = renderer(write_checkpoint(tmp_path / "run.ckpt", ENCODERS["projection, slim"], SIZE))
     scene = replace(MESH, camera=replace(distant_camera(SIZE), near=3.0))
     assert scene.colors is not None
@@ -142,12 +142,12 @@ def test_the_box_and_the_precision_can_be_chosen(tmp_path):
     (None, ConfigError, "experiment=smplpix/quick"),
     ("/nowhere/at/all", CheckpointError, "neither a file"),
 ])  # fmt: skip
-def test_without_a_run_it_says_what_to_do(run, kind, message):
+def test_a_missing_run_raises_a_clear_message(run, kind, message):
     with pytest.raises(kind, match=message):
         build("renderer", resolve("renderer", {"name": "smplpix", "checkpoint": run}))
 
 
-def test_a_path_of_its_checkpoint_is_said_again_or_refused(encoders, tmp_path):
+def test_stored_paths_must_be_repeated(encoders, tmp_path):
     run = write_checkpoint(tmp_path / "run.ckpt", encoders, SIZE, len(MESH.vertices))
     for key, path in own_paths(encoders).items():
         with pytest.raises(ConfigError, match=r"encoder\.rasterised\.root="):
@@ -156,7 +156,7 @@ def test_a_path_of_its_checkpoint_is_said_again_or_refused(encoders, tmp_path):
         renderer(run, paths={"encoder": {"rasterised": {"root": path}}})  # nested, as on a command line
 
 
-def test_what_it_cannot_draw_is_refused(encoders, tmp_path):
+def test_scenes_that_do_not_fit_raise_an_error(encoders, tmp_path):
     run = write_checkpoint(tmp_path / "run.ckpt", encoders, SIZE, len(MESH.vertices))
     smplpix = renderer(run, paths=own_paths(encoders))
     scene = replace(MESH, camera=distant_camera(SIZE))
@@ -174,7 +174,7 @@ def test_what_it_cannot_draw_is_refused(encoders, tmp_path):
             smplpix(replace(scene, vertices=MESH.vertices[:9], colors=scene.colors[:9], faces=MESH.faces[:0]))
 
 
-def test_a_run_that_paints_no_people_is_refused(tmp_path):
+def test_a_run_that_does_not_predict_rgb_raises_an_error(tmp_path):
     grey = write_checkpoint(
         tmp_path / "grey.ckpt",
         [projection_settings(SIZE, **NEAR), {"name": "slim", **SLIM, "colors": 1}],
