@@ -216,7 +216,7 @@ def decode_opaque(image: Image.Image) -> Iterator[tuple[int, UInt8[np.ndarray, "
 
 
 def _strips(
-    image: Image.Image, stored: "_Stored", channels: int, *, opaque: bool
+    image: Image.Image, stored: "_Encoding", channels: int, *, opaque: bool
 ) -> Iterator[tuple[int, Image.Image]]:
     for top in range(0, image.height, STRIP):
         strip = image.crop((0, top, image.width, min(top + STRIP, image.height)))

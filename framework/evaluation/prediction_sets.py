@@ -54,7 +54,7 @@ def set_columns(target: Target, prediction: Prediction) -> dict[str, list[Any]]:
     }
 
 
-def _around(ends: Ends) -> tuple[float, float]:
+def _around(intervals: Ends) -> tuple[float, float]:
     """Return the lowest and the highest end of ascending intervals; NaN if there is no interval."""
     return (intervals[0][0], intervals[-1][1]) if intervals else (math.nan, math.nan)
 

@@ -223,9 +223,10 @@ def encode(
                 work.advance(len(files))
                 continue
             dataset = data.read(files)
-            if len(dataset) != len(files):  # type: ignore[arg-type]
+            sample_count: int = len(dataset)  # type: ignore[arg-type]
+            if sample_count != len(files):
                 raise DataError(
-                    f"{files[0]} … {files[-1]}: {len(files)} files contain {len(dataset)} samples, but mode=encode "
+                    f"{files[0]} … {files[-1]}: {len(files)} files contain {sample_count} samples, but mode=encode "
                     "needs one sample per file. Split the files."
                 )
             batches = Batches(data, batch_size=settings.batch_size, workers=settings.workers, seed=0)
