@@ -65,7 +65,8 @@ class BernoulliImageHead(DensityHead):
         # the log-likelihood is concave in the factor, so that its derivative has a single zero
         if len(raw) == 0:
             raise ValueError(
-                "the factor of the log-odds is fitted to the validation split, but got no sample of this split."
+                "The factor of the log-odds is fitted to the validation split, but this split is empty. Use data with "
+                "a validation split."
             )
         low, high = math.log(LEAST), math.log(MOST)
         for _ in range(ROUNDS):

@@ -93,5 +93,5 @@ def test_the_loss_is_the_cross_entropy_a_number_and_calibration_finds_the_likeli
         losses[factor] = -float(head(raw).log_prob(target).double().mean())
     assert min(losses, key=losses.__getitem__) == fitted and fitted == pytest.approx(0.4, abs=0.1)
     torch.testing.assert_close(head.loss(raw, target), wanted.float())  # independent of the calibration
-    with pytest.raises(ValueError, match="got no sample"):
+    with pytest.raises(ValueError, match="this split is empty"):
         head.calibrate(raw[:0], target[:0])

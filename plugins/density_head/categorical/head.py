@@ -19,7 +19,7 @@ class CategoricalHead(DensityHead):
     """Class probabilities by softmax; trains by cross-entropy."""
 
     knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
-    bibtex = "bridle1990probabilistic"  # noqa: E501
+    bibtex = "bridle1990probabilistic"
 
     def __init__(self, target: Target) -> None:
         super().__init__()

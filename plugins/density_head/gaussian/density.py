@@ -108,7 +108,7 @@ class Gaussian(Distribution):
         assert self.coefficients is not None
         if not bool(numbers.isfinite().all()) and bool(self.coefficients.isfinite().all()):
             raise ValueError(
-                f"the covariance of {self.event_shape[0]} numbers with regression coefficients of up to "
+                f"The covariance of {self.event_shape[0]} numbers with regression coefficients of up to "
                 f"{self.coefficients.abs().amax().item():.3g} exceeds the range of {self.scale.dtype}. The density "
                 "can be computed, but samples and marginals cannot. Choose covariance=diagonal, standardise the "
                 "targets, or use float64."

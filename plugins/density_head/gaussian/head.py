@@ -104,7 +104,8 @@ class GaussianHead(DensityHead):
             return
         if len(raw) == 0:
             raise ValueError(
-                "a fixed covariance is fitted to the validation split, but got no sample of this split."
+                "A fixed covariance is fitted to the validation split, but this split is empty. Use data with a "
+                "validation split."
             )
         residual = (
             self.unit.standardise(target).double() - self._mean(require_finite(raw, self.size)).double()

@@ -87,7 +87,7 @@ def test_calibration_on_perfect_collinear_and_no_data():
     assert torch.allclose(head.scale, torch.full((3,), 1e-4, dtype=torch.float64))
     head.calibrate(raw, raw + torch.randn(20, 1))  # all three numbers have the same error
     assert head(raw).log_prob(raw).isfinite().all()
-    with pytest.raises(ValueError, match="got no sample"):
+    with pytest.raises(ValueError, match="this split is empty"):
         head.calibrate(raw[:0], raw[:0])
 
 

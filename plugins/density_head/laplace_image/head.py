@@ -35,9 +35,10 @@ class LaplaceImageHead(DensityHead):
     size of the image. With one fixed scale the loss is the L1 distance plus a constant.
 
     Args:
-        scale: "fixed": one b for all images and pixels, 1 in training, fitted to the validation split; "pixel": one
-            predicted for each pixel, "number": for each number. Predicted scales are trained by likelihood and
-            multiplied by one factor that is fitted to the validation split.
+        scale: "fixed": one scale b for all images and pixels, which is 1 in training and is fitted to the validation
+            split; "pixel": a predicted scale for each pixel; "number": a predicted scale for each number of each pixel.
+            Predicted scales are trained by likelihood and multiplied by one factor that is fitted to the validation
+            split.
         cover: probability c of the central intervals to which the factor is fitted: a share c of the validation
             split's numbers, in pixels that are not white, lies in these intervals (split conformal prediction). null:
             the most likely factor over all pixels. That factor suits predicted scales badly: three quarters of an image
@@ -106,7 +107,8 @@ class LaplaceImageHead(DensityHead):
         """Fit the factor of the scales to the validation split."""
         if len(raw) == 0:
             raise ValueError(
-                "the scale of an image's numbers is fitted to the validation split, but got no sample of this split."
+                "The scale of an image's numbers is fitted to the validation split, but this split is empty. Use data "
+                "with a validation split."
             )
         parts = zip(target, map(self._parts, raw), strict=True)
         distances = (((value - location).abs() / scale) for value, (location, scale) in parts)

@@ -82,7 +82,7 @@ class SampledMixture(Mixture):
 
     Args:
         log_weights: (*batch, S), all equal.
-        components: batch_shape (*batch, S), the samples of one replicate adjacent.
+        components: batch_shape (*batch, S); the components of one replicate are adjacent.
         replicates: R, which divides S.
     """
 
@@ -166,7 +166,7 @@ def estimate_log_mean(
     at_once: int,
     device: torch.device,
 ) -> Estimate:
-    """Return an estimate of log E w for each item, (items,), nats.
+    """Return an estimate of log E w, the log of the mean weight over z, for each item, (items,), nats.
 
     After each round, the samples of the items with an error above the tolerance are doubled. Only one sum for each
     replicate and the current chunk are in memory. The result is differentiable if log_weights is; then all weights are

@@ -30,7 +30,7 @@ from plugins.density_head.latent.rows import ONE, SMALL, TWO
 
 
 def test_each_network_may_have_a_backbone_of_its_own():
-    """Check thesis §3.6.1: each part of the raw parameters has its own backbone; the loss depends on them alone."""
+    """Check that each part of the raw parameters has its own backbone, and that the loss depends on these alone."""
     config = {
         "data": "moons",
         "density_head": {"name": "cvae", **SMALL, "backbones": "each"},

@@ -34,7 +34,7 @@ def bump(z, items):
 
 
 def run_estimate(effort, dimensions=2, seed=0, at_once=2**20, log_weight=bump):
-    """Return the estimate as a density computes it: to a tolerance by points of heavier tails."""
+    """Return the estimate that a density computes: with a tolerance, from points with heavier tails."""
     torch.manual_seed(seed)
     points = NormalPoints(ITEMS, effort.replicates, dimensions, dtype=torch.float64, device=CPU)
 
@@ -280,7 +280,7 @@ def test_the_estimated_error_is_the_error_however_samples_were_chosen(dimensions
 @pytest.mark.parametrize("height", [5.0, 20.0, 60.0])
 @pytest.mark.parametrize("border", [3.0, 4.0, 5.0])
 def test_a_rare_event_is_sampled_or_reported(height, border):
-    """Check weights 1 up to a border and e^height above: log(1 + P (e^height - 1)).
+    """Check weights of 1 up to a border and e^height above, whose mean has the log log(1 + P (e^height - 1)).
 
     The estimate is right to four standard errors and a fifth of the tolerance, or it is reported as unresolved.
     """

@@ -151,7 +151,9 @@ class ExtraTreesHead(DensityHead, Fitted):
         if self.classes:
             return
         if len(raw) == 0:
-            raise ValueError("widths are fitted to the validation split, but got no sample of this split.")
+            raise ValueError(
+                "Widths are fitted to the validation split, but this split is empty. Use data with a validation split."
+            )
         density = self(raw.double())
         assert isinstance(density, Mixture)
         means, target = map(self.unit.standardise, (density.components.mean, target.double()))

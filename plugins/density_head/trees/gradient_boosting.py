@@ -143,7 +143,8 @@ class XGBoostHead(DensityHead, Fitted):
             return
         if len(raw) == 0:
             raise ValueError(
-                "a standard deviation is fitted to the validation split, but got no sample of this split."
+                "A standard deviation is fitted to the validation split, but this split is empty. Use data with a "
+                "validation split."
             )
         self._measure_width(raw, target)
 

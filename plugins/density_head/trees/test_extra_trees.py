@@ -154,7 +154,7 @@ def test_calibrated_widths_are_the_likeliest():
 
 def test_widths_do_not_fall_below_the_floor():
     assert fit_width(torch.zeros(5, 3, 2, dtype=torch.float64)).tolist() == pytest.approx([1e-4, 1e-4])
-    with pytest.raises(ValueError, match="got no sample"):
+    with pytest.raises(ValueError, match="this split is empty"):
         fit_head(TWO, trees=2)[0].calibrate(torch.zeros(0, 6), torch.zeros(0, 2))
 
 

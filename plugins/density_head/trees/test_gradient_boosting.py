@@ -66,7 +66,7 @@ def test_reals_are_normal_about_the_librarys_prediction(target):
     np.testing.assert_allclose(head.width.numpy(), spread, rtol=1e-9)
     expected = stats.norm.logpdf(value.double().numpy(), mean, spread).sum(-1)
     np.testing.assert_allclose(head(queries.double()).log_prob(value.double()).numpy(), expected, rtol=1e-9)
-    with pytest.raises(ValueError, match="got no sample"):
+    with pytest.raises(ValueError, match="this split is empty"):
         head.calibrate(queries[:0], value[:0])
 
 

@@ -88,7 +88,8 @@ class VonMisesHead(DensityHead):
             return
         if len(raw) == 0:
             raise ValueError(
-                "a fixed concentration is fitted to the validation split, but got no sample of this split."
+                "A fixed concentration is fitted to the validation split, but this split is empty. Use data with a "
+                "validation split."
             )
         sine, _ = half_angle(target.double(), self(raw).mean.double())
         deviation = 2 * sine.square()

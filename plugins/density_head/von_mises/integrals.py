@@ -62,7 +62,8 @@ def half_width(mass: Tensor, concentration: Tensor) -> Tensor:
     """
     if not bool(((mass >= 0) & (mass <= 1)).all()):
         raise ValueError(
-            f"the mass of an arc must lie between 0 and 1, got values from {mass.min().item()} to {mass.max().item()}."
+            f"The probability of an arc must lie between 0 and 1, got values from {mass.min().item()} to "
+            f"{mass.max().item()}."
         )
     dtype = torch.promote_types(mass.dtype, concentration.dtype)
     mass, kappa = torch.broadcast_tensors(mass.double(), concentration.double())

@@ -65,7 +65,7 @@ def leaf(number, dtype):
 
 
 def error(computed, reference, scale, dtype):
-    """Return the error in machine epsilons of `scale`."""
+    """Return the error |computed - reference| / scale, in machine epsilons."""
     return float(abs(mpmath.mpf(computed.item()) - reference) / scale) / torch.finfo(dtype).eps
 
 
@@ -286,7 +286,7 @@ def test_divergence_has_first_and_second_derivatives(second):
 
 
 def tail(offset, kappa):
-    """Return the probability beyond `offset` on one side, by quadrature down to exp(-90) of its start."""
+    """Return the probability beyond `offset` on one side, by quadrature until the density has fallen by exp(-90)."""
     offset, kappa = mpmath.mpf(offset), mpmath.mpf(kappa)
     ends = [mpmath.sin(offset / 2) ** 2 + step / (2 * kappa) if kappa else 2 for step in (1, 4, 12, 30, 90)]
     ends = [2 * mpmath.asin(mpmath.sqrt(min(1, end))) for end in ends]
@@ -487,7 +487,7 @@ def test_calibration_on_perfect_and_on_no_data():
     raw = torch.tensor([[1.0, 0.0], [0.0, 1.0]])
     head.calibrate(raw, head(raw).mean)
     assert head.concentration.item() == 1e12
-    with pytest.raises(ValueError, match="got no sample"):
+    with pytest.raises(ValueError, match="this split is empty"):
         head.calibrate(raw[:0], raw[:0, :1])
 
 
@@ -514,9 +514,9 @@ def test_other_targets_are_refused(kind):
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_angles_of_any_size_are_read_as_the_docstring_says(dtype, monkeypatch):
-    """Check large angles, also under gradient and compiled.
+    """Check the density at large angles, also with gradient and in compiled code.
 
-    float32 is exact, and float64 beyond 4e8 radians is right to one unit of rounding.
+    float32 angles are read exactly; float64 angles beyond 4e8 radians have an error of one unit of their last digit.
     """
     value = torch.logspace(6, 38, 129, dtype=torch.float64).to(dtype)
     value = torch.cat([value, -value])

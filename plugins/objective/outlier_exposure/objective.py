@@ -48,7 +48,7 @@ class OutlierExposure(Objective):
         DataError: `outliers.prepare` fails.
     """
 
-    bibtex = "hendrycks2019deep, hein2019why"  # noqa: E501
+    bibtex = "hendrycks2019deep, hein2019why"
 
     def __init__(
         self,

@@ -49,7 +49,7 @@ class PredictionSet(Mixture, ValueSet):
         density: any density.
         threshold: the largest score in the set, a scalar; infinite for all values.
         score: "density" or "mass".
-        promised: as of `ValueSet`.
+        stated_probability: probability with which the set is stated to hold the target; None if it is not known.
     """
 
     arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
@@ -59,10 +59,10 @@ class PredictionSet(Mixture, ValueSet):
         density: Distribution,
         threshold: Float[Tensor, ""],
         score: Score,
-        promised: float | None = None,
+        stated_probability: float | None = None,
     ) -> None:
         self.density = density
-        self.stated_probability = promised
+        self.stated_probability = stated_probability
         self.threshold = threshold
         self.score: Score = score
         # The dtype of log_prob: for classes that of one label's, otherwise that of an empty sample.

@@ -24,7 +24,7 @@ SPLITS, POOL = 200, 1600
 
 
 class PredictorOf(Predictor):
-    """A predictor whose densities are made of the inputs; remembers its calibration data."""
+    """A predictor with the density `make(inputs)`, which records the rows on which it is calibrated."""
 
     def __init__(self, make):
         super().__init__()
@@ -77,7 +77,7 @@ def circle(count):
 
 
 def sure_direction(inputs):
-    """Return the correct direction with κ eight times too large."""
+    """Return densities with the correct direction, and a κ that is eight times too large."""
     kind = type(build("density_head", resolve("density_head", "von_mises"), target=ANGLE)(torch.zeros(1, 3)))
     return kind(inputs[:, :1], 8 * (4 + 3 * torch.tanh(inputs[:, 1:])))
 
@@ -88,7 +88,7 @@ PROBLEMS = {"moons": (moons, sure_classifier, CLASSES), "circle": (circle, sure_
 @pytest.mark.parametrize("problem", PROBLEMS)
 @pytest.mark.parametrize("score", ["density", "mass"])
 @pytest.mark.parametrize("miscoverage", [0.1, 0.05])
-def test_coverage_is_what_was_promised(problem, score, miscoverage):
+def test_coverage_is_as_stated(problem, score, miscoverage):
     """Check the mean coverage over 200 random splits of one pool to 1 %, for badly calibrated models.
 
     Half of the validation samples of every split are left to the wrapped model, as the wrapper does.

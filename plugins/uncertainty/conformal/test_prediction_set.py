@@ -107,7 +107,7 @@ def test_density_sets_of_classes_are_those_above_the_level():
 
 
 def test_mass_scores_of_classes_by_a_loop():
-    """Compare with -log(Σ of the less probable + (1 - u) p), where u depends on an item's two best labels."""
+    """Compare with -log(Σ_j p_j + (1 - u) p(y)) over the less probable labels j, with u of the two likeliest labels."""
     torch.manual_seed(4)
     density = Categorical(logits=4 * torch.randn(50, 5).double(), validate_args=False)
     scores = PredictionSet(density, EVERYTHING, "mass").scores(density.enumerate_support())
@@ -280,7 +280,7 @@ def test_volumes_of_several_numbers():
 @pytest.mark.parametrize("count", [2, 3, 7])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_sets_of_a_normal_density_are_ellipsoids(count, drop, dtype):
-    """Compare with the ball's volume by recursion times |Σ|^½, also for rims far beyond all samples."""
+    """Compare with the volume of a ball, by recursion, times |Σ|^½; some sets reach far beyond all samples."""
     root = torch.eye(count).tril() + 0.3 * torch.ones(count, count).tril(-1)
     root = (root * (1 + torch.arange(count)).reshape(-1, 1)).to(dtype).expand(3, count, count)
     density = MultivariateNormal(torch.ones(3, count, dtype=dtype), scale_tril=root, validate_args=False)
@@ -395,7 +395,7 @@ def test_what_a_set_has_not_gets_a_sentence():
     st.sampled_from(["density", "mass"]),
 )
 def test_sets_are_what_contains_says(means, exponents, mass, score):
-    """Check that ends of arcs separate inside from outside, and the probability of a mass set."""
+    """Check that `contains` changes at the ends of arcs, and that a mass set has its probability."""
     kind = type(von_mises([0.0], 1.0))
     count = len(means)
     place = torch.tensor(means).double().reshape(1, count, 1)
@@ -435,7 +435,7 @@ def test_levels_and_scores_are_inverse():
 @pytest.mark.parametrize("humps", [2, 5])
 @pytest.mark.parametrize("count", [7, 65, 500])
 def test_no_hump_is_lost_among_many_components(closed, humps, count):
-    """Check humps of 60 % and of shares of the rest, each made of many components, in any number and order."""
+    """Check mixtures of one hump of 60 % and smaller ones, each of many components, in any number and order."""
     torch.manual_seed(count)
     hump = torch.where(torch.rand(ITEMS, count) < 0.6, 0, torch.randint(1, humps, (ITEMS, count)))
     hump[:, :humps] = torch.arange(humps)  # each has one at least

@@ -169,7 +169,7 @@ class Ensemble(Uncertainty, Joining, SeveralModels):
             return self._separate_members()[index](inputs)
         except ValueError as error:  # a head's message about NaN names the row
             raise UserError(
-                f"member {index} of {self.model_count} of the ensemble: {error} {REMEDY}"
+                f"Member {index} of {self.model_count} of the ensemble: {error} {REMEDY}"
             ) from error
 
     def _densities(self, raw: Float[Tensor, "batch member size"]) -> Distribution:
@@ -180,7 +180,7 @@ class Ensemble(Uncertainty, Joining, SeveralModels):
             other_members = len(bad[:, 1].unique()) - 1
             more = f" (and {other_members} other members)" if other_members else ""
             raise UserError(
-                f"member {index} of {self.model_count} of the ensemble{more} gives distribution parameters that are "
+                f"Member {index} of {self.model_count} of the ensemble{more} gives distribution parameters that are "
                 f"not finite, first for row {row} of the batch. {REMEDY}"
             )
         if len(self.heads) == 1:

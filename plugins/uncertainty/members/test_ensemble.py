@@ -305,7 +305,7 @@ def test_a_member_that_is_not_finite_is_named(batch_norm):
         else:
             bad = whole.together.read(1)
             whole.together.write(1, {**bad, "1.bias": torch.full_like(bad["1.bias"], torch.nan)})
-        with pytest.raises(UserError, match="member 1 of 3"):
+        with pytest.raises(UserError, match="Member 1 of 3"):
             whole(data()[0])
         whole.members = 1  # only the first member is finite
         assert whole(data()[0]).log_prob(data()[1]).isfinite().all()

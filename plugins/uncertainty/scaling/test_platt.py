@@ -23,7 +23,7 @@ TWO, THREE = Target("class", ("off", "on")), Target("class", ("a", "b", "c"))
 
 
 class PredictorOf(Predictor):
-    """A predictor whose densities are made of the inputs."""
+    """A predictor whose density is a given function of the inputs."""
 
     def __init__(self, make):
         super().__init__()

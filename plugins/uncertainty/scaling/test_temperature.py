@@ -27,7 +27,7 @@ CLASSES, ANGLE, REAL = Target("class", ("a", "b", "c")), Target("angle", ("azimu
 
 
 class PredictorOf(Predictor):
-    """A predictor whose densities are made of the inputs."""
+    """A predictor whose density is a given function of the inputs."""
 
     def __init__(self, make):
         super().__init__()
