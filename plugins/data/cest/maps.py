@@ -46,9 +46,9 @@ def write_maps(
         write_nifti(written[1], np.stack(list(maps.values()), -1), volume.affine)
         written[2].write_text("".join(f"{name}\n" for name in maps), encoding="utf-8")
     if volume.dropped:
-        bad = stem.with_name(f"{stem.name}_left_out.csv")
-        np.savetxt(bad, volume.left_out, "%d", ",", header="x,y,z", comments="")
-        written.append(bad)
+        left_out_file = stem.with_name(f"{stem.name}_left_out.csv")
+        np.savetxt(left_out_file, volume.left_out, "%d", ",", header="x,y,z", comments="")
+        written.append(left_out_file)
     title = f"{file.name}: amplitudes of the lines" + ", by a model of synthetic data" * synthetic
     return [*written, save_figure(maps_figure({"": slice_of(maps, volume)}, title), stem, True)]
 

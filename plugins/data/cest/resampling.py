@@ -53,7 +53,7 @@ def resample(
         )
     clipped = np.clip(required, measured[0], measured[-1])
     interpolated = np.full((len(spectra), len(required)), np.nan)
-    whole = np.isfinite(spectra).all(1)
-    if whole.any():
-        interpolated[whole] = PchipInterpolator(measured, spectra[whole], axis=1)(clipped)
+    finite = np.isfinite(spectra).all(1)
+    if finite.any():
+        interpolated[finite] = PchipInterpolator(measured, spectra[finite], axis=1)(clipped)
     return interpolated

@@ -115,8 +115,8 @@ def _volume(arrays: Mapping[str, Any], size: int) -> Volume:
     order = np.argsort(offsets)
     spectra, offsets = spectra[..., order], offsets[order]
     inside = _mask(arrays.get("mask"), spectra)
-    whole = np.isfinite(spectra).all(-1)
-    usable = inside & whole
+    finite = np.isfinite(spectra).all(-1)
+    usable = inside & finite
     if not inside.any():
         raise DataError(
             "The mask contains no voxel: no number of the mask is above 0. Correct the mask, or leave it out."
@@ -144,7 +144,7 @@ def _volume(arrays: Mapping[str, Any], size: int) -> Volume:
             f"`region` holds the numbers {numbers.min()} to {numbers.max()}; expected 0 (healthy) and 1 (tumour)."
         )
     place = np.argwhere(usable)
-    left_out = np.argwhere(inside & ~whole)
+    left_out = np.argwhere(inside & ~finite)
     unread = tuple(shorten(other, 40) for other in arrays if other not in (name, *KNOWN))[:12]
     return Volume(
         offsets,

@@ -120,8 +120,8 @@ class COIL20(Data):
         target = batch["target"]
         shift = (torch.rand(len(target), 1, device=target.device) - 0.5) * math.radians(self.every)
         azimuth = target + shift
-        turn = torch.remainder(azimuth[:, 0].double() / (2 * math.pi), 1.0)
-        row = (turn * len(self._weights)).long().clamp(max=len(self._weights) - 1).cpu()
+        share_of_turn = torch.remainder(azimuth[:, 0].double() / (2 * math.pi), 1.0)
+        row = (share_of_turn * len(self._weights)).long().clamp(max=len(self._weights) - 1).cpu()
         views = self._training[batch["object"].cpu()]
         interpolated = torch.einsum("bv,bvchw->bchw", self._weights[row], views).clamp(0, 255).round()
         return {

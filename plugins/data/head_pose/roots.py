@@ -21,7 +21,7 @@ Row = tuple[str, float, float, float]
 """Name, pan, tilt and roll of an IDIAP image."""
 
 
-def prepared(name: str, root: Path | None, **config: Any) -> Any:
+def prepare_data(name: str, root: Path | None, **config: Any) -> Any:
     """Return the prepared data set of this name, with a folder as its root."""
     data = schema.build("data", schema.resolve("data", {"name": name, "root": root and str(root), **config}))
     data.prepare()

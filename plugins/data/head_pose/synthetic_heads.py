@@ -106,8 +106,8 @@ def random_person(random: Generator) -> Person:
         hair=np.clip(
             np.array(HAIRS[random.integers(1 if tone > 2 else 5)]) + random.normal(0, 0.02, 3), 0.02, 1
         ),
-        cloth=_muted(random),
-        hat_color=_muted(random),
+        cloth=_muted_color(random),
+        hat_color=_muted_color(random),
         axes=np.array([0.76, 1.0, 0.88]) * random.uniform(0.94, 1.06, 3),
         face_tilt=random.uniform(0.4, 0.7) if covered else random.uniform(0.75, 0.95),
         face_reach=-1.0 if bald and not hat else random.uniform(0.25, 0.4),
@@ -370,14 +370,14 @@ def _paint_face(point, look, color):
                 color[channel] *= 1 - 0.3 * glasses
 
 
-def _muted(random: Generator) -> Array:
+def _muted_color(random: Generator) -> Array:
     """Return a random colour (3,), 0…1, of any brightness and little saturation."""
     return np.clip(random.uniform(0.1, 0.9) + random.normal(0, 0.05, 3), 0, 1)
 
 
 def background(random: Generator, pixels: int, clutter: int) -> Array:
     """Return an image (pixels, pixels, 3) of smooth noise between two colours, with up to `clutter` random shapes."""
-    first = _muted(random)
+    first = _muted_color(random)
     second = np.clip(first + random.normal(0, 0.2) + random.normal(0, 0.04, 3), 0, 1)
     cells = int(random.integers(2, 7))
     grid = Image.fromarray(random.random((cells, cells), dtype=np.float32))
@@ -386,7 +386,7 @@ def background(random: Generator, pixels: int, clutter: int) -> Array:
     for _ in range(int(random.integers(0, clutter + 1))):
         centre, size = random.uniform(0, pixels, 2), random.uniform(0.08, 0.45, 2) * pixels
         mask = _shape(random, pixels, centre, size)
-        image = np.where(mask, _muted(random), image)
+        image = np.where(mask, _muted_color(random), image)
     return image
 
 
@@ -399,7 +399,7 @@ def _occlude(random: Generator, image: Array, middle: Array, scale: float) -> Ar
     angle, distance = random.uniform(0, 2 * math.pi), random.uniform(0.8, 1.3)
     centre = middle + distance * scale * np.array([0.8 * math.cos(angle), math.sin(angle)])
     mask = _shape(random, pixels, centre, random.uniform(0.6, 1.1, 2) * scale)
-    return np.where(mask, _muted(random), image)
+    return np.where(mask, _muted_color(random), image)
 
 
 def _shape(random: Generator, pixels: int, centre: Array, size: Array) -> NDArray[np.bool_]:

@@ -13,7 +13,7 @@ from plugins.data.head_pose.caviar_labels import LABELS, Label, read_labels, wri
 from plugins.data.head_pose.roots import (
     CAVIAR_FIELDS,
     caviar_row,
-    prepared,
+    prepare_data,
     save_caviar,
     struct_array,
     write_caviar,
@@ -53,7 +53,7 @@ def test_element_that_is_no_label_is_named(root: Path, bad: list[Any]) -> None:
     with pytest.raises(
         DataError, match=r"or_label\.mat: (or_label_train\(2\) holds|cannot be read as a MATLAB)"
     ):
-        prepared("caviar", root)
+        prepare_data("caviar", root)
 
 
 def test_other_contents_are_refused(root: Path) -> None:
@@ -61,15 +61,15 @@ def test_other_contents_are_refused(root: Path) -> None:
     with pytest.raises(
         DataError, match=r"or_label_train\(1\) holds .* expected a struct of gaze, x, y, size, name"
     ):
-        prepared("caviar", root)
+        prepare_data("caviar", root)
     scipy.io.savemat(
         root / LABELS, {"or_label_train": np.eye(2), "or_label_test": struct_array([caviar_row(20)])}
     )
     with pytest.raises(DataError, match=r"or_label_train\(1\) holds"):
-        prepared("caviar", root)
+        prepare_data("caviar", root)
     scipy.io.savemat(root / LABELS, {"or_label_train": struct_array([caviar_row(0)])})
     with pytest.raises(DataError, match=r"The file holds no or_label_test\. Copy"):
-        prepared("caviar", root)
+        prepare_data("caviar", root)
 
 
 @pytest.mark.parametrize("gaze", [math.nan, -math.inf])
@@ -78,7 +78,7 @@ def test_gaze_that_is_not_finite_is_never_skipped(root: Path, gaze: float) -> No
     rows[3][0] = gaze
     save_caviar(root, struct_array([caviar_row(0)]), struct_array(rows))
     with pytest.raises(DataError, match=rf"1 images have an angle .*\n.*head_23_x\.jpg: {gaze}"):
-        prepared("caviar", root, skip_unreadable=True)
+        prepare_data("caviar", root, skip_unreadable=True)
 
 
 def test_labels_are_written_as_they_are_read(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from plugins.data.head_pose.idiap import ARCHIVE as IDIAP
 from plugins.data.head_pose.roots import (
     caviar_row,
     idiap_row,
-    prepared,
+    prepare_data,
     publish_caviar,
     publish_idiap,
     table,
@@ -77,11 +77,11 @@ IN_TWO_FOLDERS = (
 )
 
 
-def named(published: Published) -> str:
+def archive_name(published: Published) -> str:
     return published.archive.name
 
 
-in_two_folders = pytest.mark.parametrize("published", IN_TWO_FOLDERS, ids=named)
+in_two_folders = pytest.mark.parametrize("published", IN_TWO_FOLDERS, ids=archive_name)
 
 
 @pytest.fixture(autouse=True)
@@ -106,7 +106,7 @@ def numbers_in(fields: Any) -> list[int]:
 @in_two_folders
 def test_images_labels_and_splits(published: Published, root: Path) -> None:
     name = published.archive.name
-    data = prepared(name, root)
+    data = prepare_data(name, root)
     assert numbers_in(table(data, "train")) == list(range(20))
     np.random.seed(13)  # noqa: NPY002  (the thesis authors' code seeds the global generator)
     order = (20 + np.random.choice(11, 11, replace=False)).tolist()  # noqa: NPY002
@@ -130,25 +130,25 @@ def test_wrong_layouts_say_what_is_missing(published: Published, root: Path, tmp
         DataError,
         match=rf"data\.root = .*nowhere does not exist .* Set data\.root to the unpacked {folder}, or to null",
     ):
-        prepared(name, tmp_path / "nowhere")
+        prepare_data(name, tmp_path / "nowhere")
     labels = published.labels.replace(".", r"\.")
     with pytest.raises(
         DataError, match=rf"it holds no train/, no test/, no {labels}\. Did you mean .*{folder}\?"
     ):
-        prepared(name, tmp_path)
+        prepare_data(name, tmp_path)
     (root / published.labels).unlink()
     with pytest.raises(DataError, match=rf"it holds no {labels}\. Unpack the whole archive into"):
-        prepared(name, root)
+        prepare_data(name, root)
 
 
 @in_two_folders
 def test_empty_split(published: Published, root: Path) -> None:
     published.publish(root, train=[0], test=[20])
     with pytest.raises(DataError, match=r"The validation split is empty \(2 images in all, 0 unreadable\)"):
-        prepared(published.archive.name, root)
+        prepare_data(published.archive.name, root)
     published.publish(root, train=[])
     with pytest.raises(DataError, match=r"The train split is empty"):
-        prepared(published.archive.name, root)
+        prepare_data(published.archive.name, root)
 
 
 @pytest.mark.parametrize(
@@ -181,13 +181,13 @@ def test_config_out_of_range(name: str, key: str, value: Any) -> None:
 
 @in_two_folders
 def test_augment_changes_no_label(published: Published, root: Path) -> None:
-    data = prepared(published.archive.name, root)
+    data = prepare_data(published.archive.name, root)
     batch = dict(table(data, "train"))
     torch.manual_seed(0)
     varied = data.augment(batch)
     assert torch.equal(varied["target"], batch["target"])
     assert not torch.equal(255 * varied["input"], batch["input"].float())
-    assert prepared(published.archive.name, root, jitter=0.0).augment(batch) is batch
+    assert prepare_data(published.archive.name, root, jitter=0.0).augment(batch) is batch
 
 
 # ---- the synthetic sets ----------------------------------------------------------------------------------
@@ -224,17 +224,17 @@ def test_generation_is_the_same_to_the_byte_for_any_number_of_threads(
 
 @pytest.mark.parametrize(("name", "sizes"), [("idiap", [38, 11, 11]), ("caviar", [36, 12, 12])])
 def test_generated_sets_have_the_published_shares(name: str, sizes: list[int]) -> None:
-    data = prepared(name, None, images=60)
+    data = prepare_data(name, None, images=60)
     assert data.fingerprint()["root"] == "synthetic, seed 0"
     assert [len(table(data, split)["input"]) for split in SPLITS] == sizes
 
 
 @pytest.mark.parametrize("name", ["idiap", "caviar"])
 def test_the_message_about_damaged_generated_data_says_to_delete_them(cache: Path, name: str) -> None:
-    prepared(name, None, images=20)
+    prepare_data(name, None, images=20)
     next(cache.rglob("*.jpg")).write_bytes(b"")
     with pytest.raises(DataError, match=rf"Delete {cache}/{name}; the next run generates the data again"):
-        prepared(name, None, images=20)
+        prepare_data(name, None, images=20)
 
 
 @pytest.mark.parametrize(
@@ -246,7 +246,7 @@ def test_images_agree_with_their_labels(name: str, images: int, correlation: flo
 
     On mirror images the sign of the correlation changes.
     """
-    data = prepared(name, None, images=images, image_size=16)
+    data = prepare_data(name, None, images=images, image_size=16)
 
     def columns(split: str, *, mirrored: bool) -> tuple[np.ndarray, np.ndarray]:
         fields = table(data, split)

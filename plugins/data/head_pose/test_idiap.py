@@ -11,7 +11,14 @@ import torch
 from framework.errors import DataError
 from plugins.data.head_pose.idiap import PEOPLE, random_pose
 from plugins.data.head_pose.idiap_labels import LABELS, Label, read_labels, write_labels
-from plugins.data.head_pose.roots import idiap_row, prepared, publish_idiap, save_idiap, table, write_idiap
+from plugins.data.head_pose.roots import (
+    idiap_row,
+    prepare_data,
+    publish_idiap,
+    save_idiap,
+    table,
+    write_idiap,
+)
 
 
 @pytest.fixture
@@ -20,15 +27,15 @@ def root(tmp_path: Path) -> Path:
 
 
 def test_structs_may_lie_in_a_row(root: Path) -> None:
-    column = table(prepared("idiap", root), "train")
+    column = table(prepare_data("idiap", root), "train")
     publish_idiap(root, column=False)
-    row = table(prepared("idiap", root), "train")
+    row = table(prepare_data("idiap", root), "train")
     assert torch.equal(row["input"], column["input"])
     assert torch.equal(row["target"], column["target"])
 
 
 def test_angles_are_chosen_and_ordered(root: Path) -> None:
-    data = prepared("idiap", root, angles=["roll", "pan", "roll"])
+    data = prepare_data("idiap", root, angles=["roll", "pan", "roll"])
     assert data.target.names == ("roll", "pan")
     expected = torch.tensor([[idiap_row(number)[3], idiap_row(number)[1]] for number in range(20)])
     torch.testing.assert_close(table(data, "train")["target"], expected)
@@ -47,14 +54,14 @@ def test_labels_in_the_wrong_unit_are_refused(root: Path) -> None:
         ]
         for split, numbers in (("train", range(20)), ("test", range(20, 31)))
     }
-    radians = table(prepared("idiap", root), "train")["target"]
+    radians = table(prepare_data("idiap", root), "train")["target"]
     with pytest.raises(DataError, match=r"looks like radians, but degrees .* Set data\.angles_in=radians"):
-        prepared("idiap", root, angles_in="degrees")
+        prepare_data("idiap", root, angles_in="degrees")
     save_idiap(root / LABELS, **in_degrees)
     with pytest.raises(DataError, match=r"look like degrees, but radians .* Set data\.angles_in=degrees"):
-        prepared("idiap", root)
+        prepare_data("idiap", root)
     torch.testing.assert_close(
-        table(prepared("idiap", root, angles_in="degrees"), "train")["target"], radians
+        table(prepare_data("idiap", root, angles_in="degrees"), "train")["target"], radians
     )
 
 
@@ -63,29 +70,29 @@ def test_label_file_that_is_cut_short_or_lacks_something_is_named(root: Path) ->
     for length in range(0, len(whole) - 1, 4999):
         (root / LABELS).write_bytes(whole[:length])
         with pytest.raises(DataError, match=r"or_label_full\.mat: cannot be read"):
-            prepared("idiap", root)
+            prepare_data("idiap", root)
     for missing in ("or_label_test", "or_label_train/roll"):
         (root / LABELS).write_bytes(whole)
         with h5py.File(root / LABELS, "r+") as content:
             del content[missing]
         with pytest.raises(DataError, match=missing.split("/")[-1]):
-            prepared("idiap", root)
+            prepare_data("idiap", root)
     (root / LABELS).write_bytes(whole)
     with h5py.File(root / LABELS, "r+") as content:
         shorter = content["or_label_train/tilt"][:19]
         del content["or_label_train/tilt"]
         content["or_label_train/tilt"] = shorter
     with pytest.raises(DataError, match=r"fields of or_label_train have different lengths: .*'tilt': 19"):
-        prepared("idiap", root)
+        prepare_data("idiap", root)
 
 
 @pytest.mark.parametrize("angle", [math.nan, math.inf])
 def test_angle_that_is_not_finite_is_never_skipped(root: Path, angle: float) -> None:
     publish_idiap(root, or_label_train=[idiap_row(0), ("head_1.png", 0.5, angle, 0.25)])
     with pytest.raises(DataError, match=rf"1 images have an angle .*\n.*head_1\.png: 0\.5, {angle}, 0\.25"):
-        prepared("idiap", root, skip_unreadable=True)
+        prepare_data("idiap", root, skip_unreadable=True)
     # without tilt among the angles, that label is good
-    assert len(table(prepared("idiap", root, angles=["pan"]), "train")["input"]) == 2
+    assert len(table(prepare_data("idiap", root, angles=["pan"]), "train")["input"]) == 2
 
 
 def test_labels_are_written_in_the_layout_of_matlab(tmp_path: Path) -> None:
@@ -108,7 +115,7 @@ def test_labels_of_the_generated_set_are_the_random_poses(
 ) -> None:
     monkeypatch.setenv("FRAMEWORK_CACHE", str(tmp_path))
     # angles_in is for a user's own label file and has no effect on generated labels
-    data = prepared("idiap", None, images=60, angles_in="degrees")
+    data = prepare_data("idiap", None, images=60, angles_in="degrees")
     poses = []
     for number in range(38):
         random = np.random.default_rng([0, 0, number])

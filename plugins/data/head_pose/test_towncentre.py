@@ -11,7 +11,7 @@ from PIL import Image
 from framework.data import Splits
 from framework.errors import DataError
 from plugins.data.head_pose import synthetic_heads
-from plugins.data.head_pose.roots import PEOPLE, pixels, prepared, table, write_towncentre
+from plugins.data.head_pose.roots import PEOPLE, pixels, prepare_data, table, write_towncentre
 from plugins.data.head_pose.towncentre import IMAGES_PER_PERSON, random_pose
 from plugins.data.head_pose.towncentre_labels import Head, find_heads, read_label, split_by_person
 
@@ -24,7 +24,7 @@ def root(tmp_path: Path) -> Path:
 
 
 def test_people_are_split_as_the_authors_code_does(root: Path) -> None:
-    data = prepared("towncentre", root)
+    data = prepare_data("towncentre", root)
     np.random.seed(13)  # noqa: NPY002  (their code seeds the global generator)
     uniform = np.random.rand(PEOPLE)  # noqa: NPY002
     people = {
@@ -63,7 +63,7 @@ def test_split_does_not_depend_on_the_order_of_folders_and_keeps_the_shares() ->
 
 def test_heads_that_are_not_valid_are_left_out_and_counted(root: Path) -> None:
     (root / "person3" / "image_3_0.txt").write_text("pan = +1.00\nvalid = 0\n", encoding="utf-8")
-    data = prepared("towncentre", root)
+    data = prepare_data("towncentre", root)
     assert data.invalid == 1
     assert data.skipped == 0
     assert sum(len(table(data, split)["input"]) for split in SPLITS) == 2 * PEOPLE - 1
@@ -106,9 +106,9 @@ def test_the_message_names_a_file_that_holds_no_label(root: Path, content: bytes
     file = root / "person3" / "image_3_0.txt"
     file.write_bytes(content)
     with pytest.raises(DataError) as caught:
-        prepared("towncentre", root)
+        prepare_data("towncentre", root)
     assert f"1 of {2 * PEOPLE} samples cannot be read:\n  {file}: " in str(caught.value)
-    assert prepared("towncentre", root, skip_unreadable=True).skipped == 1
+    assert prepare_data("towncentre", root, skip_unreadable=True).skipped == 1
 
 
 def test_missing_damaged_and_doubtful_images_are_named_at_once_or_skipped(root: Path) -> None:
@@ -119,7 +119,7 @@ def test_missing_damaged_and_doubtful_images_are_named_at_once_or_skipped(root: 
     (root / "person6" / "image_6_0.txt").rename(root / "person6" / "other.txt")
     (root / "person6" / "image_6_0_17_0.png").rename(root / "person6" / "other.png")
     with pytest.raises(DataError) as caught:
-        prepared("towncentre", root)
+        prepare_data("towncentre", root)
     message = str(caught.value)
     assert message.startswith(f"4 of {2 * PEOPLE} samples cannot be read")
     for part in (
@@ -130,7 +130,7 @@ def test_missing_damaged_and_doubtful_images_are_named_at_once_or_skipped(root: 
         "data.skip_unreadable=true",
     ):
         assert part in message
-    data = prepared("towncentre", root, skip_unreadable=True)
+    data = prepare_data("towncentre", root, skip_unreadable=True)
     assert data.skipped == 4
     assert sum(len(table(data, split)["input"]) for split in SPLITS) == 2 * PEOPLE - 4
 
@@ -141,19 +141,19 @@ def test_pan_that_is_not_finite_is_refused(root: Path) -> None:
     with pytest.raises(
         DataError, match=r"image_3_0\.txt: .*Two lines are expected, `pan = ` with finite degrees"
     ):
-        prepared("towncentre", root)
-    prepared("towncentre", root, skip_unreadable=True)
+        prepare_data("towncentre", root)
+    prepare_data("towncentre", root, skip_unreadable=True)
 
 
 def test_the_message_about_a_wrong_layout_names_the_fault_and_the_remedy(root: Path, tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"nowhere does not exist .* Set data\.root to the unpacked Town"):
-        prepared("towncentre", tmp_path / "nowhere")
+        prepare_data("towncentre", tmp_path / "nowhere")
     with pytest.raises(DataError, match=r"has not the layout of .* Did you mean .*TownCentreHeadImages\?"):
-        prepared("towncentre", tmp_path)
+        prepare_data("towncentre", tmp_path)
     with pytest.raises(
         DataError, match=r"none of its folders holds a label file .* Unpack the whole archive"
     ):
-        prepared("towncentre", root / "person3")
+        prepare_data("towncentre", root / "person3")
 
 
 def test_empty_split(root: Path) -> None:
@@ -163,11 +163,11 @@ def test_empty_split(root: Path) -> None:
     with pytest.raises(
         DataError, match=r"split is empty \(4 images in all, 0 unreadable, 76 marked as not valid"
     ):
-        prepared("towncentre", root)
+        prepare_data("towncentre", root)
 
 
 def test_augment_mirrors_with_the_sign_of_pan(root: Path) -> None:
-    data = prepared("towncentre", root, jitter=0.0)
+    data = prepare_data("towncentre", root, jitter=0.0)
     batch = dict(table(data, "train"))
     torch.manual_seed(0)
     varied = data.augment(batch)
@@ -175,7 +175,7 @@ def test_augment_mirrors_with_the_sign_of_pan(root: Path) -> None:
     assert 10 < int(flipped.sum()) < len(flipped) - 10
     expected = torch.where(flipped[:, None], -batch["target"], batch["target"])
     assert torch.equal(varied["target"], expected)
-    off = prepared("towncentre", root, jitter=0.0, mirror=False)
+    off = prepare_data("towncentre", root, jitter=0.0, mirror=False)
     assert off.augment(batch) is batch
 
 
@@ -183,7 +183,7 @@ def test_labels_of_the_generated_set_are_the_random_poses(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("FRAMEWORK_CACHE", str(tmp_path))
-    data = prepared("towncentre", None, images=600)
+    data = prepare_data("towncentre", None, images=600)
     counts = [len(table(data, split)["input"]) for split in SPLITS]
     assert sum(counts) == 600 - data.invalid
     assert 3 < data.invalid < 40

@@ -34,7 +34,7 @@ def write_folder(root: Path, table: str | None = None, images: int = 40) -> Path
     return root
 
 
-def prepared(root: Path, **config: Any) -> ImagesWithAngles:
+def prepare_data(root: Path, **config: Any) -> ImagesWithAngles:
     config = {"name": "images_with_angles", "root": str(root), "image_size": 8, **config}
     data = schema.build("data", schema.resolve("data", config))
     data.prepare()
@@ -48,7 +48,7 @@ def fields(data: ImagesWithAngles, split: str) -> Mapping[str, torch.Tensor]:
 
 
 def test_whole_folder(tmp_path: Path) -> None:
-    data = prepared(write_folder(tmp_path))
+    data = prepare_data(write_folder(tmp_path))
     assert data.target.kind == "angle"
     assert data.target.names == ("pan", "tilt")  # the column `note` holds no numbers
     assert data.input_shape == (3, 8, 8)
@@ -68,7 +68,9 @@ def test_whole_folder(tmp_path: Path) -> None:
 
 def test_columns_splits_and_grey(tmp_path: Path) -> None:
     table = "file , split,yaw,roll\n000.png,train,370,5\n001.png,test,-190,6\n002.png,validation,0,7\n\n"
-    data = prepared(write_folder(tmp_path, table, 3), angle_columns=["roll", "yaw", "roll"], grayscale=True)
+    data = prepare_data(
+        write_folder(tmp_path, table, 3), angle_columns=["roll", "yaw", "roll"], grayscale=True
+    )
     assert data.target.names == ("roll", "yaw")
     assert data.input_shape == (1, 8, 8)
     for split, roll, yaw in (("train", 5, 10), ("test", 6, 170), ("validation", 7, 0)):
@@ -126,27 +128,27 @@ def table_with(line: str, header: str = "file,pan,tilt", index: int = 3) -> str:
 )
 def test_wrong_tables_are_refused(tmp_path: Path, table: str, message: str) -> None:
     with pytest.raises(DataError, match=message):
-        prepared(write_folder(tmp_path, table, 30))
+        prepare_data(write_folder(tmp_path, table, 30))
 
 
 def test_messages_about_missing_names_suggest_a_remedy(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"labels\.csv: no such file; expected a table .* data\.csv"):
-        prepared(write_folder(tmp_path), csv="labels.csv")
+        prepare_data(write_folder(tmp_path), csv="labels.csv")
     with pytest.raises(
         DataError, match=r"names the column 'pam', which .* does not have\. Did you mean 'pan'\?"
     ):
-        prepared(tmp_path, angle_columns=["pam"])
+        prepare_data(tmp_path, angle_columns=["pam"])
     with pytest.raises(DataError, match=r"column 'note': 'text' is no finite number"):
-        prepared(tmp_path, angle_columns=["note"])
+        prepare_data(tmp_path, angle_columns=["note"])
     with pytest.raises(DataError, match="angle_columns is empty"):
-        prepared(tmp_path, angle_columns=[])
+        prepare_data(tmp_path, angle_columns=[])
     with pytest.raises(
         DataError, match=r"data\.mirror names 'pam', which is no angle of the table\. Did you mean 'pan'\?"
     ):
-        prepared(tmp_path, mirror=["pam"])
+        prepare_data(tmp_path, mirror=["pam"])
     (tmp_path / "angles.csv").write_bytes("file,pan\nä.png,3".encode("latin-1"))
     with pytest.raises(DataError, match=r"angles\.csv: cannot be read .* Save it as UTF-8 text"):
-        prepared(tmp_path)
+        prepare_data(tmp_path)
 
 
 def test_table_written_by_a_spreadsheet(tmp_path: Path) -> None:
@@ -154,7 +156,7 @@ def test_table_written_by_a_spreadsheet(tmp_path: Path) -> None:
     text = "file,pan\r\n" + "".join(f'"{n:03d}.png", {10 * n}.5\r\n,\r\n' for n in range(40))
     write_folder(tmp_path)
     (tmp_path / "angles.csv").write_bytes(b"\xef\xbb\xbf" + text.encode())
-    data = prepared(tmp_path)
+    data = prepare_data(tmp_path)
     assert sum(len(fields(data, split)["index"]) for split in SPLITS) == 40
 
 
@@ -166,9 +168,9 @@ def test_radians_are_noticed(tmp_path: Path) -> None:
     values = np.linspace(-3.1, 3.1, 40).round(4).tolist()
     message = r"looks like radians, but degrees are expected\. Set data\.angles_in=radians"
     with pytest.raises(DataError, match=message):
-        prepared(write_folder(tmp_path, radians_table(values)))
+        prepare_data(write_folder(tmp_path, radians_table(values)))
     for unit, factor in (("radians", 1.0), ("degrees", math.pi / 180)):
-        data = prepared(tmp_path, angles_in=unit)
+        data = prepare_data(tmp_path, angles_in=unit)
         targets = torch.cat([fields(data, split)["target"] for split in SPLITS])
         expected = torch.tensor(values) * factor
         torch.testing.assert_close(targets.flatten().sort().values, expected.sort().values)
@@ -179,7 +181,7 @@ def test_radians_are_noticed(tmp_path: Path) -> None:
 )
 def test_small_degrees_are_not_refused_without_reason(tmp_path: Path, values: list[float]) -> None:
     rows = [f"{index:03d}.png,{value},{SPLITS[index % 3]}" for index, value in enumerate(values)]
-    prepared(write_folder(tmp_path, "file,pan,split\n" + "\n".join(rows)))
+    prepare_data(write_folder(tmp_path, "file,pan,split\n" + "\n".join(rows)))
 
 
 def test_augment_changes_the_sign_of_the_named_angles_only(tmp_path: Path) -> None:
@@ -187,19 +189,19 @@ def test_augment_changes_the_sign_of_the_named_angles_only(tmp_path: Path) -> No
         "input": torch.randint(0, 256, (64, 3, 8, 8), dtype=torch.uint8),
         "target": torch.rand(64, 2) + 0.1,
     }
-    data = prepared(write_folder(tmp_path), mirror=["tilt"], jitter=0.0)
+    data = prepare_data(write_folder(tmp_path), mirror=["tilt"], jitter=0.0)
     varied = data.augment(batch)
     flipped = (255 * varied["input"] - batch["input"].flip(-1)).abs().amax((1, 2, 3)) < 0.01
     assert 15 < int(flipped.sum()) < 50
     expected = torch.where(flipped[:, None], batch["target"] * torch.tensor([1.0, -1.0]), batch["target"])
     assert torch.equal(varied["target"], expected)
-    assert prepared(tmp_path, jitter=0.0).augment(batch) is batch
-    unmirrored = prepared(tmp_path).augment(batch)
+    assert prepare_data(tmp_path, jitter=0.0).augment(batch) is batch
+    unmirrored = prepare_data(tmp_path).augment(batch)
     assert torch.equal(unmirrored["target"], batch["target"])
 
 
 def test_read_gives_inputs_as_the_splits_hold_them(tmp_path: Path) -> None:
-    data = prepared(write_folder(tmp_path), grayscale=True)
+    data = prepare_data(write_folder(tmp_path), grayscale=True)
     names = [name for name in ("000.png", "001.png", "002.png", "003.png") if split_of(name) == "train"]
     read = data.read([tmp_path / name for name in names])
     assert isinstance(read, Fields)
@@ -222,4 +224,4 @@ def test_any_text_for_a_table_is_refused_with_a_sentence(
     root = tmp_path_factory.mktemp("any")
     (root / "angles.csv").write_text("file,pan\n" + text, encoding="utf-8", errors="replace", newline="")
     with pytest.raises(DataError):
-        prepared(root)
+        prepare_data(root)

@@ -62,8 +62,8 @@ def _check_arrays(file: Path, arrays: dict[str, np.ndarray]) -> Archive:
         )
     points, offset, label = arrays["points"], arrays["offset"], arrays["label"]
     identity = arrays.get("object_id", np.arange(len(label)))
-    whole = all(array.ndim == 1 and array.dtype.kind in "iu" for array in (offset, label, identity))
-    if points.dtype.kind != "f" or points.ndim != 2 or points.shape[1] != 3 or not whole:
+    integers = all(array.ndim == 1 and array.dtype.kind in "iu" for array in (offset, label, identity))
+    if points.dtype.kind != "f" or points.ndim != 2 or points.shape[1] != 3 or not integers:
         shapes = ", ".join(f"{name} {array.dtype} {array.shape}" for name, array in arrays.items())
         raise DataError(
             f"{file}: The arrays have other types or shapes than expected: {shorten(shapes)}. {REMEDY}"
@@ -78,17 +78,17 @@ def _check_arrays(file: Path, arrays: dict[str, np.ndarray]) -> Archive:
             f"each with one of the {len(label)} labels and {len(identity)} numbers in object_id. {REMEDY}"
         )
     classes = tuple(map(str, arrays["classes"].tolist()))
-    wrong = np.flatnonzero((label < 0) | (label >= len(classes)))
-    if len(wrong):
+    unknown_label = np.flatnonzero((label < 0) | (label >= len(classes)))
+    if len(unknown_label):
         raise DataError(
-            f"{file}: Object {wrong[0]} has label {label[wrong[0]]}, but there are only {len(classes)} classes. "
-            "Correct the label."
+            f"{file}: Object {unknown_label[0]} has label {label[unknown_label[0]]}, but there are only {len(classes)} "
+            "classes. Correct the label."
         )
-    bad = np.flatnonzero(~np.isfinite(points).all(1))
-    if len(bad):
-        number = int(np.searchsorted(offset, bad[0], side="right")) - 1
+    not_finite = np.flatnonzero(~np.isfinite(points).all(1))
+    if len(not_finite):
+        number = int(np.searchsorted(offset, not_finite[0], side="right")) - 1
         raise DataError(
-            f"{file}: Point {bad[0] - offset[number]} of object {number} has a coordinate that is not finite. "
+            f"{file}: Point {not_finite[0] - offset[number]} of object {number} has a coordinate that is not finite. "
             "Leave such points out of the archive."
         )
     return Archive(points, offset, label, identity.astype(np.int64), classes)

@@ -24,7 +24,7 @@ def data(request):
 
 
 @pytest.fixture
-def prepared(data):
+def prepare_data(data):
     """Return a function that builds and prepares the data set."""
 
     def make(**config):

@@ -20,9 +20,9 @@ def root(tmp_path):
     return Path(archive(tmp_path)["root"])
 
 
-def test_objects_are_cut_out_and_padded(prepared, root):
+def test_objects_are_cut_out_and_padded(prepare_data, root):
     arrays = objects()
-    dataset = prepared(root=root)
+    dataset = prepare_data(root=root)
     assert dataset.target.names == CLASSES
     assert dataset.input_shape == (int(np.diff(arrays["offset"]).max()), 3)
     assert (dataset.columns, dataset.varies) == (("x", "y", "z"), False)
@@ -38,10 +38,10 @@ def test_objects_are_cut_out_and_padded(prepared, root):
     assert sorted(numbers) == list(range(100, 133))  # each object is in one split
 
 
-def test_every_object_is_in_the_test_split_of_one_fold(prepared, root):
+def test_every_object_is_in_the_test_split_of_one_fold(prepare_data, root):
     numbers = []
     for fold in range(5):
-        splits = prepared(root=root, fold=fold, validation_share=0.2).splits()
+        splits = prepare_data(root=root, fold=fold, validation_share=0.2).splits()
         batch = splits.test.__getitems__(range(len(splits.test)))
         numbers += batch["object"].tolist()
         counts = torch.bincount(batch["target"], minlength=3)
@@ -53,15 +53,15 @@ def test_every_object_is_in_the_test_split_of_one_fold(prepared, root):
         )
     assert sorted(numbers) == list(range(100, 133))
     assert (
-        prepared(root=root).fingerprint()["sha256"]
-        != prepared(root=root, data_seed=1).fingerprint()["sha256"]
+        prepare_data(root=root).fingerprint()["sha256"]
+        != prepare_data(root=root, data_seed=1).fingerprint()["sha256"]
     )
 
 
-def test_the_points_of_larger_objects_do_not_depend_on_the_fold(prepared, root):
+def test_the_points_of_larger_objects_do_not_depend_on_the_fold(prepare_data, root):
     clouds, sizes = {}, np.diff(objects()["offset"])
     for fold in (0, 1):
-        dataset = prepared(root=root, points=10, fold=fold)
+        dataset = prepare_data(root=root, points=10, fold=fold)
         assert dataset.input_shape == (10, 3)
         for split in dataset.splits():
             for number in range(len(split)):
@@ -108,30 +108,30 @@ def with_change(name, change):
         ),
     ],
 )
-def test_another_archive_is_refused(prepared, tmp_path, change, message):
+def test_another_archive_is_refused(prepare_data, tmp_path, change, message):
     arrays = objects()
     assert arrays["offset"][1] > 7  # so that point 7 belongs to object 0
     np.savez(tmp_path / "objects.npz", **change(arrays))
     with pytest.raises(DataError, match=message):
-        prepared(root=tmp_path / "objects.npz")
+        prepare_data(root=tmp_path / "objects.npz")
 
 
-def test_other_archives_are_refused(data, prepared, tmp_path):
+def test_other_archives_are_refused(data, prepare_data, tmp_path):
     with pytest.raises(DataError, match=r"data\.root is not set\. .* github\.com/ATRM-Raphael/geo5017_A2"):
         data().prepare()
     np.save(tmp_path / "array.npy", np.zeros(3))
     with pytest.raises(DataError, match="the file is a single array"):
-        prepared(root=tmp_path / "array.npy")
+        prepare_data(root=tmp_path / "array.npy")
 
 
-def test_a_class_of_few_objects_keeps_its_training_samples(prepared, tmp_path):
+def test_a_class_of_few_objects_keeps_its_training_samples(prepare_data, tmp_path):
     np.savez(tmp_path / "objects.npz", **objects((30, 5)))
-    dataset = prepared(root=tmp_path / "objects.npz", fold=2)
+    dataset = prepare_data(root=tmp_path / "objects.npz", fold=2)
     assert torch.bincount(dataset.splits().train.fields.fields["target"], minlength=2).min() >= 1
 
 
 @pytest.mark.skipif("REAL_DATA_ROOT" not in os.environ, reason="REAL_DATA_ROOT is not set")
-def test_distances_to_fixed_points_distinguish_the_real_objects(prepared):
+def test_distances_to_fixed_points_distinguish_the_real_objects(prepare_data):
     random = np.random.default_rng(0)
     basis = random.normal(size=(128, 3))
     basis *= random.random((128, 1)) ** (1 / 3) / np.linalg.norm(basis, axis=1, keepdims=True)
@@ -146,7 +146,7 @@ def test_distances_to_fixed_points_distinguish_the_real_objects(prepared):
             rows.append(cKDTree(points).query(basis)[0])
         return np.array(rows), split.fields.fields["target"].numpy()
 
-    dataset = prepared(root=Path(os.environ["REAL_DATA_ROOT"]) / "clouds" / "dales500.npz", points=2000)
+    dataset = prepare_data(root=Path(os.environ["REAL_DATA_ROOT"]) / "clouds" / "dales500.npz", points=2000)
     assert dataset.target.names == ("building", "car", "fence", "pole", "tree")
     train, validation, test = dataset.splits()
     assert (len(train), len(validation), len(test)) == (339, 60, 100)

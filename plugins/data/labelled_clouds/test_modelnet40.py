@@ -32,9 +32,9 @@ def write_official(folder):
     return folder
 
 
-def test_splits_labels_and_attributes(prepared, tmp_path):
+def test_splits_labels_and_attributes(prepare_data, tmp_path):
     root = write_official(tmp_path / "ModelNet40")
-    clouds = prepared(root=root, points=64, validation_share=0.2)
+    clouds = prepare_data(root=root, points=64, validation_share=0.2)
     assert clouds.target.kind == "class"
     assert clouds.target.names == ("box", "crate", "cube")
     assert clouds.input_shape == (64, 3)
@@ -52,30 +52,30 @@ def test_splits_labels_and_attributes(prepared, tmp_path):
     assert (fingerprint["train"], fingerprint["version"]) == ("12", "ModelNet40")
 
 
-def test_the_points_of_a_file_do_not_depend_on_other_files(data, prepared, tmp_path):
+def test_the_points_of_a_file_do_not_depend_on_other_files(data, prepare_data, tmp_path):
     root = write_official(tmp_path / "ModelNet40")
     file = root / "cube" / "test" / "cube_0006.off"
     expected = sample(read(file), 64, stream(7, "cube_0006.off")).points.astype(np.float32)
     for config in ({}, {"classes": ["cube", "box"]}):
-        clouds = prepared(root=root, points=64, data_seed=7, **config)
+        clouds = prepare_data(root=root, points=64, data_seed=7, **config)
         last = clouds.splits().test[len(clouds.splits().test) - 1]
         np.testing.assert_array_equal(last["input"], expected)
     unlabelled = data(points=64, data_seed=7).read([file])  # without prepare
     np.testing.assert_array_equal(unlabelled[0]["input"], expected)
 
 
-def test_the_second_run_reads_no_mesh(prepared, tmp_path, monkeypatch):
+def test_the_second_run_reads_no_mesh(prepare_data, tmp_path, monkeypatch):
     root = write_official(tmp_path / "ModelNet40")
-    first = prepared(root=root, points=32)
+    first = prepare_data(root=root, points=32)
     monkeypatch.setitem(READERS, ".off", None)
-    again = prepared(root=root, points=32)
+    again = prepare_data(root=root, points=32)
     assert torch.equal(
         first.splits().train.__getitems__([3, 1])["input"], again.splits().train.__getitems__([3, 1])["input"]
     )
 
 
-def test_normals_are_those_of_the_faces(prepared, tmp_path):
-    clouds = prepared(root=write_official(tmp_path / "ModelNet40"), points=50, normals=True)
+def test_normals_are_those_of_the_faces(prepare_data, tmp_path):
+    clouds = prepare_data(root=write_official(tmp_path / "ModelNet40"), points=50, normals=True)
     assert clouds.columns == ("x", "y", "z", "normal_x", "normal_y", "normal_z")
     assert clouds.input_shape == (50, 6)
     inputs = clouds.splits().train.__getitems__(range(len(clouds.splits().train)))["input"]
@@ -86,10 +86,10 @@ def test_normals_are_those_of_the_faces(prepared, tmp_path):
     torch.testing.assert_close(inputs[..., 3:], outwards, atol=1e-6, rtol=0)
 
 
-def test_the_whole_training_split_can_be_used_for_training(prepared, tmp_path):
+def test_the_whole_training_split_can_be_used_for_training(prepare_data, tmp_path):
     """Check that nothing is held out, as in the thesis, and that validation uses unrotated training clouds."""
     config = {"root": write_official(tmp_path / "ModelNet40"), "points": 40}
-    whole, held_out = prepared(**config, validation_share=0, rotations=2), prepared(**config)
+    whole, held_out = prepare_data(**config, validation_share=0, rotations=2), prepare_data(**config)
     train, validation, test = whole.splits()
     assert len(validation) == len(held_out.splits().train) + len(held_out.splits().validation)
     assert len(train) == 2 * len(validation)
@@ -98,9 +98,9 @@ def test_the_whole_training_split_can_be_used_for_training(prepared, tmp_path):
     assert len(test) == len(held_out.splits().test)
 
 
-def test_rotations_repeat_the_training_split_about_the_up_axis(prepared, tmp_path):
+def test_rotations_repeat_the_training_split_about_the_up_axis(prepare_data, tmp_path):
     config = {"root": write_official(tmp_path / "ModelNet40"), "points": 40, "normals": True}
-    plain, rotated = prepared(**config), prepared(**config, rotations=3)
+    plain, rotated = prepare_data(**config), prepare_data(**config, rotations=3)
     count = len(plain.splits().train)
     assert len(rotated.splits().train) == 3 * count
     assert len(rotated.splits().test) == len(plain.splits().test)
@@ -126,22 +126,22 @@ def test_rotations_repeat_the_training_split_about_the_up_axis(prepared, tmp_pat
         rotated.splits().train[3 * count]
 
 
-def test_other_layouts_and_classes_are_refused(prepared, tmp_path):
+def test_other_layouts_and_classes_are_refused(prepare_data, tmp_path):
     root = write_official(tmp_path / "ModelNet40")
     with pytest.raises(DataError, match="the folder ModelNet40 has no folders train and test"):
-        prepared(root=tmp_path)
+        prepare_data(root=tmp_path)
     with pytest.raises(DataError, match=r"names 'crat', which .* Did you mean 'crate'"):
-        prepared(root=root, classes=["crat", "box"])
+        prepare_data(root=root, classes=["crat", "box"])
     with pytest.raises(DataError, match=r"at least two classes are required\. Choose from box, crate, cube"):
-        prepared(root=root, classes=["box"])
+        prepare_data(root=root, classes=["box"])
     for file in (root / "crate" / "test").iterdir():
         file.unlink()
     with pytest.raises(DataError, match=r"crate/test holds no \.off file"):
-        prepared(root=root)
+        prepare_data(root=root)
 
 
-def test_without_a_root_every_class_is_generated(prepared):
-    clouds = prepared(points=128, **SIZES)
+def test_without_a_root_every_class_is_generated(prepare_data):
+    clouds = prepare_data(points=128, **SIZES)
     assert len(clouds.target.names) == len(CLASSES) == 40
     assert clouds.fingerprint()["root"] == "synthetic, seed 0"
     assert torch.bincount(clouds.splits().test.fields.fields["target"]).tolist() == [2] * len(CLASSES)

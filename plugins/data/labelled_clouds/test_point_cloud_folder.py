@@ -47,13 +47,13 @@ def write_every_format(folder, name, height):
     np.savez(folder / f"{name}.npz", points=corners)
 
 
-def test_every_format_is_read_and_clouds_keep_their_sizes(prepared, tmp_path):
+def test_every_format_is_read_and_clouds_keep_their_sizes(prepare_data, tmp_path):
     for number, name in enumerate(("low", "high")):
         for height in (0, 10):
             write_every_format(tmp_path / name, f"t{height}", 100.0 * number + height)
     (tmp_path / "low" / "t0.mtl").write_text("a companion")
     (tmp_path / "low" / ".hidden").write_text("")
-    dataset = prepared(root=tmp_path, validation=0.2, test=0.2)
+    dataset = prepare_data(root=tmp_path, validation=0.2, test=0.2)
     assert dataset.target.names == ("high", "low")
     assert dataset.input_shape == (2048, 3)
     assert dataset.columns == ("x", "y", "z")
@@ -73,12 +73,12 @@ def test_every_format_is_read_and_clouds_keep_their_sizes(prepared, tmp_path):
     assert sizes == [16, 6, 6]  # of 28 files
 
 
-def test_folders_determine_the_splits(prepared, tmp_path):
+def test_folders_determine_the_splits(prepare_data, tmp_path):
     for split, count in (("train", 3), ("validation", 2), ("test", 1)):
         for name in "ab":
             for number in range(count):
                 cloud_file(tmp_path / split / name / f"{split}{number}.xyz", points=10 * count + number)
-    dataset = prepared(root=tmp_path)
+    dataset = prepare_data(root=tmp_path)
     assert [len(split) for split in dataset.splits()] == [6, 4, 2]
     assert dataset.input_shape == (32, 3)
     batch = dataset.splits().train.__getitems__(range(6))
@@ -87,19 +87,19 @@ def test_folders_determine_the_splits(prepared, tmp_path):
 
 
 @pytest.mark.parametrize("layout", ["{split}/{name}", "{name}/{split}"])
-def test_the_validation_split_is_random_without_a_folder_for_it(prepared, tmp_path, layout):
+def test_the_validation_split_is_random_without_a_folder_for_it(prepare_data, tmp_path, layout):
     for split, count in (("train", 5), ("test", 2)):
         for name in "ab":
             for number in range(count):
                 cloud_file(tmp_path / layout.format(split=split, name=name) / f"{number}.xyz", 5 + number)
-    dataset = prepared(root=tmp_path, validation=0.2)
+    dataset = prepare_data(root=tmp_path, validation=0.2)
     assert [len(split) for split in dataset.splits()] == [8, 2, 4]
     assert sorted(dataset.splits().validation.fields.fields["target"].tolist()) == [0, 1]
-    other = prepared(root=tmp_path, validation=0.2, data_seed=1)
+    other = prepare_data(root=tmp_path, validation=0.2, data_seed=1)
     assert dataset.fingerprint()["sha256"] != other.fingerprint()["sha256"]
 
 
-def test_without_a_validation_share_the_training_split_is_used(prepared, tmp_path):
+def test_without_a_validation_share_the_training_split_is_used(prepare_data, tmp_path):
     for split in ("train", "test"):
         for name in "ab":
             cloud_file(tmp_path / name / split / "cloud.xyz")
@@ -107,61 +107,61 @@ def test_without_a_validation_share_the_training_split_is_used(prepared, tmp_pat
         DataError,
         match=r"validation split is empty .* At least one sample of each class is used for training",
     ):
-        prepared(root=tmp_path)
-    dataset = prepared(root=tmp_path, validation=0)
+        prepare_data(root=tmp_path)
+    dataset = prepare_data(root=tmp_path, validation=0)
     assert [len(split) for split in dataset.splits()] == [2, 2, 2]
 
 
-def test_larger_clouds_are_subsampled(prepared, tmp_path):
+def test_larger_clouds_are_subsampled(prepare_data, tmp_path):
     for name in "ab":
         for points in (5, 50, 60):
             cloud_file(tmp_path / name / f"{points}.xyz", points)
-    dataset = prepared(root=tmp_path, points=20, validation=0.3, test=0.3)
+    dataset = prepare_data(root=tmp_path, points=20, validation=0.3, test=0.3)
     assert dataset.input_shape == (20, 3)
     batches = [split.__getitems__(range(len(split))) for split in dataset.splits()]
     sizes = [size for batch in batches for size in (~batch["input"].isnan().all(-1)).sum(1).tolist()]
     assert sorted(sizes) == [5, 5, 20, 20, 20, 20]
 
 
-def test_the_columns_are_the_configured_ones(prepared, tmp_path):
+def test_the_columns_are_the_configured_ones(prepare_data, tmp_path):
     for name, red in (("a", 0.25), ("b", 0.75)):
         for number in range(3):
             cloud_file(tmp_path / name / f"{number}.xyz", 10, red)
     config = {"validation": 0.3, "test": 0.3}
-    assert prepared(root=tmp_path, **config).input_shape == (10, 3)
-    dataset = prepared(root=tmp_path, columns=["x", "red"], **config)
+    assert prepare_data(root=tmp_path, **config).input_shape == (10, 3)
+    dataset = prepare_data(root=tmp_path, columns=["x", "red"], **config)
     assert dataset.columns == ("x", "y", "z", "red")
     batch = dataset.splits().train.__getitems__([0, 1])
     assert (batch["input"][..., 3] == 0.25 + 0.5 * batch["target"][:, None]).all()
     assert dataset.read([tmp_path / "a" / "1.xyz"])[0]["input"].shape == (10, 4)
     with pytest.raises(DataError, match=r"(?s)6 of 6 samples.*no column 'rad'\. Did you mean 'red'"):
-        prepared(root=tmp_path, columns=["rad"], **config)
+        prepare_data(root=tmp_path, columns=["rad"], **config)
 
 
-def test_a_clouds_mean_is_subtracted_before_it_is_rounded(prepared, tmp_path):
+def test_a_clouds_mean_is_subtracted_before_it_is_rounded(prepare_data, tmp_path):
     for name in "ab":
         for number in range(3):
             file = cloud_file(tmp_path / name / f"{number}.xyz", 40 + number)
             np.savetxt(file, np.loadtxt(file, skiprows=1) + np.array([4e8, 5e8, 0]))
     with pytest.raises(DataError, match=r"data\.centred=true"):
-        prepared(root=tmp_path)
-    dataset = prepared(root=tmp_path, centred=True, validation=0.3, test=0.3)
+        prepare_data(root=tmp_path)
+    dataset = prepare_data(root=tmp_path, centred=True, validation=0.3, test=0.3)
     cloud = dataset.splits().test[0]["input"]
     assert cloud.mean(0).abs().max() < 1e-6
     assert 0.5 < cloud.std() < 1.5
 
 
-def test_unreadable_files_are_refused_or_skipped_and_counted(prepared, tmp_path):
+def test_unreadable_files_are_refused_or_skipped_and_counted(prepare_data, tmp_path):
     for name in "ab":
         for number in range(4):
             cloud_file(tmp_path / name / f"{number}.xyz")
     (tmp_path / "b" / "4.xyz").write_text("1 2 3\n4 5 nan\n")
     (tmp_path / "a" / "4.ply").write_text("no ply")
     with pytest.raises(
-        DataError, match=r"(?s)2 of 10 samples cannot.*4\.ply.*first point 1.*data\.unreadable=skip"
+        DataError, match=r"(?s)2 of 10 samples cannot.*4\.ply.*first is point 1.*data\.unreadable=skip"
     ):
-        prepared(root=tmp_path)
-    assert prepared(root=tmp_path, unreadable="skip", validation=0.25, test=0.25).skipped == 2
+        prepare_data(root=tmp_path)
+    assert prepare_data(root=tmp_path, unreadable="skip", validation=0.25, test=0.25).skipped == 2
 
 
 def test_own_files_are_read_without_prepare(data, tmp_path):
@@ -176,54 +176,54 @@ def test_own_files_are_read_without_prepare(data, tmp_path):
         data().read([tmp_path / "t.gltf"])
 
 
-def test_other_layouts_are_refused(prepared, tmp_path):
+def test_other_layouts_are_refused(prepare_data, tmp_path):
     with pytest.raises(DataError, match=r"0 classes \(no folder\)"):
-        prepared(root=tmp_path)
+        prepare_data(root=tmp_path)
     cloud_file(tmp_path / "a" / "1.xyz")
     with pytest.raises(DataError, match=r"1 classes \(a\), but at least two"):
-        prepared(root=tmp_path)
+        prepare_data(root=tmp_path)
     (tmp_path / "b").mkdir()
     (tmp_path / "b" / "notes.txt").write_text("")
     with pytest.raises(DataError, match=r"b holds no file that can be read, but notes\.txt"):
-        prepared(root=tmp_path)
+        prepare_data(root=tmp_path)
     cloud_file(tmp_path / "b" / "deep" / "1.xyz")
     with pytest.raises(DataError, match=r"b holds further folders \(deep\)"):
-        prepared(root=tmp_path)
+        prepare_data(root=tmp_path)
     for split in ("train", "test"):
         cloud_file(tmp_path / "c" / split / "1.xyz")
     with pytest.raises(DataError, match="a has no folders train and test, but others have"):
-        prepared(root=tmp_path)
+        prepare_data(root=tmp_path)
 
 
 @pytest.mark.parametrize(
     "folder, message", [("val", "holds a folder val beside"), (None, "holds no folder test")]
 )
-def test_incomplete_splits_are_refused(prepared, tmp_path, folder, message):
+def test_incomplete_splits_are_refused(prepare_data, tmp_path, folder, message):
     for split in filter(None, ("train", folder, "test" if folder else None)):
         for name in "ab":
             cloud_file(tmp_path / split / name / "1.xyz")
     with pytest.raises(DataError, match=message):
-        prepared(root=tmp_path)
+        prepare_data(root=tmp_path)
 
 
-def test_a_class_without_a_training_sample_is_refused(prepared, tmp_path):
+def test_a_class_without_a_training_sample_is_refused(prepare_data, tmp_path):
     for split, names in (("train", "ab"), ("validation", "ab"), ("test", "abc")):
         for name in names:
             cloud_file(tmp_path / split / name / "1.xyz")
     with pytest.raises(DataError, match="The class c has no training sample"):
-        prepared(root=tmp_path)
+        prepare_data(root=tmp_path)
 
 
-def test_too_large_shares_and_a_missing_root_are_refused(data, prepared, tmp_path):
+def test_too_large_shares_and_a_missing_root_are_refused(data, prepare_data, tmp_path):
     with pytest.raises(DataError, match=r"data\.validation \+ data\.test = 1\.2"):
-        prepared(root=tmp_path, validation=0.6, test=0.6)
+        prepare_data(root=tmp_path, validation=0.6, test=0.6)
     with pytest.raises(DataError, match=r"data\.root is not set"):
         data().prepare()
 
 
 @pytest.mark.skipif("REAL_DATA_ROOT" not in os.environ, reason="REAL_DATA_ROOT is not set")
 @pytest.mark.parametrize("name", ["point_cloud_folder", "modelnet40"])
-def test_the_real_shapes(prepared, tmp_path, name):
+def test_the_real_shapes(prepare_data, tmp_path, name):
     with zipfile.ZipFile(
         Path(os.environ["REAL_DATA_ROOT"]) / "clouds" / "geometric_shapes_off.zip"
     ) as archive:
@@ -235,7 +235,7 @@ def test_the_real_shapes(prepared, tmp_path, name):
         with pytest.raises(DataError, match="validation split is empty"):
             build("data", resolve("data", config)).prepare()
         return
-    shapes = prepared(root=tmp_path / "raw", validation=0, points=256)
+    shapes = prepare_data(root=tmp_path / "raw", validation=0, points=256)
     assert len(shapes.target.names) == 40
     batch = shapes.splits().test.__getitems__(range(40))
     assert sorted(batch["target"].tolist()) == list(range(40))
@@ -251,12 +251,12 @@ def test_the_real_shapes(prepared, tmp_path, name):
     assert math.isfinite(float(extent.sum()))
 
 
-def test_remarks_name_the_columns_that_are_not_read(prepared, tmp_path):
+def test_remarks_name_the_columns_that_are_not_read(prepare_data, tmp_path):
     for number, name in enumerate(("low", "high")):
         (tmp_path / name).mkdir()
         for sample in range(8):
             rows = "\n".join(f"{number} {row} {sample} 0.5 7" for row in range(5))
             (tmp_path / name / f"{sample}.xyz").write_text(f"x y z red heat\n{rows}\n")
     remark = "left out: the columns red, heat of 0.xyz; list them in data.columns to read them"
-    assert prepared(root=tmp_path, validation=0.2, test=0.2).remarks == (remark,)
-    assert not prepared(root=tmp_path, validation=0.2, test=0.2, columns=["red", "heat"]).remarks
+    assert prepare_data(root=tmp_path, validation=0.2, test=0.2).remarks == (remark,)
+    assert not prepare_data(root=tmp_path, validation=0.2, test=0.2, columns=["red", "heat"]).remarks

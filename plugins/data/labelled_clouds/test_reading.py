@@ -127,14 +127,14 @@ def test_points_depend_on_the_name_and_not_on_the_order(folder):
     assert not torch.equal(points[:5], points[5:])
 
 
-def packed(*sizes):
+def pack_clouds(*sizes):
     """Return clouds of these sizes."""
     table = torch.arange(float(3 * sum(sizes))).reshape(-1, 3)
     return Packed(table, torch.tensor([0, *np.cumsum(sizes).tolist()]))
 
 
 def test_a_batch_is_padded_to_its_own_largest_cloud():
-    clouds = Clouds(packed(2, 5, 1, 3), np.array([3, 0, 2]), target=torch.tensor([7, 8, 9]))
+    clouds = Clouds(pack_clouds(2, 5, 1, 3), np.array([3, 0, 2]), target=torch.tensor([7, 8, 9]))
     assert len(clouds) == 3
     assert clouds.packed.largest() == 5
     batch = clouds.__getitems__([2, 0])

@@ -21,7 +21,7 @@ from plugins.data.moons.points import SIDE
 DEFAULT = 0.37
 
 
-def prepared(name: str = "moons", **config: Any) -> Any:
+def prepare_data(name: str = "moons", **config: Any) -> Any:
     data = build("data", resolve("data", {"name": name, **config}))
     data.prepare()
     return data
@@ -178,7 +178,7 @@ def test_draws_follow_the_density() -> None:
 
 def test_the_splits_are_independent_and_depend_on_the_data_seed_alone() -> None:
     data, other, larger = (
-        prepared(**config) for config in ({}, {"data_seed": 1}, {"train": 800, "test": 10})
+        prepare_data(**config) for config in ({}, {"data_seed": 1}, {"train": 800, "test": 10})
     )
     tables = {name: split.fields for name, split in data.splits()._asdict().items()}
     assert [len(table["index"]) for table in tables.values()] == [500, 500, 5000]
@@ -206,7 +206,7 @@ def class_means(table: dict[str, torch.Tensor], label: torch.Tensor) -> torch.Te
 
 
 def test_a_batch_holds_labels_and_the_posterior_of_its_points() -> None:
-    data = prepared(test=101, noise=0.2)
+    data = prepare_data(test=101, noise=0.2)
     batch = data.splits().test.__getitems__([0, 3, 100])
     assert data.target.kind == "class"
     assert data.target.names == ("upper", "lower")
@@ -217,7 +217,7 @@ def test_a_batch_holds_labels_and_the_posterior_of_its_points() -> None:
 
 
 def test_outliers_lie_far_from_both_moons() -> None:
-    data = prepared("moons_outliers")
+    data = prepare_data("moons_outliers")
     points = np.concatenate([split.fields["input"].double().numpy() for split in data.splits()])
     assert len(points) == 500 + 500 + 1000
     corner = np.where(points[:, :1] < 0, 1, -1) * np.array([-3.2, 3.2])
@@ -235,15 +235,15 @@ def test_outliers_lie_far_from_both_moons() -> None:
     assert np.exp(logsumexp(log_density(plane(0.05), DEFAULT), axis=-1)).max() / 2 == pytest.approx(
         0.12, abs=5e-4
     )
-    turn = np.linspace(0, math.pi, 721)
-    arc = np.stack([np.cos(turn), np.sin(turn)], -1)
+    angle = np.linspace(0, math.pi, 721)
+    arc = np.stack([np.cos(angle), np.sin(angle)], -1)
     gap = np.linalg.norm((edge * scale(DEFAULT) + CENTRE)[:, None] - arc, axis=-1).min() / DEFAULT
     assert 5 < gap < 5.1
     assert 1 - posterior(edge, DEFAULT)[:, 0].min() < 4e-6
 
 
 def test_outliers_have_the_shapes_of_moons_and_independent_splits() -> None:
-    moons, outliers = prepared(), prepared("moons_outliers", radius=0.0, corner=10.0, test=3)
+    moons, outliers = prepare_data(), prepare_data("moons_outliers", radius=0.0, corner=10.0, test=3)
     assert (outliers.target, outliers.input_shape) == (moons.target, moons.input_shape)
     test = outliers.splits().test.fields
     assert test["input"].tolist() == [[-10, 10], [10, -10], [-10, 10]]
@@ -251,7 +251,7 @@ def test_outliers_have_the_shapes_of_moons_and_independent_splits() -> None:
     firsts = {
         tuple(split.fields["input"][0].tolist())
         for seed in (0, 1)
-        for split in prepared("moons_outliers", data_seed=seed).splits()
+        for split in prepare_data("moons_outliers", data_seed=seed).splits()
     }
     assert len(firsts) == 6
 
@@ -279,14 +279,14 @@ def test_a_users_points_are_read_without_prepare(name: str, tmp_path: Path) -> N
 
 @pytest.mark.parametrize("name", ["moons", "moons_outliers"])
 def test_a_picture_marks_the_point_in_the_cloud(name: str) -> None:
-    data = prepared(name)
+    data = prepare_data(name)
     for point, row, column in (([0.0, 0.0], 47, 48), ([-4.0, 4.0], 0, 0), ([1e9, -1e9], 95, 95)):
-        picture = data.preview(torch.tensor(point))
-        assert picture.shape == (SIDE, SIDE, 3)
-        black = np.argwhere((picture == 0).all(-1))
+        image = data.preview(torch.tensor(point))
+        assert image.shape == (SIDE, SIDE, 3)
+        black = np.argwhere((image == 0).all(-1))
         assert [row, column] in black.tolist()
         assert np.abs(black - [row, column]).max() == 4
-        assert len(np.unique(picture.reshape(-1, 3), axis=0)) == 4  # white, two classes, the cross
+        assert len(np.unique(image.reshape(-1, 3), axis=0)) == 4  # white, two classes, the cross
 
 
 @pytest.mark.parametrize(

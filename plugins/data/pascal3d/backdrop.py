@@ -18,12 +18,12 @@ def texture(random: Generator, height: int, width: int) -> FloatImage:
         grid = random.random((cells, cells), dtype=np.float32) - np.float32(0.5)
         noise += weight * np.asarray(Image.fromarray(grid).resize((width, height), Image.Resampling.BICUBIC))
     share = np.clip(noise + np.float32(0.5), 0, 1)[..., None]
-    first = muted(random)
+    first = muted_color(random)
     second = np.clip(first + random.normal(0, 0.2, 3).astype(np.float32), 0, 1)
     return np.asarray(first + share * (second - first), dtype=np.float32)
 
 
-def muted(random: Generator) -> FloatImage:
+def muted_color(random: Generator) -> FloatImage:
     """Return a random colour (3,) of any brightness and little saturation."""
     grey = random.uniform(0.12, 0.9)
     return np.clip(grey + random.normal(0, 0.1, 3), 0, 1).astype(np.float32)
@@ -50,7 +50,7 @@ def background(
         ground = sky + share * (ground - sky)
     for _ in range(int(random.integers(0, 5))):
         mask = blob(random, height, width, (random.uniform(0, width), random.uniform(0, height)), 0.5 * width)
-        ground += 0.85 * mask[..., None] * (muted(random) - ground)
+        ground += 0.85 * mask[..., None] * (muted_color(random) - ground)
     return ground
 
 

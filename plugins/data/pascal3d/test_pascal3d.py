@@ -42,7 +42,7 @@ def root(shared_root: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(shared_root, tmp_path / "root"))
 
 
-def prepared(root: Path | None, **config: Any) -> Pascal3D:
+def prepare_data(root: Path | None, **config: Any) -> Pascal3D:
     config = {"name": "pascal3d", "root": root and str(root), **config}
     data = schema.build("data", schema.resolve("data", config))
     data.prepare()
@@ -264,7 +264,7 @@ def test_lists(tmp_path: Path) -> None:
 
 def test_reading_a_generated_root_gives_the_drawn_objects(shared_root: Path, renderer: Renderer) -> None:
     """Compare with images that are drawn again, to which this test applies the protocol itself."""
-    data = prepared(shared_root)
+    data = prepare_data(shared_root)
     assert data.synthetic
     expected: dict[str, list[tuple[float, ...]]] = {"training": [], "test": []}
     left_out = {"without a fine label": 0, "difficult": 0, "truncated or occluded": 0}
@@ -299,7 +299,7 @@ def test_reading_a_generated_root_gives_the_drawn_objects(shared_root: Path, ren
 
 
 def test_fields_of_a_batch(shared_root: Path) -> None:
-    data = prepared(shared_root, image_size=32)
+    data = prepare_data(shared_root, image_size=32)
     fields = table(data, "train")
     count = len(data.splits().train)  # type: ignore[arg-type]
     assert data.input_shape == (3, 32, 32)
@@ -313,7 +313,7 @@ def test_fields_of_a_batch(shared_root: Path) -> None:
 
 def test_crop_holds_the_object_and_its_margin(shared_root: Path) -> None:
     """Compare a crop with pixels of the image that this test selects itself, about the middle of the box."""
-    data = prepared(shared_root, margin=0.25, image_size=64)
+    data = prepare_data(shared_root, margin=0.25, image_size=64)
     first = layout.read_list(shared_root / VOC_LISTS / "car_val.txt")
     annotation = next(
         car
@@ -355,7 +355,7 @@ def test_whole_images_are_held_out_independent_of_their_order(shared_root: Path)
 
 
 def test_occluded_objects_can_be_used_for_training_but_never_for_the_test(shared_root: Path) -> None:
-    without, including = prepared(shared_root), prepared(shared_root, include_occluded=True)
+    without, including = prepare_data(shared_root), prepare_data(shared_root, include_occluded=True)
     counts = [
         len(table(d, "train")["index"]) + len(table(d, "validation")["index"]) for d in (without, including)
     ]
@@ -368,21 +368,21 @@ def test_occluded_objects_can_be_used_for_training_but_never_for_the_test(shared
 def test_real_data_have_no_symmetry_and_no_blur(root: Path) -> None:
     """Check that a root without synthetic.json counts as real, independent of its annotations."""
     (root / "synthetic.json").unlink()
-    data = prepared(root)
+    data = prepare_data(root)
     assert "blur" not in table(data, "train")
     assert data.fingerprint()["version"] == "PASCAL3D+ release 1.1"
 
 
 def test_several_classes_are_groups(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FRAMEWORK_CACHE", str(tmp_path))
-    data = prepared(None, category=["bottle", "diningtable", "bottle"], images=40, image_size=16)
+    data = prepare_data(None, category=["bottle", "diningtable", "bottle"], images=40, image_size=16)
     assert data.groups == ("bottle", "diningtable")
     fields = table(data, "train")
     assert {(int(g), int(s)) for g, s in zip(fields["group"], fields["symmetry"], strict=True)} == {
         (0, 0),
         (1, 2),
     }
-    alone = prepared(None, category="bottle", images=40, image_size=16)
+    alone = prepare_data(None, category="bottle", images=40, image_size=16)
     bottles = fields["group"] == 0
     assert torch.equal(table(alone, "train")["target"], fields["target"][bottles])
 
@@ -393,7 +393,7 @@ def test_grey_and_cmyk_images_are_read_as_colour(root: Path) -> None:
         with Image.open(file) as image:
             converted = image.convert(mode)
         converted.save(file)
-    data = prepared(root)
+    data = prepare_data(root)
     assert table(data, "train")["input"].shape[1] == 3
     assert data.skipped == 0
 
@@ -402,9 +402,9 @@ def test_box_beyond_the_image_is_clipped(root: Path) -> None:
     def reach_out(record: dict[str, Any]) -> None:
         record["bbox"] = np.array([[-50.0, -20.0, 900.0, 700.0]])
 
-    before = len(table(prepared(root), "test")["index"])
+    before = len(table(prepare_data(root), "test")["index"])
     change_objects(root, "car_val", reach_out)
-    data = prepared(root)
+    data = prepare_data(root)
     assert len(table(data, "test")["index"]) == before
     assert data.skipped == 0
 
@@ -437,22 +437,22 @@ def change_objects(
 
 def test_the_message_about_a_wrong_layout_names_the_fault_and_a_remedy(root: Path, tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"no Annotations/bus_pascal/.*Unpack the whole release into"):
-        prepared(root, category="bus")
+        prepare_data(root, category="bus")
     (root / "Image_sets" / "car_imagenet_val.txt").unlink()
     shutil.rmtree(root / "Images" / "car_imagenet")
     with pytest.raises(DataError, match=r"no Images/car_imagenet/, no Image_sets/car_imagenet_val\.txt\."):
-        prepared(root)
+        prepare_data(root)
     with pytest.raises(DataError, match=r"Did you mean .*/root\?"):
-        prepared(tmp_path)
+        prepare_data(tmp_path)
 
 
 def test_a_misspelt_class_and_an_empty_list_are_refused(shared_root: Path) -> None:
     with pytest.raises(
         DataError, match=r"'motorbyke' is no class of PASCAL3D\+\. Did you mean 'motorbike'\?"
     ):
-        prepared(shared_root, category="motorbyke")
+        prepare_data(shared_root, category="motorbyke")
     with pytest.raises(DataError, match="category is empty"):
-        prepared(shared_root, category=[])
+        prepare_data(shared_root, category=[])
 
 
 def test_all_unreadable_files_are_named_or_skipped(root: Path) -> None:
@@ -464,13 +464,13 @@ def test_all_unreadable_files_are_named_or_skipped(root: Path) -> None:
     image.write_bytes(image.read_bytes()[:900])
     other = change_objects(root, "car_train", lambda entry: entry.update(bbox=[500.0, 500, 600, 600]))[0]
     with pytest.raises(DataError) as caught:
-        prepared(root)
+        prepare_data(root)
     message = str(caught.value)
     assert message.startswith("4 of ")
     for part in (f"{names[0]}.mat", f"{names[1]}.mat", f"{test_name}.jpg", f"{other}.jpg: the box"):
         assert part in message
     assert "data.skip_unreadable=true" in message
-    data = prepared(root, skip_unreadable=True)
+    data = prepare_data(root, skip_unreadable=True)
     assert data.skipped == 4
     for split in ("train", "validation", "test"):
         fields = table(data, split)
@@ -482,7 +482,7 @@ def test_the_message_about_damaged_generated_data_says_to_delete_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("FRAMEWORK_CACHE", str(tmp_path))
-    data = prepared(None, images=20)
+    data = prepare_data(None, images=20)
     next(tmp_path.rglob("car_pascal/*.mat")).write_bytes(b"")
     with pytest.raises(
         DataError, match=rf"Delete {tmp_path}/pascal3d; the next run generates the data again"
@@ -497,7 +497,7 @@ def test_angle_that_is_not_finite_is_never_skipped(root: Path, name: str, value:
         root, "car_train", lambda entry: entry["viewpoint"].update({name: value}), only=2
     )
     with pytest.raises(DataError) as caught:
-        prepared(root, skip_unreadable=True)
+        prepare_data(root, skip_unreadable=True)
     assert str(caught.value).startswith("2 objects have an angle that is not a finite number of degrees")
     assert all(f"{name}.mat" in str(caught.value) for name in changed)
 
@@ -507,12 +507,12 @@ def test_empty_split(root: Path) -> None:
     with pytest.raises(
         DataError, match=r"The test split of car is empty: none of the objects .*left out: \d+ "
     ):
-        prepared(root)
+        prepare_data(root)
     (root / VOC_LISTS / "car_train.txt").write_text("", encoding="utf-8")
     for half in ("train", "val"):
         (root / "Image_sets" / f"car_imagenet_{half}.txt").write_text("", encoding="utf-8")
     with pytest.raises(DataError, match="The train split of car is empty"):
-        prepared(root)
+        prepare_data(root)
 
 
 @pytest.mark.parametrize(
@@ -535,9 +535,9 @@ def test_config_out_of_range(key: str, value: Any) -> None:
 
 
 def test_large_data_are_read_when_used(shared_root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    in_memory = prepared(shared_root)
+    in_memory = prepare_data(shared_root)
     monkeypatch.setattr(images, "IN_MEMORY", 0)
-    lazy = prepared(shared_root).splits().train
+    lazy = prepare_data(shared_root).splits().train
     assert isinstance(lazy, Crops)
     eager = table(in_memory, "train")
     assert len(lazy) == len(eager["input"])
@@ -554,11 +554,11 @@ def test_a_missing_image_is_noticed_before_training_even_if_images_are_read_when
     (root / "Images" / "car_pascal" / f"{name}.jpg").unlink()
     monkeypatch.setattr(images, "IN_MEMORY", 0)
     with pytest.raises(DataError, match=rf"{name}\.jpg: no such file"):
-        prepared(root)
+        prepare_data(root)
 
 
 def test_read_takes_a_users_own_files(shared_root: Path, tmp_path: Path) -> None:
-    data = prepared(shared_root, image_size=16)
+    data = prepare_data(shared_root, image_size=16)
     Image.new("RGB", (30, 10), (255, 0, 0)).save(tmp_path / "wide.png")
     Image.new("L", (5, 9), 128).save(tmp_path / "small.png")
     samples = data.read([tmp_path / "wide.png", tmp_path / "small.png"])
@@ -573,7 +573,7 @@ def test_read_takes_a_users_own_files(shared_root: Path, tmp_path: Path) -> None
 
 
 def test_augment_mirrors_half_of_a_batch_with_its_labels(shared_root: Path) -> None:
-    data = prepared(shared_root, image_size=16, jitter=0.0)
+    data = prepare_data(shared_root, image_size=16, jitter=0.0)
     torch.manual_seed(0)
     pixels = torch.randint(0, 256, (200, 3, 16, 16), dtype=torch.uint8)
     batch = {"input": pixels, "target": torch.rand(200, 3) + 0.1, "index": torch.arange(200)}
@@ -590,20 +590,20 @@ def test_augment_mirrors_half_of_a_batch_with_its_labels(shared_root: Path) -> N
 
 
 def test_augment_can_be_switched_off(shared_root: Path) -> None:
-    data = prepared(shared_root)
+    data = prepare_data(shared_root)
     batch = {name: field[:8] for name, field in table(data, "train").items()}
     assert not torch.equal(data.augment(batch)["input"], data.augment(batch)["input"])
-    off = prepared(shared_root, mirror=False, jitter=0.0)
+    off = prepare_data(shared_root, mirror=False, jitter=0.0)
     assert off.augment(batch) is batch
-    unmirrored = prepared(shared_root, mirror=False)
+    unmirrored = prepare_data(shared_root, mirror=False)
     assert torch.equal(unmirrored.augment(batch)["target"], batch["target"])
 
 
 def test_fingerprint_changes_with_a_label(root: Path) -> None:
     change_objects(root, "car_val", lambda entry: None)
-    before = prepared(root).fingerprint()
+    before = prepare_data(root).fingerprint()
     change_objects(root, "car_val", lambda entry: entry["viewpoint"].update(azimuth=31.0))
-    after = prepared(root).fingerprint()
+    after = prepare_data(root).fingerprint()
     assert before["test"] == after["test"]
     assert before["sha256"] != after["sha256"]
 

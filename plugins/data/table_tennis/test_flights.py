@@ -14,7 +14,7 @@ from plugins.data.table_tennis.rows import table, write_csv
 from plugins.data.table_tennis.windows import Grid, is_no_outlier, prefix, windows
 
 
-def prepared(**config: Any) -> Any:
+def prepare_data(**config: Any) -> Any:
     data = build("data", resolve("data", {"name": "table_tennis", **config}))
     data.prepare()
     return data
@@ -38,7 +38,7 @@ def test_the_message_about_a_bad_frame_names_file_and_line(tmp_path: Path, line:
         lines[3] = lines[3].replace("0.032000", "0.080000")
     file.write_text("\n".join(lines))
     with pytest.raises(DataError, match=message.replace("(", r"\(")) as error:
-        prepared(root=str(tmp_path))
+        prepare_data(root=str(tmp_path))
     assert "bad.csv" in str(error.value)
 
 
@@ -47,11 +47,11 @@ def test_the_message_about_another_frame_rate_names_the_remedy(tmp_path: Path) -
     rows[:, 0] *= 4
     write_csv(tmp_path / "slow.csv", rows)
     with pytest.raises(DataError, match=r"a frame every 64 ms.*Set data.step=0.064"):
-        prepared(root=str(tmp_path))
+        prepare_data(root=str(tmp_path))
     rows[:, 0] *= 1e5
     write_csv(tmp_path / "slow.csv", rows)
     with pytest.raises(DataError, match=r"at most 1 s apart\. Correct the times, or set data\.times_in"):
-        prepared(root=str(tmp_path))
+        prepare_data(root=str(tmp_path))
 
 
 @pytest.mark.parametrize("unit, seconds", [("milliseconds", 1e-3), ("microseconds", 1e-6), ("seconds", 1.0)])
@@ -64,13 +64,13 @@ def test_times_are_read_in_the_configured_unit(
     for number, rows in enumerate(tables):
         write_csv(tmp_path / f"{number}.csv", np.column_stack([rows[:, 0] / seconds, rows[:, 1:]]))
     if times_in == unit:
-        data = prepared(root=str(tmp_path), times_in=times_in, future=5)
+        data = prepare_data(root=str(tmp_path), times_in=times_in, future=5)
         first = data.read([tmp_path / "0.csv"])[0]["input"].view(20, 5)
         np.testing.assert_allclose(first[-1, 1:4], tables[0][-1, 1:], atol=1e-5)
         np.testing.assert_allclose(first[-2, 0], -0.016, atol=1e-6)
     else:
         with pytest.raises(DataError, match=rf"0\.csv has a frame every .* Set data\.times_in={unit}\."):
-            prepared(root=str(tmp_path), times_in=times_in, future=5)
+            prepare_data(root=str(tmp_path), times_in=times_in, future=5)
 
 
 def test_unread_columns_are_remarked_and_millimetres_are_recognised(tmp_path: Path) -> None:
@@ -78,14 +78,14 @@ def test_unread_columns_are_remarked_and_millimetres_are_recognised(tmp_path: Pa
         file = write_csv(tmp_path / f"{number}.csv", table(number))
         head, *lines = file.read_text().splitlines()
         file.write_text("\n".join([f"{head},spin,note", *(f"{line},3,x" for line in lines)]))
-    assert prepared(root=str(tmp_path), future=5).remarks[0] == "left out: the columns spin, note"
+    assert prepare_data(root=str(tmp_path), future=5).remarks[0] == "left out: the columns spin, note"
     rows = table(0)
     rows[:, 1:] *= 1000
     write_csv(tmp_path / "0.csv", rows)
     with pytest.raises(
         DataError, match=r"0\.csv line 2: .* divide all positions by 1000 if they are in millimetres"
     ):
-        prepared(root=str(tmp_path), future=5)
+        prepare_data(root=str(tmp_path), future=5)
 
 
 def test_a_missing_frame_is_masked_and_a_gap_in_the_future_leaves_the_window_out() -> None:
@@ -125,7 +125,7 @@ def test_an_outlier_is_read_but_is_no_target() -> None:
 
 @pytest.mark.skipif("REAL_DATA_ROOT" not in os.environ, reason="REAL_DATA_ROOT is not set")
 def test_the_laboratorys_flights_are_82_and_none_is_in_two_splits() -> None:
-    data = prepared(root=f"{os.environ['REAL_DATA_ROOT']}/trajectories", observed=12, future=22)
+    data = prepare_data(root=f"{os.environ['REAL_DATA_ROOT']}/trajectories", observed=12, future=22)
     fingerprint = data.fingerprint()
     assert fingerprint["repeated"] == "40"
     flights = [set(split.fields["flight"].tolist()) for split in data.splits()]
@@ -135,7 +135,7 @@ def test_the_laboratorys_flights_are_82_and_none_is_in_two_splits() -> None:
 
 def test_noise_constants_and_stiff_contact_change_the_simulated_flights() -> None:
     small = {"flights": 5, "observed": 6, "future": 4, "least": 4, "stride": 20}
-    digests = {prepared(**small, **more).fingerprint()["sha256"] for more in (
+    digests = {prepare_data(**small, **more).fingerprint()["sha256"] for more in (
         {}, {"noise": 0.01}, {"drag": 0.1}, {"contact": "spring"}, {"outliers": 0.2}, {"dropped": 0.3},
     )}  # fmt: skip
     assert len(digests) == 6

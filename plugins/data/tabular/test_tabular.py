@@ -42,12 +42,12 @@ def table(folder: Path, text: str | None = None, rows: int = ROWS) -> Path:
     return file
 
 
-def unprepared(file: Path, **config: Any) -> Tabular:
+def build_data(file: Path, **config: Any) -> Tabular:
     return build("data", resolve("data", {"name": "tabular", "path": str(file), "target": "class", **config}))
 
 
-def prepared(file: Path, **config: Any) -> Tabular:
-    data = unprepared(file, **config)
+def prepare_data(file: Path, **config: Any) -> Tabular:
+    data = build_data(file, **config)
     data.prepare()
     return data
 
@@ -59,7 +59,7 @@ def fields(data: Tabular, split: str) -> Mapping[str, torch.Tensor]:
 
 
 def test_a_table_is_split_and_standardised_by_its_training_rows(tmp_path: Path) -> None:
-    data = prepared(table(tmp_path), columns=None, target="class")
+    data = prepare_data(table(tmp_path), columns=None, target="class")
     assert data.input_shape == (5,)  # number, square, same, real and angle; words are not read
     assert data.target.kind == "class"
     assert data.target.names == ("cat", "dog", "emu")
@@ -80,27 +80,29 @@ def test_a_table_is_split_and_standardised_by_its_training_rows(tmp_path: Path) 
 
 def test_the_data_seed_determines_the_random_split(tmp_path: Path) -> None:
     file = table(tmp_path)
-    lines = [fields(prepared(file, data_seed=seed), "test")["line"].tolist() for seed in (0, 0, 1)]
+    lines = [fields(prepare_data(file, data_seed=seed), "test")["line"].tolist() for seed in (0, 0, 1)]
     assert lines[0] == lines[1] != lines[2]
-    shares = prepared(file, validation=0.25, test=0.5)
+    shares = prepare_data(file, validation=0.25, test=0.5)
     assert [len(fields(shares, name)["index"]) for name in SPLITS] == [10, 10, 20]
-    assert prepared(file).fingerprint()["sha256"] != prepared(file, data_seed=1).fingerprint()["sha256"]
+    assert (
+        prepare_data(file).fingerprint()["sha256"] != prepare_data(file, data_seed=1).fingerprint()["sha256"]
+    )
 
 
 def test_reals_keep_their_unit_and_degrees_become_radians(tmp_path: Path) -> None:
     file = table(tmp_path)
-    real = prepared(file, target="real", kind="real")
-    assert (real.target.kind, real.target.names) == ("real", ("real",))
-    train = fields(real, "train")
+    reals = prepare_data(file, target="real", kind="real")
+    assert (reals.target.kind, reals.target.names) == ("real", ("real",))
+    train = fields(reals, "train")
     np.testing.assert_array_equal(train["target"][:, 0], (train["line"] - 2) / 2 - 3)
-    angle = prepared(file, target="angle", kind="degrees")
+    angle = prepare_data(file, target="angle", kind="degrees")
     assert (angle.target.kind, angle.target.names) == ("angle", ("angle",))
     train = fields(angle, "train")
     degrees = 20 * (train["line"].double() - 2) - 360
-    turn = train["target"][:, 0].double() - torch.deg2rad(degrees)
-    np.testing.assert_allclose(torch.remainder(turn + 1, 2 * math.pi) - 1, 0, atol=1e-6)
+    error = train["target"][:, 0].double() - torch.deg2rad(degrees)
+    np.testing.assert_allclose(torch.remainder(error + 1, 2 * math.pi) - 1, 0, atol=1e-6)
     assert train["target"].abs().max() <= math.pi + 1e-6
-    several = prepared(file, target=["real", "number"], kind="real")
+    several = prepare_data(file, target=["real", "number"], kind="real")
     assert several.target.names == ("real", "number")
     assert fields(several, "train")["target"].shape == (28, 2)
     assert several.input_shape == (3,)
@@ -108,7 +110,7 @@ def test_reals_keep_their_unit_and_degrees_become_radians(tmp_path: Path) -> Non
 
 def test_angles_of_many_turns_keep_their_digits(tmp_path: Path) -> None:
     text = "x,angle\n" + "\n".join(f"{row},{360 * 10**9 * (row - 20) + row}" for row in range(40))
-    angle = prepared(table(tmp_path, text), target="angle", kind="degrees")
+    angle = prepare_data(table(tmp_path, text), target="angle", kind="degrees")
     for name in SPLITS:
         expected = torch.deg2rad((fields(angle, name)["line"] - 2).double())
         np.testing.assert_allclose(fields(angle, name)["target"][:, 0], expected, atol=1e-6)
@@ -117,7 +119,7 @@ def test_angles_of_many_turns_keep_their_digits(tmp_path: Path) -> None:
 def test_splits_and_groups_come_from_columns_of_these_names(tmp_path: Path) -> None:
     lines = ["split,group,x,class"]
     lines += [f"{SPLITS[row % 3]},{(10, 9, 'b')[row % 5 % 3]},{row},{row // 3 % 2}" for row in range(60)]
-    data = prepared(table(tmp_path, "\n".join(lines)))
+    data = prepare_data(table(tmp_path, "\n".join(lines)))
     assert data.input_shape == (1,)
     assert data.groups == ("9", "10", "b")  # numbers by size
     for index, name in enumerate(SPLITS):
@@ -129,7 +131,7 @@ def test_splits_and_groups_come_from_columns_of_these_names(tmp_path: Path) -> N
 
 def test_labels_are_ordered_by_size_where_they_are_numbers(tmp_path: Path) -> None:
     text = "x,class\n" + "\n".join(f"{row},{(10, 2, -1)[row % 3]}" for row in range(60))
-    data = prepared(table(tmp_path, text))
+    data = prepare_data(table(tmp_path, text))
     assert data.target.names == ("-1", "2", "10")
     row = fields(data, "test")["line"] - 2
     assert fields(data, "test")["target"].tolist() == [(2, 1, 0)[int(number) % 3] for number in row]
@@ -209,14 +211,14 @@ def test_wrong_tables_are_refused(tmp_path: Path, text: str, message: str) -> No
         if {1, 2} <= set(np.random.default_rng(seed).permutation(ROWS)[6:12].tolist())
     )
     with pytest.raises(DataError, match=message):
-        prepared(file, data_seed=seed)
+        prepare_data(file, data_seed=seed)
 
 
 def test_missing_words_determine_which_words_are_labels(tmp_path: Path) -> None:
     text = "x,class\n" + "\n".join(f"{row},{('none', 'mild', 'NA')[row % 3]}" for row in range(60))
-    data = prepared(table(tmp_path, text), missing_words=[])
+    data = prepare_data(table(tmp_path, text), missing_words=[])
     assert data.target.names == ("NA", "mild", "none")
-    skipping = prepared(table(tmp_path, text), missing_words=["na"], missing="skip")
+    skipping = prepare_data(table(tmp_path, text), missing_words=["na"], missing="skip")
     assert (skipping.target.names, skipping.skipped) == (("mild", "none"), 20)
 
 
@@ -228,15 +230,15 @@ def test_angles_in_the_other_unit_are_refused(tmp_path: Path, kind: str) -> None
     file = table(tmp_path, text)
     other = {"degrees": "radians", "radians": "degrees"}[kind]
     with pytest.raises(DataError, match=rf"column 'angle': .* looks like {other}, .* Set data\.kind={other}"):
-        prepared(file, target="angle", kind=kind)
-    data = prepared(file, target="angle", kind=other)
+        prepare_data(file, target="angle", kind=kind)
+    data = prepare_data(file, target="angle", kind=other)
     angle, line = (fields(data, "train")[name] for name in ("target", "line"))
     error = angle[:, 0].double() - torch.deg2rad(torch.from_numpy(degrees)[line - 2])
     np.testing.assert_allclose(torch.remainder(error + 1, 2 * math.pi) - 1, 0, atol=1e-3)
     if kind == "degrees":
-        prepared(file, target="angle", kind=kind, small_angles=True)
+        prepare_data(file, target="angle", kind=kind, small_angles=True)
         with pytest.raises(DataError, match=r"small_angles=true has no effect with data\.kind=real"):
-            prepared(file, target="angle", kind="real", small_angles=True)
+            prepare_data(file, target="angle", kind="real", small_angles=True)
 
 
 def test_remarks_name_the_target_and_the_columns_that_are_left_out(tmp_path: Path) -> None:
@@ -244,7 +246,7 @@ def test_remarks_name_the_target_and_the_columns_that_are_left_out(tmp_path: Pat
     text += "\n".join(
         f"{row + 5},{row * row % 7},{('TRUE', 'false')[row % 2]},w,,{'ab'[row % 2]}" for row in range(40)
     )
-    data = prepared(table(tmp_path, text))
+    data = prepare_data(table(tmp_path, text))
     assert data.columns == ("a", "flag")
     assert data.remarks == (
         "predicted: the column 'class', data.kind=class",
@@ -258,47 +260,49 @@ def test_settings_that_do_not_fit_the_table_are_refused(tmp_path: Path) -> None:
     with pytest.raises(
         DataError, match=r"data\.columns names the column 'nomber', .* Did you mean 'number'\?"
     ):
-        prepared(file, columns=["nomber"])
+        prepare_data(file, columns=["nomber"])
     with pytest.raises(DataError, match=r"data\.columns names 'class', but this column is the target"):
-        prepared(file, columns=["number", "class"])
+        prepare_data(file, columns=["number", "class"])
     with pytest.raises(DataError, match=r"line 2, column 'word': 'a' is no finite number"):
-        prepared(file, columns=["word"])
+        prepare_data(file, columns=["word"])
     with pytest.raises(DataError, match=r"line 2, column 'class': 'cat' is no finite number"):
-        prepared(file, kind="real")
+        prepare_data(file, kind="real")
     with pytest.raises(DataError, match=r"data\.target = \['class', 'word'\] does not fit data\.kind=class"):
-        prepared(file, target=["class", "word"])
+        prepare_data(file, target=["class", "word"])
     with pytest.raises(DataError, match=r"data\.target = \[\]"):
-        prepared(file, target=[], kind="real")
+        prepare_data(file, target=[], kind="real")
     with pytest.raises(DataError, match="the sum must be less than 1"):
-        prepared(file, validation=0.5, test=0.5)
+        prepare_data(file, validation=0.5, test=0.5)
     with pytest.raises(DataError, match="has no column of numbers besides"):
-        prepared(file, columns=[])
+        prepare_data(file, columns=[])
 
 
 @pytest.mark.parametrize("cell", ["", "NA", "nan", "?"])
 def test_missing_skip_leaves_out_rows_without_a_number(tmp_path: Path, cell: str) -> None:
     lines = with_cell(cell).splitlines()
     lines[10] = lines[10].replace(",a", ",").replace(",b", ",")
-    data = prepared(table(tmp_path, "\n".join(lines)), missing="skip")
+    data = prepare_data(table(tmp_path, "\n".join(lines)), missing="skip")
     assert data.skipped == 2
     used_lines = torch.cat([fields(data, name)["line"] for name in SPLITS])
     assert sorted(used_lines.tolist()) == [line for line in range(2, ROWS + 2) if line not in (5, 11)]
-    reals = prepared(table(tmp_path, with_cell(cell)), missing="skip", target="x", kind="real", columns=["y"])
+    reals = prepare_data(
+        table(tmp_path, with_cell(cell)), missing="skip", target="x", kind="real", columns=["y"]
+    )
     assert reals.skipped == 1
     with pytest.raises(DataError, match="line 5, column 'x': 'inf'"):
-        prepared(table(tmp_path, with_cell("inf")), missing="skip")
+        prepare_data(table(tmp_path, with_cell("inf")), missing="skip")
     with pytest.raises(DataError, match="line 5, column 'x': 'abc'"):
-        prepared(table(tmp_path, with_cell("abc")), missing="skip")
+        prepare_data(table(tmp_path, with_cell("abc")), missing="skip")
 
 
 def test_read_uses_the_training_rows_and_needs_no_prepare(tmp_path: Path) -> None:
     file = table(tmp_path)
-    data = prepared(file, columns=["square", "number"])
+    data = prepare_data(file, columns=["square", "number"])
     other = tmp_path / "other.csv"
     test = fields(data, "test")
     numbers = (test["line"] - 2).tolist()
     other.write_text("number,note,square\n" + "\n".join(f"{n},hello,{n * n}" for n in numbers))
-    fresh = unprepared(file, columns=["square", "number"])
+    fresh = build_data(file, columns=["square", "number"])
     read = fresh.read([other, other])
     assert isinstance(read, Fields)
     assert torch.equal(read.fields["input"], torch.cat([test["input"], test["input"]]))

@@ -82,18 +82,18 @@ def door(random: Random) -> Solid:
         parts.append(with_mirror(knob or box(0.12, 0.03, bar, (0.4 * width, 0.06, at)), 1))
         parts.append(box(0.02, 0.12, 0.02, (0.42 * width, 0, at)))
     leaf = join(parts)
-    turn = random.uniform(15, 75) if random.random() < 0.2 else 0.0
-    hinged = leaf.move(width / 2, 0, 0).rotate("z", -turn).move(-width / 2, 0, 0)
+    opening_deg = random.uniform(15, 75) if random.random() < 0.2 else 0.0
+    hinged = leaf.move(width / 2, 0, 0).rotate("z", -opening_deg).move(-width / 2, 0, 0)
     if wings == 2:
         hinged = with_mirror(hinged.move(-width / 2, 0, 0), 0)
     parts = [hinged]
     if random.random() < 0.6:  # the frame
         side, deep = random.uniform(0.05, 0.14), random.uniform(0.08, 0.2)
-        whole = wings * width
-        parts.append(with_mirror(box(side, deep, height, ((whole + side) / 2, 0, 0)), 0))
-        parts.append(box(whole + 2 * side, deep, side, (0, 0, height)))
+        full_width = wings * width
+        parts.append(with_mirror(box(side, deep, height, ((full_width + side) / 2, 0, 0)), 0))
+        parts.append(box(full_width + 2 * side, deep, side, (0, 0, height)))
         if random.random() < 0.25:
-            parts.append(box(whole + 2 * side, 0.5 * deep, 0.3, (0, 0, height + side)))
+            parts.append(box(full_width + 2 * side, 0.5 * deep, 0.3, (0, 0, height + side)))
     return join(parts)
 
 
@@ -135,13 +135,13 @@ def stairs(random: Random) -> Solid:
     kind, open_ = random.random(), random.random() < 0.4
     parts: list[Solid] = []
     if kind < 0.2:  # winding about a post
-        radius, turn = random.uniform(0.7, 1.1), random.uniform(20, 32)
+        radius, step_deg = random.uniform(0.7, 1.1), random.uniform(20, 32)
         for step in range(count):
             tread = frustum(0.85 * radius, 0.2, 0.85 * radius, 0.2, 0.04)
             vertices = tread.vertices.copy()
             vertices[:, 1] *= 1 + 1.2 * vertices[:, 0] / radius  # wider outside
             tread = Solid(vertices, tread.faces).move(0.5 * radius, 0, rise * (step + 1))
-            parts.append(tread.rotate("z", turn * step))
+            parts.append(tread.rotate("z", step_deg * step))
         parts.append(cylinder(0.07, rise * (count + 1) + random.uniform(0, 0.9), sides=12))
         return join(parts)
     for step in range(count):
