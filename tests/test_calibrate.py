@@ -74,7 +74,7 @@ def test_it_is_the_model_that_was_trained_with_the_wrappers(framework: Framework
     other = ("mode=calibrate", f"checkpoint={plain.folder}", "uncertainty=[temperature]")
     for change, sentence in (
         ("data=dial", "trained on"),
-        ("uncertainty=[]", "none is chosen. Give uncertainty="),
+        ("uncertainty=[]", "no wrapper is chosen. Add uncertainty="),
         ("checkpoint=null", "needs checkpoint="),
         ("checkpoint=nowhere", "nowhere is neither a file"),
         ("uncertainty=[ensemble]", "mode=combine"),
@@ -163,7 +163,9 @@ def test_few_rows_are_said_with_what_they_leave_open(rows: int, miscoverage: flo
     scores = torch.rand(4000, rows, generator=generator).sort(1).values[:, kept]
     inside = ((scores >= low) & (scores <= high)).double().mean().item()
     assert inside == pytest.approx(0.9, abs=0.02)
-    assert ("keep the deviation within" in said) == (max(high - 1 + miscoverage, 1 - miscoverage - low) > 0.03)
+    assert ("keep the deviation within" in said) == (
+        max(high - 1 + miscoverage, 1 - miscoverage - low) > 0.03
+    )
 
 
 def test_a_checkpoint_of_before_has_no_remarks(tmp_path: Path) -> None:

@@ -93,7 +93,7 @@ def test_parts_of_something_else_are_not_added_to(root, tmp_path, change):
 def test_what_cannot_be_encoded_is_refused(root, tmp_path):
     with pytest.raises(ConfigError, match="would be read itself"):
         collect_files(root, root / "a" / "features", 4)
-    with pytest.raises(DataError, match="no folder that holds files"):
+    with pytest.raises(DataError, match="no folder with files"):
         collect_files(tmp_path / "nowhere", tmp_path / "features", 4)
     with pytest.raises(ConfigError, match=r"no job 3 of 2\. Use 1/2 to 2/2"):
         parts_of_job(6, "3/2")

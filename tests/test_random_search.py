@@ -139,16 +139,16 @@ def test_the_last_override_of_a_key_counts() -> None:
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["x=1", "~y"], "nothing to search: no override is a sweep. Give one"),
+        (["x=1", "~y"], "no search space, because no override is a sweep. Add a sweep"),
         (["x=interval(2,2)"], r"x=interval\(2,2\): The smaller end must come first"),
         (["x=interval(3.0,2)"], "The smaller end must come first"),
         (["x=interval(0,inf)"], "Both ends of the interval must be finite"),
-        (["x=interval(0,1)"], r"only whole number in it is 0. Write interval\(0.0,1.0\)"),
+        (["x=interval(0,1)"], r"only whole number in the interval is 0. Write interval\(0.0,1.0\)"),
         (["x=tag(log,interval(0.0,1))"], "0 has no logarithm. Start above 0"),
         (["x=tag(log,interval(-3,2))"], "-3 has no logarithm"),
         (["x=tag(lgo,interval(1.0,2))"], "only tag is log, not lgo. Did you mean 'log'"),
-        (["x=tag(log,range(1,9))"], "the tag log means nothing on it"),
-        (["x=range(9,1)"], "nothing in it to draw"),
+        (["x=tag(log,range(1,9))"], "The tag log is allowed on intervals only"),
+        (["x=range(9,1)"], "The sweep has no value"),
         (["x=range(1,9,0)"], "its step is 0"),
     ],
 )
@@ -466,7 +466,7 @@ def test_a_key_that_varies_within_the_data_is_shown(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["seed=3"], "has nothing to search"),
+        (["seed=3"], "has no search space"),
         (
             ["seed=1,2", "hydra.sweeper.trials=0"],
             "hydra.sweeper.trials = 0, but a whole number of at least 1 is required",

@@ -151,5 +151,5 @@ def test_batch_norm_wants_more_than_one_row(rows: int, tmp_path: Path, composed:
     if rows > 1:
         train.run(config)
         return
-    with pytest.raises(Exception, match=r"batch norm one value of each channel.*Give a batch_size"):
+    with pytest.raises(Exception, match=r"batch norm one value per channel.*Set batch_size"):
         train.run(config)

@@ -537,7 +537,7 @@ def test_a_run_killed_while_it_was_closed_is_sent_by_resume(framework: Framework
     (done.folder / "run.json").write_text(json.dumps({**info, "sent": info["sent"] - 2}), encoding="utf-8")
     resumed = framework(f"resume={done.folder}")
     assert resumed.code == 0, resumed.out
-    assert "2 lines of its journal" in resumed.out
+    assert "2 journal lines" in resumed.out
     assert stored_statuses(done) == ["FINISHED"]
     again = framework(f"resume={done.folder}")
     assert again.code == 2

@@ -257,8 +257,8 @@ def test_no_two_estimates_share_random_numbers(model: Model, pairs: list[Batch])
     ("changed", "message"),
     [
         ({"knob": "sample"}, "a knob 'sample'. Did you mean 'samples'"),
-        ({"reference": 99}, "below the largest value tried, 100"),
-        ({"repeats": 1}, "two at least"),
+        ({"reference": 99}, "below the largest value of the curve, 100"),
+        ({"repeats": 1}, "at least 2 are required"),
         ({"values": ()}, r"those of Convolved worth trying: \(1, 10, 100\)"),
     ],
 )
