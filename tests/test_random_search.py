@@ -146,10 +146,13 @@ def test_the_last_override_of_a_key_counts() -> None:
         (["x=interval(0,1)"], r"only whole number in the interval is 0. Write interval\(0.0,1.0\)"),
         (["x=tag(log,interval(0.0,1))"], "0 has no logarithm. Start above 0"),
         (["x=tag(log,interval(-3,2))"], "-3 has no logarithm"),
-        (["x=tag(lgo,interval(1.0,2))"], "only tag is log, not lgo. Did you mean 'log'"),
+        (
+            ["x=tag(lgo,interval(1.0,2))"],
+            "only tag of an interval is log, but lgo was given. Did you mean 'log'",
+        ),
         (["x=tag(log,range(1,9))"], "The tag log is allowed on intervals only"),
         (["x=range(9,1)"], "The sweep has no value"),
-        (["x=range(1,9,0)"], "its step is 0"),
+        (["x=range(1,9,0)"], "step of the range is 0"),
     ],
 )
 def test_a_sweep_that_makes_no_sense_is_refused(overrides: list[str], message: str) -> None:
@@ -382,7 +385,7 @@ def test_a_metric_of_the_results_ranks_its_own_way(
     numbers = {"accuracy": [0.5, 0.7, 0.9], "parameters": [3, 1, 2], "odd": [0.1, 0.3, 0.2]}
     given = trials(tmp_path, 1.0, 2.0, None, **numbers)
     assert comparison.rank(tmp_path, given, [], "accuracy").best == given[1], "that of a failed trial is none"
-    assert "accuracy is of the test split" in capsys.readouterr().out
+    assert "accuracy was computed on the test split" in capsys.readouterr().out
     assert comparison.rank(tmp_path, given, [], "accuracy", "minimize").best == given[0]
     assert comparison.rank(tmp_path, given, [], "parameters").best == given[1], "costs are to be low"
     assert comparison.rank(tmp_path, given, [], "odd", "maximize").best == given[1]
