@@ -190,7 +190,7 @@ def test_a_disk_without_room_is_refused_before_writing(
     WholeCheckpoints().save_checkpoint(contents, saved.with_name("measured.ckpt"))
     size = saved.with_name("measured.ckpt").stat().st_size
     monkeypatch.setattr(shutil, "disk_usage", lambda path: Usage(10**9, 10**9 - size + 1, size - 1))
-    with pytest.raises(CheckpointError, match=r"last\.ckpt needs .* MB free.*untouched"):
+    with pytest.raises(CheckpointError, match=r"last\.ckpt needs .* MB free.*unchanged"):
         WholeCheckpoints().save_checkpoint(contents, saved)
     assert same(read(saved), CONTENTS)
     # Room for twice as much is enough, and shared storage counts once.

@@ -100,7 +100,7 @@ def test_a_folder_may_be_reached_by_a_link_that_the_user_names(tmp_path: Path) -
             read_plain(folder / "run.json", 1)
     require_enclosed(tmp_path / "nowhere")
     (tmp_path / "file").touch()
-    with pytest.raises(DataError, match="no folder"):
+    with pytest.raises(DataError, match="is not a folder"):
         require_enclosed(tmp_path / "file")
 
 
