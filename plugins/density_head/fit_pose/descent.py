@@ -31,10 +31,10 @@ class Stage(NamedTuple):
     """Settings of one level of the image pyramid.
 
     Attributes:
-        part: its size is 1/part of the whole image's.
-        blur: standard deviation, in its own pixels.
-        pull: weight of the prior: of the squared parameters, in units of their standard deviations, in a loss that sums
-            over pixels of the whole image.
+        part: the images of this level have 1/part of the height and the width of the whole image.
+        blur: standard deviation of the blur, in pixels of this level.
+        pull: weight of the prior, which is the sum of the squared parameters in units of their standard deviations. The
+            loss is summed over pixels of the whole image.
     """
 
     part: int
@@ -52,7 +52,7 @@ STAGES = (
     Stage(1, 0.8, 0.0),
 )
 AGAIN_FROM = 2
-"""Stage at which a restart from another pose begins."""
+"""Index of the stage at which a restart from another pose begins."""
 AFRESH = 6
 """Number of steps after which the Hessian approximation is computed anew from the optical flow."""
 DAMPING, LEAST = 0.01, 1e-3

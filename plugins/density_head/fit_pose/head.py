@@ -33,23 +33,23 @@ class FitPoseHead(DensityHead, Fitted):
 
     The descent (plugins.density_head.fit_pose.descent) starts from the nominal pose. The head reads images of
     `data=pose_from_image` unchanged, without an encoder. The density is normal, with the end of the descent as its
-    mean. `calibrate` measures its standard deviations from the errors on the validation split, separately for descents
-    whose image differs from the given one by more than `enough` and for those that agree. Before calibration, and for
-    inputs that are no images of a body (numbers outside of [0, 1], no silhouette), the density is that of the training
-    set: mean 0, and the spread of the targets. The gradient of the density by the image is declared to be 0.
+    mean. `calibrate` sets its standard deviations to the root mean square errors on the validation split, separately
+    for fits whose image agrees with the input to within `enough` and for the other fits. Before calibration, and for
+    inputs that are not images of a body (numbers outside [0, 1], or no silhouette), the density is that of the training
+    split: mean 0, and the standard deviations of the targets. The gradient of the density in the image is set to 0.
 
     Attributes:
         steps: largest number of steps of a stage (a knob).
 
     Args:
-        renderer: differentiable renderer that draws what is compared with the image.
+        renderer: differentiable renderer that draws the body for the comparison with the image.
         steps: largest number of steps of a stage; there are seven stages.
         restarts: largest number of restarts from other poses while the images differ by more than `enough`.
         enough: root mean square difference of colours below which images agree.
-        height, width, body: settings of the same names of the data.
+        height, width, body: the same values as in the config of the data.
 
     Raises:
-        ConfigError: a renderer without gradients, or a target that is not this body's.
+        ConfigError: the renderer has no gradient, or the target belongs to another body.
     """
 
     knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {"steps": (1, 3, 10, 30)}
@@ -74,15 +74,16 @@ class FitPoseHead(DensityHead, Fitted):
         target.require("real", by="density_head fit_pose")
         if missing := NEEDED - renderer.differentiable or {"color", "face"} - renderer.channels:
             raise ConfigError(
-                f"density_head.renderer = {type(renderer).__name__} has no gradient in, or does not draw, "
-                f"{' and '.join(sorted(missing))}; the fit needs both. Choose another renderer."
+                "density_head fit_pose needs a renderer that draws color and face, and that is differentiable in the "
+                f"vertices, but density_head.renderer={type(renderer).__name__} lacks {' and '.join(sorted(missing))}. "
+                "Choose another renderer."
             )
         self.body_model = parametric_body(body)
         if target.names != self.body_model.names:
             raise ConfigError(
                 f"density_head fit_pose fits {self.body_model.source}, whose parameters are "
-                f"{', '.join(self.body_model.names)}; the data's are {target.listed_names}. Choose "
-                "data=pose_from_image, with the same body for both."
+                f"{', '.join(self.body_model.names)}, but the targets of this data set are {target.listed_names}. "
+                "Choose data=pose_from_image, with the same body for both."
             )
         self.camera = self.body_model.camera(height, width)
         self.renderer = renderer
@@ -102,14 +103,11 @@ class FitPoseHead(DensityHead, Fitted):
     def forward(self, raw: Float[Tensor, "*batch size"]) -> Distribution:
         raw = require_finite(raw, self.size)
         fits = self._fits(raw)
-        # the end of a descent is piecewise constant at the scale of an image's rounding: its gradient is declared 0
+        # small changes of an image, below its rounding, do not change the end of a descent; the gradient is set to 0
         zero = (raw * 0).sum(-1, keepdim=True)
         mean = self._rows([self.prior * 0 if fit is None else fit.parameters for fit in fits], raw) + zero
         scale = self._rows([self._width(fit) for fit in fits], raw)
         return PosedBodyDensity(mean, scale, fits, self.body_model, self.renderer, self.camera)
-
-    def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
-        return -self(raw).log_prob(target)
 
     @torch.no_grad()
     def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
@@ -125,7 +123,7 @@ class FitPoseHead(DensityHead, Fitted):
                 self.spread[int(agrees)] = square.sqrt().clamp(min=FLOOR).to(self.spread)
 
     def _fits(self, raw: Tensor) -> list[BodyFit | None]:
-        """Return the fit of each image of a flattened batch; None for inputs that are no images of a body."""
+        """Return the fit of each image of a flattened batch; None for inputs that are not images of a body."""
         descent = Descent(
             self.body_model,
             self.renderer,

@@ -12,10 +12,10 @@ ROWS = {
             Target("real", parametric_body(DOLL["body"]).names),
             {**DOLL, "renderer": "rasterizer", "height": 16, "width": 12, "steps": 1, "restarts": 0},
             leave_out={
-                "integral by draws": "the check fits a covariance to its draws; of so many numbers it is further off "
-                "than what it looks for. A product of torch's normals; test_fit_pose.py has its log_prob and entropy",
-                "every raw parameter is read": "they are an image, of which one pixel alone may move no fit",
-                "target's unit": "poses are radians and metres, in which its renderer draws",
+                "integral by draws": "a covariance of 30 numbers from samples is too inexact for this check; "
+                "test_fit_pose.py compares log_prob and entropy with SciPy",
+                "every raw parameter is read": "a change of a single pixel of the image may leave the fit as it is",
+                "target's unit": "the renderer needs poses in radians and metres",
             },
         ),
     ),

@@ -47,9 +47,9 @@ def data():
         **SIZE,
         **DOLL,
     }
-    found = build("data", resolve("data", config))
-    found.prepare()
-    return found
+    pose_data = build("data", resolve("data", config))
+    pose_data.prepare()
+    return pose_data
 
 
 def head(target, **config):
@@ -59,17 +59,17 @@ def head(target, **config):
 
 def numbers(body_model, seed=0, size=1.0):
     random = np.random.default_rng(seed)
-    found = torch.from_numpy(random.normal(0, 1, len(body_model.names))) * body_model.spread
-    found[:6] = torch.from_numpy(random.normal(0, 1, 6)) * 0.2
-    return size * torch.minimum(torch.maximum(found, body_model.limits[:, 0]), body_model.limits[:, 1])
+    parameters = torch.from_numpy(random.normal(0, 1, len(body_model.names))) * body_model.spread
+    parameters[:6] = torch.from_numpy(random.normal(0, 1, 6)) * 0.2
+    return size * torch.minimum(torch.maximum(parameters, body_model.limits[:, 0]), body_model.limits[:, 1])
 
 
 def test_a_smaller_picture_is_the_mean_of_the_pixels(body_model):
     """Check that 1/part of the pixels with part times the samples has the same samples, and so the same numbers."""
     camera, fine = body_model.camera(**SIZE), renderer(supersampling=8)
     whole = renderer(supersampling=2)(scene_of(body_model, numbers(body_model), camera))["color"]
-    drawn = fine(scene_of(body_model, numbers(body_model), reduce_camera(camera, 4)))["color"]
-    torch.testing.assert_close(drawn, reduce_image(whole, 4), atol=1e-5, rtol=0)
+    rendered = fine(scene_of(body_model, numbers(body_model), reduce_camera(camera, 4)))["color"]
+    torch.testing.assert_close(rendered, reduce_image(whole, 4), atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize("deviation", [0.7, 1.0, 2.0])
@@ -119,13 +119,13 @@ def test_an_update_keeps_the_curvature_positive_and_learns_a_quadratic():
     random = np.random.default_rng(0)
     root = torch.from_numpy(random.normal(0, 1, (5, 5)))
     wanted = root @ root.T + torch.eye(5)
-    found = torch.eye(5, dtype=torch.float64)
+    hessian = torch.eye(5, dtype=torch.float64)
     for direction in torch.linalg.eigh(wanted).eigenvectors.T:
-        found = update_hessian(found, direction, wanted @ direction)
-    torch.testing.assert_close(found, wanted)
+        hessian = update_hessian(hessian, direction, wanted @ direction)
+    torch.testing.assert_close(hessian, wanted)
     for _ in range(20):
-        found = update_hessian(found, *torch.from_numpy(random.normal(0, 1, (2, 5))))
-        assert torch.linalg.eigvalsh(found).min() > 0
+        hessian = update_hessian(hessian, *torch.from_numpy(random.normal(0, 1, (2, 5))))
+        assert torch.linalg.eigvalsh(hessian).min() > 0
 
 
 def place_errors(parameters, wanted):
@@ -174,13 +174,13 @@ def test_the_density_knows_how_far_off_it_is(data):
     wanted = norm.logpdf(target.double(), density.mean.double(), density.stddev.double()).sum(1)
     np.testing.assert_allclose(density.log_prob(target), wanted, rtol=1e-4)
     np.testing.assert_allclose(density.entropy(), norm.entropy(0, density.stddev.double()).sum(1), rtol=1e-4)
-    seen = Prediction(density, batch, reads=("color", "mask"))
-    assert seen.image("color").shape == seen.true_image("color").shape == (6, 48, 40, 3)
-    assert seen.image("mask").shape == seen.true_image("mask").shape
-    assert torch.isfinite(seen.image("color")).all()
+    prediction = Prediction(density, batch, reads=("color", "mask"))
+    assert prediction.image("color").shape == prediction.true_image("color").shape == (6, 48, 40, 3)
+    assert prediction.image("mask").shape == prediction.true_image("mask").shape
+    assert torch.isfinite(prediction.image("color")).all()
     drawn_by = (fitting.body_model, density.renderer, density.camera)
-    there = PosedBodyDensity(target, density.stddev, [None] * 6, *drawn_by)
-    shown = Prediction(there, batch, reads=("color", "mask"))
+    true_density = PosedBodyDensity(target, density.stddev, [None] * 6, *drawn_by)
+    shown = Prediction(true_density, batch, reads=("color", "mask"))
     assert (shown.image("color") - shown.true_image("color")).abs().mean() < 0.01
     other = head(data.target, steps=3, restarts=0)
     other.load_state_dict(fitting.state_dict())
@@ -200,9 +200,9 @@ class Blind(Renderer):
 def test_what_does_not_fit_gets_a_sentence(data):
     from plugins.density_head.fit_pose.head import FitPoseHead
 
-    with pytest.raises(ConfigError, match=r"renderer = Blind has no gradient in.*vertices.*another renderer"):
+    with pytest.raises(ConfigError, match=r"renderer=Blind lacks vertices.*another renderer"):
         FitPoseHead(data.target, renderer=Blind(), **SIZE, **DOLL)
-    with pytest.raises(ConfigError, match=r"data's are x, y\. Choose data=pose_from_image"):
+    with pytest.raises(ConfigError, match=r"this data set are x, y\. Choose data=pose_from_image"):
         head(Target("real", ("x", "y")))
     with pytest.raises(ValueError, match="row 1"):
         head(data.target)(torch.full((2, 4 * 48 * 40), 0.5).index_fill(0, torch.tensor([1]), torch.nan))
