@@ -94,7 +94,7 @@ def test_nothing_has_no_rows():
 def test_a_density_that_lists_no_classes_is_refused():
     density = Independent(Normal(torch.zeros(4, 2), 1.0), 1)
     with pytest.raises(
-        UserError, match=r"of a Independent with event_shape \(2,\).*density_head=categorical"
+        UserError, match=r"predicts a Independent with event_shape \(2,\).*density_head=categorical"
     ):
         class_probabilities(density)
 

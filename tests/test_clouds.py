@@ -79,7 +79,7 @@ def test_a_bad_number_is_named_wherever_it_stands(lengths, columns, data):
     number = data.draw(st.sampled_from([NAN, INF, -INF]))
     batch[which, point, column] = number
     with pytest.raises(
-        DataError, match=f"Cloud {which} .* holds {number} in column {column} of its point {point};"
+        DataError, match=f"Cloud {which} .* holds {number} in column {column} of point {point};"
     ):
         sizes(batch)
 
@@ -87,7 +87,7 @@ def test_a_bad_number_is_named_wherever_it_stands(lengths, columns, data):
 def test_rows_of_nan_within_a_cloud_are_bad_points_and_at_its_end_padding():
     batch = pad([cloud(5), cloud(3)])
     batch[0, 2] = NAN
-    with pytest.raises(DataError, match=r"Cloud 0 .* of its point 2;"):
+    with pytest.raises(DataError, match=r"Cloud 0 .* of point 2;"):
         sizes(batch)
 
 
@@ -108,7 +108,7 @@ def test_what_is_no_batch_of_clouds_is_refused(batch):
 
 @pytest.mark.parametrize("clouds", [[], [cloud(2), cloud(2, 4)], [torch.zeros(3)]])
 def test_clouds_that_do_not_fit_together_are_refused(clouds):
-    with pytest.raises(DataError, match="do not make a batch"):
+    with pytest.raises(DataError, match="do not form a batch"):
         pad(clouds)
 
 
@@ -267,7 +267,7 @@ def test_clouds_that_were_not_normalised_are_refused():
     for factor, reach in ((10, "10"), (1e8, r"1e\+08"), (0.005, "0.005"), (1e-8, "1e-08")):
         batch = pad([good[:9], good * factor])
         with pytest.raises(
-            DataError, match=rf"Cloud 1 of the batch reaches {reach} .* a grid with normalise=none"
+            DataError, match=rf"Cloud 1 of the batch extends to {reach} .* a grid with normalise=none"
         ):
             require_normalised(batch, 1.0, sizes(batch), by="a grid")
     require_normalised(torch.zeros(0, 0, 3), 1.0, torch.zeros(0), by="a grid")
@@ -281,7 +281,7 @@ def test_a_minority_of_far_outliers_is_no_sign_of_clouds_that_were_not_normalise
     batch = pad([strays, good[:9]])
     require_normalised(batch, 1.0, sizes(batch), by="a grid")
     batch = pad([good, torch.cat([good[:10], good[:20] * 1e6])])
-    with pytest.raises(DataError, match="Cloud 1 of the batch reaches"):
+    with pytest.raises(DataError, match="Cloud 1 of the batch extends to"):
         require_normalised(batch, 1.0, sizes(batch), by="a grid")
 
 

@@ -210,7 +210,7 @@ def test_a_direct_head_reads_what_the_encoder_gives_once_a_step() -> None:
     model(inputs)
     model(inputs)
     assert encoder.calls == 4
-    with pytest.raises(ConfigError, match=r"gives 3×2×2 numbers, but Odd reads 13 as they are"):
+    with pytest.raises(ConfigError, match=r"gives 3×2×2 numbers, but Odd reads 13 numbers"):
         Model([encoder], type("Odd", (Whole,), {"size": 13})())
 
 

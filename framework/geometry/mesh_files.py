@@ -227,8 +227,8 @@ def off(content: bytes) -> Parsed:
     body = lines[1:]
     if len(body) < vertices + faces:
         raise ValueError(
-            f"the header announces {vertices} vertices and {faces} faces, but only {len(body)} lines follow; it is cut "
-            "short"
+            f"the header announces {vertices} vertices and {faces} faces, but only {len(body)} lines follow; the file "
+            "is cut short"
         )
     start = 1 + skipped
     return Parsed(
