@@ -120,8 +120,8 @@ def check_scene(
     check_channels(channels)
     check_device("vertices", scene.vertices)
     check_device("faces", scene.faces)
-    vertices = checked_rows("vertices", scene.vertices, 3)
-    faces = indices("faces", scene.faces, len(vertices), "vertices", mesh_cache)
+    vertices = check_matrix("vertices", scene.vertices, 3)
+    faces = to_corners("faces", scene.faces, len(vertices), "vertices", mesh_cache)
     check_device("camera.rotation", scene.camera.rotation)
     check_device("camera.translation", scene.camera.translation)
     lens = check_camera(scene.camera)
@@ -132,7 +132,7 @@ def check_scene(
     if "color" in channels:
         if scene.colors is not None:
             check_device("colors", scene.colors)
-            colors = checked_colors(scene.colors, len(vertices))
+            colors = check_colors(scene.colors, len(vertices))
         learned.append(colors)
     if scene.texture is not None and not set(TEXTURED).isdisjoint(channels):
         if gradient == "soft" and "color" in channels:
@@ -143,10 +143,10 @@ def check_scene(
             )
         for name, part in texture_tensors(scene.texture).items():
             check_device(name, part)
-        texture = checked_texture(
-            scene.texture, len(faces.array), None if colors is None else colors.shape[1]
+        texture = check_texture(scene.texture, len(faces.array), None if colors is None else colors.shape[1])
+        corners = to_corners(
+            "texture.faces", texture.faces, len(texture.uv), "texture coordinates", mesh_cache
         )
-        corners = indices("texture.faces", texture.faces, len(texture.uv), "texture coordinates", mesh_cache)
         learned += [texture.uv, *texture.images]
     needs_gradient = torch.is_grad_enabled() and any(
         isinstance(part, Tensor) and part.requires_grad for part in learned
@@ -178,15 +178,15 @@ def check_on_device(scene: Scene, channels: Collection[str], gradient: Gradient)
             raise ValueError(
                 f"{name} is on {part.device}, but vertices are on {device}. Move both to the same device."
             )
-    checked_rows("vertices", scene.vertices, 3)
+    check_matrix("vertices", scene.vertices, 3)
     check_indices("faces", scene.faces, len(scene.vertices), "vertices")
     check_camera(camera)
     check_paint(scene, channels)
     colors = None
     if "color" in channels and scene.colors is not None:
-        colors = checked_colors(scene.colors, len(scene.vertices))
+        colors = check_colors(scene.colors, len(scene.vertices))
     if texture is not None and not set(TEXTURED).isdisjoint(channels):
-        checked_texture(texture, len(scene.faces), None if colors is None else colors.shape[1])
+        check_texture(texture, len(scene.faces), None if colors is None else colors.shape[1])
         check_indices("texture.faces", texture.faces, len(texture.uv), "texture coordinates")
     lens = [
         torch.as_tensor(part, dtype=torch.float64, device=device) for part in (camera.focal, camera.principal)
@@ -236,7 +236,7 @@ def check_device(name: str, tensor: Tensor) -> None:
         )
 
 
-def checked_rows(name: str, tensor: Tensor, columns: int | None) -> Tensor:
+def check_matrix(name: str, tensor: Tensor, columns: int | None) -> Tensor:
     """Return a floating-point matrix in a number type that kernels read, after checking its shape.
 
     `columns` is the required number of columns; None for any number from 1.
@@ -254,9 +254,9 @@ def to_float(name: str, tensor: Tensor) -> Tensor:
     return tensor if tensor.dtype in (torch.float32, torch.float64) else tensor.float()
 
 
-def checked_colors(colors: Tensor, count: int) -> Tensor:
+def check_colors(colors: Tensor, count: int) -> Tensor:
     """Return colours in a number type that kernels read, after checking that their number is `count`."""
-    checked = checked_rows("colors", colors, None)
+    checked = check_matrix("colors", colors, None)
     if len(checked) != count:
         raise ValueError(f"got {len(checked)} colors for {count} vertices, expected one color per vertex.")
     return checked
@@ -274,20 +274,20 @@ def check_indices(name: str, face_indices: Tensor, count: int, of: str) -> None:
     """Check that a tensor on any device holds three indices from 0 to `count` - 1 per face."""
     check_corners(name, face_indices)
     if face_indices.numel() and not (int(face_indices.min()) >= 0 and int(face_indices.max()) < count):
-        raise ValueError(out_of_range(name, face_indices, count, of))
+        raise ValueError(describe_out_of_range(name, face_indices, count, of))
 
 
-def indices(name: str, face_indices: Tensor, count: int, of: str, mesh_cache: MeshCache) -> Corners:
+def to_corners(name: str, face_indices: Tensor, count: int, of: str, mesh_cache: MeshCache) -> Corners:
     """Return face indices on the CPU in the form that kernels read, after checking that they lie below `count`."""
     check_corners(name, face_indices)
     readable = face_indices.dtype in (torch.int32, torch.int64)
     corners = mesh_cache.find(to_array(face_indices if readable else face_indices.long()))
     if face_indices.numel() and corners.largest >= count:
-        raise ValueError(out_of_range(name, face_indices, count, of))
+        raise ValueError(describe_out_of_range(name, face_indices, count, of))
     return corners
 
 
-def out_of_range(name: str, face_indices: Tensor, count: int, of: str) -> str:
+def describe_out_of_range(name: str, face_indices: Tensor, count: int, of: str) -> str:
     """Return the message about indices out of range; `of` names what they refer to."""
     return (
         f"{name} refer to the {of} {int(face_indices.min())} to {int(face_indices.max())}, expected 0 to {count - 1}, "
@@ -304,7 +304,7 @@ def texture_tensors(texture: Texture) -> dict[str, Tensor]:
     return parts | {f"image {number} of a texture": image for number, image in enumerate(texture.images)}
 
 
-def checked_texture(texture: Texture, count: int, channels: int | None) -> Texture:
+def check_texture(texture: Texture, count: int, channels: int | None) -> Texture:
     """Return a texture on any device in number types that kernels read, after all checks but that of `texture.faces`.
 
     Args:
@@ -328,7 +328,7 @@ def checked_texture(texture: Texture, count: int, channels: int | None) -> Textu
         images.append(to_float("image of a texture", image))
     if len({image.dtype for image in images}) > 1:
         images = [image.double() for image in images]
-    uv = checked_rows("uv", texture.uv, 2)
+    uv = check_matrix("uv", texture.uv, 2)
     if uv.numel() and not bool((uv.detach().abs() <= FARTHEST_UV).all()):
         raise ValueError(
             f"uv has a number that is not finite or is beyond {FARTHEST_UV:g}; texture coordinates should be near 0 "
