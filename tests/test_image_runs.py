@@ -23,7 +23,7 @@ from framework.deployment.served import _load_pyfunc
 from framework.encoder import Encoder
 from framework.errors import DataError
 from framework.geometry.srgb import bytes_from_linear, linear_from_srgb
-from framework.testing.bodies import body_file, colored, scanned
+from framework.testing.bodies import colored_mesh, write_body_file, write_subjects
 from plugins.data.human_scans.rows import colored_meshes
 from tests.conftest import Done, Framework, paths_again
 from tests.test_composition import composed
@@ -101,7 +101,7 @@ def test_a_killed_run_goes_on_bit_by_bit(
 
 def people(folder: Path) -> tuple[str, ...]:
     """A run on photographs of a dressed doll, small."""
-    file = body_file(folder)["body"]
+    file = write_body_file(folder)["body"]
     drawing = ("views=3", "height=32", "width=24", "texture_side=0", "topologies=[7k]")
     counts = ("train=2", "validation=1", "test=1")
     return (
@@ -208,7 +208,7 @@ def test_textures_are_drawn_wherever_the_subjects_are_and_nowhere_else(
         "logger=none",
         "pictures=false",
         "metric=[psnr]",
-        f"data.root={scanned(scans)['root']}",
+        f"data.root={write_subjects(scans)['root']}",
         "data.height=12",
         "data.width=9",
     )
@@ -218,7 +218,7 @@ def test_textures_are_drawn_wherever_the_subjects_are_and_nowhere_else(
     models = package.load(done.folder, paths=paths), package.freeze(done.folder, paths=paths).density
     mesh, *_ = colored_meshes(tmp_path)  # who has the colours of the first subject
     assert torch.equal(models[0](mesh).mean, models[1](mesh).mean)
-    write_registration(mesh, colored(9))
+    write_registration(mesh, colored_mesh(9))
     for model in models:
         with pytest.raises(DataError, match="has the vertex colours of no subject in"):
             model(mesh)

@@ -554,7 +554,7 @@ def masses(density: Distribution, worst: Worst) -> None:
     else:
         actual = cdf(density, value.unsqueeze(-1))
     if actual is None:
-        worst.count(False, "not known in closed form")
+        worst.count(False, "cdf or arc_probability is not known in closed form")
         return
     expected = quadrature.mass_below(value)
     worst.record(

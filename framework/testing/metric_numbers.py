@@ -159,7 +159,7 @@ def check_scaling(
         )
         if power is None:
             shift = (second_unit[key] - value).item() / math.log(SCALE)
-            bits = abs(shift) > 1e-3 and _whole(shift * math.log(2)) and not _whole(shift)
+            bits = abs(shift) > 1e-3 and _is_integer(shift * math.log(2)) and not _is_integer(shift)
             worst.count(
                 bits and "bit" not in title,
                 f"{key} changes by {shift:.6g} log {SCALE:g} for {numbers} numbers: bits, expected nats",
@@ -185,10 +185,10 @@ def _power(second: Tensor, first: Tensor) -> int | None:
 
 def _shifts(second: Tensor, first: Tensor) -> bool:
     shift = (second - first).item() / math.log(SCALE)
-    return _whole(shift) or _whole(shift * math.log(2))
+    return _is_integer(shift) or _is_integer(shift * math.log(2))
 
 
-def _whole(number: float) -> bool:
+def _is_integer(number: float) -> bool:
     return abs(number - round(number)) < 1e-6 * max(1.0, abs(number))
 
 
@@ -208,7 +208,7 @@ def check_nats(columns: Mapping[str, str], target: Target, flat: Numbers, worst:
     for key, value in flat.items():
         title = f"{key} {columns.get(key, '')}".lower()
         # for two or four classes the number of bits is an integer, which other numbers may also equal
-        bits = not _whole(uniform) and abs(abs(value.item()) - uniform) < 1e-6
+        bits = not _is_integer(uniform) and abs(abs(value.item()) - uniform) < 1e-6
         worst.count(
             bits and "bit" not in title,
             f"{key} is {value.item():.6g} for uniform densities: bits, expected nats",

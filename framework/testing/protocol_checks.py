@@ -188,7 +188,7 @@ def check_quadratic_bound(density: Distribution, worst: Worst) -> None:
     value = value.detach()
     bound_at_value = quadratic_bound(density, value)
     if bound_at_value is None:
-        worst.count(False, "not known")
+        worst.count(False, "quadratic_bound is not known")
         return
     size = log_prob.detach().abs().clamp(min=1)
     worst.record(
@@ -244,7 +244,7 @@ def known_widths(density: Distribution) -> Tensor:
 
 def check_normals(density: Distribution, worst: Worst) -> None:
     """Check that `normals` gives log p and that `mahalanobis` is -2 log p plus a constant, if they are known."""
-    worst.count(False, "not known")
+    worst.count(False, "neither normals nor mahalanobis is known")
     value = draws_and_mode(density)
     log_prob = density.log_prob(value).double()
     size = log_prob.abs().clamp(min=1)
@@ -279,9 +279,9 @@ def check_marginal_cdfs(density: Distribution, worst: Worst) -> None:
     value = draws_and_mode(density)
     stated = marginal_cdfs(density, value)
     if stated is None:
-        worst.count(False, "not known")
+        worst.count(False, "marginal_cdfs is not known")
         return
-    worst.same("shape", tuple(stated.shape), tuple(value.shape))
+    worst.same("shape of marginal_cdfs", tuple(stated.shape), tuple(value.shape))
     draws = density.sample(torch.Size((MANY,)))
     share = torch.stack([(draws <= single_value).double().mean(0) for single_value in value])
     noise = (stated * (1 - stated) / MANY).clamp(min=0).sqrt() + 1 / MANY

@@ -217,19 +217,22 @@ def _densities(make: Make, row: WrapperRow, worst: Worst) -> None:
         for count in (0, 1, 5):
             density = wrapper(inputs(count))
             target = values(row.target, (count,))
-            worst.same(f"batch_shape of {count}", tuple(density.batch_shape), (count,))
-            worst.same(f"event_shape of {count}", tuple(density.event_shape), event)
+            worst.same(f"batch_shape for {count} samples", tuple(density.batch_shape), (count,))
+            worst.same(f"event_shape for {count} samples", tuple(density.event_shape), event)
             log_prob = density.log_prob(target)
-            worst.same(f"log_prob of {count}", tuple(log_prob.shape), (count,))
-            worst.finite(f"log_prob of {count}", log_prob)
+            worst.same(f"shape of log_prob for {count} samples", tuple(log_prob.shape), (count,))
+            worst.finite(f"log_prob for {count} samples", log_prob)
             if row.target.kind == "angle":
                 worst.count(
-                    not isinstance(density.support, Circular), f"support: {density.support}, expected angles"
+                    not isinstance(density.support, Circular),
+                    f"support is {density.support}, expected that of angles",
                 )
             if count:
-                worst.same(f"sample of {count}", tuple(density.sample().shape), (count, *event))
-                worst.same(f"entropy of {count}", tuple(density.entropy().shape), (count,))
-                worst.same(f"mode of {count}", tuple(density.mode.shape), (count, *event))
+                worst.same(
+                    f"shape of sample for {count} samples", tuple(density.sample().shape), (count, *event)
+                )
+                worst.same(f"shape of entropy for {count} samples", tuple(density.entropy().shape), (count,))
+                worst.same(f"shape of mode for {count} samples", tuple(density.mode.shape), (count, *event))
 
 
 def _number_types(make: Make, row: WrapperRow, worst: Worst) -> None:
@@ -348,7 +351,7 @@ def _knobs(make: Make, row: WrapperRow, worst: Worst) -> None:
 def _loss(make: Make, row: WrapperRow, worst: Worst) -> None:
     wrapper = make().train()
     loss = wrapper.loss(inputs(8), values(row.target, (8,)))
-    worst.same("shape of the loss of 8", tuple(loss.shape), (8,))
+    worst.same("shape of the loss of 8 samples", tuple(loss.shape), (8,))
     worst.finite("loss", loss)
     loss.sum().backward()
     gradients = [parameter.grad for parameter in wrapper.parameters() if parameter.grad is not None]

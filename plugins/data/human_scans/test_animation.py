@@ -49,26 +49,27 @@ def homography(vertices):
 
 def test_flow_of_a_plane_is_its_homography_and_what_is_hidden_is_not_seen():
     camera = canonical_camera(*SIZE)
-    one, other = square(3.0, 1.6, (0.2, -0.3, 0.1)), square(3.2, 1.6, (-0.1, 0.4, 0.5), (0.2, -0.1))
+    first, second = square(3.0, 1.6, (0.2, -0.3, 0.1)), square(3.2, 1.6, (-0.1, 0.4, 0.5), (0.2, -0.1))
     hiding = square(1.5, 0.3, shift=(-0.1, 0.1))  # hides a part of the first image, absent in the second
     away = hiding + torch.tensor([9.0, 0, 0])
     faces = torch.cat([FACES, FACES + 4])
-    scenes = [Scene(torch.cat(pair), faces, None, camera) for pair in ((one, hiding), (other, away))]
-    drawn = [RENDERER(scene, flow.CHANNELS) for scene in scenes]
-    place, seen = flow.flow(*scenes, *drawn)
+    scenes = [Scene(torch.cat(pair), faces, None, camera) for pair in ((first, hiding), (second, away))]
+    channels = [RENDERER(scene, flow.CHANNELS) for scene in scenes]
+    place, visible = flow.flow(*scenes, *channels)
     row, column = torch.meshgrid(*[torch.arange(side, dtype=torch.float64) for side in SIZE], indexing="ij")
     wanted = (
-        torch.stack([column, row, torch.ones(SIZE)], -1) @ (homography(one) @ homography(other).inverse()).T
+        torch.stack([column, row, torch.ones(SIZE)], -1)
+        @ (homography(first) @ homography(second).inverse()).T
     )
     wanted = wanted[..., :2] / wanted[..., 2:]
-    assert seen.sum() > 500
-    assert (place - wanted)[seen].abs().max() < 0.01  # pixels; the rasteriser rounds corners to 1/256
+    assert visible.sum() > 500
+    assert (place - wanted)[visible].abs().max() < 0.01  # pixels; the rasteriser rounds corners to 1/256
     corners = torch.tensor([[-0.25, -0.05], [0.05, 0.25]]) / 1.5  # of the hiding square
     x, y = (torch.tensor(camera.principal) + SIZE[0] * corners).T
     hidden = (
         (wanted[..., 0] > x[0]) & (wanted[..., 0] < x[1]) & (wanted[..., 1] > y[0]) & (wanted[..., 1] < y[1])
     )
-    assert (hidden & (drawn[1]["face"] >= 0)).sum() > 50 and not (seen & hidden).any()
+    assert (hidden & (channels[1]["face"] >= 0)).sum() > 50 and not (visible & hidden).any()
 
 
 def test_a_warped_picture_agrees_where_a_textured_body_turns_and_does_not_where_colours_change():
@@ -80,14 +81,14 @@ def test_a_warped_picture_agrees_where_a_textured_body_turns_and_does_not_where_
     turn = torch.from_numpy(Rotation.from_rotvec([0.05, 0.1, 0.2]).as_matrix()).float()
     before = replace(ball, colors=colors, camera=replace(ball.camera))
     after = replace(before, vertices=place @ turn.T + torch.tensor([0.05, 0.0, 0.02]))
-    drawn = [RENDERER(scene, ("color", *flow.CHANNELS)) for scene in (before, after)]
-    where, seen = flow.flow(before, after, *drawn)
-    assert seen.float().mean() > 0.2
-    off = (flow.warp(drawn[0]["color"], where) - drawn[1]["color"])[seen].abs()
-    still = (drawn[0]["color"] - drawn[1]["color"])[seen].abs()
+    channels = [RENDERER(scene, ("color", *flow.CHANNELS)) for scene in (before, after)]
+    where, visible = flow.flow(before, after, *channels)
+    assert visible.float().mean() > 0.2
+    off = (flow.warp(channels[0]["color"], where) - channels[1]["color"])[visible].abs()
+    still = (channels[0]["color"] - channels[1]["color"])[visible].abs()
     assert off.mean() < 0.004 < 0.05 < still.mean()
     brighter = RENDERER(replace(after, colors=colors + 0.1), ("color",))["color"]
-    change = (brighter - flow.warp(drawn[0]["color"], where))[seen].mean()
+    change = (brighter - flow.warp(channels[0]["color"], where))[visible].mean()
     assert change == pytest.approx(0.1, abs=0.002)
 
 
@@ -135,8 +136,8 @@ TURNS = {"Hips": (10, 20, -5), "LeftUpLeg": (0, 0, -40), "LeftLeg": (5, 0, 60), 
 def test_frames_last_as_long_as_a_motion_file_says(tmp_path):
     file = tmp_path / "walk.bvh"
     file.write_text(bvh([{}, TURNS]))
-    found = motion.read(file)
-    assert found.seconds == 0.05 and found.rotations.shape == (2, len(JOINTS), 3, 3)
+    recorded = motion.read(file)
+    assert recorded.seconds == 0.05 and recorded.rotations.shape == (2, len(JOINTS), 3, 3)
     for wrong in ("0", "-0.1", "nan", "1e9"):
         file.write_text(bvh([{}]).replace("0.05", wrong))
         with pytest.raises(DataError, match=r"walk\.bvh"):
@@ -174,15 +175,17 @@ def test_pictures_show_a_mesh_on_white_and_the_data_sets_photograph(data, person
     Crowd(data.renderer, data.counts, data.drawing, data.data_seed)._write_person(tmp_path, "test", 0)
     view = scan_layout.read_subject(tmp_path, "test_0000", data.topology).views[1]
     written = bytes_from_linear(photograph(view)[0]).numpy()
-    found = animation.photograph(data.renderer, person.first().scan, view.camera)
+    shot = animation.photograph(data.renderer, person.first().scan, view.camera)
     assert (
-        np.abs(found.astype(int) - written).max() <= 1
+        np.abs(shot.astype(int) - written).max() <= 1
     )  # the file's colours are rounded before compositing on white
     scene = animation.actor(person.registration).scene(person.first(), view.camera)
-    drawn = animation.on_white(RENDERER, scene)
-    seen = RENDERER(scene, ("mask", "color"))
-    assert (drawn[~seen["mask"]] == 255).all()
-    assert torch.equal(torch.from_numpy(drawn)[seen["mask"]], bytes_from_linear(seen["color"])[seen["mask"]])
+    image = animation.on_white(RENDERER, scene)
+    channels = RENDERER(scene, ("mask", "color"))
+    assert (image[~channels["mask"]] == 255).all()
+    assert torch.equal(
+        torch.from_numpy(image)[channels["mask"]], bytes_from_linear(channels["color"])[channels["mask"]]
+    )
 
 
 @pytest.mark.parametrize("walks", [False, True])
@@ -193,8 +196,8 @@ def test_a_run_and_a_motion_become_pictures_side_by_side(data, tmp_path, walks, 
     # data of a doll, because the run's own data needs the default body
     monkeypatch.setattr(animate, "data_of", lambda description: data)
     (tmp_path / "walk.bvh").write_text(bvh([{}, TURNS, {}]))
-    asked = [run, "--frames", "3", "--out", str(tmp_path / "new/film.gif")]
-    animate.main([*asked, *(["test_0001", "--motion", str(tmp_path / "walk.bvh")] if walks else [])])
+    arguments = [run, "--frames", "3", "--out", str(tmp_path / "new/film.gif")]
+    animate.main([*arguments, *(["test_0001", "--motion", str(tmp_path / "walk.bvh")] if walks else [])])
     assert "film.gif" in capsys.readouterr().out
     with Image.open(tmp_path / "new/film.gif") as film:
         assert film.n_frames == 3 and film.size == (3 * width, height + animation.CAPTION)
@@ -220,8 +223,8 @@ def test_cameras_see_all_of_somebody_from_everywhere(person):
 def frames(count):
     pixels = np.random.default_rng(0).integers(0, 256, (count, 40, 32, 3), np.uint8)
     pixels[:, :20] = 255
-    pictures = [{"mesh": one, "photograph": 255 - one} for one in pixels]
-    return [animation.side_by_side(copy.copy(one), synthetic=True) for one in pictures]
+    pictures = [{"mesh": image, "photograph": 255 - image} for image in pixels]
+    return [animation.side_by_side(copy.copy(image), synthetic=True) for image in pictures]
 
 
 @pytest.mark.parametrize("kind", [".gif", ".webp"])

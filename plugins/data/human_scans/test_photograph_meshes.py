@@ -14,7 +14,7 @@ SMALLER = ["--views", "3", "--size", "20", "16", "--topology", "mine"]
 
 
 @pytest.fixture
-def given(tmp_path):
+def mesh_folder(tmp_path):
     folder = tmp_path / "given"
     for split, names in {"train": ("ann", "bob"), "validation": ("dan",), "test": ("eve",)}.items():
         for number, name in enumerate(names):
@@ -25,22 +25,22 @@ def given(tmp_path):
     return folder
 
 
-def test_meshes_become_a_root(given, tmp_path, capsys):
+def test_meshes_become_a_root(mesh_folder, tmp_path, capsys):
     root = tmp_path / "root"
-    photograph_meshes.main([str(given), str(root), *SMALLER])
+    photograph_meshes.main([str(mesh_folder), str(root), *SMALLER])
     assert "4 people" in capsys.readouterr().out
-    found = build(
+    data = build(
         "data", resolve("data", {"name": "human_scans", **SMALL, "root": str(root), "topology": "mine"})
     )
-    found.prepare()
-    assert found.synthetic and found.size == (20, 16)
-    assert [len(split) for split in found.splits()] == [6, 3, 3]
+    data.prepare()
+    assert data.synthetic and data.size == (20, 16)
+    assert [len(split) for split in data.splits()] == [6, 3, 3]
     read = scan_layout.read_subject(root, "bob", "mine").mesh
     assert torch.equal(read.vertices, colored_mesh(6).vertices) and torch.equal(
         read.colors, colored_mesh(6).colors
     )
     with pytest.raises(DataError, match="exists already"):
-        photograph_meshes.main([str(given), str(root), *SMALLER])
+        photograph_meshes.main([str(mesh_folder), str(root), *SMALLER])
 
 
 WRONG = {
@@ -51,8 +51,8 @@ WRONG = {
     "no scans": (lambda folder: shutil.rmtree(folder / "test"), "test: the folder has no scan"),
     "twice": (
         lambda folder: [
-            shutil.copy(folder / f"train/ann_{what}.ply", folder / "test")
-            for what in ("scan", "registration")
+            shutil.copy(folder / f"train/ann_{kind}.ply", folder / "test")
+            for kind in ("scan", "registration")
         ],
         "the name ann occurs twice",
     ),
@@ -61,8 +61,8 @@ WRONG = {
 
 
 @pytest.mark.parametrize("spoil, words", WRONG.values(), ids=WRONG)
-def test_what_is_wrong_is_said_and_nothing_is_left(given, tmp_path, spoil, words):
-    spoil(given)
+def test_what_is_wrong_is_said_and_nothing_is_left(mesh_folder, tmp_path, spoil, words):
+    spoil(mesh_folder)
     with pytest.raises(DataError, match=words):
-        photograph_meshes.main([str(given), str(tmp_path / "root"), *SMALLER])
+        photograph_meshes.main([str(mesh_folder), str(tmp_path / "root"), *SMALLER])
     assert not (tmp_path / "root").exists()

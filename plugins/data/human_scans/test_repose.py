@@ -42,12 +42,12 @@ def test_any_pose_and_shape_is_found_from_the_vertices_alone(doll, size, number)
     shape, place = (torch.from_numpy(random.normal(size=(1, count))) for count in (4, 3))
     model = BodyModel(doll).double()
     mesh = model(shape, pose, place)[0]
-    found = fit_mesh(doll, mesh, usual=0.0)
-    assert found.error < 1e-6
-    torch.testing.assert_close(model(*found[:3])[0], mesh, atol=1e-6, rtol=0)
-    torch.testing.assert_close(found.shape, shape, atol=1e-5, rtol=0)
-    for one, other in zip(pose[0].numpy(), found.pose[0].numpy(), strict=True):
-        assert (Rotation.from_rotvec(one).inv() * Rotation.from_rotvec(other)).magnitude() < 1e-5
+    fit = fit_mesh(doll, mesh, usual=0.0)
+    assert fit.error < 1e-6
+    torch.testing.assert_close(model(*fit[:3])[0], mesh, atol=1e-6, rtol=0)
+    torch.testing.assert_close(fit.shape, shape, atol=1e-5, rtol=0)
+    for true_turn, found_turn in zip(pose[0].numpy(), fit.pose[0].numpy(), strict=True):
+        assert (Rotation.from_rotvec(true_turn).inv() * Rotation.from_rotvec(found_turn)).magnitude() < 1e-5
 
 
 def test_what_is_usual_shares_a_bend_and_counts_less_the_better_the_mesh_fits(doll):
@@ -57,7 +57,7 @@ def test_what_is_usual_shares_a_bend_and_counts_less_the_better_the_mesh_fits(do
     )
     assert strict < usual < free and free == pytest.approx(3.0, abs=1e-5)
     for wrong in (mesh[:-1], mesh.clone().fill_(torch.nan)):
-        with pytest.raises(DataError, match="wanted the 132 of"):
+        with pytest.raises(DataError, match="expected the 132 vertices of"):
             fit_mesh(doll, wrong)
 
 
@@ -71,11 +71,13 @@ def test_few_shapes_are_the_principal_components_of_adults(default):
     values = traits.coefficients(
         torch.from_numpy(sample_adults(traits.labels, 100, np.random.default_rng(3)))
     ).numpy()
-    apart = np.stack([(body.template + body.shapes @ one - few.template).ravel() for one in values])
-    found = np.linalg.lstsq(directions, apart.T, rcond=None)[0]
-    assert np.sqrt(3 * np.square(apart.T - directions @ found).mean()) < 0.002
-    np.testing.assert_allclose(found.std(1), 1, atol=0.3)
-    np.testing.assert_allclose(found.mean(1), 0, atol=0.4)
+    displacements = np.stack(
+        [(body.template + body.shapes @ person - few.template).ravel() for person in values]
+    )
+    coefficients = np.linalg.lstsq(directions, displacements.T, rcond=None)[0]
+    assert np.sqrt(3 * np.square(displacements.T - directions @ coefficients).mean()) < 0.002
+    np.testing.assert_allclose(coefficients.std(1), 1, atol=0.3)
+    np.testing.assert_allclose(coefficients.mean(1), 0, atol=0.4)
     assert np.ptp((few.template + few.shapes[..., 0])[:, 1]) > np.ptp(few.template[:, 1]) + 0.02
 
 
@@ -97,10 +99,12 @@ def test_vertices_of_a_topology_bend_with_the_body(doll, default, name):
             poses.rotations(body, poses.skeleton(body), repose.a_pose_with("left elbow=90"))
         )
         shape = torch.zeros(1, 0)
-        whole, some = (BodyModel(one).double()(shape.double(), pose)[0].numpy() for one in (body, own))
-        apart = np.linalg.norm(some - surface.interpolate(whole)[mesh.rows], axis=1)
-        assert apart[mesh.rows < len(body.template)].max() < tolerance
-        assert np.quantile(apart, 0.99) < 0.002 and apart.max() < 0.01
+        whole, some = (
+            BodyModel(some_body).double()(shape.double(), pose)[0].numpy() for some_body in (body, own)
+        )
+        distances = np.linalg.norm(some - surface.interpolate(whole)[mesh.rows], axis=1)
+        assert distances[mesh.rows < len(body.template)].max() < tolerance
+        assert np.quantile(distances, 0.99) < 0.002 and distances.max() < 0.01
 
 
 def test_meshes_of_other_bodies_are_told(doll):
@@ -117,7 +121,7 @@ def test_somebody_posed_anew_is_as_in_that_pose_and_reshaped_as_of_that_shape(de
     few = reduce_shapes(body, traits)
     surface = sheet(body, 0)
     mesh = topology(body, surface, "7k")
-    whole, own = (BodyModel(body_in_topology(one, surface, mesh)).double() for one in (body, few))
+    whole, own = (BodyModel(body_in_topology(somebody, surface, mesh)).double() for somebody in (body, few))
     rest = whole.template.unflatten(0, (3, -1)).T
     outwards = trimesh.Trimesh(rest, mesh.faces, process=False).vertex_normals
     clothes = (0.01 + 0.01 * torch.sin(9 * rest[:, :1])) * torch.tensor(outwards)[None]
@@ -128,30 +132,30 @@ def test_somebody_posed_anew_is_as_in_that_pose_and_reshaped_as_of_that_shape(de
         for moved in (repose.a_pose_with("yaw=170,right knee=30"), poses.draw(1, random))
     )
     still = torch.tensor([[1.0, 0.2, -3.0]]).double()
-    given = RegisteredMesh(
+    registration = RegisteredMesh(
         whole(shape, before, still, clothes)[0].float(),
         torch.zeros(6890, 3).byte(),
         torch.from_numpy(mesh.faces),
     )
-    one = repose.subject(body, few, given, "somebody")
-    assert one.folded == 0 and one.fit.error < 0.015
-    back = own(one.fit.shape, one.fit.pose, one.fit.translation, one.offsets)[0]
-    torch.testing.assert_close(back, given.vertices.double(), atol=1e-6, rtol=0)
+    somebody = repose.subject(body, few, registration, "somebody")
+    assert somebody.folded == 0 and somebody.fit.error < 0.015
+    back = own(somebody.fit.shape, somebody.fit.pose, somebody.fit.translation, somebody.offsets)[0]
+    torch.testing.assert_close(back, registration.vertices.double(), atol=1e-6, rtol=0)
     taller = torch.zeros(COUNT).double()
     taller[0] = 2.0
     step = torch.from_numpy(body_in_topology(few, surface, mesh).shapes[..., 0]).double()
     joints = torch.from_numpy(few.joint_shapes[..., 0]).double()
-    for found, truth in (
-        (one.posed(after[0].numpy()), whole(shape, after, None, clothes)[0]),
-        (one.posed(before[0].numpy(), taller), None),
+    for estimate, truth in (
+        (somebody.posed(after[0].numpy()), whole(shape, after, None, clothes)[0]),
+        (somebody.posed(before[0].numpy(), taller), None),
     ):
         if truth is None:  # joints and vertices of the truth are moved by the same two standard deviations
             whole.joints += 2 * joints
             truth = whole(shape, before, None, clothes + 2 * step)[0]
-        ours = found.vertices.double()
+        ours = estimate.vertices.double()
         gaps = ((ours - ours.mean(0)) - (truth - truth.mean(0))).norm(dim=1)
         assert gaps.median() < 0.006 and gaps.quantile(0.95) < 0.012
-        assert ours[:, 1].min() == pytest.approx(float(given.vertices[:, 1].min()), abs=1e-6)
+        assert ours[:, 1].min() == pytest.approx(float(registration.vertices[:, 1].min()), abs=1e-6)
 
 
 def registered(folder, doll, number=0):
@@ -162,20 +166,20 @@ def registered(folder, doll, number=0):
         + 5.0
     )
     colors = torch.from_numpy(random.integers(0, 256, (len(mesh), 3), np.uint8))
-    given = RegisteredMesh(mesh.float(), colors, torch.from_numpy(doll.faces))
-    scan_layout.write_registration(folder / "registration_mine.ply", given)
-    return given
+    registration = RegisteredMesh(mesh.float(), colors, torch.from_numpy(doll.faces))
+    scan_layout.write_registration(folder / "registration_mine.ply", registration)
+    return registration
 
 
 def test_what_is_written_is_read_by_the_data_set_and_seen_whole(doll, tmp_path, capsys):
-    given = registered(tmp_path / "ann", doll)
+    registration = registered(tmp_path / "ann", doll)
     out = tmp_path / "out"
     wanted = ["--pose", "rest", "--pose", "left raise=90,right knee=40", "--random", "2"]
     wanted += ["--shape", "0=-2", "--shape", "1=1,3=2"]
     arguments = ["--body", DOLL["body"], "--topology", "mine", "--views", "3", "--size", "40", "30"]
     repose.main([str(tmp_path / "ann"), "--out", str(out), *wanted, *arguments])
-    told = capsys.readouterr().out
-    assert "ann: 132 vertices" in told and "0 folded" in told and "7 meshes, 3 cameras" in told
+    output = capsys.readouterr().out
+    assert "ann: 132 vertices" in output and "0 folded" in output and "7 meshes, 3 cameras" in output
     files = {file.stem: file for file in sorted(out.glob("*.ply"))}
     assert list(files) == sorted(
         f"ann_{name}"
@@ -190,9 +194,9 @@ def test_what_is_written_is_read_by_the_data_set_and_seen_whole(doll, tmp_path, 
         )
     )
     same = meshes.read(files["ann_registration"])
-    apart = given.vertices.numpy() - same.vertices
-    np.testing.assert_allclose(apart, np.broadcast_to(apart[0], apart.shape), atol=1e-5)
-    assert abs(apart[0, 1]) < 1e-5
+    differences = registration.vertices.numpy() - same.vertices
+    np.testing.assert_allclose(differences, np.broadcast_to(differences[0], differences.shape), atol=1e-5)
+    assert abs(differences[0, 1]) < 1e-5
     rest = meshes.read(files["ann_pose_0"]).vertices
     joints = rest.reshape(22, 6, 3).mean(1)
     assert np.abs(joints[[0]] * [1, 0, 1]).max() < 1e-4  # the root is over the origin
@@ -203,7 +207,7 @@ def test_what_is_written_is_read_by_the_data_set_and_seen_whole(doll, tmp_path, 
     cameras = scan_layout.read_cameras(out / "cameras.json")
     for file in files.values():
         assert len(data.read([file])) == 3
-        np.testing.assert_array_equal(scan_layout.vertex_colors(meshes.read(file)), given.colors)
+        np.testing.assert_array_equal(scan_layout.vertex_colors(meshes.read(file)), registration.colors)
         for camera in cameras.values():
             pixel, depth = camera.project(torch.from_numpy(meshes.read(file).vertices).float())
             assert (depth > 0).all() and (pixel > -0.5).all() and (pixel < torch.tensor([29.5, 39.5])).all()

@@ -157,9 +157,9 @@ def test_another_topology_is_named(whole):
 def test_what_is_written_is_read(tmp_path):
     mesh = colored_mesh(3)
     scan_layout.write_registration(tmp_path / "registration_7k.ply", mesh)
-    found = scan_layout.read_registration(tmp_path / "registration_7k.ply")
+    mesh_read = scan_layout.read_registration(tmp_path / "registration_7k.ply")
     for name in ("vertices", "colors", "faces"):
-        assert torch.equal(getattr(found, name), getattr(mesh, name))
+        assert torch.equal(getattr(mesh_read, name), getattr(mesh, name))
 
 
 def test_one_changed_pixel_changes_the_fingerprint(root):
@@ -200,13 +200,13 @@ def test_inputs_keep_their_pixels_in_the_canonical_camera(whole):
     view = json.loads((whole / "subjects/ann/cameras.json").read_text())["views"][1]
     matrix, rotation, shift = (np.array(view[key]) for key in ("K", "R", "t"))
     mesh = colored_mesh(0)
-    seen = (matrix @ (rotation @ mesh.vertices.double().numpy().T + shift[:, None])).T
-    given = prepared.splits().train[1]["input"].double().numpy()
+    projected = (matrix @ (rotation @ mesh.vertices.double().numpy().T + shift[:, None])).T
+    inputs = prepared.splits().train[1]["input"].double().numpy()
     height, width = prepared.size
-    pixel = height * given[:, :2] / given[:, 2:3] + [(width - 1) / 2, (height - 1) / 2]
-    np.testing.assert_allclose(pixel, seen[:, :2] / seen[:, 2:], rtol=1e-5, atol=1e-4)
-    np.testing.assert_allclose(given[:, 2], seen[:, 2], rtol=1e-6)
-    np.testing.assert_allclose(given[:, 3:] * 255, mesh.colors.numpy(), atol=1e-4)
+    pixel = height * inputs[:, :2] / inputs[:, 2:3] + [(width - 1) / 2, (height - 1) / 2]
+    np.testing.assert_allclose(pixel, projected[:, :2] / projected[:, 2:], rtol=1e-5, atol=1e-4)
+    np.testing.assert_allclose(inputs[:, 2], projected[:, 2], rtol=1e-6)
+    np.testing.assert_allclose(inputs[:, 3:] * 255, mesh.colors.numpy(), atol=1e-4)
 
 
 def test_own_meshes_are_seen_whole_or_by_their_own_cameras(whole, tmp_path):
@@ -219,9 +219,9 @@ def test_own_meshes_are_seen_whole_or_by_their_own_cameras(whole, tmp_path):
         vertices = mesh.vertices * torch.from_numpy(10 ** random.uniform(-2, 1, 3)).float() + 5
         file = tmp_path / f"{number}.ply"
         scan_layout.write_registration(file, scan_layout.RegisteredMesh(vertices, mesh.colors, mesh.faces))
-        given = unprepared.inputs(file)[0]
-        pixel = 40 * given[:, :2] / given[:, 2:3] + torch.tensor([14.5, 19.5])
-        assert (given[:, 2] > 0).all() and (pixel > 0).all() and (pixel < torch.tensor([29.0, 39.0])).all()
+        inputs = unprepared.inputs(file)[0]
+        pixel = 40 * inputs[:, :2] / inputs[:, 2:3] + torch.tensor([14.5, 19.5])
+        assert (inputs[:, 2] > 0).all() and (pixel > 0).all() and (pixel < torch.tensor([29.0, 39.0])).all()
     beside = whole / "subjects/ann"
     assert unprepared.inputs(beside / "registration_7k.ply").shape == (2, 40, 6)
 
@@ -237,45 +237,48 @@ def test_a_varied_batch_shows_what_a_photograph_of_the_varied_points_would(
     train = prepared.splits().train
     batch = default_collate([train[number % len(train)] for number in range(120)])
     torch.manual_seed(0)
-    found = prepared.augment(batch)
+    augmented = prepared.augment(batch)
     height, width = prepared.size
     ways = set()
     for row in range(120):
-        sign = found["input"][row, :, 0] / batch["input"][row, :, 0]
+        sign = augmented["input"][row, :, 0] / batch["input"][row, :, 0]
         assert torch.equal(sign, sign[:1].expand(len(sign))) and abs(float(sign[0])) == 1
         order = next(
             order
             for order in permutations(range(3))
             if torch.equal(
-                batch["color"][row][..., list(order)].flip(1 if sign[0] < 0 else ()), found["color"][row]
+                batch["color"][row][..., list(order)].flip(1 if sign[0] < 0 else ()), augmented["color"][row]
             )
         )
         ways.add((float(sign[0]), order))
-        assert torch.equal(found["input"][row, :, 3:], batch["input"][row, :, 3:][:, list(order)])
+        assert torch.equal(augmented["input"][row, :, 3:], batch["input"][row, :, 3:][:, list(order)])
         turned = {
             key: batch[key][row].flip(1) if sign[0] < 0 else batch[key][row] for key in ("target", "mask")
         }
         target = turned["target"][..., list(order)] if shows == "photograph" else turned["target"]
-        assert torch.equal(found["target"][row], target)
-        assert torch.equal(found["mask"][row], turned["mask"])
+        assert torch.equal(augmented["target"][row], target)
+        assert torch.equal(augmented["mask"][row], turned["mask"])
         # pixels at which the canonical camera sees the points, mirrored about its middle column
-        pixel = height * found["input"][row, :, 0] / found["input"][row, :, 2] + (width - 1) / 2
+        pixel = height * augmented["input"][row, :, 0] / augmented["input"][row, :, 2] + (width - 1) / 2
         before = height * batch["input"][row, :, 0] / batch["input"][row, :, 2] + (width - 1) / 2
         torch.testing.assert_close(pixel, before if sign[0] > 0 else width - 1 - before)
-        assert torch.equal(found["input"][row, :, 1:3], batch["input"][row, :, 1:3])
+        assert torch.equal(augmented["input"][row, :, 1:3], batch["input"][row, :, 1:3])
     assert len(ways) == (2 if mirrored else 1) * (6 if recoloured else 1)
     assert prepared.varies == (mirrored or recoloured > 0)
 
 
 def test_targets_are_silhouettes_where_who_is_where_is_asked(whole):
-    found, shown = (data(whole, shows=what) for what in ("subject", "photograph"))
-    for one in (found, shown):
-        one.prepare()
-    assert found.target.names == ("subject",) and found.target.event_shape == (12, 9, 1)
-    assert found.fingerprint() != shown.fingerprint() and "shows" not in shown.fingerprint()
-    for one, other in zip(found.splits().test, shown.splits().test, strict=True):
-        assert torch.equal(one["target"][..., 0], other["mask"].float()) and 0 < one["target"].mean() < 1
-        assert all(torch.equal(one[name], other[name]) for name in ("input", "color", "mask"))
+    silhouettes, photographs = (data(whole, shows=target_kind) for target_kind in ("subject", "photograph"))
+    for data_set in (silhouettes, photographs):
+        data_set.prepare()
+    assert silhouettes.target.names == ("subject",) and silhouettes.target.event_shape == (12, 9, 1)
+    assert silhouettes.fingerprint() != photographs.fingerprint() and "shows" not in photographs.fingerprint()
+    for data_set, photograph in zip(silhouettes.splits().test, photographs.splits().test, strict=True):
+        assert (
+            torch.equal(data_set["target"][..., 0], photograph["mask"].float())
+            and 0 < data_set["target"].mean() < 1
+        )
+        assert all(torch.equal(data_set[name], photograph[name]) for name in ("input", "color", "mask"))
 
 
 def test_a_mesh_drawn_as_ground_leaves_free_what_its_picture_leaves_white():
@@ -290,7 +293,7 @@ def test_a_mesh_drawn_as_ground_leaves_free_what_its_picture_leaves_white():
         "width": 20,
         "depth": True,
     }
-    drawn, ground = (
+    rendered, ground = (
         build(
             "encoder",
             resolve("encoder", {**config, "ground": ground}),
@@ -299,7 +302,7 @@ def test_a_mesh_drawn_as_ground_leaves_free_what_its_picture_leaves_white():
         )(cloud)
         for ground in (False, True)
     )
-    assert drawn.shape == (1, 4, 24, 20) and ground.shape == (1, 2, 24, 20)
+    assert rendered.shape == (1, 4, 24, 20) and ground.shape == (1, 2, 24, 20)
     # vertices are black, so that all remaining light is the white background
-    torch.testing.assert_close(linear_from_srgb(drawn[:, :1]), ground[:, :1], atol=1e-5, rtol=0)
-    assert torch.equal(drawn[:, 3], ground[:, 1]) and 0 < float(ground[:, 0].mean()) < 1
+    torch.testing.assert_close(linear_from_srgb(rendered[:, :1]), ground[:, :1], atol=1e-5, rtol=0)
+    assert torch.equal(rendered[:, 3], ground[:, 1]) and 0 < float(ground[:, 0].mean()) < 1

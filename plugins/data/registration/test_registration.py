@@ -31,37 +31,43 @@ def data(file, **config):
 
 
 def prepared(file, **config):
-    made = data(file, **config)
-    made.prepare()
-    return made
+    registration_data = data(file, **config)
+    registration_data.prepare()
+    return registration_data
 
 
 def test_people_are_split_and_drawn_by_the_data_seed(file):
-    one, other = prepared(file), prepared(file, data_seed=1)
-    assert one.fingerprint()["sha256"] != other.fingerprint()["sha256"]
-    assert one.target.names[:4] == ("x0", "y0", "z0", "x1")
-    assert len(one.target.names) == 3 * 132
-    assert one.input_shape == (500, 3)
-    assert (one.groups, one.varies, one.columns) == (("whole", "partial", "outliers"), False, ("x", "y", "z"))
-    batch = one.splits().test.__getitems__([3, 0, 29])
+    first, second = prepared(file), prepared(file, data_seed=1)
+    assert first.fingerprint()["sha256"] != second.fingerprint()["sha256"]
+    assert first.target.names[:4] == ("x0", "y0", "z0", "x1")
+    assert len(first.target.names) == 3 * 132
+    assert first.input_shape == (500, 3)
+    assert (first.groups, first.varies, first.columns) == (
+        ("whole", "partial", "outliers"),
+        False,
+        ("x", "y", "z"),
+    )
+    batch = first.splits().test.__getitems__([3, 0, 29])
     assert {name: batch[name].dtype for name in ("target", "centre", "scale")} == dict.fromkeys(
         ("target", "centre", "scale"), torch.float32
     )
-    assert one.splits().train.__getitems__([0])["target"].dtype == torch.float16
+    assert first.splits().train.__getitems__([0])["target"].dtype == torch.float16
 
 
 def test_points_lie_on_the_body_and_both_in_one_frame(file):
-    made = prepared(file, noise=0, partial=0, outliers=0)
-    scans = made.splits().test
+    registration_data = prepared(file, noise=0, partial=0, outliers=0)
+    scans = registration_data.splits().test
     batch = scans.__getitems__(range(5))
     place = batch["centre"].double(), batch["scale"].double()
     vertices = denormalise_clouds(batch["target"].double().unflatten(1, (-1, 3)), *place)
     np.testing.assert_allclose(vertices, scans.model(scans.shape[:5], scans.pose[:5]), atol=1e-6)
     points = denormalise_clouds(batch["input"].double(), *place)
-    normal, corners = planes(vertices, made.model.faces)
+    normal, corners = planes(vertices, registration_data.model.faces)
     for cloud, n, c in zip(points, normal, corners, strict=True):
-        apart = torch.einsum("fk,pfk->pf", n, cloud[:, None] - c[None, :, 0]).abs()  # from every face's plane
-        assert apart.amin(1).max() < 1e-6
+        distances_to_planes = torch.einsum(
+            "fk,pfk->pf", n, cloud[:, None] - c[None, :, 0]
+        ).abs()  # from every face's plane
+        assert distances_to_planes.amin(1).max() < 1e-6
 
 
 def planes(vertices, faces):
@@ -90,9 +96,9 @@ def test_a_scanner_sees_one_side_and_cuts_no_more_than_asked():
     content = doll()
     mesh = Mesh("a doll", content["v_template"], content["f"])
     for seed in range(40):
-        found = scan(mesh, "partial", Scanner(points=2_000, noise=0.0, cut=0.1), np.random.default_rng(seed))
+        points = scan(mesh, "partial", Scanner(points=2_000, noise=0.0, cut=0.1), np.random.default_rng(seed))
         # a tenth at most is removed by a plane or a ball; or the half that faces away
-        assert len(found) >= 1_800 or 800 < len(found) < 1_200
+        assert len(points) >= 1_800 or 800 < len(points) < 1_200
     noisy = scan(mesh, "whole", Scanner(points=20_000, noise=0.01), np.random.default_rng(3))
     assert len(noisy) == 20_000
     outside = np.linalg.norm(noisy[:, None] - JOINTS, axis=-1).min(1) > 0.0401
@@ -101,10 +107,10 @@ def test_a_scanner_sees_one_side_and_cuts_no_more_than_asked():
 
 def test_strangers_are_a_patch_of_floor_and_a_few_others():
     vertices = doll()["v_template"]
-    found = strangers(vertices, 1_000, np.random.default_rng(0))
-    floor = np.abs(found[:, 1] - vertices[:, 1].min()) < 0.02
+    points = strangers(vertices, 1_000, np.random.default_rng(0))
+    floor = np.abs(points[:, 1] - vertices[:, 1].min()) < 0.02
     assert floor.mean() >= 0.98
-    assert np.ptp(found[floor][:, 0]) < 1.7
+    assert np.ptp(points[floor][:, 0]) < 1.7
 
 
 def test_a_users_scan_is_read_in_metres_without_preparing(file, tmp_path):
@@ -147,10 +153,10 @@ def test_a_result_is_one_coloured_ply(tmp_path):
     content = doll()
     cloud = np.random.default_rng(0).normal(size=(50, 3))
     write_ply(tmp_path / "a.ply", content["v_template"], content["f"], cloud)
-    found = read(tmp_path / "a.ply")
-    np.testing.assert_allclose(found.vertices, np.concatenate([content["v_template"], cloud]), atol=1e-6)
-    assert np.array_equal(found.faces, content["f"])
-    colours = found.attribute(("red", "green", "blue"))
+    mesh = read(tmp_path / "a.ply")
+    np.testing.assert_allclose(mesh.vertices, np.concatenate([content["v_template"], cloud]), atol=1e-6)
+    assert np.array_equal(mesh.faces, content["f"])
+    colours = mesh.attribute(("red", "green", "blue"))
     np.testing.assert_allclose(colours[0], SKIN, atol=1 / 255)
     np.testing.assert_allclose(colours[-1], SCAN, atol=1 / 255)
 
@@ -162,10 +168,10 @@ def test_the_panels_show_the_front_and_the_left_side():
     faces = np.array([(0, 1, 2), (0, 2, 3), (1, 4, 5), (1, 5, 2)])
     cloud = np.array([(0.5, 0.5, 1.0), (-0.5, -0.5, -1.0)])
     red = np.array([(1.0, 0.0, 0.0)] * 2)
-    drawn = render_panels(vertices, faces, cloud, red, height=100)
-    assert drawn.shape == (2, 4, 100, 100, 3)
+    images = render_panels(vertices, faces, cloud, red, height=100)
+    assert images.shape == (2, 4, 100, 100, 3)
     skin, blue = ((255 * np.array(color)).round() for color in (SKIN, SCAN))
-    front, left = drawn[:, 2].astype(float)
+    front, left = images[:, 2].astype(float)
     assert (front == blue).all(-1).sum() == 1  # the point behind the square is hidden
     row, column = np.argwhere((front == blue).all(-1))[0]
     assert row < 50 < column  # up, and to the body's left, which is the viewer's right
@@ -174,8 +180,8 @@ def test_the_panels_show_the_front_and_the_left_side():
     assert column < 50  # the front is to the left when a body is seen from its left
     share = (np.abs(left - skin).max(-1) <= 1).mean()
     assert 0.05 < share < 0.15  # the bar alone, 0.3 by 2 of 2.12 by 2.12
-    assert (drawn[0, 0] != 255).any(-1).sum() == 2  # the cloud alone
-    assert (drawn[0, 3] == (255, 0, 0)).all(-1).sum() == 2  # in its own colours
+    assert (images[0, 0] != 255).any(-1).sum() == 2  # the cloud alone
+    assert (images[0, 3] == (255, 0, 0)).all(-1).sum() == 2  # in its own colours
     shown = figure(vertices, faces, cloud, "square")
     shown.draw_without_rendering()
     heads = ["scan", "registered mesh", "both", "distance from the mesh"]
@@ -202,24 +208,24 @@ def command(folder, *arguments):
     """Run `python -m ...` as a user does, and return exit code and output."""
     call = [sys.executable, "-m", *map(str, arguments)]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(call, cwd=folder, env=environment, capture_output=True, text=True, timeout=300)
-    return done.returncode, done.stdout + done.stderr
+    process = subprocess.run(call, cwd=folder, env=environment, capture_output=True, text=True, timeout=300)
+    return process.returncode, process.stdout + process.stderr
 
 
 def test_a_trained_run_registers_a_users_scan(file, tmp_path):
     small = ["data.train=64", "data.validation=16", "data.test=16", "data.points=200", "trainer.max_epochs=2"]
-    code, told = command(
+    code, output = command(
         tmp_path, "framework", "experiment=registration/quick", f"data.body={file}", *small, "batch_size=16",
         "encoder.bps.points=64", "encoder.dense_blocks.width=32", "workers=0", "logger=none", "hydra.run.dir=run",
     )  # fmt: skip
-    assert code == 0, told
-    found = json.loads((tmp_path / "run" / "results.json").read_text(encoding="utf-8"))
-    assert found["synthetic"]
-    assert 0 < found["vertex_error_median_cm"] < 100
+    assert code == 0, output
+    results = json.loads((tmp_path / "run" / "results.json").read_text(encoding="utf-8"))
+    assert results["synthetic"]
+    assert 0 < results["vertex_error_median_cm"] < 100
     points = prepared(file).splits().test.__getitems__([0])
     cloud = denormalise_clouds(points["input"], points["centre"], points["scale"])[0, :400].numpy()
     np.save(tmp_path / "me.npy", cloud)
-    code, told = command(
+    code, output = command(
         tmp_path,
         "plugins.data.registration",
         "run",
@@ -229,8 +235,8 @@ def test_a_trained_run_registers_a_users_scan(file, tmp_path):
         "--path",
         f"data.body={file}",
     )
-    assert code == 0, told
-    assert told.split() == ["meshes/me_registered.ply", "meshes/me_registered.png"]
+    assert code == 0, output
+    assert output.split() == ["meshes/me_registered.ply", "meshes/me_registered.png"]
     mesh = read(tmp_path / "meshes" / "me_registered.ply")
     assert np.array_equal(mesh.faces, doll()["f"])
     np.testing.assert_allclose(mesh.vertices[6 * 22 :], cloud, atol=1e-5)
@@ -238,11 +244,11 @@ def test_a_trained_run_registers_a_users_scan(file, tmp_path):
     assert np.linalg.norm(body.mean(0) - cloud.mean(0)) < 1
     with Image.open(tmp_path / "meshes" / "me_registered.png") as image:
         assert image.size[1] > 100
-    code, told = command(
+    code, output = command(
         tmp_path, "plugins.data.registration", "run", "nobody.ply", "--path", f"data.body={file}"
     )
     assert code == 1
-    assert "error:" in told and "nobody.ply: no such file" in told and "Traceback" not in told
+    assert "error:" in output and "nobody.ply: no such file" in output and "Traceback" not in output
 
     # thesis Table 6.4: a model is tested on FAUST's scans; it was trained on the body of FAUST's registrations
     batch = prepared(file, points=200).splits().test.__getitems__(range(6))
@@ -253,12 +259,12 @@ def test_a_trained_run_registers_a_users_scan(file, tmp_path):
         training = tmp_path / "faust" / "training"
         write(training / "scans" / f"tr_scan_{number:03}.ply", scans[row][np.isfinite(scans[row]).all(1)])
         write(training / "registrations" / f"tr_reg_{number:03}.ply", meshes[row], doll()["f"])
-    code, told = command(
+    code, output = command(
         tmp_path, "framework", "mode=test", "checkpoint=run", "data=faust", "data.root=faust", "data.points=200",
         "metric=[vertex_error,correspondence]", "logger=none", "hydra.run.dir=faust_run",
     )  # fmt: skip
-    assert code == 0, told
-    found = json.loads((tmp_path / "faust_run" / "results.json").read_text(encoding="utf-8"))
-    assert not found["synthetic"]
+    assert code == 0, output
+    results = json.loads((tmp_path / "faust_run" / "results.json").read_text(encoding="utf-8"))
+    assert not results["synthetic"]
     for key in ("vertex_error_cm", "intra_cm", "inter_cm"):
-        assert 0 < found[key] < 200
+        assert 0 < results[key] < 200

@@ -23,7 +23,7 @@ PEOPLE = ("ann", "bob", "cleo", "dan", "eve", "fay")
 
 
 def encoder(root, height=HEIGHT, width=WIDTH, **config):
-    given = {
+    config_of_encoder = {
         "name": "rasterised",
         "root": str(root),
         "height": height,
@@ -32,7 +32,7 @@ def encoder(root, height=HEIGHT, width=WIDTH, **config):
         "textures": {"name": "human_scans", "root": str(root)},
         **config,
     }
-    return build("encoder", resolve("encoder", given), input_shape=(40, 6), input_columns=())
+    return build("encoder", resolve("encoder", config_of_encoder), input_shape=(40, 6), input_columns=())
 
 
 @pytest.fixture
@@ -59,13 +59,13 @@ def globe(root, sides):
     vertices = (radius[..., None] * ball).reshape(-1, 3)
     faces, uv_faces = [], []
     for row, column in product(range(rows), range(columns)):
-        for found, width, numbers in (
+        for triangles, width, numbers in (
             (faces, columns, number),
             (uv_faces, columns + 1, np.arange((rows + 1) * (columns + 1)).reshape(rows + 1, -1)),
         ):
             a, b = numbers[row, column], numbers[row, (column + 1) % width]
             c, d = numbers[row + 1, column], numbers[row + 1, (column + 1) % width]
-            found += [(a, c, b), (b, c, d)]
+            triangles += [(a, c, b), (b, c, d)]
     for person, name in enumerate(PEOPLE):
         colors = np.random.default_rng(person).integers(0, 256, (len(vertices), 3), np.uint8)
         mesh = RegisteredMesh(
@@ -95,17 +95,17 @@ def traced(vertices, faces, places, uv_faces, texels):
     y = (np.arange(HEIGHT)[:, None] + step).ravel() - (HEIGHT - 1) / 2
     x = (np.arange(WIDTH)[:, None] + step).ravel() - (WIDTH - 1) / 2
     height, width = texels.shape[:2]
-    found = np.ones((len(y), len(x), 3))
+    image = np.ones((len(y), len(x), 3))
     a, b, c = vertices[faces].swapaxes(0, 1)
-    one, other = b - a, c - a
+    first_side, second_side = b - a, c - a
     for row, column in product(range(len(y)), range(len(x))):
         ray = np.array([x[column], y[row], HEIGHT]) / HEIGHT  # from the origin
-        across = np.cross(ray, other)
+        across = np.cross(ray, second_side)
         with np.errstate(divide="ignore", invalid="ignore"):
-            scale = 1 / (one * across).sum(1)
+            scale = 1 / (first_side * across).sum(1)
             second = -(a * across).sum(1) * scale
-            third = (np.cross(-a, one) * ray).sum(1) * scale
-            far = (np.cross(-a, one) * other).sum(1) * scale
+            third = (np.cross(-a, first_side) * ray).sum(1) * scale
+            far = (np.cross(-a, first_side) * second_side).sum(1) * scale
             met = (second >= 0) & (third >= 0) & (second + third <= 1) & (far > 0)
         if not met.any():
             continue
@@ -117,8 +117,8 @@ def traced(vertices, faces, places, uv_faces, texels):
         for down, right in product((0, 1), (0, 1)):
             i, j = math.floor(top) + down, math.floor(left) + right
             texel += max(0, 1 - abs(top - i)) * max(0, 1 - abs(left - j)) * texels[i % height, j % width]
-        found[row, column] = texel
-    mean = found.reshape(HEIGHT, SAMPLES, WIDTH, SAMPLES, 3).mean((1, 3))
+        image[row, column] = texel
+    mean = image.reshape(HEIGHT, SAMPLES, WIDTH, SAMPLES, 3).mean((1, 3))
     return np.where(mean <= 0.0031308, 12.92 * mean, 1.055 * mean ** (1 / 2.4) - 0.055)
 
 
@@ -130,12 +130,12 @@ def test_a_textured_mesh_is_what_a_ray_through_every_sample_sees(root, times):
     placed = vertices + np.array([0.1, -0.05, 2.0])
     colors = np.random.default_rng(0).integers(0, 256, (len(vertices), 3), np.uint8)
     cloud = torch.from_numpy(np.concatenate([placed, colors / 255], 1)).float()
-    drawn = encoder(root)(cloud[None])[0].movedim(0, -1).numpy()
+    rendered = encoder(root)(cloud[None])[0].movedim(0, -1).numpy()
     wanted = traced(placed, faces, places, uv_faces, texels)
-    apart = np.abs(drawn - wanted).max(-1)
+    differences = np.abs(rendered - wanted).max(-1)
     assert 0.3 < (wanted < 0.99).any(-1).mean() < 0.9
-    assert np.median(apart) < 1e-3 and (apart > 1 / 255).mean() < 0.02, (
-        apart.max()
+    assert np.median(differences) < 1e-3 and (differences > 1 / 255).mean() < 0.02, (
+        differences.max()
     )  # corners move by 1/512 sample
     plain = encoder(root, textures=None)(cloud[None])[0].movedim(0, -1).numpy()
     assert np.abs(plain - wanted).max() > 0.1
@@ -170,12 +170,12 @@ def test_a_stranger_is_refused_by_the_row(root):
 
 
 def test_extreme_vertices_leave_a_finite_picture(root):
-    made, inputs = encoder(root), inputs_of(1)
+    rasterised, inputs = encoder(root), inputs_of(1)
     for spoilt in (1e30, -1e30, 1e-30, 0.0, -5.0):
         inputs[0, :3, 2] = spoilt
-        assert made(inputs).isfinite().all()
+        assert rasterised(inputs).isfinite().all()
     padded = torch.cat([inputs_of(1), torch.full((1, 3, 6), math.nan)], 1)
-    assert torch.equal(made(padded), made(inputs_of(1)))
+    assert torch.equal(rasterised(padded), rasterised(inputs_of(1)))
 
 
 def places(**change):
@@ -225,12 +225,12 @@ WRONG = {
 
 @pytest.mark.parametrize("spoil, words", WRONG.values(), ids=WRONG)
 def test_what_is_wrong_is_said(root, spoil, words):
-    made = encoder(root)  # built before the fault, as in a model that is loaded later
+    rasterised = encoder(root)  # built before the fault, as in a model that is loaded later
     spoil(root)
     with pytest.raises(DataError) as caught:
-        made(inputs_of(1))
-    said = " ".join(str(caught.value).split())
-    assert words in said and str(root) in said
+        rasterised(inputs_of(1))
+    message = " ".join(str(caught.value).split())
+    assert words in message and str(root) in message
 
 
 def test_what_lacks_textures_is_refused(root, monkeypatch):
