@@ -1459,7 +1459,7 @@ def test_a_runs_model_is_one_of_mlflow_that_answers_raw_rows(
     assert list(answer) == ["mass", "entropy_nats", "mass_mode"]
     assert answer["mass_mode"].tolist() == density.mode.flatten().tolist()
     assert answer["entropy_nats"].tolist() == density.entropy().tolist()
-    with pytest.raises(MlflowException, match=r"reads a column 'height', which is not given\."):
+    with pytest.raises(MlflowException, match=r"reads the column 'height', which the data do not have\."):
         served.predict(rows[["width"]])
 
     shutil.move(folder, tmp_path / "moved")
