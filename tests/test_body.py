@@ -211,8 +211,8 @@ def test_joints_that_never_bend_can_be_left_out():
     "names, features, message",
     [
         (["b", "z"], None, "has no joint 'z'"),
-        (["a"], None, "its root 'b'"),
-        (["b"], 45, "without pose shapes"),
+        (["a"], None, "the root 'b'"),
+        (["b"], 45, "no pose shapes"),
     ],
 )
 def test_joints_that_cannot_be_left_out_are_named(names, features, message):
@@ -223,7 +223,7 @@ def test_joints_that_cannot_be_left_out_are_named(names, features, message):
 @pytest.mark.parametrize(
     "changes, message",
     [
-        ({"weights": np.ones((17, 6))}, r"those of vertex 0 .* sum to 6"),
+        ({"weights": np.ones((17, 6))}, r"weights of vertex 0 .* sum to 6"),
         ({"weights": np.ones((16, 6)) / 6}, r"weights has the shape \(16, 6\); expected \(17, 6\)"),
         ({"template": np.full((17, 3), np.nan)}, "51 numbers of template are not finite"),
         ({"faces": np.array([[0, 1, 17]])}, "vertices 0 to 17, but the vertices are numbered 0 to 16"),

@@ -21,7 +21,7 @@ TURN = 0.2
 class Decimated(NamedTuple):
     """Remaining vertices, and their triangles and texture triangles, with the numbers of the input."""
 
-    kept: Int[np.ndarray, "left"]
+    kept: Int[np.ndarray, "left"]  # this name is a key of cached files
     faces: Int[np.ndarray, "triangles 3"]
     uv_faces: Int[np.ndarray, "triangles 3"]
 
@@ -89,7 +89,7 @@ class _Collapses:
         return False
 
     def _entry(self, v: int, u: int) -> tuple[float, int, int, int, int]:
-        a = [one + other for one, other in zip(self.quadrics[v], self.quadrics[u], strict=True)]
+        a = [first + second for first, second in zip(self.quadrics[v], self.quadrics[u], strict=True)]
         x, y, z = self.points[u]
         error = (
             a[0] * x * x + a[4] * y * y + a[7] * z * z + a[9]
@@ -121,8 +121,8 @@ class _Collapses:
             corners = self.corners[face] or []
             before = _normal(*(self.points[corner] for corner in corners))
             after = _normal(*(self.points[u if corner == v else corner] for corner in corners))
-            dot = sum(one * other for one, other in zip(before, after, strict=True))
-            lengths = sum(one * one for one in before) * sum(one * one for one in after)
+            dot = sum(first * second for first, second in zip(before, after, strict=True))
+            lengths = sum(first * first for first in before) * sum(first * first for first in after)
             if lengths == 0 or dot < TURN * lengths**0.5:
                 return False
         return True
@@ -149,8 +149,8 @@ class _Collapses:
 
 
 def _normal(a: tuple[float, ...], b: tuple[float, ...], c: tuple[float, ...]) -> tuple[float, float, float]:
-    x, y, z = (one - other for one, other in zip(b, a, strict=True))
-    p, q, r = (one - other for one, other in zip(c, a, strict=True))
+    x, y, z = (start - origin for start, origin in zip(b, a, strict=True))
+    p, q, r = (start - origin for start, origin in zip(c, a, strict=True))
     return y * r - z * q, z * p - x * r, x * q - y * p
 
 

@@ -231,10 +231,10 @@ class HumanScans(Data, SubjectFolder):
         image = torch.ones(height * width, 3)
         order = (-depth).argsort(stable=True)  # the nearest last
         column, row = place[order].round().T
-        seen = (depth[order] > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        pixel = (row[seen] * width + column[seen]).long().numpy()
+        visible = (depth[order] > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        pixel = (row[visible] * width + column[visible]).long().numpy()
         # if several points share a pixel, NumPy keeps the last
-        image.numpy()[pixel] = points[order][seen][:, 3:].numpy()
+        image.numpy()[pixel] = points[order][visible][:, 3:].numpy()
         return (image.clamp(0, 1) * 255).round().byte().view(height, width, 3).numpy()
 
 

@@ -44,11 +44,11 @@ def dressed(wardrobe, posed):
 def test_registrations_are_near_the_body_and_scans_are_not_registrations(wardrobe, posed, dressed):
     bare = wardrobe.sheet.interpolate(posed)
     gaps = []
-    for scan, found in dressed:
+    for scan, registration in dressed:
         assert np.isfinite(scan.vertices).all() and scan.faces.max() < len(scan.vertices)
         assert (scan.colors >= 0).all() and (scan.colors <= 1).all()
-        assert np.linalg.norm(found.vertices - bare, axis=1).max() < FURTHEST + 5 * ERROR
-        gap = np.linalg.norm(found.vertices - scan.vertices[: len(bare)], axis=1)
+        assert np.linalg.norm(registration.vertices - bare, axis=1).max() < FURTHEST + 5 * ERROR
+        gap = np.linalg.norm(registration.vertices - scan.vertices[: len(bare)], axis=1)
         gaps.append((np.median(gap), gap.max()))
     median, largest = np.array(gaps).T
     assert (median < 0.01).all()  # the registration follows the scan
@@ -58,13 +58,13 @@ def test_registrations_are_near_the_body_and_scans_are_not_registrations(wardrob
 
 
 def test_colours_of_a_registration_are_those_of_the_nearest_points_that_a_scanner_sees(dressed):
-    for scan, found in dressed[:3]:
-        for vertex in range(0, len(found.vertices), 4001):
-            order = np.linalg.norm(scan.vertices - found.vertices[vertex], axis=1).argsort()
+    for scan, registration in dressed[:3]:
+        for vertex in range(0, len(registration.vertices), 4001):
+            order = np.linalg.norm(scan.vertices - registration.vertices[vertex], axis=1).argsort()
             colors = bytes_from_linear(torch.from_numpy(scan.colors[order[:1]])).numpy()
             # legs under a skirt are nearer than the skirt, but no scanner sees them
-            hidden = len(scan.vertices) > len(found.vertices)
-            assert hidden or np.array_equal(found.colors[vertex], colors[0])
+            hidden = len(scan.vertices) > len(registration.vertices)
+            assert hidden or np.array_equal(registration.colors[vertex], colors[0])
 
 
 def test_the_same_seed_dresses_alike_and_others_differ(wardrobe, posed, dressed):
@@ -89,14 +89,14 @@ def test_blank_parts_of_a_skin_take_the_tone_of_the_face(wardrobe, posed):
         )
     vertices = wardrobe.sheet
     shown = skins.colors_at(pixels, wardrobe.uv)[wardrobe._place_of]
-    found = skins.fill_blanks(
+    filled = skins.fill_blanks(
         shown, wardrobe.anatomy, wardrobe.vertices, wardrobe._neighbours.dot, vertices.interpolate
     )
     grey = float(linear_from_bytes(torch.tensor(skins.BLANK, dtype=torch.uint8)))
     assert (np.abs(shown - grey).max(1) < 0.002).mean() > 0.3
-    assert (np.abs(found - grey).max(1) < 0.002).mean() < 0.01
+    assert (np.abs(filled - grey).max(1) < 0.002).mean() < 0.01
     tone = linear_from_bytes(torch.tensor([200, 120, 80], dtype=torch.uint8)).numpy()
-    np.testing.assert_allclose(np.median(found[wardrobe.anatomy.along_leg > 0.3], 0), tone, atol=0.01)
+    np.testing.assert_allclose(np.median(filled[wardrobe.anatomy.along_leg > 0.3], 0), tone, atol=0.01)
 
 
 def test_a_texture_holds_the_colours_of_its_places(wardrobe, dressed):
@@ -104,8 +104,8 @@ def test_a_texture_holds_the_colours_of_its_places(wardrobe, dressed):
     faces = wardrobe.sheet.corners[-1].uv_faces
     pixels = photographs.texture(RENDERER, wardrobe.uv, faces, colors, 512)
     used = np.unique(faces)
-    found = skins.colors_at(pixels, wardrobe.uv)[used]
-    assert np.quantile(np.abs(found - colors.numpy()[used]).max(1), 0.9) < 0.05
+    sampled = skins.colors_at(pixels, wardrobe.uv)[used]
+    assert np.quantile(np.abs(sampled - colors.numpy()[used]).max(1), 0.9) < 0.05
 
 
 @pytest.mark.parametrize("number", range(4))
@@ -123,13 +123,15 @@ def test_photographs_show_a_point_where_its_camera_says(number):
     corner = (40 * np.arange(39)[:, None] + np.arange(39)).ravel()
     faces = np.concatenate([corner[:, None] + half for half in ((0, 1, 40), (1, 41, 40))])
     scene = Scene(torch.from_numpy(ball).float(), torch.from_numpy(faces), torch.ones(len(ball), 3), camera)
-    (found,) = photographs.take_photographs(RENDERER, scene, [camera])
-    cover = found.mask.astype(float)
+    (photograph,) = photographs.take_photographs(RENDERER, scene, [camera])
+    cover = photograph.mask.astype(float)
     row, column = (np.average(place, weights=cover) for place in np.indices(cover.shape))
     pixel, depth = camera.project(torch.from_numpy(centre)[None])
     # the outline of a ball is shifted outwards by (radius / depth)² times its distance from the axis
     assert np.abs(np.array([column, row]) - pixel[0].numpy()).max() < 0.05 + 40 * (0.12 / float(depth)) ** 2
-    assert (found.pixels[found.mask > 0] == 255).all() and (found.pixels[found.mask == 0] == 188).all()
+    assert (photograph.pixels[photograph.mask > 0] == 255).all() and (
+        photograph.pixels[photograph.mask == 0] == 188
+    ).all()
 
 
 @pytest.mark.parametrize("number", range(10))
@@ -160,9 +162,9 @@ def prepared(**config):
         "validation": 1,
         "test": 1,
     }
-    found = build("data", resolve("data", {"name": "human_scans", **small, **config}))
-    found.prepare()
-    return found
+    scans = build("data", resolve("data", {"name": "human_scans", **small, **config}))
+    scans.prepare()
+    return scans
 
 
 def test_a_subject_is_a_function_of_seed_split_and_number(tmp_path, monkeypatch):
@@ -170,10 +172,10 @@ def test_a_subject_is_a_function_of_seed_split_and_number(tmp_path, monkeypatch)
     few, more = prepared(), prepared(train=3, test=2)
     assert few.folder != more.folder
     for split in ("train", "validation", "test"):
-        one, other = getattr(few.splits(), split), getattr(more.splits(), split)
-        for number in range(len(one)):
-            assert torch.equal(one[number]["input"], other[number]["input"])
-            assert torch.equal(one[number]["target"], other[number]["target"])
+        first, second = getattr(few.splits(), split), getattr(more.splits(), split)
+        for number in range(len(first)):
+            assert torch.equal(first[number]["input"], second[number]["input"])
+            assert torch.equal(first[number]["target"], second[number]["target"])
     names = scan_layout.read_splits(more.folder)
     assert [len(some) for some in names.values()] == [3, 1, 2]
     lively = prepared(posed=1.0).splits()
@@ -188,16 +190,16 @@ def test_the_default_body_is_photographed_with_what_textured_renderers_need(tmp_
     monkeypatch.setenv("FRAMEWORK_CACHE", str(tmp_path))
     size = {"height": 128, "width": 96, "views": 1, "train": 1, "validation": 1, "test": 1}
     config = {"name": "human_scans", "renderer": "rasterizer", **size, "texture_side": 512}
-    found = build("data", resolve("data", config))
-    found.prepare()
+    scans = build("data", resolve("data", config))
+    scans.prepare()
     smooth = build("renderer", resolve("renderer", {"name": "rasterizer", "supersampling": 4}))
     errors = []
     for topology in ("7k", "27k"):
-        subject = scan_layout.read_subject(found.folder, "test_0000", topology)
-        places = scan_layout.read_places(found.folder, topology)
+        subject = scan_layout.read_subject(scans.folder, "test_0000", topology)
+        places = scan_layout.read_places(scans.folder, topology)
         mesh, camera = subject.mesh, subject.views[0].camera
         assert np.array_equal(places.faces, mesh.faces)
-        texture = linear_from_bytes(torch.from_numpy(scan_layout.read_texture(found.folder, "test_0000")))
+        texture = linear_from_bytes(torch.from_numpy(scan_layout.read_texture(scans.folder, "test_0000")))
         light, cover = photograph(subject.views[0])
         ones = torch.ones(len(mesh.vertices), 1)
         shares = smooth(Scene(mesh.vertices, mesh.faces, ones, camera))["color"]
@@ -206,23 +208,23 @@ def test_the_default_body_is_photographed_with_what_textured_renderers_need(tmp_
             Scene(mesh.vertices, mesh.faces, linear_from_bytes(mesh.colors), camera),
             Scene(mesh.vertices, mesh.faces, None, camera, shown),
         ):
-            drawn = srgb_from_linear(smooth(scene)["color"] + 1 - shares)
-            errors.append(float((drawn - srgb_from_linear(light))[cover > 0].square().mean()))
+            rendered = srgb_from_linear(smooth(scene)["color"] + 1 - shares)
+            errors.append(float((rendered - srgb_from_linear(light))[cover > 0].square().mean()))
     few, few_textured, many, many_textured = errors
     assert 10**-3 < many < few < 10**-1.3
     assert few_textured < few and many_textured < many
     for read, file in (
-        (lambda: scan_layout.read_places(found.folder, "7k"), "topology_7k.npz"),
-        (lambda: scan_layout.read_texture(found.folder, "test_0000"), "subjects/test_0000/texture.png"),
+        (lambda: scan_layout.read_places(scans.folder, "7k"), "topology_7k.npz"),
+        (lambda: scan_layout.read_texture(scans.folder, "test_0000"), "subjects/test_0000/texture.png"),
     ):
         for kind in DAMAGES:
-            before = (found.folder / file).read_bytes()
-            damage(found.folder / file, kind)
+            before = (scans.folder / file).read_bytes()
+            damage(scans.folder / file, kind)
             with pytest.raises(DataError, match=Path(file).name):
                 read()
-            if (found.folder / file).is_dir():
-                (found.folder / file).rmdir()
-            (found.folder / file).write_bytes(before)
+            if (scans.folder / file).is_dir():
+                (scans.folder / file).rmdir()
+            (scans.folder / file).write_bytes(before)
 
 
 def test_a_topology_that_is_not_generated_is_told_before_anything_is_drawn():
@@ -236,12 +238,12 @@ def test_a_renderer_that_smooths_edges_itself_draws_nearly_the_same():
     camera = Camera(torch.eye(3), torch.zeros(3), (40.0, 40.0), (2.0, 2.0), 24, 24)
     scene = Scene(corners, torch.tensor([[0, 1, 2]]), torch.tensor([[0.2, 0.5, 0.9]]).expand(3, 3), camera)
     smooth = build("renderer", resolve("renderer", {"name": "rasterizer", "supersampling": 3}))
-    one, other = (
+    first, second = (
         photographs.take_photographs(renderer, scene, [camera])[0] for renderer in (RENDERER, smooth)
     )
-    assert np.abs(one.mask.astype(int) - other.mask).max() < 30
-    both = (one.mask > 0) & (other.mask > 0)
-    assert both.sum() > 50 and np.abs(one.pixels[both].astype(int) - other.pixels[both]).max() <= 1
+    assert np.abs(first.mask.astype(int) - second.mask).max() < 30
+    both = (first.mask > 0) & (second.mask > 0)
+    assert both.sum() > 50 and np.abs(first.pixels[both].astype(int) - second.pixels[both]).max() <= 1
 
 
 def test_skins_are_worn_in_one_split_each(tmp_path):

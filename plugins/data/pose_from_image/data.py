@@ -40,7 +40,7 @@ class Counts:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Apart:
+class Apart:  # this name is part of stored fingerprints
     """Distance of people from the nominal pose: exact for rotation and translation, random for pose and shape.
 
     Attributes:
@@ -212,12 +212,12 @@ class Poses(Dataset[Batch]):
             Scene(body_model(numbers), body_model.faces, body_model.colors, self.camera)
             for numbers in self.numbers[chosen]
         ]
-        drawn = torch.stack([found["color"] for found in self.renderer.batch(scenes)])
+        rendered = torch.stack([channels["color"] for channels in self.renderer.batch(scenes)])
         return {
-            "input": drawn.movedim(-1, 1).contiguous(),
+            "input": rendered.movedim(-1, 1).contiguous(),
             "target": self.numbers[chosen].float(),
-            "color": drawn[..., :3].contiguous(),
-            "mask": drawn[..., 3] >= 0.5,
+            "color": rendered[..., :3].contiguous(),
+            "mask": rendered[..., 3] >= 0.5,
             "group": torch.zeros(len(chosen), dtype=torch.int64),
             "index": chosen,
         }

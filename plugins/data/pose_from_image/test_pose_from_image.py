@@ -25,9 +25,9 @@ def data():
         **SIZE,
         **DOLL,
     }
-    found = build("data", resolve("data", config))
-    found.prepare()
-    return found
+    pose_data = build("data", resolve("data", config))
+    pose_data.prepare()
+    return pose_data
 
 
 def test_samples_are_as_far_off_as_they_should_be(data):
@@ -44,10 +44,10 @@ def test_samples_are_as_far_off_as_they_should_be(data):
 def test_own_pictures_are_read_and_others_refused(data, tmp_path):
     pixels = np.random.default_rng(0).integers(0, 256, (48, 40, 4), dtype=np.uint8)
     Image.fromarray(pixels).save(tmp_path / "cut.png")
-    found = data.read([tmp_path / "cut.png"])[0]["input"]
+    image = data.read([tmp_path / "cut.png"])[0]["input"]
     cover = torch.from_numpy(pixels[..., 3:]).float() / 255
     torch.testing.assert_close(
-        found.movedim(0, -1)[..., :3], linear_from_bytes(torch.from_numpy(pixels[..., :3])) * cover
+        image.movedim(0, -1)[..., :3], linear_from_bytes(torch.from_numpy(pixels[..., :3])) * cover
     )
     for name, other in {"rgb.png": pixels[..., :3], "small.png": pixels[:20]}.items():
         Image.fromarray(np.ascontiguousarray(other)).save(tmp_path / name)

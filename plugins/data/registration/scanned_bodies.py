@@ -57,8 +57,8 @@ class Bodies(Data):
         if isinstance(files, Sequence) and files and all(isinstance(file, str | Path) for file in files):
             return fetch(self.read([Path(file) for file in files]), range(len(files)))
         clouds = as_inputs(user_data, self.input_shape)
-        found = normalise_scans(clouds if clouds.is_floating_point() else clouds.double())
-        return {**found, "input": found["input"].float()}
+        fields = normalise_scans(clouds if clouds.is_floating_point() else clouds.double())
+        return {**fields, "input": fields["input"].float()}
 
     def inputs(self, user_data: Any) -> Tensor:
         return self.user_batch(user_data)["input"]

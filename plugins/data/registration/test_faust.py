@@ -46,8 +46,8 @@ def test_people_are_split_and_meshes_come_back_in_metres(root):
         for row, number in enumerate(wanted):
             mesh, scan = person(number)
             place = batch["centre"][row].numpy(), batch["scale"][row].numpy()
-            found = batch["target"][row].reshape(-1, 3).numpy() * place[1] + place[0]
-            np.testing.assert_allclose(found, mesh, atol=1e-6)
+            vertices = batch["target"][row].reshape(-1, 3).numpy() * place[1] + place[0]
+            np.testing.assert_allclose(vertices, mesh, atol=1e-6)
             cloud = batch["input"][row].numpy() * place[1] + place[0]
             gap = np.linalg.norm(cloud[:, None] - scan, axis=-1)
             assert gap.min(1).max() < 1e-6  # points of the scan,
@@ -55,10 +55,10 @@ def test_people_are_split_and_meshes_come_back_in_metres(root):
 
 
 def test_points_depend_on_the_seed_and_small_scans_are_padded(root):
-    one, other, whole = data(root, points=150), data(root, points=150, data_seed=1), data(root, points=500)
-    for each in (one, other, whole):
-        each.prepare()
-    assert not torch.equal(one.splits().train.fields["input"], other.splits().train.fields["input"])
+    first, second, whole = data(root, points=150), data(root, points=150, data_seed=1), data(root, points=500)
+    for data_set in (first, second, whole):
+        data_set.prepare()
+    assert not torch.equal(first.splits().train.fields["input"], second.splits().train.fields["input"])
     assert whole.splits().train.fields["input"].shape == (2, 300, 3)
 
 
@@ -98,19 +98,19 @@ def generated():
 
 
 def test_generated_people_lie_in_fausts_layout_and_say_so(generated):
-    made = data(None, body=small_body()["body"], points=200)
-    made.prepare()
-    assert made.synthetic and made.fingerprint()["root"] == "generated"
-    assert [len(split) for split in made.splits()] == [70, 10, 20]
-    assert {one.parent.name for one in generated.glob("test/*/*")} == {
+    faust_data = data(None, body=small_body()["body"], points=200)
+    faust_data.prepare()
+    assert faust_data.synthetic and faust_data.fingerprint()["root"] == "generated"
+    assert [len(split) for split in faust_data.splits()] == [70, 10, 20]
+    assert {path.parent.name for path in generated.glob("test/*/*")} == {
         "scans",
         "registrations",
         "challenge_pairs",
     }
     for challenge in faust.CHALLENGES:
-        found = faust.pairs(generated, challenge)
-        assert len(set(found)) == 30
-        assert all((one // 3 == other // 3) == (challenge == "intra") for one, other in found)
+        scan_pairs = faust.pairs(generated, challenge)
+        assert len(set(scan_pairs)) == 30
+        assert all((path // 3 == second // 3) == (challenge == "intra") for path, second in scan_pairs)
 
 
 @pytest.mark.parametrize("challenge", faust.CHALLENGES)
@@ -119,14 +119,14 @@ def test_challenges_are_answered_as_they_ask(generated, tmp_path, challenge):
         truth = read(faust.test_registration(generated, int(scan.stem[-3:]))).vertices
         return truth + np.array([off, 0, 0])
 
-    found = write_correspondences(registered, generated, challenge, tmp_path)
-    assert found.pairs == 30 and max(found.error_cm) < 1e-3
-    with ZipFile(found.file) as archive:
-        asked = faust.pairs(generated, challenge)
-        assert archive.namelist() == [f"{pair}.txt" for pair in asked]
-        places = np.loadtxt(archive.open(f"{asked[0]}.txt"))
-    assert places.shape == read(faust.test_scan(generated, asked[0].first)).vertices.shape
-    mesh = read(faust.test_registration(generated, asked[0].second)).vertices
+    result = write_correspondences(registered, generated, challenge, tmp_path)
+    assert result.pairs == 30 and max(result.error_cm) < 1e-3
+    with ZipFile(result.file) as archive:
+        scan_pairs = faust.pairs(generated, challenge)
+        assert archive.namelist() == [f"{pair}.txt" for pair in scan_pairs]
+        places = np.loadtxt(archive.open(f"{scan_pairs[0]}.txt"))
+    assert places.shape == read(faust.test_scan(generated, scan_pairs[0].first)).vertices.shape
+    mesh = read(faust.test_registration(generated, scan_pairs[0].second)).vertices
     gap = np.linalg.norm(places[:200, None] - mesh, axis=-1)
     assert gap.min(1).max() < 1e-5  # a vertex of the mesh on the second scan
     off = write_correspondences(lambda scan: registered(scan, 0.07), generated, challenge, tmp_path)
@@ -135,21 +135,21 @@ def test_challenges_are_answered_as_they_ask(generated, tmp_path, challenge):
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "words"),
     [
-        ("000_01\n", "'000_01'; wanted two test scans"),
-        ("000_199\n", r"test_scan_199\.ply is not there"),
-        ("", "holds no pair"),
-        ("0\u00e9", "wanted two test scans"),
+        ("000_01\n", "'000_01'; expected two test scans"),
+        ("000_199\n", r"test_scan_199\.ply does not exist"),
+        ("", "contains no pair"),
+        ("0\u00e9", "expected two test scans"),
     ],
 )
-def test_bad_lists_of_pairs_get_a_sentence(tmp_path, text, said):
+def test_bad_lists_of_pairs_get_a_sentence(tmp_path, text, words):
     mesh, _ = person(0)
     write_ply(faust.test_scan(tmp_path, 0), mesh, NO_FACES)
     file = faust.pairs_file(tmp_path, "intra")
     file.parent.mkdir(parents=True)
     file.write_text(text, encoding="utf-8")
-    with pytest.raises(DataError, match=said):
+    with pytest.raises(DataError, match=words):
         faust.pairs(tmp_path, "intra")
     with pytest.raises(DataError, match="no such file"):
         faust.pairs(tmp_path, "inter")
