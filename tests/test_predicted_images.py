@@ -103,7 +103,7 @@ def test_a_missing_truth_and_a_density_that_draws_nothing_get_a_sentence() -> No
     del batch["mask"]
     prediction = Prediction(simplest_density(PLACE, batch["target"]), batch)
     with pytest.raises(
-        DataError, match=r"The true 'mask' .* only input, target, index, color, depth\. Choose data"
+        DataError, match=r"the true 'mask' .* only input, target, index, color, depth\. Choose data"
     ):
         prediction.true_image("mask")
     with pytest.raises(
