@@ -11,8 +11,8 @@ from framework.bodies.body import (
     Body,
     BodyModel,
     quaternion_minus_identity,
-    sine_over_angle,
     rotation_minus_identity,
+    sine_over_angle,
     with_joints,
 )
 from framework.errors import ConfigError, DataError
