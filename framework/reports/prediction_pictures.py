@@ -155,9 +155,9 @@ def deviation(truth: Tensor, point: Tensor, symmetry: Tensor) -> Tensor:
 
 def _caption(error: float, entropy: float, symmetry: int) -> str:
     """Return the text below a panel: error and entropy."""
-    accuracy = f"error {math.degrees(error):.0f}°" if symmetry else "any direction is true"
+    error_text = f"error {math.degrees(error):.0f}°" if symmetry else "any direction is true"
     note = f", {symmetry}-fold symmetric" if symmetry > 1 else ""
-    return f"{accuracy}, entropy {entropy:.2f} nats{note}"
+    return f"{error_text}, entropy {entropy:.2f} nats{note}"
 
 
 def _equally_true(truth: float, symmetry: int) -> np.ndarray:
