@@ -77,8 +77,8 @@ class HumanScans(Data, SubjectFolder):
         shows: what the target is: "photograph", or "subject", one number per pixel, 1 where the subject covers half of
             it or more and else 0, for a network that segments (thesis §7.3.1).
         counts, drawing: settings of generated people.
-        variation: random changes of the training images.
         data_seed: seed of the draws of generated people, independent of the seed of the run.
+        variation: random changes of the training images.
 
     Raises:
         DataError: a file is missing or damaged, or images differ in size, or meshes in their number of vertices.
@@ -98,8 +98,8 @@ class HumanScans(Data, SubjectFolder):
         shows: Shows = "photograph",
         counts: Counts,
         drawing: Drawing,
-        variation: Variation,
         data_seed: Seed = 0,
+        variation: Variation,
     ) -> None:
         if "color" not in renderer.channels or renderer.background:
             raise ConfigError(
