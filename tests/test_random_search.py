@@ -341,7 +341,7 @@ def test_a_launcher_that_runs_jobs_in_this_process_will_do(tmp_path: Path) -> No
 
 def trials(folder: Path, *values: float | None, **more: list[float]) -> list[comparison.Trial]:
     """Trials that returned `values` (None: that failed), and measured what `more` holds."""
-    results = []
+    made_trials = []
     for number, value in enumerate(values):
         home = folder / str(number)
         home.mkdir()
@@ -353,8 +353,10 @@ def trials(folder: Path, *values: float | None, **more: list[float]) -> list[com
             "better": {"accuracy": "higher"},
         }
         (home / "results.json").write_text(json.dumps(results))
-        results.append(comparison.Trial(home, [f"+x={number}", "y=1"], value, completed=value is not None))
-    return results
+        made_trials.append(
+            comparison.Trial(home, [f"+x={number}", "y=1"], value, completed=value is not None)
+        )
+    return made_trials
 
 
 def ranked(folder: Path) -> list[str]:

@@ -62,8 +62,8 @@ class SeededBatches(Sampler[list[int]]):
     ) -> None:
         if batch_size < ranks:
             raise ConfigError(
-                f"batch_size = {batch_size} gives some of the {ranks} devices no sample. Set batch_size to at least "
-                f"{ranks}."
+                f"batch_size = {batch_size} over {ranks} devices gives some devices no sample. Set batch_size to at "
+                f"least {ranks}."
             )
         if length < ranks:
             raise DataError(
