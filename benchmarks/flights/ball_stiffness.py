@@ -1,8 +1,10 @@
-"""Compare SciPy's solvers on a ball that lands on ever harder tables: error against 50 digits, evaluations and time.
+"""Compare SciPy's solvers on a ball that lands on harder and harder tables: error, evaluations and run time.
+
+The reference is a closed form that is computed with 50 digits.
 
     python -m benchmarks.flights.ball_stiffness
 
-Writes ball_stiffness.md and ball_stiffness.png beside this file; about a minute on one core.
+This writes ball_stiffness.md and ball_stiffness.png beside this file and takes about a minute on one core.
 """
 
 import time
@@ -22,7 +24,7 @@ RATIOS = (1e2, 1e3, 1e4, 1e5, 1e6, 1e7, 1e8)
 TOLERANCES = (1e-4, 1e-8, 1e-11)
 TOLERANCE = 1e-8
 HARD = (1e3, 1e6)
-"""Ratios of which all tolerances are tried."""
+"""Stiffness ratios at which every solver runs with all tolerances."""
 HEIGHT = 0.1
 SECONDS = 1.0
 STEPS = 4_000
@@ -30,18 +32,26 @@ CONSTANTS = Constants(drag=0.0, lift=0.0, spin_decay=0.0, friction=0.0, near=-10
 TIMES = np.linspace(0, SECONDS, 101)
 
 
-def measured(method: str, ratio: float, tolerance: float, wanted: np.ndarray) -> dict[str, object]:
+def run_solver(method: str, ratio: float, tolerance: float, heights: np.ndarray) -> dict[str, object]:
+    """Return the run time and, if the solver reached the end, its largest error (m) and its counts.
+
+    Args:
+        method: SciPy's name of the solver.
+        ratio: Duration of the flight over the duration 1/Ω of the contact.
+        tolerance: Relative tolerance.
+        heights: True heights of the ball above the table at `TIMES`, metres.
+    """
     start = np.array([0, 0, CONSTANTS.touching + HEIGHT, 0.5, 0.5, 0.0, 0, 0, 0])
     spring = Spring(frequency=ratio / SECONDS, damping=1.0)
-    began = time.process_time()
+    start_time = time.process_time()
     try:
         path = flight(start, TIMES, CONSTANTS, spring, method=method, tolerance=tolerance, most_steps=STEPS)  # type: ignore[arg-type]
     except SolverGaveUp as error:
-        return {"ms": 1e3 * (time.process_time() - began), "gave up": str(error)}
-    error = np.abs(path.states[:, 2] - CONSTANTS.touching - wanted).max()
+        return {"ms": 1e3 * (time.process_time() - start_time), "gave up": str(error)}
+    error = np.abs(path.states[:, 2] - CONSTANTS.touching - heights).max()
     assert np.isfinite(path.states).all()
     return {
-        "ms": 1e3 * (time.process_time() - began),
+        "ms": 1e3 * (time.process_time() - start_time),
         "error": error,
         "evaluations": path.evaluations,
         "steps": path.steps,
@@ -49,61 +59,71 @@ def measured(method: str, ratio: float, tolerance: float, wanted: np.ndarray) ->
 
 
 def main() -> None:
-    wanted = {
+    heights = {
         ratio: np.array(
             landing(HEIGHT, 0.0, TIMES.tolist(), CONSTANTS, Spring(frequency=ratio / SECONDS, damping=1.0))
         )
         for ratio in RATIOS
     }
-    found = {
-        (method, ratio, tolerance): measured(method, ratio, tolerance, wanted[ratio])
+    results = {
+        (method, ratio, tolerance): run_solver(method, ratio, tolerance, heights[ratio])
         for method in METHODS
         for ratio in RATIOS
         for tolerance in TOLERANCES
         if tolerance == TOLERANCE or ratio == HARD[0] or (ratio == HARD[1] and method not in EXPLICIT)
     }
-    sentence = next(str(one["gave up"]) for one in found.values() if "gave up" in one)
+    message = next(str(result["gave up"]) for result in results.values() if "gave up" in result)
     text = [
         "# Stiff contact of a ball with a table",
         "",
-        f"A ball falls {100 * HEIGHT:g} cm onto a table that is a critically damped spring, hops ever lower, and lies "
-        f"on it; {SECONDS:g} s in all. The ratio is that of the flight's {SECONDS:g} s and the contact's time 1/Ω. "
-        "Error: largest of 101 heights, metres, against the closed form of every phase (`closed_form.py`), 50 digits. "
-        f"Relative tolerance {TOLERANCE:g}; at most {STEPS:,} steps. Air and friction are off, since with them no "
-        "closed form is known.",
+        "This page compares the error and the run time of SciPy's solvers of differential equations on simulated "
+        "flights of a ball. The table becomes harder from row to row, which makes the equation stiff. The page shows "
+        "which solvers still succeed.",
         "",
-        "Error (m) / evaluations of the derivative / processor time (ms):",
+        f"A ball falls {100 * HEIGHT:g} cm onto a table that is a critically damped spring with the frequency Ω. The "
+        "ball hops, each time less high, and then lies on the table. The simulation ends after "
+        f"{SECONDS:g} s. The relative tolerance is {TOLERANCE:g}, and a solver may take at most {STEPS:,} steps. The "
+        "forces of the air and the friction are switched off, because no closed form is known with them.",
         "",
-        "| ratio | " + " | ".join(METHODS) + " |",
+        f"The column `stiffness ratio` holds the {SECONDS:g} s of the flight divided by the duration 1/Ω of a contact. "
+        "The other columns hold three numbers for each solver: the error in metres / the number of evaluations of the "
+        "derivative / the processor time in ms. The error is the largest difference between the computed height of the "
+        "ball and its true height at 101 times. The true height comes from a closed form (`closed_form.py`) that is "
+        "computed with 50 digits.",
+        "",
+        "| stiffness ratio | " + " | ".join(METHODS) + " |",
         "|---|" + "---|" * len(METHODS),
     ]
     for ratio in RATIOS:
         cells = []
         for method in METHODS:
-            one = found[method, ratio, TOLERANCE]
-            if "gave up" in one:
-                cells.append(f"gave up after {one['ms']:,.0f} ms")
+            result = results[method, ratio, TOLERANCE]
+            if "gave up" in result:
+                cells.append(f"gave up after {result['ms']:,.0f} ms")
             else:
-                cells.append(f"{one['error']:.0e} / {one['evaluations']:,} / {one['ms']:,.0f}")
+                cells.append(f"{result['error']:.0e} / {result['evaluations']:,} / {result['ms']:,.0f}")
         text.append(f"| 1e{round(np.log10(ratio))} | " + " | ".join(cells) + " |")
     text += [
         "",
-        "An explicit method's step is bounded by its stability, some 3/Ω for as long as the ball lies on the table: "
-        "the work grows with the ratio until the solver says so. Implicit methods, and LSODA, which changes to one, "
-        "pay a little for each further hop. What a solver says when it gives up:",
+        "RK45 and DOP853 are explicit methods. An explicit method remains stable only with steps of at most about 3/Ω "
+        "while the ball lies on the table. Its work therefore grows with the stiffness ratio, until the solver reaches "
+        "its limit of steps and gives up. BDF and Radau are implicit methods, and LSODA changes to an implicit method "
+        "if the equation is stiff. Their work grows only slowly, because a harder table adds a few more hops. A solver "
+        "that gives up prints a message like this one:",
         "",
-        f"> {sentence}",
+        f"> {message}",
         "",
-        "![Work and precision](ball_stiffness.png)",
+        "![Error of the height against run time](ball_stiffness.png)",
         "",
         f"{machine('scipy', 'numpy')} One thread. Command: `python -m benchmarks.flights.ball_stiffness`.",
         "",
     ]
     write_page(HERE, text)
-    drawn(found)
+    draw_figure(results)
 
 
-def drawn(found: dict) -> None:
+def draw_figure(results: dict) -> None:
+    """Save the figure of run time against stiffness and of error against run time at two stiffness ratios."""
     figure = titled_figure(
         (12.5, 4.6), "A ball lands on an ever harder table: SciPy's solvers against 50 digits", False
     )
@@ -116,17 +136,21 @@ def drawn(found: dict) -> None:
             "markersize": 5,
         }
         name = f"{method} ({'explicit' if method in EXPLICIT else 'changes' if method == 'LSODA' else 'implicit'})"
-        there = [(ratio, found[method, ratio, TOLERANCE]) for ratio in RATIOS]
-        good = [(ratio, one["ms"]) for ratio, one in there if "error" in one]
+        by_ratio = [(ratio, results[method, ratio, TOLERANCE]) for ratio in RATIOS]
+        good = [(ratio, result["ms"]) for ratio, result in by_ratio if "error" in result]
         axes[0].loglog(*zip(*good, strict=True), label=name, **look)
-        failed = [(ratio, one["ms"]) for ratio, one in there if "error" not in one]
+        failed = [(ratio, result["ms"]) for ratio, result in by_ratio if "error" not in result]
         if failed:
             axes[0].loglog(
                 *zip(*failed, strict=True), color=look["color"], marker="x", linestyle="", markersize=9
             )
         for axis, ratio in zip(axes[1:], HARD, strict=True):
-            there = [found[method, ratio, one] for one in TOLERANCES if (method, ratio, one) in found]
-            pairs = [(one["ms"], one["error"]) for one in there if "error" in one]
+            by_tolerance = [
+                results[method, ratio, tolerance]
+                for tolerance in TOLERANCES
+                if (method, ratio, tolerance) in results
+            ]
+            pairs = [(result["ms"], result["error"]) for result in by_tolerance if "error" in result]
             if pairs:
                 axis.loglog(*zip(*pairs, strict=True), **look)
             else:
