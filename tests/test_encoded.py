@@ -133,7 +133,7 @@ def test_features_are_computed_once_and_are_the_same_as_in_each_step():
     )
     assert encoded.augment(same) is same
     assert len(encoded.read([])) == 3
-    with pytest.raises(ConfigError, match="no picture"):
+    with pytest.raises(ConfigError, match="cannot be drawn"):
         encoded.preview(same["input"])
 
 
@@ -176,7 +176,7 @@ def test_features_that_are_not_finite_are_named():
 def test_a_head_fitted_at_once_gives_no_gradient_to_what_is_before_it():
     learned = build("encoder", resolve("encoder", "mlp"), input_shape=(2,))
     with pytest.raises(
-        ConfigError, match=r"Shares is fitted to all features at once .* Squares and MLP learn"
+        ConfigError, match=r"Shares is fitted to all features at once .* Squares and MLP have parameters"
     ):
         Model([Squares(), learned], Shares())
 
