@@ -61,7 +61,7 @@ def test_targets_of_the_right_shape_pass(kind: Kind) -> None:
 def test_targets_of_another_shape_are_refused(kind: Kind, fault: str) -> None:
     batch = targets(TARGETS[kind])
     wrong = {**batch, "target": FAULTS[fault](batch["target"])}
-    with pytest.raises(DataError, match=r"of shape .*: wanted \(6"):
+    with pytest.raises(DataError, match=r"of shape .*, but shape \(6"):
         require_targets(wrong, TARGETS[kind])
 
 
@@ -85,11 +85,11 @@ def test_a_label_of_no_class_is_refused_wherever_it_is_read(label: float, worker
 @pytest.mark.parametrize(
     ("chosen", "said"),
     [
-        (["density_head=gaussian", "data.kind=real", "data.fault=flat"], "wanted (2, 1)"),
-        (["density_head=gaussian", "data.kind=real", "data.fault=wide"], "wanted (2, 1)"),
-        (["density_head=von_mises", "data.kind=angle", "data.fault=flat"], "wanted (2, 1)"),
-        (["density_head=von_mises", "data.kind=angles", "data.fault=column"], "wanted (2, 2)"),
-        (["density_head=categorical", "data.kind=class", "data.fault=column"], "wanted (2,)"),
+        (["density_head=gaussian", "data.kind=real", "data.fault=flat"], "but shape (2, 1) is required"),
+        (["density_head=gaussian", "data.kind=real", "data.fault=wide"], "but shape (2, 1) is required"),
+        (["density_head=von_mises", "data.kind=angle", "data.fault=flat"], "but shape (2, 1) is required"),
+        (["density_head=von_mises", "data.kind=angles", "data.fault=column"], "but shape (2, 2) is required"),
+        (["density_head=categorical", "data.kind=class", "data.fault=column"], "but shape (2,) is required"),
         (
             ["density_head=categorical", "data.kind=class", "data.fault=label"],
             "is 7, but class indices go from 0 to 1",
