@@ -79,7 +79,7 @@ experiment=moons/vanilla_128 checkpoint=outputs/run | outputs/run is neither a f
 seed=-1 | seed = -1
 seed=one | seed = 'one'
 seed=0,1 | To sweep over it, add --multirun
--m experiment=moons/vanilla_128 seed=0,one | seed=one; No job of the sweep was run
+-m experiment=moons/vanilla_128 seed=0,one | seed=one. No job of the sweep was run
 -m experiment=moons/vanilla_128 optimizer.learning_rate=0.1,0 | greater than 0
 -m experiment=moons/vanilla_128 density_head=categorical,von_mises | von_mises describes targets of kind 'angle'
 -m experiment=moons/vanilla_128 metric=[accuracy],[crps] | crps measures distances
@@ -119,8 +119,8 @@ data=moons density_head=extra_trees metric=[psnr] | A metric reads the true 'col
 objective=[outlier] | Did you mean 'outlier_exposure'?
 renderer=zbufer | Did you mean 'zbuffer'?
 experiment=moons/vanilla_128 density_head=scvae | density_head scvae, which contains
-experiment=pascal3d/scvae density_head=categorical | Choose another one, or other data
-experiment=pascal3d/scvae metric=[accuracy] | Choose another one, or other data
+experiment=pascal3d/scvae density_head=categorical | Choose another plugin for this target, or other data
+experiment=pascal3d/scvae metric=[accuracy] | Choose another plugin for this target, or other data
 experiment=moons/vanilla_128 +data._target_=os.system | must not be able to run code
 experiment=moons/vanilla_128 data@outliers=pascal3d | outliers.data_seed: unknown key
 mode=tran | Did you mean 'train'?
@@ -131,8 +131,8 @@ mode=predict mode.files=nowhere | Give a file, or a folder of files
 mode=combine | mode.members is missing
 mode=combine mode.members=nowhere | at least two are required
 mode=encode mode.files=a mode.into=b | data.name is missing
-mode=sync mode.run=nowhere | Give the folder of a run
-mode=check | name a plugin
+mode=sync mode.run=nowhere | is no run folder
+mode=check | needs a plugin, but none is chosen
 --epochs 5 | without dashes: trainer.max_epochs=5
 --epochs=5 | without dashes: trainer.max_epochs=5
 --max-epochs 5 | without dashes: trainer.max_epochs=5
@@ -147,7 +147,7 @@ experiment=moons/vanilla_128 --seed 3 | without dashes: seed=3
 seed=1 --package | expected one argument
 experiment=moons/vanilla_128 -m seed=range(3,3) | seed=range(3,3) has no value, so there is no job
 -m experiment=moons/vanilla_128 'optimizer=glob(xyz*)' | optimizer=glob(xyz*) has no value
-experiment=moons/vanilla_128 -m seed=0,one | seed=one; No job of the sweep was run
+experiment=moons/vanilla_128 -m seed=0,one | seed=one. No job of the sweep was run
 experiment=moons/vanilla_128 hydra.run.dir=/proc/self/x | /proc/self/x cannot be written
 experiment=moons/vanilla_128 hydra.run.dir=/dev/null/x | /dev/null/x cannot be written
 mode=test checkpoint=last | no run in that folder has a checkpoint
