@@ -1,4 +1,4 @@
-"""Commands of the framework that a benchmark runs, in the project's folder."""
+"""Running commands of the framework from a benchmark script, in the project's folder."""
 
 import signal
 import subprocess
@@ -12,37 +12,38 @@ ROOT = Path(__file__).resolve().parent.parent
 
 
 def carry_out(command: Sequence[str]) -> None:
-    """Run it to its end, however long it takes to stop where it is told to.
+    """Run a command to its end and forward every stop signal to it.
 
-    Ctrl-C, SIGTERM and the closing of a terminal are passed on to it, once each: it has a process group of its own,
-    since from a terminal it would get them a second time, which hurries it. `subprocess.run` kills what has not ended
-    a quarter of a second after Ctrl-C, and on SIGTERM leaves a sweep to itself. Where this process is killed, the
-    command gets SIGTERM (Linux).
+    Ctrl-C, SIGTERM and the closing of a terminal are forwarded once each. After a signal, the command may take any
+    time to stop. It has a process group of its own, because the terminal would otherwise send it the same signal a
+    second time, and a second signal makes a run stop without finishing its work. `subprocess.run` is not suitable: it
+    kills the command a quarter of a second after Ctrl-C, and on SIGTERM it leaves a sweep running. If this process is
+    killed, the command gets SIGTERM (on Linux only).
 
     Raises:
-        SystemExit: it was told to stop; with the exit code that shells give.
-        subprocess.CalledProcessError: it failed.
+        SystemExit: a signal was received; the exit code is that of shells, 128 + the signal's number.
+        subprocess.CalledProcessError: the command failed.
     """
     numbers = [number for number in SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
     received: list[int] = []
-    early: list[int] = []
-    started: list[subprocess.Popen[bytes]] = []
+    pending: list[int] = []
+    processes: list[subprocess.Popen[bytes]] = []
 
-    def passed_on(number: int, frame: FrameType | None) -> None:
+    def forward(number: int, frame: FrameType | None) -> None:
         received.append(number)
-        if started:
-            started[0].send_signal(number)
+        if processes:
+            processes[0].send_signal(number)
         else:
-            early.append(number)
+            pending.append(number)
 
-    before = {number: signal.signal(number, passed_on) for number in numbers}
+    handlers = {number: signal.signal(number, forward) for number in numbers}
     try:
-        started.append(subprocess.Popen(command, cwd=ROOT, process_group=0, preexec_fn=end_with_parent()))
-        for number in early:
-            started[0].send_signal(number)
-        code = started[0].wait()
+        processes.append(subprocess.Popen(command, cwd=ROOT, process_group=0, preexec_fn=end_with_parent()))
+        for number in pending:
+            processes[0].send_signal(number)
+        code = processes[0].wait()
     finally:
-        for number, handler in before.items():
+        for number, handler in handlers.items():
             signal.signal(number, handler)
     if received:
         raise SystemExit(128 + received[0])

@@ -1,4 +1,4 @@
-"""Pages of results: where and when they were measured, how they are written, and their tables read back."""
+"""Pages of results: the line about the machine and the date, writing pages, and reading tables of results."""
 
 import datetime
 import platform
@@ -11,14 +11,15 @@ from framework.datasets.csv_columns import read_columns
 
 
 def machine(*packages: str) -> str:
-    """Return processor, date and versions, one line of Markdown."""
+    """Return one line with the processor, the date and the versions of Python and of these packages."""
     processor = platform.processor() or "unknown processor"
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.is_file():
         text = cpuinfo.read_text()
         names = re.findall(r"^model name\s*:\s*(.*)$", text, re.MULTILINE)
-        # the widest of them decides by how much float32 and bfloat16 differ
-        widest = [each for each in ("avx512_bf16", "avx512f", "avx2") if re.search(rf"\b{each}\b", text)][:1]
+        # the widest instruction set of the processor determines how much float32 and bfloat16 results differ
+        instruction_sets = ("avx512_bf16", "avx512f", "avx2")
+        widest = [name for name in instruction_sets if re.search(rf"\b{name}\b", text)][:1]
         processor = ", ".join([names[0], f"{len(names)} cores", *widest]) if names else processor
     versions = ", ".join(f"{name} {version(name)}" for name in packages)
     return (
@@ -27,12 +28,12 @@ def machine(*packages: str) -> str:
 
 
 def write_page(script: str | Path, text: str | Sequence[str], name: str = "") -> Path:
-    """Write the page of a script beside it and return its path.
+    """Write the page of a script into the script's folder and return the path of the page.
 
     Args:
-        script: the script's `__file__`; the page has its name, with `.md`.
-        text: the page, or its lines.
-        name: stem of the page, where it is not the script's.
+        script: `__file__` of the script; the page has the same name with the suffix `.md`.
+        text: the text of the page, or its lines.
+        name: name of the page without suffix, if it differs from the script's.
     """
     page = Path(script).resolve().with_suffix(".md")
     page = page.with_stem(name or page.stem)
@@ -41,17 +42,20 @@ def write_page(script: str | Path, text: str | Sequence[str], name: str = "") ->
 
 
 def replace_section(page: Path, heading: str, text: str) -> None:
-    """Replace what stands under a heading of a page, up to the next heading of its level or above.
+    """Replace the text under a heading of a page, up to the next heading of the same or a higher level.
 
     Raises:
-        ValueError: the page has no such heading, or several.
+        ValueError: the page does not have the heading exactly once.
     """
     lines = page.read_text(encoding="utf-8").splitlines()
-    places = [number for number, line in enumerate(lines) if line == heading]
-    if len(places) != 1:
-        raise ValueError(f"{page} has {len(places)} lines {heading!r}; wanted one.")
+    headings = [number for number, line in enumerate(lines) if line == heading]
+    if len(headings) != 1:
+        raise ValueError(
+            f"{page} has {len(headings)} lines {heading!r}, but exactly one is required. Run the script without "
+            "options, which writes the whole page."
+        )
     level = len(heading) - len(heading.lstrip("#"))
-    first = places[0] + 1
+    first = headings[0] + 1
     ends = (
         number
         for number in range(first, len(lines))
@@ -63,16 +67,16 @@ def replace_section(page: Path, heading: str, text: str) -> None:
 
 
 def read_rows(table: Path) -> list[dict[str, object]]:
-    """Return the rows that `framework.reports.table.write_csv` wrote, to draw a figure again without measuring.
+    """Return the rows of a CSV file that `framework.reports.table.write_csv` wrote, to draw a figure again.
 
-    Values are numbers, words, True and False; an empty cell has no key.
+    Values are numbers, texts, True and False; for an empty cell the row has no key.
     """
     cells = read_columns(table).cells
     lines = [dict(zip(cells, line, strict=True)) for line in zip(*cells.values(), strict=True)]
-    return [{key: _value(cell) for key, cell in line.items() if cell} for line in lines]
+    return [{key: _parse_cell(cell) for key, cell in line.items() if cell} for line in lines]
 
 
-def _value(cell: str) -> object:
+def _parse_cell(cell: str) -> object:
     if cell in ("true", "false"):
         return cell == "true"
     try:

@@ -1,4 +1,4 @@
-"""Runs of a sweep, as a benchmark reads them: their records, settings and speed."""
+"""Records, settings and speed of the runs of a sweep, for benchmark scripts."""
 
 import json
 import math
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def record(run: Path) -> dict[str, Any]:
-    """Return the record of the job whose folder it is (framework.sweeps.jobs); empty for a run outside of a sweep."""
+    """Return the record of a job from its folder (framework.sweeps.jobs); empty for a run outside a sweep."""
     path = run / "job.json"
     if not path.exists():
         return {}
@@ -21,41 +21,44 @@ def record(run: Path) -> dict[str, Any]:
 
 
 def processor_seconds(job: Mapping[str, Any]) -> float:
-    """Return the processor seconds of a whole job; NaN where they are not known."""
-    spent = job.get("processor_seconds")
-    return math.nan if spent is None else float(spent)
+    """Return the processor time of a whole job in seconds; NaN if the record does not have it."""
+    seconds = job.get("processor_seconds")
+    return math.nan if seconds is None else float(seconds)
 
 
-def by_the_clock(job: Mapping[str, Any]) -> float:
-    """Return the seconds from a job's start to its end; NaN where they are not known."""
+def wall_seconds(job: Mapping[str, Any]) -> float:
+    """Return the wall time of a whole job in seconds; NaN if the record does not have its end."""
     return job["ended"] - job["started"] if "ended" in job else math.nan
 
 
 def settings(runs: Iterable[Path], *keys: str) -> list[str]:
-    """Return the values that a setting has in the runs' configs, each once: "15" or "15 and 30".
+    """Return the different values of each setting over the configurations of the runs, such as "15" or "15 and 30".
 
     Args:
-        keys: such as "trainer.max_epochs"; one answer each.
+        runs: folders of the runs.
+        keys: names of the settings, such as "trainer.max_epochs"; the result has one text for each.
     """
     configs = [yaml.safe_load((run / "config.yaml").read_text(encoding="utf-8")) for run in runs]
-    found = []
+    texts = []
     for key in keys:
         values = set()
         for config in configs:
             for part in key.split("."):
                 config = config[part]
             values.add(config)
-        found.append(" and ".join(str(value) for value in sorted(values)))
-    return found
+        texts.append(" and ".join(str(value) for value in sorted(values)))
+    return texts
 
 
 def milliseconds_per_sample(run: Path, loaders: "dict[str, Batches]", batch: int = 16) -> float:
-    """Return the milliseconds of one sample in a batch: density and point prediction of the run's model.
+    """Return the milliseconds per sample, in a batch, for the density and the point prediction of a run's model.
 
     Args:
-        loaders: those of the data seen so far.
+        run: folder of the run.
+        loaders: cache of the loaders of the data sets, by their settings; a missing one is added.
+        batch: samples of a batch.
     """
-    # here, since the records of jobs are read without torch
+    # imported here, so that the records of jobs can be read without torch
     import torch
 
     from framework.configuration.assembly import build_data

@@ -1,4 +1,4 @@
-"""Timing: several ways in turn, so that all meet the same machine, how far rounds differ, single calls, first calls."""
+"""Time measurements: interleaved rounds of several functions, repeated calls of one function, and first calls."""
 
 import os
 import subprocess
@@ -14,102 +14,109 @@ from benchmarks.commands import ROOT
 
 ROUNDS = 5
 BUSY = 0.25
-"""Cores that other processes may use, on average, while a page is measured."""
+"""Largest number of cores that other processes may use, on average, when a measurement starts."""
 
 
 @dataclass(frozen=True)
 class Rounds:
-    """Milliseconds of one way, or ratios of two ways, one number for each round."""
+    """Milliseconds of one function, or ratios of two functions: one number for each round."""
 
     milliseconds: tuple[float, ...]
 
     @property
     def median(self) -> float:
-        """Middle of the rounds."""
+        """Median over the rounds."""
         return median(self.milliseconds)
 
     def text(self, digits: int = 3) -> str:
-        """Write the median and, in brackets, the least and the largest round."""
+        """Return the median and, in brackets, the smallest and the largest round as text."""
         return median_and_range(self.milliseconds, digits)
 
-    def over(self, other: "Rounds") -> "Rounds":
-        """Return by round how many times as fast this way is as another."""
+    def speedup(self, other: "Rounds") -> "Rounds":
+        """Return for each round how many times as fast this function is as another."""
         return Rounds(tuple(b / a for a, b in zip(self.milliseconds, other.milliseconds, strict=True)))
 
     def times_faster(self, than: "Rounds", digits: int = 2) -> str:
-        """Write how many times as fast this way is as another: median (least to largest)."""
-        return self.over(than).text(digits)
+        """Return as text how many times as fast this function is as another: median (smallest to largest round)."""
+        return self.speedup(than).text(digits)
 
 
 def median_and_range(numbers: Sequence[float], digits: int = 3) -> str:
-    """Write the median and, in brackets, the least and the largest number."""
-    low, middle, high = (_plain(number, digits) for number in (min(numbers), median(numbers), max(numbers)))
+    """Return the median and, in brackets, the smallest and the largest number as text."""
+    low, middle, high = (
+        _format_plain(number, digits) for number in (min(numbers), median(numbers), max(numbers))
+    )
     return f"{middle} ({low} to {high})"
 
 
-def in_turn(
-    ways: Mapping[str, Callable[[], object]],
+def time_interleaved(
+    functions: Mapping[str, Callable[[], object]],
     *,
     rounds: int = ROUNDS,
     seconds: float = 0.3,
     clock: Callable[[], float] = time.process_time,
 ) -> dict[str, Rounds]:
-    """Time the ways in turn; a round of a way is the median of the calls that fit into `seconds`, at least three.
+    """Time several functions in interleaved rounds, so that other load on the machine affects all of them.
 
-    Each way is called twice before, to warm up.
+    In each round a function is called repeatedly for about `seconds`, at least three times; its time in the round is
+    the median of these calls. Before the first round, each function is called twice to warm up.
 
     Args:
-        ways: what to call, by name.
-        rounds: how many turns.
-        seconds: how long a way is called in a round.
-        clock: processor or wall time, seconds.
+        functions: functions to time, by name.
+        rounds: number of rounds.
+        seconds: time in seconds for which a function is called in a round.
+        clock: function that returns processor or wall time in seconds.
+
+    Returns:
+        Milliseconds of each function, by name.
     """
-    for call in ways.values():
+    for call in functions.values():
         call()
         call()
-    found: dict[str, list[float]] = {name: [] for name in ways}
+    milliseconds_of_rounds: dict[str, list[float]] = {name: [] for name in functions}
     for _ in range(rounds):
-        for name, call in ways.items():
+        for name, call in functions.items():
             times: list[float] = []
             while len(times) < 3 or sum(times) < seconds:
                 start = clock()
                 call()
                 times.append(clock() - start)
-            found[name].append(1e3 * median(times))
-    return {name: Rounds(tuple(times)) for name, times in found.items()}
+            milliseconds_of_rounds[name].append(1e3 * median(times))
+    return {name: Rounds(tuple(times)) for name, times in milliseconds_of_rounds.items()}
 
 
 def require_idle() -> None:
-    """Leave with a sentence where other processes use the machine: a page that is measured then does not reproduce.
+    """Exit with a message if other processes use the machine, because such times cannot be reproduced.
 
     Raises:
-        SystemExit: others use more than `BUSY` cores.
+        SystemExit: other processes use more than `BUSY` cores.
     """
-    used = others_use()
+    used = cores_used_by_others()
     if used > BUSY:
         sys.exit(
-            f"Other processes use {used:.2f} cores; wanted at most {BUSY}, for figures that reproduce. Nothing is "
-            "written. End them and run this again."
+            f"Other processes use {used:.2f} cores, but at most {BUSY} are allowed, so that the times can be "
+            "reproduced. Nothing was written. End the other processes and run the script again."
         )
 
 
-def others_use(seconds: float = 2.0) -> float:
-    """Return how many cores other processes use, on average over so many seconds (Linux; 0 elsewhere)."""
+def cores_used_by_others(seconds: float = 2.0) -> float:
+    """Return the number of cores that other processes use, averaged over some seconds (on Linux; elsewhere 0)."""
     if not Path("/proc/stat").is_file():
         return 0.0
-    before, own = _busy(), time.process_time()
+    before, own = _total_processor_seconds(), time.process_time()
     time.sleep(seconds)
-    return max(0.0, (_busy() - before - (time.process_time() - own)) / seconds)
+    return max(0.0, (_total_processor_seconds() - before - (time.process_time() - own)) / seconds)
 
 
-def first_calls(script: str, **elsewhere: str) -> tuple[float, float]:
-    """Return the seconds that a script prints in a fresh process: with nothing compiled, and with a full cache.
+def first_calls(script: str, **variables: str) -> tuple[float, float]:
+    """Return the seconds that a script prints in a new process, with an empty cache of code and with a full one.
 
     Args:
-        elsewhere: further environment; the cache of compiled code is in the folder {} of a value.
+        script: Python code that prints a number of seconds.
+        variables: additional environment variables; "{}" in a value is replaced by the folder of the cache.
     """
     with tempfile.TemporaryDirectory() as folder:
-        environment = {**os.environ, **{name: value.format(folder) for name, value in elsewhere.items()}}
+        environment = {**os.environ, **{name: value.format(folder) for name, value in variables.items()}}
         cold, warm = (
             subprocess.run(
                 [sys.executable, "-c", script],
@@ -126,7 +133,14 @@ def milliseconds(
     clock: Callable[[], float] = time.thread_time,
     warm_up: int = 10,
 ) -> float:
-    """Return the median milliseconds of a call after calls to warm up; by default the thread's processor time."""
+    """Return the median time of a call in milliseconds, after calls to warm up; by default the thread's processor time.
+
+    Args:
+        call: function to time.
+        repeats: number of timed calls.
+        clock: function that returns seconds.
+        warm_up: number of calls before the timed calls.
+    """
     for _ in range(warm_up):
         call()
     times = []
@@ -137,11 +151,11 @@ def milliseconds(
     return 1e3 * median(times)
 
 
-def _busy() -> float:
-    """Return the processor seconds that all processes have had since the machine started."""
+def _total_processor_seconds() -> float:
+    """Return the processor seconds that all processes together have used since the machine started."""
     user, nice, system, *_ = Path("/proc/stat").read_text().split("\n", 1)[0].split()[1:]
     return (int(user) + int(nice) + int(system)) / os.sysconf("SC_CLK_TCK")
 
 
-def _plain(number: float, digits: int) -> str:
+def _format_plain(number: float, digits: int) -> str:
     return f"{number:.{digits}g}" if abs(number) < 10**digits else f"{number:,.0f}"

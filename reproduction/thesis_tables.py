@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 from benchmarks.commands import ROOT, carry_out
 from benchmarks.pages import machine
-from benchmarks.sweeps import by_the_clock, processor_seconds, record
+from benchmarks.sweeps import processor_seconds, record, wall_seconds
 from framework.reports.table import NOT_AVAILABLE, format_number
 
 HERE = Path(__file__).resolve()
@@ -289,7 +289,7 @@ def report(page: str, written: Mapping[str, float]) -> str:
             continue
         asked = sum(choices(table.sweeps[sweep], table.seeds) for sweep in own)
         shown = ", ".join(link(script) for script in (table.script, *table.also))
-        seconds = sum(by_the_clock(job) if table.alone else processor_seconds(job) / AT_ONCE for job in done)
+        seconds = sum(wall_seconds(job) if table.alone else processor_seconds(job) / AT_ONCE for job in done)
         on_pages = written.get(name, cell(before.get(name, ""), PAGES))
         told = [one_decimal(seconds / 60), one_decimal(on_pages)]
         cells = [name, table.about, shown, f"{len(done)} of {asked}", *told, when(done)]

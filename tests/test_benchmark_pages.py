@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.pages import replace_section
-from benchmarks.timing import Rounds, in_turn, others_use
+from benchmarks.timing import Rounds, cores_used_by_others, time_interleaved
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted(
@@ -57,13 +57,13 @@ def test_a_page_says_how_it_was_measured(page: Path) -> None:
         assert page.name not in WITHOUT_SPREAD
 
 
-def test_ways_are_timed_in_turn_after_a_call_to_warm_up() -> None:
+def test_functions_are_timed_in_interleaved_rounds_after_calls_to_warm_up() -> None:
     calls: list[str] = []
     moments = iter(range(1000))
-    ways = {name: lambda name=name: calls.append(name) for name in ("a", "b")}
-    found = in_turn(ways, rounds=2, seconds=0.0, clock=lambda: next(moments))
+    functions = {name: lambda name=name: calls.append(name) for name in ("a", "b")}
+    times = time_interleaved(functions, rounds=2, seconds=0.0, clock=lambda: next(moments))
     assert calls == ["a", "a", "b", "b", *["a"] * 3, *["b"] * 3, *["a"] * 3, *["b"] * 3]
-    assert found == {"a": Rounds((1000.0, 1000.0)), "b": Rounds((1000.0, 1000.0))}
+    assert times == {"a": Rounds((1000.0, 1000.0)), "b": Rounds((1000.0, 1000.0))}
 
 
 def test_a_ratio_is_taken_round_by_round() -> None:
@@ -88,7 +88,7 @@ def test_a_process_of_others_is_seen() -> None:
 
     busy = subprocess.Popen([sys.executable, "-c", "while True: pass"])
     try:
-        assert others_use(1.0) > 0.2
+        assert cores_used_by_others(1.0) > 0.2
     finally:
         busy.kill()
         busy.wait()

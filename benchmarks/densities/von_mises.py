@@ -20,7 +20,7 @@ from scipy import special, stats
 from torch import Tensor
 
 from benchmarks.pages import machine, replace_section, write_page
-from benchmarks.timing import ROUNDS, in_turn, median_and_range, require_idle
+from benchmarks.timing import ROUNDS, median_and_range, require_idle, time_interleaved
 from framework.distributions.circular import circular_median, wrap
 from framework.distributions.density import Mixture
 from plugins.density_head.von_mises import functions, integrals
@@ -113,9 +113,11 @@ def speed() -> list[str]:
         arguments = (value, mean.requires_grad_(), torch.exp(2 * logarithm + 1).requires_grad_())
         detached = tuple(argument.detach() for argument in arguments)
         ones = torch.ones(COUNT, dtype=dtype)
-        values = in_turn({name: partial(value_only, density, arguments) for name, density in ways.items()})
+        values = time_interleaved(
+            {name: partial(value_only, density, arguments) for name, density in ways.items()}
+        )
         one_pass = {"compiled, `log_prob_and_slopes`": partial(ONE_PASS, *detached)}
-        gradients = in_turn(
+        gradients = time_interleaved(
             {name: partial(both, density, arguments, ones) for name, density in ways.items()} | one_pass
         )
         for name, found in gradients.items():
@@ -149,7 +151,7 @@ def sampling() -> list[str]:
         # torch's sampler does not end at κ = 0 and from 1e16 on, and is wrong before
         if 0 < kappa <= 1e6:
             ways["torch"] = torch.distributions.VonMises(zero, concentration, validate_args=False).sample
-        found = in_turn(ways, seconds=0.1)
+        found = time_interleaved(ways, seconds=0.1)
         ours, theirs = found["ours"], found.get("torch")
         cells += [ours.text(), *([theirs.text(), ours.times_faster(theirs)] if theirs else ["–", "–"])]
         lines.append(f"| {kappa:g} | {' | '.join(cells)} |")
@@ -252,7 +254,7 @@ def medians() -> list[str]:
             cost = torch.cat([wrap(part[:, None] - row).abs().mean(1) for part in row.split(500)])
             row[cost.argmin()]
 
-    found = in_turn({"sorted": partial(circular_median, samples), "pairs": all_pairs}, seconds=0.1)
+    found = time_interleaved({"sorted": partial(circular_median, samples), "pairs": all_pairs}, seconds=0.1)
     ratios = [
         32 * slow / fast
         for fast, slow in zip(found["sorted"].milliseconds, found["pairs"].milliseconds, strict=True)

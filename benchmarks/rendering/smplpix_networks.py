@@ -23,7 +23,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from benchmarks.commands import ROOT, carry_out
 from benchmarks.pages import machine, replace_section, write_page
 from benchmarks.rendering.rasterizer import figure
-from benchmarks.timing import ROUNDS, Rounds, in_turn, milliseconds, require_idle
+from benchmarks.timing import ROUNDS, Rounds, milliseconds, require_idle, time_interleaved
 from framework.configuration.loading import load_with_description, reader
 from framework.configuration.schema import build, resolve
 from framework.encoder import Encoder
@@ -107,7 +107,7 @@ def frames() -> tuple[list[str], dict[tuple, Rounds], list[float]]:
             made = encoder(name, tuple(source.shape[1:]), precision=precision, residual=True, **config)
             calls[name, precision, crop] = made, source
         with torch.inference_mode():
-            times = in_turn({str(key): partial(call, given) for key, (call, given) in calls.items()})
+            times = time_interleaved({str(key): partial(call, given) for key, (call, given) in calls.items()})
         found |= {(size, *key): times[str(key)] for key in calls}
         for splat in (0, SPLAT):
             what = f"splats of {splat} pixels" if splat else "no splats"
@@ -206,7 +206,7 @@ def judged(found: dict[tuple, Rounds]) -> list[str]:
         unet, slim = (found[size, name, kind, None] for name in ("unet", "slim"))
         limit = {"float32": MOST_FLOAT32, "bfloat16": MOST_BFLOAT16}[kind]
         box = found[size, "slim", kind, "default"]
-        faster, gain = slim.over(unet), box.over(slim)
+        faster, gain = slim.speedup(unet), box.speedup(slim)
         rows.append(
             (f"slim faster than unet, {kind}", faster, f"≥ {LEAST_RATIO:g}", faster.median >= LEAST_RATIO)
         )

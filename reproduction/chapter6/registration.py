@@ -25,7 +25,7 @@ from jaxtyping import Float
 
 import framework
 from benchmarks.pages import machine, write_page
-from benchmarks.sweeps import by_the_clock, record, settings
+from benchmarks.sweeps import record, settings, wall_seconds
 from benchmarks.timing import milliseconds
 from framework.bodies.default_body import load_default_body
 from framework.configuration.schema import build, resolve
@@ -142,7 +142,7 @@ def main(runs: list[Path], scan: Path | None) -> None:
 def trained(run: Path, split) -> list[str]:
     """The errors that a run's own test stage wrote, how long it took, and what one scan costs its model."""
     found = json.loads((run / "results.json").read_text(encoding="utf-8"))
-    minutes = format_number(by_the_clock(record(run)) / 60)
+    minutes = format_number(wall_seconds(record(run)) / 60)
     (threads,) = settings([run], "threads")
     model = framework.load(run)
     batch = split.__getitems__([0])
