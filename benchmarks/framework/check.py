@@ -2,10 +2,10 @@
 
     python -m benchmarks.framework.check [seeds, 50 by default] [more]
 
-Finds the planted faults of tests/planted_faults.py and tests/planted_questions.py, and counts false alarms: every row
-of every head that is shipped, and the right heads of tests/right_heads.py, over seeds of everything that is drawn.
-Writes check.md beside this file. With `more` it goes on where that file ends, which is fair as long as the code is the
-same.
+The planted faults are in tests/planted_faults.py and tests/planted_questions.py. False alarms are counted over the rows
+of all density heads of this project and over the correct density heads of tests/right_heads.py, with several random
+seeds. The results are written to check.md beside this file. With `more` the script continues after the last seed of
+that file, which is valid only if the code has not changed.
 """
 
 import re
@@ -26,11 +26,11 @@ from tests.right_heads import HEADS, right_findings
 PAGE = Path(__file__).with_suffix(".md")
 
 
-def faults() -> list[str]:
-    """A line of the table for each planted fault."""
+def examine_faults() -> list[str]:
+    """Return one table row for each planted fault, and print it."""
     lines = []
     for fault in (*ALL_FAULTS, *FURTHER_FAULTS):
-        failed = list(dict.fromkeys(one.name for one in fault.findings() if not one.holds))
+        failed = list(dict.fromkeys(result.name for result in fault.findings() if not result.holds))
         lines.append(
             f"| {fault.name} | {len(fault.target.names)} {fault.target.kind} | {', '.join(failed) or '**missed**'} |"
         )
@@ -38,10 +38,10 @@ def faults() -> list[str]:
     return lines
 
 
-def alarms(seed: int) -> list[str]:
-    """What fails of the shipped rows and of the right heads of others with this seed."""
+def find_alarms(seed: int) -> list[str]:
+    """Return the failed tests of correct density heads with a random seed."""
     before = finding.SEED
-    for module in list(sys.modules.values()):  # whoever imported it has a copy
+    for module in list(sys.modules.values()):  # every module that imported SEED has a copy of it
         if getattr(module, "SEED", None) == before and module.__name__.startswith(
             ("framework.testing", "plugins")
         ):
@@ -50,53 +50,78 @@ def alarms(seed: int) -> list[str]:
     for name in installed("density_head"):
         whole = contract("density_head", name)
         for row in whole.rows:
-            failed += [f"{name}, {row.name}: {one}" for one in whole.findings(row) if not one.holds]
+            failed += [f"{name}, {row.name}: {result}" for result in whole.findings(row) if not result.holds]
     for name, (_, targets) in HEADS.items():
         for target in targets:
-            what = f"{name} of somebody else, {target.listed_names}"
-            failed += [f"{what}: {one}" for one in right_findings(name, target) if not one.holds]
+            label = f"{name} (not shipped), {target.listed_names}"
+            failed += [f"{label}: {result}" for result in right_findings(name, target) if not result.holds]
     return failed
 
 
 def write(lines: list[str], seeds: int, failed: dict[str, list[int]], minutes: float) -> None:
+    """Write the page.
+
+    Args:
+        lines: Table rows of the planted faults.
+        seeds: Number of random seeds with which false alarms were counted.
+        failed: Name of each false alarm, with the seeds at which it occurred.
+        minutes: Run time so far.
+    """
     rows = sum(len(contract("density_head", name).rows) for name in installed("density_head"))
-    others = sum(len(targets) for _, targets in HEADS.values())
-    told = [f"- seeds {', '.join(map(str, at))}: {what}" for what, at in failed.items()]
-    found = sum("**missed**" not in line for line in lines)
+    right_rows = sum(len(targets) for _, targets in HEADS.values())
+    alarm_lines = [
+        f"- seed {', '.join(map(str, alarm_seeds))}: {alarm}" for alarm, alarm_seeds in failed.items()
+    ]
+    found_count = sum("**missed**" not in line for line in lines)
     text = f"""# What `mode=check` finds in density heads
 
-`python -m benchmarks.framework.check`: {machine("torch")} {minutes:.0f} minutes.
+This page shows how well `mode=check` finds errors in density heads. `mode=check` tests the properties that every
+density head must have. The benchmark counts two things: the planted faults that `mode=check` finds, and its false
+alarms. A planted fault is a known error that is put into a correct density head. A false alarm is a failed test of a
+correct density head.
 
-**Planted faults: {found} of {len(lines)} found ({100 * found / len(lines):.1f} %).** A sound head is changed in one
-thing; the third column names every property that fails.
+## Planted faults
 
-| fault | target | found by |
+`mode=check` found {found_count} of {len(lines)} planted faults ({100 * found_count / len(lines):.1f} %).
+
+In each row of the table one thing is changed in a correct density head. The column `fault` names the change, `target`
+names the predicted quantity, and `failed properties` lists every property whose test failed. κ is the concentration of
+a von Mises density, μ is its mean direction, and σ is the standard deviation of a normal density. A row with
+**missed** has no failed test.
+
+| fault | target | failed properties |
 | --- | --- | --- |
 {chr(10).join(lines)}
 
-**False alarms: {sum(map(len, failed.values()))} findings** of {rows} rows of shipped heads × {seeds} seeds,
-and of {others} rows of right heads that are not shipped (tests/right_heads.py).
+## False alarms
 
-{chr(10).join(told)}
-"""
+`mode=check` gave {sum(map(len, failed.values()))} false alarms. It tested {rows} constructions of the density heads of
+this project with {seeds} random seeds each. It also tested {right_rows} constructions of correct density heads that are
+not part of this project (tests/right_heads.py). Each line of the following list names the random seeds, the density
+head, the construction and the property whose test failed.
+
+{chr(10).join(alarm_lines)}
+
+{machine("torch")} Command: `python -m benchmarks.framework.check`. Run time: {minutes:.0f} minutes.
+""".replace("\n\n\n\n", "\n\n")
     write_page(__file__, text)
 
 
-def written() -> tuple[list[str], int, dict[str, list[int]], float]:
-    """What an earlier run has written: as `write` takes it."""
+def read_page() -> tuple[list[str], int, dict[str, list[int]], float]:
+    """Return the arguments of `write` that an earlier run has written to the page."""
     text = PAGE.read_text(encoding="utf-8")
     lines = [
         line
         for line in text.splitlines()
         if line.startswith("| ") and not line.startswith(("| fault", "| ---"))
     ]
-    (seeds,) = re.findall(r"shipped heads × (\d+) seeds", text)
+    (seeds,) = re.findall(r"with (\d+) random seeds each", text)
     (minutes,) = re.findall(r"(\d+) minutes\.$", text, re.MULTILINE)
-    told = re.findall(r"^- seeds ([\d, ]+): (.*)$", text, re.MULTILINE)
+    alarm_matches = re.findall(r"^- seeds? ([\d, ]+): (.*)$", text, re.MULTILINE)
     return (
         lines,
         int(seeds),
-        {what: [int(seed) for seed in at.split(", ")] for at, what in told},
+        {alarm: [int(seed) for seed in alarm_seeds.split(", ")] for alarm_seeds, alarm in alarm_matches},
         float(minutes),
     )
 
@@ -105,14 +130,14 @@ def main() -> None:
     torch.set_num_threads(1)
     start = time.perf_counter()
     if "more" in sys.argv:
-        lines, first, failed, before = written()
+        lines, first, failed, before = read_page()
     else:
-        lines, first, failed, before = faults(), 0, {}, 0.0
+        lines, first, failed, before = examine_faults(), 0, {}, 0.0
     for seed in range(first, int(sys.argv[1]) if len(sys.argv) > 1 else 50):
-        for one in alarms(seed):
-            sys.stdout.write(f"seed {seed}: {one}\n")
-            failed.setdefault(one.partition(" FAILS")[0], []).append(seed)
-        # after each seed, so that what was found is kept when it is ended
+        for alarm in find_alarms(seed):
+            sys.stdout.write(f"seed {seed}: {alarm}\n")
+            failed.setdefault(alarm.partition(" FAILS")[0], []).append(seed)
+        # after each seed, so that an interrupted run keeps its results
         write(lines, seed + 1, failed, before + (time.perf_counter() - start) / 60)
 
 

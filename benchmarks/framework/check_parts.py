@@ -1,11 +1,11 @@
-"""Count the planted faults that contracts of other parts find, and their false alarms.
+"""Count the planted faults that the contracts of the other groups find, and their false alarms.
 
     python -m benchmarks.framework.check_parts GROUP [seeds, 20 by default] [names ...]
 
-GROUP is data, metric, encoder, renderer, uncertainty or objective. This finds the planted faults of
-tests/planted_*.py, and counts false alarms: every row of every part that is shipped, and right parts as strangers
-write them, over seeds of everything that is drawn. Writes check_<group>.md beside this file, after each seed. With
-names only those shipped parts are tried.
+GROUP is data, metric, encoder, renderer, uncertainty or objective. The planted faults are in tests/planted_*.py. False
+alarms are counted over the rows of all plugins of the group and over correct plugins that are not part of this project
+(RIGHT in tests/planted_*.py), with several random seeds. The results are written to check_<group>.md beside this file
+after each seed. If names are given, only these plugins of the group are tested.
 """
 
 import statistics
@@ -36,11 +36,11 @@ from tests import (
     planted_wrappers,
 )
 
-Look = Callable[[], Iterator[Finding]]
+Examine = Callable[[], Iterator[Finding]]
 
 
-def planted(group: str) -> dict[str, Look]:
-    """Fault → its findings."""
+def planted_faults(group: str) -> dict[str, Examine]:
+    """Return, for each planted fault of a group, a function that tests a plugin with this fault."""
     match group:
         case "data":
             return {
@@ -71,20 +71,20 @@ def planted(group: str) -> dict[str, Look]:
                 )
                 for fault in planted_objectives.ALL_FAULTS
             }
-    others = {
+    left_out = {
         fault.name: dict(planted_renderers.RIGHT["discs"][1]) if fault.by == "points" else {}
         for fault in planted_renderers.ALL_FAULTS
     }
     return {
         fault.name: lambda fault=fault: examine_renderer(
-            RendererRow("", leave_out=others[fault.name]), fault.build
+            RendererRow("", leave_out=left_out[fault.name]), fault.build
         )
         for fault in planted_renderers.ALL_FAULTS
     }
 
 
-def strangers(group: str) -> dict[str, Look]:
-    """Right part → its findings."""
+def external_plugins(group: str) -> dict[str, Examine]:
+    """Return, for each correct plugin outside of this project, a function that tests it."""
     match group:
         case "data":
             return {
@@ -123,19 +123,19 @@ def strangers(group: str) -> dict[str, Look]:
     }
 
 
-def shipped(group: str, names: list[str]) -> dict[str, Look]:
-    """Part → the findings of all its rows."""
+def own_plugins(group: str, names: list[str]) -> dict[str, Examine]:
+    """Return, for each plugin of a group, a function that tests all its rows."""
 
-    def every(name: str) -> Iterator[Finding]:
+    def examine_rows(name: str) -> Iterator[Finding]:
         whole = contract(group, name)
         for row in whole.rows:
             yield from whole.findings(row)
 
-    return {name: lambda name=name: every(name) for name in names or installed(group)}
+    return {name: lambda name=name: examine_rows(name) for name in names or installed(group)}
 
 
 def change_seed(seed: int) -> None:
-    """Whoever imported it has a copy."""
+    """Set the random seed of the tests in every module that has imported it."""
     before = finding.SEED
     for module in list(sys.modules.values()):
         if getattr(module, "SEED", None) == before and module.__name__.startswith(
@@ -145,38 +145,67 @@ def change_seed(seed: int) -> None:
 
 
 def write(
-    group: str, found: dict[str, list[str]], seconds: dict[str, list[float]], alarms: list[str], rows: int
+    group: str,
+    failed_properties: dict[str, list[str]],
+    seconds: dict[str, list[float]],
+    alarms: list[str],
+    rows: int,
 ) -> None:
+    """Write the page of a group.
+
+    Args:
+        group: Name of the group.
+        failed_properties: Name of each planted fault, with the properties whose tests failed.
+        seconds: Name of each correct plugin, with its processor time for each random seed.
+        alarms: Description of each false alarm.
+        rows: Number of rows of the plugins of this project.
+    """
     seeds = max(map(len, seconds.values()), default=0)
-    caught = sum(map(bool, found.values()))
-    lines = [f"| {name} | {', '.join(by) or '**missed**'} |" for name, by in found.items()]
+    caught, count = sum(map(bool, failed_properties.values())), len(failed_properties)
+    lines = [
+        f"| {name} | {', '.join(properties) or '**missed**'} |"
+        for name, properties in failed_properties.items()
+    ]
     costs = [
-        f"| {name} | {statistics.median(each):.2f} | {min(each):.2f} to {max(each):.2f} |"
-        for name, each in sorted(seconds.items(), key=lambda item: -statistics.median(item[1]))
+        f"| {name} | {statistics.median(durations):.2f} | {min(durations):.2f} to {max(durations):.2f} |"
+        for name, durations in sorted(seconds.items(), key=lambda item: -statistics.median(item[1]))
     ]
     write_page(
         __file__,
-        f"""# What `mode=check` finds in parts of the group {group}
+        f"""# What `mode=check` finds in plugins of the group {group}
 
-`python -m benchmarks.framework.check_parts {group}`: {machine("torch")}
+This page shows how well `mode=check` finds errors in plugins of the group {group}. The benchmark counts two things: the
+planted faults that `mode=check` finds, and its false alarms. A planted fault is a known error that is put into a
+correct plugin. A false alarm is a failed test of a correct plugin.
 
-**Planted faults: {caught} of {len(found)} found ({100 * caught / max(len(found), 1):.1f} %).** A right part is changed
-in one thing; the second column names every property that fails.
+## Planted faults
 
-| fault | found by |
+`mode=check` found {caught} of {count} planted faults ({100 * caught / max(count, 1):.1f} %).
+
+In each row of the table one thing is changed in a correct plugin. The column `fault` names the change, and
+`failed properties` lists every property whose test failed.
+
+| fault | failed properties |
 | --- | --- |
 {chr(10).join(lines)}
 
-**False alarms: {len(alarms)} findings** of {rows} rows of shipped parts and {len(strangers(group))} right parts of
-strangers × {seeds} seeds.
+## False alarms
+
+`mode=check` gave {len(alarms)} false alarms. It tested {rows} constructions of the plugins of this project and
+{len(external_plugins(group))} correct plugins that are not part of it, with {seeds} random seeds each.
 
 {chr(10).join(f"- {alarm}" for alarm in alarms)}
 
-Processor seconds of a part with all its rows, one thread, beside other work: median and range over the seeds.
+## Run time
 
-| part | median | range |
+The table shows the processor time that `mode=check` needs for all rows of a plugin on one thread. It holds the median
+and the range over the random seeds. Other processes ran at the same time.
+
+| plugin | median, s | range, s |
 | --- | --- | --- |
 {chr(10).join(costs)}
+
+{machine("torch")} Command: `python -m benchmarks.framework.check_parts {group}`.
 """.replace("\n\n\n\n", "\n\n"),
         f"check_{group}",
     )
@@ -185,27 +214,27 @@ Processor seconds of a part with all its rows, one thread, beside other work: me
 def main() -> None:
     torch.set_num_threads(1)
     group, seeds = sys.argv[1], int(sys.argv[2]) if len(sys.argv) > 2 else 20
-    parts = {
-        **shipped(group, sys.argv[3:]),
-        **{f"a stranger's: {name}": look for name, look in strangers(group).items()},
+    plugins = {
+        **own_plugins(group, sys.argv[3:]),
+        **{f"external: {name}": examine for name, examine in external_plugins(group).items()},
     }
-    rows = sum(len(contract(group, name).rows) for name in parts if not name.startswith("a stranger's"))
-    found = {
-        name: list(dict.fromkeys(one.name for one in look() if not one.holds))
-        for name, look in planted(group).items()
+    rows = sum(len(contract(group, name).rows) for name in plugins if not name.startswith("external: "))
+    failed_properties = {
+        name: list(dict.fromkeys(result.name for result in examine() if not result.holds))
+        for name, examine in planted_faults(group).items()
     }
-    for name, by in found.items():
-        sys.stdout.write(f"{name}: {', '.join(by) or 'MISSED'}\n")
+    for name, properties in failed_properties.items():
+        sys.stdout.write(f"{name}: {', '.join(properties) or 'MISSED'}\n")
     seconds: dict[str, list[float]] = {}
     alarms: list[str] = []
     for seed in range(seeds):
         change_seed(seed)
-        for name, look in parts.items():
+        for name, examine in plugins.items():
             start = time.process_time()
-            failed = [str(one) for one in look() if not one.holds]
+            failed = [str(result) for result in examine() if not result.holds]
             seconds.setdefault(name, []).append(time.process_time() - start)
-            alarms += [f"seed {seed}, {name}: {one}" for one in failed]
-        write(group, found, seconds, alarms, rows)
+            alarms += [f"seed {seed}, {name}: {result}" for result in failed]
+        write(group, failed_properties, seconds, alarms, rows)
         sys.stdout.write(f"seed {seed}: {len(alarms)} alarms\n")
         sys.stdout.flush()
 

@@ -1,17 +1,17 @@
-"""Time frozen models against eager ones on one core.
+"""Compare the run time of frozen models and of PyTorch models on one core.
 
     python -m benchmarks.framework.frozen
 
-The thesis's classifier of basis point sets (512-400-400-40, batch norm, dropout), alone and with its encoder on clouds
-of 2048 points: the predictor in torch without gradient, other ways to deploy it, and deployment.frozen, one after the
-other in each round of one process. Weights are random: they do not change the cost, but for the zeros that ReLU leaves
-(about half, as after training). Run it on one core (`taskset -c 0`). Writes frozen.md beside this
-file.
+The model is the thesis's classifier of basis point sets (512-400-400-40, batch norm, dropout), alone and with its
+encoder on clouds of 2048 points. In each round, the PyTorch model without gradient, other forms for deployment and the
+frozen model run one after the other in one process. The weights are random. They affect the run time only through the
+zeros that ReLU leaves, which are about half of the numbers, as after training. Run the script on one core
+(`taskset -c 0`). It writes frozen.md beside this file.
 """
 
 import os
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # of NumPy's products too
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # this also limits the threads of NumPy's matrix products
 
 import statistics
 import sys
@@ -37,22 +37,22 @@ Calls = dict[str, Callable[[], object]]
 
 
 def predictor(encoders: list[dict], shape: tuple[int, ...]) -> Model | FrozenFrontEnd:
-    """Untrained but for the moments of batch norm."""
+    """Return a model with random weights and with moments of batch norm from one random batch."""
     config = {
         "encoder": [resolve("encoder", part) for part in encoders],
         "density_head": resolve("density_head", "categorical"),
         "uncertainty": [],
     }
-    made = build_predictor(config, CLASSES, shape, seed=0)
+    model = build_predictor(config, CLASSES, shape, seed=0)
     with torch.no_grad():
-        made.train()(torch.rand(64, *shape))
-    made.eval()
-    assert isinstance(made, Model | FrozenFrontEnd)
-    return made
+        model.train()(torch.rand(64, *shape))
+    model.eval()
+    assert isinstance(model, Model | FrozenFrontEnd)
+    return model
 
 
 def seconds(call: Callable[[], object], repeats: int) -> float:
-    """The least processor time of a call."""
+    """Return the shortest processor time of one call, seconds."""
     least = float("inf")
     for _ in range(repeats):
         start = time.process_time_ns()
@@ -62,15 +62,15 @@ def seconds(call: Callable[[], object], repeats: int) -> float:
 
 
 def rows(title: str, calls: Calls, count: int) -> list[str]:
-    """Lines of the table; ratios to the first call, of the medians over rounds."""
+    """Return table rows with the median time of each call over the rounds, and its ratio to the first call."""
     repeats = 400 if count == 1 else 12
-    taken: dict[str, list[float]] = {name: [] for name in calls}
+    durations: dict[str, list[float]] = {name: [] for name in calls}
     with torch.inference_mode():
         for _ in range(ROUNDS):
             for name, call in calls.items():
-                call()  # brings its weights back into the caches
-                taken[name].append(seconds(call, repeats))
-    medians = {name: statistics.median(found) for name, found in taken.items()}
+                call()  # brings the model's weights back into the caches of the processor
+                durations[name].append(seconds(call, repeats))
+    medians = {name: statistics.median(values) for name, values in durations.items()}
     first = next(iter(medians.values()))
     return [
         f"| {title} | {count} | {name} | {1e3 * median:.4f} | {1e3 * median / count:.4f} | {first / median:.2f} |"
@@ -78,20 +78,21 @@ def rows(title: str, calls: Calls, count: int) -> list[str]:
     ]
 
 
-def classifier(count: int) -> list[str]:
-    made = predictor([MLP], (512,))
-    form = freeze_predictor(made, (512,))
-    assert isinstance(made, Model)
-    network = torch.nn.Sequential(made.encoders, made.projection, torch.nn.Softmax(-1)).eval()
+def classifier_rows(count: int) -> list[str]:
+    """Return the table rows of the classifier alone, for a batch size."""
+    model = predictor([MLP], (512,))
+    form = freeze_predictor(model, (512,))
+    assert isinstance(model, Model)
+    network = torch.nn.Sequential(model.encoders, model.projection, torch.nn.Softmax(-1)).eval()
     inputs = torch.rand(count, 512)
     array = inputs.numpy()
-    check(form(array), made, inputs)
+    check(form(array), model, inputs)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # torch.jit is deprecated
         script = torch.jit.optimize_for_inference(torch.jit.freeze(torch.jit.trace(network, inputs)))
     exported = torch.export.export(network, (inputs,)).module()
     calls: Calls = {
-        "predictor in torch": lambda: made(inputs).probs,
+        "PyTorch model": lambda: model(inputs).probs,
         "torch.export": lambda: exported(inputs),
         "torch.jit.freeze": lambda: script(inputs),
         "frozen": lambda: form(array),
@@ -99,26 +100,29 @@ def classifier(count: int) -> list[str]:
     return rows("classify", calls, count)
 
 
-def clouds(count: int) -> list[str]:
-    made = predictor([BPS, MLP], (2048, 3))
-    assert isinstance(made, FrozenFrontEnd)
-    form = freeze_predictor(made)
+def cloud_rows(count: int) -> list[str]:
+    """Return the table rows of the classifier with its encoder, for a batch size."""
+    model = predictor([BPS, MLP], (2048, 3))
+    assert isinstance(model, FrozenFrontEnd)
+    form = freeze_predictor(model)
     inputs = torch.randn(count, 2048, 3)
     inputs = inputs / inputs.norm(dim=-1, keepdim=True)
-    check(form(inputs), made, inputs)
+    check(form(inputs), model, inputs)
     calls: Calls = {
-        "predictor in torch": lambda: made(inputs).probs,
+        "PyTorch model": lambda: model(inputs).probs,
         "frozen": lambda: form(inputs),
-        "of it the encoder": lambda: made.features(inputs),
+        "encoder of the PyTorch model alone": lambda: model.features(inputs),
     }
     return rows("encode and classify", calls, count)
 
 
-def check(found: np.ndarray, made: Predictor, inputs: torch.Tensor) -> None:
-    """Stop where a frozen probability is not the predictor's."""
-    error = np.abs(found - made(inputs).probs.detach().numpy()).max()
+def check(probabilities: np.ndarray, model: Predictor, inputs: torch.Tensor) -> None:
+    """Exit with a message if the frozen probabilities differ from those of the predictor."""
+    error = np.abs(probabilities - model(inputs).probs.detach().numpy()).max()
     if error > 1e-6:
-        raise SystemExit(f"frozen probabilities are off by {error}")
+        raise SystemExit(
+            f"The frozen probabilities differ from those of the model by {error}; at most 1e-6 is allowed."
+        )
 
 
 def main() -> None:
@@ -126,18 +130,26 @@ def main() -> None:
     start = time.perf_counter()
     freeze_predictor(predictor([MLP], (512,)), (512,))
     freezing = time.perf_counter() - start
-    lines = [line for count in (1, 2, 4, 8, 32, 256) for line in classifier(count)]
-    lines += [line for count in (1, 256) for line in clouds(count)]
+    lines = [line for count in (1, 2, 4, 8, 32, 256) for line in classifier_rows(count)]
+    lines += [line for count in (1, 256) for line in cloud_rows(count)]
     text = (
-        "# Frozen models: eager against deployable, one core\n\n"
-        "`python -m benchmarks.framework.frozen`: 512-400-400-40 with batch norm and dropout, 40 classes; clouds of "
-        f"2048 points, 512 basis points. Least processor time of a call in each of {ROUNDS} rounds, their median; "
-        "ratios to the first line of each block. Frozen probabilities are the predictor's to 1e-6, checked in the "
-        "run.\n\n"
-        "| what | batch | how | ms / call | ms / sample | times as fast |\n|---|---|---|---|---|---|\n"
+        "# Frozen models: run time on one core\n\n"
+        "This page compares the run time of a classifier in several forms: as a PyTorch model and in forms that are "
+        "meant for deployment. `frozen` is the form that this project deploys (`framework.freeze`). The benchmark "
+        "shows how much time it saves on one core.\n\n"
+        "The classifier is the multilayer perceptron 512-400-400-40 with batch norm and dropout. It has 40 classes. In "
+        "the rows `classify` its input is 512 features. In the rows `encode and classify` its input is a point cloud "
+        "of 2048 points, and an encoder computes the 512 features with a basis point set. The benchmark checks that "
+        "the frozen probabilities differ from those of the PyTorch model by at most 1e-6.\n\n"
+        "`ms a call` is the processor time of one call with the whole batch. It is the median of "
+        f"{ROUNDS} rounds, and each round contributes its shortest call. `ms a sample` is this time divided by the "
+        "batch size. `speed ratio` says how many times as fast the form is as the PyTorch model in the first row with "
+        "the same task and batch size.\n\n"
+        "| task | batch size | form | ms a call | ms a sample | speed ratio |\n|---|---|---|---|---|---|\n"
         + "\n".join(lines)
-        + f"\n\nFreezing takes {freezing:.1f} s: the exporter's import, and compiled functions from their cache.\n\n"
-        f"{machine('torch', 'numpy', 'numba')}\n"
+        + f"\n\nFreezing a model takes {freezing:.1f} s. This time includes the import of PyTorch's exporter and the "
+        "reading of compiled functions from their cache.\n\n"
+        f"{machine('torch', 'numpy', 'numba')} Command: `python -m benchmarks.framework.frozen`.\n"
     )
     write_page(__file__, text)
     sys.stdout.write(text)

@@ -1,9 +1,10 @@
-"""Time a training step against bare PyTorch loops.
+"""Compare the run time of a training step of the framework with that of plain PyTorch loops.
 
     python -m benchmarks.framework.step_overhead
 
-All loops run the same batches, fused optimiser and gradient clipping, in turn in one process. One bare loop trains this
-framework's model, the other the same network and loss written in plain torch. Writes step_overhead.md beside this file.
+All loops use the same batches, fused optimiser and gradient clipping. They run one after the other in one process. One
+plain loop trains this framework's model, the other trains the same network and loss written in plain PyTorch. The
+script writes step_overhead.md beside this file.
 """
 
 import logging
@@ -39,21 +40,21 @@ ROUNDS = 7
 
 @dataclass(frozen=True)
 class Case:
-    """A model, its batches, and the same in plain torch."""
+    """A model, its training data, and the same network and loss in plain PyTorch."""
 
     name: str
     config: dict[str, Any]
-    data: "Memory"
+    data: "InMemoryData"
     batch: int
     plain: Callable[[], nn.Module]
 
     @property
     def steps(self) -> int:
-        """Steps of an epoch."""
+        """Number of steps in an epoch."""
         return len(self.data.fields) // self.batch
 
 
-class Memory:
+class InMemoryData:
     """Training samples in memory."""
 
     def __init__(self, target: Target, inputs: Tensor, labels: Tensor) -> None:
@@ -68,23 +69,23 @@ class Memory:
         return batch
 
 
-def crops() -> Memory:
-    """Random crops, shaped like the main experiment's."""
+def crops() -> InMemoryData:
+    """Return random images of the same shape as in the main experiment, with three random angles each."""
     generator = torch.Generator().manual_seed(0)
     images = torch.randint(0, 256, (64 * 40, 3, 48, 48), dtype=torch.uint8, generator=generator)
     target = Target("angle", ("azimuth", "elevation", "tilt"))
-    return Memory(target, images, torch.rand(len(images), 3, generator=generator))
+    return InMemoryData(target, images, torch.rand(len(images), 3, generator=generator))
 
 
-def points() -> Memory:
-    """Points of a plane in two classes, shaped like the moons'."""
+def points() -> InMemoryData:
+    """Return random points of the plane in two classes, of the same shape as the data set moons."""
     generator = torch.Generator().manual_seed(0)
     inputs = torch.randn(50 * 400, 2, generator=generator)
-    return Memory(Target("class", ("first", "second")), inputs, (inputs[:, 0] > 0).long())
+    return InMemoryData(Target("class", ("first", "second")), inputs, (inputs[:, 0] > 0).long())
 
 
 class PlainBiternion(nn.Module):
-    """biternion_vgg's network by itself, and torch's own von Mises density of three angles."""
+    """The network of biternion_vgg with PyTorch's own von Mises density of three angles."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -104,7 +105,7 @@ class PlainBiternion(nn.Module):
 
 
 class PlainMoons(nn.Module):
-    """`moons/vanilla_128` in plain torch."""
+    """The model of `moons/vanilla_128` in plain PyTorch."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -118,8 +119,14 @@ class PlainMoons(nn.Module):
         )
 
 
-def bare(model: nn.Module, loss: Callable[[Tensor], Tensor], case: Case) -> float:
-    """Milliseconds a step of the plainest loop; `loss` gets the rows of a batch."""
+def time_plain_loop(model: nn.Module, loss: Callable[[Tensor], Tensor], case: Case) -> float:
+    """Return the milliseconds a step of a plain PyTorch loop.
+
+    Args:
+        model: Model that is trained.
+        loss: Function that returns the loss of a batch from the indices of its samples.
+        case: Training data and batch size.
+    """
     optimizer = OPTIMIZERS["adamw"](model.train().parameters(), lr=1e-3)
     order = torch.randperm(len(case.data.fields)).split(case.batch)
     start = time.perf_counter()
@@ -131,24 +138,24 @@ def bare(model: nn.Module, loss: Callable[[Tensor], Tensor], case: Case) -> floa
     return 1e3 * (time.perf_counter() - start) / len(order)
 
 
-def plain(case: Case) -> float:
-    """Milliseconds a step of the plainest loop around plain torch."""
+def time_plain_model(case: Case) -> float:
+    """Return the milliseconds a step of a plain loop that trains the model in plain PyTorch."""
     model, inputs, target = case.plain(), case.data.inputs, case.data.labels
-    return bare(model, lambda rows: model(inputs[rows], target[rows]), case)
+    return time_plain_loop(model, lambda rows: model(inputs[rows], target[rows]), case)
 
 
-def with_predictor(case: Case) -> float:
-    """Milliseconds a step of the plainest loop around this framework's model."""
-    model, inputs, target = predictor_of(case), case.data.inputs, case.data.labels
-    return bare(model, lambda rows: model.loss(inputs[rows], target[rows]).mean(), case)
+def time_predictor(case: Case) -> float:
+    """Return the milliseconds a step of a plain loop that trains this framework's model."""
+    model, inputs, target = build_case_predictor(case), case.data.inputs, case.data.labels
+    return time_plain_loop(model, lambda rows: model.loss(inputs[rows], target[rows]).mean(), case)
 
 
-def predictor_of(case: Case) -> Predictor:
+def build_case_predictor(case: Case) -> Predictor:
     return build_predictor(resolve_all(case.config), case.data.target, case.data.input_shape, seed=0)
 
 
 class Clock(pl.Callback):
-    """Wall time from the first batch's fetch to the last one's end."""
+    """Clock that measures the wall time from the start of an epoch to the end of its last batch."""
 
     def on_train_epoch_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         self.start = time.perf_counter()
@@ -157,11 +164,11 @@ class Clock(pl.Callback):
         self.end = time.perf_counter()
 
 
-def ours(case: Case) -> float:
-    """Milliseconds a step of the framework's training, journal and callbacks included."""
+def time_framework(case: Case) -> float:
+    """Return the milliseconds a step of the framework's training, including journal and callbacks."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        predictor = predictor_of(case)
+        predictor = build_case_predictor(case)
         training = Training(predictor, [], case.data, OptimizerSettings(name="adamw"), 0, {})  # type: ignore[arg-type]
         batches = Batches(case.data, batch_size=case.batch, workers=0, seed=0)  # type: ignore[arg-type]
         tracker = NoTracker(folder)
@@ -186,9 +193,9 @@ def ours(case: Case) -> float:
     return 1e3 * (clock.end - clock.start) / case.steps
 
 
-def config(data: str, encoder: str, head: str, **more: Any) -> dict[str, Any]:
+def make_config(data: str, encoder: str, head: str, **more: Any) -> dict[str, Any]:
     return {
-        "data": data,  # says what the target is; the batches come from memory
+        "data": data,  # only decides the kind of target; the batches come from memory
         "encoder": {encoder: {"name": encoder, **more}},
         "density_head": head,
         "metric": {},
@@ -203,32 +210,49 @@ def main() -> None:
     cases = [
         Case(
             "biternion_vgg + von_mises, 3 × 48 × 48, batch 64",
-            config("pascal3d", "biternion_vgg", "von_mises"), crops(), 64, PlainBiternion,
+            make_config("pascal3d", "biternion_vgg", "von_mises"), crops(), 64, PlainBiternion,
         ),
         Case(
             "mlp of 2 × 128 + bernoulli (`moons/vanilla_128`), batch 50",
-            config("moons", "mlp", "bernoulli", widths=[128, 128]), points(), 50, PlainMoons,
+            make_config("moons", "mlp", "bernoulli", widths=[128, 128]), points(), 50, PlainMoons,
         ),
     ]  # fmt: skip
-    loops = {"plain torch": plain, "bare loop, this model": with_predictor, "framework": ours}
+    loops = {
+        "plain loop, plain model": time_plain_model,
+        "plain loop, framework's model": time_predictor,
+        "framework": time_framework,
+    }
     rows = []
     for case in cases:
-        turns = [[loop(case) for loop in loops.values()] for _ in range(ROUNDS + 1)][1:]  # the first warms up
-        found = {
-            name: Rounds(tuple(column)) for name, column in zip(loops, zip(*turns, strict=True), strict=True)
+        rounds_of_loops = [[loop(case) for loop in loops.values()] for _ in range(ROUNDS + 1)][
+            1:
+        ]  # the first round warms up
+        times = {
+            name: Rounds(tuple(column))
+            for name, column in zip(loops, zip(*rounds_of_loops, strict=True), strict=True)
         }
-        times = [one.text() for one in found.values()]
-        ratios = [found[name].times_faster(found["framework"], 3) for name in list(loops)[:2]]
-        rows.append(f"| {' | '.join([case.name, *times, *ratios])} |")
+        cells = [rounds.text() for rounds in times.values()]
+        ratios = [times[name].times_faster(times["framework"], 3) for name in list(loops)[:2]]
+        rows.append(f"| {' | '.join([case.name, *cells, *ratios])} |")
     text = "\n".join(
         [
-            "# Training step: framework over bare PyTorch loops",
+            "# Training step: run time of the framework and of plain PyTorch loops",
             "",
-            f"Wall time, one thread, all loops in turn in one process: median of {ROUNDS} rounds (least to largest). "
-            "All have the same batches, AdamW (fused) and gradient clipping. A ratio is that of the framework's time "
-            "to the loop's: 1 means that the framework costs nothing.",
+            "This page compares the time of a training step in this framework with the time of a step in a plain "
+            "PyTorch loop. The difference is what the framework itself costs.",
             "",
-            f"| model | {', ms a step | '.join(loops)}, ms a step | over plain torch | over the bare loop |",
+            "Three loops train each model on generated data. `plain loop, plain model` is a PyTorch loop with a "
+            "network and a loss that are written in plain PyTorch. `plain loop, framework's model` is the same loop "
+            "with the same network as a model of this framework. `framework` is the training of this framework, "
+            "including its journal and callbacks. All loops use the same batches, the fused AdamW optimiser and "
+            "gradient clipping.",
+            "",
+            f"Each time is the median of {ROUNDS} rounds (least to largest) of wall time on one thread. The loops "
+            "alternate in one process. The last two columns hold the framework's time divided by the time of a plain "
+            "loop. A ratio of 1 means that the framework costs no time.",
+            "",
+            f"| model | {', ms a step | '.join(loops)}, ms a step | ratio to plain loop, plain model | ratio to plain "
+            "loop, framework's model |",
             "|---|---:|---:|---:|---:|---:|",
             *rows,
             "",

@@ -1,9 +1,10 @@
-"""Time the start of a sweep's jobs, as forks and as fresh processes.
+"""Compare the run time of a sweep whose jobs are forks of one process with that of new processes.
 
     python -m benchmarks.framework.sweep_start
 
-The same sweep of runs as short as can be, each job a fork of one process or a process of its own, in turns. Processor
-time is of the whole command, all processes. Writes sweep_start.md beside this file.
+The sweep consists of very short runs, so that its run time is mainly that of starting the jobs. The two ways to start
+the jobs alternate. Processor time is that of the whole command with all its processes. The script writes sweep_start.md
+beside this file.
 """
 
 import json
@@ -23,8 +24,15 @@ JOBS, ROUNDS, AT_ONCE = 8, 3, 2
 RUNS = ("experiment=moons/vanilla_128", "debug=fast", "pictures=false", "logger=none", "threads=1")
 
 
-def sweep(fork: bool) -> tuple[float, float, list[float]]:
-    """Seconds by the clock and of processors that the command takes; of processors each job."""
+def run_sweep(fork: bool) -> tuple[float, float, list[float]]:
+    """Run a sweep, and return its run times.
+
+    Args:
+        fork: Start the jobs as forks of one process, instead of new processes.
+
+    Returns:
+        Wall time of the command, processor time of the command, and processor time of each job, seconds.
+    """
     with tempfile.TemporaryDirectory() as folder:
         settings = (f"hydra.launcher.fork={fork}".lower(), f"hydra.launcher.jobs={AT_ONCE}")
         seeds = "seed=" + ",".join(map(str, range(JOBS)))
@@ -38,32 +46,34 @@ def sweep(fork: bool) -> tuple[float, float, list[float]]:
             *settings,
             f"hydra.sweep.dir={folder}",
         ]
-        before, start = children(), time.perf_counter()
+        before, start = processor_seconds(), time.perf_counter()
         subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.DEVNULL, env={**os.environ})
-        taken, spent = time.perf_counter() - start, children() - before
+        elapsed, spent = time.perf_counter() - start, processor_seconds() - before
         records = [json.loads((Path(folder) / str(job) / "job.json").read_text()) for job in range(JOBS)]
-    return taken, spent, [record["processor_seconds"] for record in records]
+    return elapsed, spent, [record["processor_seconds"] for record in records]
 
 
-def children() -> float:
+def processor_seconds() -> float:
+    """Return the processor time of all child processes that have ended, seconds."""
     usage = resource.getrusage(resource.RUSAGE_CHILDREN)
     return usage.ru_utime + usage.ru_stime
 
 
 def main() -> None:
-    sweep(True)  # compiles and fills the disk's cache
+    run_sweep(True)  # warm-up: compiles functions and fills the disk cache
     measured = {fork: [] for fork in (True, False)}
     for _ in range(ROUNDS):
-        for fork, found in measured.items():
-            found.append(sweep(fork))
+        for fork, sweeps in measured.items():
+            sweeps.append(run_sweep(fork))
     median = {
-        fork: [statistics.median(one[column] for one in found) for column in (0, 1)]
-        for fork, found in measured.items()
+        fork: [statistics.median(result[column] for result in sweeps) for column in (0, 1)]
+        for fork, sweeps in measured.items()
     }
     of_job = {
-        fork: statistics.median(job for one in found for job in one[2]) for fork, found in measured.items()
+        fork: statistics.median(job for result in sweeps for job in result[2])
+        for fork, sweeps in measured.items()
     }
-    names = {True: "forks of one process", False: "a process of its own each"}
+    names = {True: "forks of one process", False: "new processes"}
     lines = [
         f"| {names[fork]} | {median[fork][0]:.1f} | {median[fork][1]:.1f} | {of_job[fork]:.1f} |"
         for fork in names
@@ -74,16 +84,23 @@ def main() -> None:
         [
             "# The start of a sweep's jobs",
             "",
-            f"`python -m benchmarks.framework.sweep_start`: {JOBS} jobs, {AT_ONCE} at once, `{' '.join(RUNS)}`; "
-            f"medians of {ROUNDS} sweeps, in turns. On Linux jobs are forks of a process that has imported torch and "
-            "Lightning (`hydra.launcher.fork`); a job's own seconds leave that process out, the command's do not.",
+            "This page compares two ways to start the jobs of a sweep: as forks of one process, and as new processes. "
+            "On Linux the framework uses forks (`hydra.launcher.fork`). The forked process has imported PyTorch and "
+            "Lightning, so that a job need not import them again. The benchmark shows how much time this saves.",
             "",
-            "| jobs are | command, s | processors, s | a job, processor s |",
+            f"The sweep has {JOBS} jobs, of which {AT_ONCE} run at once. Each job is a very short training run "
+            f"(`{' '.join(RUNS)}`). All numbers are medians of {ROUNDS} sweeps; the two ways alternate. "
+            "The processor time of a job does not include the process that is forked. That of the sweep includes it. "
+            "The last row holds the numbers of new processes divided by those of forks.",
+            "",
+            "| start of the jobs | wall time of the sweep, s | processor time of the sweep, s | processor time of a "
+            "job, s |",
             "|---|---:|---:|---:|",
             *lines,
             f"| ratio | {ratios[0]:.2f} | {ratios[1]:.2f} | {of_job[False] / of_job[True]:.2f} |",
             "",
-            machine("torch", "pytorch-lightning", "hydra-core"),
+            f"{machine('torch', 'pytorch-lightning', 'hydra-core')} "
+            "Command: `python -m benchmarks.framework.sweep_start`.",
         ],
     )
 
