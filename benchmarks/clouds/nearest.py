@@ -1,11 +1,11 @@
-"""Time exact nearest neighbours of a basis in clouds against public libraries, on one core.
+"""Compare the time of the exact search for nearest points with public libraries, on one core.
 
     python -m benchmarks.clouds.nearest [--stream]
 
-Writes nearest.md beside this file. Clouds are synthetic but for `scan`, points of a real scan drawn again with jitter
-(REAL_DATA_ROOT/clouds/demo_scan.ply; left out where that is missing). Every method builds its structure for each cloud
-and returns distances and difference vectors. `--stream` instead reads 1e8 generated points in chunks and writes
-nearest_stream.md.
+Writes nearest.md into the folder of this file. The clouds are synthetic except for `scan`, which resamples the points
+of a real scan with jitter (REAL_DATA_ROOT/clouds/demo_scan.ply; left out if that file is missing). Every method builds
+its search structure for each cloud and returns distances and difference vectors. `--stream` reads 1e8 generated points
+in chunks instead and writes nearest_stream.md.
 """
 
 import argparse
@@ -35,9 +35,18 @@ from framework.geometry.nearest.streamed import Middle, Reach, Stream, normalise
 
 Array = NDArray[np.floating]
 ROWS = ((2048, 512, 24, 12), (10_000, 1000, 12, 8), (100_000, 1000, 3, 5), (1_000_000, 4096, 3, 2))
-"""Points, basis points, clouds, rounds."""
+"""Sizes of the comparison: points, basis points, clouds, rounds."""
 TARGETS = {2048: (15, 3.5), 10_000: (10, 2.5), 100_000: (18, 4), 1_000_000: (18, 5)}
-"""Times faster than the ball tree, and than the best of the others."""
+"""Required speed-up over the ball tree, and over the fastest other method, by the number of points."""
+THREAD_SIZES = (
+    (64, 2048, 512),
+    (16, 10_000, 1000),
+    (8, 100_000, 1000),
+    (1, 1_000_000, 4096),
+    (1, 10_000, 32_768),
+)
+"""Sizes of the comparison of one and two threads: clouds, points, basis points."""
+ONE_PER_CALL = "ours, one cloud per call"
 FIRST_CALL = """
 import time, torch
 from framework.geometry.nearest import nearest
@@ -49,20 +58,21 @@ print(time.process_time() - cpu)
 
 
 def ball(count: int, generator: np.random.Generator) -> Array:
-    """Uniform in the unit ball (eq. 6.3)."""
+    """Return points that are uniform in the unit ball (eq. 6.3)."""
     direction = generator.normal(size=(count, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     return (direction * generator.uniform(size=(count, 1)) ** (1 / 3)).astype(np.float32)
 
 
 def torus(count: int, generator: np.random.Generator) -> Array:
+    """Return points on the surface of a torus."""
     a, b = generator.uniform(0, 2 * math.pi, (2, count))
     radius = 1 + 0.35 * np.cos(b)
     return np.stack([radius * np.cos(a), radius * np.sin(a), 0.35 * np.sin(b)], 1)
 
 
 def chair(count: int, generator: np.random.Generator) -> Array:
-    """The surface of a seat, a back and four legs."""
+    """Return points on the surfaces of a seat, a back and four legs."""
     boxes = [((-0.5, -0.5, 0.45), (0.5, 0.5, 0.55)), ((-0.5, 0.4, 0.55), (0.5, 0.5, 1.3))]
     boxes += [((x, y, 0.0), (x + 0.1, y + 0.1, 0.45)) for x in (-0.5, 0.4) for y in (-0.5, 0.4)]
     low, high = (np.array(sides) for sides in zip(*boxes, strict=True))
@@ -74,8 +84,9 @@ def chair(count: int, generator: np.random.Generator) -> Array:
     return low[box] + inside * size[box]
 
 
-def shapes() -> dict[str, Callable[[int, np.random.Generator], Array]]:
-    found: dict[str, Callable[[int, np.random.Generator], Array]] = {"torus": torus, "chair": chair}
+def samplers() -> dict[str, Callable[[int, np.random.Generator], Array]]:
+    """Return the function that samples points of each shape, by name."""
+    functions: dict[str, Callable[[int, np.random.Generator], Array]] = {"torus": torus, "chair": chair}
     path = Path(os.environ.get("REAL_DATA_ROOT", "")) / "clouds" / "demo_scan.ply"
     if path.is_file():
         import trimesh
@@ -88,24 +99,28 @@ def shapes() -> dict[str, Callable[[int, np.random.Generator], Array]]:
                 scale=spacing, size=(count, 3)
             )
 
-        found["scan"] = scan
-    return found
+        functions["scan"] = scan
+    return functions
 
 
 def clouds(points: int, count: int) -> list[Array]:
-    """Of every shape as many, in the unit ball (eq. 6.2); no two alike, so that no branch is learnt by heart."""
-    makers = list(shapes().values())
-    made = []
+    """Return clouds in the unit ball (eq. 6.2), of each shape in turn.
+
+    All clouds differ, so that the processor cannot learn the branches of one cloud.
+    """
+    functions = list(samplers().values())
+    normalised = []
     for i in range(count):
-        cloud = makers[i % len(makers)](points, np.random.default_rng(i))
+        cloud = functions[i % len(functions)](points, np.random.default_rng(i))
         cloud = cloud - cloud.mean(0)
-        made.append((cloud / np.linalg.norm(cloud, axis=1).max()).astype(np.float32))
-    return made
+        normalised.append((cloud / np.linalg.norm(cloud, axis=1).max()).astype(np.float32))
+    return normalised
 
 
-# each: cloud (n, 3), basis (k, 3) → distances (k,), differences (k, 3)
+# Each of the following methods gets a cloud (n, 3) and basis points (k, 3), and returns distances (k,) and difference
+# vectors (k, 3).
 def ball_tree(cloud: Array, basis: Array) -> tuple[Array, Array]:
-    """The kernel of the package that came with the paper, re-created from its description."""
+    """Search as the package of the paper does, re-created from its description."""
     tree = NearestNeighbors(n_neighbors=1, leaf_size=1, algorithm="ball_tree").fit(cloud)
     distance, index = tree.kneighbors(basis)
     return distance[:, 0], cloud[index[:, 0]] - basis
@@ -117,9 +132,8 @@ def sklearn_kd(cloud: Array, basis: Array) -> tuple[Array, Array]:
 
 
 def scipy_kd(cloud: Array, basis: Array) -> tuple[Array, Array]:
-    distance, index = cKDTree(cloud, balanced_tree=False, compact_nodes=False).query(
-        basis
-    )  # its faster settings
+    tree = cKDTree(cloud, balanced_tree=False, compact_nodes=False)  # the faster settings
+    distance, index = tree.query(basis)
     return distance, cloud[index] - basis
 
 
@@ -135,7 +149,7 @@ def nanoflann(cloud: Array, basis: Array) -> tuple[Array, Array]:
     return distance[:, 0], cloud[index[:, 0]] - basis
 
 
-RIVALS = (ball_tree, sklearn_kd, scipy_kd, pykdtree, nanoflann)
+LIBRARIES = (ball_tree, sklearn_kd, scipy_kd, pykdtree, nanoflann)
 
 
 def ours(batch: torch.Tensor, queries: Queries) -> tuple[torch.Tensor, torch.Tensor]:
@@ -143,56 +157,64 @@ def ours(batch: torch.Tensor, queries: Queries) -> tuple[torch.Tensor, torch.Ten
     return distance, batch.gather(1, index[..., None].expand(-1, -1, 3)) - queries.points
 
 
-def one_core(points: int, basis_points: int, count: int, rounds: int) -> dict[str, tuple[float, float]]:
-    """Method → milliseconds of processor time a cloud, least of the rounds; and largest error of a distance."""
+def time_on_one_core(
+    points: int, basis_points: int, count: int, rounds: int
+) -> dict[str, tuple[float, float]]:
+    """Return for each method the least milliseconds per cloud over the rounds, and the largest error of a distance."""
     basis = ball(basis_points, np.random.default_rng(99))
     queries = prepare(torch.from_numpy(basis))
-    made = clouds(points, count)
-    batches = [torch.from_numpy(cloud)[None] for cloud in made]
+    arrays = clouds(points, count)
+    batches = [torch.from_numpy(cloud)[None] for cloud in arrays]
     together = torch.cat(batches)
-    exact = [cKDTree(cloud.astype(float)).query(basis.astype(float))[0] for cloud in made]
+    exact = [cKDTree(cloud.astype(float)).query(basis.astype(float))[0] for cloud in arrays]
 
     def run(method: Callable[[Array, Array], tuple[Array, Array]]) -> list[Array]:
-        return [method(cloud, basis)[0] for cloud in made]
+        return [method(cloud, basis)[0] for cloud in arrays]
 
     work: dict[str, Callable[[], list[Array]]] = {
         "ours": lambda: list(ours(together, queries)[0].numpy()),
-        "ours, a call a cloud": lambda: [ours(batch, queries)[0][0].numpy() for batch in batches],
+        ONE_PER_CALL: lambda: [ours(batch, queries)[0][0].numpy() for batch in batches],
     }
-    work |= {rival.__name__: lambda rival=rival: run(rival) for rival in RIVALS}
+    work |= {method.__name__: lambda method=method: run(method) for method in LIBRARIES}
     least = dict.fromkeys(work, math.inf)
     errors = dict.fromkeys(work, 0.0)
-    for turn in range(rounds + 1):  # in turns, so that a busy machine is busy for all; the first warms up
+    for turn in range(
+        rounds + 1
+    ):  # interleaved, so that other load affects all methods; the first round warms up
         for name, call in work.items():
             start = time.process_time()
-            found = call()
+            distances = call()
             spent = time.process_time() - start
             if turn == 0:
-                errors[name] = max(float(abs(a - b).max()) for a, b in zip(found, exact, strict=True))
+                errors[name] = max(float(abs(a - b).max()) for a, b in zip(distances, exact, strict=True))
             else:
                 least[name] = min(least[name], 1e3 * spent / count)
     return {name: (least[name], errors[name]) for name in work}
 
 
-def hard_clouds(points: int = 100_000, basis_points: int = 1000) -> str:
-    """Milliseconds of clouds that spoil grids and trees, ours and the best of the others: a table row each."""
+def time_hard_clouds(points: int = 100_000, basis_points: int = 1000) -> str:
+    """Return a table of milliseconds for clouds that are difficult for grids and trees, ours and pykdtree."""
     generator = np.random.default_rng(7)
     plain = torus(points, generator)
     nested = 100.0 ** -generator.integers(0, 10, points)[:, None] * generator.normal(size=(points, 3))
     side = round(points ** (1 / 3))
     kinds = {
         "torus": plain,
-        "volume: uniform in the ball": ball(points, generator),
-        "one outlier, 1e6 times as far": np.concatenate([plain[1:], [[1e6, 0, 0]]]),
-        "ten nested clusters, each 100 times smaller": nested,
-        "20 places, each point many times": ball(20, generator)[generator.integers(0, 20, points)],
-        "all points in one place": np.full((points, 3), 0.25),
-        "lattice: many ties": np.stack(np.meshgrid(*[np.linspace(-1, 1, side)] * 3), -1).reshape(-1, 3),
-        "sphere about the origin, seen from inside": plain / np.linalg.norm(plain, axis=1, keepdims=True),
+        "uniform in the unit ball": ball(points, generator),
+        "torus with one outlier, 1e6 times as far away": np.concatenate([plain[1:], [[1e6, 0, 0]]]),
+        "ten nested clusters, each 100 times smaller than the one before": nested,
+        "20 different points, each repeated many times": ball(20, generator)[
+            generator.integers(0, 20, points)
+        ],
+        "all points equal": np.full((points, 3), 0.25),
+        "regular lattice, with many equal distances": np.stack(
+            np.meshgrid(*[np.linspace(-1, 1, side)] * 3), -1
+        ).reshape(-1, 3),
+        "unit sphere around all basis points": plain / np.linalg.norm(plain, axis=1, keepdims=True),
     }
     basis = ball(basis_points, generator)
     queries = prepare(torch.from_numpy(basis))
-    lines = ["| cloud | ours | pykdtree | error |", "|---|---|---|---|"]
+    lines = ["| cloud | ours, ms | pykdtree, ms | largest error of ours |", "|---|---|---|---|"]
     for name, kind in kinds.items():
         cloud = (kind / np.linalg.norm(kind, axis=1).max()).astype(np.float32)
         batch = torch.from_numpy(cloud)[None]
@@ -210,9 +232,14 @@ def hard_clouds(points: int = 100_000, basis_points: int = 1000) -> str:
     return "\n".join(lines)
 
 
-def two_cores(points: int, basis_points: int, count: int, seconds: float = 12.0) -> tuple[float, float]:
-    """How many times faster two threads are than one: by least wall time, in turns; and by least processor time,
-    2 t₁ / t₂, which is what two cores give that nobody else uses, if both are busy to the end."""
+def speedup_of_two_threads(
+    points: int, basis_points: int, count: int, seconds: float = 12.0
+) -> tuple[float, float]:
+    """Return the speed-up of two threads over one in wall time, and 2 t₁ / t₂ for the processor times t.
+
+    Both use the least time of interleaved calls. The second is the speed-up on two cores without other load, if both
+    threads are busy to the end.
+    """
     queries = prepare(torch.from_numpy(ball(basis_points, np.random.default_rng(99))))
     batch = torch.from_numpy(np.stack(clouds(points, count)))
     wall, processor = {1: math.inf, 2: math.inf}, {1: math.inf, 2: math.inf}
@@ -229,59 +256,89 @@ def two_cores(points: int, basis_points: int, count: int, seconds: float = 12.0)
 
 
 def report() -> str:
+    """Measure everything but the stream, and return the page."""
     torch.set_num_threads(1)
-    names = ["ours", "ours, a call a cloud", *(rival.__name__ for rival in RIVALS)]
-    lines = [f"| n | k | {' | '.join(names)} | × ball_tree | × best other |", "|---" * (len(names) + 4) + "|"]
+    names = ["ours", ONE_PER_CALL, *(method.__name__ for method in LIBRARIES)]
+    heads = [
+        "points n",
+        "basis points k",
+        *names,
+        "speed-up over ball_tree",
+        "speed-up over the fastest library",
+    ]
+    lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
     errors = dict.fromkeys(names, 0.0)
     for points, basis_points, count, rounds in ROWS:
-        found = one_core(points, basis_points, count, rounds)
+        results = time_on_one_core(points, basis_points, count, rounds)
         for name in names:
-            errors[name] = max(errors[name], found[name][1])
-        cells = [f"{found[name][0]:.3f}" for name in names]
-        best = min(found[rival.__name__][0] for rival in RIVALS)
-        alone = found["ours, a call a cloud"][0]
+            errors[name] = max(errors[name], results[name][1])
+        cells = [f"{results[name][0]:.3f}" for name in names]
+        best = min(results[method.__name__][0] for method in LIBRARIES)
+        alone = results[ONE_PER_CALL][0]
         ratios = []
-        for rival, target in zip((found["ball_tree"][0], best), TARGETS[points], strict=True):
-            ratios.append(f"**{rival / found['ours'][0]:.1f}** ({rival / alone:.1f}; ≥ {target})")
+        for library, target in zip((results["ball_tree"][0], best), TARGETS[points], strict=True):
+            ratios.append(f"**{library / results['ours'][0]:.1f}** ({library / alone:.1f}; ≥ {target})")
         lines.append(f"| {points:,} | {basis_points:,} | {' | '.join(cells)} | {' | '.join(ratios)} |")
-    hard = hard_clouds()
-    scaling = {
-        "64 clouds, 2,048 and 512": two_cores(2048, 512, 64),
-        "16 clouds, 10,000 and 1,000": two_cores(10_000, 1000, 16),
-        "8 clouds, 100,000 and 1,000": two_cores(100_000, 1000, 8),
-        "one cloud, 1,000,000 and 4,096": two_cores(1_000_000, 4096, 1),
-        "one cloud, 10,000 and 32,768": two_cores(10_000, 32_768, 1),
-    }
+    hard = time_hard_clouds()
+    scaling = [
+        (count, points, basis_points, *speedup_of_two_threads(points, basis_points, count))
+        for count, points, basis_points in THREAD_SIZES
+    ]
     load = os.getloadavg()[0]
     cold, warm = first_calls(FIRST_CALL, FRAMEWORK_CACHE="{}", NUMBA_CACHE_DIR="")
     return "\n".join(
         [
-            "# Nearest neighbours of a basis: milliseconds a cloud on one core",
+            "# Nearest points of a cloud to each basis point: milliseconds per cloud on one core",
             "",
-            f"`python -m benchmarks.clouds.nearest`: n points of {', '.join(shapes())} (`scan` is a real scan drawn "
-            "again with jitter, the others are synthetic), float32, k basis points uniform in the unit ball; "
-            "structure, distances and difference vectors of every cloud. Least processor time of several rounds "
-            "over different clouds, methods in turns. `ours` gets all clouds in one call, the others one at a time. "
-            "Ratios: one call (a call a cloud; target).",
+            "The encoding by basis points needs, for each basis point, the nearest point of a cloud. This page "
+            "compares the run time of the project's exact search (`ours`) with five exact searches of public "
+            "libraries. It is written by `python -m benchmarks.clouds.nearest`.",
+            "",
+            f"Each cloud has n points in float32. The shapes are {', '.join(samplers())}. The clouds of `scan` are "
+            "points of a real scan, resampled with jitter; the other shapes are synthetic. The k basis points are "
+            "uniform in the unit ball. A measured call builds the search structure of a cloud and computes the k "
+            "distances and the k difference vectors.",
+            "",
+            "The table gives processor time in milliseconds per cloud: the least of several rounds, in which the "
+            f"methods are interleaved. `ours` gets all clouds in one call. `{ONE_PER_CALL}` and the libraries get one "
+            "cloud per call. `ball_tree` and `sklearn_kd` are the two trees of scikit-learn, and `scipy_kd` is the "
+            "tree of SciPy. The last two columns give the speed-up of `ours`. In brackets follow the speed-up of "
+            f"`{ONE_PER_CALL}` and the required speed-up.",
             "",
             *lines,
             "",
-            "Largest difference of a distance from SciPy in float64: "
-            + ", ".join(f"{name} {error:.0e}" for name, error in errors.items())
+            "The distances of each method were compared with SciPy in float64. The largest absolute differences, for "
+            "clouds in the unit ball, are: "
+            + ", ".join(f"`{name}` {error:.0e}" for name, error in errors.items())
             + ".",
             "",
-            "Clouds of 100,000 points that spoil grids and trees, 1,000 basis points:",
+            "## Clouds that are difficult for grids and trees",
+            "",
+            "These clouds have 100,000 points, and there are 1,000 basis points. The table gives the least processor "
+            "time of four interleaved calls, and the largest absolute difference of a distance of `ours` from SciPy "
+            "in float64.",
             "",
             hard,
             "",
-            "Two threads against one (≥ 1.8 wanted), by wall time and by processor time, 2 t₁ / t₂; load of the "
-            f"machine meanwhile {load:.1f}, of which about 1.5 are this benchmark (wall time says something where "
-            "others leave both cores free): "
-            + "; ".join(f"{name}: {wall:.2f}, **{spent:.2f}**" for name, (wall, spent) in scaling.items())
-            + ".",
+            "## Two threads",
             "",
-            f"First call of a process, processor time: {cold:.1f} s where everything is compiled, {warm:.2f} s where "
-            "machine code is read from the cache; once for each of float32 and float64.",
+            "This table gives the speed-up of two threads over one; at least 1.8 is required. The speed-up by "
+            "processor time is 2 t₁ / t₂, where t₁ and t₂ are the least processor times with one and with two threads. "
+            "The speed-up by wall time is meaningful only if no other process uses the two cores. The load average of "
+            f"the machine was {load:.1f}; this benchmark alone causes a load of about 1.5.",
+            "",
+            "| clouds | points | basis points | speed-up by wall time | speed-up by processor time |",
+            "|---:|---:|---:|---:|---:|",
+            *(
+                f"| {count} | {points:,} | {basis_points:,} | {wall:.2f} | **{processor:.2f}** |"
+                for count, points, basis_points, wall, processor in scaling
+            ),
+            "",
+            "## First call",
+            "",
+            "The first call in a process also compiles the search, once for float32 and once for float64. It takes "
+            f"{cold:.1f} s of processor time if everything is compiled, and {warm:.2f} s if the machine code is read "
+            "from the cache.",
             "",
             machine("numba", "torch", "scipy", "scikit-learn", "pykdtree", "pynanoflann"),
             "",
@@ -290,7 +347,7 @@ def report() -> str:
 
 
 def streaming(total: int = 10**8, size: int = 10**6, basis_points: int = 1000) -> str:
-    """Three readings of a generated cloud, in chunks: mean, largest norm, nearest points."""
+    """Read a generated cloud three times in chunks, for mean, largest norm and nearest points; return the page."""
     torch.set_num_threads(1)
     basis = prepare(torch.from_numpy(ball(basis_points, np.random.default_rng(99))))
 
@@ -300,10 +357,10 @@ def streaming(total: int = 10**8, size: int = 10**6, basis_points: int = 1000) -
         radius = 5 + 1.7 * torch.cos(b)
         return torch.stack([radius * torch.cos(a) + 100, radius * torch.sin(a), 1.7 * torch.sin(b)], 1)
 
-    nearest(chunk(0)[None], basis)  # compiled before
+    nearest(chunk(0)[None], basis)  # compiles the search before it is timed
     base = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     middle = Middle()
-    spent = {"generating": 0.0, "mean": 0.0, "largest norm": 0.0, "nearest": 0.0}
+    seconds_by_step = {"generating": 0.0, "mean": 0.0, "largest norm": 0.0, "nearest": 0.0}
 
     def read(name: str, use: Callable[[torch.Tensor], None]) -> None:
         for number in range(total // size):
@@ -311,30 +368,37 @@ def streaming(total: int = 10**8, size: int = 10**6, basis_points: int = 1000) -
             points = chunk(number)
             between = time.process_time()
             use(points)
-            spent["generating"] += between - start
-            spent[name] += time.process_time() - between
+            seconds_by_step["generating"] += between - start
+            seconds_by_step[name] += time.process_time() - between
 
     read("mean", middle.add)
     reach = Reach(middle.mean)
     read("largest norm", reach.add)
     stream = Stream(basis)
     read("nearest", lambda points: stream.add(normalise_chunk(points, middle.mean, reach.norm)))
-    found = stream.result()
+    result = stream.result()
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    times = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in spent.items())
+    times = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in seconds_by_step.items())
     return (
-        f"# A cloud of {total:,} points in chunks of {size:,}\n\n`python -m benchmarks.clouds.nearest --stream`: a "
-        f"synthetic torus, {basis_points:,} basis points, one core. Processor time: {times}. Peak memory "
-        f"{peak / 2**10:.0f} MiB, of which {base / 2**10:.0f} MiB before the first chunk was read (libraries and one "
-        f"chunk); all points would be {12 * total / 2**20:.0f} MiB. Centre "
-        f"{[round(x, 4) for x in middle.mean.tolist()]}, largest norm "
-        f"{reach.norm:.4f}, mean distance {float(found.distance.mean()):.6f}.\n\n{machine('numba', 'torch')}\n"
+        f"# A cloud of {total:,} points in chunks of {size:,}\n\n"
+        "This page shows how much time and memory the search for nearest points takes if the cloud is read in chunks "
+        "and never held in memory as a whole. It is written by `python -m benchmarks.clouds.nearest --stream`. The "
+        f"points of a synthetic torus are generated chunk by chunk and read three times on one core: for their mean, "
+        "for the largest distance from the mean (largest norm), and for the point that is nearest to each of "
+        f"{basis_points:,} basis points.\n\n"
+        f"The processor times are: {times}. The peak memory was {peak / 2**10:.0f} MiB; {base / 2**10:.0f} MiB of it "
+        "were in use before the first chunk was read (libraries and one chunk). All points together would take "
+        f"{12 * total / 2**20:.0f} MiB. The results are: centre {[round(x, 4) for x in middle.mean.tolist()]}, "
+        f"largest norm {reach.norm:.4f}, mean distance {float(result.distance.mean()):.6f}.\n\n"
+        f"{machine('numba', 'torch')}\n"
     )
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--stream", action="store_true", help="1e8 points in chunks; takes some minutes")
+    parser.add_argument(
+        "--stream", action="store_true", help="read 1e8 points in chunks instead; takes some minutes"
+    )
     if parser.parse_args().stream:
         text, name = streaming(), "nearest_stream"
     else:

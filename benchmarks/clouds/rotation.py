@@ -1,8 +1,9 @@
-"""Measure how far encodings of one shape are apart, with and without `rotation_invariant`.
+"""Measure how much the encoding of a shape changes with rotation and sampling, with and without `rotation_invariant`.
 
     python -m benchmarks.clouds.rotation
 
-Writes rotation.md beside this file. Shapes are the generated CAD models of data=modelnet40; half a minute on one core.
+Writes rotation.md into the folder of this file. The shapes are the generated CAD models of data=modelnet40. It takes
+half a minute on one core.
 """
 
 import sys
@@ -20,31 +21,32 @@ from plugins.encoder.bps.basis import basis
 from plugins.encoder.bps.encoding import channels, encode, prepared
 
 MODELS = 3
-"""Of each class."""
+"""Number of shapes of each class."""
 BASIS = 512
 LIMIT = 0.05
-"""Codes further apart than this, root mean square, count as different."""
+"""Root mean square difference above which two encodings count as different."""
 
 
-def sampled(points: int, draw: int) -> Tensor:
-    """A cloud of each shape (shape, points, 3), float32; another `draw` has other points of the same surfaces."""
+def sample_clouds(points: int, seed: int) -> Tensor:
+    """Return a cloud of each shape, (shape, points, 3), float32; the seed determines the points of the surfaces."""
     clouds = []
     for category in CLASSES:
         for number in range(MODELS):
             solid = model(category, "test", number, 0)
-            random = np.random.default_rng([draw, len(clouds)])
+            random = np.random.default_rng([seed, len(clouds)])
             clouds.append(sample(Mesh(category, solid.vertices, solid.faces), points, random).points)
     return torch.from_numpy(np.stack(clouds)).float()
 
 
-def codes(clouds: Tensor, invariant: bool) -> Tensor:
-    made = prepared(basis("ball_uniform", BASIS, 1.0, 13).float())
-    return channels(encode(clouds, made, ["distance"], rotation_invariant=invariant)).flatten(1)
+def encode_distances(clouds: Tensor, invariant: bool) -> Tensor:
+    """Return the distances from the basis points to each cloud, (shape, basis points)."""
+    basis_points = prepared(basis("ball_uniform", BASIS, 1.0, 13).float())
+    return channels(encode(clouds, basis_points, ["distance"], rotation_invariant=invariant)).flatten(1)
 
 
-def apart(first: Tensor, other: Tensor) -> Tensor:
-    """Root mean square differences of rows."""
-    return (first - other).square().mean(1).sqrt()
+def rms_difference(first: Tensor, second: Tensor) -> Tensor:
+    """Return the root mean square difference of each row of two encodings, (shape,)."""
+    return (first - second).square().mean(1).sqrt()
 
 
 def main() -> None:
@@ -52,38 +54,49 @@ def main() -> None:
     rows = []
     for invariant in (False, True):
         for points in (2048, 5000):
-            clouds = sampled(points, 0)
-            turns = Rotation.random(len(clouds), 0)  # pyright: ignore[reportArgumentType]  # SciPy takes a seed
-            rotation = torch.from_numpy(turns.as_matrix())
-            turned = (clouds.double() @ rotation.mT).float()
-            own = codes(clouds, invariant)
-            again = apart(own, codes(sampled(points, 1), invariant))
-            others = (own[:, None] - own).square().mean(-1).sqrt()
-            others.fill_diagonal_(torch.inf)
+            clouds = sample_clouds(points, 0)
+            rotations = Rotation.random(len(clouds), 0)  # pyright: ignore[reportArgumentType]  # SciPy takes a seed
+            matrices = torch.from_numpy(rotations.as_matrix())
+            rotated = (clouds.double() @ matrices.mT).float()
+            encodings = encode_distances(clouds, invariant)
+            resampled = rms_difference(encodings, encode_distances(sample_clouds(points, 1), invariant))
+            between_shapes = (encodings[:, None] - encodings).square().mean(-1).sqrt()
+            between_shapes.fill_diagonal_(torch.inf)
             rows.append(
                 {
                     "invariant": invariant,
                     "points": points,
-                    "turned": apart(own, codes(turned, invariant)).max().item(),
-                    "share": 100 * (again > LIMIT).double().mean().item(),
-                    "again": again.median().item(),
-                    "other": others.amin(1).median().item(),
+                    "rotated": rms_difference(encodings, encode_distances(rotated, invariant)).max().item(),
+                    "resampled": resampled.median().item(),
+                    "share": 100 * (resampled > LIMIT).double().mean().item(),
+                    "other": between_shapes.amin(1).median().item(),
                     "synthetic": True,
                 }
             )
     columns = {
         "invariant": "`rotation_invariant`",
         "points": "points",
-        "turned": "largest: the same points, turned",
-        "again": "median: other points of the same surface",
-        "share": f"above {LIMIT:g}, %",
-        "other": "median: nearest other shape",
+        "rotated": "same points rotated, largest difference",
+        "resampled": "surface resampled, median difference",
+        "share": f"surface resampled, difference above {LIMIT:g}, %",
+        "other": "nearest other shape, median difference",
     }
     text = (
-        f"# Distances between encodings of one shape\n\n{len(CLASSES) * MODELS} generated shapes (synthetic data), "
-        f"{BASIS} basis points, float32; root mean square difference of the distances (eq. 6.4) of two clouds, in "
-        "units of the normalised cloud. Axes are not determined where two moments are nearly equal, as of round or "
-        f"square things: of those shapes two samples of one surface are more than {LIMIT:g} apart.\n\n"
+        "# Differences between encodings of one shape\n\n"
+        "This page shows how much the encoding of a shape by basis points changes if the shape is rotated, or if other "
+        "points of its surface are sampled. The encoder is measured with and without its option "
+        f"`rotation_invariant`, which encodes each cloud along its own axes. The data are {len(CLASSES) * MODELS} "
+        f"generated shapes (synthetic data). There are {BASIS} basis points, in float32.\n\n"
+        "An encoding holds the distance from each basis point to the cloud (eq. 6.4). The difference of two encodings "
+        "is the root mean square difference of these distances, in units of the normalised cloud. For clouds with the "
+        "given number of points, the columns give:\n\n"
+        "- the largest difference, over the shapes, between a cloud and the same points in a random rotation;\n"
+        "- the median difference between two samples of points of the same surface;\n"
+        f"- the share of shapes for which this difference is above {LIMIT:g};\n"
+        "- for comparison, the median difference between a shape and the shape with the most similar encoding.\n\n"
+        "With `rotation_invariant`, the axes come from the second moments of the points. If two moments are nearly "
+        "equal, as for round or square shapes, another sample of the surface can have other axes. These are the shapes "
+        f"whose two samples differ by more than {LIMIT:g}.\n\n"
         f"{markdown(rows, columns)}\n{machine('torch', 'numba')}\n"
     )
     write_page(__file__, text)

@@ -1,10 +1,11 @@
-"""Recognise body parts, point by point, from the encoding of the whole cloud (thesis §8.2).
+"""Measure how accurately body parts are recognised point by point, with the encoding of the whole cloud (thesis §8.2).
 
     python -m benchmarks.clouds.segmentation
 
-Scans of data=registration; a point's part is that of the nearest vertex of its body. The same network reads a point's
-normalised coordinates alone, or with the code of its cloud (`per_point`). Writes segmentation.md and
-segmentation.png beside this file; five minutes on one core. The default body is wanted: pip install -e '.[body]'.
+The data are scans of data=registration; the part of a point is the part of the nearest vertex of its body. The same
+network reads the normalised coordinates of a point, either alone or with the encoding of the cloud (`per_point`).
+Writes segmentation.md and segmentation.png into the folder of this file and takes five minutes on one core. It needs
+the default body: pip install -e '.[body]'.
 """
 
 import sys
@@ -32,7 +33,7 @@ from plugins.encoder.bps.encoding import Basis, encode, per_point, prepared
 HERE = Path(__file__).resolve()
 TRAIN, TEST, BASIS = 2_000, 200, 512
 EPOCHS, SCANS, POINTS = 20, 8, 256
-"""Of training: epochs, scans of a batch, points of a scan in each epoch."""
+"""Size of the training: epochs, scans of a batch, points of a scan in each epoch."""
 LIMBS = {
     "neck": "head",
     "arm": "upper arm",
@@ -42,15 +43,15 @@ LIMBS = {
     "knee": "shin",
     "ankle": "foot",
 }
-"""The joint that a limb begins at, and the limb."""
+"""Limbs, by the joint at which each begins."""
 
 
 def parts_of(body: Body) -> tuple[list[str], Tensor]:
-    """Names of the parts, and of each vertex the part that its weightiest joint hangs on."""
-    where = poses.skeleton(body)
+    """Return the names of the parts, and for each vertex the part of the joint that has the largest weight there."""
+    skeleton = poses.skeleton(body)
     names, start = ["torso"], {}
     for limb in LIMBS:
-        joints = getattr(where, limb)
+        joints = getattr(skeleton, limb)
         for side, joint in zip(("",) if limb == "neck" else ("left ", "right "), joints, strict=False):
             start[joint] = len(names)
             names.append(side + LIMBS[limb])
@@ -63,16 +64,18 @@ def parts_of(body: Body) -> tuple[list[str], Tensor]:
     return names, torch.tensor(part)[torch.from_numpy(body.weights.argmax(1))]
 
 
-def labelled(split, count: int, vertex_part: Tensor) -> tuple[Tensor, Tensor]:
-    """Clouds (scan, point, 3) padded with NaN, and the part of each point; -1 of padding and strangers."""
+def load_labelled(split, count: int, vertex_part: Tensor) -> tuple[Tensor, Tensor]:
+    """Return clouds (scan, point, 3) padded with NaN, and the part of each point; -1 marks padding and outliers."""
     clouds, labels = [], []
     for first in range(0, count, 50):
         batch = split.__getitems__(range(first, min(count, first + 50)))
         vertices = batch["target"].float().unflatten(1, (-1, 3)).contiguous()
         number = sizes(batch["input"])
-        found = nearest(vertices, batch["input"].nan_to_num(0), None, number)
-        label = vertex_part[found.index].clone()
-        far = found.distance * batch["scale"][:, None] > 0.1  # metres: no point of the body
+        neighbours = nearest(vertices, batch["input"].nan_to_num(0), None, number)
+        label = vertex_part[neighbours.index].clone()
+        far = (
+            neighbours.distance * batch["scale"][:, None] > 0.1
+        )  # metres: an outlier, not a point of the body
         label[far | batch["input"].isnan().any(-1)] = -1
         clouds.append(batch["input"])
         labels.append(label)
@@ -84,12 +87,13 @@ def labelled(split, count: int, vertex_part: Tensor) -> tuple[Tensor, Tensor]:
     return torch.cat(clouds), torch.cat(labels)
 
 
-def inputs(clouds: Tensor, made: Basis, points: Tensor, whole: bool) -> Tensor:
-    """What the network reads of some points (scan, point, 3) of clouds."""
-    return per_point(encode(clouds, made, ["distance"], "none"), points) if whole else points
+def network_inputs(clouds: Tensor, basis_points: Basis, points: Tensor, whole: bool) -> Tensor:
+    """Return what the network reads for some points (scan, point, 3) of clouds; `whole`: also the cloud's encoding."""
+    return per_point(encode(clouds, basis_points, ["distance"], "none"), points) if whole else points
 
 
-def trained(clouds: Tensor, labels: Tensor, classes: int, made: Basis, whole: bool) -> nn.Sequential:
+def train(clouds: Tensor, labels: Tensor, classes: int, basis_points: Basis, whole: bool) -> nn.Sequential:
+    """Return a network that was trained to predict the part of a point."""
     torch.manual_seed(0)
     generator = torch.Generator().manual_seed(0)
     layers = [nn.Linear(3 + (BASIS if whole else 0), 256), nn.ReLU(), nn.Linear(256, 128), nn.ReLU()]
@@ -99,10 +103,10 @@ def trained(clouds: Tensor, labels: Tensor, classes: int, made: Basis, whole: bo
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
     for _ in range(EPOCHS):
         for chosen in torch.randperm(len(clouds), generator=generator).split(SCANS)[: len(clouds) // SCANS]:
-            drawn = torch.multinomial((labels[chosen] >= 0).float(), POINTS, generator=generator)
-            points = clouds[chosen].gather(1, drawn[..., None].expand(-1, -1, 3))
-            said = network(inputs(clouds[chosen], made, points, whole))
-            loss = nn.functional.cross_entropy(said.flatten(0, 1), labels[chosen].gather(1, drawn).flatten())
+            indices = torch.multinomial((labels[chosen] >= 0).float(), POINTS, generator=generator)
+            points = clouds[chosen].gather(1, indices[..., None].expand(-1, -1, 3))
+            logits = network(network_inputs(clouds[chosen], basis_points, points, whole)).flatten(0, 1)
+            loss = nn.functional.cross_entropy(logits, labels[chosen].gather(1, indices).flatten())
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
@@ -111,21 +115,21 @@ def trained(clouds: Tensor, labels: Tensor, classes: int, made: Basis, whole: bo
 
 
 @torch.inference_mode()
-def judged(
-    network: nn.Sequential, clouds: Tensor, labels: Tensor, made: Basis, whole: bool
+def evaluate(
+    network: nn.Sequential, clouds: Tensor, labels: Tensor, basis_points: Basis, whole: bool
 ) -> dict[str, float]:
-    """Share of right points and its standard error over scans, mean intersection over union, milliseconds a scan."""
+    """Return accuracy with its standard error over scans, mean intersection over union, and milliseconds per scan."""
     last = network[-1]
     assert isinstance(last, nn.Linear)
     classes = last.out_features
-    right, spent = [], []
+    right, seconds = [], []
     table = torch.zeros(classes, classes)
     for cloud, label in zip(clouds, labels, strict=True):
         known = label >= 0
         cloud = cloud[: int(sizes(cloud[None]))][None]
         start = perf_counter()
-        guess = network(inputs(cloud, made, cloud, whole))[0].argmax(-1)
-        spent.append(perf_counter() - start)
+        guess = network(network_inputs(cloud, basis_points, cloud, whole))[0].argmax(-1)
+        seconds.append(perf_counter() - start)
         guess, label = guess[known[: len(guess)]], label[known]
         right.append((guess == label).double().mean())
         table += torch.bincount(label * classes + guess, minlength=classes**2).reshape(classes, classes)
@@ -135,20 +139,22 @@ def judged(
         "accuracy": shares.mean().item(),
         "accuracy_sem": (shares.std() / len(shares) ** 0.5).item(),
         "overlap": (table.diagonal() / union).mean().item(),
-        "ms": 1e3 * float(np.median(spent)),
+        "ms": 1e3 * float(np.median(seconds)),
     }
 
 
-def pictured(clouds: Tensor, labels: Tensor, said: dict[str, list[Tensor]], names: list[str]) -> None:
-    """Scans from the front: true parts, and what each network says."""
-    rows = {"truth": list(labels), **said}
+def draw_figure(
+    clouds: Tensor, labels: Tensor, predictions: dict[str, list[Tensor]], names: list[str]
+) -> None:
+    """Draw scans from the front: a row with the true parts, and a row with the predictions of each network."""
+    rows = {"truth": list(labels), **predictions}
     figure = titled_figure(
         (2.0 * len(clouds) + 0.5, 2.4 * len(rows) + 1.3), "Parts of bodies, point by point", True
     )
     panels = figure.subplots(len(rows), len(clouds), squeeze=False)
-    for line, (heading, found) in zip(panels, rows.items(), strict=True):
+    for line, (heading, parts) in zip(panels, rows.items(), strict=True):
         line[0].set_ylabel(heading, fontsize=11, weight="bold")
-        for axes, cloud, label, true in zip(line, clouds, found, labels, strict=True):
+        for axes, cloud, label, true in zip(line, clouds, parts, labels, strict=True):
             shown = true >= 0
             axes.scatter(*cloud[shown][:, :2].T, s=0.4, c=label[shown], cmap="tab20", vmin=-0.5, vmax=19.5)
             axes.set(xticks=[], yticks=[], frame_on=False, aspect="equal")
@@ -163,34 +169,50 @@ def main() -> None:
     data = build("data", resolve("data", {"name": "registration", "train": TRAIN, "test": TEST}))
     data.prepare()
     names, vertex_part = parts_of(load_body(None)[0])
-    clouds, labels = labelled(data.splits().train, TRAIN, vertex_part)
-    held = labelled(data.splits().test, TEST, vertex_part)
-    made = prepared(basis("ball_uniform", BASIS, 1.0, 13).float())
-    rows, said = [], {}
-    for heading, whole in (("the point alone", False), ("with its cloud's code", True)):
+    clouds, labels = load_labelled(data.splits().train, TRAIN, vertex_part)
+    test_clouds, test_labels = load_labelled(data.splits().test, TEST, vertex_part)
+    basis_points = prepared(basis("ball_uniform", BASIS, 1.0, 13).float())
+    rows, predictions = [], {}
+    for heading, whole in (("point alone", False), ("point and cloud", True)):
         start = perf_counter()
-        network = trained(clouds, labels, len(names), made, whole)
-        spent = perf_counter() - start
+        network = train(clouds, labels, len(names), basis_points, whole)
+        seconds = perf_counter() - start
         rows.append(
-            {"reads": heading, **judged(network, *held, made, whole), "train": spent, "synthetic": True}
+            {
+                "reads": heading,
+                **evaluate(network, test_clouds, test_labels, basis_points, whole),
+                "train": seconds,
+                "synthetic": True,
+            }
         )
         with torch.inference_mode():
-            some = held[0][:5]
-            said[heading] = list(network(inputs(some, made, some.nan_to_num(0), whole)).argmax(-1))
-    pictured(held[0][:5], held[1][:5], said, names)
+            some = test_clouds[:5]
+            logits = network(network_inputs(some, basis_points, some.nan_to_num(0), whole))
+            predictions[heading] = list(logits.argmax(-1))
+    draw_figure(test_clouds[:5], test_labels[:5], predictions, names)
     columns = {
-        "reads": "the network reads",
+        "reads": "input of the network",
         "accuracy": "accuracy",
         "overlap": "mean intersection over union",
-        "ms": "ms a scan of 10,000 points",
-        "train": "training, s",
+        "ms": "ms per scan of 10,000 points",
+        "train": "training time, s",
     }
     text = (
-        f"# Parts of bodies, point by point (thesis §8.2)\n\n{TRAIN} scans of synthetic people for training, {TEST} "
-        f"for the test, {len(names)} parts ({', '.join(names)}); {BASIS} basis points, layers of 256 and 128 units, "
-        f"{EPOCHS} epochs of {POINTS} points a scan. Strangers' points do not count. One thread, encoding included.\n\n"
+        "# Body parts, recognised point by point (thesis §8.2)\n\n"
+        "This page shows whether a network recognises the body part of a point of a scan better if it reads the "
+        "encoding of the whole cloud in addition to the coordinates of the point. One network reads the point alone. "
+        f"The other also reads the distances from {BASIS} basis points to the cloud.\n\n"
+        f"The scans show synthetic people: {TRAIN} scans are for training and {TEST} for the test. Each point belongs "
+        f"to one of {len(names)} parts ({', '.join(names)}). Both networks have layers of 256 and 128 units and are "
+        f"trained for {EPOCHS} epochs, with {POINTS} random points of each scan in an epoch. Points that do not belong "
+        "to the body (outliers of the scan) are left out.\n\n"
+        "Accuracy is the share of points whose part is recognised; ± is its standard error over the test scans. The "
+        "mean intersection over union is the mean over the parts. The time per scan is a median over the test scans; "
+        "it was measured on one thread and includes the encoding.\n\n"
         f"{markdown(rows, columns, better={'accuracy': 'higher', 'overlap': 'higher', 'ms': 'lower'})}"
-        f"\n![Five scans](segmentation.png)\n\n{machine('torch', 'numba')}\n"
+        "\nThe figure shows five test scans from the front: the true parts (top), the parts that are recognised from "
+        "the point alone (middle), and those that are recognised from point and cloud (bottom).\n\n"
+        f"![True and recognised parts of five scans](segmentation.png)\n\n{machine('torch', 'numba')}\n"
     )
     write_page(HERE, text)
     sys.stdout.write(text)

@@ -1,9 +1,10 @@
-"""Time a training step of networks for sets, with the points that attain a maximum and with every point.
+"""Compare training steps of networks for point sets that use every point, or only the points that attain a maximum.
 
     python -m benchmarks.clouds.set_steps
 
-Both ways on the same weights and clouds, in turns; processor time of one thread. Before that a network trains for some
-steps, since untrained ones have other maxima. Writes set_steps.md beside this file; three minutes.
+Both methods use the same weights and clouds, in interleaved rounds; the times are processor times of one thread. Each
+network is trained for some steps before, because other points attain the maxima of an untrained network. Writes
+set_steps.md into the folder of this file and takes three minutes.
 """
 
 import copy
@@ -19,6 +20,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 from unittest import mock
 
 import torch
@@ -44,29 +46,39 @@ NETWORKS: dict[str, Callable[[], Encoder]] = {
 }
 
 
-def classified(network: nn.Module, last: nn.Module, clouds: Tensor, labels: Tensor) -> Tensor:
+def cross_entropy_loss(network: nn.Module, last: nn.Module, clouds: Tensor, labels: Tensor) -> Tensor:
+    """Return the cross entropy of the classes that the last layer predicts."""
     return cross_entropy(last(network(clouds)), labels)
 
 
-def measured(loss: Callable[[], Tensor], parameters: list[nn.Parameter]) -> tuple[float, float, list[Tensor]]:
-    """Milliseconds of a step, MB that it holds for the gradient, and the gradient."""
-    held = dict[int, int]()
+class Step(NamedTuple):
+    """Milliseconds of a training step, megabytes that it stores for the backward pass, and its gradient."""
 
-    def hold(tensor: Tensor) -> Tensor:
-        held[tensor.untyped_storage().data_ptr()] = tensor.untyped_storage().nbytes()
+    milliseconds: float
+    megabytes: float
+    gradient: list[Tensor]
+
+
+def measure_step(loss: Callable[[], Tensor], parameters: list[nn.Parameter]) -> Step:
+    """Measure one training step."""
+    bytes_by_address = dict[int, int]()
+
+    def record_storage(tensor: Tensor) -> Tensor:
+        bytes_by_address[tensor.untyped_storage().data_ptr()] = tensor.untyped_storage().nbytes()
         return tensor
 
-    began = time.process_time()
+    start = time.process_time()
     gradient = torch.autograd.grad(loss(), parameters)
-    taken = time.process_time() - began
-    with torch.autograd.graph.saved_tensors_hooks(hold, lambda tensor: tensor):
-        kept = loss()  # noqa: F841 - so that nothing is freed before it is counted
+    seconds = time.process_time() - start
+    with torch.autograd.graph.saved_tensors_hooks(record_storage, lambda tensor: tensor):
+        graph = loss()  # noqa: F841 - a reference, so that no memory is freed before it is counted
     own = {parameter.untyped_storage().data_ptr() for parameter in parameters}
-    return taken * 1e3, sum(size for place, size in held.items() if place not in own) / 1e6, list(gradient)
+    size = sum(size for address, size in bytes_by_address.items() if address not in own)
+    return Step(seconds * 1e3, size / 1e6, list(gradient))
 
 
 def every_point(network: nn.Module) -> AbstractContextManager[object]:
-    """In which no layer chooses points."""
+    """Return a context in which every point passes every layer of the network."""
     if isinstance(network, DeepSets):
         return mock.patch.object(
             network, "_attaining", lambda values, counts: (torch.arange(len(values)), counts)
@@ -74,22 +86,26 @@ def every_point(network: nn.Module) -> AbstractContextManager[object]:
     return mock.patch.object(pooled, "POINTS", math.inf)
 
 
-def in_float64(network: Encoder, last: nn.Module, clouds: Tensor, labels: Tensor) -> list[Tensor]:
-    """The gradient through every point."""
+def gradient_in_float64(network: Encoder, last: nn.Module, clouds: Tensor, labels: Tensor) -> list[Tensor]:
+    """Return the gradient of each parameter in float64, computed through every point."""
     network, last = copy.deepcopy(network).double(), copy.deepcopy(last).double()
     with every_point(network):
-        loss = classified(network, last, clouds.double(), labels)
+        loss = cross_entropy_loss(network, last, clouds.double(), labels)
     return list(torch.autograd.grad(loss, [*network.parameters(), *last.parameters()]))
 
 
-def apart(gradient: list[Tensor], exact: list[Tensor]) -> float:
-    """The largest relative error of a parameter's, of those whose gradient is not rounding alone."""
+def largest_relative_error(gradients: list[Tensor], exact: list[Tensor]) -> float:
+    """Return the largest relative error over the parameters; a gradient that is only rounding error is left out."""
     least = 1e-6 * max(float(true.norm()) for true in exact)
-    pairs = [(one, true) for one, true in zip(gradient, exact, strict=True) if float(true.norm()) > least]
-    return max(float((one - true).norm() / true.norm()) for one, true in pairs)
+    return max(
+        float((gradient - true).norm() / true.norm())
+        for gradient, true in zip(gradients, exact, strict=True)
+        if float(true.norm()) > least
+    )
 
 
-def row(name: str, network: Encoder, clouds: Tensor, labels: Tensor) -> list[str]:
+def table_row(name: str, network: Encoder, clouds: Tensor, labels: Tensor) -> list[str]:
+    """Measure a network and return the cells of its row."""
     last = nn.Linear(network.output_shape[0], int(labels.max()) + 1)
     parameters = [*network.parameters(), *last.parameters()]
     optimizer = torch.optim.Adam(parameters, 1e-3)
@@ -97,26 +113,35 @@ def row(name: str, network: Encoder, clouds: Tensor, labels: Tensor) -> list[str
     for _ in range(TRAINED):
         index = torch.randperm(len(clouds), generator=order)[:BATCH]
         optimizer.zero_grad()
-        classified(network, last, clouds[index], labels[index]).backward()
+        cross_entropy_loss(network, last, clouds[index], labels[index]).backward()
         optimizer.step()
-    found: dict[bool, list[tuple[float, float, list[Tensor]]]] = {False: [], True: []}
+    steps: dict[bool, list[Step]] = {False: [], True: []}
     exact: list[list[Tensor]] = []
     for number in range(ROUNDS):
         index = torch.arange(number * BATCH, (number + 1) * BATCH) % len(clouds)
-        loss = partial(classified, network, last, clouds[index], labels[index])
-        for every in found:
+        loss = partial(cross_entropy_loss, network, last, clouds[index], labels[index])
+        for every in steps:
             with every_point(network) if every else nullcontext():
-                found[every].append(measured(loss, parameters))
-        exact.append(in_float64(network, last, clouds[index], labels[index]))
-    few, all_of_them = found[False], found[True]
-    off = [
-        max(apart(one[2], true) for one, true in zip(way, exact, strict=True)) for way in (few, all_of_them)
+                steps[every].append(measure_step(loss, parameters))
+        exact.append(gradient_in_float64(network, last, clouds[index], labels[index]))
+    methods = (steps[False], steps[True])
+    errors = [
+        max(
+            largest_relative_error(step.gradient, gradient)
+            for step, gradient in zip(method, exact, strict=True)
+        )
+        for method in methods
     ]
-    times = [[one[0] for one in way] for way in (few, all_of_them)]
+    times = [[step.milliseconds for step in method] for method in methods]
     ratio = statistics.median(b / a for a, b in zip(*times, strict=True))
-    held = [statistics.median(one[1] for one in way) for way in (few, all_of_them)]
-    cells = [f"{statistics.median(way):.0f}" for way in times]
-    return [name, *cells, f"{ratio:.1f}", *(f"{size:.0f}" for size in held), *(f"{one:.1g}" for one in off)]
+    memory = [statistics.median(step.megabytes for step in method) for method in methods]
+    return [
+        name,
+        *(f"{statistics.median(rounds):.0f}" for rounds in times),
+        f"{ratio:.1f}",
+        *(f"{size:.0f}" for size in memory),
+        *(f"{error:.1g}" for error in errors),
+    ]
 
 
 def main() -> None:
@@ -125,22 +150,30 @@ def main() -> None:
     clouds, synthetic = shapes(POINTS, 4)
     labels = torch.arange(40).repeat_interleave(4)
     assert synthetic and len(clouds) == len(labels)
-    mixed = torch.randperm(len(clouds))
-    rows = [row(name, make(), clouds[mixed].float(), labels[mixed]) for name, make in NETWORKS.items()]
+    order = torch.randperm(len(clouds))
+    rows = [table_row(name, make(), clouds[order].float(), labels[order]) for name, make in NETWORKS.items()]
     heads = (
         "network",
-        *("ms, attaining points", "ms, every point", "ratio"),
-        *("MB held, attaining points", "every point"),
-        *("gradient off, attaining points", "every point"),
+        *("attaining points, ms", "every point, ms", "time ratio"),
+        *("attaining points, MB", "every point, MB"),
+        *("attaining points, gradient error", "every point, gradient error"),
     )
     lines = [f"| {' | '.join(cells)} |" for cells in (heads, ["---"] + ["---:"] * (len(heads) - 1), *rows)]
-    text = f"""# A training step of networks for sets
+    text = f"""# A training step of networks for point sets
 
-Command: `python -m benchmarks.clouds.set_steps`. Forward and backward of {BATCH} clouds (synthetic CAD models),
-float32, one thread, processor time, after {TRAINED} steps of training; medians of {ROUNDS} rounds, both ways in
-each. Held: what autograd keeps until the backward pass, without the parameters. Off: the largest relative error of a
-parameter's gradient, of all rounds, against float64 through every point; of parameters whose gradient is not
-rounding alone.
+This page shows how much time and memory a training step of a network for point sets saves if only some points have a
+gradient. These networks compute the maximum of each channel over the points of a cloud, and only the points that attain
+a maximum influence the result. The column names say whether these "attaining points" or "every point" pass the last
+layers with a gradient. The page is written by `python -m benchmarks.clouds.set_steps`.
+
+A step is the forward and the backward pass of {BATCH} clouds (synthetic CAD models) in float32 on one thread. It is
+measured after {TRAINED} steps of training. Both methods run in each of {ROUNDS} interleaved rounds. The columns are:
+
+- ms: processor time of a step, median over the rounds;
+- time ratio: time with every point divided by time with the attaining points, median over the rounds;
+- MB: memory that autograd stores until the backward pass, without the parameters, median over the rounds;
+- gradient error: largest relative error of the gradient of a parameter, over all rounds, compared with the gradient in
+  float64 through every point. Parameters whose gradient consists only of rounding errors are left out.
 
 {chr(10).join(lines)}
 

@@ -1,4 +1,4 @@
-"""Clouds of the generated CAD models of data=modelnet40, for benchmarks."""
+"""Point clouds of the generated CAD models of data=modelnet40, for benchmarks."""
 
 from torch import Tensor
 
@@ -7,7 +7,13 @@ from framework.geometry.clouds import normalise_clouds
 
 
 def shapes(points: int, models: int, classes: list[str] | None = None) -> tuple[Tensor, bool]:
-    """Return clouds in the unit ball, so many of each class, and whether they are synthetic."""
+    """Return clouds in the unit ball, (cloud, points, 3), and whether they are synthetic.
+
+    Args:
+        points: points of a cloud.
+        models: number of clouds of each class.
+        classes: names of the classes; None: all.
+    """
     config = {
         "name": "modelnet40",
         "points": points,
