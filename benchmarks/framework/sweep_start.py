@@ -89,9 +89,9 @@ def main() -> None:
             "Lightning, so that a job need not import them again. The benchmark shows how much time this saves.",
             "",
             f"The sweep has {JOBS} jobs, of which {AT_ONCE} run at once. Each job is a very short training run "
-            f"(`{' '.join(RUNS)}`). All numbers are medians of {ROUNDS} sweeps; the two ways alternate. "
-            "The processor time of a job does not include the process that is forked. That of the sweep includes it. "
-            "The last row holds the numbers of new processes divided by those of forks.",
+            f"(`{' '.join(RUNS)}`). All times are in seconds and are medians of {ROUNDS} sweeps; the two ways "
+            "alternate. The processor time of a job does not include the process that is forked. That of the sweep "
+            "includes it. The last row holds the numbers of new processes divided by those of forks.",
             "",
             "| start of the jobs | wall time of the sweep, s | processor time of the sweep, s | processor time of a "
             "job, s |",
