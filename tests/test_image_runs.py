@@ -225,7 +225,7 @@ def test_textures_are_drawn_wherever_the_subjects_are_and_nowhere_else(
     models = package.load(done.folder, paths=paths), package.freeze(done.folder, paths=paths)
     scans.rename(tmp_path / "moved")
     for model in models:
-        with pytest.raises(DataError, match="no such folder; wanted that of the subjects"):
+        with pytest.raises(DataError, match="no such folder; expected the folder of the subjects"):
             model(mesh)
 
 
