@@ -254,3 +254,22 @@ def test_tests_import_mlflow_without_a_change_to_others() -> None:
                 )
 
     assert faults(files, unguarded) == {}
+
+
+def test_a_long_constructor_says_why() -> None:
+    """A comment stands above each constructor of more than eight parameters."""
+
+    def unexplained(path: Path) -> Iterator[str]:
+        lines = path.read_text(encoding="utf-8").splitlines()
+        for node in ast.walk(ast.parse("\n".join(lines))):
+            if isinstance(node, ast.FunctionDef) and node.name == "__init__":
+                parameters = len([*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]) - 1
+                if parameters > 8 and not lines[node.lineno - 2].strip().startswith("#"):
+                    yield f"line {node.lineno}: {parameters} parameters"
+
+    files = [
+        path
+        for room in ("framework", "plugins", "hydra_plugins", "benchmarks", "reproduction")
+        for path in sorted((ROOT / room).rglob("*.py"))
+    ]
+    assert faults(files, unexplained) == {}

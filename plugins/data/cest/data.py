@@ -86,6 +86,7 @@ class CEST(Data, Mapped):
     suffixes = SUFFIXES
     companions = (".mask.nii.gz", ".mask.nii", ".offsets.txt")
 
+    # More than eight parameters: each keyword is a config key that a user sets alone.
     def __init__(
         self,
         *,

@@ -41,6 +41,7 @@ class ImagesWithAngles(Data):
 
     suffixes = images.SUFFIXES
 
+    # More than eight parameters: each keyword is a config key that a user sets alone.
     def __init__(
         self,
         *,

@@ -68,6 +68,7 @@ class TableTennis(Data):
     groups = ("table_tennis",)
     suffixes = SUFFIXES
 
+    # More than eight parameters: each keyword is a config key that a user sets alone.
     def __init__(
         self,
         *,

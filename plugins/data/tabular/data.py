@@ -57,6 +57,7 @@ class Tabular(Data):
     suffixes = (".csv",)
     varies = False
 
+    # More than eight parameters: each keyword is a config key that a user sets alone.
     def __init__(
         self,
         *,

@@ -74,6 +74,7 @@ class BallisticHead(DensityHead, Fitted):
     noise: Tensor
     spread: Tensor
 
+    # More than eight parameters: each keyword is a config key that a user sets alone.
     def __init__(
         self,
         target: Target,
