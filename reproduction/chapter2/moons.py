@@ -1,9 +1,10 @@
-"""Make Table 2.1 on the two moons (synthetic), with errors and run times of five seeds, and Figures 2.3 and 2.4.
+"""Make Table 2.1 of the thesis on the two moons (synthetic) with five seeds, and Figures 2.3 and 2.4.
 
     python -m reproduction.thesis_tables 2.1
 
-Or of sweeps that have run: `python -m reproduction.chapter2.moons <their folders>`. Writes moons.md,
-moons_landscapes.png and moons_reliability.png beside this file; with `--draw` before the folders only the figures.
+To evaluate sweeps that have already run: `python -m reproduction.chapter2.moons <folders of the sweeps>`. The script
+writes moons.md, moons_landscapes.png and moons_reliability.png beside this file. With `--draw` before the folders it
+only draws the figures.
 """
 
 import json
@@ -73,18 +74,19 @@ BETTER: Better = {
     "entropy_sure": "lower",
 }
 SURE, UNSURE = 0.99, 0.7
-"""Of the generator's own posterior: where one class is all but certain, and where both are likely."""
+"""Bounds on the largest class probability of the generator's posterior: above the first one class is nearly certain,
+below the second both classes are likely."""
 BAND = (0.1, 0.9)
-"""A prediction between them is not sure."""
-SEEN = {
+"""Predicted probabilities of class 1 that count as unsure."""
+LANDSCAPE_COLUMNS = {
     "method": "method",
     "entropy_sure": "entropy where the posterior is sure, nats",
     "entropy_unsure": "entropy where it is not, nats",
     "band": "share of points with 0.1 < p < 0.9",
     "n": "seeds",
 }
-NUMBERS = {**COLUMNS, **SEEN}
-THESIS = """| method (thesis, its own data) | accuracy | NLL | Brier | ECE | OOD entropy |
+NUMBERS = {**COLUMNS, **LANDSCAPE_COLUMNS}
+THESIS = """| method | accuracy | NLL | Brier | ECE | OOD entropy |
 |---|---|---|---|---|---|
 | vanilla, 128 | 85.8 % | 0.345 | 0.102 | 0.045 | 0.024 |
 | vanilla, 512 | 86.5 % | 0.437 | 0.107 | 0.081 | 0.009 |
@@ -95,37 +97,43 @@ THESIS = """| method (thesis, its own data) | accuracy | NLL | Brier | ECE | OOD
 
 
 def variant(config: dict[str, Any], experiment: str) -> str:
-    """Which of `METHODS` a run is: its experiment, and what was changed of it."""
+    """Return the key in `METHODS` of a run, from its experiment and its changed settings."""
     key, dropout = experiment.rpartition("/")[2], config["encoder"]["mlp"]["dropout"]
     if key == "mc_dropout" and dropout != 0.5:
         return f"{key} {dropout:g}"
     return f"{key} adversarial" if key == "ensemble" and config.get("objective") else key
 
 
-def results(sweeps: list[Path]) -> list[dict[str, Any]]:
+def read_results(sweeps: list[Path]) -> list[dict[str, Any]]:
     rows = []
     for path in sorted(path for sweep in sweeps for path in sweep.glob("*/results.json")):
-        found = json.loads(path.read_text(encoding="utf-8"))
+        numbers = json.loads(path.read_text(encoding="utf-8"))
         key = variant(
-            yaml.safe_load((path.parent / "config.yaml").read_text(encoding="utf-8")), found["experiment"]
+            yaml.safe_load((path.parent / "config.yaml").read_text(encoding="utf-8")), numbers["experiment"]
         )
-        kept = {name: found[name] for name in COLUMNS if name in found}
+        selected = {name: numbers[name] for name in COLUMNS if name in numbers}
         rows.append(
-            {**kept, "key": key, "method": METHODS[key], "seed": found["seed"], "folder": str(path.parent)}
-            | {"seconds": processor_seconds(record(path.parent)), "synthetic": found["synthetic"]}
+            {
+                **selected,
+                "key": key,
+                "method": METHODS[key],
+                "seed": numbers["seed"],
+                "folder": str(path.parent),
+            }
+            | {"seconds": processor_seconds(record(path.parent)), "synthetic": numbers["synthetic"]}
         )
     order = list(METHODS)
     return sorted(rows, key=lambda row: (order.index(row["key"]), row["seed"]))
 
 
-def times(rows: list[dict[str, Any]]) -> None:
-    """Replaces each row's run time of a prediction, measured while others ran beside it, by one of now."""
+def measure_times(rows: list[dict[str, Any]]) -> None:
+    """Measure the prediction time of each row again, alone; in the sweep other jobs ran at the same time."""
     data = build("data", resolve("data", "moons"))
     data.prepare()
     batch = next(iter(Batches(data, batch_size=100, workers=0, seed=0).test_dataloader()))
     for row in rows:
-        found = cost(framework.load(row["folder"]), batch, samples=1000, device=torch.device("cpu"))
-        row["milliseconds_per_sample"] = found.milliseconds_per_sample
+        prediction_cost = cost(framework.load(row["folder"]), batch, samples=1000, device=torch.device("cpu"))
+        row["milliseconds_per_sample"] = prediction_cost.milliseconds_per_sample
 
 
 def test_points(seed: int) -> dict[str, torch.Tensor]:
@@ -135,44 +143,49 @@ def test_points(seed: int) -> dict[str, torch.Tensor]:
 
 
 @torch.inference_mode()
-def landscape(rows: list[dict[str, Any]]) -> None:
-    """Adds to each row what Figure 2.3 shows, in numbers, on the test points; p is the predicted P(y = 1)."""
+def add_landscape(rows: list[dict[str, Any]]) -> None:
+    """Add to each row the entropies and the share of unsure test points that describe Figure 2.3."""
     points = {seed: test_points(seed) for seed in {row["seed"] for row in rows}}
     for row in rows:
         fields = points[row["seed"]]
         torch.manual_seed(row["seed"])
-        found = class_probabilities(framework.load(row["folder"])(fields["input"])).double()
-        entropy = torch.special.entr(found).sum(-1)
+        probability = class_probabilities(framework.load(row["folder"])(fields["input"])).double()
+        entropy = torch.special.entr(probability).sum(-1)
         best = fields["posterior"].max(-1).values
         row["entropy_sure"] = entropy[best > SURE].mean().item()
         row["entropy_unsure"] = entropy[best < UNSURE].mean().item()
-        row["band"] = ((found[:, 1] > BAND[0]) & (found[:, 1] < BAND[1])).double().mean().item()
+        row["band"] = ((probability[:, 1] > BAND[0]) & (probability[:, 1] < BAND[1])).double().mean().item()
 
 
 def posterior_landscape(seeds: list[int]) -> str:
-    """The same of the generator's posterior."""
-    found = []
+    """Return a sentence with the same numbers for the posterior of the generator."""
+    statistics = []
     for seed in seeds:
         p = test_points(seed)["posterior"].double()
         best, entropy = p.max(-1).values, torch.special.entr(p).sum(-1)
         inside = (p[:, 1] > BAND[0]) & (p[:, 1] < BAND[1])
-        found.append([entropy[best > SURE].mean(), entropy[best < UNSURE].mean(), inside.double().mean()])
-    sure, unsure, band = np.mean(found, 0)
-    return f"The posterior itself: entropy {sure:.3f} and {unsure:.3f}, share {band:.3f}."
+        statistics.append(
+            [entropy[best > SURE].mean(), entropy[best < UNSURE].mean(), inside.double().mean()]
+        )
+    sure, unsure, band = np.mean(statistics, 0)
+    return (
+        f"The posterior itself has the entropies {sure:.3f} (sure) and {unsure:.3f} (not sure), and the share "
+        f"{band:.3f}."
+    )
 
 
-def best_possible(seeds: list[int]) -> str:
-    """What the exact posterior of the generator gives on the same test points."""
-    found = []
+def posterior_scores(seeds: list[int]) -> str:
+    """Return a sentence with the scores of the generator's exact posterior on the test points."""
+    scores = []
     for seed in seeds:
         fields = test_points(seed)
         p, label = fields["posterior"][:, 1].double().numpy(), fields["target"].numpy()
-        own = np.where(label == 1, p, 1 - p)
-        found.append((((p > 0.5) == label).mean(), -np.log(own).mean(), ((label - p) ** 2).mean()))
-    accuracy, nll, brier = np.mean(found, 0)
+        true_class = np.where(label == 1, p, 1 - p)
+        scores.append((((p > 0.5) == label).mean(), -np.log(true_class).mean(), ((label - p) ** 2).mean()))
+    accuracy, nll, brier = np.mean(scores, 0)
     return (
-        f"The exact posterior of the generator on the same test points: accuracy {accuracy:.3f}, NLL {nll:.4f}, Brier "
-        f"{brier:.4f}."
+        f"For comparison, the exact posterior of the generator has these scores on the same test points: accuracy "
+        f"{accuracy:.3f}, NLL {nll:.4f}, Brier {brier:.4f}."
     )
 
 
@@ -181,59 +194,74 @@ CLAIMS = (
     ("temperature", "vanilla_512", "ece", "temperature lowers ECE"),
     ("mc_dropout", "vanilla_512", "nll", "dropout lowers NLL"),
     ("ensemble", "vanilla_512", "nll", "an ensemble lowers NLL"),
-    ("vanilla_128", "vanilla_512", "nll", "the narrow net has the lower NLL"),
-    ("vanilla_128", "vanilla_512", "ece", "the narrow net has the lower ECE"),
-    ("everything", "mc_dropout", "nll", "all together: NLL against the best row of the table"),
-    ("everything", "mc_dropout", "brier", "all together: Brier against the best row"),
-    ("everything", "mc_dropout", "ece", "all together: ECE against the best row"),
-    ("everything", "outlier_exposure", "ood_entropy", "all together: OOD entropy against the best row"),
-    ("outlier_exposure", "vanilla_512", "brier", "outlier exposure costs Brier"),
-    ("outlier_exposure", "vanilla_512", "ece", "outlier exposure costs ECE"),
+    ("vanilla_128", "vanilla_512", "nll", "the narrow network (128) has a lower NLL than the wide one (512)"),
+    ("vanilla_128", "vanilla_512", "ece", "the narrow network has a lower ECE than the wide one"),
+    ("everything", "mc_dropout", "nll", "the combination in the last row lowers NLL against MC dropout"),
+    ("everything", "mc_dropout", "brier", "the combination lowers Brier against MC dropout"),
+    ("everything", "mc_dropout", "ece", "the combination lowers ECE against MC dropout"),
+    (
+        "everything",
+        "outlier_exposure",
+        "ood_entropy",
+        "the combination raises OOD entropy against outlier exposure",
+    ),
+    ("outlier_exposure", "vanilla_512", "brier", "outlier exposure lowers Brier"),
+    ("outlier_exposure", "vanilla_512", "ece", "outlier exposure lowers ECE"),
     ("platt", "vanilla_512", "nll", "Platt scaling lowers NLL"),
     ("adversarial", "vanilla_512", "nll", "adversarial training lowers NLL"),
     ("ensemble adversarial", "ensemble", "nll", "adversarial training lowers an ensemble's NLL"),
-    ("mc_dropout 0.1", "mc_dropout", "nll", "a rate of 0.1 has a lower NLL than 0.5"),
-    ("mc_dropout 0.3", "mc_dropout", "nll", "a rate of 0.3 has a lower NLL than 0.5"),
-    ("mc_dropout 0.1", "mc_dropout", "band", "a rate of 0.1 has a softer boundary than 0.5"),
-    ("vanilla_128", "vanilla_512", "band", "the narrow net has the softer boundary"),
+    ("mc_dropout 0.1", "mc_dropout", "nll", "a dropout rate of 0.1 has a lower NLL than 0.5"),
+    ("mc_dropout 0.3", "mc_dropout", "nll", "a dropout rate of 0.3 has a lower NLL than 0.5"),
+    ("mc_dropout 0.1", "mc_dropout", "band", "a dropout rate of 0.1 has a softer boundary than 0.5"),
+    ("vanilla_128", "vanilla_512", "band", "the narrow network has a softer boundary than the wide one"),
     ("temperature", "vanilla_512", "band", "temperature softens the boundary"),
     ("mc_dropout", "vanilla_512", "band", "dropout softens the boundary"),
-    ("mc_dropout", "vanilla_512", "ood_entropy", "dropout is less sure far away"),
+    ("mc_dropout", "vanilla_512", "ood_entropy", "dropout raises the OOD entropy"),
     ("ensemble", "vanilla_512", "band", "an ensemble softens the boundary"),
     ("ensemble", "mc_dropout", "band", "an ensemble has a softer boundary than dropout"),
     ("outlier_exposure", "vanilla_512", "band", "outlier exposure softens the boundary"),
-    ("outlier_exposure", "vanilla_512", "entropy_sure", "outlier exposure stays as sure in the clusters"),
+    (
+        "outlier_exposure",
+        "vanilla_512",
+        "entropy_sure",
+        "outlier exposure lowers the entropy where the posterior is sure",
+    ),
 )
 
 
-def claims(rows: list[dict[str, Any]]) -> str:
-    """Differences of two methods on the same data and seed: mean ± SD, and in how many seeds the first is better."""
-    lines = ["| claim | difference (same seed) | seeds in favour |", "|---|---|---|"]
-    for first, second, key, said in CLAIMS:
-        one, two = ({row["seed"]: row[key] for row in rows if row["key"] == name} for name in (first, second))
-        if not one or not two:
-            lines.append(f"| {said} | not run | |")
+def claims_table(rows: list[dict[str, Any]]) -> str:
+    """Return a table of the differences in `CLAIMS`: mean, standard deviation, and seeds in which the first is
+    better."""
+    lines = ["| claim | difference of two methods, same seed | seeds in favour |", "|---|---|---|"]
+    for first, second, key, claim in CLAIMS:
+        first_scores, second_scores = (
+            {row["seed"]: row[key] for row in rows if row["key"] == name} for name in (first, second)
+        )
+        if not first_scores or not second_scores:
+            lines.append(f"| {claim} | not run | |")
             continue
-        gaps = np.array([one[seed] - two[seed] for seed in sorted(one)])
-        good = (gaps < 0 if BETTER[key] == "lower" else gaps > 0).sum()
+        gaps = np.array([first_scores[seed] - second_scores[seed] for seed in sorted(first_scores)])
+        favourable = (gaps < 0 if BETTER[key] == "lower" else gaps > 0).sum()
         lines.append(
-            f"| {said} | {NUMBERS[key]} {gaps.mean():+.4f} ± {gaps.std(ddof=1):.4f} | {good} of {len(gaps)} |"
+            f"| {claim} | {NUMBERS[key]} {gaps.mean():+.4f} ± {gaps.std(ddof=1):.4f} | {favourable} of {len(gaps)} |"
         )
     return "\n".join(lines)
 
 
-def pictures(rows: list[dict[str, Any]]) -> None:
-    """Of the runs with seed 0."""
+def draw_figures(rows: list[dict[str, Any]]) -> None:
+    """Draw Figures 2.3 and 2.4 from the runs with seed 0."""
     folders = {row["key"]: Path(row["folder"]) for row in rows if row["seed"] == 0}
-    data, others = build("data", resolve("data", "moons")), build("data", resolve("data", "moons_outliers"))
+    data, outliers = build("data", resolve("data", "moons")), build("data", resolve("data", "moons_outliers"))
     data.prepare()
-    others.prepare()
-    seen, far = data.splits().train.fields, others.splits().test.fields["input"].numpy()
-    plane = Plane(seen["input"].numpy(), seen["target"].numpy(), far, data.target.names, 4.0)
-    six = ["vanilla_128", "vanilla_512", "temperature", "mc_dropout", "ensemble", "outlier_exposure"]
+    outliers.prepare()
+    train_fields, outlier_points = data.splits().train.fields, outliers.splits().test.fields["input"].numpy()
+    plane = Plane(
+        train_fields["input"].numpy(), train_fields["target"].numpy(), outlier_points, data.target.names, 4.0
+    )
+    methods = ["vanilla_128", "vanilla_512", "temperature", "mc_dropout", "ensemble", "outlier_exposure"]
     panels = {
         f"({letter}) {METHODS[key]}": probabilities(framework.load(folders[key]), plane.half_width)
-        for letter, key in zip("abcdef", six, strict=True)
+        for letter, key in zip("abcdef", methods, strict=True)
     }
     figure = draw_landscapes(
         panels, plane, title="Probability landscapes of Table 2.1, seed 0", synthetic=True
@@ -241,9 +269,9 @@ def pictures(rows: list[dict[str, Any]]) -> None:
     figure.savefig(HERE / "moons_landscapes.png", dpi=100)
     figure = Figure(figsize=(11, 6.6), dpi=110, layout="constrained")
     FigureCanvasAgg(figure)
-    for place, key in zip(figure.subplots(1, 2), ("vanilla_512", "temperature"), strict=True):
+    for axes, key in zip(figure.subplots(1, 2), ("vanilla_512", "temperature"), strict=True):
         predictor = framework.load(folders[key])
-        found = evaluate(
+        evaluation = evaluate(
             predictor,
             Batches(data, batch_size=1000, workers=0, seed=0).test_dataloader(),
             [build("metric", resolve("metric", "calibration_error"), target=data.target)],
@@ -252,43 +280,70 @@ def pictures(rows: list[dict[str, Any]]) -> None:
             seed=0,
             device=torch.device("cpu"),
         )
-        drawn = cast(HasFigure, found.metrics[0]).figure(METHODS[key], synthetic=True)
+        diagram = cast(HasFigure, evaluation.metrics[0]).figure(METHODS[key], synthetic=True)
         stored = BytesIO()
-        drawn.savefig(stored, dpi=110)
+        diagram.savefig(stored, dpi=110)
         stored.seek(0)
-        place.imshow(imread(stored))
-        place.set_axis_off()
+        axes.imshow(imread(stored))
+        axes.set_axis_off()
     figure.savefig(HERE / "moons_reliability.png")
 
 
 def main() -> None:
     torch.set_num_threads(1)
-    rows = results([Path(folder) for folder in sys.argv[1:]])
-    pictures(rows)
-    landscape(rows)
-    times(rows)
-    took = sum(row["seconds"] for row in rows) / 60
-    kept = [
+    rows = read_results([Path(folder) for folder in sys.argv[1:]])
+    draw_figures(rows)
+    add_landscape(rows)
+    measure_times(rows)
+    minutes = sum(row["seconds"] for row in rows) / 60
+    numeric_rows = [
         {key: value for key, value in row.items() if key in NUMBERS or key in ("seed", "synthetic")}
         for row in rows
     ]
-    compared = aggregate(kept, by=["method"])
+    compared = aggregate(numeric_rows, by=["method"])
     seeds = sorted({row["seed"] for row in rows})
     text = (
         "# Table 2.1: uncertainty on the two moons (synthetic data)\n\n"
-        f"{len(rows)} runs, {took:.0f} processor minutes: "
-        "`python -m reproduction.thesis_tables 2.1`. A seed draws data and weights; all methods with the same seed "
-        "have the same data and 5000 test points. ± is the standard deviation over seeds. Run times are measured on "
-        "one thread, in batches of 100, each model alone. Epochs, batches and learning rate were chosen such that "
-        "the two vanilla rows overfit as in the thesis. The settings of the last row were chosen on other draws of "
-        "the generator, after a first combination (5 networks, no dropout, λ = 1) missed the best rows of the table "
-        "on the test split by 0.0002 (Brier) and 0.002 (OOD entropy).\n\n"
-        f"{markdown(compared, COLUMNS, better=BETTER)}\n\n{best_possible(seeds)}\n\n"
-        f"What Figure 2.3 shows, in numbers: the test points where the generator's posterior of one class is above "
-        f"{SURE}, those where no class's is above {UNSURE}, and how many points are predicted with neither "
-        f"certainty.\n\n{markdown(compared, SEEN)}\n\n{posterior_landscape(seeds)}\n\n"
-        f"{claims(rows)}\n\n{THESIS}\n\n"
-        "![landscapes](moons_landscapes.png)\n\n![reliability](moons_reliability.png)\n\n"
+        "This page repeats Table 2.1 of the thesis. Methods of uncertainty estimation classify the generated points of "
+        "two interleaved half circles, the two moons. The table shows how accurate and how well calibrated each method "
+        "is, and whether it recognises outliers.\n\n"
+        f"The command is `python -m reproduction.thesis_tables 2.1`. It made {len(rows)} runs in {minutes:.0f} "
+        "processor minutes. The seed of a run determines its training data and its initial weights. All methods with "
+        "the same seed have the same data and the same 5000 test points. A cell holds the mean over seeds and, after "
+        "±, the standard deviation over seeds.\n\n"
+        "- **vanilla, 128** and **vanilla, 512** are one network without any method, with that many units in each "
+        "hidden layer. All other rows use networks of 512 units.\n"
+        "- **NLL** is the mean negative log-likelihood of the true class, in nats. **Brier** is the mean squared "
+        "difference between the predicted probability of class 1 and the label.\n"
+        "- **ECE** is the expected calibration error of the probability of the predicted class. **ECE of p(y = 1)** is "
+        "that of the probability of class 1, as the thesis defines it.\n"
+        "- **OOD entropy** is the mean entropy of the predictions for outliers, in nats; it is at most 0.693. "
+        "**AUROC** is the probability that an outlier has a higher entropy than a test point.\n"
+        "- **ms / sample** is the time of one prediction in a batch of 100, measured on one thread while no other "
+        "model runs. The next column is the processor time of the whole run, in seconds.\n\n"
+        "The number of epochs, the batch size and the learning rate were chosen such that the two vanilla networks "
+        "overfit as in the thesis. The settings of the last row were chosen on further data of the same generator. "
+        "Before that, a first combination (5 networks, no dropout, λ = 1) had missed the best rows of the table on the "
+        "test split by 0.0002 (Brier) and 0.002 (OOD entropy).\n\n"
+        f"{markdown(compared, COLUMNS, better=BETTER)}\n\n{posterior_scores(seeds)}\n\n"
+        "## What Figure 2.3 shows, in numbers\n\n"
+        "Figure 2.3 of the thesis shows the predicted probability p of class 1 over the plane. The next table "
+        "describes the same predictions by numbers: the mean entropy at the test points where the posterior of the "
+        f"generator is sure (one class has more than {SURE}), the mean entropy where it is not (no class has more than "
+        f"{UNSURE}), and the share of test points with 0.1 < p < 0.9. A larger share means a softer boundary between "
+        f"the classes.\n\n{markdown(compared, LANDSCAPE_COLUMNS)}\n\n{posterior_landscape(seeds)}\n\n"
+        "## Comparisons of two methods\n\n"
+        "Each row compares two methods on the same data and seeds. The difference is that of the first method minus "
+        "the second, as mean ± standard deviation over seeds. The last column counts the seeds that agree with the "
+        f"claim.\n\n{claims_table(rows)}\n\n"
+        "## Table 2.1 as printed in the thesis\n\n"
+        "The thesis generated its own two moons, so these values can be compared with ours only in their "
+        f"order.\n\n{THESIS}\n\n"
+        "## Figures\n\n"
+        "Figure 2.3: predicted class probabilities over the plane, for six methods with seed 0.\n\n"
+        "![Predicted class probabilities over the plane](moons_landscapes.png)\n\n"
+        "Figure 2.4: reliability diagrams of one network of 512 units, without and with temperature, with seed 0.\n\n"
+        "![Reliability diagrams](moons_reliability.png)\n\n"
         f"{machine('torch', 'pytorch-lightning')}\n"
     )
     write_page(__file__, text)
@@ -298,6 +353,6 @@ def main() -> None:
 if __name__ == "__main__":
     if sys.argv[1:2] == ["--draw"]:
         torch.set_num_threads(1)
-        pictures(results([Path(folder) for folder in sys.argv[2:]]))
+        draw_figures(read_results([Path(folder) for folder in sys.argv[2:]]))
     else:
         main()

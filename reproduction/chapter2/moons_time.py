@@ -1,4 +1,4 @@
-"""Measure NLL and ECE against run time on the two moons (synthetic): networks, dropout passes, temperature.
+"""Measure NLL and ECE against run time on the two moons (synthetic) for ensembles, MC dropout and temperature.
 
     python -m framework experiment=moons/ensemble uncertainty.ensemble.members=20 hydra.run.dir=outputs/time/ensemble
     python -m framework experiment=moons/ensemble_temperature uncertainty.ensemble.members=20 \\
@@ -7,7 +7,8 @@
     python -m reproduction.chapter2.moons_time outputs/time
     python -m reproduction.chapter2.moons_time --draw
 
-Writes moons_time.csv and moons_time.png beside this file; `--draw` draws moons_time.png again from moons_time.csv.
+The script writes moons_time.csv and moons_time.png beside this file. `--draw` draws moons_time.png again from
+moons_time.csv.
 """
 
 import sys
@@ -37,14 +38,14 @@ LABELS = {"nll": "negative log-likelihood (nats)", "ece": "expected calibration 
 NOTE = "Bars: standard deviation over five draws of the masks. Numbers beside points: members, or samples."
 
 
-def drawn(found: Sequence[Row]) -> None:
+def draw_figure(measurements: Sequence[Row]) -> None:
     figure = error_against_run_time(
-        found,
+        measurements,
         LABELS,
         dict.fromkeys(LABELS, "lower"),
         title="Two moons: error against run time of networks of 512-512 units",
         synthetic=True,
-        machine=str(found[0]["machine"]),
+        machine=str(measurements[0]["machine"]),
         note=NOTE,
     )
     save_figure(figure, HERE / "moons_time", True)
@@ -72,19 +73,20 @@ def main() -> None:
             seed=0,
             repeats=5 if knob == "samples" else 1,
         )
-    where = f"{machine('torch').rstrip('.')}; batches of 500, one thread"
-    found = [
-        {**row, "machine": where} for row in rows(curves, dict.fromkeys(LABELS, "lower"), synthetic=True)
+    machine_line = f"{machine('torch').rstrip('.')}; batches of 500, one thread"
+    measurements = [
+        {**row, "machine": machine_line}
+        for row in rows(curves, dict.fromkeys(LABELS, "lower"), synthetic=True)
     ]
-    write_csv(found, None, HERE / "moons_time.csv")
-    drawn(found)
-    for row in found:
+    write_csv(measurements, None, HERE / "moons_time.csv")
+    draw_figure(measurements)
+    for row in measurements:
         sys.stdout.write(f"{row['method']}, {row['value']}: NLL {row['nll']:.4f}, ECE {row['ece']:.4f}, ")
         sys.stdout.write(f"{row['milliseconds_per_sample'] * 1e3:.2f} µs\n")
 
 
 if __name__ == "__main__":
     if sys.argv[1:] == ["--draw"]:
-        drawn(read_rows(HERE / "moons_time.csv"))
+        draw_figure(read_rows(HERE / "moons_time.csv"))
     else:
         main()

@@ -3,10 +3,10 @@
     python -m reproduction.thesis_tables 3.3
     python -m reproduction.chapter3.azimuths outputs/thesis_tables/pascal3d outputs/thesis_tables/pascal3d_classes
 
-Of the models of Table 3.3, on the test images of the classes that look different from every side: is a density wide
-where it errs (thesis Figures 3.2, 3.6), is it wide for blurred images (§3.1), how often is it sure of the back
-instead of the front (Figure 3.6), does a point chosen by decision theory err less than the mode (§3.1, eq. 3.23).
-Writes azimuths.md beside this file.
+The models of Table 3.3 predict the test images of the classes that look different from every side. The script measures
+whether a density is wide where its prediction is wrong (thesis Figures 3.2, 3.6) and for blurred images (§3.1), how
+often it confidently takes the back for the front (Figure 3.6), and whether the median has a smaller error than the mode
+(§3.1, eq. 3.23). It writes azimuths.md beside this file.
 """
 
 import json
@@ -32,18 +32,18 @@ from framework.training.batches import Batches
 
 METHODS = ("fixed_kappa", "von_mises", "mixture", "cvae", "scvae")
 POINTS = 720
-"""Azimuths at which a density is evaluated: half a degree apart."""
+"""Number of azimuths at which a density is evaluated, half a degree apart."""
 CHUNK = 16
 SAMPLES = 1000
-"""Draws of which the point prediction is chosen (S of eq. 3.24)."""
+"""Number of samples from which the median is chosen (S of eq. 3.24)."""
 TURNED = math.radians(135)
-"""An error above this shows the back for the front."""
+"""Error in radians above which the back of an object is taken for its front."""
 SURE, NEAR = 0.9, math.radians(45)
-"""A density is sure where it gives SURE to NEAR of its point."""
+"""A density is sure if it puts the probability SURE within the angle NEAR (radians) of its median."""
 
 
-class Seen(NamedTuple):
-    """Of every test image: errors of the azimuth in degrees, entropy in nats, mass near the point, its own blur."""
+class ImageScores(NamedTuple):
+    """For each test image: errors of median and mode in degrees, entropy in nats, probability near the median, blur."""
 
     median_error: np.ndarray
     mode_error: np.ndarray
@@ -52,69 +52,70 @@ class Seen(NamedTuple):
     blur: np.ndarray
 
 
-Question = Callable[[Seen], float]
+Statistic = Callable[[ImageScores], float]
 
 
-def correlation(one: np.ndarray, other: np.ndarray) -> float:
-    """Spearman's; NaN where one of them does not vary, as the entropy of a concentration that is the same for all."""
-    if np.ptp(one) < 1e-6 or np.ptp(other) < 1e-6:
+def correlation(first: np.ndarray, second: np.ndarray) -> float:
+    """Return Spearman's rank correlation, or NaN if one of the two arrays is constant."""
+    if np.ptp(first) < 1e-6 or np.ptp(second) < 1e-6:
         return math.nan
-    return float(np.corrcoef(rankdata(one), rankdata(other))[0, 1])
+    return float(np.corrcoef(rankdata(first), rankdata(second))[0, 1])
 
 
-def thirds(seen: Seen) -> tuple[float, float]:
-    """Mean error of the third with the least entropy and of that with the most; NaN where all have the same."""
-    if np.ptp(seen.entropy) < 1e-6:
+def errors_of_thirds(scores: ImageScores) -> tuple[float, float]:
+    """Return the mean errors of the thirds with the lowest and the highest entropy, or NaN if all entropies are
+    equal."""
+    if np.ptp(scores.entropy) < 1e-6:
         return math.nan, math.nan
-    order = np.argsort(seen.entropy, kind="stable")
-    many = len(order) // 3
-    return float(seen.median_error[order[:many]].mean()), float(seen.median_error[order[-many:]].mean())
+    order = np.argsort(scores.entropy, kind="stable")
+    count = len(order) // 3
+    return float(scores.median_error[order[:count]].mean()), float(scores.median_error[order[-count:]].mean())
 
 
-def sure_of_the_back(seen: Seen) -> float:
-    turned = seen.median_error > math.degrees(TURNED)
-    return 100 * float((turned & (seen.near > SURE)).mean())
+def percent_sure_of_the_back(scores: ImageScores) -> float:
+    turned = scores.median_error > math.degrees(TURNED)
+    return 100 * float((turned & (scores.near > SURE)).mean())
 
 
-QUESTIONS: dict[str, Question] = {
-    "rank correlation of entropy and error": lambda seen: correlation(seen.entropy, seen.median_error),
-    "error of the surest third, °": lambda seen: thirds(seen)[0],
-    "of the least sure, °": lambda seen: thirds(seen)[1],
-    "rank correlation of entropy and blur": lambda seen: correlation(seen.entropy, seen.blur),
-    "turned round, %": lambda seen: 100 * float((seen.median_error > math.degrees(TURNED)).mean()),
-    "… and sure of it, %": sure_of_the_back,
-    "error of the mode above the median's, °": lambda seen: float(
-        (seen.mode_error - seen.median_error).mean()
+STATISTICS: dict[str, Statistic] = {
+    "rank correlation of entropy and error": lambda scores: correlation(scores.entropy, scores.median_error),
+    "error of the surest third, °": lambda scores: errors_of_thirds(scores)[0],
+    "error of the least sure third, °": lambda scores: errors_of_thirds(scores)[1],
+    "rank correlation of entropy and blur": lambda scores: correlation(scores.entropy, scores.blur),
+    "error above 135°, %": lambda scores: 100 * float((scores.median_error > math.degrees(TURNED)).mean()),
+    "confident error above 135°, %": percent_sure_of_the_back,
+    "error of the mode minus error of the median, °": lambda scores: float(
+        (scores.mode_error - scores.median_error).mean()
     ),
 }
 
 
 @torch.no_grad()
-def seen(densities: Sequence[Distribution], azimuths: Tensor, blur: Tensor) -> Seen:
-    """Of densities of the azimuth alone, batch by batch; the true ones and the blur of all images."""
-    found = [
-        _of_batch(density, angle)
-        for density, angle in zip(densities, _split(densities, azimuths), strict=True)
+def score_images(densities: Sequence[Distribution], azimuths: Tensor, blur: Tensor) -> ImageScores:
+    """Score densities of the azimuth, one density per batch, with the true azimuths and the blur of all images."""
+    columns = [
+        _score_batch(density, angle)
+        for density, angle in zip(densities, _split_by_batch(densities, azimuths), strict=True)
     ]
     median_error, mode_error, entropy, near = (
-        torch.cat(column).double().numpy() for column in zip(*found, strict=True)
+        torch.cat(column).double().numpy() for column in zip(*columns, strict=True)
     )
-    return Seen(median_error, mode_error, entropy, near, blur.double().numpy())
+    return ImageScores(median_error, mode_error, entropy, near, blur.double().numpy())
 
 
-def _split(densities: Sequence[Distribution], azimuths: Tensor) -> Sequence[Tensor]:
+def _split_by_batch(densities: Sequence[Distribution], azimuths: Tensor) -> Sequence[Tensor]:
     return azimuths.split([density.batch_shape[0] for density in densities])
 
 
-def _of_batch(density: Distribution, azimuth: Tensor) -> tuple[Tensor, ...]:
-    places = grid(POINTS, dtype=torch.float64)
-    angles = places.to(azimuth.dtype)[:, None, None].expand(-1, len(azimuth), 1)
+def _score_batch(density: Distribution, azimuth: Tensor) -> tuple[Tensor, ...]:
+    grid_angles = grid(POINTS, dtype=torch.float64)
+    angles = grid_angles.to(azimuth.dtype)[:, None, None].expand(-1, len(azimuth), 1)
     log_density = torch.cat([density.log_prob(some).double() for some in angles.split(CHUNK)])
     mass = log_density.softmax(0)
     entropy = -(mass * (mass.clamp(min=1e-300).log() - math.log(2 * math.pi / POINTS))).sum(0)
-    mode = places[log_density.argmax(0)]
+    mode = grid_angles[log_density.argmax(0)]
     point = median(density, SAMPLES).squeeze(-1).double()
-    near = (mass * (angular_distance(places[:, None], point) <= NEAR)).sum(0)
+    near = (mass * (angular_distance(grid_angles[:, None], point) <= NEAR)).sum(0)
     degrees = 180 / math.pi
     return (
         angular_distance(point, azimuth.double()) * degrees,
@@ -124,8 +125,9 @@ def _of_batch(density: Distribution, azimuth: Tensor) -> tuple[Tensor, ...]:
     )
 
 
-def of_run(run: Path, loaders: dict[str, Batches]) -> Seen | None:
-    """What one trained model sees of its class's test images; None of a class that looks alike from several sides."""
+def score_run(run: Path, loaders: dict[str, Batches]) -> ImageScores | None:
+    """Score a trained model on the test images of its class; return None if the class looks alike from several
+    sides."""
     model, description = load_with_description(run)
     category = str(description.config["data"]["category"])
     if category not in loaders:
@@ -139,55 +141,74 @@ def of_run(run: Path, loaders: dict[str, Batches]) -> Seen | None:
     with torch.inference_mode():
         densities = [marginal(model(batch["input"]), 0) for batch in batches]
         azimuths, blur = (torch.cat([batch[key] for batch in batches]) for key in ("target", "blur"))
-        return seen(densities, azimuths[:, 0], blur)
+        return score_images(densities, azimuths[:, 0], blur)
 
 
 def main() -> None:
     torch.set_num_threads(1)
     loaders: dict[str, Batches] = {}
-    found: dict[str, dict[str, list[list[float]]]] = {method: {} for method in METHODS}
+    values_by_method: dict[str, dict[str, list[list[float]]]] = {method: {} for method in METHODS}
     minutes: dict[str, dict[str, list[float]]] = {method: {} for method in METHODS}
     runs = 0
     for path in sorted(path for folder in sys.argv[1:] for path in Path(folder).glob("*/results.json")):
         row = json.loads(path.read_text(encoding="utf-8"))
         minutes[row["method"]].setdefault(row["data"], []).append(processor_seconds(record(path.parent)) / 60)
-        answers = of_run(path.parent, loaders)
-        if answers is not None:
-            values = [question(answers) for question in QUESTIONS.values()]
-            found[row["method"]].setdefault(row["data"], []).append(values)
+        scores = score_run(path.parent, loaders)
+        if scores is not None:
+            values = [question(scores) for question in STATISTICS.values()]
+            values_by_method[row["method"]].setdefault(row["data"], []).append(values)
             runs += 1
     classes = sorted(
         name.removeprefix("pascal3d ")
-        for name in set.intersection(*(set(each) for each in found.values() if each))
+        for name in set.intersection(
+            *(set(values_by_class) for values_by_class in values_by_method.values() if values_by_class)
+        )
     )
     lines = [
-        f"| method | classes | {' | '.join(QUESTIONS)} | processor minutes a run, all classes |",
-        "|---|---:|" + "---:|" * (len(QUESTIONS) + 1),
+        f"| method | classes | {' | '.join(STATISTICS)} | processor minutes per run |",
+        "|---|---:|" + "---:|" * (len(STATISTICS) + 1),
     ]
-    for method, each in found.items():
-        if each:
-            lines.append(f"| {method} | {len(each)} | {cells(each)} | {mean_of(minutes[method])} |")
+    for method, values_by_class in values_by_method.items():
+        if values_by_class:
+            lines.append(
+                f"| {method} | {len(values_by_class)} | {cells(values_by_class)} | "
+                f"{mean_over_classes(minutes[method])} |"
+            )
     text = (
         "# Do azimuth densities know their own errors? (synthetic data)\n\n"
-        "The models of [pascal3d.md](pascal3d.md) predict the test images of the classes without symmetry; a quarter "
-        "of the images is blurred. Numbers are means over classes, each the mean of its seeds, ± the standard error "
-        f"over classes; classes with every method: {', '.join(classes) or 'none'}. The median is the draw of "
-        f"{SAMPLES} with "
-        'the least expected deviation (eq. 3.24). "Turned round" is an error above 135°; "sure of it" means that nine '
-        "tenths of the probability lie within 45° of the point.\n\n" + "\n".join(lines) + "\n\n"
+        "This page measures whether predicted densities of the azimuth, the horizontal viewpoint angle, are wide where "
+        "the prediction is wrong. The models are those of [pascal3d.md](pascal3d.md). They predict the test images of "
+        "the classes that look different from every side; a quarter of these images is blurred.\n\n"
+        "A number is the mean over classes, and ± is its standard error over classes. The value of a class is the mean "
+        "over its seeds. A dash means that the concentration, and so the entropy, is the same for all images. Classes "
+        f"with every method: {', '.join(classes) or 'none'}.\n\n"
+        "- The **error** is the angle between the true azimuth and the predicted one. The predicted azimuth is the "
+        f"median: of {SAMPLES} samples of the density, the one with the least expected deviation (eq. 3.24).\n"
+        "- The **rank correlation** (Spearman) is that of the entropy of the density with the error, or with the "
+        "strength of the blur, over the test images.\n"
+        "- The **surest third** are the third of the images with the lowest entropy, the **least sure third** those "
+        "with the highest.\n"
+        "- **Error above 135°** is the share of images whose front is taken for the back. **Confident error above "
+        "135°** is the share in which, in addition, nine tenths of the probability lie within 45° of the wrong "
+        "median.\n"
+        "- **Error of the mode minus error of the median** shows what the median gains over the most likely "
+        "angle.\n"
+        "- **Processor minutes per run** are a mean over all classes of Table 3.3.\n\n"
+        + "\n".join(lines)
+        + "\n\n"
         f"{runs} runs. {machine('torch', 'pytorch-lightning')}\n"
     )
     write_page(__file__, text)
     sys.stdout.write(text)
 
 
-def cells(each: dict[str, list[list[float]]]) -> str:
-    columns = np.array([np.mean(values, axis=0) for values in each.values()]).T
+def cells(values_by_class: dict[str, list[list[float]]]) -> str:
+    columns = np.array([np.mean(values, axis=0) for values in values_by_class.values()]).T
     return " | ".join(with_error(column) for column in columns)
 
 
-def mean_of(each: dict[str, list[float]]) -> str:
-    return with_error(np.array([np.mean(values) for values in each.values()]))
+def mean_over_classes(values_by_class: dict[str, list[float]]) -> str:
+    return with_error(np.array([np.mean(values) for values in values_by_class.values()]))
 
 
 def with_error(values: np.ndarray) -> str:

@@ -2,8 +2,8 @@
 
     python -m reproduction.thesis_tables 3.1-3.2
 
-Or of sweeps that have run: `python -m reproduction.chapter3.head_pose <their folders>`. Writes head_pose.md
-beside this file.
+To evaluate sweeps that have already run: `python -m reproduction.chapter3.head_pose <folders of the sweeps>`. The
+script writes head_pose.md beside this file.
 """
 
 import json
@@ -26,17 +26,17 @@ METHODS = {
     "von_mises": "single von Mises",
     "mixture": "finite mixture",
     "cvae": "CVAE",
-    "cvae_each": "CVAE, a backbone each",
+    "cvae_each": "CVAE, three backbones",
 }
 COLUMNS = {
-    "data": "heads as of",
+    "data": "layout",
     "angle": "angle",
     "method": "method",
     "n": "seeds",
     "maad_deg": "MAAD °",
     "log_likelihood": "log-likelihood (nats)",
     "milliseconds_per_sample": "ms / image",
-    "minutes": "processor minutes a run",
+    "minutes": "processor minutes per run",
     "thesis": "thesis: MAAD °, log-likelihood (its own data)",
 }
 BETTER: Better = {"maad_deg": "lower", "log_likelihood": "higher"}
@@ -58,26 +58,27 @@ THESIS = {
     ("towncentre", "pan", "von_mises"): "22.9 ± 1.1, −0.57 ± 0.05",
     ("towncentre", "pan", "mixture"): "23.5 ± 1.1, −0.50 ± 0.04",
 }
-"""Means and standard errors over test images. The thesis's CVAE has three backbones (§3.6.1)."""
+"""MAAD and log-likelihood of the thesis with standard errors over test images; its CVAE has three backbones
+(§3.6.1)."""
 
 
-def results(folders: list[Path]) -> list[dict[str, Any]]:
+def read_results(folders: list[Path]) -> list[dict[str, Any]]:
     torch.set_num_threads(1)
     loaders: dict[str, Batches] = {}
     rows = []
     for path in (path for folder in folders for path in folder.glob("*/results.json")):
-        found = json.loads(path.read_text(encoding="utf-8"))
+        numbers = json.loads(path.read_text(encoding="utf-8"))
         job = record(path.parent)
-        data, _, method = found["experiment"].partition("/")
+        data, _, method = numbers["experiment"].partition("/")
         if "density_head.backbones=each" in job["overrides"]:
             method += "_each"
         angles = [word for word in job["overrides"] if word.startswith("data.angles=")]
         angle = angles[0].partition("=")[2].strip("[]") if angles else "pan"
-        taken = {
+        costs = {
             "milliseconds_per_sample": milliseconds_per_sample(path.parent, loaders),
             "minutes": processor_seconds(job) / 60,
         }
-        rows.append(found | {"data": data, "angle": angle, "method": method} | taken)
+        rows.append(numbers | {"data": data, "angle": angle, "method": method} | costs)
     order, places = list(METHODS), [key[:2] for key in THESIS]
     return sorted(
         rows,
@@ -85,22 +86,22 @@ def results(folders: list[Path]) -> list[dict[str, Any]]:
     )
 
 
-def differences(rows: list[dict[str, Any]]) -> str:
-    """Of each method and the one with fixed κ on the same data and seed."""
+def difference_table(rows: list[dict[str, Any]]) -> str:
+    """Return a table of the differences between each method and fixed κ on the same data and seed."""
     lines = [
-        "| data, angle | method | log-likelihood above fixed κ's, nats | MAAD below fixed κ's, ° | seeds |",
+        "| layout, angle | method | gain in log-likelihood, nats | decrease of MAAD, ° | seeds |",
         "|---|---|---:|---:|---:|",
     ]
     for (data, angle), group in groupby(rows, key=lambda row: (row["data"], row["angle"])):
         by_method: dict[str, dict[int, dict[str, Any]]] = {}
         for row in group:
             by_method.setdefault(row["method"], {})[row["seed"]] = row
-        rival = by_method.pop("fixed_kappa", {})
-        for method, found in by_method.items():
-            seeds = sorted(found.keys() & rival.keys())
+        baseline = by_method.pop("fixed_kappa", {})
+        for method, rows_by_seed in by_method.items():
+            seeds = sorted(rows_by_seed.keys() & baseline.keys())
             cells = []
             for key, sign in (("log_likelihood", 1), ("maad_deg", -1)):
-                gaps = np.array([sign * (found[seed][key] - rival[seed][key]) for seed in seeds])
+                gaps = np.array([sign * (rows_by_seed[seed][key] - baseline[seed][key]) for seed in seeds])
                 if len(gaps) > 1:
                     cells.append(f"{gaps.mean():+.2f} ± {gaps.std(ddof=1) / len(gaps) ** 0.5:.2f}")
                 else:
@@ -111,7 +112,7 @@ def differences(rows: list[dict[str, Any]]) -> str:
 
 def main() -> None:
     folders = [Path(folder) for folder in sys.argv[1:]]
-    rows = results(folders)
+    rows = read_results(folders)
     size, epochs, batch, precision = settings(
         [path.parent for folder in folders for path in folder.glob("*/results.json")],
         *("data.image_size", "trainer.max_epochs", "batch_size", "trainer.precision"),
@@ -125,16 +126,23 @@ def main() -> None:
         tables.append(markdown(compared, COLUMNS, better=BETTER))
     text = (
         "# Tables 3.1 and 3.2: head poses (synthetic data)\n\n"
-        "Generated heads in the layouts of IDIAP, CAVIAR and TownCentre; a model for each angle: images of "
-        f"{size} pixels, {epochs} epochs in batches of {batch}, {precision}. "
-        "± is the standard deviation over seeds, or the standard error over test images where there is one seed; "
-        "milliseconds are of one thread. The thesis measures on the real data sets, with standard errors over test "
-        "images: orderings compare, absolute numbers do not. Command: `python -m reproduction.thesis_tables "
+        "This page repeats Tables 3.1 and 3.2 of the thesis: networks predict the angles of heads from images. The "
+        "images are generated in the layouts of the data sets IDIAP, CAVIAR and TownCentre. The tables compare density "
+        "heads with a fixed concentration κ, with a predicted κ, and with several modes.\n\n"
+        f"One model is trained for each angle, on images of {size} pixels, for {epochs} epochs in batches of {batch}, "
+        f"with precision {precision}. ± is the standard deviation over seeds, or the standard error over test images "
+        "if there is one seed. MAAD is the mean absolute angular deviation of the point prediction. The time of a "
+        "prediction in milliseconds is measured on one thread. The column of the thesis gives its MAAD and "
+        "log-likelihood with standard errors over the test images of the real data sets. The order of the methods can "
+        "be compared with ours; absolute numbers cannot. The command is `python -m reproduction.thesis_tables "
         "3.1-3.2`.\n\n"
         f"{chr(10).join(tables)}\n"
-        "## Against one concentration\n\n"
-        "Differences on the same data and seed, ± standard error over seeds where there are several.\n\n"
-        f"{differences(rows)}\n\n{machine('torch', 'pytorch-lightning')}\n"
+        "## Gain over one fixed concentration\n\n"
+        "Each row is the mean difference between a method and the fixed concentration κ, trained on the same data with "
+        'the same seed. Positive numbers mean that the method is better. ± is the standard error over seeds. "CVAE, '
+        'three backbones" has one convolutional backbone for each of its three networks, as in the thesis; the other '
+        "CVAE shares one.\n\n"
+        f"{difference_table(rows)}\n\n{machine('torch', 'pytorch-lightning')}\n"
     )
     write_page(HERE, text)
     sys.stdout.write(text)

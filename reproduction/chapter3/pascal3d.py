@@ -2,10 +2,10 @@
 
     python -m reproduction.thesis_tables 3.3
 
-Or of sweeps that have run: `python -m reproduction.chapter3.pascal3d <their folders>`.
+To evaluate sweeps that have already run: `python -m reproduction.chapter3.pascal3d <folders of the sweeps>`.
 
-The run time of one prediction is measured again by this script, every model alone on the machine: in a sweep the jobs
-disturb each other. Writes pascal3d.md beside this file.
+The script measures the run time of a prediction again with one model at a time, because the jobs of a sweep disturb
+each other. It writes pascal3d.md beside this file.
 """
 
 import json
@@ -30,58 +30,64 @@ COLUMNS = {
     "maad_deg": "MAAD °",
     "acc_pi_6": "Acc π/6",
     "mederr_deg": "MedErr °",
-    "azimuth_entropy": "azimuth entropy",
+    "azimuth_entropy": "azimuth entropy (nats)",
     "mode_mass_min": "least mode mass",
-    "uniform_gap": "gap to uniform",
+    "uniform_gap": "gap to uniform (nats)",
     "milliseconds_per_sample": "ms / image",
     "parameters": "parameters",
 }
 
 PAIRS = (("scvae", "von_mises"),)
-"""Compared too, class by class."""
+"""Pairs of methods that are also compared with each other, class by class."""
 THESIS = {
     "fixed_kappa": "−0.07 ± 0.15, 0.81, 12.6",
     "von_mises": "1.17 ± 0.07, 0.84, 10.7",
     "scvae": "1.15 ± 0.07, 0.84, 12.2",
 }
-"""Table 3.3's last column, of its own data."""
+"""Last column of Table 3.3 in the thesis, on real PASCAL3D+."""
 
 
-def over_classes(rows: list[dict[str, Any]]) -> str:
-    """Of each method that was trained on every class: the mean of the classes, each the mean of its seeds, and its
-    standard error over classes of the difference from the fixed concentration."""
+def class_mean_section(rows: list[dict[str, Any]]) -> str:
+    """Return a table of the methods that were trained on every class: means over classes, and differences from fixed
+    κ."""
     classes = sorted({row["data"] for row in rows})
-    found: dict[str, np.ndarray] = {}
+    values_by_method: dict[str, np.ndarray] = {}
     for method in METHODS:
-        own = [[row for row in rows if (row["method"], row["data"]) == (method, name)] for name in classes]
-        if all(own):
+        rows_by_class = [
+            [row for row in rows if (row["method"], row["data"]) == (method, name)] for name in classes
+        ]
+        if all(rows_by_class):
             keys = ("log_likelihood", "acc_pi_6", "mederr_deg")
-            found[method] = np.array([[np.mean([row[key] for row in some]) for key in keys] for some in own])
+            values_by_method[method] = np.array(
+                [[np.mean([row[key] for row in class_rows]) for key in keys] for class_rows in rows_by_class]
+            )
     lines = [
         f"## Mean of {len(classes)} classes",
         "",
-        "In brackets the difference from fixed_kappa, class by class, ± its standard error over classes.",
+        "This table holds the methods that were trained on every class. The numbers are means over classes. Brackets "
+        "hold the mean difference from `fixed_kappa` on the same class, ± its standard error over classes.",
         "",
-        "| method | log-likelihood (nats) | Acc π/6 | MedErr ° | thesis: the same of its own data |",
+        "| method | log-likelihood (nats) | Acc π/6 | MedErr ° | thesis, real PASCAL3D+: the same three columns |",
         "|---|---:|---:|---:|---|",
     ]
-    for method, values in found.items():
+    for method, values in values_by_method.items():
         cells = []
-        for place, figures in enumerate((2, 3, 1)):
-            cell = f"{values[:, place].mean():.{figures}f}"
-            if method != "fixed_kappa" and "fixed_kappa" in found:
-                gap = values[:, place] - found["fixed_kappa"][:, place]
+        for column, decimals in enumerate((2, 3, 1)):
+            cell = f"{values[:, column].mean():.{decimals}f}"
+            if method != "fixed_kappa" and "fixed_kappa" in values_by_method:
+                gap = values[:, column] - values_by_method["fixed_kappa"][:, column]
                 error = gap.std(ddof=1) / len(gap) ** 0.5
-                cell += f" ({gap.mean():+.{figures}f} ± {error:.{figures}f})"
+                cell += f" ({gap.mean():+.{decimals}f} ± {error:.{decimals}f})"
             cells.append(cell)
         lines.append(f"| {method} | {' | '.join(cells)} | {THESIS.get(method, '–')} |")
-    for one, other in PAIRS:
-        if one in found and other in found:
-            gap = (found[one] - found[other])[:, 0]
+    for first, second in PAIRS:
+        if first in values_by_method and second in values_by_method:
+            gap = (values_by_method[first] - values_by_method[second])[:, 0]
             error = gap.std(ddof=1) / len(gap) ** 0.5
             lines += [
                 "",
-                f"{one} − {other}: {gap.mean():+.2f} ± {error:.2f} nats, above 0 in {(gap > 0).sum()} classes.",
+                f"The log-likelihood of `{first}` minus that of `{second}` is {gap.mean():+.2f} ± {error:.2f} nats; it "
+                f"is above 0 in {(gap > 0).sum()} classes.",
             ]
     return "\n".join(lines)
 
@@ -107,13 +113,21 @@ def main() -> None:
     )
     text = (
         "# Table 3.3: five density heads on synthetic PASCAL3D+\n\n"
-        f"Generated objects in crops of {size} pixels, `biternion_vgg`, {epochs} epochs, batches of {batch}; the "
-        "commands are in `pascal3d.py`. ± is the standard deviation over seeds, or the standard error over the test "
-        "set where there is one seed. `diningtable` looks the same after a rotation by 180°: its column is the least "
-        "probability that a density gives to one of the two true azimuths, within 45°. `bottle` looks the same from "
-        "everywhere: its column is the gap between its azimuth entropy and log 2π.\n\n"
-        f"{markdown(compared, COLUMNS)}\n\n{over_classes(rows)}\n\n"
-        f"{len(rows)} runs, {threads} each. {machine('torch', 'pytorch-lightning')}\n"
+        "This page repeats Table 3.3 of the thesis: networks predict the viewpoint of an object, that is its azimuth, "
+        "elevation and tilt. The images are generated in the layout of PASCAL3D+. Five density heads are compared on "
+        "the same encoder.\n\n"
+        f"The images are crops of {size} pixels. The encoder is `biternion_vgg`, trained for {epochs} epochs in "
+        f"batches of {batch}. The commands are at the head of `pascal3d.py`. ± is the standard deviation over seeds, "
+        "or the standard error over the test set if there is one seed.\n\n"
+        "- **MAAD** is the mean absolute angular deviation. **Acc π/6** is the share of predicted rotations less than "
+        "30° from the true one. **MedErr** is the median angle between them.\n"
+        "- **Azimuth entropy** is the mean entropy of the density of the azimuth, in nats.\n"
+        "- **Least mode mass** is for `diningtable`, which looks the same after a rotation by 180° and so has two true "
+        "azimuths. It is the smaller of the two probabilities within 45° of a true azimuth; 0.5 is best.\n"
+        "- **Gap to uniform** is for `bottle`, which looks the same from every side. It is the difference between "
+        "log 2π, the entropy of the uniform density, and the azimuth entropy; 0 is best.\n\n"
+        f"{markdown(compared, COLUMNS)}\n\n{class_mean_section(rows)}\n\n"
+        f"The table summarises {len(rows)} runs on {threads} each. {machine('torch', 'pytorch-lightning')}\n"
     )
     write_page(__file__, text)
     sys.stdout.write(text)

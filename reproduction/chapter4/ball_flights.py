@@ -1,11 +1,12 @@
 """Compare physics, TVAE, LSTM and hybrid on simulated and recorded ball flights (thesis Figure 4.3).
 
-    python -m reproduction.chapter4.ball_flights <folder of the laboratory's *.mat>
+    python -m reproduction.chapter4.ball_flights <folder of the laboratory's *.mat files>
     python -m reproduction.chapter4.ball_flights --draw
 
-Trains what is not yet in outputs/ball_flights, some ten minutes a method on one core, and writes ball_flights.md, .csv,
-.png and ball_flights_bundle.png beside this file; `--draw` draws ball_flights.png again from the table. On recorded
-flights networks start from the weights of the simulated ones; flights, not windows, are split, by the seed.
+The script trains the models that are not yet in outputs/ball_flights, which takes about ten minutes per method on one
+core. It writes ball_flights.md, .csv, .png and ball_flights_bundle.png beside this file. `--draw` draws
+ball_flights.png again from the table. For recorded flights the networks start from the weights that were trained on
+simulated flights. The split is by flight, not by window, and depends on the seed.
 """
 
 import os
@@ -41,24 +42,25 @@ RUNS = ROOT / "outputs" / "ball_flights"
 METHODS = {"ballistic": "physics", "tvae": "TVAE", "lstm": "LSTM", "hybrid": "hybrid"}
 SEEDS = (0, 1, 2, 3, 4)
 SIMULATED = {"flights": 4000, "stride": 2}
-BRIEF = (
+FINE_TUNING = (
     "optimizer.learning_rate=0.001",
     "optimizer.warmup_steps=20",
     "trainer.check_val_every_n_epoch=10",
 )
 EPOCHS = {"tvae": 600, "lstm": 150, "hybrid": 150}
-"""Three steps each; the TVAE's validation loss falls for longer."""
-MOST = 1000
-"""Test windows that are looked at."""
+"""Epochs of three steps on recorded flights; the validation loss of the TVAE falls for longer."""
+MOST_WINDOWS = 1000
+"""Largest number of windows of a split that are evaluated."""
 BUNDLES = (0, 3, 5)
-"""Of the windows that `FlightError` keeps for its figure, those drawn."""
-AT = (1, 5, 10, 20, 35)
-"""Frames of the table."""
+"""Numbers of the windows that are drawn, among those that `FlightError` keeps for its figure."""
+TABLE_FRAMES = (1, 5, 10, 20, 35)
+"""Predicted frames, 16 ms apart, that have a column in the table."""
 Model = Any
 
 
-class Measured(NamedTuple):
-    """Mean error at each time (cm), `FlightError`'s numbers, and coverage of 90 % intervals before and after."""
+class FlightErrors(NamedTuple):
+    """Results of a method: mean error at each frame (cm), results of `FlightError`, and coverage of the 90 % intervals
+    before and after calibration."""
 
     growth: np.ndarray
     numbers: dict[str, float]
@@ -67,136 +69,146 @@ class Measured(NamedTuple):
     metric: FlightError
 
 
-def trained(method: str, root: str | None, seed: int) -> Path:
-    """The folder of a run, which is made unless it is there."""
+def train(method: str, root: str | None, seed: int) -> Path:
+    """Return the folder of a run; train it first if the folder holds no results."""
     folder = RUNS / (f"{method}" if root is None else f"{method}_recorded_{seed}")
     if not (folder / "results.json").exists():
         further = [f"seed={seed}"]
         if root is not None:
             further += [f"data.root={root}", f"data.data_seed={seed}"]
             if method != "ballistic":
-                further += [f"checkpoint={RUNS / method}", f"trainer.max_epochs={EPOCHS[method]}", *BRIEF]
+                further += [
+                    f"checkpoint={RUNS / method}",
+                    f"trainer.max_epochs={EPOCHS[method]}",
+                    *FINE_TUNING,
+                ]
         command = [sys.executable, "-m", "framework", f"experiment=table_tennis/{method}", "threads=1"]
         command += ["logger=none", "pictures=false", f"hydra.run.dir={folder}", *further]
         carry_out(command)
     return folder
 
 
-def split_of(data: Data, name: str) -> dict[str, torch.Tensor]:
-    """Evenly chosen windows."""
+def select_windows(data: Data, name: str) -> dict[str, torch.Tensor]:
+    """Return at most `MOST_WINDOWS` windows of a split, evenly spaced."""
     fields = getattr(data.splits(), name).fields
-    rows = torch.linspace(0, len(fields["input"]) - 1, min(MOST, len(fields["input"]))).round().long()
+    rows = torch.linspace(0, len(fields["input"]) - 1, min(MOST_WINDOWS, len(fields["input"]))).round().long()
     return {key: value[rows] for key, value in fields.items()}
 
 
 @torch.no_grad()
-def ranks(model: Model, batch: dict[str, torch.Tensor]) -> tuple[Prediction, torch.Tensor]:
-    """The prediction, and the share of draws below each recorded coordinate, (window, number)."""
+def draw_ranks(model: Model, batch: dict[str, torch.Tensor]) -> tuple[Prediction, torch.Tensor]:
+    """Return the prediction, and the share of samples below each recorded coordinate, shape (window, coordinate)."""
     density = model(batch["input"])
     prediction = Prediction(density, batch, samples=200)
-    drawn = density.sample((DRAWS,))
-    return prediction, (drawn < batch["target"]).sum(0) / (DRAWS + 1)
+    draws = density.sample((DRAWS,))
+    return prediction, (draws < batch["target"]).sum(0) / (DRAWS + 1)
 
 
-def measured(model: Model, data: Data) -> Measured:
-    """On the test split; intervals are calibrated on the validation split, for each coordinate and time by itself.
+def evaluate_flights(model: Model, data: Data) -> FlightErrors:
+    """Evaluate a model on the test split, with intervals that are calibrated on the validation split.
 
-    The middle m of the draws holds 90 % of the validation windows' truths (distributional conformal prediction:
-    Chernozhukov, Wüthrich & Zhu 2021), and so of the test's as far as windows are exchangeable.
+    For each coordinate and frame, the calibrated interval is the middle share of the samples that holds the true value
+    of 90 % of the validation windows (distributional conformal prediction: Chernozhukov, Wüthrich & Zhu 2021). It has
+    the same coverage on the test split if windows are exchangeable.
     """
     torch.manual_seed(0)
     metric = FlightError(data.target)
-    _, held = ranks(model, split_of(data, "validation"))
-    prediction, found = ranks(model, split_of(data, "test"))
+    _, validation_ranks = draw_ranks(model, select_windows(data, "validation"))
+    prediction, test_ranks = draw_ranks(model, select_windows(data, "test"))
     metric.update(prediction)
-    off = (held - 0.5).abs()
-    rank = min(len(off), int(np.ceil(0.9 * (len(off) + 1)))) - 1
-    reach = off.sort(0).values[rank]
-    after = float(((found - 0.5).abs() <= reach).double().mean())
+    deviation = (validation_ranks - 0.5).abs()
+    rank = min(len(deviation), int(np.ceil(0.9 * (len(deviation) + 1)))) - 1
+    half_width = deviation.sort(0).values[rank]
+    after = float(((test_ranks - 0.5).abs() <= half_width).double().mean())
     numbers = {key: float(value) for key, value in metric.compute().items()}
-    return Measured(metric.growth.numpy(), numbers, numbers["interval_90"], after, metric)
+    return FlightErrors(metric.growth.numpy(), numbers, numbers["interval_90"], after, metric)
 
 
-def latency(folder: Path, data: Data) -> str:
-    """Median ms of one prediction with 30 draws in frozen form and in torch; the largest difference of the two."""
-    model, form = framework.load(folder), framework.freeze(folder)
-    inputs = split_of(data, "test")["input"]
+def measure_latency(folder: Path, data: Data) -> str:
+    """Return table cells: median ms of one prediction with 30 samples, frozen and in torch, and their largest
+    difference."""
+    model, frozen = framework.load(folder), framework.freeze(folder)
+    inputs = select_windows(data, "test")["input"]
     extreme = torch.cat(
         [inputs[:20], 1e3 * torch.randn(20, inputs.shape[1]), torch.zeros(2, inputs.shape[1])]
     )
     points = []
-    for asked in (form.density, model):
+    for predictor in (frozen.density, model):
         torch.manual_seed(0)
         with torch.no_grad():
-            points.append(median(asked(extreme), 30))
-    apart = float(((points[0] - points[1]).abs() / (1 + points[1].abs())).max())
-    one = inputs[:1]
-    taken = {}
-    for name, asked in {"torch": model, "frozen": form.density}.items():
+            points.append(median(predictor(extreme), 30))
+    difference = float(((points[0] - points[1]).abs() / (1 + points[1].abs())).max())
+    first_input = inputs[:1]
+    medians = {}
+    for name, predictor in {"torch": model, "frozen": frozen.density}.items():
         times = []
         for _ in range(60):
             began = time.perf_counter()
             with torch.no_grad():
-                asked(one).sample((30,))
+                predictor(first_input).sample((30,))
             times.append(1e3 * (time.perf_counter() - began))
-        taken[name] = statistics.median(times[10:])
-    return f"{taken['frozen']:.2f} | {taken['torch']:.2f} | {apart:.0e}"
+        medians[name] = statistics.median(times[10:])
+    return f"{medians['frozen']:.2f} | {medians['torch']:.2f} | {difference:.0e}"
 
 
-def prepared(root: str | None, seed: int = 0) -> Data:
+def prepare_data(root: str | None, seed: int = 0) -> Data:
     changes = SIMULATED if root is None else {"root": root, "stride": 2, "data_seed": seed}
     data = build("data", resolve("data", {"name": "table_tennis", **changes}))
     data.prepare()
     return data
 
 
-def remembered(data: Data) -> np.ndarray:
-    """Mean error at each time, cm, of the mean future of the five training windows that are most alike: where the ball
-    was last, and its last frames from there."""
+def nearest_window_errors(data: Data) -> np.ndarray:
+    """Return the mean error in cm at each frame of the mean future of the five nearest training windows.
+
+    Windows are compared by the last position of the ball and by the eight last positions relative to it.
+    """
 
     def alike(fields: dict[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
         frames = fields["input"].unflatten(1, (-1, len(PARTS)))
-        last = frames[:, -1:, 1:4]
-        path = torch.where(frames[:, -8:, 4:] > 0.5, frames[:, -8:, 1:4] - last, 0.0)
-        return last, torch.cat([last.flatten(1), 3 * path.flatten(1)], 1)
+        train_last = frames[:, -1:, 1:4]
+        path = torch.where(frames[:, -8:, 4:] > 0.5, frames[:, -8:, 1:4] - train_last, 0.0)
+        return train_last, torch.cat([train_last.flatten(1), 3 * path.flatten(1)], 1)
 
-    known, asked = (getattr(data.splits(), name).fields for name in ("train", "test"))
-    (last, place), (now, wanted) = alike(known), alike(asked)
-    nearest = torch.cdist(wanted, place).topk(5, largest=False).indices
-    ahead = known["target"].unflatten(1, (-1, 3)) - last
-    off = now + ahead[nearest].mean(1) - asked["target"].unflatten(1, (-1, 3))
-    return 100 * off.norm(dim=-1).mean(0).numpy()
+    train_fields, test_fields = (getattr(data.splits(), name).fields for name in ("train", "test"))
+    (train_last, train_features), (test_last, test_features) = alike(train_fields), alike(test_fields)
+    nearest = torch.cdist(test_features, train_features).topk(5, largest=False).indices
+    ahead = train_fields["target"].unflatten(1, (-1, 3)) - train_last
+    error = test_last + ahead[nearest].mean(1) - test_fields["target"].unflatten(1, (-1, 3))
+    return 100 * error.norm(dim=-1).mean(0).numpy()
 
 
-def bouncing(data: Data) -> float:
-    """Share of the test windows whose future holds a bounce: a lowest point between two frames."""
+def bounce_share(data: Data) -> float:
+    """Return the share of test windows whose future has a bounce, which is a local minimum of the height."""
     rise = getattr(data.splits(), "test").fields["target"].unflatten(1, (-1, 3))[..., 2].diff(dim=1)  # noqa: B009
     return float(((rise[:, :-1] < 0) & (rise[:, 1:] > 0)).any(1).double().mean())
 
 
-def table(found: dict[str, list[Measured]]) -> list[str]:
-    moments = " | ".join(f"{16 * frame} ms" for frame in AT)
+def error_table(results: dict[str, list[FlightErrors]]) -> list[str]:
+    moments = " | ".join(f"error at {16 * frame} ms, cm" for frame in TABLE_FRAMES)
     lines = [
-        f"| method | {moments} | mean | 90 % before | after | landing CRPS cm | landing in 90 % |",
-        "|---|" + "---|" * (len(AT) + 5),
+        f"| method | {moments} | mean error, cm | coverage before, % | coverage after, % | landing CRPS, cm | "
+        "landing coverage, % |",
+        "|---|" + "---|" * (len(TABLE_FRAMES) + 5),
     ]
-    for method, several in found.items():
-        growth = np.mean([one.growth for one in several], 0)
-        numbers = {key: np.nanmean([one.numbers[key] for one in several]) for key in several[0].numbers}
-        cells = [f"{growth[frame - 1]:.2f}" for frame in AT] + [f"{growth.mean():.2f}"]
+    for method, several in results.items():
+        growth = np.mean([result.growth for result in several], 0)
+        numbers = {key: np.nanmean([result.numbers[key] for result in several]) for key in several[0].numbers}
+        cells = [f"{growth[frame - 1]:.2f}" for frame in TABLE_FRAMES] + [f"{growth.mean():.2f}"]
         cells += [
-            f"{100 * np.mean([getattr(one, key) for one in several]):.1f}" for key in ("before", "after")
+            f"{100 * np.mean([getattr(result, key) for result in several]):.1f}"
+            for key in ("before", "after")
         ]
         cells += [f"{numbers['landing_crps_cm']:.2f}", f"{100 * numbers['landing_cover_90']:.1f}"]
         lines.append(f"| {METHODS[method]} | " + " | ".join(cells) + " |")
     return lines
 
 
-def curves(flights: str, found: dict[str, list[Measured]]) -> Iterator[dict[str, object]]:
-    """Rows of the table: each method's and seed's mean error at each time."""
-    for method, several in found.items():
-        for seed, one in zip(SEEDS, several, strict=False):
-            for frame, error in enumerate(one.growth.tolist(), 1):
+def error_rows(flights: str, results: dict[str, list[FlightErrors]]) -> Iterator[dict[str, object]]:
+    """Yield the rows of the CSV file: the mean error of each method and seed at each frame."""
+    for method, several in results.items():
+        for seed, result in zip(SEEDS, several, strict=False):
+            for frame, error in enumerate(result.growth.tolist(), 1):
                 yield {
                     "flights": flights,
                     "method": METHODS[method],
@@ -206,7 +218,7 @@ def curves(flights: str, found: dict[str, list[Measured]]) -> Iterator[dict[str,
                 }
 
 
-def drawn(rows: Sequence[Row]) -> None:
+def draw_errors(rows: Sequence[Row]) -> None:
     figure = titled_figure((10, 4.6), "Error of predicted flights against time into the future", False)
     flights = list(dict.fromkeys(str(row["flights"]) for row in rows))
     panels = figure.subplots(1, len(flights), squeeze=False)[0]
@@ -243,14 +255,14 @@ def drawn(rows: Sequence[Row]) -> None:
     save_figure(figure, HERE.with_suffix(""), True)
 
 
-def bundles(found: dict[str, Measured]) -> None:
-    """The same windows by each method, in space, and where they land, in the same colours."""
+def draw_bundles(results: dict[str, FlightErrors]) -> None:
+    """Draw the same windows for each method: sampled flights in space, and landing places in the same colours."""
     title = "30 drawn flights of three windows, and where all draws come down"
-    figure = titled_figure((4 * len(found), 7.6), title, True)
+    figure = titled_figure((4 * len(results), 7.6), title, True)
     first = None
-    for place, (method, one) in enumerate(found.items(), 1):
-        space: Any = figure.add_subplot(2, len(found), place, projection="3d")
-        shown: list[ShownFlight] = [one.metric.shown[number] for number in BUNDLES]
+    for place, (method, result) in enumerate(results.items(), 1):
+        space: Any = figure.add_subplot(2, len(results), place, projection="3d")
+        shown: list[ShownFlight] = [result.metric.shown[number] for number in BUNDLES]
         for flight, color in zip(shown, COLOURS, strict=False):
             draw_flight(space, flight, color)
         space.set(xlabel="x (m)", ylabel="y (m)", zlabel="z (m)")
@@ -258,101 +270,127 @@ def bundles(found: dict[str, Measured]) -> None:
         space.set(xlim=(-0.2, 1.0), ylim=(-4, 0.2), zlim=(-1.1, -0.2), xticks=[0, 0.8], yticks=[-3, -1])
         space.view_init(elev=18, azim=-35)
         space.set_title(f"{METHODS[method]}: seen (dots), true (black), drawn (thin)", fontsize=9)
-        axes = figure.add_subplot(2, len(found), len(found) + place, sharex=first, sharey=first)
+        axes = figure.add_subplot(2, len(results), len(results) + place, sharex=first, sharey=first)
         first = first or axes
-        draw_landing_places(axes, shown, one.metric.height)
+        draw_landing_places(axes, shown, result.metric.height)
         axes.set_aspect("equal", adjustable="box")
     figure.savefig(HERE.with_name("ball_flights_bundle.png"), dpi=110)
 
 
 def main(root: str | None) -> None:
     torch.set_num_threads(1)
-    data = prepared(None)
-    simulated = {method: [measured(framework.load(trained(method, None, 0)), data)] for method in METHODS}
-    recorded: dict[str, list[Measured]] = {}
-    alike = ""
+    data = prepare_data(None)
+    simulated = {
+        method: [evaluate_flights(framework.load(train(method, None, 0)), data)] for method in METHODS
+    }
+    recorded: dict[str, list[FlightErrors]] = {}
+    nearest_text = ""
     if root is not None:
-        sets = [prepared(root, seed) for seed in SEEDS]
-        growth = np.mean([remembered(one) for one in sets], 0)
-        alike = (
-            f"{100 * np.mean([bouncing(one) for one in sets]):.0f} % of the test windows have a bounce ahead, "
-            f"{100 * bouncing(data):.0f} % of the simulated ones. The flights are alike: the mean future of the five "
-            "training windows that are nearest is "
-            + ", ".join(f"{growth[frame - 1]:.1f} cm off at {16 * frame} ms" for frame in AT)
-            + ". A network that reads places can remember them; physics, and what is told relative to a parabola, must "
-            "find where each ball bounces, and how, from frames before it."
+        datasets = [prepare_data(root, seed) for seed in SEEDS]
+        growth = np.mean([nearest_window_errors(dataset) for dataset in datasets], 0)
+        nearest_text = (
+            f"A bounce lies ahead in {100 * np.mean([bounce_share(dataset) for dataset in datasets]):.0f} % of the "
+            f"test windows, and in {100 * bounce_share(data):.0f} % of the simulated ones. The recorded flights are "
+            "similar to each other. This is shown by a simple prediction, the mean future of the five training windows "
+            "nearest to a test window: its error is "
+            + ", ".join(f"{growth[frame - 1]:.1f} cm at {16 * frame} ms" for frame in TABLE_FRAMES)
+            + ". A network that reads positions can memorise such flights. The physical model and the methods that "
+            "predict relative to a parabola must infer from the observed frames where and how each ball bounces."
         )
         recorded = {
             method: [
-                measured(framework.load(trained(method, root, seed)), one)
-                for seed, one in zip(SEEDS, sets, strict=True)
+                evaluate_flights(framework.load(train(method, root, seed)), dataset)
+                for seed, dataset in zip(SEEDS, datasets, strict=True)
             ]
             for method in METHODS
         }
-    latencies = [f"| {METHODS[method]} | {latency(trained(method, None, 0), data)} |" for method in METHODS]
-    write(simulated, recorded, latencies, alike)
+    latencies = [
+        f"| {METHODS[method]} | {measure_latency(train(method, None, 0), data)} |" for method in METHODS
+    ]
+    write_results(simulated, recorded, latencies, nearest_text)
 
 
-def write(
-    simulated: dict[str, list[Measured]],
-    recorded: dict[str, list[Measured]],
+def write_results(
+    simulated: dict[str, list[FlightErrors]],
+    recorded: dict[str, list[FlightErrors]],
     latencies: list[str],
-    alike: str,
+    nearest_text: str,
 ) -> None:
-    """The page and both figures."""
+    """Write the page, the CSV file and both figures."""
     text = [
         "# Predicted ball flights: error against time", "",
+        "This page repeats Figure 4.3 of the thesis: four methods observe a table tennis ball for some frames and "
+        "predict its further flight. They are a physical model, a trajectory variational autoencoder (TVAE), a "
+        "recurrent network (LSTM) and a hybrid of physics and network. The flights are either simulated or recorded "
+        "with the cameras of "
+        "a laboratory.", "",
         "![Error against time](ball_flights.png)", "",
-        "The tables show the mean distance (cm) between the point prediction and the ball at several times into the "
-        "future; the share (%) of recorded coordinates within 90 % intervals, before and after calibration on the "
-        "validation windows; the continuous ranked probability score (CRPS) of the landing place; and the share (%) of "
-        "true landing places within the ellipse that holds 90 %.", "",
-        f"## Simulated flights (synthetic): 4,000, one seed, {MOST:,} test windows", "", *table(simulated), "",
-        "The truth is the flight without noise. Physics is the model that simulated them, its constants found from "
-        "training windows. The TVAE knows no physics; it is furthest behind where the ball has just bounced.", "",
-        f"TVAE by physics: {ratios(simulated, 'tvae')}.", "",
-        f"Hybrid by physics: {ratios(simulated, 'hybrid')}.", "",
-        "![Drawn flights](ball_flights_bundle.png)", "",
-        "A flight begins where the ball was seen last, and may come down before the first predicted frame. Learned "
-        "densities put fewer than 90 % of the true places in their ellipse.", "",
+        "- **Error at 16 ms** and so on is the mean distance in cm between the point prediction and the ball, so many "
+        "milliseconds into the future. **Mean error** averages over all predicted frames.",
+        "- **Coverage before** and **coverage after** are the share in % of recorded coordinates that lie within the "
+        "predicted 90 % intervals, before and after the intervals are calibrated on the validation windows. 90 is "
+        "right.",
+        "- **Landing CRPS** is the continuous ranked probability score of the landing place in cm; lower is better.",
+        "- **Landing coverage** is the share in % of true landing places within the ellipse that holds 90 % of the "
+        "sampled ones.", "",
+        "## Simulated flights (synthetic)", "",
+        "The data are 4,000 simulated flights. Each method is trained with one seed and tested on "
+        f"{MOST_WINDOWS:,} windows.", "",
+        *error_table(simulated), "",
+        "The error is measured against the simulated flight without noise. The physical model has the form of the "
+        "simulator, and its constants are estimated from the training windows. The TVAE contains no physics; it "
+        "falls behind the physical model most where the ball has just bounced.", "",
+        f"The error of the TVAE divided by that of physics is {error_ratios(simulated, 'tvae')}.", "",
+        f"The error of the hybrid divided by that of physics is {error_ratios(simulated, 'hybrid')}.", "",
+        "The next figure shows 30 sampled flights for each of three windows, and the places where all sampled flights "
+        "land.", "",
+        "![Sampled flights and landing places](ball_flights_bundle.png)", "",
+        "A flight begins at the last observed position of the ball, so it may land before the first predicted frame. "
+        "The ellipses of the learned densities hold fewer than 90 % of the true landing places.", "",
     ]  # fmt: skip
     if recorded:
         text += [
-            f"## Recorded flights: 40 long enough of 82, split by flight, {len(SEEDS)} seeds", "", *table(recorded), "",
-            "28 flights train, 4 validate, 8 test. Networks start from the weights of the simulated flights and go on "
-            f"for {EPOCHS['lstm']} epochs of three steps, the TVAE for {EPOCHS['tvae']}; physics finds its constants. "
-            "The truth is the recording itself, noise and all.", "", alike, "",
+            "## Recorded flights", "",
+            "Of 82 recorded flights, 40 are long enough: 28 are for training, 4 for validation and 8 for the test. "
+            f"Each method is trained with {len(SEEDS)} seeds, and the seed also determines the split.", "",
+            *error_table(recorded), "",
+            "The networks start from the weights that were trained on simulated flights. The LSTM and the hybrid are "
+            f"then trained for {EPOCHS['lstm']} epochs of three steps, the TVAE for {EPOCHS['tvae']}. The physical "
+            "model estimates its constants from the training windows. The error is measured against the recorded "
+            "positions, which contain noise.", "", nearest_text, "",
         ]  # fmt: skip
     text += [
-        "## Latency", "", "One prediction with 30 drawn flights on one core, median ms, and the largest relative "
-        "difference of the point prediction between the two forms, extreme inputs included:", "",
-        "| method | frozen | in torch | apart |", "|---|---|---|---|", *latencies, "",
+        "## Latency", "",
+        "The table shows the median time of one prediction with 30 sampled flights, on one core, for the frozen model "
+        "and for the model in torch. The last column is the largest relative difference between the point predictions "
+        "of the two forms; the inputs include extreme values.", "",
+        "| method | frozen, ms | torch, ms | largest relative difference |", "|---|---|---|---|", *latencies, "",
         f"{machine('torch', 'numpy')} One thread. Command: `python -m reproduction.chapter4.ball_flights <folder>`.",
     ]  # fmt: skip
     write_page(HERE, text)
     rows = [
         row
-        for kind, found in (
+        for kind, results in (
             ("simulated flights (synthetic)", simulated),
             ("recorded flights (WAM laboratory)", recorded),
         )
-        for row in curves(kind, found)
+        for row in error_rows(kind, results)
     ]
     write_csv(rows, None, HERE.with_suffix(".csv"))
-    drawn(rows)
-    bundles({method: several[0] for method, several in simulated.items()})
+    draw_errors(rows)
+    draw_bundles({method: several[0] for method, several in simulated.items()})
 
 
-def ratios(found: dict[str, list[Measured]], method: str) -> str:
-    """Of errors, at some times, and the largest."""
-    by = found[method][0].growth / found["ballistic"][0].growth
-    frames = sorted({1, 2, 3, 4, *AT})
-    said = ", ".join(f"{by[frame - 1]:.2f} at {16 * frame} ms" for frame in frames)
-    return f"{said}; at most {by.max():.2f}, at {16 * (int(by.argmax()) + 1)} ms"
+def error_ratios(results: dict[str, list[FlightErrors]], method: str) -> str:
+    """Return the ratios between the errors of a method and of physics at some times, and the largest ratio, as text."""
+    ratio = results[method][0].growth / results["ballistic"][0].growth
+    frames = sorted({1, 2, 3, 4, *TABLE_FRAMES})
+    text = ", ".join(f"{ratio[frame - 1]:.2f} at {16 * frame} ms" for frame in frames)
+    return f"{text}. The largest ratio is {ratio.max():.2f}, at {16 * (int(ratio.argmax()) + 1)} ms"
 
 
 if __name__ == "__main__":
     if sys.argv[1:] == ["--draw"]:
-        drawn(read_rows(HERE.with_suffix(".csv")))
+        draw_errors(read_rows(HERE.with_suffix(".csv")))
     else:
         main(sys.argv[1] if len(sys.argv) > 1 else None)
