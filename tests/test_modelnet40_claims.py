@@ -5,7 +5,15 @@ import math
 import numpy as np
 import pytest
 
-from reproduction.chapter6.modelnet40 import CLAIMS, ROWS, Method, claims, compared, seed_variance, verdict
+from reproduction.chapter6.modelnet40 import (
+    CLAIMS,
+    ROWS,
+    Method,
+    claims_table,
+    seed_variance,
+    verdict,
+    weighted_score,
+)
 
 
 def method(*runs):
@@ -18,7 +26,7 @@ def test_one_run_each_is_mcnemars_difference():
     random = np.random.default_rng(0)
     first, other = random.random((2, 500)) < [[0.8], [0.7]]
     b, c, n = (first & ~other).sum(), (~first & other).sum(), 500
-    value, error = compared({"a": method(first), "b": method(other)}, {"a": 1, "b": -1})
+    value, error = weighted_score({"a": method(first), "b": method(other)}, {"a": 1, "b": -1})
     assert value == pytest.approx((b - c) / n)
     assert error == pytest.approx(math.sqrt((b + c - (b - c) ** 2 / n) / (n * (n - 1))))
 
@@ -34,7 +42,7 @@ def test_errors_are_those_of_new_clouds_and_new_seeds(spread):
         for key, mean in (("a", 0.0), ("b", -0.1)):
             chance = ease + mean + spread * random.standard_normal((3, 1))
             runs[key] = method(*(random.random((3, 200)) < chance))
-        value, error = compared(runs, {"a": 1, "b": -1})
+        value, error = weighted_score(runs, {"a": 1, "b": -1})
         values.append(value)
         variances.append(error**2)
         components.append(seed_variance(runs["a"].accuracy))
@@ -47,8 +55,8 @@ def test_a_row_of_one_seed_takes_the_others_variance():
     random = np.random.default_rng(2)
     several = method(*(random.random((5, 300)) < 0.7 + 0.1 * random.standard_normal((5, 1))))
     single = method(random.random(300) < 0.7)
-    alone = compared({"single": single}, {"single": 1})[1]
-    both = compared({"single": single, "several": several}, {"single": 1})[1]
+    alone = weighted_score({"single": single}, {"single": 1})[1]
+    both = weighted_score({"single": single, "several": several}, {"single": 1})[1]
     assert both**2 - alone**2 == pytest.approx(seed_variance(several.accuracy))
 
 
@@ -71,7 +79,7 @@ def test_every_claim_is_of_rows_of_the_tables_and_is_printed():
     }
     share |= {"tdf_mlp_32": 0.7, "voxnet": 0.7}
     runs = {key: method(ease < share[key]) for key in named}
-    text = claims(runs)
+    text = claims_table(runs)
     assert text.count("\n") == 1 + len(CLAIMS) + sum(map(len, CLAIMS.values()))
     verdicts = [line.rsplit("**", 2)[1] for line in text.splitlines() if "| **" in line]
     found = dict(zip(CLAIMS, verdicts, strict=True))
@@ -80,13 +88,13 @@ def test_every_claim_is_of_rows_of_the_tables_and_is_printed():
     held = {claim.partition(" (")[0] for claim, verdict in found.items() if verdict == "held"}
     assert held == {
         "Basis point sets are better than occupancy and truncated distances",
-        "A plain network on them is better than VoxNet on occupancy",
-        "A small grid costs them little",
-        "A small grid costs others",
+        "A plain network on basis point sets is better than VoxNet on occupancy",
+        "A small grid of basis points costs little accuracy",
+        "A small grid costs other encodings accuracy",
         # rows that are right of the same clouds are less than two points apart
         "Truncated distances are hardly better than occupancy",
         "Basis points and a plain network are as accurate as PointNet",
         "3D convolutions on vectors are as accurate as PointNet++",
     }
     del runs["voxnet"]
-    assert "not run: voxnet | | open" in claims(runs)
+    assert "not run: voxnet | | open" in claims_table(runs)

@@ -1,17 +1,18 @@
 """Make Tables 6.1 to 6.3 on synthetic CAD models, with errors, run times and the thesis's claims.
 
-    python -m reproduction.thesis_tables 6.1-6.3          # with --tell it prints its sweeps, to run one by one
+    python -m reproduction.thesis_tables 6.1-6.3          # with --tell: print the commands only
 
-That is three seeds of every row that takes at most five minutes of one core (`modelnet40_quick`), and one of the
-others (`modelnet40_slow`), but for two that take hours by themselves (`thesis_tables.BY_HAND`). Add `--bfloat16` where
-/proc/cpuinfo lists avx512_bf16; elsewhere it is emulated, and slower by far. Of sweeps that have run, these or others
-with fewer rows:
+The command trains three seeds of every row that takes at most five minutes of one core (`modelnet40_quick`), and one
+seed of the others (`modelnet40_slow`). Two rows take hours each and are left out (`thesis_tables.BY_HAND`). Add
+`--bfloat16` if /proc/cpuinfo lists avx512_bf16; other processors emulate it and are much slower. To evaluate sweeps
+that have already run, also ones with fewer rows:
 
     python -m reproduction.chapter6.modelnet40 outputs/thesis_tables/modelnet40_quick \\
         outputs/thesis_tables/modelnet40_slow
 
-Latencies are measured here, on one thread; encoding is in them. Every model predicts the test clouds again, so that
-methods are compared cloud by cloud: minutes more. Writes modelnet40.md beside this file.
+The script measures latencies on one thread, with the encoding included. It lets every model predict the test clouds
+again, so that methods are compared cloud by cloud, which takes some minutes more. It writes modelnet40.md beside this
+file.
 """
 
 import json
@@ -39,7 +40,7 @@ from framework.errors import DataError
 from framework.evaluation.cost import wall_time
 from framework.reports.table import Better, aggregate, markdown
 
-ROWS = {  # table and row, what the thesis reports: accuracy, FLOPs, parameters
+ROWS = {  # table and row, name, then accuracy, FLOPs and parameters in the thesis
     "voxnet": ("6.1, 1", "VoxNet (32³ occupancy)", "83.0 %", "> 1e8", "9.0e5"),
     "occ_mlp_32": ("6.1, 2", "Occ-MLP (32³)", "79.9 %", "3.4e7", "1.7e7"),
     "occ_mlp_8": ("6.1, 3", "Occ-MLP (8³)", "74.5 %", "1.1e6", "5.5e5"),
@@ -76,7 +77,7 @@ COLUMNS = {
     "parameters": "parameters",
     "megabytes": "checkpoint, MB",
     "one_ms": "ms, batch of 1",
-    "many_ms": "ms / cloud, 256",
+    "many_ms": "ms / cloud, batch of 256",
     "seconds": "whole run, processor s",
     "epochs": "epochs",
     "n": "seeds",
@@ -84,19 +85,19 @@ COLUMNS = {
 }
 BETTER: Better = {"accuracy": "higher", "nll": "lower", "ece": "lower", "one_ms": "lower", "many_ms": "lower"}
 SCORES = ("accuracy", "nll")
-"""Means over test clouds; their errors are computed here, from the clouds' own numbers."""
+"""Scores whose standard errors are computed here, from the scores of single clouds."""
 BLOCK = 256
-"""Clouds that are predicted at once."""
+"""Number of clouds in a batch."""
 
 
 class Contrast(NamedTuple):
-    """A comparison of the thesis: `margin` + Σ weight · accuracy is above 0.
+    """A comparison that the thesis makes: `margin` + Σ weight · accuracy is above 0.
 
     Attributes:
-        claim: in words.
-        thesis: what it reports, in points.
-        weights: of methods, by their experiments.
-        margin: a share of the clouds.
+        claim: The comparison in words.
+        thesis: The difference that the thesis reports, in percentage points.
+        weights: Weight of the accuracy of each method, by the name of its experiment.
+        margin: Allowed loss of accuracy, between 0 and 1.
     """
 
     claim: str
@@ -105,94 +106,126 @@ class Contrast(NamedTuple):
     margin: float = 0.0
 
 
-def better(one: str, other: str) -> dict[str, float]:
-    return {one: 1.0, other: -1.0}
+def accuracy_gain(first: str, second: str) -> dict[str, float]:
+    return {first: 1.0, second: -1.0}
 
 
-def cheaper(grid: str, other: str) -> dict[str, float]:
-    """How much more `other` loses than `grid` does, from 32³ to 8³."""
+def extra_loss(grid: str, other: str) -> dict[str, float]:
+    """Return the weights that measure how much more `other` loses than `grid` from 32³ to 8³."""
     return {f"{other}_32": 1.0, f"{other}_8": -1.0, f"{grid}_32": -1.0, f"{grid}_8": 1.0}
 
 
 CLAIMS: dict[str, tuple[Contrast, ...]] = {
     "Basis point sets are better than occupancy and truncated distances (§6.5.1)": (
-        Contrast("than occupancy, 32³", "+8.4", better("bps_mlp_grid_32", "occ_mlp_32")),
-        Contrast("than occupancy, 8³", "+13.1", better("bps_mlp_grid_8", "occ_mlp_8")),
-        Contrast("than truncated distances, 32³", "+8.3", better("bps_mlp_grid_32", "tdf_mlp_32")),
-        Contrast("than truncated distances, 8³", "+11.7", better("bps_mlp_grid_8", "tdf_mlp_8")),
-    ),
-    "A plain network on them is better than VoxNet on occupancy (§6.5.1)": (
-        Contrast("32³", "+5.3", better("bps_mlp_grid_32", "voxnet")),
-    ),
-    "A small grid costs them little (§6.5.1)": (
+        Contrast("better than occupancy, 32³", "+8.4", accuracy_gain("bps_mlp_grid_32", "occ_mlp_32")),
+        Contrast("better than occupancy, 8³", "+13.1", accuracy_gain("bps_mlp_grid_8", "occ_mlp_8")),
         Contrast(
-            "8³ instead of 32³: less than two points",
+            "better than truncated distances, 32³", "+8.3", accuracy_gain("bps_mlp_grid_32", "tdf_mlp_32")
+        ),
+        Contrast(
+            "better than truncated distances, 8³", "+11.7", accuracy_gain("bps_mlp_grid_8", "tdf_mlp_8")
+        ),
+    ),
+    "A plain network on basis point sets is better than VoxNet on occupancy (§6.5.1)": (
+        Contrast("32³: better than VoxNet", "+5.3", accuracy_gain("bps_mlp_grid_32", "voxnet")),
+    ),
+    "A small grid of basis points costs little accuracy (§6.5.1)": (
+        Contrast(
+            "8³ loses less than two points against 32³",
             "0.7",
-            better("bps_mlp_grid_8", "bps_mlp_grid_32"),
+            accuracy_gain("bps_mlp_grid_8", "bps_mlp_grid_32"),
             0.02,
         ),
-        Contrast("less than it costs occupancy", "0.7, 5.4", cheaper("bps_mlp_grid", "occ_mlp")),
-        Contrast("less than it costs truncated distances", "0.7, 4.1", cheaper("bps_mlp_grid", "tdf_mlp")),
+        Contrast("8³ loses less than occupancy does", "0.7, 5.4", extra_loss("bps_mlp_grid", "occ_mlp")),
+        Contrast(
+            "8³ loses less than truncated distances do", "0.7, 4.1", extra_loss("bps_mlp_grid", "tdf_mlp")
+        ),
     ),
     "Truncated distances are hardly better than occupancy (§6.5.1)": (
-        Contrast("32³: by less than two points", "+0.1", better("occ_mlp_32", "tdf_mlp_32"), 0.02),
-        Contrast("8³: by less than two points", "+1.4", better("occ_mlp_8", "tdf_mlp_8"), 0.02),
+        Contrast(
+            "32³: better by less than two points", "+0.1", accuracy_gain("occ_mlp_32", "tdf_mlp_32"), 0.02
+        ),
+        Contrast("8³: better by less than two points", "+1.4", accuracy_gain("occ_mlp_8", "tdf_mlp_8"), 0.02),
     ),
-    "A small grid costs others (§6.5.1)": (
-        Contrast("occupancy", "5.4", better("occ_mlp_32", "occ_mlp_8")),
-        Contrast("truncated distances", "4.1", better("tdf_mlp_32", "tdf_mlp_8")),
+    "A small grid costs other encodings accuracy (§6.5.1)": (
+        Contrast("occupancy: 32³ better than 8³", "5.4", accuracy_gain("occ_mlp_32", "occ_mlp_8")),
+        Contrast("truncated distances: 32³ better than 8³", "4.1", accuracy_gain("tdf_mlp_32", "tdf_mlp_8")),
     ),
     "With occupancy the plain network is below VoxNet (Table 6.1)": (
-        Contrast("32³", "+3.1", better("voxnet", "occ_mlp_32")),
+        Contrast("32³: VoxNet better", "+3.1", accuracy_gain("voxnet", "occ_mlp_32")),
     ),
     "Other arrangements of 512 points are better than a grid (Table 6.1)": (
-        Contrast("random", "+0.4", better("bps_mlp", "bps_mlp_grid_8")),
-        Contrast("hexagonal", "+0.5", better("bps_mlp_hexagonal", "bps_mlp_grid_8")),
+        Contrast("random better than grid", "+0.4", accuracy_gain("bps_mlp", "bps_mlp_grid_8")),
+        Contrast("hexagonal better than grid", "+0.5", accuracy_gain("bps_mlp_hexagonal", "bps_mlp_grid_8")),
     ),
     "Boosting is better than extremely randomised trees (Table 6.1)": (
-        Contrast("of other grids", "+0.7", better("bps_xgboost", "bps_extra_trees")),
+        Contrast(
+            "boosting on 32³ better than trees on 16³",
+            "+0.7",
+            accuracy_gain("bps_xgboost", "bps_extra_trees"),
+        ),
     ),
     "3D convolutions are better than the plain network (§6.5.1)": (
-        Contrast("distances, 32³", "+1.5", better("bps_conv3d", "bps_mlp_grid_32")),
+        Contrast(
+            "convolutions better than plain, distances, 32³",
+            "+1.5",
+            accuracy_gain("bps_conv3d", "bps_mlp_grid_32"),
+        ),
     ),
     "Vectors harm the plain network and help the convolutions (§6.5.1)": (
-        Contrast("plain: distances above vectors", "+1.8", better("bps_mlp", "bps_mlp_delta")),
-        Contrast("convolutions: vectors above distances", "+1.0", better("bps_conv3d_delta", "bps_conv3d")),
+        Contrast(
+            "plain network: distances better than vectors", "+1.8", accuracy_gain("bps_mlp", "bps_mlp_delta")
+        ),
+        Contrast(
+            "convolutions: vectors better than distances",
+            "+1.0",
+            accuracy_gain("bps_conv3d_delta", "bps_conv3d"),
+        ),
     ),
-    "Turned copies of the training clouds help (§6.5.1)": (
-        Contrast("four instead of one", "+1.0, with a schedule", better("bps_mlp turned", "bps_mlp")),
+    "Rotated copies of the training clouds help (§6.5.1)": (
+        Contrast(
+            "four copies better than one", "+1.0, with a schedule", accuracy_gain("bps_mlp turned", "bps_mlp")
+        ),
     ),
     "PointNet's transforms help (Table 6.2)": (
-        Contrast("with and without", "+2.1", better("pointnet", "pointnet_vanilla")),
+        Contrast("with better than without", "+2.1", accuracy_gain("pointnet", "pointnet_vanilla")),
     ),
     "Basis points and a plain network are as accurate as PointNet (§6.5.1)": (
-        Contrast("less than two points below", "-0.3", better("bps_mlp_400", "pointnet"), 0.02),
+        Contrast(
+            "less than two points below PointNet", "-0.3", accuracy_gain("bps_mlp_400", "pointnet"), 0.02
+        ),
     ),
-    "DeepSets is better than (Table 6.2)": (
-        Contrast("the plain network of 400 units", "+1.0", better("deepsets", "bps_mlp_400")),
-        Contrast("PointNet", "+0.7", better("deepsets", "pointnet")),
-        Contrast("itself with 100 points", "+8.0", better("deepsets", "deepsets_micro")),
+    "DeepSets is better than other networks (Table 6.2)": (
+        Contrast(
+            "better than the plain network of 400 units", "+1.0", accuracy_gain("deepsets", "bps_mlp_400")
+        ),
+        Contrast("better than PointNet", "+0.7", accuracy_gain("deepsets", "pointnet")),
+        Contrast("2048 points better than 100 points", "+8.0", accuracy_gain("deepsets", "deepsets_micro")),
     ),
     "3D convolutions on vectors are as accurate as PointNet++ (Table 6.2)": (
         Contrast(
-            "less than two points below, balls of one size",
+            "less than two points below PointNet++ with balls of one size",
             "+0.1, balls of three sizes",
-            better("bps_conv3d_unpadded", "pointnet2_single"),
+            accuracy_gain("bps_conv3d_unpadded", "pointnet2_single"),
             0.02,
         ),
     ),
     "Ten convolutional networks are better than one (Table 6.2)": (
-        Contrast("mean of their probabilities", "+0.8", better("bps_conv3d_ensemble", "bps_conv3d_unpadded")),
+        Contrast(
+            "mean of ten probabilities better than one network",
+            "+0.8",
+            accuracy_gain("bps_conv3d_ensemble", "bps_conv3d_unpadded"),
+        ),
     ),
 }
 
 
 class Method(NamedTuple):
-    """What the runs of one row say of each test cloud.
+    """Scores of the runs of one row for each test cloud.
 
     Attributes:
         accuracy: 1 where the likeliest class is the true one, else 0.
-        nll: of the true class, nats.
+        nll: Negative log-likelihood of the true class, in nats.
     """
 
     accuracy: Float[np.ndarray, "seeds clouds"]
@@ -200,10 +233,10 @@ class Method(NamedTuple):
 
 
 def seed_variance(values: Float[np.ndarray, "seeds clouds"]) -> float:
-    """Of a run's mean over all clouds there are, among seeds, without bias: it may come out below 0.
+    """Return an unbiased estimate of the variance among seeds of a mean over all possible clouds; it may be below 0.
 
-    Two-way analysis of variance without replication: the means of seeds also differ because on each cloud they differ
-    by chance, by the residual variance over the number of clouds.
+    This is a two-way analysis of variance without replication. The means of seeds also differ by chance on each cloud,
+    which adds the residual variance divided by the number of clouds; this part is subtracted.
     """
     seeds, clouds = values.shape
     residual = values - values.mean(0) - values.mean(1, keepdims=True) + values.mean()
@@ -211,80 +244,84 @@ def seed_variance(values: Float[np.ndarray, "seeds clouds"]) -> float:
     return float(values.mean(1).var(ddof=1) - chance / clouds)
 
 
-def pooled(methods: Mapping[str, Method], score: str) -> float:
-    """The mean of it over all rows of several seeds: three seeds of one row know little. NaN where there are none."""
-    found = [seed_variance(getattr(own, score)) for own in methods.values() if len(own.accuracy) > 1]
-    return max(0.0, float(np.mean(found))) if found else math.nan
+def pooled_seed_variance(methods: Mapping[str, Method], score: str) -> float:
+    """Return the mean of `seed_variance` over all rows with several seeds, or NaN if there is none."""
+    variances = [
+        seed_variance(getattr(method, score)) for method in methods.values() if len(method.accuracy) > 1
+    ]
+    return max(0.0, float(np.mean(variances))) if variances else math.nan
 
 
-def compared(
+def weighted_score(
     methods: Mapping[str, Method], weights: Mapping[str, float], score: str = "accuracy"
 ) -> tuple[float, float]:
-    """Σ weight · mean score, and its standard error over new test clouds and new seeds.
+    """Return Σ weight · mean score, and its standard error for new test clouds and new seeds.
 
-    Clouds: the same for all methods, hence the variance of Σ weight · score over clouds, of means over seeds; what
-    differs by chance from seed to seed on each cloud is in it. Seeds: of every method its own, hence
-    Σ weight² · (pooled variance) / seeds. Without a row of several seeds only the clouds are in it.
+    All methods have the same clouds. Their part of the variance is therefore that of Σ weight · score over clouds, with
+    scores averaged over seeds. Every method has seeds of its own, so that their part is
+    Σ weight² · (pooled variance) / seeds. This part is left out if no row has several seeds.
     """
-    among_seeds = np.nan_to_num(pooled(methods, score))
-    each = sum(weight * getattr(methods[key], score).mean(0) for key, weight in weights.items())
-    assert isinstance(each, np.ndarray)
-    variance = each.var(ddof=1) / len(each)
+    among_seeds = np.nan_to_num(pooled_seed_variance(methods, score))
+    cloud_scores = sum(weight * getattr(methods[key], score).mean(0) for key, weight in weights.items())
+    assert isinstance(cloud_scores, np.ndarray)
+    variance = cloud_scores.var(ddof=1) / len(cloud_scores)
     variance += sum(w**2 * among_seeds / len(methods[key].accuracy) for key, w in weights.items())
-    return float(each.mean()), math.sqrt(variance)
+    return float(cloud_scores.mean()), math.sqrt(variance)
 
 
 def verdict(value: float, error: float) -> str:
-    """Of a claim that the value is above 0, at two standard errors."""
+    """Return the verdict on the claim that a value is above 0, at two standard errors."""
     return "held" if value > 2 * error else "contradicted" if value < -2 * error else "open"
 
 
-def claims(methods: Mapping[str, Method]) -> str:
-    """A table: each comparison, and what the claim amounts to: held where all are, contradicted where any is."""
+def claims_table(methods: Mapping[str, Method]) -> str:
+    """Return a table of all comparisons, with the verdict of each claim before its comparisons."""
     lines = [
         "| claim | thesis, points | here, points | standard errors | verdict |",
         "|---|---:|---:|---:|---|",
     ]
     for claim, contrasts in CLAIMS.items():
-        said, rows = [], []
+        verdicts, rows = [], []
         for words, thesis, weights, margin in contrasts:
             missing = [key for key in weights if key not in methods]
             if missing:
-                said.append("open")
+                verdicts.append("open")
                 rows.append(f"| … {words} | {thesis} | not run: {', '.join(missing)} | | open |")
                 continue
-            value, error = compared(methods, weights)
+            value, error = weighted_score(methods, weights)
             shown = f"{100 * value:+.1f} ± {100 * error:.1f}"
-            size = (value + margin) / error if error else math.copysign(math.inf, value + margin)
-            said.append(verdict(value + margin, error))
-            rows.append(f"| … {words} | {thesis} | {shown} | {size:+.1f} | {said[-1]} |")
-        whole = "contradicted" if "contradicted" in said else "open" if "open" in said else "held"
-        lines += [f"| **{claim}** | | | | **{whole}** |", *rows]
+            distance = (value + margin) / error if error else math.copysign(math.inf, value + margin)
+            verdicts.append(verdict(value + margin, error))
+            rows.append(f"| … {words} | {thesis} | {shown} | {distance:+.1f} | {verdicts[-1]} |")
+        claim_verdict = (
+            "contradicted" if "contradicted" in verdicts else "open" if "open" in verdicts else "held"
+        )
+        lines += [f"| **{claim}** | | | | **{claim_verdict}** |", *rows]
     return "\n".join(lines)
 
 
-def on_test(model: Any, clouds: Tensor, labels: Tensor) -> tuple[np.ndarray, np.ndarray, float]:
-    """Of every test cloud whether its class is found, and the true class's negative log-likelihood.
+def score_clouds(model: Any, clouds: Tensor, labels: Tensor) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return for each test cloud whether its class is predicted and the negative log-likelihood, and seconds per cloud.
 
-    The seconds are those of a cloud in the median of the blocks: the first of them warms up.
+    The time is the median over batches, because the first batch also warms up.
     """
     right, nll, seconds = [], [], []
     with torch.inference_mode():
-        for some, label in zip(clouds.split(BLOCK), labels.split(BLOCK), strict=True):
+        for block, label in zip(clouds.split(BLOCK), labels.split(BLOCK), strict=True):
             began = time.perf_counter()
-            density = model(some)
-            seconds.append((time.perf_counter() - began) / len(some))
+            density = model(block)
+            seconds.append((time.perf_counter() - began) / len(block))
             probability = class_probabilities(density)
             right.append(probability.argmax(-1) == label)
             nll.append(-probability.gather(1, label[:, None])[:, 0].log())
     return torch.cat(right).double().numpy(), torch.cat(nll).numpy(), statistics.median(seconds)
 
 
-def found(sweep: Path, clouds: Tensor, labels: Tensor) -> list[dict[str, Any]]:
-    """A row for each run that is done, with its scores on each test cloud; "key" tells variants of a row apart.
+def score_runs(sweep: Path, clouds: Tensor, labels: Tensor) -> list[dict[str, Any]]:
+    """Return a row for each finished run, with its scores on each test cloud; "key" distinguishes variants of a method.
 
     Raises:
-        DataError: a run was tested on other data than those made now.
+        DataError: A run was tested on other data than the present test split.
     """
     rows = []
     for path in sorted(sweep.glob("*/results.json")):
@@ -300,16 +337,21 @@ def found(sweep: Path, clouds: Tensor, labels: Tensor) -> list[dict[str, Any]]:
         if cut != 1:
             method, key = f"{method}, cut off at {cut:g} cells", f"{key} {cut:g}"
         if key == "bps_mlp" and config["data"]["rotations"] > 1:
-            method, key = f"{method}, {config['data']['rotations']} turns of each cloud", f"{key} turned"
+            method, key = (
+                f"{method}, {config['data']['rotations']} rotated copies of each cloud",
+                f"{key} turned",
+            )
         model = framework.load(path.parent)
-        right, nll, many = on_test(model, clouds, labels)
+        right, nll, block_seconds = score_clouds(model, clouds, labels)
         if abs(right.mean() - numbers["accuracy"]) > 2 / len(right):
             raise DataError(
-                f"{path.parent}: accuracy {right.mean():.4f} on the test clouds made now, {numbers['accuracy']:.4f} in "
-                "its results; wanted the same. It was run on other data: run it anew."
+                f"{path.parent}: the accuracy on the present test clouds is {right.mean():.4f}, but results.json holds "
+                f"{numbers['accuracy']:.4f}. The run was made on other data. Repeat the run."
             )
         with torch.inference_mode():
-            one = wall_time(lambda model=model: model(clouds[:1]), torch.device("cpu"), budget_seconds=2)
+            single_seconds = wall_time(
+                lambda model=model: model(clouds[:1]), torch.device("cpu"), budget_seconds=2
+            )
         fitted = config["density_head"]["name"] in ("extra_trees", "xgboost")
         rows.append(
             {name: value for name, value in numbers.items() if name in COLUMNS}
@@ -322,7 +364,7 @@ def found(sweep: Path, clouds: Tensor, labels: Tensor) -> list[dict[str, Any]]:
                 "right": right,
                 "nlls": nll,
             }
-            | {"one_ms": 1e3 * one, "many_ms": 1e3 * many}
+            | {"one_ms": 1e3 * single_seconds, "many_ms": 1e3 * block_seconds}
             | {"megabytes": (path.parent / "checkpoints" / "model.ckpt").stat().st_size / 1e6}
             | {"seconds": processor_seconds(record(path.parent)), "synthetic": numbers["synthetic"]}
             | {"epochs": "at once" if fitted else str(config["trainer"]["max_epochs"])}
@@ -330,12 +372,12 @@ def found(sweep: Path, clouds: Tensor, labels: Tensor) -> list[dict[str, Any]]:
     return rows
 
 
-def by_method(rows: Sequence[dict[str, Any]]) -> dict[str, Method]:
-    """The clouds' scores of each row of the tables; takes them out of `rows`."""
-    kept: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
+def collect_scores(rows: Sequence[dict[str, Any]]) -> dict[str, Method]:
+    """Remove the scores of single clouds from `rows` and return them by method."""
+    pairs_by_key: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
     for row in rows:
-        kept.setdefault(row["key"], []).append((row.pop("right"), row.pop("nlls")))
-    return {key: Method(*map(np.stack, zip(*pairs, strict=True))) for key, pairs in kept.items()}
+        pairs_by_key.setdefault(row["key"], []).append((row.pop("right"), row.pop("nlls")))
+    return {key: Method(*map(np.stack, zip(*pairs, strict=True))) for key, pairs in pairs_by_key.items()}
 
 
 def main() -> None:
@@ -345,43 +387,61 @@ def main() -> None:
     test = data.splits().test
     batch = test.__getitems__(range(len(test)))
     order = list(ROWS)
-    rows = [row for folder in sys.argv[1:] for row in found(Path(folder), batch["input"], batch["target"])]
+    rows = [
+        row for folder in sys.argv[1:] for row in score_runs(Path(folder), batch["input"], batch["target"])
+    ]
     rows.sort(key=lambda row: (order.index(row["key"].split()[0]), row["seed"]))
-    methods = by_method(rows)
+    methods = collect_scores(rows)
     table = aggregate(rows, by=["method", "key"])
-    for row in table:  # its own errors instead of the deviation among runs
+    for row in table:  # replace the deviation among runs by the standard error of this page
         for name in [name for name in row if name.endswith("_std")]:
             del row[name]
         for score in SCORES:
-            row[score], row[f"{score}_sem"] = compared(methods, {str(row["key"]): 1.0}, score)
+            row[score], row[f"{score}_sem"] = weighted_score(methods, {str(row["key"]): 1.0}, score)
     missing = [words for key, (_, words, *_) in ROWS.items() if key not in methods]
     fingerprint = data.fingerprint()
-    among_seeds = pooled(methods, "accuracy")
+    among_seeds = pooled_seed_variance(methods, "accuracy")
     boosting = packages_distributions()["xgboost"] if "bps_xgboost" in methods else []
-    known = (
-        "No row has several: it is not in the errors."
+    seed_sentence = (
+        "No row has several seeds, so the second variance is missing here."
         if math.isnan(among_seeds)
-        else f"One run's accuracy has {100 * math.sqrt(among_seeds):.2f} points of it."
+        else "The resulting standard deviation of the accuracy of one run among seeds is "
+        f"{100 * math.sqrt(among_seeds):.2f} points."
     )
     text = (
         "# Tables 6.1 to 6.3: classes of CAD models (synthetic data)\n\n"
-        f"The generated set of `data=modelnet40` ({fingerprint['version']}): {len(data.target.names)} classes, "
-        f"{fingerprint['train']} clouds for training, {fingerprint['test']} for the test, 2048 points each. The "
-        "thesis trains on ModelNet40 for thousands of epochs on a GPU, so orderings compare and absolute numbers do "
-        "not. Latencies are measured on one thread and include the encoding. FLOPs count matrix products and "
-        "convolutions. The number of epochs is what two cores allow; learning rates were chosen on the validation "
-        "split of an earlier, easier generated set. The commands are in `modelnet40.py`. Numbers are means over "
-        f"seeds. {'Not run: ' + '; '.join(missing) + '.' if missing else 'Every row was run.'}\n\n"
+        "This page repeats Tables 6.1 to 6.3 of the thesis: point clouds of CAD models are classified. It compares "
+        "encodings of a cloud (occupancy, truncated distances, basis point sets) and networks by accuracy and cost.\n\n"
+        f"The data are the generated set `data=modelnet40` ({fingerprint['version']}): {len(data.target.names)} "
+        f"classes, {fingerprint['train']} clouds for training and {fingerprint['test']} for the test, with 2048 points "
+        "each. The thesis trains on the real ModelNet40 for thousands of epochs on a GPU. The order of the methods can "
+        "therefore be compared with the thesis; absolute numbers cannot. The number of epochs is what two cores allow. "
+        "Learning rates were chosen on the validation split of an earlier, easier generated set. The commands are at "
+        "the head of `modelnet40.py`. Numbers are means over seeds. "
+        f"{'Not run: ' + '; '.join(missing) + '.' if missing else 'Every row was run.'}\n\n"
+        "- **Method** names the encoding and the network: Occ is occupancy, TDF truncated distances, BPS a basis point "
+        "set. Deltas are the vectors to the nearest points, in place of distances. MLP is a multilayer perceptron and "
+        "Conv3D a convolutional network.\n"
+        '- **Table, row** is the place of the method in the thesis; "beyond" means that the thesis has no such '
+        "row.\n"
+        "- **FLOPs** are per cloud and count matrix products and convolutions.\n"
+        "- **ms, batch of 1** is the time of one cloud predicted alone, and **ms / cloud, batch of 256** that of a "
+        "cloud in a batch. Both are measured on one thread and include the encoding.\n\n"
         f"{markdown(table, COLUMNS, better=BETTER)}\n\n"
-        "± of accuracy and NLL is the standard error over new test clouds and new seeds: the variance over clouds of "
-        "the mean over seeds, and the variance among seeds beyond what clouds explain over the number of seeds. The "
-        "latter is estimated once, over all rows of several seeds (two-way analysis of variance), and so it also "
-        f"stands for rows of one. {known}\n\n"
+        "± of accuracy and NLL is the standard error for new test clouds and new seeds. Its square is the sum of two "
+        "variances. The first is the variance over clouds, of the means over seeds, divided by the number of clouds. "
+        "The second is the variance among seeds, beyond what differences between clouds explain, divided by the number "
+        "of seeds. It is estimated once from all rows with several seeds (two-way analysis of variance) and is also "
+        f"used for rows with one seed. {seed_sentence}\n\n"
         "## The thesis's claims\n\n"
-        "Differences of accuracy on the same test clouds (paired), ± as above; at two standard errors a comparison is "
-        "held or contradicted, else open. A claim is held where all its comparisons are, contradicted where one is. "
-        "The column before the verdict is the distance from the bound: 0, or two points where less is said.\n\n"
-        f"{claims(methods)}\n\n"
+        "Each claim of the thesis (bold) is tested by one or several comparisons below it. A comparison is a "
+        "difference of accuracies on the same test clouds, in percentage points, ± the standard error as above. "
+        "**Standard errors** is the number of standard errors between this difference and the bound of the claim, "
+        "positive in favour of the claim. The bound is 0, or two points where "
+        'the claim says "less than two points". Beyond two standard errors a comparison is held or '
+        "contradicted; otherwise it is open. A claim is held if all its comparisons are held, and contradicted if at "
+        "least one is contradicted.\n\n"
+        f"{claims_table(methods)}\n\n"
         f"{len(rows)} runs took {sum(row['seconds'] for row in rows) / 3600:.1f} hours of one core. "
         f"{machine('torch', 'pytorch-lightning', 'scikit-learn', *boosting)}\n"
     )

@@ -4,9 +4,10 @@
     python -m reproduction.chapter6.registration [<run of registration/quick> [<run of faust/registration>]] \\
         [--scan <file>]
 
-Writes registration.md beside this file; of the first run also its error and, of both, those of the correspondences that
-FAUST's challenges ask for, on people generated in its layout; of a scan (one is in the folder REAL_DATA_ROOT) the
-figure registration.png. Times are the processor's, of one thread.
+The script writes registration.md beside this file. With runs, the page also has the error of the first run and, for all
+runs, the correspondences of the FAUST challenges on people generated in the layout of FAUST. With a scan (the folder
+REAL_DATA_ROOT holds one) the first run registers it for the figure registration.png. Times are processor times of one
+thread.
 """
 
 import argparse
@@ -36,43 +37,49 @@ from plugins.data.registration.faust import Challenge
 
 HERE = Path(__file__).parent
 RANKS = (16, 32, 48, 64, 96, 128)
-BODIES, HELD = 3_000, 500
+TRAIN_BODIES, TEST_BODIES = 3_000, 500
 WANTED_MS = 5.0
 ROOT = os.environ.get("REAL_DATA_ROOT")
 REAL_SCAN = Path(ROOT) / "clouds/demo_scan.ply" if ROOT else None
 THESIS: dict[Challenge, float] = {"intra": 2.33, "inter": 4.53}
-"""Table 6.4's last row, centimetres."""
+"""Last row of Table 6.4 in the thesis, mean error in centimetres."""
 
 
-def timed(call: Callable[[], object], repeats: int = 100) -> float:
-    """Median milliseconds of processor time of a call, of all its threads."""
+def processor_ms(call: Callable[[], object], repeats: int = 100) -> float:
+    """Return the median processor time of a call over all its threads, in milliseconds."""
     return milliseconds(call, repeats, time.process_time)
 
 
-def residuals(data) -> dict[int, float]:
-    """Mean vertex error, cm, of held-out bodies projected onto as many principal components of training bodies."""
-    # every k-th sample's target is the mesh in its scan's own frame, as a model has to predict it
+def projection_errors(data) -> dict[int, float]:
+    """Return, for each rank, the mean vertex error in cm of test bodies after projection onto as many principal
+    components of training bodies."""
+    # the target of a sample is the mesh in the frame of its scan, which is what a model predicts
     parts = {}
-    for name, split, count in (("fitted", data.splits().train, BODIES), ("held", data.splits().test, HELD)):
+    for name, split, count in (
+        ("fitted", data.splits().train, TRAIN_BODIES),
+        ("held", data.splits().test, TEST_BODIES),
+    ):
         batches = [split.__getitems__(range(first, first + 100)) for first in range(0, count, 100)]
         parts[name] = {
             key: torch.cat([batch[key].float() for batch in batches]) for key in ("target", "scale")
         }
-    fitted, held = parts["fitted"]["target"], parts["held"]["target"]
+    fitted, test_targets = parts["fitted"]["target"], parts["held"]["target"]
     mean = fitted.mean(0)
     fitted = fitted - mean
     values, vectors = torch.linalg.eigh((fitted @ fitted.T).double())
-    found = {}
+    errors = {}
     for rank in RANKS:
         basis = (fitted.T @ vectors[:, -rank:].float()) / values[-rank:].float().sqrt()
-        left = (held - mean) - (held - mean) @ basis @ basis.T
-        norm = torch.linalg.vector_norm(left.unflatten(1, (-1, 3)), dim=-1) * parts["held"]["scale"][:, None]
-        found[rank] = 100 * norm.mean().item()
-    return found
+        residual = (test_targets - mean) - (test_targets - mean) @ basis @ basis.T
+        norm = (
+            torch.linalg.vector_norm(residual.unflatten(1, (-1, 3)), dim=-1) * parts["held"]["scale"][:, None]
+        )
+        errors[rank] = 100 * norm.mean().item()
+    return errors
 
 
-def speeds(data) -> list[tuple[str, float]]:
-    """Milliseconds of every step for one scan, one thread."""
+def measure_speeds(data) -> list[tuple[str, float]]:
+    """Measure each step for one scan on one thread, in milliseconds."""
     split = data.splits().test
     batch = split.__getitems__([0])
     cloud = batch["input"][:, : int((~batch["input"].isnan()).all(-1).sum())]
@@ -84,9 +91,12 @@ def speeds(data) -> list[tuple[str, float]]:
         input_columns=("x", "y", "z"),
     )
     rows = [
-        ("pose one body of 64 (linear blend skinning)", timed(lambda: split.model(shape, pose), 20) / 64),
-        ("pose and scan one body of 32", timed(lambda: split.__getitems__(range(32)), 10) / 32),
-        (f"encode {cloud.shape[1]} points, 1024 basis points", timed(lambda: encoder(cloud))),
+        (
+            "pose one body of 64 (linear blend skinning)",
+            processor_ms(lambda: split.model(shape, pose), 20) / 64,
+        ),
+        ("pose and scan one body of 32", processor_ms(lambda: split.__getitems__(range(32)), 10) / 32),
+        (f"encode {cloud.shape[1]} points, 1024 basis points", processor_ms(lambda: encoder(cloud))),
     ]
     features = encoder(cloud)
     numbers = len(data.target.names)
@@ -94,9 +104,9 @@ def speeds(data) -> list[tuple[str, float]]:
         part = {"name": "dense_blocks", "bottleneck": rank, "standardise": True}
         blocks = build("encoder", resolve("encoder", part), input_shape=(1024,)).eval()
         last = torch.nn.Linear(rank, numbers)
-        rows.append((f"forward, rank {rank}", timed(lambda b=blocks, n=last: n(b(features)))))
+        rows.append((f"forward, rank {rank}", processor_ms(lambda b=blocks, n=last: n(b(features)))))
         rows.append(
-            (f"encode and forward, rank {rank}", timed(lambda b=blocks, n=last: n(b(encoder(cloud)))))
+            (f"encode and forward, rank {rank}", processor_ms(lambda b=blocks, n=last: n(b(encoder(cloud)))))
         )
     return rows
 
@@ -108,56 +118,72 @@ def main(runs: list[Path], scan: Path | None) -> None:
     data.prepare()
     _, traits = load_default_body()
     with torch.inference_mode():
-        rows, ranks = speeds(data), residuals(data)
+        rows, ranks = measure_speeds(data), projection_errors(data)
     lines = [
         "# Table 6.4, and the run time of registration",
         "",
+        "A network predicts the vertices of a registered body mesh from the point cloud of a scan. This page measures "
+        "the run time of each step, the error of the registered meshes, and the correspondences of Table 6.4 of the "
+        "thesis.",
+        "",
         machine("torch", "numba"),
         "",
-        f"The default body's vertices are at most {1e6 * traits.largest_error:.2g} µm from where its package puts them "
-        "(8 bodies of random shape and pose, float32 against float64).",
+        "The bodies come from the default body model. Its vertices differ by at most "
+        f"{1e6 * traits.largest_error:.2g} µm from those of its original package, for 8 bodies of random shape and "
+        "pose, in float32 compared with float64.",
         "",
-        "| one core | ms |",
+        "## Run time of each step",
+        "",
+        'The table shows the median processor time in milliseconds on one core. "Forward" is the network alone; its '
+        "last layer is a product of two matrices of the given rank.",
+        "",
+        "| step, on one core | ms |",
         "|---|---:|",
         *(f"| {name} | {value:.2f} |" for name, value in rows),
         "",
-        f"Wanted: encode and forward within {WANTED_MS:g} ms.",
+        f"The aim was to encode and predict within {WANTED_MS:g} ms.",
         "",
-        f"Mean vertex error of {HELD} held-out bodies (synthetic) projected onto principal components of {BODIES} "
-        "others: what a last layer of that rank cannot be better than.",
+        "## Error that the rank of the last layer makes unavoidable",
         "",
-        "| rank | cm |",
+        f"The table shows the mean vertex error of {TEST_BODIES} test bodies (synthetic) after projection onto that "
+        f"many principal components of {TRAIN_BODIES} training bodies. A last layer of that rank cannot have a smaller "
+        "error.",
+        "",
+        "| rank | vertex error, cm |",
         "|---:|---:|",
         *(f"| {rank} | {value:.2f} |" for rank, value in ranks.items()),
     ]
     if runs:
-        lines += ["", *trained(runs[0], data.splits().test)]
+        lines += ["", *report_run(runs[0], data.splits().test)]
         if scan is not None:
-            picture(runs[0], scan)
+            draw_registration(runs[0], scan)
             lines += ["", "![A real scan and the mesh registered to it](registration.png)"]
-        lines += ["", *table_64(runs)]
+        lines += ["", *correspondence_table(runs)]
     write_page(__file__, lines)
 
 
-def trained(run: Path, split) -> list[str]:
-    """The errors that a run's own test stage wrote, how long it took, and what one scan costs its model."""
-    found = json.loads((run / "results.json").read_text(encoding="utf-8"))
+def report_run(run: Path, split) -> list[str]:
+    """Return the section on a trained run: duration, time of a prediction, and errors from its results.json."""
+    numbers = json.loads((run / "results.json").read_text(encoding="utf-8"))
     minutes = format_number(wall_seconds(record(run)) / 60)
     (threads,) = settings([run], "threads")
     model = framework.load(run)
     batch = split.__getitems__([0])
     cloud = batch["input"][:, : int((~batch["input"].isnan()).all(-1).sum())]
     with torch.inference_mode():
-        vertices = timed(lambda: median(model(cloud), 1))
-    rows = {"all": found, **found.get("groups", {})}
+        vertices = processor_ms(lambda: median(model(cloud), 1))
+    rows = {"all": numbers, **numbers.get("groups", {})}
     keys = ("vertex_error_median_cm", "vertex_error_95_cm")
     return [
-        f"`experiment={found['experiment']}`: {minutes} minutes from start to report, threads={threads}, "
-        f"computing its features included. From a cloud of {cloud.shape[1]} points to a density of all vertices and "
-        f"its median, by `framework.load`, one core: {vertices:.2f} ms. Vertex error of held-out bodies (synthetic), "
-        "centimetres (± standard error over scans):",
+        "## Error of a trained model",
         "",
-        "| scans | mean | median | 95 % |",
+        f"The run of `experiment={numbers['experiment']}` took {minutes} minutes with threads={threads}, including the "
+        f"computation of its features. The loaded model takes {vertices:.2f} ms on one core from a cloud of "
+        f"{cloud.shape[1]} points to the density of all vertices and its median. The table shows the vertex error for "
+        "test bodies (synthetic): mean ± standard error over scans, median, and 95th percentile. Scans are whole, "
+        "partial, or contain outliers.",
+        "",
+        "| scans | mean error, cm | median error, cm | 95th percentile, cm |",
         "|---|---:|---:|---:|",
         *(
             f"| {name} | {row['vertex_error_cm']:.2f} ± {row['vertex_error_cm_sem']:.2f} | "
@@ -167,48 +193,49 @@ def trained(run: Path, split) -> list[str]:
     ]
 
 
-def table_64(runs: list[Path]) -> list[str]:
-    """Correspondences of FAUST's challenges, of people generated in its layout, whose registrations are known."""
-    took: list[float] = []
+def correspondence_table(runs: list[Path]) -> list[str]:
+    """Return the section with the errors of the correspondences of the FAUST challenges, on generated people."""
+    seconds: list[float] = []
     rows = []
     for run in runs:
-        registered, generated = model(str(run))
+        register, generate = model(str(run))
 
-        def timed_registered(
-            scan: Path, registered: RegisterScan = registered
-        ) -> Float[np.ndarray, "vertex 3"]:
+        def register_timed(scan: Path, register: RegisterScan = register) -> Float[np.ndarray, "vertex 3"]:
             start = time.process_time()
-            found = registered(scan)
-            took.append(time.process_time() - start)
-            return found
+            vertices = register(scan)
+            seconds.append(time.process_time() - start)
+            return vertices
 
         experiment = json.loads((run / "results.json").read_text(encoding="utf-8"))["experiment"]
         with tempfile.TemporaryDirectory() as folder:
             for challenge, thesis in THESIS.items():
                 errors = np.array(
-                    write_correspondences(timed_registered, generated(), challenge, Path(folder)).error_cm
+                    write_correspondences(register_timed, generate(), challenge, Path(folder)).error_cm
                 )
-                spread = errors.std(ddof=1) / len(errors) ** 0.5
-                shown = f"{errors.mean():.2f} ± {spread:.2f} | {errors.max():.2f}"
+                standard_error = errors.std(ddof=1) / len(errors) ** 0.5
+                shown = f"{errors.mean():.2f} ± {standard_error:.2f} | {errors.max():.2f}"
                 rows.append(f"| `{experiment}` | {challenge} | {len(errors)} | {shown} | {thesis:.2f} |")
     return [
         "## Table 6.4: correspondences (synthetic data)",
         "",
-        "People generated in FAUST's layout (`data=faust`; scans of people and poses that no model saw, read as "
-        "files): each vertex of the first scan's registration through both registered meshes to the second, mean "
-        "distance from its true place there, centimetres; ± standard error over pairs, which share scans and people. "
-        "`intra`: one person in two poses, `inter`: two people. `registration/quick` learned from bodies generated by "
-        "the thousand, `faust/registration` from the 70 training scans of that layout alone. The thesis's figures are "
-        f"of FAUST's real scans and another body. Reading a scan, encoding, registering: {1e3 * middle(took):.0f} ms, "
-        "one core.",
+        "The people are generated in the layout of FAUST (`data=faust`). No model was trained on these people or "
+        "poses, and the scans are read from files. In the challenge `intra` a pair shows one person in two poses, in "
+        "`inter` two people. Each vertex of the first scan's true registration is mapped through the two registered "
+        "meshes to the second scan. The error is the mean distance in centimetres between this position and the true "
+        "position. ± is the standard error over pairs; the pairs share scans and people.",
         "",
-        "| learned by | challenge | pairs | mean error, cm | worst pair, cm | thesis, cm (FAUST) |",
+        "`registration/quick` was trained on generated bodies by the thousand, and `faust/registration` only on the "
+        "70 training scans in this layout. The errors of the thesis are for the real scans of FAUST and another body "
+        f"model. Reading, encoding and registering a scan takes {1e3 * middle(seconds):.0f} ms on one core.",
+        "",
+        "| training run | challenge | pairs | mean error, cm | error of the worst pair, cm | mean error in the thesis "
+        "(real FAUST), cm |",
         "|---|---|---:|---:|---:|---:|",
         *rows,
     ]
 
 
-def picture(run: Path, scan: Path) -> None:
+def draw_registration(run: Path, scan: Path) -> None:
     from plugins.data.registration.__main__ import register
 
     with tempfile.TemporaryDirectory() as folder, torch.no_grad():
@@ -222,5 +249,5 @@ if __name__ == "__main__":
     )
     arguments.add_argument("runs", nargs="*", type=Path)
     arguments.add_argument("--scan", type=Path, default=REAL_SCAN, help=f"default: {REAL_SCAN}")
-    given = arguments.parse_args()
-    main(given.runs, given.scan)
+    options = arguments.parse_args()
+    main(options.runs, options.scan)
