@@ -334,7 +334,7 @@ def upright(data: Data) -> dict[str, Reader]:
         sent = {"base64": [base64.b64encode(case.content).decode()], "name": [f"image{case.suffix}"]}
         served = object.__new__(ServedModel)  # as far as requests are read: that needs no trained model
         vars(served).update(predictor=torch.nn.Identity(), data=data)
-        return pixels(served._asked(pd.DataFrame(sent))["input"][0])
+        return pixels(served._read_request(pd.DataFrame(sent))["input"][0])
 
     def of_notebook(case: Case, folder: Path) -> np.ndarray:
         try:
