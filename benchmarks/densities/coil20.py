@@ -1,10 +1,10 @@
-"""Predict angles of real objects on a turntable, trained on views every 20° and tested in between.
+"""Report predictions of the angle of real objects on a turntable, for views between the training views.
 
     python -m framework -m experiment=coil20/von_mises,coil20/mixture data.root=/path/to/COIL20 seed=0,1,2 threads=1 \\
         hydra.sweep.dir=outputs/sweeps/coil20
     python -m benchmarks.densities.coil20 outputs/sweeps/coil20
 
-Writes coil20.md beside this file.
+Writes coil20.md into the folder of this file.
 """
 
 import json
@@ -16,12 +16,12 @@ from framework.reports.table import aggregate, markdown
 
 COLUMNS = {
     "objects": "objects",
-    "method": "method",
+    "method": "density head",
     "n": "seeds",
     "log_likelihood": "log-likelihood (nats)",
-    "maad_deg": "MAAD °",
-    "median_deviation_deg": "median °",
-    "milliseconds_per_sample": "ms / image",
+    "maad_deg": "MAAD (degrees)",
+    "median_deviation_deg": "median deviation (degrees)",
+    "milliseconds_per_sample": "ms per image",
     "parameters": "parameters",
 }
 
@@ -29,21 +29,31 @@ COLUMNS = {
 def main() -> None:
     rows = []
     for path in sorted(Path(sys.argv[1]).glob("*/results.json")):
-        found = json.loads(path.read_text(encoding="utf-8"))
-        cost = {key: found[key] for key in ("milliseconds_per_sample", "parameters")}
-        same = {"method": found["method"], "seed": found["seed"], "synthetic": found["synthetic"], **cost}
-        for objects, numbers in {"all": found, **found["groups"]}.items():
-            kept = {key: value for key, value in numbers.items() if key in COLUMNS or key.endswith("_sem")}
-            rows.append({**same, **kept, "objects": objects})
+        results = json.loads(path.read_text(encoding="utf-8"))
+        shared_keys = ("method", "seed", "synthetic", "milliseconds_per_sample", "parameters")
+        shared = {key: results[key] for key in shared_keys}
+        for objects, numbers in {"all": results, **results["groups"]}.items():
+            columns = {key: value for key, value in numbers.items() if key in COLUMNS or key.endswith("_sem")}
+            rows.append({**shared, **columns, "objects": objects})
     order = ("all", "unique", "look-alikes")
     rows.sort(key=lambda row: (order.index(row["objects"]), row["method"] != "von_mises", row["seed"]))
     compared = aggregate(rows, by=["objects", "method"])
     text = (
         "# COIL-20: real views between the training views\n\n"
-        "20 objects, 18 training views each (every 20°), 36 test views each, 5° from the nearest learnt one; "
-        "32 × 32 pixels, `biternion_vgg`, 200 epochs on views interpolated by a periodic cubic spline. ± is the "
-        "standard deviation over seeds. `look-alikes` are the 8 objects whose training views half a turn apart are "
-        "nearer to one another than neighbouring ones are (`plugins/data/coil20`). Commands in `coil20.py`.\n\n"
+        "This page shows how accurately the azimuth of real objects on a turntable is predicted from images that lie "
+        "between the training views. It compares a single von Mises density (`von_mises`) with a mixture of von Mises "
+        "densities (`mixture`).\n\n"
+        "The data set COIL-20 has 20 objects. Each object has 18 training views, one every 20°, and 36 test views, "
+        "which are 5° from the nearest training view. Images have 32 × 32 pixels. The encoder is `biternion_vgg`, "
+        "trained for 200 epochs on views that a periodic cubic spline interpolates between the training views. The "
+        "head of `coil20.py` lists the commands.\n\n"
+        "`look-alikes` are the 8 objects that look alike from opposite sides: their training views 180° apart are on "
+        "average more similar than neighbouring training views (`plugins/data/coil20`). `unique` are the other 12 "
+        "objects.\n\n"
+        "Each row is a mean over seeds, and ± is the standard deviation over seeds. The log-likelihood is a mean over "
+        "the test views; higher is better. MAAD is the mean absolute angular deviation of the point prediction, and "
+        "the median deviation is the median of the same deviations. The time per image is the time of a prediction in "
+        "a batch. The last column is the number of parameters of the model.\n\n"
         f"{markdown(compared, COLUMNS)}\n\n{machine('torch', 'pytorch-lightning')}\n"
     )
     write_page(__file__, text)

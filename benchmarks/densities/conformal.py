@@ -2,10 +2,11 @@
 
     python -m benchmarks.densities.conformal
 
-Every figure is a mean over 200 random splits of one pool of 2000 samples, half of it for validation, from which the
-wrapper leaves half to what it wraps. The models are fixed and badly calibrated on purpose: a classifier of two moons
-that is much too sure, and a von Mises density of the right direction whose κ is wrong by a factor. Writes conformal.md
-beside this file.
+Every number is a mean over 200 random splits of one pool of 2000 samples. Half of a split is for validation; the
+wrapper calibrates the wrapped model on one half of the validation samples and its threshold on the other half. The
+models are fixed and badly calibrated on purpose: classifiers of two moons that are overconfident or underconfident, and
+von Mises densities with the right direction and a κ that is wrong by a factor. Writes conformal.md into the folder of
+this file.
 """
 
 import math
@@ -31,7 +32,7 @@ CLASSES, ANGLE = Target("class", ("upper", "lower")), Target("angle", ("azimuth"
 
 
 class Fixed(Predictor):
-    """Densities as a function of the input, nothing to train."""
+    """A predictor whose densities are a fixed function of the input."""
 
     def __init__(self, predict: Callable[[Tensor], Distribution]) -> None:
         super().__init__()
@@ -51,12 +52,13 @@ class Fixed(Predictor):
 
 
 def moons() -> tuple[Tensor, Tensor]:
+    """Return points of two moons, (sample, 2), and their classes, (sample,)."""
     points, label = make_moons(POOL, noise=0.35, random_state=0)
     return torch.from_numpy(points), torch.from_numpy(label)
 
 
 def classifier(sharpness: float) -> Callable[[Tensor], Distribution]:
-    """A hand-made boundary; sharpness 1 is about calibrated."""
+    """Return a classifier with a hand-made boundary; with sharpness 1 it is nearly calibrated."""
 
     def predict(points: Tensor) -> Distribution:
         x, y = points.unbind(-1)
@@ -67,26 +69,30 @@ def classifier(sharpness: float) -> Callable[[Tensor], Distribution]:
 
 
 def concentration(inputs: Tensor) -> Tensor:
+    """Return the true κ for each input, (sample, 1)."""
     return 4 + 3 * torch.tanh(inputs[:, 1:])
 
 
 def circle() -> tuple[Tensor, Tensor]:
+    """Return inputs, (sample, 2), and angles with von Mises noise, (sample, 1)."""
     generator = np.random.default_rng(0)
     inputs = torch.from_numpy(generator.uniform(-3, 3, (POOL, 2)))
     noise = generator.vonmises(0, concentration(inputs)[:, 0].numpy())
     return inputs, inputs[:, :1] + torch.from_numpy(noise)[:, None]
 
 
-def direction(factor: float) -> Callable[[Tensor], Distribution]:
-    """The right direction with κ times a factor."""
+def scaled_von_mises(factor: float) -> Callable[[Tensor], Distribution]:
+    """Return the von Mises density with the true direction and the true κ times a factor."""
     head = build("density_head", resolve("density_head", "von_mises"), target=ANGLE)
     kind = type(head(torch.zeros(1, head.size)))
     return lambda inputs: kind(inputs[:, :1], factor * concentration(inputs))
 
 
-def wrapped(
-    predict: Callable[[Tensor], Distribution], target: Target, score: str, miscoverage: float, warm: bool
+def wrap(
+    predict: Callable[[Tensor], Distribution], target: Target, score: str, miscoverage: float, tempered: bool
 ) -> Predictor:
+    """Return a fixed predictor in the conformal wrapper; `tempered`: with a temperature wrapper between them."""
+
     def model() -> Predictor:
         return Fixed(predict)
 
@@ -94,30 +100,30 @@ def wrapped(
         return build("uncertainty", resolve("uncertainty", "temperature"), model=model, target=target)
 
     config = resolve("uncertainty", {"name": "conformal", "score": score, "miscoverage": miscoverage})
-    return build("uncertainty", config, model=temperature if warm else model, target=target).eval()
+    return build("uncertainty", config, model=temperature if tempered else model, target=target).eval()
 
 
-def measured(
+def measure(
     predict: Callable[[Tensor], Distribution],
     inputs: Tensor,
     label: Tensor,
     target: Target,
     score: str,
     miscoverage: float,
-    warm: bool,
+    tempered: bool,
 ) -> tuple[float, float, float, float]:
-    """Coverage, its standard deviation over splits, size, and the coverage of the model's own region of that mass."""
+    """Return coverage, its standard deviation over splits, mean size, and the coverage without calibration."""
     generator = torch.Generator().manual_seed(0)
     covered, sizes = [], []
     for _ in range(SPLITS):
         order = torch.randperm(POOL, generator=generator)
         first, rest = order[: POOL // 2], order[POOL // 2 :]
-        wrapper = wrapped(predict, target, score, miscoverage, warm)
+        wrapper = wrap(predict, target, score, miscoverage, tempered)
         wrapper.calibrate([{"input": inputs[first], "target": label[first], "index": first}])
         sets = wrapper(inputs[rest])
         assert isinstance(sets, PredictionSet)
         covered.append(sets.contains(label[rest]).double().mean())
-        if len(sizes) < 10:  # sizes vary little, and arcs cost more than coverage
+        if len(sizes) < 10:  # sizes vary little, and the lengths of arcs take longer than the coverage
             sizes.append(sets.size().mean())
     own = PredictionSet(predict(inputs), -torch.tensor(miscoverage).double().log(), "mass")
     cover = torch.stack(covered)
@@ -134,36 +140,59 @@ def main() -> None:
     rows = []
     for name, (inputs, label), target, models in (
         (
-            "moons, labels",
+            "two moons, labels",
             moons(),
             CLASSES,
-            {"too sure": classifier(6.0), "not sure enough": classifier(0.3)},
+            {"overconfident": classifier(6.0), "underconfident": classifier(0.3)},
         ),
-        ("circle, degrees", circle(), ANGLE, {"κ × 8": direction(8.0), "κ / 4": direction(0.25)}),
+        (
+            "circle, degrees",
+            circle(),
+            ANGLE,
+            {"κ 8 times too large": scaled_von_mises(8.0), "κ 4 times too small": scaled_von_mises(0.25)},
+        ),
     ):
-        for told, predict in models.items():
-            for warm in (False, True):
+        for calibration, predict in models.items():
+            for tempered in (False, True):
                 for score in ("density", "mass"):
-                    for miscoverage in (0.1,) if warm else (0.1, 0.05):
+                    for miscoverage in (0.1,) if tempered else (0.1, 0.05):
                         start = time.perf_counter()
-                        cover, spread, size, own = measured(
-                            predict, inputs, label, target, score, miscoverage, warm
+                        cover, spread, size, own = measure(
+                            predict, inputs, label, target, score, miscoverage, tempered
                         )
                         size = size if target is CLASSES else math.degrees(size)
-                        wrappers = "temperature, conformal" if warm else "conformal"
+                        wrappers = "temperature, conformal" if tempered else "conformal"
                         rows.append(
-                            f"| {name} | {told} | {wrappers} | {score} | {100 * (1 - miscoverage):g} % | "
+                            f"| {name} | {calibration} | {wrappers} | {score} | {100 * (1 - miscoverage):g} % | "
                             f"{100 * cover:.2f} % | {100 * spread:.1f} % | {100 * own:.1f} % | {size:.3g} |"
                         )
                         sys.stderr.write(f"{rows[-1]} {time.perf_counter() - start:.1f} s\n")
     text = (
         "# Conformal prediction sets: coverage and size\n\n"
-        f"`python -m benchmarks.densities.conformal`: means over {SPLITS} random splits of {POOL} samples (half "
-        "validation, of which the wrapper's own half gives the threshold); fixed models, badly calibrated on "
-        "purpose; size over the first 10 splits. `spread` is the standard deviation over splits, about 1.6 % where "
-        "500 scores and 1000 targets are drawn at 90 %. `model's own` is the coverage of the model's region of that "
-        "mass without any calibration. Synthetic data.\n\n"
-        "| data, unit of size | model | wrappers | score | promised | covered | spread | model's own | mean size |\n"
+        "This page shows whether conformal prediction sets hold the target with the stated probability, and how large "
+        "the sets are, if the wrapped model is badly calibrated. It is written by "
+        "`python -m benchmarks.densities.conformal`.\n\n"
+        f"There are two synthetic data sets of {POOL} samples: two moons with two classes, and angles on a circle. The "
+        "models are fixed and badly calibrated on purpose. The classifiers of the moons are overconfident or "
+        "underconfident. The von Mises densities of the angles have the right direction and a wrong κ.\n\n"
+        f"Each row is a mean over {SPLITS} random splits of the samples into two halves, for validation and for the "
+        "test. Half of the validation samples calibrate the wrapped model; the other half determine the threshold of "
+        "the sets. The columns are:\n\n"
+        "- data, unit of size: the data set, and the unit of the last column;\n"
+        "- model: how the model is wrong;\n"
+        "- wrappers: the conformal wrapper alone, or around a calibrated temperature;\n"
+        "- score: the rule that selects the values of a set. With `density`, a set holds all values above one level of "
+        "density; with `mass`, it holds the densest values up to one probability mass. The level and the mass are the "
+        "same for all inputs;\n"
+        "- stated: the stated probability;\n"
+        "- coverage: share of test targets in their sets;\n"
+        "- SD of coverage: standard deviation of the coverage over the splits. With 500 validation samples and 1000 "
+        "test samples, about 1.6 % is expected at a stated probability of 90 %;\n"
+        "- coverage without calibration: share of targets in the regions of the stated mass that the model predicts "
+        "itself;\n"
+        "- mean size: mean size of the sets, over the first 10 splits.\n\n"
+        "| data, unit of size | model | wrappers | score | stated | coverage | SD of coverage | "
+        "coverage without calibration | mean size |\n"
         "|---|---|---|---|---:|---:|---:|---:|---:|\n" + "\n".join(rows) + "\n\n"
         f"{machine('torch', 'scikit-learn')}\n"
     )

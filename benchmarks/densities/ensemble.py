@@ -1,10 +1,11 @@
-"""Time ten small networks that are trained side by side and one after the other.
+"""Compare the training of ten small networks together, as an ensemble, with training them one after the other.
 
     python -m benchmarks.densities.ensemble
 
-On the two moons (synthetic), two threads. Times of whole trainings, alternating in one process, as a bare PyTorch loop
-and through the framework's Trainer; then whether members become what they become alone, and whether their test NLLs
-are distributed like those of networks trained with seeds of their own. Writes ensemble.md beside this file.
+The data are the two moons (synthetic), on two threads. Whole trainings are timed, interleaved in one process, with a
+bare PyTorch loop and with the framework's Trainer. The script also compares each member with the same network trained
+alone, and the distribution of the members' test NLLs with that of networks trained alone from other seeds. Writes
+ensemble.md into the folder of this file.
 """
 
 import logging
@@ -36,7 +37,8 @@ MEMBERS, BATCH, EPOCHS, ROUNDS = 10, 50, 20, 3
 LEARNING_RATE = 1e-3
 
 
-def predictor(data: Data, width: int, seed: int, members: int | None = None) -> Predictor:
+def build_network(data: Data, width: int, seed: int, members: int | None = None) -> Predictor:
+    """Return a model with two hidden layers, or an ensemble of such models."""
     config = {
         "data": "moons",
         "encoder": {"mlp": {"name": "mlp", "widths": [width, width]}},
@@ -47,33 +49,42 @@ def predictor(data: Data, width: int, seed: int, members: int | None = None) -> 
     return build_predictor(resolve_all(config), data.target, data.input_shape, seed)
 
 
-def bare(built: Predictor, fields: dict[str, Tensor], epochs: int, seed: int, member: int = 0) -> None:
-    """The plainest loop over the batches that the framework would give, with its optimiser: each member's own.
+def train_bare(
+    predictor: Predictor, fields: dict[str, Tensor], epochs: int, seed: int, member: int = 0
+) -> None:
+    """Train in a minimal loop, with the optimiser and the batches of the framework; each member has its own batches.
 
     Args:
-        member: whose order of batches a network that trains alone has.
+        predictor: the model or ensemble.
+        fields: the training split.
+        epochs: number of epochs.
+        seed: seed of the order of the batches.
+        member: for a model alone, the number of the member whose order of batches it gets.
     """
-    optimizer = OPTIMIZERS["adam"](built.parameters(), lr=LEARNING_RATE)
-    dtype = next(built.parameters()).dtype
-    several = outermost(built)
-    members = range(several.model_count) if several else [member]
-    with own_batches(built):
+    optimizer = OPTIMIZERS["adam"](predictor.parameters(), lr=LEARNING_RATE)
+    dtype = next(predictor.parameters()).dtype
+    ensemble = outermost(predictor)
+    members = range(ensemble.model_count) if ensemble else [member]
+    with own_batches(predictor):
         for epoch in range(epochs):
-            orders = torch.tensor([epoch_order(len(fields["target"]), seed, epoch, one) for one in members])
+            orders = torch.tensor(
+                [epoch_order(len(fields["target"]), seed, epoch, number) for number in members]
+            )
             for rows in orders.split(BATCH, 1):
                 optimizer.zero_grad()
-                given = rows.flatten()
-                built.loss(fields["input"][given].to(dtype), fields["target"][given]).mean().backward()
+                index = rows.flatten()
+                inputs, target = fields["input"][index].to(dtype), fields["target"][index]
+                predictor.loss(inputs, target).mean().backward()
                 optimizer.step()
 
 
-def framed(built: Predictor, data: Data, epochs: int, seed: int) -> None:
-    """The framework's own training: its module, its batches, Lightning's loops; no validation, nothing saved."""
+def train_with_framework(predictor: Predictor, data: Data, epochs: int, seed: int) -> None:
+    """Train with the framework's module and batches and Lightning's loops; nothing is validated or saved."""
     training = Training(
-        built, [], data, OptimizerSettings(name="adam", learning_rate=LEARNING_RATE), seed, {}
+        predictor, [], data, OptimizerSettings(name="adam", learning_rate=LEARNING_RATE), seed, {}
     )
-    several = outermost(built)
-    orders = several.model_count if several else 1
+    ensemble = outermost(predictor)
+    orders = ensemble.model_count if ensemble else 1
     batches = Batches(data, batch_size=BATCH, workers=0, seed=seed, orders=orders)
     with tempfile.TemporaryDirectory() as folder:
         trainer = pl.Trainer(
@@ -92,78 +103,85 @@ def framed(built: Predictor, data: Data, epochs: int, seed: int) -> None:
 
 
 def seconds(call: Callable[[], object]) -> float:
+    """Return the wall time of a call."""
     start = time.perf_counter()
     call()
     return time.perf_counter() - start
 
 
-def ratios(data: Data, fields: dict[str, Tensor], width: int) -> dict[str, tuple[float, float, list[float]]]:
-    """Loop → median seconds together and apart, and the ratio of each round."""
+def time_loops(
+    data: Data, fields: dict[str, Tensor], width: int
+) -> dict[str, tuple[float, float, list[float]]]:
+    """Return for each loop the median seconds together and separately, and the speed-up of each round."""
 
-    def apart(train: Callable[[Predictor], None]) -> None:
+    def train_separately(train: Callable[[Predictor], None]) -> None:
         for seed in range(MEMBERS):
-            train(predictor(data, width, seed))
+            train(build_network(data, width, seed))
 
     loops: dict[str, Callable[[Predictor], None]] = {
-        "bare PyTorch loop": lambda built: bare(built, fields, EPOCHS, 0),
-        "framework's Trainer": lambda built: framed(built, data, EPOCHS, 0),
+        "bare PyTorch loop": lambda predictor: train_bare(predictor, fields, EPOCHS, 0),
+        "framework's Trainer": lambda predictor: train_with_framework(predictor, data, EPOCHS, 0),
     }
-    found = {}
+    times = {}
     for name, train in loops.items():
         pairs = []
         for _ in range(ROUNDS + 1):
-            together = seconds(lambda train=train: train(predictor(data, width, 0, MEMBERS)))
-            pairs.append((together, seconds(lambda train=train: apart(train))))
-        kept = pairs[1:]  # the first round warms up
-        medians = [statistics.median(times) for times in zip(*kept, strict=True)]
-        found[name] = (medians[0], medians[1], [b / a for a, b in kept])
-    return found
+            together = seconds(lambda train=train: train(build_network(data, width, 0, MEMBERS)))
+            pairs.append((together, seconds(lambda train=train: train_separately(train))))
+        rounds = pairs[1:]  # the first round warms up
+        medians = [statistics.median(column) for column in zip(*rounds, strict=True)]
+        times[name] = (medians[0], medians[1], [b / a for a, b in rounds])
+    return times
 
 
-def differences(data: Data, fields: dict[str, Tensor], dtype: torch.dtype) -> float:
-    """The largest difference of p(y|x) on the test split between members and the same networks trained alone."""
-    whole = predictor(data, 128, 0, MEMBERS).to(dtype)
-    assert isinstance(whole, Ensemble) and whole.together is not None
+def largest_difference(data: Data, fields: dict[str, Tensor], dtype: torch.dtype) -> float:
+    """Return the largest difference of p(y|x) on the test split between members and the same networks trained alone."""
+    ensemble = build_network(data, 128, 0, MEMBERS).to(dtype)
+    assert isinstance(ensemble, Ensemble) and ensemble.together is not None
     alone = []
     for index in range(MEMBERS):
-        model = predictor(data, 128, 0).to(dtype)
+        model = build_network(data, 128, 0).to(dtype)
         assert isinstance(model, Model)
-        network(model).load_state_dict(whole.together.read(index))
+        network(model).load_state_dict(ensemble.together.read(index))
         alone.append(model)
-    bare(whole, fields, EPOCHS, 0)
+    train_bare(ensemble, fields, EPOCHS, 0)
     test = data.splits().test.fields["input"].to(dtype)  # type: ignore[attr-defined]
     label = torch.ones(len(test), dtype=torch.int64)
     worst = 0.0
     for index, model in enumerate(alone):
-        bare(model, fields, EPOCHS, 0, index)
+        train_bare(model, fields, EPOCHS, 0, index)
     with torch.no_grad():
-        together = whole.training_densities(test).log_prob(label[:, None]).exp()
+        together = ensemble.training_densities(test).log_prob(label[:, None]).exp()
         for index, model in enumerate(alone):
             worst = max(worst, float((together[:, index] - model(test).log_prob(label).exp()).abs().max()))
     return worst
 
 
-def spread(
+def compare_nlls(
     data: Data, fields: dict[str, Tensor], count: int, epochs: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Test NLL of members of one ensemble; of networks trained apart from starts of their own in the same order of
-    batches; and of such with orders of their own."""
+    """Return the test NLLs of three groups of networks.
+
+    The groups are the members of one ensemble, networks trained alone from other initial weights with the same order
+    of batches, and networks trained alone from other initial weights with other orders of batches.
+    """
     test = data.splits().test.fields  # type: ignore[attr-defined]
-    whole = predictor(data, 128, 0, count)
-    bare(whole, fields, epochs, 0)
+    ensemble = build_network(data, 128, 0, count)
+    train_bare(ensemble, fields, epochs, 0)
     with torch.no_grad():
-        members = -whole.training_densities(test["input"]).log_prob(test["target"][:, None]).mean(0)
-    apart: dict[bool, list[float]] = {True: [], False: []}
-    for same, found in apart.items():
+        members = -ensemble.training_densities(test["input"]).log_prob(test["target"][:, None]).mean(0)
+    alone: dict[bool, list[float]] = {True: [], False: []}
+    for same_order, nlls in alone.items():
         for seed in range(1000, 1000 + count):
-            model = predictor(data, 128, seed)
-            bare(model, fields, epochs, 0 if same else seed)
+            model = build_network(data, 128, seed)
+            train_bare(model, fields, epochs, 0 if same_order else seed)
             with torch.no_grad():
-                found.append(float(-model(test["input"]).log_prob(test["target"]).mean()))
-    return members.numpy(), np.array(apart[True]), np.array(apart[False])
+                nlls.append(float(-model(test["input"]).log_prob(test["target"]).mean()))
+    return members.numpy(), np.array(alone[True]), np.array(alone[False])
 
 
-def told(values: np.ndarray) -> str:
+def format_mean(values: np.ndarray) -> str:
+    """Return mean ± standard deviation as text."""
     return f"{values.mean():.4f} ± {values.std(ddof=1):.4f}"
 
 
@@ -174,29 +192,42 @@ def main() -> None:
     data: Data = build("data", resolve("data", "moons"))
     data.prepare()
     fields: dict[str, Tensor] = data.splits().train.fields  # type: ignore[attr-defined]
-    lines = ["| network | loop | together, s | apart, s | ratio | rounds |", "|---|---|---|---|---|---|"]
+    lines = [
+        "| hidden layers | training loop | together, s | one after the other, s | speed-up | speed-up in each round |",
+        "|---|---|---|---|---|---|",
+    ]
     for width in (32, 128, 512):
-        for loop, (together, apart, rounds) in ratios(data, fields, width).items():
-            tried = ", ".join(f"{ratio:.1f}" for ratio in rounds)
-            lines.append(
-                f"| {width}-{width} | {loop} | {together:.2f} | {apart:.2f} | **{apart / together:.1f}** | {tried} |"
-            )
-    gaps = {name: differences(data, fields, dtype) for name, dtype in DTYPES.items()}
-    members, same, own = spread(data, fields, 30, 60)
+        for loop, (together, separate, speedups) in time_loops(data, fields, width).items():
+            cells = [f"{width}-{width}", loop, f"{together:.2f}", f"{separate:.2f}"]
+            cells += [f"**{separate / together:.1f}**", ", ".join(f"{speedup:.1f}" for speedup in speedups)]
+            lines.append(f"| {' | '.join(cells)} |")
+    gaps = {name: largest_difference(data, fields, dtype) for name, dtype in DTYPES.items()}
+    members, same_order, other_orders = compare_nlls(data, fields, 30, 60)
     text = (
-        "# Ensembles: ten networks side by side against one after the other (synthetic data)\n\n"
-        f"`python -m benchmarks.densities.ensemble`: `mlp` + `bernoulli` on `moons` ({len(fields['target'])} training "
-        f"points), Adam, batches of {BATCH}, {EPOCHS} epochs, two threads; seconds of a whole training of {MEMBERS} "
-        "networks, "
-        f"median of {ROUNDS} alternating rounds.\n\n" + "\n".join(lines) + "\n\n"
-        "**The same for given seeds.** Largest difference of p(y|x) on 5000 test points between a member (128-128) and "
-        "the same network trained alone from the same start on the same batches, after the training: "
-        + ", ".join(f"{gap:.1e} in {name}" for name, gap in gaps.items())
-        + ".\n\n**Alike in distribution.** Test NLL (mean ± SD) after 60 epochs of 30 members of one ensemble: "
-        f"{told(members)}; of 30 networks trained alone from other starts in the same order of batches: {told(same)}, "
-        f"Kolmogorov-Smirnov p = {stats.ks_2samp(members, same).pvalue:.2f}; with orders of their own as well: "  # type: ignore[attr-defined]
-        f"{told(own)}, p = {stats.ks_2samp(members, own).pvalue:.2f}. "  # type: ignore[attr-defined]
-        "Members have orders of their own (eq. 2.17: independently trained).\n\n"
+        "# Ensembles: ten networks trained together or one after the other (synthetic data)\n\n"
+        f"This page shows how much faster {MEMBERS} small networks are trained together, as members of one ensemble "
+        "with batched matrix products, than one after the other. It also compares the resulting "
+        "networks. It is written by `python -m benchmarks.densities.ensemble`.\n\n"
+        f"The networks are `mlp` encoders with the head `bernoulli` on the data set `moons` ({len(fields['target'])} "
+        f"training points). They are trained with Adam for {EPOCHS} epochs in batches of {BATCH}, on two threads. The "
+        "first column gives the widths of the two hidden layers. The training loop is either a minimal loop in PyTorch "
+        f"or the framework's Trainer. Times are wall times of the whole training of all {MEMBERS} networks, medians of "
+        f"{ROUNDS} rounds in which the two trainings alternate. The speed-up is the ratio of the two medians.\n\n"
+        + "\n".join(lines)
+        + "\n\n**Members equal networks that are trained alone.** Each member (128-128) was compared with the same "
+        "network trained alone, with the same initial weights and the same batches. After the training, the largest "
+        "difference of p(y|x) on 5000 test points is "
+        + " and ".join(f"{gap:.1e} in {name}" for name, gap in gaps.items())
+        + ".\n\n**Members are distributed like networks that are trained alone, each with its own order of "
+        "batches.** The test NLL (mean ± standard deviation) was compared after 60 epochs, and p is "
+        "the p-value of a Kolmogorov-Smirnov test against the members:\n\n"
+        f"- 30 members of one ensemble: {format_mean(members)};\n"
+        "- 30 networks trained alone from other initial weights, with one order of batches for all: "
+        f"{format_mean(same_order)}, p = {stats.ks_2samp(members, same_order).pvalue:.2f};\n"  # type: ignore[attr-defined]
+        "- 30 networks trained alone from other initial weights, each with its own order of batches: "
+        f"{format_mean(other_orders)}, p = {stats.ks_2samp(members, other_orders).pvalue:.2f}.\n\n"  # type: ignore[attr-defined]
+        "The members of an ensemble also have their own orders of batches, because eq. 2.17 assumes networks that are "
+        "trained independently.\n\n"
         f"{machine('torch', 'pytorch-lightning')}\n"
     )
     write_page(__file__, text)

@@ -1,8 +1,8 @@
-"""Time every metric on every kind of density.
+"""Time the metrics, and the methods of a density, on every kind of density.
 
     python -m benchmarks.densities.evaluation_time
 
-Writes evaluation_time.md beside this file; some minutes on one core.
+Writes evaluation_time.md into the folder of this file. It takes some minutes on one core.
 """
 
 import sys
@@ -27,18 +27,22 @@ ANGLE, THREE = Target("angle", ("azimuth",)), Target("angle", ("azimuth", "eleva
 REAL, CLASSES = Target("real", ("x",)), Target("class", tuple("abcdefghij"))
 DENSITIES: dict[str, tuple[Target, dict[str, Any], float]] = {
     "ten classes": (CLASSES, {"name": "categorical"}, 1.0),
-    "a normal": (REAL, {"name": "gaussian"}, 1.0),
-    "10 normals": (REAL, {"name": "mixture", "components": 10, "component": {"name": "gaussian"}}, 1.0),
-    "a von Mises": (ANGLE, {"name": "von_mises"}, 1.0),
-    "a narrow von Mises": (ANGLE, {"name": "von_mises"}, 100.0),
-    "5 von Mises": (ANGLE, {"name": "mixture"}, 1.0),
-    "500 von Mises": (ANGLE, {"name": "mixture", "components": 500}, 1.0),
+    "normal": (REAL, {"name": "gaussian"}, 1.0),
+    "mixture of 10 normals": (
+        REAL,
+        {"name": "mixture", "components": 10, "component": {"name": "gaussian"}},
+        1.0,
+    ),
+    "von Mises": (ANGLE, {"name": "von_mises"}, 1.0),
+    "narrow von Mises": (ANGLE, {"name": "von_mises"}, 100.0),
+    "mixture of 5 von Mises": (ANGLE, {"name": "mixture"}, 1.0),
+    "mixture of 500 von Mises": (ANGLE, {"name": "mixture", "components": 500}, 1.0),
     "von Mises of 3 angles": (THREE, {"name": "von_mises"}, 1.0),
-    "matrix Fisher": (THREE, {"name": "matrix_fisher"}, 1.0),
+    "matrix Fisher of 3 angles": (THREE, {"name": "matrix_fisher"}, 1.0),
 }
-"""Target, head, and size of the raw numbers that it reads."""
+"""Target, density head and standard deviation of the raw parameters, by name of the density."""
 METRICS = ("log_likelihood", "crps", "coverage", "pit", "true_posterior")
-QUESTIONS: dict[str, Callable[[Distribution], object]] = {
+METHODS: dict[str, Callable[[Distribution], object]] = {
     "mode": lambda density: density.mode,
     "entropy": lambda density: density.entropy(),
     "1000 samples": lambda density: density.sample(torch.Size((1000,))),
@@ -53,45 +57,48 @@ ENCODERS: dict[str, tuple[tuple[int, ...], dict[str, Any]]] = {
 SAMPLES = (1, 10, 30, 100)
 
 
-def each(call: Callable[[], object]) -> float:
-    """Milliseconds a sample: the median of seven calls, of one where it takes half a second."""
+def milliseconds_per_sample(call: Callable[[], object]) -> float:
+    """Return the median of seven calls on a batch, or the time of one call that takes more than half a second."""
     once = milliseconds(call, repeats=1, warm_up=1)
     return (once if once > 500 else milliseconds(call, repeats=7, warm_up=0)) / BATCH
 
 
-def prediction(name: str) -> Prediction:
+def predict(name: str) -> Prediction:
+    """Return a batch of densities with random raw parameters, and targets that are sampled from them."""
     target, head, size = DENSITIES[name]
     torch.manual_seed(0)
-    made = build("density_head", resolve("density_head", head), target=target)
-    density = made(size * torch.randn(BATCH, made.size))
+    density_head = build("density_head", resolve("density_head", head), target=target)
+    density = density_head(size * torch.randn(BATCH, density_head.size))
     batch = {"target": density.sample(), "symmetry": torch.ones(BATCH, dtype=torch.int64)}
     return Prediction(density, batch)
 
 
-def judged(name: str, metric: str) -> float | None:
-    """Milliseconds a sample; None: the metric is not for such targets."""
-    found = prediction(name)
+def time_metric(name: str, metric: str) -> float | None:
+    """Return milliseconds per sample, or None if the metric does not apply to the kind of target."""
+    prediction = predict(name)
     try:
-        made = build("metric", resolve("metric", {"name": metric}), target=DENSITIES[name][0])
+        built = build("metric", resolve("metric", {"name": metric}), target=DENSITIES[name][0])
     except ConfigError:
         return None
 
     def call() -> None:
-        # what a prediction derives is kept: a new one each time
-        made.update(Prediction(found.density, found.batch))
+        # a prediction stores what is computed from it, so that each call needs a new prediction
+        built.update(Prediction(prediction.density, prediction.batch))
 
-    return each(call)
+    return milliseconds_per_sample(call)
 
 
-def asked(name: str, question: Callable[[Distribution], object]) -> float | None:
-    density = prediction(name).density
-    if density.event_shape == () and question is not QUESTIONS["mode"]:
+def time_method(name: str, method: Callable[[Distribution], object]) -> float | None:
+    """Return milliseconds per sample, or None for classes, of which only the mode is timed."""
+    density = predict(name).density
+    if density.event_shape == () and method is not METHODS["mode"]:
         return None
-    return each(lambda: question(density))
+    return milliseconds_per_sample(lambda: method(density))
 
 
 def table(columns: dict[str, Callable[[str], float | None]]) -> list[str]:
-    lines = [f"| | {' | '.join(columns)} |", f"|---|{'---:|' * len(columns)}"]
+    """Return the lines of a table with a row for each density, from the function that measures each column."""
+    lines = [f"| density | {' | '.join(columns)} |", f"|---|{'---:|' * len(columns)}"]
     for name in DENSITIES:
         times = [column(name) for column in columns.values()]
         cells = ["–" if took is None else f"{took:.2g}" if took < 10 else f"{took:.0f}" for took in times]
@@ -99,8 +106,8 @@ def table(columns: dict[str, Callable[[str], float | None]]) -> list[str]:
     return lines
 
 
-def masks(name: str) -> str:
-    """Of an encoder with dropout: milliseconds a sample, and how many times faster than one mask after the other."""
+def time_masks(name: str) -> str:
+    """Return the row of an encoder: milliseconds per sample, and speed-up over predictions with one mask each."""
     shape, encoder = ENCODERS[name]
     inputs = torch.randn(BATCH, *shape)
 
@@ -110,13 +117,13 @@ def masks(name: str) -> str:
             "density_head": resolve("density_head", "von_mises"),
             "uncertainty": [resolve("uncertainty", {"name": "mc_dropout", "samples": samples})],
         }
-        made = build_predictor(parts, ANGLE, shape, seed=0).eval()
-        return lambda: made(inputs)
+        predictor = build_predictor(parts, ANGLE, shape, seed=0).eval()
+        return lambda: predictor(inputs)
 
-    once = each(model(1))
+    once = milliseconds_per_sample(model(1))
     cells = []
     for samples in SAMPLES:
-        took = each(model(samples))
+        took = milliseconds_per_sample(model(samples))
         cells.append(f"{took:.2g} ({samples * once / took:.1f})")
     return f"| {name} | {' | '.join(cells)} |"
 
@@ -128,25 +135,35 @@ def main() -> None:
         [
             "# Run time of metrics, by kind of density",
             "",
-            f"Milliseconds per sample in batches of {BATCH}, float32, one thread: the median of seven calls, or one "
-            "call "
-            "where it takes half a second. Raw parameters are random; targets are drawn from their densities.",
+            "This page shows how long the evaluation of a prediction takes, for each metric and each kind of density. "
+            f"All tables give milliseconds per sample, in batches of {BATCH}, in float32 on one thread. A number is "
+            "the median of seven calls, or the time of one call if a call takes more than half a second.",
+            "",
+            "The densities have random raw parameters, and the targets are sampled from the densities. For the narrow "
+            "von Mises density, the raw parameters are 100 times as large as for the others.",
             "",
             "## Metrics",
             "",
-            *table({metric: partial(judged, metric=metric) for metric in METRICS}),
+            "Each column is a metric of `plugins/metric`. A dash means that the metric does not apply to this kind of "
+            "target.",
             "",
-            "## Questions",
+            *table({metric: partial(time_metric, metric=metric) for metric in METRICS}),
             "",
-            *table({question: partial(asked, question=call) for question, call in QUESTIONS.items()}),
+            "## Methods of a density",
             "",
-            "## Dropout",
+            "Metrics and figures call these methods of a density. The last column is the marginal density of the first "
+            "number of the target, evaluated at 360 angles. A dash means that the method was not measured.",
             "",
-            "Of `mc_dropout` with S masks; in brackets how many times faster than S passes with one.",
+            *table({name: partial(time_method, method=method) for name, method in METHODS.items()}),
             "",
-            f"| | {' | '.join(f'S = {samples}' for samples in SAMPLES)} |",
+            "## Dropout at test time",
+            "",
+            "The wrapper `mc_dropout` averages the predictions under S random dropout masks. In brackets follows how "
+            "many times faster this is than S predictions with one mask each.",
+            "",
+            f"| network | {' | '.join(f'S = {samples}' for samples in SAMPLES)} |",
             f"|---|{'---:|' * len(SAMPLES)}",
-            *(masks(name) for name in ENCODERS),
+            *(time_masks(name) for name in ENCODERS),
             "",
             f"{machine('torch', 'numba')} Command: `python -m benchmarks.densities.evaluation_time`.",
             "",
