@@ -1,12 +1,12 @@
-"""Fit Lorentzian lines in a real brain slice: SciPy, batched least squares, a network, and a fit that starts from it.
+"""Compare fits of Lorentzian lines in a real brain slice: SciPy, batched least squares, a network, and both combined.
 
     for seed in 0 1 2; do python -m framework experiment=cest/mlp data.root=/path/to/brain7T.mat seed=$seed threads=1 \\
         pictures=false logger=none hydra.run.dir=outputs/cest/$seed; done
     python -m benchmarks.spectra.cest outputs/cest/0 outputs/cest/1 outputs/cest/2
 
-Writes cest.md, cest.csv, cest.png and cest_maps.png beside this file. One thread, processor time, all in one run.
-With `--draw` it draws cest.png again from cest.csv, with `--only speed brain7T.mat` it writes the first section alone,
-in four minutes and without networks.
+The script measures processor time on one thread. It writes cest.md, cest.csv, cest.png and cest_maps.png beside this
+file. With `--draw` it draws cest.png again from cest.csv. With `--only speed brain7T.mat` it writes only the first
+section, which takes four minutes and needs no networks.
 """
 
 import sys
@@ -20,7 +20,7 @@ from PIL import Image
 from torch import Tensor
 
 from benchmarks.pages import machine, read_rows, replace_section, write_page
-from benchmarks.spectra.cest_scipy import AGREEMENT, TIGHT, agreement, scipys, timed
+from benchmarks.spectra.cest_scipy import AGREEMENT, TIGHT, compare_with_scipy, fit_with_scipy, time_call
 from benchmarks.timing import ROUNDS, require_idle
 from framework.configuration.loading import load_with_description
 from framework.data import Batch
@@ -42,21 +42,25 @@ from plugins.uncertainty.refined.wrapper import Refined
 HERE = Path(__file__).with_suffix("")
 STEPS = (1, 2, 3, 4, 5, 6, 8, 12, 300)
 DETERMINED = 0.1
-"""Share of a box's side below which a parameter's standard error says that the data determine it."""
+"""Largest standard error of a parameter that the data determine, as a share of the parameter's permitted range."""
 BLOCK = 512
 METHODS = {
     "method": "method",
-    "ms": "ms a voxel",
-    "times": "times SciPy's speed",
+    "ms": "time a voxel, ms",
+    "times": "speed ratio to SciPy",
     "median": "median error, standard errors",
-    "within": "within one standard error",
+    "within": "errors below one standard error",
 }
-DOUBTS = {
+CHANGED_SPECTRA = {
     "case": "held-out spectra",
-    "rise": "σ, times that as measured",
-    "error": "error, times that as measured",
-    "cover": "90 % intervals cover",
+    "rise": "σ ratio",
+    "error": "error ratio",
+    "cover": "coverage",
 }
+TABLE_HEAD = (
+    "| parameter | determined | standard error | network error | below standard error | coverage, not calibrated | "
+    "coverage, calibrated on the validation split | coverage, calibrated on half of the test split |"
+)
 
 
 LEGEND = {
@@ -66,16 +70,16 @@ LEGEND = {
     "network, then least squares": "network, then so many steps of least squares",
 }
 LEAST = 1e-8
-"""The smallest error that is drawn as it is."""
+"""Smallest error in the figure; smaller errors are drawn at this value."""
 
 
 @torch.no_grad()
-def means(model: Callable[[Tensor], torch.distributions.Distribution], inputs: Tensor) -> Tensor:
+def predict_means(model: Callable[[Tensor], torch.distributions.Distribution], inputs: Tensor) -> Tensor:
     return model(inputs).mean
 
 
-class One(Predictor):
-    """One number of a model's density, for intervals of its own."""
+class SingleParameter(Predictor):
+    """Predictor of the marginal density of one parameter, so that conformal prediction can calibrate it alone."""
 
     def __init__(self, model: Predictor, number: int) -> None:
         super().__init__()
@@ -88,53 +92,67 @@ class One(Predictor):
 
 
 def batches(fields: dict[str, Tensor], number: int) -> list[Batch]:
+    """Return the batches of a split, with one parameter as the target."""
     target = fields["target"][:, number : number + 1]
     both = zip(fields["input"].split(BLOCK), target.split(BLOCK), strict=True)
-    return [{"input": some, "target": labels} for some, labels in both]
+    return [{"input": inputs, "target": labels} for inputs, labels in both]
 
 
-def halves(fields: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+def split_in_halves(fields: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """Divide a split at random into two halves."""
     order = torch.randperm(len(fields["input"]), generator=torch.Generator().manual_seed(0))
     first, second = order.chunk(2)
-    return tuple({name: tensor[some] for name, tensor in fields.items()} for some in (first, second))  # type: ignore[return-value]
+    return tuple({name: tensor[rows] for name, tensor in fields.items()} for rows in (first, second))  # type: ignore[return-value]
 
 
 @torch.no_grad()
 def conformal_coverage(model: Predictor, validation: dict[str, Tensor], test: dict[str, Tensor]) -> Tensor:
-    """Share of test targets in intervals promised to hold 90 %, of each number."""
-    found = []
+    """Return, for each parameter, the share of test targets in its calibrated 90 % intervals."""
+    shares = []
     for number in range(test["target"].shape[1]):
-        wrapped = Conformal(lambda number=number: One(model, number), miscoverage=0.1, score="mass")
+        wrapped = Conformal(
+            lambda number=number: SingleParameter(model, number), miscoverage=0.1, score="mass"
+        )
         wrapped.calibrate(batches(validation, number))
         inside = [wrapped(batch["input"]).contains(batch["target"]) for batch in batches(test, number)]
-        found.append(torch.cat(inside).double().mean())
-    return torch.stack(found)
+        shares.append(torch.cat(inside).double().mean())
+    return torch.stack(shares)
 
 
 class Voxels(NamedTuple):
-    """The test split: parameters of least squares, their standard errors, and which the data determine."""
+    """Test split, fitted by least squares.
+
+    Attributes:
+        target: (voxel, parameter), fitted parameters.
+        error: (voxel, parameter), standard errors of the fit.
+        determined: (voxel, parameter), whether the data determine a parameter.
+    """
 
     target: Tensor
     error: Tensor
     determined: Tensor
 
-    def median(self, found: Tensor | np.ndarray) -> float:
-        return float(self.ratios(found).median())
+    def median(self, estimates: Tensor | np.ndarray) -> float:
+        """Return the median error, in standard errors."""
+        return float(self.ratios(estimates).median())
 
-    def within(self, found: Tensor | np.ndarray) -> float:
-        return float((self.ratios(found) < 1).double().mean())
+    def within(self, estimates: Tensor | np.ndarray) -> float:
+        """Return the share of errors below one standard error."""
+        return float((self.ratios(estimates) < 1).double().mean())
 
-    def ratios(self, found: Tensor | np.ndarray) -> Tensor:
-        off = (torch.as_tensor(found).double()[:, : self.target.shape[1]] - self.target).abs()
-        return (off / self.error)[self.determined]
+    def ratios(self, estimates: Tensor | np.ndarray) -> Tensor:
+        """Return the errors of all determined parameters, in standard errors."""
+        errors = (torch.as_tensor(estimates).double()[:, : self.target.shape[1]] - self.target).abs()
+        return (errors / self.error)[self.determined]
 
 
-def voxels_of(data: CEST, test: dict[str, Tensor]) -> Voxels:
-    wanted = data.parameters
-    found = fit(test["input"], torch.tensor(data.offsets, dtype=torch.float64), wanted)
-    told = slice(wanted.target_count)
-    lower, upper = (torch.tensor(side[told]).double() for side in (wanted.lower, wanted.upper))
-    target, error = found.parameters[:, told], found.root.square().sum(-1).sqrt()[:, told]
+def fit_voxels(data: CEST, test: dict[str, Tensor]) -> Voxels:
+    """Fit the test split by least squares."""
+    parameters = data.parameters
+    fitted = fit(test["input"], torch.tensor(data.offsets, dtype=torch.float64), parameters)
+    columns = slice(parameters.target_count)
+    lower, upper = (torch.tensor(side[columns]).double() for side in (parameters.lower, parameters.upper))
+    target, error = fitted.parameters[:, columns], fitted.root.square().sum(-1).sqrt()[:, columns]
     inside = (target > lower + 1e-9) & (target < upper - 1e-9)
     return Voxels(target, error, inside & (error < DETERMINED * (upper - lower)))
 
@@ -142,28 +160,37 @@ def voxels_of(data: CEST, test: dict[str, Tensor]) -> Voxels:
 def curves(
     network: Predictor, data: CEST, inputs: Tensor, test: dict[str, Tensor], voxels: Voxels
 ) -> dict[str, list[tuple[float, float, float]]]:
-    """Milliseconds a voxel, median error in standard errors, and share within one, of each method's knob."""
+    """Return results by method, one for each value of its knob.
+
+    A result is the time a voxel (ms), the median error in standard errors, and the share of errors below one standard
+    error.
+    """
     target = Target("real", data.parameters.target)
 
-    def entry(model: Predictor | LorentzianHead) -> tuple[float, float, float]:
-        _, spent = timed(lambda: means(model, inputs), len(inputs))
-        found = means(model, test["input"])
-        return spent, voxels.median(found), voxels.within(found)
+    def evaluate(model: Predictor | LorentzianHead) -> tuple[float, float, float]:
+        _, spent = time_call(lambda: predict_means(model, inputs), len(inputs))
+        estimates = predict_means(model, test["input"])
+        return spent, voxels.median(estimates), voxels.within(estimates)
 
-    found: dict[str, list[tuple[float, float, float]]] = {"SciPy": []}
+    results: dict[str, list[tuple[float, float, float]]] = {"SciPy": []}
     for most in (*STEPS[:-1], 20, None):
-        one = scipys(
+        fitted = fit_with_scipy(
             test["input"][::3].double().numpy(), np.array(data.offsets), data.parameters, TIGHT, most
         )
-        some = Voxels(*(part[::3] for part in voxels))
-        found["SciPy"].append((one.milliseconds, some.median(one.parameters), some.within(one.parameters)))
-    found["least squares"] = [entry(LorentzianHead(target, steps=steps)) for steps in STEPS]
-    found["network"] = [entry(network)]
-    found["network, then least squares"] = [entry(Refined(lambda: network, steps=steps)) for steps in STEPS]
-    return found
+        subset = Voxels(*(part[::3] for part in voxels))
+        results["SciPy"].append(
+            (fitted.milliseconds, subset.median(fitted.parameters), subset.within(fitted.parameters))
+        )
+    results["least squares"] = [evaluate(LorentzianHead(target, steps=steps)) for steps in STEPS]
+    results["network"] = [evaluate(network)]
+    results["network, then least squares"] = [
+        evaluate(Refined(lambda: network, steps=steps)) for steps in STEPS
+    ]
+    return results
 
 
-def drawn(rows: Sequence[Row]) -> None:
+def draw_curves(rows: Sequence[Row]) -> None:
+    """Save the figure of error against run time."""
     figure = titled_figure((7, 5), "Ten lines' parameters of a real slice: error against run time", False)
     axis = figure.subplots()
     for (name, label), colour, marker in zip(LEGEND.items(), (GREY, BLUE, RED, GREEN), "osD^", strict=True):
@@ -179,7 +206,8 @@ def drawn(rows: Sequence[Row]) -> None:
     save_figure(figure, HERE, True)
 
 
-def mapped(network: Predictor, data: CEST, file: Path) -> None:
+def draw_maps(network: Predictor, data: CEST, file: Path) -> None:
+    """Save the maps of the amplitudes by three methods."""
     volume, names = read_volume(file), data.parameters.target
     inputs = torch.from_numpy(volume.spectra.astype(np.float32))
     models = {
@@ -195,12 +223,14 @@ def mapped(network: Predictor, data: CEST, file: Path) -> None:
         methods[name] = slice_of(maps_of(volume, names, point, deviation), volume)
     figure = maps_figure(methods, f"{file.name}: amplitudes of the lines")
     path = save_figure(figure, HERE.with_name("cest_maps"), True)
-    Image.open(path).convert("RGB").quantize(256).save(path, optimize=True)  # a third of the bytes
+    Image.open(path).convert("RGB").quantize(256).save(
+        path, optimize=True
+    )  # reduces the file to a third of its size
 
 
 @torch.no_grad()
-def doubts(network: Predictor, data: CEST, test: dict[str, Tensor]) -> Iterator[dict[str, object]]:
-    """By how much the predicted standard deviations rise where spectra are unlike those seen."""
+def change_spectra(network: Predictor, data: CEST, test: dict[str, Tensor]) -> Iterator[dict[str, object]]:
+    """Yield table rows: by how much the predicted standard deviations and the errors rise for changed spectra."""
     generator = torch.Generator().manual_seed(0)
     offsets, lines, inputs = torch.tensor(data.offsets), test["lines"], test["input"]
     plain, target = network(inputs).stddev, test["target"]
@@ -211,8 +241,8 @@ def doubts(network: Predictor, data: CEST, test: dict[str, Tensor]) -> Iterator[
         moved = lines.clone()
         moved[:, 2 * COUNT] += shift
         cases[f"shifted by {shift} ppm"] = inputs + spectrum(moved, offsets) - spectrum(lines, offsets)
-    for name, some in cases.items():
-        density = network(some)
+    for name, spectra in cases.items():
+        density = network(spectra)
         error = (density.mean - target).abs()
         yield {
             "case": name,
@@ -224,16 +254,29 @@ def doubts(network: Predictor, data: CEST, test: dict[str, Tensor]) -> Iterator[
         }
 
 
-FIRST = "## Batched least squares against SciPy, the whole slice"
+FIRST = "## Batched least squares compared with SciPy"
 
 
-def speeds(file: Path) -> str:
-    """The section with the speed of SciPy and of all voxels at once."""
-    return f"""{markdown(list(agreement(file)), AGREEMENT)}
+def speed_section(file: Path) -> str:
+    """Return the section that compares SciPy with the batched fit."""
+    return f"""The table compares SciPy with the batched least squares of this project, which fits all voxels at
+once. The model has 11 or 15 parameters. SciPy runs with the tolerance 1e-14 and with its default 1e-8. The three
+columns after the number of parameters hold milliseconds a voxel: the median of {ROUNDS} rounds (least to largest). In
+each round SciPy fits another fifth of the voxels with 1e-14 and a twentieth of the voxels with 1e-8, and the batched fit has all
+voxels. A speed ratio is SciPy's time divided by that of the batched fit. `whole slice` is the time of the batched fit
+for all voxels.
 
-Median of {ROUNDS} rounds (least to largest); in each, SciPy has another fifth of the voxels to 1e-14 and a twentieth to
-1e-8, and all voxels are fitted at once. Within 1e-6: |difference| ≤ 1e-6 of the number, or of 1 % of its box where that
-is more. Fifteen numbers are fitted from two starts and the better fit is kept; SciPy has the first of them.
+The last five columns compare the results with those of SciPy at 1e-14. `sum of squares ≤ SciPy's` is the share of
+voxels where the batched fit is at least as good. `same minimum` is the share of voxels where the parameters are well
+determined and both sums of squares agree. `parameters agree` is the share of these where every parameter agrees to
+1e-6: the difference is at most 1e-6 of the parameter, or 1e-6 of 1 % of its permitted range if that is larger. The
+column `batched nearer` is the share of the remaining voxels where the batched fit is nearer to the minimum. `warnings`
+is the number of voxels for which the batched fit reports a problem.
+
+With 15 parameters the batched fit starts from two points and keeps the better result. SciPy starts from the first of
+them only.
+
+{markdown(list(compare_with_scipy(file)), AGREEMENT)}
 
 {machine("torch", "scipy", "numpy")} Command: `python -m benchmarks.spectra.cest --only speed brain7T.mat`."""
 
@@ -249,45 +292,45 @@ def main() -> None:
     train, validation, test = (dict(part.fields) for part in data.splits())  # type: ignore[attr-defined]
     volume = read_volume(file)
     inputs = torch.from_numpy(volume.spectra.astype(np.float32))
-    voxels, network = voxels_of(data, test), networks[0]
-    found = curves(network, data, inputs, test, voxels)
+    voxels, network = fit_voxels(data, test), networks[0]
+    results = curves(network, data, inputs, test, voxels)
     points = [
         {"method": name, "ms": ms, "median": off, "within": share}
-        for name, several in found.items()
+        for name, several in results.items()
         for ms, off, share in several
     ]
     write_csv(points, None, HERE.with_suffix(".csv"))
-    drawn(points)
-    mapped(network, data, file)
-    scipy = found["SciPy"][-1][0]
-    named = [(name, points[-1]) for name, points in found.items()]
-    few = next(point for point in found["network, then least squares"] if point[1] < 1e-3)
-    named.append(("the same, stopped where the median is below 0.001", few))
+    draw_curves(points)
+    draw_maps(network, data, file)
+    scipy = results["SciPy"][-1][0]
+    methods_shown = [(name, points[-1]) for name, points in results.items()]
+    stopped = next(point for point in results["network, then least squares"] if point[1] < 1e-3)
+    methods_shown.append(("the same, stopped where the median is below 0.001", stopped))
     methods = [
         {"method": name, "ms": ms, "times": scipy / ms, "median": off, "within": f"{100 * share:.1f} %"}
-        for name, (ms, off, share) in named
+        for name, (ms, off, share) in methods_shown
     ]
     numbers, shares = [], []
     before, after, mixed = [], [], []
-    for one in networks:
+    for trained in networks:
         with torch.no_grad():
-            density = one(test["input"])
-        off = (density.mean - test["target"]).abs()
+            density = trained(test["input"])
+        errors = (density.mean - test["target"]).abs()
         shares.append(voxels.within(density.mean))
-        before.append((off < 1.6449 * density.stddev).double().mean(0))
-        after.append(conformal_coverage(one, validation, test))
-        mixed.append(conformal_coverage(one, *halves(test)))
+        before.append((errors < 1.6449 * density.stddev).double().mean(0))
+        after.append(conformal_coverage(trained, validation, test))
+        mixed.append(conformal_coverage(trained, *split_in_halves(test)))
     density = network(test["input"])
-    off = (density.mean.detach().double() - voxels.target).abs()
+    errors = (density.mean.detach().double() - voxels.target).abs()
     for number, name in enumerate(data.parameters.target):
-        told = voxels.determined[:, number]
-        ratio = (off / voxels.error)[told, number]
+        determined = voxels.determined[:, number]
+        ratio = (errors / voxels.error)[determined, number]
         numbers.append(
             {
                 "name": name,
-                "determined": f"{100 * float(told.double().mean()):.1f} %",
+                "determined": f"{100 * float(determined.double().mean()):.1f} %",
                 "error": float(voxels.error[:, number].median()),
-                "off": float(off[:, number].median()),
+                "off": float(errors[:, number].median()),
                 "within": f"{100 * float((ratio < 1).double().mean()):.1f} %",
                 "before": " / ".join(f"{100 * float(part[number]):.1f}" for part in before),
                 "after": " / ".join(f"{100 * float(part[number]):.1f}" for part in after),
@@ -295,51 +338,77 @@ def main() -> None:
             }
         )
     coverage = {
-        what: " / ".join(f"{100 * float(part.mean()):.1f}" for part in parts)
-        for what, parts in (("before", before), ("after", after), ("mixed", mixed))
+        column: " / ".join(f"{100 * float(part.mean()):.1f}" for part in parts)
+        for column, parts in (("before", before), ("after", after), ("mixed", mixed))
     }
-    doubted = list(doubts(network, data, test))
-    told = f"{100 * float(voxels.determined.double().mean()):.1f} %"
+    changed = list(change_spectra(network, data, test))
+    determined = f"{100 * float(voxels.determined.double().mean()):.1f} %"
     row = "| {name} | {determined} | {error:.4f} | {off:.4f} | {within} | {before} | {after} | {mixed} |"
-    lines = [row.format(**each) for each in numbers]
+    lines = [row.format(**line) for line in numbers]
     text = f"""# Lorentzian lines in a real brain slice
 
-{len(inputs):,} voxels of `{file.name}` (7 T, 93 offsets; {volume.dropped} voxels that are not finite left out), one
-core, processor time. Networks saw {len(train["input"])} voxels, {len(test["input"])} are held out in bands of rows
-(`plugins/data/cest/README.md`). SciPy: `optimize.least_squares` (trf, bounds, x_scale="jac"), one voxel after another,
-with residuals and an analytic Jacobian in lean NumPy. Commands in `cest.py`.
+This page compares ways to fit five Lorentzian lines to each spectrum of a real brain slice: by least squares and with
+a neural network. It shows how fast and how exact each way is. `plugins/data/cest/README.md` describes the data and the
+model of the spectra.
+
+The slice has {len(inputs):,} voxels with one spectrum each (`{file.name}`, 7 T, 93 offsets).
+Another {volume.dropped} voxels are left out, because their spectra hold numbers that are not finite. The networks
+were trained on {len(train["input"])} voxels and are tested on {len(test["input"])} other voxels, in separate
+bands of rows. All times are processor times on one core. SciPy means `optimize.least_squares` (trf, bounds,
+x_scale="jac"). It fits one voxel after another, with residuals and an analytic Jacobian in NumPy that compute nothing
+twice. The commands are in `cest.py`.
 
 {FIRST}
 
-{speeds(file)}
+{speed_section(file)}
 
-## Error against run time, ten numbers
+## Error against run time
 
-![error against run time](cest.png)
+The table and the figure hold the errors of the ten amplitudes and widths in held-out voxels. An error is the distance
+from the converged least-squares fit, divided by the standard error of that fit. Only parameters that the data determine
+are counted: the standard error is below {100 * DETERMINED:.0f} % of the permitted range, and the parameter is not at
+the border of this range. `time a voxel` is measured with the whole slice at once, except for SciPy. The column
+`speed ratio to SciPy` is the time of SciPy divided by that of the method. `errors below one standard error` is the share of such
+errors. For the networks of {len(networks)} seeds this share is
+{" / ".join(f"{100 * share:.1f} %" for share in shares)}. The small errors of least squares are no evidence of
+accuracy, because the targets are themselves least-squares fits.
+
+![Error of the parameters against run time](cest.png)
 
 {markdown(methods, METHODS)}
 
-Errors are those of held-out voxels against converged least squares, in its standard errors, over the numbers that the
-data determine: standard error below {100 * DETERMINED:.0f} % of the box's side, and not at a bound. Within one standard
-error, networks of {len(networks)} seeds: {" / ".join(f"{100 * share:.1f} %" for share in shares)}. What least
-squares say of themselves is not judged: the targets are their answers. All are given the whole slice at once.
+Each row is one parameter of the spectra. `determined` is the share of voxels whose data determine the parameter.
+`standard error` is the median standard error of least squares, and `network error` is the median absolute error of the
+network; both are in the unit of the parameter. `below standard error` is the share of determined parameters for which
+the network error is smaller than the standard error. These columns are for the first network. The last three columns
+hold the coverage of the predicted 90 % intervals in %, for each of the networks: without calibration, after calibration
+on the validation split, and after calibration on the test split.
 
-| number | determined | standard error | its error | within | 90 % intervals cover | calibrated elsewhere | on others |
+{TABLE_HEAD}
 |---|---|---|---|---|---|---|---|
 {chr(10).join(lines)}
-| all | {told} | | | | {coverage["before"]} | {coverage["after"]} | {coverage["mixed"]} |
+| all | {determined} | | | | {coverage["before"]} | {coverage["after"]} | {coverage["mixed"]} |
 
-Medians, and shares by seed. Calibrated by `conformal` (score=mass) about each number's marginal: elsewhere, on the
-validation split's bands of rows, where there is other tissue, so that nothing is promised; on others, a random half of
-the test split, the other half of which is judged.
+The intervals are calibrated with `conformal` (score=mass) for each parameter separately. The validation split consists
+of other bands of rows with other tissue. Conformal prediction therefore does not guarantee the coverage for the test
+split. For the last column a random half of the test split is used for calibration and the other half for the test.
 
-## What the network doubts
+## Predicted uncertainty for unusual spectra
 
-{markdown(doubted, DOUBTS)}
+A predicted standard deviation σ should increase if a spectrum is unlike those of the training. For this table the
+held-out spectra were changed: noise with the given standard deviation was added, or the lines were shifted along the
+axis of the offsets. `σ ratio` is the predicted σ divided by that for the unchanged spectra, and `error ratio` is the
+same ratio of the mean absolute errors; both are geometric means. `coverage` is the share of targets in the predicted
+90 % intervals. If σ rises less than the error, the coverage falls.
+
+{markdown(changed, CHANGED_SPECTRA)}
 
 ## Maps
 
-![maps](cest_maps.png)
+The maps show the amplitudes of the lines in the whole slice, as computed by least squares, by the network, and by
+least squares that start from the network.
+
+![Maps of the amplitudes](cest_maps.png)
 
 {machine("torch", "scipy", "numpy")}
 """
@@ -349,10 +418,10 @@ the test split, the other half of which is judged.
 
 if __name__ == "__main__":
     if sys.argv[1:] == ["--draw"]:
-        drawn(read_rows(HERE.with_suffix(".csv")))
+        draw_curves(read_rows(HERE.with_suffix(".csv")))
     elif sys.argv[1:3] == ["--only", "speed"]:
         torch.set_num_threads(1)
         require_idle()
-        replace_section(HERE.with_suffix(".md"), FIRST, speeds(Path(sys.argv[3])))
+        replace_section(HERE.with_suffix(".md"), FIRST, speed_section(Path(sys.argv[3])))
     else:
         main()

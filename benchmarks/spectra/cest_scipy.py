@@ -1,4 +1,4 @@
-"""SciPy's least squares of one Z-spectrum after another, in lean NumPy, against all of them at once."""
+"""Comparison of SciPy's least squares, one Z-spectrum after another, with the batched fit of all spectra at once."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -16,11 +16,11 @@ from framework.spectra.spectrum import CENTRES, COUNT, PRESETS, Misfit, Paramete
 from plugins.data.cest.volumes import read_volume
 
 TIGHT, ORDINARY = 1e-14, 1e-8
-"""SciPy's tolerances: at which its parameters are right to 1e-6, and its default."""
+"""Tolerances of SciPy: the one at which its parameters are exact to 1e-6, and its default."""
 
 
-class Lean:
-    """Residuals and Jacobian of one spectrum in NumPy, with what both need computed once: SciPy at its best."""
+class FastResiduals:
+    """Residuals and Jacobian of one spectrum in NumPy, which share intermediate results to make SciPy fast."""
 
     def __init__(self, measured: np.ndarray, offsets: np.ndarray, size: int) -> None:
         self.measured, self.offsets, self.size = measured, offsets, size
@@ -39,124 +39,143 @@ class Lean:
 
     def jacobian(self, x: np.ndarray) -> np.ndarray:
         self(x)
-        found = np.empty((self.size, len(self.offsets)))
-        found[:COUNT] = -self.lines
+        matrix = np.empty((self.size, len(self.offsets)))
+        matrix[:COUNT] = -self.lines
         weight = self.amplitude * self.half * self.inverse**2
         moved = weight * self.distance
-        found[COUNT : 2 * COUNT] = -moved * self.distance
+        matrix[COUNT : 2 * COUNT] = -moved * self.distance
         moved *= -2 * self.half
-        found[2 * COUNT] = moved.sum(0)
-        found[2 * COUNT + 1 :] = moved[1:] if self.size > 2 * COUNT + 1 else 0
-        return found.T
+        matrix[2 * COUNT] = moved.sum(0)
+        matrix[2 * COUNT + 1 :] = moved[1:] if self.size > 2 * COUNT + 1 else 0
+        return matrix.T
 
 
-class Timed(NamedTuple):
-    """Parameters (voxel, p), half the sum of squares, milliseconds a voxel."""
+class SciPyFit(NamedTuple):
+    """Results of SciPy.
+
+    Attributes:
+        parameters: (voxel, p), fitted parameters.
+        cost: (voxel,), half the sum of squares.
+        milliseconds: Processor time a voxel.
+    """
 
     parameters: np.ndarray
     cost: np.ndarray
     milliseconds: float
 
 
-def scipys(
-    measured: np.ndarray, offsets: np.ndarray, wanted: Parameters, tolerance: float, most: int | None = None
-) -> Timed:
-    found, tolerances = [], dict.fromkeys(("ftol", "xtol", "gtol"), tolerance)
+def fit_with_scipy(
+    measured: np.ndarray,
+    offsets: np.ndarray,
+    model: Parameters,
+    tolerance: float,
+    most_evaluations: int | None = None,
+) -> SciPyFit:
+    solutions, tolerances = [], dict.fromkeys(("ftol", "xtol", "gtol"), tolerance)
     begin = time.process_time()
-    for one in measured:
-        lean = Lean(one, offsets, len(wanted.names))
-        box = (wanted.lower, wanted.upper)
-        jacobian: Any = lean.jacobian
-        ended = optimize.least_squares(
-            lean, wanted.start, jacobian, box, x_scale="jac", max_nfev=most, **tolerances
+    for spectrum in measured:
+        residuals = FastResiduals(spectrum, offsets, len(model.names))
+        box = (model.lower, model.upper)
+        jacobian: Any = residuals.jacobian
+        solution = optimize.least_squares(
+            residuals, model.start, jacobian, box, x_scale="jac", max_nfev=most_evaluations, **tolerances
         )
-        found.append((ended.x, ended.cost))
+        solutions.append((solution.x, solution.cost))
     spent = time.process_time() - begin
-    parameters, cost = (np.array(part) for part in zip(*found, strict=True))
-    return Timed(parameters, cost, 1e3 * spent / len(measured))
+    parameters, cost = (np.array(part) for part in zip(*solutions, strict=True))
+    return SciPyFit(parameters, cost, 1e3 * spent / len(measured))
 
 
-def timed(call: Callable[[], Tensor], voxels: int) -> tuple[Tensor, float]:
-    """What it gives, and the middle of three calls' milliseconds a voxel."""
+def time_call(call: Callable[[], Tensor], voxels: int) -> tuple[Tensor, float]:
+    """Return the result of a call, and the median milliseconds a voxel of three calls."""
     spent = []
     for _ in range(3):
         begin = time.process_time()
-        found = call()
+        result = call()
         spent.append(time.process_time() - begin)
-    return found, 1e3 * sorted(spent)[1] / voxels
+    return result, 1e3 * sorted(spent)[1] / voxels
 
 
-def slope(spectra: Tensor, offsets: Tensor, wanted: Parameters, found: Tensor) -> Tensor:
-    """The greatest cosine between residuals and a column of the Jacobian that no bound holds: 0 at a minimum."""
-    residuals, jacobian = Misfit(spectra, offsets)(found, torch.arange(len(found)))
+def gradient_cosine(spectra: Tensor, offsets: Tensor, model: Parameters, parameters: Tensor) -> Tensor:
+    """Return for each spectrum how far a fit is from a minimum, (spectrum,): 0 at a minimum, at most 1.
+
+    The number is the largest cosine between the residuals and a column of the Jacobian. Parameters that a bound keeps
+    from descending are left out.
+    """
+    residuals, jacobian = Misfit(spectra, offsets)(parameters, torch.arange(len(parameters)))
     gradient = (jacobian.mT @ residuals.unsqueeze(-1)).squeeze(-1)
-    lower, upper = (torch.tensor(side).double() for side in (wanted.lower, wanted.upper))
+    lower, upper = (torch.tensor(side).double() for side in (model.lower, model.upper))
     near = 1e-6 * (upper - lower)
-    held = (found <= lower + near) & (gradient > 0) | (found >= upper - near) & (gradient < 0)
+    at_bound = (parameters <= lower + near) & (gradient > 0) | (parameters >= upper - near) & (gradient < 0)
     cosine = gradient / (jacobian.norm(dim=1) * residuals.norm(dim=1, keepdim=True))
-    return cosine.masked_fill(held, 0.0).abs().amax(1)
+    return cosine.masked_fill(at_bound, 0.0).abs().amax(1)
 
 
-def agreement(file: Path) -> Iterator[dict[str, object]]:
-    """Fit the whole slice by SciPy and at once, for each preset; SciPy has a fifth of the voxels in each round."""
+def compare_with_scipy(file: Path) -> Iterator[dict[str, object]]:
+    """Yield a table row for each preset: run times and results of SciPy and of the batched fit for the whole slice.
+
+    In each round SciPy fits another fifth of the voxels, and the batched fit has all voxels.
+    """
     volume = read_volume(file)
     spectra = torch.from_numpy(volume.spectra.astype(np.float32)).double()
     offsets = torch.from_numpy(volume.offsets)
-    for name, wanted in PRESETS.items():
-        fit(spectra[:512], offsets, wanted)  # to warm up
-        parts: list[Timed] = []
-        usual, spent = [], []
-        ours: Fit | None = None
+    for name, model in PRESETS.items():
+        fit(spectra[:512], offsets, model)  # warm-up
+        parts: list[SciPyFit] = []
+        default_times, spent = [], []
+        batched_fit: Fit | None = None
         for part in range(ROUNDS):
-            own = spectra[part::ROUNDS].numpy()
-            parts.append(scipys(own, volume.offsets, wanted, TIGHT))
-            usual.append(scipys(own[::4], volume.offsets, wanted, ORDINARY).milliseconds)
+            part_spectra = spectra[part::ROUNDS].numpy()
+            parts.append(fit_with_scipy(part_spectra, volume.offsets, model, TIGHT))
+            default_times.append(
+                fit_with_scipy(part_spectra[::4], volume.offsets, model, ORDINARY).milliseconds
+            )
             begin = time.process_time()
-            ours = fit(spectra, offsets, wanted)
+            batched_fit = fit(spectra, offsets, model)
             spent.append(1e3 * (time.process_time() - begin) / len(spectra))
-        assert ours is not None
-        parameters, cost = np.empty((len(spectra), len(wanted.names))), np.empty(len(spectra))
-        for part, theirs in enumerate(parts):
-            parameters[part::ROUNDS], cost[part::ROUNDS] = theirs.parameters, theirs.cost
-        side = np.array(wanted.upper) - np.array(wanted.lower)
-        same = (np.abs(ours.cost.numpy() / cost - 1) < 1e-9) & (ours.status.numpy() > 0)
-        off = np.abs(ours.parameters.numpy() - parameters)
-        off = off / np.maximum(np.abs(parameters), 1e-2 * side)
-        apart = same & (off.max(1) >= 1e-6)
-        slopes = [
-            slope(spectra[apart], offsets, wanted, found)
-            for found in (ours.parameters[apart], torch.from_numpy(parameters[apart]))
+        assert batched_fit is not None
+        parameters, cost = np.empty((len(spectra), len(model.names))), np.empty(len(spectra))
+        for part, scipy_fit in enumerate(parts):
+            parameters[part::ROUNDS], cost[part::ROUNDS] = scipy_fit.parameters, scipy_fit.cost
+        side = np.array(model.upper) - np.array(model.lower)
+        same = (np.abs(batched_fit.cost.numpy() / cost - 1) < 1e-9) & (batched_fit.status.numpy() > 0)
+        relative = np.abs(batched_fit.parameters.numpy() - parameters)
+        relative = relative / np.maximum(np.abs(parameters), 1e-2 * side)
+        different = same & (relative.max(1) >= 1e-6)
+        cosines = [
+            gradient_cosine(spectra[different], offsets, model, estimates)
+            for estimates in (batched_fit.parameters[different], torch.from_numpy(parameters[different]))
         ]
         tight, ordinary, batched = (
-            Rounds(tuple(times)) for times in ([part.milliseconds for part in parts], usual, spent)
+            Rounds(tuple(times)) for times in ([part.milliseconds for part in parts], default_times, spent)
         )
         yield {
-            "numbers": f"{len(wanted.names)} ({name})",
+            "numbers": f"{len(model.names)} ({name})",
             "scipy": tight.text(),
             "usual": ordinary.text(),
             "ours": batched.text(),
             "ratio": batched.times_faster(tight),
             "usual_ratio": batched.times_faster(ordinary),
             "slice": batched.median * len(spectra) / 1e3,
-            "cost": f"{100 * np.mean(ours.cost.numpy() <= cost * (1 + 1e-9)):.2f} %",
+            "cost": f"{100 * np.mean(batched_fit.cost.numpy() <= cost * (1 + 1e-9)):.2f} %",
             "same": f"{100 * same.mean():.2f} %",
-            "within": f"{100 * np.mean(off[same].max(1) < 1e-6):.2f} %",
-            "nearer": f"{100 * float((slopes[0] < slopes[1]).double().mean()):.0f} %",
-            "flagged": int((ours.status <= 0).sum()),
+            "within": f"{100 * np.mean(relative[same].max(1) < 1e-6):.2f} %",
+            "nearer": f"{100 * float((cosines[0] < cosines[1]).double().mean()):.0f} %",
+            "flagged": int((batched_fit.status <= 0).sum()),
         }
 
 
 AGREEMENT = {
-    "numbers": "numbers fitted",
-    "scipy": "SciPy to 1e-14, ms a voxel",
-    "usual": "SciPy to 1e-8, ms",
-    "ours": "batched, ms",
-    "ratio": "ratio to the first",
-    "usual_ratio": "ratio to the second",
-    "slice": "slice, s",
-    "cost": "cost ≤ SciPy's",
-    "same": "well-posed, same minimum",
-    "within": "of these, all numbers within 1e-6",
-    "nearer": "of the others, batched nearer the minimum",
-    "flagged": "flagged",
+    "numbers": "parameters",
+    "scipy": "SciPy, tolerance 1e-14, ms a voxel",
+    "usual": "SciPy, tolerance 1e-8, ms a voxel",
+    "ours": "batched, ms a voxel",
+    "ratio": "speed ratio to SciPy, 1e-14",
+    "usual_ratio": "speed ratio to SciPy, 1e-8",
+    "slice": "whole slice, s",
+    "cost": "sum of squares ≤ SciPy's",
+    "same": "same minimum",
+    "within": "parameters agree",
+    "nearer": "batched nearer",
+    "flagged": "warnings",
 }
