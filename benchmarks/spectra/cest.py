@@ -262,9 +262,9 @@ def speed_section(file: Path) -> str:
     return f"""The table compares SciPy with the batched least squares of this project, which fits all voxels at
 once. The model has 11 or 15 parameters. SciPy runs with the tolerance 1e-14 and with its default 1e-8. The three
 columns after the number of parameters hold milliseconds a voxel: the median of {ROUNDS} rounds (least to largest). In
-each round SciPy fits another fifth of the voxels with 1e-14 and a twentieth of the voxels with 1e-8, and the batched fit has all
-voxels. A speed ratio is SciPy's time divided by that of the batched fit. `whole slice` is the time of the batched fit
-for all voxels.
+each round SciPy fits another fifth of the voxels with 1e-14 and a twentieth of the voxels with 1e-8, and the
+batched fit has all voxels. A speed ratio is SciPy's time divided by that of the batched fit. `whole slice` is the time
+of the batched fit for all voxels.
 
 The last five columns compare the results with those of SciPy at 1e-14. `sum of squares ≤ SciPy's` is the share of
 voxels where the batched fit is at least as good. `same minimum` is the share of voxels where the parameters are well
@@ -368,8 +368,8 @@ The table and the figure hold the errors of the ten amplitudes and widths in hel
 from the converged least-squares fit, divided by the standard error of that fit. Only parameters that the data determine
 are counted: the standard error is below {100 * DETERMINED:.0f} % of the permitted range, and the parameter is not at
 the border of this range. `time a voxel` is measured with the whole slice at once, except for SciPy. The column
-`speed ratio to SciPy` is the time of SciPy divided by that of the method. `errors below one standard error` is the share of such
-errors. For the networks of {len(networks)} seeds this share is
+`speed ratio to SciPy` is the time of SciPy divided by that of the method. The last column
+is the share of errors below one standard error. For the networks of {len(networks)} seeds this share is
 {" / ".join(f"{100 * share:.1f} %" for share in shares)}. The small errors of least squares are no evidence of
 accuracy, because the targets are themselves least-squares fits.
 
