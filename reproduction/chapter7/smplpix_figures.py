@@ -2,8 +2,9 @@
 
     python -m reproduction.chapter7.smplpix_figures <run of smplpix/quick> <run of smplpix/hybrid>
 
-Other people than in training, other views, other poses, other shapes: projected points, mesh, what each run paints,
-photograph, and where each is off. Writes smplpix_figures.md and each figure beside this file.
+The figures show other people, views, poses and shapes than the training data. Each compares projected points, the mesh,
+the image of each run and the photograph, and shows the errors. The script writes smplpix_figures.md and the figures
+beside this file.
 """
 
 import math
@@ -39,39 +40,40 @@ VIEWS = tuple(math.radians(degrees) for degrees in (0, 60, 120, 180, 240, 300))
 FRONT = math.radians(25)
 POSES = 5
 SHAPES = ("0=-2", "0=2", "1=-2", "1=2", "2=-2", "2=2")
-"""Directions and standard deviations, as plugins.data.human_scans.repose has them."""
-DARKER = 3
-"""Errors are drawn so many times as large."""
+"""Changes of shape as in plugins.data.human_scans.repose: number of the direction and standard deviations."""
+ERROR_FACTOR = 3
+"""Factor by which errors are enlarged in the figures."""
 
 
 NAMES = {"quick": "SMPLpix", "hybrid": "network over the mesh"}
-"""Of runs, by their experiments; others are called as these."""
+"""Names of runs by experiment; other runs keep the name of their experiment."""
 ABOUT = (
-    "Generated people who are not in the training data: {height} × {width} pixels, {vertices:,} vertices. The mesh "
-    "has its vertices' colours and 4 × 4 samples a pixel. For other poses, the registration to the first scan is "
-    "posed and the clothed person is photographed in that pose; other shapes have no photograph, since clothes would "
-    f"fall otherwise. Errors are drawn {DARKER} times as large as they are."
+    "The people are generated. An image has {height} × {width} pixels, and the mesh has {vertices:,} coloured vertices "
+    "and is drawn with 4 × 4 samples per pixel. For other poses, the mesh that is registered to the first scan is "
+    "posed, and the clothed person is photographed in that pose. Other shapes have no photograph, because clothes "
+    f"would fall differently on them. The last rows of a figure show the errors, enlarged {ERROR_FACTOR} times. PSNR "
+    "is the peak signal-to-noise ratio over the whole frame."
 )
 
 
 class Shot(NamedTuple):
-    """What is drawn, and how; the photograph is known where the moment has a scan."""
+    """A scene with its name; the photograph is known if the moment has a scan."""
 
     name: str
     scene: Scene
     moment: Moment
 
 
-class Ways(NamedTuple):
-    """How a scene is drawn, by what a sheet calls it; and what draws the data's photographs."""
+class DrawingMethods(NamedTuple):
+    """Renderers of a scene by name, the renderer of the photographs, and the image size."""
 
     renderers: Mapping[str, Renderer]
     camera: Renderer
     size: tuple[int, int]
 
 
-Pictures = dict[str, np.ndarray]
-"""(height, width, 3), 0 to 255, by way."""
+Images = dict[str, np.ndarray]
+"""Images by method, (height, width, 3), 0 to 255."""
 
 
 def main(runs: Sequence[str]) -> None:
@@ -85,91 +87,99 @@ def main(runs: Sequence[str]) -> None:
     for run in runs:
         method = read_stored(run)[0].method
         renderers[NAMES.get(method, method)] = rendered("smplpix", checkpoint=run)
-    ways = Ways(renderers, data.renderer, (height, width))
+    methods = DrawingMethods(renderers, data.renderer, (height, width))
     people = [generated_person(data, name) for name in SUBJECTS]
     figures = {
-        "7_2": ("Figure 7.2: people of the test split", list(seen_from(people, FRONT, ways.size))),
-        "7_3": ("Figure 7.3: views all around one of them", list(around(people[1], ways.size))),
-        "7_4": ("Figure 7.4: one of them in other poses", list(posed(people[1], ways.size))),
-        "7_5": ("Figure 7.5: one of them in other shapes", list(shaped(data, people[1], ways.size))),
+        "7_2": ("Figure 7.2: people of the test split", list(shots_of_people(people, FRONT, methods.size))),
+        "7_3": ("Figure 7.3: views all around one of them", list(shots_of_views(people[1], methods.size))),
+        "7_4": ("Figure 7.4: one of them in other poses", list(shots_of_poses(people[1], methods.size))),
+        "7_5": (
+            "Figure 7.5: one of them in other shapes",
+            list(shots_of_shapes(data, people[1], methods.size)),
+        ),
     }
     lines = []
     for number, (title, shots) in figures.items():
-        drawn = {shot.name: pictures(shot, ways) for shot in shots}
-        place = HERE.with_name(f"{HERE.stem}_{number}.png")
-        sheet(drawn, title).savefig(place)
-        lines += [f"## {title}", "", f"![{title}]({place.name})", "", decibels(drawn), ""]
+        images_by_shot = {shot.name: draw_shot(shot, methods) for shot in shots}
+        path = HERE.with_name(f"{HERE.stem}_{number}.png")
+        draw_sheet(images_by_shot, title).savefig(path)
+        lines += [f"## {title}", "", f"![{title}]({path.name})", "", psnr_sentence(images_by_shot), ""]
     about = ABOUT.format(height=height, width=width, vertices=len(people[0].registration.vertices))
-    trained = "; ".join(
-        f"{name}: {training(run).removesuffix('.')}"
-        for name, run in zip(list(renderers)[1:], runs, strict=True)
-    )
-    told = f"{machine('torch', 'numpy')} Command: `python -m reproduction.chapter7.smplpix_figures <runs>`."
+    trained = [f"- {name}: {training(run)}" for name, run in zip(list(renderers)[1:], runs, strict=True)]
+    footer = f"{machine('torch', 'numpy')} Command: `python -m reproduction.chapter7.smplpix_figures <runs>`."
     text = [
         "# Qualitative results of SMPLpix, as in Figures 7.2 to 7.5 (synthetic people)",
         "",
-        f"{about} Runs: {trained}.",
+        "This page shows qualitative results as in Figures 7.2 to 7.5 of the thesis: images of people who are not in "
+        "the training data. Each figure compares the projected points, the drawn mesh, the networks and the "
+        "photograph.",
+        "",
+        about,
+        "",
+        "The networks were trained as follows:",
+        "",
+        *trained,
         "",
         *lines,
-        told,
+        footer,
         "",
     ]
     write_page(HERE, text)
 
 
-def seen_from(people: Sequence[Generated], azimuth: float, size: tuple[int, int]) -> Iterator[Shot]:
-    for name, one in zip(SUBJECTS, people, strict=True):
-        moment = one.first()
+def shots_of_people(people: Sequence[Generated], azimuth: float, size: tuple[int, int]) -> Iterator[Shot]:
+    for name, person in zip(SUBJECTS, people, strict=True):
+        moment = person.first()
         (camera,) = orbit([moment], [azimuth], size)
-        yield shot(name.replace("_", " "), one, moment, camera)
+        yield make_shot(name.replace("_", " "), person, moment, camera)
 
 
-def around(one: Generated, size: tuple[int, int]) -> Iterator[Shot]:
-    moment = one.first()
+def shots_of_views(person: Generated, size: tuple[int, int]) -> Iterator[Shot]:
+    moment = person.first()
     for azimuth, camera in zip(VIEWS, orbit([moment] * len(VIEWS), VIEWS, size), strict=True):
-        yield shot(f"{math.degrees(azimuth):.0f}°", one, moment, camera)
+        yield make_shot(f"{math.degrees(azimuth):.0f}°", person, moment, camera)
 
 
-def posed(one: Generated, size: tuple[int, int]) -> Iterator[Shot]:
-    body = one.crowd.body
-    drawn = poses.rotations(body, poses.skeleton(body), poses.draw(POSES, np.random.default_rng(4)))
-    moments = [one.first(), *(one.at(pose) for pose in drawn)]
+def shots_of_poses(person: Generated, size: tuple[int, int]) -> Iterator[Shot]:
+    body = person.crowd.body
+    rotations = poses.rotations(body, poses.skeleton(body), poses.draw(POSES, np.random.default_rng(4)))
+    moments = [person.first(), *(person.at(pose) for pose in rotations)]
     cameras = orbit(moments, [FRONT] * len(moments), size)
     for number, (moment, camera) in enumerate(zip(moments, cameras, strict=True)):
-        yield shot(f"pose {number}" if number else "as scanned", one, moment, camera)
+        yield make_shot(f"pose {number}" if number else "as scanned", person, moment, camera)
 
 
-def shaped(data: HumanScans, one: Generated, size: tuple[int, int]) -> Iterator[Shot]:
-    """Pose and shape are found from the registration alone; the photograph is known of the first alone."""
-    few = reduce_shapes(one.crowd.body, one.crowd.traits)
-    found = subject(one.crowd.body, few, one.registration, SUBJECTS[1])
-    count = few.shapes.shape[-1]
+def shots_of_shapes(data: HumanScans, person: Generated, size: tuple[int, int]) -> Iterator[Shot]:
+    """Yield shots of a person in other shapes; only the first has a photograph."""
+    shape_space = reduce_shapes(person.crowd.body, person.crowd.traits)
+    reposed = subject(person.crowd.body, shape_space, person.registration, SUBJECTS[1])
+    count = shape_space.shapes.shape[-1]
     meshes = {
-        f"direction {int(text[0]) + 1}, {float(text[2:]):+g} SD": found.posed(
+        f"direction {int(text[0]) + 1}, {float(text[2:]):+g} SD": reposed.posed(
             change=shape_change(text, count)
         )
         for text in SHAPES
     }
-    moments = [one.first(), *(Moment(mesh.vertices, None) for mesh in meshes.values())]
+    moments = [person.first(), *(Moment(mesh.vertices, None) for mesh in meshes.values())]
     cameras = orbit(moments, [FRONT] * len(moments), size)
     for name, moment, camera in zip(["as scanned", *meshes], moments, cameras, strict=True):
-        yield shot(name, one, moment, camera)
+        yield make_shot(name, person, moment, camera)
 
 
-def shot(name: str, one: Generated, moment: Moment, camera: Camera) -> Shot:
-    return Shot(name, actor(one.registration).scene(moment, camera), moment)
+def make_shot(name: str, person: Generated, moment: Moment, camera: Camera) -> Shot:
+    return Shot(name, actor(person.registration).scene(moment, camera), moment)
 
 
 @torch.no_grad()
-def pictures(given: Shot, ways: Ways) -> Pictures:
-    found = {"points": projected(given.scene, ways.size)}
-    found |= {name: on_white(renderer, given.scene) for name, renderer in ways.renderers.items()}
-    if given.moment.scan is not None:
-        found[TRUTH] = photograph(ways.camera, given.moment.scan, given.scene.camera)
-    return found
+def draw_shot(shot: Shot, methods: DrawingMethods) -> Images:
+    images = {"points": project_points(shot.scene, methods.size)}
+    images |= {name: on_white(renderer, shot.scene) for name, renderer in methods.renderers.items()}
+    if shot.moment.scan is not None:
+        images[TRUTH] = photograph(methods.camera, shot.moment.scan, shot.scene.camera)
+    return images
 
 
-def projected(scene: Scene, size: tuple[int, int]) -> np.ndarray:
+def project_points(scene: Scene, size: tuple[int, int]) -> np.ndarray:
     config = {"name": "projection", "height": size[0], "width": size[1]}
     encoder = build("encoder", resolve("encoder", config), input_shape=(1, 6), input_columns=())
     assert scene.colors is not None
@@ -178,44 +188,50 @@ def projected(scene: Scene, size: tuple[int, int]) -> np.ndarray:
     return (255 * image.permute(1, 2, 0)).round().byte().numpy()
 
 
-def sheet(drawn: Mapping[str, Pictures], title: str) -> Figure:
-    """A column for each shot; below the ways their errors, where there is a photograph."""
-    first = next(iter(drawn.values()))
-    ways = list(first)
-    judged = [name for name in ways if name not in ("points", TRUTH)]
+def draw_sheet(images_by_shot: Mapping[str, Images], title: str) -> Figure:
+    """Draw a column for each shot: its images, and below them their errors if there is a photograph."""
+    first = next(iter(images_by_shot.values()))
+    methods = list(first)
+    judged = [name for name in methods if name not in ("points", TRUTH)]
     rows = [
-        *ways,
-        *(f"{name}, error" for name in judged if any(TRUTH in one for one in list(drawn.values())[1:])),
+        *methods,
+        *(
+            f"{name}, error"
+            for name in judged
+            if any(TRUTH in images for images in list(images_by_shot.values())[1:])
+        ),
     ]
-    rows_of, columns_of = shown(drawn)
+    rows_of, columns_of = crop_to_people(images_by_shot)
     height, width = rows_of.stop - rows_of.start, columns_of.stop - columns_of.start
-    figure = titled_figure((1.3 * len(drawn) + 0.5, 1.3 * height / width * len(rows) + 0.6), title, True)
-    axes = figure.subplots(len(rows), len(drawn), squeeze=False)
-    for column, (name, some) in enumerate(drawn.items()):
+    figure = titled_figure(
+        (1.3 * len(images_by_shot) + 0.5, 1.3 * height / width * len(rows) + 0.6), title, True
+    )
+    axes = figure.subplots(len(rows), len(images_by_shot), squeeze=False)
+    for column, (name, some) in enumerate(images_by_shot.items()):
         axes[0, column].set_title(name, fontsize=9)
-        for row, way in enumerate(rows):
-            place = axes[row, column]
-            place.set(xticks=[], yticks=[])
-            place.spines[:].set_visible(False)
+        for row, method in enumerate(rows):
+            panel = axes[row, column]
+            panel.set(xticks=[], yticks=[])
+            panel.spines[:].set_visible(False)
             if column == 0:
-                place.set_ylabel(way.replace(" over ", "\nover ").replace(", ", ",\n"), fontsize=9)
-            pixels = some.get(way)
-            if way.endswith(", error") and TRUTH in some:
-                off = np.abs(some[way.removesuffix(", error")].astype(int) - some[TRUTH])
-                pixels = (255 - DARKER * off).clip(0, 255).astype(np.uint8)
+                panel.set_ylabel(method.replace(" over ", "\nover ").replace(", ", ",\n"), fontsize=9)
+            pixels = some.get(method)
+            if method.endswith(", error") and TRUTH in some:
+                error = np.abs(some[method.removesuffix(", error")].astype(int) - some[TRUTH])
+                pixels = (255 - ERROR_FACTOR * error).clip(0, 255).astype(np.uint8)
             if pixels is not None:
-                place.imshow(pixels[rows_of, columns_of])
+                panel.imshow(pixels[rows_of, columns_of])
     return figure
 
 
-def shown(drawn: Mapping[str, Pictures]) -> tuple[slice, slice]:
-    """Rows and columns that hold all people, and a few pixels about them."""
-    some = [
+def crop_to_people(images_by_shot: Mapping[str, Images]) -> tuple[slice, slice]:
+    """Return the slices of rows and columns that hold all people, with a margin of a few pixels."""
+    frames = [
         pixels
-        for one in drawn.values()
-        for pixels in (one["points"], one["mesh"], one.get(TRUTH, one["mesh"]))
+        for images in images_by_shot.values()
+        for pixels in (images["points"], images["mesh"], images.get(TRUTH, images["mesh"]))
     ]
-    dark = (np.stack(some) < 250).any(-1).any(0)
+    dark = (np.stack(frames) < 250).any(-1).any(0)
 
     def span(axis: int) -> slice:
         places = np.nonzero(dark)[axis]
@@ -224,16 +240,16 @@ def shown(drawn: Mapping[str, Pictures]) -> tuple[slice, slice]:
     return span(0), span(1)
 
 
-def decibels(drawn: Mapping[str, Pictures]) -> str:
-    """PSNR of the frame, mean over the shots whose photograph is known."""
-    known = [some for some in drawn.values() if TRUTH in some]
-    ways = [name for name in known[0] if name not in ("points", TRUTH)]
+def psnr_sentence(images_by_shot: Mapping[str, Images]) -> str:
+    """Return a sentence with the mean PSNR over the shots that have a photograph."""
+    known = [images for images in images_by_shot.values() if TRUTH in images]
+    methods = [name for name in known[0] if name not in ("points", TRUTH)]
     means = []
-    for name in ways:
-        errors = [np.square((some[name].astype(float) - some[TRUTH]) / 255).mean() for some in known]
+    for name in methods:
+        errors = [np.square((images[name].astype(float) - images[TRUTH]) / 255).mean() for images in known]
         means.append(f"{name} {np.mean(-10 * np.log10(errors)):.1f} dB")
     count = f"{len(known)} images" if len(known) > 1 else "one image"
-    return f"PSNR of the frame, mean of {count}: {', '.join(means)}."
+    return f"Mean PSNR of {count}: {', '.join(means)}."
 
 
 if __name__ == "__main__":

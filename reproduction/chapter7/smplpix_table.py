@@ -2,8 +2,8 @@
 
     python -m reproduction.chapter7.smplpix_table
 
-Runs SWEEPS into outputs/smplpix_table, or goes on with them, then judges every test image again; `… <folders of
-sweeps> [--lpips <alexnet.pth>]` only judges. Writes smplpix_table.md beside it.
+The script runs `SWEEPS` into outputs/smplpix_table, or continues them, and then evaluates every test image again. With
+`<folders of sweeps> [--lpips <alexnet.pth>]` it only evaluates. It writes smplpix_table.md beside this file.
 """
 
 import argparse
@@ -51,8 +51,8 @@ SWEEPS = {
         "seed=1",
     ),
 }
-"""Folders and arguments: the table's six rows, what a network over the mesh adds, meshes without anti-aliasing. Epochs
-are a quarter of the experiments', so that all of it takes two hours of one core."""
+"""Folders and overrides of the sweeps: meshes, networks, and meshes without anti-aliasing. Networks have a quarter of
+the epochs of their experiments, so that everything takes two hours of one core."""
 METRICS = ("psnr", "ssim", "ms_ssim", "lpips")
 NAMES = {
     "rasterised": "mesh, vertex colours",
@@ -60,33 +60,34 @@ NAMES = {
     "quick": "SMPLpix",
     "hybrid": "network over the mesh",
 }
-"""Of rows, by the experiments' names; any other stands for itself."""
-SAID = (
+"""Names of rows by experiment; other experiments keep their own name."""
+UNNAMED_OVERRIDES = (
     *("experiment", "data.topology", "seed", "trainer.max_epochs"),
     *("metric", "pictures", "logger", "threads", "workers"),
 )
-"""Arguments that a row says already, or that all have, or that change no image."""
-RIVAL = "rasterised"
+"""Overrides that do not distinguish rows by name: a column shows them, all runs have them, or no image depends on
+them."""
+BASELINE = "rasterised"
 COLUMNS = {
     "psnr_db": ("PSNR, dB", 2),
-    "psnr_masked_db": ("inside", 2),
+    "psnr_masked_db": ("PSNR inside, dB", 2),
     "ssim": ("SSIM", 4),
-    "ssim_masked": ("inside", 3),
+    "ssim_masked": ("SSIM inside", 3),
     "ms_ssim": ("MS-SSIM", 4),
     "lpips": ("LPIPS", 4),
-    "lpips_masked": ("inside", 4),
+    "lpips_masked": ("LPIPS inside", 4),
 }
-"""Keys of numbers, their headings and decimals."""
+"""Headings and decimals of the quality columns, by the key of the result."""
 GAINS = ("psnr_masked_db", "ssim_masked", "psnr_db")
 
 
 class Row(NamedTuple):
-    """What a line of the table is of.
+    """A row of the table.
 
     Attributes:
-        method: an experiment's name.
-        topology: of the vertices.
-        change: arguments that other runs were not given.
+        method: Name of an experiment.
+        topology: Number of vertices: 7k or 27k.
+        change: Overrides that the other runs do not have.
     """
 
     method: str
@@ -110,14 +111,15 @@ THESIS = {
 
 
 @dataclass(frozen=True)
-class Judged:
-    """One trained model on every test image.
+class Evaluation:
+    """Results of one model on every test image.
 
     Attributes:
-        numbers: of each image by key, NaN where it has none.
-        subjects: of each image.
-        drawing, network: milliseconds of an image, of encoders that are fixed and of those that learn.
-        learns: whether anything was trained.
+        numbers: Result of each image by key, NaN where an image has none.
+        subjects: Subject of each image.
+        drawing: Milliseconds per image of the encoders that are fixed.
+        network: Milliseconds per image of the encoders that are trained.
+        learns: Whether the model has trained parameters.
     """
 
     numbers: Mapping[str, np.ndarray]
@@ -132,65 +134,86 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     arguments.add_argument(
-        "folders", nargs="*", type=Path, help="of sweeps that have run; none: they are run now"
+        "folders",
+        nargs="*",
+        type=Path,
+        help="folders of sweeps that have run; without any, the sweeps are run first",
     )
     arguments.add_argument("--lpips", help="file of torchvision's AlexNet trained on ImageNet")
-    given = arguments.parse_args()
-    for name, words in [] if given.folders else SWEEPS.items():
+    options = arguments.parse_args()
+    for name, words in [] if options.folders else SWEEPS.items():
         command = [sys.executable, "-m", "framework", "-m", *words, f"hydra.sweep.dir={FOLDER / name}"]
         carry_out(command)
     torch.set_num_threads(1)
-    text = report(given.folders or [FOLDER / name for name in SWEEPS], given.lpips)
+    text = report(options.folders or [FOLDER / name for name in SWEEPS], options.lpips)
     write_page(HERE, text)
 
 
 def report(folders: Sequence[Path], lpips: str | None) -> str:
-    runs = grouped([result for folder in folders for result in completed(folder)])
-    told = " and ".join(f"`python -m framework -m {' '.join(words)}`" for words in SWEEPS.values())
-    rows: dict[Row, list[Judged]] = {}
-    about = ""
+    runs = group_by_row([result for folder in folders for result in read_completed(folder)])
+    sweep_commands = " and ".join(f"`python -m framework -m {' '.join(words)}`" for words in SWEEPS.values())
+    rows: dict[Row, list[Evaluation]] = {}
+    data_text = ""
     for row, results in runs.items():
-        # what is not trained is the same whatever the seed: the runs' own numbers say so
-        chosen = results[:1] if same(results) else results
+        # a model without training gives equal numbers for all seeds, so one run is enough
+        chosen = results[:1] if have_equal_numbers(results) else results
         rows[row] = []
         for result in chosen:
-            found, data = judged(Path(result["folder"]), lpips)
-            rows[row].append(found)
-            if about not in ("", described(data)):
-                sys.exit(f"{row} has other data: {described(data)} The rows before it: {about}")
-            about = described(data)
+            evaluation, data = evaluate_run(Path(result["folder"]), lpips)
+            rows[row].append(evaluation)
+            if data_text not in ("", describe_data(data)):
+                sys.exit(
+                    f"The row {row} has other data than the rows before. This row: {describe_data(data)} Rows before: "
+                    f"{data_text} Give sweeps that use the same data."
+                )
+            data_text = describe_data(data)
     return "\n".join(
         [
             "# Table 7.1 on synthetic people",
             "",
-            f"{about} Sweeps: {told}. Means over "
-            "test images; behind ± the standard deviation over seeds, then that over subjects (of the means of each "
-            "one's images and seeds). A dash: nothing is trained, all seeds give the same numbers. Inside: over "
-            "the subject's pixels; the others over the frame, most of which is white. Milliseconds of "
-            "processor time, one image alone on one thread: drawing the mesh, 4 × 4 samples a pixel unless said, or "
-            "projecting its vertices; then the network. Networks are trained for a quarter of the experiments' epochs; "
-            "what longer training brings: [smplpix_training.md](smplpix_training.md)." + unfinished(runs),
+            "This page repeats Table 7.1 of the thesis: images of unseen people are drawn either as a mesh, or by a "
+            "neural network from projected vertices (SMPLpix) or from the drawn mesh. The table compares the images "
+            f"with photographs, and gives the run time. {data_text}",
             "",
-            f"| | vertices | seeds | {' | '.join(heading for heading, _ in COLUMNS.values())} | drawing, ms | "
+            "A cell of a quality column holds the mean over test images ± the standard deviation over seeds ± the "
+            "standard deviation over subjects. The value of a subject is the mean over its images and seeds. A dash "
+            "stands where nothing is trained, so that all seeds give the same numbers.",
+            "",
+            "- **Vertices** is the number of vertices of the mesh: 6,890 (7k) or about 27,000 (27k).",
+            "- **Inside** means that only the pixels of the subject count. The other columns are over the whole frame, "
+            "most of which is white.",
+            "- **Drawing** is the processor time in milliseconds to draw the mesh, or to project its vertices, for one "
+            'image on one thread. A mesh is drawn with 4 × 4 samples per pixel; "supersampling 1" has one sample. '
+            "**Network** is the processor time of the network.",
+            "",
+            "The networks are trained for a quarter of the epochs of the experiments. "
+            "[smplpix_training.md](smplpix_training.md) shows what longer training brings. The sweeps are "
+            f"{sweep_commands}.{unfinished_note(runs)}",
+            "",
+            f"| method | vertices | seeds | {' | '.join(heading for heading, _ in COLUMNS.values())} | drawing, ms | "
             "network, ms |",
             f"|---|---|{'---:|' * (len(COLUMNS) + 3)}",
-            *(line(row, found, len(runs[row])) for row, found in rows.items()),
+            *(table_line(row, evaluation, len(runs[row])) for row, evaluation in rows.items()),
             "",
-            "## Against the mesh with the same vertices' colours",
+            "## Difference from the mesh with vertex colours",
             "",
-            "Image by image, then the mean of each subject: mean difference ± standard deviation over subjects.",
+            "Each row is compared with the mesh that has the same number of vertices and colours at its vertices. The "
+            "difference is taken image by image and averaged for each subject. A cell holds the mean difference ± the "
+            "standard deviation over subjects; positive numbers mean better images. The last column counts the "
+            "subjects whose PSNR inside improves.",
             "",
-            f"| | vertices | {' | '.join(gain_heading(key) for key in GAINS)} | subjects who gain inside |",
+            f"| method | vertices | {' | '.join(COLUMNS[key][0] for key in GAINS)} | subjects with a gain |",
             f"|---|---|{'---:|' * (len(GAINS) + 1)}",
-            *gains(rows),
+            *gain_lines(rows),
             "",
-            "## The thesis's own numbers",
+            "## Table 7.1 as printed in the thesis",
             "",
-            "**Other data**: photographs of 68 unseen subjects, real people in a scanner, 410 × 308 pixels, not "
-            "public; another renderer of meshes (Kato et al. 2018, no anti-aliasing), another network, another "
-            "machine. No number here compares with one above; what can be compared is how the rows are ordered.",
+            "The thesis used other data: photographs of 68 unseen real people in a scanner, with 410 × 308 pixels, "
+            "which are not public. Its mesh renderer (Kato et al. 2018, without anti-aliasing), its network and its "
+            "machine were also different. Only the order of the rows can therefore be compared with the table above, "
+            "not the numbers.",
             "",
-            "| | vertices | PSNR, dB | LPIPS | ms |",
+            "| method | vertices | PSNR, dB | LPIPS | run time, ms |",
             "|---|---|---:|---:|---:|",
             *(f"| {row} | {psnr} | {distance} | {took} |" for row, (psnr, distance, took) in THESIS.items()),
             "",
@@ -200,65 +223,73 @@ def report(folders: Sequence[Path], lpips: str | None) -> str:
     )
 
 
-def unfinished(runs: Mapping[Row, list[dict[str, Any]]]) -> str:
-    """A sentence where trained rows have different numbers of seeds."""
+def unfinished_note(runs: Mapping[Row, list[dict[str, Any]]]) -> str:
+    """Return a warning if trained rows have different numbers of seeds, else an empty text."""
     counts = {len(results) for results in runs.values() if results[0]["parameters"]}
     return " **Sweeps were stopped before all seeds had run.**" if len(counts) > 1 else ""
 
 
-def completed(folder: Path) -> list[dict[str, Any]]:
-    """Results of the jobs of a sweep, by their numbers."""
-    found = []
+def read_completed(folder: Path) -> list[dict[str, Any]]:
+    """Return the results of the completed jobs of a sweep, ordered by job number."""
+    jobs = []
     for path in sorted(folder.glob("*/results.json"), key=lambda path: (len(path.parent.name), path)):
         record = json.loads((path.parent / RECORD).read_text())
         if record["status"] == "completed":
             results = json.loads(path.read_text())
-            found.append({**results, "overrides": record["overrides"], "folder": str(path.parent)})
-    if not found:
-        sys.exit(f"{folder} holds no results of a sweep. Give the folder of one, or none to run it.")
-    return found
+            jobs.append({**results, "overrides": record["overrides"], "folder": str(path.parent)})
+    if not jobs:
+        sys.exit(
+            f"{folder} holds no results of a sweep. Give the folder of a sweep that has run, or no folder to run the "
+            "sweeps."
+        )
+    return jobs
 
 
-def grouped(results: Sequence[dict[str, Any]]) -> dict[Row, list[dict[str, Any]]]:
-    """Results that differ in their seeds alone, method after method."""
-    found: dict[Row, list[dict[str, Any]]] = {}
-    told = [set(result["overrides"]) for result in results]
+def group_by_row(results: Sequence[dict[str, Any]]) -> dict[Row, list[dict[str, Any]]]:
+    """Group the results that differ only in their seed, ordered by method."""
+    rows: dict[Row, list[dict[str, Any]]] = {}
+    override_sets = [set(result["overrides"]) for result in results]
     for result in results:
-        given = [word for word in result["overrides"] if not all(word in words for words in told)]
-        own = [word for word in given if word.partition("=")[0] not in SAID]
+        differing = [
+            word for word in result["overrides"] if not all(word in words for words in override_sets)
+        ]
+        change_words = [word for word in differing if word.partition("=")[0] not in UNNAMED_OVERRIDES]
         _, description = load_with_description(result["folder"])
         change = ", ".join(
-            word.partition("=")[0].rpartition(".")[2] + " " + word.partition("=")[2] for word in own
+            word.partition("=")[0].rpartition(".")[2] + " " + word.partition("=")[2] for word in change_words
         )
         row = Row(result["method"], description.config["data"]["topology"], change)
-        found.setdefault(row, []).append(result)
-    for row, some in found.items():
-        if len({result["seed"] for result in some}) < len(some):
-            sys.exit(f"Two results of {row} have one seed; wanted sweeps over methods, topologies and seeds.")
+        rows.setdefault(row, []).append(result)
+    for row, runs in rows.items():
+        if len({result["seed"] for result in runs}) < len(runs):
+            sys.exit(
+                f"Two results of {row} have the same seed. Give sweeps in which every combination of method, topology "
+                "and seed occurs once."
+            )
     order = {method: place for place, method in enumerate(NAMES)}
 
     def place(row: Row) -> tuple[int, str, int]:
         return order.get(row.method, len(order)), row.change, int(row.topology.removesuffix("k"))
 
-    return {row: found[row] for row in sorted(found, key=place)}
+    return {row: rows[row] for row in sorted(rows, key=place)}
 
 
-def same(results: Sequence[dict[str, Any]]) -> bool:
-    """Whether runs say the same of the test split, to the last bit."""
+def have_equal_numbers(results: Sequence[dict[str, Any]]) -> bool:
+    """Return whether nothing was trained and all runs have exactly equal results."""
     keys = [key for key in COLUMNS if key in results[0]]
     return not results[0]["parameters"] and all(
         [result[key] for key in keys] == [results[0][key] for key in keys] for result in results
     )
 
 
-def judged(folder: Path, lpips: str | None) -> tuple[Judged, Data]:
+def evaluate_run(folder: Path, lpips: str | None) -> tuple[Evaluation, Data]:
     predictor, description = load_with_description(folder)
     data = reader(description)
     data.prepare()
-    return examined(predictor, data, lpips), data
+    return evaluate_images(predictor, data, lpips), data
 
 
-def examined(predictor: Predictor, data: Data, lpips: str | None) -> Judged:
+def evaluate_images(predictor: Predictor, data: Data, lpips: str | None) -> Evaluation:
     metrics = []
     for name in METRICS:
         weights = {"weights": lpips} if name == "lpips" else {}
@@ -271,84 +302,95 @@ def examined(predictor: Predictor, data: Data, lpips: str | None) -> Judged:
             yield batch
 
     cpu = torch.device("cpu")
-    found = evaluate(predictor, noted(), metrics, groups=["all"], samples=1, seed=0, device=cpu)
+    evaluation = evaluate(predictor, noted(), metrics, groups=["all"], samples=1, seed=0, device=cpu)
     numbers: dict[str, np.ndarray] = {}
-    for metric in found.metrics:
-        each: Any = metric  # PerImage keeps the numbers of each image
-        numbers |= dict(zip(each.keys, dim_zero_cat(each.numbers).numpy().T, strict=True))
-    one = data.splits().test[0]["input"][None]
+    for metric in evaluation.metrics:
+        image_metric: Any = metric  # the metrics derived from PerImage keep the numbers of each image
+        numbers |= dict(zip(image_metric.keys, dim_zero_cat(image_metric.numbers).numpy().T, strict=True))
+    sample = data.splits().test[0]["input"][None]
     encoders = [part for part in predictor.modules() if isinstance(part, Encoder)]
-    spent = {True: 0.0, False: 0.0}
+    milliseconds_by_fixed = {True: 0.0, False: 0.0}
     with torch.inference_mode():
-        inputs = [one]
+        inputs = [sample]
         for encoder in encoders:
             inputs.append(encoder(inputs[-1]))
         for encoder, (before, _) in zip(encoders, pairwise(inputs), strict=True):
-            spent[encoder.fixed] += milliseconds(partial(encoder, before), 30, warm_up=3)
+            milliseconds_by_fixed[encoder.fixed] += milliseconds(partial(encoder, before), 30, warm_up=3)
     learns = any(True for encoder in encoders for _ in encoder.parameters())
-    return Judged(numbers, torch.cat(subjects).numpy(), spent[True], spent[False], learns)
+    return Evaluation(
+        numbers,
+        torch.cat(subjects).numpy(),
+        milliseconds_by_fixed[True],
+        milliseconds_by_fixed[False],
+        learns,
+    )
 
 
-def described(data: Data) -> str:
-    given = data.splits()
-    counts = ", ".join(
-        f"{len({number for number, _ in split.of})} {name}" for name, split in given._asdict().items()
-    )  # type: ignore[attr-defined]
+def describe_data(data: Data) -> str:
+    splits = data.splits()
+    counts = [len({number for number, _ in split.of}) for split in splits]  # type: ignore[attr-defined]
     height, width = data.target.size or (0, 0)
-    made = "Generated people (`human_scans`), not real ones" if data.synthetic else "People of a folder"
+    origin = (
+        "The people are generated (`human_scans`), not real"
+        if data.synthetic
+        else "The people are read from a folder"
+    )
     return (
-        f"{made}: subjects of {counts}; unseen ones in {len(given.test)} views of {height} × {width} pixels."  # type: ignore[arg-type]
+        f"{origin}: {counts[0]} subjects are for training, {counts[1]} for validation and {counts[2]} for the test. "
+        f"The test split has {len(splits.test)} views of {height} × {width} pixels."  # type: ignore[arg-type]
     )
 
 
 def by_subject(values: np.ndarray, subjects: np.ndarray) -> np.ndarray:
-    """Means over each subject's images that have a number."""
-    return np.array([np.nanmean(values[subjects == one]) for one in np.unique(subjects)])
+    """Return the mean of each subject over its images, without NaN."""
+    return np.array([np.nanmean(values[subjects == subject]) for subject in np.unique(subjects)])
 
 
 def spread(values: Sequence[float] | np.ndarray) -> float:
     return float(np.std(values, ddof=1)) if len(values) > 1 else float("nan")
 
 
-def line(row: Row, found: Sequence[Judged], seeds: int) -> str:
+def table_line(row: Row, evaluations: Sequence[Evaluation], seeds: int) -> str:
     cells = []
     for key, (_, decimals) in COLUMNS.items():
-        values = [one.numbers[key] for one in found]
+        values = [evaluation.numbers[key] for evaluation in evaluations]
         if np.isnan(values).all():
             cells.append(NOT_AVAILABLE)
             continue
         means = [float(np.nanmean(value)) for value in values]
         over_seeds = (
-            f"{spread(means):.{decimals}f}" if len(means) > 1 else "–" if not found[0].learns else "one seed"
+            f"{spread(means):.{decimals}f}"
+            if len(means) > 1
+            else "–"
+            if not evaluations[0].learns
+            else "one seed"
         )
-        over_subjects = spread(by_subject(np.mean(values, 0), found[0].subjects))
+        over_subjects = spread(by_subject(np.mean(values, 0), evaluations[0].subjects))
         cells.append(f"{np.mean(means):.{decimals}f} ± {over_seeds} ± {over_subjects:.{decimals}f}")
     drawing, network = (
-        float(np.median([getattr(one, name) for one in found])) for name in ("drawing", "network")
+        float(np.median([getattr(evaluation, name) for evaluation in evaluations]))
+        for name in ("drawing", "network")
     )
     times = f"{drawing:.1f} | {f'{network:.1f}' if network else '–'}"
     return f"| {row} | {seeds} | {' | '.join(cells)} | {times} |"
 
 
-def gain_heading(key: str) -> str:
-    heading, _ = COLUMNS[key]
-    whole = COLUMNS[key.replace("_masked", "")][0]
-    return f"{whole} {heading}" if heading != whole else f"{whole}, frame"
-
-
-def gains(rows: Mapping[Row, Sequence[Judged]]) -> list[str]:
+def gain_lines(rows: Mapping[Row, Sequence[Evaluation]]) -> list[str]:
     lines = []
-    for row, found in rows.items():
-        rival = rows.get(Row(RIVAL, row.topology))
-        if rival is None or rival is found:
+    for row, evaluations in rows.items():
+        baseline = rows.get(Row(BASELINE, row.topology))
+        if baseline is None or baseline is evaluations:
             continue
         cells, share = [], ""
         for key in GAINS:
-            ours, theirs = (np.mean([one.numbers[key] for one in some], 0) for some in (found, rival))
-            each = by_subject(ours - theirs, found[0].subjects)
+            ours, theirs = (
+                np.mean([evaluation.numbers[key] for evaluation in group], 0)
+                for group in (evaluations, baseline)
+            )
+            differences = by_subject(ours - theirs, evaluations[0].subjects)
             decimals = COLUMNS[key][1]
-            cells.append(f"{each.mean():+.{decimals}f} ± {spread(each):.{decimals}f}")
-            share = share or f"{int((each > 0).sum())} of {len(each)}"
+            cells.append(f"{differences.mean():+.{decimals}f} ± {spread(differences):.{decimals}f}")
+            share = share or f"{int((differences > 0).sum())} of {len(differences)}"
         lines.append(f"| {row} | {' | '.join(cells)} | {share} |")
     return lines
 

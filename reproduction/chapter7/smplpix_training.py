@@ -2,8 +2,9 @@
 
     python -m reproduction.chapter7.smplpix_training [--skins <folder>]
 
-Runs what outputs/smplpix_training does not hold yet, five hours of one core, and goes on where it was stopped;
-`--there` runs nothing. Every row of smplpix_training.csv stays until its own runs are there again.
+The script trains the runs that outputs/smplpix_training does not hold yet, which takes up to five hours of one core,
+and continues after an interruption. With `--there` it trains nothing. A row of smplpix_training.csv stays unchanged
+until its runs exist again.
 """
 
 import argparse
@@ -28,18 +29,19 @@ from reproduction.chapter7 import smplpix_table as table
 HERE = Path(__file__).resolve()
 FOLDER = ROOT / "outputs/smplpix_training"
 RECORD = HERE.with_suffix(".csv")
-SKINS = "Skins nobody wore in training"
-WORN = "skins, "
-"""What names of methods begin with whose people wear skins."""
+SKINS = "People with skins that are not in the training data"
+SKINS_PREFIX = "skins, "
+"""Prefix of the names of methods that are tested on people with skins."""
 
 
 @dataclass(frozen=True)
 class Method:
-    """
+    """A mesh or a network of the table.
+
     Attributes:
-        folder: what the folders of its runs begin with.
-        words: arguments of its runs.
-        seeds: of trainings by their epochs, each with a schedule of its own; {0: (0,)} where nothing is trained.
+        folder: Beginning of the names of its run folders.
+        words: Overrides of its runs.
+        seeds: Seeds by number of epochs, each a training with its own schedule; {0: (0,)} if nothing is trained.
     """
 
     folder: str
@@ -52,13 +54,14 @@ class Method:
 
 @dataclass(frozen=True)
 class Row:
-    """What the record holds of a method's trainings of as many epochs.
+    """A row of the record: the trainings of one method with one number of epochs.
 
     Attributes:
-        seeds: that ran.
-        minutes: epochs times the shortest one of all runs, since the machine did other work too.
-        means, spreads: by key of `COLUMNS`, over seeds; the standard deviation is NaN of one.
-        measured: machine and date.
+        seeds: Number of seeds that ran.
+        minutes: Number of epochs times the shortest epoch of all runs, because the machine also did other work.
+        means: Means over seeds, by key of `COLUMNS`.
+        spreads: Standard deviations over seeds, by key of `COLUMNS`; NaN for one seed.
+        measured: Machine and date.
     """
 
     seeds: int
@@ -69,35 +72,37 @@ class Row:
 
 
 Record = dict[tuple[str, int], Row]
-"""By method and epochs."""
+"""Rows by method and number of epochs."""
 
 
-def over(experiment: str, *more: str) -> tuple[str, ...]:
+def overrides_of(experiment: str, *more: str) -> tuple[str, ...]:
     return (f"experiment=smplpix/{experiment}", *more)
 
 
 BUDGETS = {2: (0,), 6: (0,), 20: (0, 1, 2)}
 METHODS = {
-    "mesh, 7k": Method("rasterised_7k", over("rasterised")),
+    "mesh, 7k": Method("rasterised_7k", overrides_of("rasterised")),
     "mesh, 7k, one sample a pixel": Method(
-        "rasterised_7k_plain", over("rasterised", "encoder.rasterised.renderer.supersampling=1")
+        "rasterised_7k_plain", overrides_of("rasterised", "encoder.rasterised.renderer.supersampling=1")
     ),
-    "mesh, 27k": Method("rasterised_27k", over("rasterised", "data.topology=27k")),
-    "points alone, 7k": Method("quick_7k", over("quick"), {**BUDGETS, 60: (0,)}),
+    "mesh, 27k": Method("rasterised_27k", overrides_of("rasterised", "data.topology=27k")),
+    "points alone, 7k": Method("quick_7k", overrides_of("quick"), {**BUDGETS, 60: (0,)}),
     "points alone, 7k, no splats": Method(
-        "bare_7k", over("quick", "encoder.projection.splat=0", "encoder.slim.residual=false"), {20: (0,)}
+        "bare_7k",
+        overrides_of("quick", "encoder.projection.splat=0", "encoder.slim.residual=false"),
+        {20: (0,)},
     ),
-    "points alone, 27k": Method("quick_27k", over("quick", "data.topology=27k"), {20: (0,)}),
-    "over the mesh, 7k": Method("hybrid_7k", over("hybrid"), BUDGETS),
-    "over the mesh, 27k": Method("hybrid_27k", over("hybrid", "data.topology=27k"), {20: (0,)}),
+    "points alone, 27k": Method("quick_27k", overrides_of("quick", "data.topology=27k"), {20: (0,)}),
+    "over the mesh, 7k": Method("hybrid_7k", overrides_of("hybrid"), BUDGETS),
+    "over the mesh, 27k": Method("hybrid_27k", overrides_of("hybrid", "data.topology=27k"), {20: (0,)}),
 }
 DRAWN = {"points alone, 7k": RED, "over the mesh, 7k": GREEN}
 LINES = {"mesh, 7k": "-", "mesh, 27k": "--"}
-RIVAL = "mesh, 7k"
-COLUMNS = {key: told for key, told in table.COLUMNS.items() if not key.startswith("lpips")}
+BASELINE = "mesh, 7k"
+COLUMNS = {key: heading for key, heading in table.COLUMNS.items() if not key.startswith("lpips")}
 
 
-def recorded() -> Record:
+def read_record() -> Record:
     if not RECORD.is_file():
         return {}
     with RECORD.open(encoding="utf-8", newline="") as file:
@@ -113,65 +118,70 @@ def recorded() -> Record:
         }
 
 
-def record(rows: Record) -> None:
+def write_record(rows: Record) -> None:
     names = [*COLUMNS, *(f"{key}_sd" for key in COLUMNS)]
     with RECORD.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["method", "epochs", "seeds", "minutes", *names, "measured"])
         for (name, epochs), row in rows.items():
             numbers = [row.means[key] for key in COLUMNS] + [row.spreads[key] for key in COLUMNS]
-            told = [f"{number:.6g}" for number in numbers]
-            writer.writerow([name, epochs, row.seeds, f"{row.minutes:.2f}", *told, row.measured])
+            formatted = [f"{number:.6g}" for number in numbers]
+            writer.writerow([name, epochs, row.seeds, f"{row.minutes:.2f}", *formatted, row.measured])
 
 
-def recorded_already(row: Row, known: Row) -> bool:
-    """Whether they are of the same runs, so that minutes, machine and date stay."""
+def is_same_run(row: Row, known: Row) -> bool:
+    """Return whether two rows hold the same runs, so that the recorded minutes, machine and date stay."""
     same = all(math.isclose(row.means[key], known.means[key], rel_tol=1e-5) for key in COLUMNS)
     return same and row.seeds == known.seeds
 
 
-def run(method: Method, epochs: int, seed: int) -> None:
+def run_training(method: Method, epochs: int, seed: int) -> None:
     words = [*method.words, f"seed={seed}", "threads=1", "logger=none"]
     words += [f"hydra.run.dir={method.place(epochs, seed)}"]
     words += [f"trainer.max_epochs={epochs}"] if epochs else []
     carry_out([sys.executable, "-m", "framework", *words])
 
 
-def measured(method: Method, epochs: int) -> Row | None:
-    """What the folders of its runs say; None where none has ended."""
-    places = [method.place(epochs, seed) for seed in method.seeds[epochs]]
-    there = [place for place in places if (place / "results.json").is_file()]
-    if not there:
+def read_runs(method: Method, epochs: int) -> Row | None:
+    """Return the row of a method from its run folders, or None if no run has finished."""
+    folders = [method.place(epochs, seed) for seed in method.seeds[epochs]]
+    finished = [folder for folder in folders if (folder / "results.json").is_file()]
+    if not finished:
         return None
-    results = [json.loads((place / "results.json").read_text()) for place in there]
+    results = [json.loads((folder / "results.json").read_text()) for folder in finished]
     values = {key: [result[key] for result in results] for key in COLUMNS}
     return Row(
-        len(there),
+        len(finished),
         epochs * epoch_minutes(method) if epochs else 0.0,
-        {key: float(np.mean(some)) for key, some in values.items()},
-        {key: float(np.std(some, ddof=1)) if len(some) > 1 else float("nan") for key, some in values.items()},
+        {key: float(np.mean(numbers)) for key, numbers in values.items()},
+        {
+            key: float(np.std(numbers, ddof=1)) if len(numbers) > 1 else float("nan")
+            for key, numbers in values.items()
+        },
         machine("torch", "numpy"),
     )
 
 
 def epoch_minutes(method: Method) -> float:
-    """Of an epoch on one core, the shortest of all runs."""
-    found = []
+    """Return the minutes of the shortest epoch of all runs of a method on one core."""
+    durations = []
     for place in FOLDER.glob(f"{method.folder}_*"):
         lines = [json.loads(line) for line in (place / "journal.jsonl").read_text().splitlines()]
         ends = [line["time"] for line in lines if "validation/loss" in line.get("values", {})]
-        found += [after - before for before, after in pairwise(ends)]
-    return min(found) / 60
+        durations += [after - before for before, after in pairwise(ends)]
+    return min(durations) / 60
 
 
 def crossing(minutes: Sequence[float], values: Sequence[float], level: float) -> str:
-    """When a curve rises above a level, straight between trainings in the logarithm of time."""
+    """Return in words when a curve rises above a level, interpolated linearly in the logarithm of time."""
     for first, (before, after) in enumerate(pairwise(values)):
         if before <= level < after:
             share = (level - before) / (after - before)
             return f"after {np.exp(np.interp(share, [0, 1], np.log(minutes[first : first + 2]))):.0f} minutes"
     return (
-        f"before {minutes[0]:.0f} minutes" if values[0] > level else f"not within {minutes[-1]:.0f} minutes"
+        f"already after {minutes[0]:.0f} minutes"
+        if values[0] > level
+        else f"at no time within {minutes[-1]:.0f} minutes"
     )
 
 
@@ -180,62 +190,66 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     arguments.add_argument("--skins", help="folder of skins in the default body's texture layout")
-    arguments.add_argument("--there", action="store_true", help="run nothing, report what is there")
-    given = arguments.parse_args()
+    arguments.add_argument("--there", action="store_true", help="train nothing, report the runs that exist")
+    options = arguments.parse_args()
     methods = dict(METHODS)
-    if given.skins:
-        worn = f"data.skins={given.skins}"
+    if options.skins:
+        worn = f"data.skins={options.skins}"
         methods |= {
-            f"{WORN}{RIVAL}": Method("skins_rasterised_7k", over("rasterised", worn)),
-            f"{WORN}over the mesh, 7k": Method("skins_hybrid_7k", over("hybrid", worn), {20: (0,)}),
+            f"{SKINS_PREFIX}{BASELINE}": Method("skins_rasterised_7k", overrides_of("rasterised", worn)),
+            f"{SKINS_PREFIX}over the mesh, 7k": Method(
+                "skins_hybrid_7k", overrides_of("hybrid", worn), {20: (0,)}
+            ),
         }
-    before, found = recorded(), {}
+    before, rows = read_record(), {}
     for name, method in methods.items():
         for epochs, seeds in method.seeds.items():
-            for seed in () if given.there else seeds:
+            for seed in () if options.there else seeds:
                 if not (method.place(epochs, seed) / "results.json").is_file():
-                    run(method, epochs, seed)
-            row, known = measured(method, epochs), before.get((name, epochs))
-            if known and (row is None or recorded_already(row, known)):
+                    run_training(method, epochs, seed)
+            row, known = read_runs(method, epochs), before.get((name, epochs))
+            if known and (row is None or is_same_run(row, known)):
                 row = known
             if row is not None:
-                found[name, epochs] = row
-    found |= {key: row for key, row in before.items() if key not in found}
-    record(found)
-    draw(found, HERE.with_suffix(".png"))
-    sheet(HERE.with_name(HERE.stem + "_people.png"))
-    write_page(HERE, report(found))
+                rows[name, epochs] = row
+    rows |= {key: row for key, row in before.items() if key not in rows}
+    write_record(rows)
+    draw_curves(rows, HERE.with_suffix(".png"))
+    draw_people(HERE.with_name(HERE.stem + "_people.png"))
+    write_page(HERE, report(rows))
 
 
 def report(rows: Record) -> str:
     def lines(worn: bool) -> list[str]:
-        told = []
+        table_lines = []
         for (name, epochs), row in rows.items():
-            if name.startswith(WORN) is not worn:
+            if name.startswith(SKINS_PREFIX) is not worn:
                 continue
             cells = []
             for key, (_, decimals) in COLUMNS.items():
                 spread = "" if math.isnan(row.spreads[key]) else f" ± {row.spreads[key]:.{decimals}f}"
                 cells.append(f"{row.means[key]:.{decimals}f}{spread}")
             trained = f"{epochs} | {row.minutes:.0f} | {row.seeds}" if epochs else "– | – | –"
-            told.append(f"| {name.removeprefix(WORN)} | {trained} | {' | '.join(cells)} |")
-        return told
+            table_lines.append(f"| {name.removeprefix(SKINS_PREFIX)} | {trained} | {' | '.join(cells)} |")
+        return table_lines
 
     header = [
-        f"| | epochs | minutes | seeds | {' | '.join(heading for heading, _ in COLUMNS.values())} |",
+        f"| method | epochs | minutes | seeds | {' | '.join(heading for heading, _ in COLUMNS.values())} |",
         f"|---|{'---:|' * (3 + len(COLUMNS))}",
     ]
     crossings = []
     for name in DRAWN:
-        budgets = curve(rows, name)
+        budgets = rows_of(rows, name)
         for key, heading in (
             ("psnr_db", "PSNR"),
             ("psnr_masked_db", "PSNR inside"),
             ("ssim_masked", "SSIM inside"),
         ):
             values = [row.means[key] for row in budgets]
-            when = crossing([row.minutes for row in budgets], values, rows[RIVAL, 0].means[key])
-            crossings.append(f"- {name}, {heading}: above the mesh of 7k {when}.")
+            when = crossing([row.minutes for row in budgets], values, rows[BASELINE, 0].means[key])
+            crossings.append(
+                f"- {name[0].upper()}{name[1:]}: the {heading} is higher than that of the mesh with 7k vertices {when}."
+            )
     missing = [
         f"{name}, {epochs} epochs"
         for name, method in METHODS.items()
@@ -246,44 +260,65 @@ def report(rows: Record) -> str:
     machines: dict[str, list[str]] = {}
     for (name, epochs), row in rows.items():
         machines.setdefault(row.measured, []).append(f"{name}, {epochs} epochs" if epochs else name)
-    usual = max(machines, key=lambda one: len(machines[one]))
-    others = [f"{'; '.join(names)}: {one}" for one, names in machines.items() if one != usual]
+    usual_machine = max(machines, key=lambda machine_line: len(machines[machine_line]))
+    other_machines = [
+        f"{'; '.join(names)}: {machine_line}"
+        for machine_line, names in machines.items()
+        if machine_line != usual_machine
+    ]
     return "\n".join(
         [
             "# Rendering networks against meshes, by training time (synthetic people)",
             "",
-            "Generated people (`human_scans`, not real ones): 160 to train on, 96 views of 16 unseen ones, 256 × 192. "
-            "Meshes are drawn with their vertices' colours, 4 × 4 samples a pixel unless said. Inside: over the "
-            "subject's pixels. ± is the standard deviation over seeds, where there are several. Each budget is a "
-            "training of its own, whose rate falls to 0 at its end. Minutes: epochs times the shortest one, one core.",
+            "This page measures how the images of rendering networks improve with training time, and after which "
+            'time they are better than a drawn mesh. "Points alone" networks (SMPLpix) draw a person from '
+            'projected vertices. "No splats" draws each vertex into one pixel only, without filling the surface '
+            'between the vertices. "Over the mesh" networks improve the drawn mesh.',
             "",
-            f"![curves]({HERE.stem}.png)",
+            "The people are generated (`human_scans`), not real: 160 are for training and 16 for the test, with 96 "
+            "views of 256 × 192 pixels. A mesh has 7k or 27k coloured vertices and is drawn with 4 × 4 samples per "
+            "pixel unless the row says otherwise. The columns compare the images with photographs over the whole "
+            "frame, or inside, that is over the pixels of the subject. ± is the standard deviation over seeds, if "
+            "there are several.",
+            "",
+            "Each number of epochs is a training of its own, whose learning rate falls to 0 at the end. The minutes "
+            "are the number of epochs times the shortest epoch, on one core.",
+            "",
+            f"![Quality against minutes of training]({HERE.stem}.png)",
             "",
             *header,
             *lines(worn=False),
             "",
             *crossings,
             "",
-            f"![people]({HERE.stem}_people.png)",
+            f"![Photographs, images and errors]({HERE.stem}_people.png)",
             "",
-            "From the left: photograph, mesh, points alone, network over the mesh (20 epochs); then where each is off.",
+            "The columns of the figure are, from the left: the photograph, the mesh, the network on points alone and "
+            "the network over the mesh (20 epochs each), and then the error of these three images.",
             "",
             *([f"## {SKINS}", "", *header, *skins, ""] if skins else []),
-            *([f"Not run: {'; '.join(missing)}.", ""] if missing else []),
-            *([f"Measured elsewhere or on another day: {' '.join(others)}", ""] if others else []),
-            f"{usual} Command: `python -m reproduction.chapter7.smplpix_training"
+            *([f"These combinations were not run: {'; '.join(missing)}.", ""] if missing else []),
+            *(
+                [
+                    f"These rows were measured on another machine or another day: {' '.join(other_machines)}",
+                    "",
+                ]
+                if other_machines
+                else []
+            ),
+            f"{usual_machine} Command: `python -m reproduction.chapter7.smplpix_training"
             f"{' --skins <folder>' if skins else ''}{' --there' if missing else ''}`.",
             "",
         ]
     )
 
 
-def curve(rows: Record, name: str) -> list[Row]:
-    """A method's rows by their epochs."""
+def rows_of(rows: Record, name: str) -> list[Row]:
+    """Return the rows of a method, ordered by number of epochs."""
     return [row for (which, _), row in sorted(rows.items()) if which == name]
 
 
-def draw(rows: Record, place: Path) -> None:
+def draw_curves(rows: Record, place: Path) -> None:
     figure = titled_figure(
         (10, 4), "Unseen people, 256 × 192 pixels; bars: standard deviation over seeds", True
     )
@@ -295,7 +330,7 @@ def draw(rows: Record, place: Path) -> None:
         strict=True,
     ):
         for name, colour in DRAWN.items():
-            budgets = curve(rows, name)
+            budgets = rows_of(rows, name)
             minutes, values = [row.minutes for row in budgets], [row.means[key] for row in budgets]
             spreads = np.nan_to_num([row.spreads[key] for row in budgets])
             axes.errorbar(minutes, values, spreads, color=colour, marker="o", capsize=3, label=name)
@@ -310,9 +345,9 @@ def draw(rows: Record, place: Path) -> None:
 
 
 @torch.inference_mode()
-def sheet(place: Path, chosen: Sequence[int] = (0, 20, 44, 75)) -> None:
-    """Photographs of unseen people, their images, and where these are off; as it was where a run is not there."""
-    names = {RIVAL: 0, "points alone, 7k": 20, "over the mesh, 7k": 20}
+def draw_people(place: Path, chosen: Sequence[int] = (0, 20, 44, 75)) -> None:
+    """Draw photographs of unseen people, their images and the errors; keep the old figure if a run does not exist."""
+    names = {BASELINE: 0, "points alone, 7k": 20, "over the mesh, 7k": 20}
     runs = [METHODS[name].place(epochs, 0) for name, epochs in names.items()]
     if not all((run / "results.json").is_file() for run in runs):
         return

@@ -2,8 +2,8 @@
 
     python -m reproduction.chapter7.smplpix_work_precision <run> …
 
-With runs of smplpix/quick, hybrid or their like, all on the same data; writes smplpix_work_precision.md, .csv
-and .png beside this file. `--draw` draws the figure again from the table.
+The runs are of smplpix/quick, smplpix/hybrid or similar experiments, all on the same data. The script writes
+smplpix_work_precision.md, .csv and .png beside this file. `--draw` draws the figure again from the table.
 """
 
 import math
@@ -26,12 +26,12 @@ from framework.model import Predictor
 from framework.reports.table import Row, write_csv
 from framework.reports.tradeoff_picture import error_against_run_time
 from framework.training.batches import Batches
-from reproduction.chapter7.smplpix_table import Judged, by_subject, described, examined
+from reproduction.chapter7.smplpix_table import Evaluation, by_subject, describe_data, evaluate_images
 
 HERE = Path(__file__).resolve()
 TOPOLOGIES = ("7k", "27k")
 SAMPLES = (1, 2, 3, 4)
-"""Of a pixel along each axis."""
+"""Samples per pixel along each axis."""
 SHOWN = {
     "psnr_db": "PSNR of the frame (dB)",
     "ssim_masked": "SSIM about the subject",
@@ -40,7 +40,7 @@ SHOWN = {
 BETTER: Mapping[str, Any] = {"psnr_db": "higher", "ssim_masked": "higher", "features": "lower"}
 
 
-def prepared(description: Description, topology: str) -> Data:
+def prepare_data(description: Description, topology: str) -> Data:
     part = {**description.config["data"], "topology": topology}
     data: Data = build("data", resolve("data", part))
     data.prepare()
@@ -48,9 +48,9 @@ def prepared(description: Description, topology: str) -> Data:
 
 
 def meshes(description: Description) -> Iterator[tuple[str, int, Predictor, Data]]:
-    """The registered mesh, with its vertices' colours and with textures: name, samples, predictor and data."""
+    """Yield name, samples, predictor and data of the registered mesh, with vertex colours and with textures."""
     for topology, painted in product(TOPOLOGIES, ("vertex colours", "texture")):
-        data = prepared(description, topology)
+        data = prepare_data(description, topology)
         part = description.config["data"]
         height, width = data.target.size
         for samples in SAMPLES:
@@ -69,26 +69,27 @@ def meshes(description: Description) -> Iterator[tuple[str, int, Predictor, Data
                 "density_head": resolve("density_head", "laplace_image"),
                 "uncertainty": [],
             }
-            made = build_predictor(resolved, data.target, data.input_shape, 0, data.columns).eval()
-            yield f"mesh {topology}, {painted}", samples, made, data
+            predictor = build_predictor(resolved, data.target, data.input_shape, 0, data.columns).eval()
+            yield f"mesh {topology}, {painted}", samples, predictor, data
 
 
 def networks(run: str) -> Iterator[tuple[str, Predictor, Data]]:
-    """A run with float32 and bfloat16, its box alone and whole frames."""
+    """Yield name, predictor and data of a run in float32 and bfloat16, for the box of the subject and the whole
+    frame."""
     description, state = read_stored(run)
-    data = prepared(description, description.config["data"]["topology"])
-    first = f"{description.method} {description.config['data']['topology']}"
+    data = prepare_data(description, description.config["data"]["topology"])
+    name = f"{description.method} {description.config['data']['topology']}"
     for precision, crop in product(("float32", "bfloat16"), ("box", "frame")):
         description, state = read_stored(run)
         for part in description.config["encoder"]:
             if "precision" in part:
                 part["precision"] = precision
                 part["crop"] = None if crop == "frame" else part["crop"]
-        yield f"{first}, {precision}, {crop}", rebuild(description, state), data
+        yield f"{name}, {precision}, {crop}", rebuild(description, state), data
 
 
 def feature_distance(predictor: Predictor, data: Data) -> float:
-    """Mean over the test images of the objective `random_features`, whose network knows nothing about images."""
+    """Return the mean of the objective `random_features` over the test images; its network is untrained."""
     objective = build("objective", resolve("objective", {"name": "random_features", "cache": 0}))
     total, count = 0.0, 0
     with torch.no_grad():
@@ -98,66 +99,87 @@ def feature_distance(predictor: Predictor, data: Data) -> float:
     return total / max(1, count)
 
 
-def row(found: Judged, distance: float) -> dict[str, Any]:
-    numbers: dict[str, Any] = {"features": distance, "milliseconds_per_sample": found.drawing + found.network}
+def numbers_of(evaluation: Evaluation, distance: float) -> dict[str, Any]:
+    numbers: dict[str, Any] = {
+        "features": distance,
+        "milliseconds_per_sample": evaluation.drawing + evaluation.network,
+    }
     for key in ("psnr_db", "psnr_masked_db", "ssim", "ssim_masked"):
-        each = by_subject(found.numbers[key], found.subjects)
-        numbers |= {key: float(each.mean()), f"{key}_sem": float(each.std(ddof=1) / math.sqrt(len(each)))}
-    return numbers | {"drawing": found.drawing, "network": found.network}
+        subject_means = by_subject(evaluation.numbers[key], evaluation.subjects)
+        numbers |= {
+            key: float(subject_means.mean()),
+            f"{key}_sem": float(subject_means.std(ddof=1) / math.sqrt(len(subject_means))),
+        }
+    return numbers | {"drawing": evaluation.drawing, "network": evaluation.network}
 
 
-def line(method: str, one: Mapping[str, Any]) -> str:
-    samples = str(one["value"]) if "value" in one else "–"
+def table_line(method: str, row: Mapping[str, Any]) -> str:
+    samples = str(row["value"]) if "value" in row else "–"
     return (
-        f"| {method} | {samples} | {one['psnr_db']:.2f} | {one['psnr_masked_db']:.2f} | {one['ssim']:.4f} | "
-        f"{one['ssim_masked']:.3f} | {one['features']:.4f} | {one['drawing']:.1f} | {one['network']:.1f} |"
+        f"| {method} | {samples} | {row['psnr_db']:.2f} | {row['psnr_masked_db']:.2f} | {row['ssim']:.4f} | "
+        f"{row['ssim_masked']:.3f} | {row['features']:.4f} | {row['drawing']:.1f} | {row['network']:.1f} |"
     )
 
 
 def main(runs: list[str]) -> None:
     if not runs:
-        sys.exit("No run was given; wanted folders of trained runs of smplpix/quick or its like.")
+        sys.exit("No run was given. Give the folders of trained runs of smplpix/quick or smplpix/hybrid.")
     torch.set_num_threads(1)
     rows: list[dict[str, Any]] = []
     description, _ = read_stored(runs[0])
     about = ""
     for method, samples, predictor, data in meshes(description):
-        numbers = row(examined(predictor, data, None), feature_distance(predictor, data))
+        numbers = numbers_of(evaluate_images(predictor, data, None), feature_distance(predictor, data))
         rows.append({"method": method, "knob": "samples", "value": samples, **numbers})
-        about = described(data)
-        sys.stdout.write(line(method, rows[-1]) + "\n")
+        about = describe_data(data)
+        sys.stdout.write(table_line(method, rows[-1]) + "\n")
     for run in runs:
         for method, predictor, data in networks(run):
-            if described(data) != about:
-                sys.exit(f"{run} has other data: {described(data)} The meshes: {about}")
+            if describe_data(data) != about:
+                sys.exit(
+                    f"{run} has other data than the meshes. The run: {describe_data(data)} The meshes: {about} Give "
+                    "runs on the same data."
+                )
             rows.append(
-                {"method": method, **row(examined(predictor, data, None), feature_distance(predictor, data))}
+                {
+                    "method": method,
+                    **numbers_of(evaluate_images(predictor, data, None), feature_distance(predictor, data)),
+                }
             )
-            sys.stdout.write(line(method, rows[-1]) + "\n")
-    write_csv([{**one, "synthetic": True} for one in rows], None, HERE.with_suffix(".csv"))
-    drawn(rows)
+            sys.stdout.write(table_line(method, rows[-1]) + "\n")
+    write_csv([{**row, "synthetic": True} for row in rows], None, HERE.with_suffix(".csv"))
+    draw_figure(rows)
     text = [
         "# Quality of an image against its run time (synthetic people)",
         "",
-        f"{about} Means over subjects. Milliseconds of processor time, one image alone on one thread: of drawing the "
-        "mesh or projecting its vertices, and of the network. Networks compute the subject's box or the whole frame. "
-        "The distance in random features is that of an untrained network (objective `random_features`), not LPIPS, "
-        "whose weights are not available.",
+        "This page shows how the quality of an image of an unseen person depends on its run time. Meshes are drawn "
+        "with one to four samples per pixel along each axis, and the network over the mesh (`hybrid`) computes in "
+        "float32 or bfloat16. The quality is measured against photographs as a mean over subjects. "
+        f"{about}",
         "",
-        "| | samples | PSNR, dB | inside | SSIM | inside | random features | drawing, ms | network, ms |",
+        "- **Samples** is the number of samples per pixel along each axis with which a mesh is drawn.",
+        "- **Inside** means that only the pixels of the subject count; the other columns are over the whole frame.",
+        "- **Distance in random features** compares the features of an untrained network (objective "
+        "`random_features`); lower is better. It replaces LPIPS, whose weights are not available.",
+        "- **Drawing** is the processor time in milliseconds to draw the mesh or to project its vertices, **network** "
+        "that of the network, for one image on one thread.",
+        "- `box` networks compute only the bounding box of the subject, `frame` networks the whole image.",
+        "",
+        "| method | samples | PSNR, dB | PSNR inside, dB | SSIM | SSIM inside | distance in random features | drawing, "
+        "ms | network, ms |",
         f"|---|{'---:|' * 8}",
-        *(line(one["method"], one) for one in rows),
+        *(table_line(row["method"], row) for row in rows),
         "",
         f"![Quality against milliseconds]({HERE.with_suffix('.png').name})",
         "",
         f"{machine('torch', 'numpy')} Command: `python -m reproduction.chapter7.smplpix_work_precision <runs>`; runs: "
-        f"{'; '.join(trained(run) for run in runs)}.",
+        f"{'; '.join(describe_run(run) for run in runs)}.",
         "",
     ]
     write_page(HERE, text)
 
 
-def drawn(rows: Sequence[Row]) -> None:
+def draw_figure(rows: Sequence[Row]) -> None:
     figure = error_against_run_time(
         rows,
         SHOWN,
@@ -170,8 +192,8 @@ def drawn(rows: Sequence[Row]) -> None:
     save_figure(figure, HERE.with_suffix(""), True)
 
 
-def trained(run: str) -> str:
-    """What a run was, in a few words."""
+def describe_run(run: str) -> str:
+    """Return the method and the seed of a run."""
     description, _ = read_stored(run)
     settings = description.settings
     return f"{description.method}, seed {settings.get('seed', '?')}"
@@ -179,6 +201,6 @@ def trained(run: str) -> str:
 
 if __name__ == "__main__":
     if sys.argv[1:] == ["--draw"]:
-        drawn(read_rows(HERE.with_suffix(".csv")))
+        draw_figure(read_rows(HERE.with_suffix(".csv")))
     else:
         main(sys.argv[1:])
