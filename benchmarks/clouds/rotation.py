@@ -18,7 +18,7 @@ from framework.geometry.meshes import Mesh, sample
 from framework.reports.table import markdown
 from plugins.data.labelled_clouds.shapes.generator import CLASSES, model
 from plugins.encoder.bps.basis import basis
-from plugins.encoder.bps.encoding import channels, encode, prepared
+from plugins.encoder.bps.encoding import channels, encode, prepare_basis
 
 MODELS = 3
 """Number of shapes of each class."""
@@ -40,7 +40,7 @@ def sample_clouds(points: int, seed: int) -> Tensor:
 
 def encode_distances(clouds: Tensor, invariant: bool) -> Tensor:
     """Return the distances from the basis points to each cloud, (shape, basis points)."""
-    basis_points = prepared(basis("ball_uniform", BASIS, 1.0, 13).float())
+    basis_points = prepare_basis(basis("ball_uniform", BASIS, 1.0, 13).float())
     return channels(encode(clouds, basis_points, ["distance"], rotation_invariant=invariant)).flatten(1)
 
 

@@ -28,7 +28,7 @@ from framework.geometry.clouds import sizes
 from framework.geometry.nearest import nearest
 from framework.reports.table import markdown
 from plugins.encoder.bps.basis import basis
-from plugins.encoder.bps.encoding import Basis, encode, per_point, prepared
+from plugins.encoder.bps.encoding import Basis, encode, per_point, prepare_basis
 
 HERE = Path(__file__).resolve()
 TRAIN, TEST, BASIS = 2_000, 200, 512
@@ -171,7 +171,7 @@ def main() -> None:
     names, vertex_part = parts_of(load_body(None)[0])
     clouds, labels = load_labelled(data.splits().train, TRAIN, vertex_part)
     test_clouds, test_labels = load_labelled(data.splits().test, TEST, vertex_part)
-    basis_points = prepared(basis("ball_uniform", BASIS, 1.0, 13).float())
+    basis_points = prepare_basis(basis("ball_uniform", BASIS, 1.0, 13).float())
     rows, predictions = [], {}
     for heading, whole in (("point alone", False), ("point and cloud", True)):
         start = perf_counter()

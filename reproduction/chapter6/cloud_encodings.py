@@ -2,8 +2,8 @@
 
     python -m reproduction.chapter6.cloud_encodings
 
-Writes cloud_encodings.md beside this file; a minute on one core. Shapes are the generated CAD models of
-data=modelnet40.
+The script takes a minute on one core and writes cloud_encodings.md beside this file. The shapes are the generated CAD
+models of data=modelnet40.
 """
 
 import os
@@ -23,18 +23,18 @@ from benchmarks.pages import machine, write_page
 from framework.geometry.clouds import Normalisation
 from framework.reports.table import markdown
 from plugins.encoder.bps.basis import basis
-from plugins.encoder.bps.encoding import encode, prepared
+from plugins.encoder.bps.encoding import encode, prepare_basis
 from plugins.encoder.grids.occupancy import occupancy
 from plugins.encoder.grids.tdf import truncated_distance
 
 HERE = Path(__file__).resolve()
 POINTS = 2048
 STEPS = (0.1, 0.01, 0.001)
-"""Of a shift, in radii of the ball; of a turn, in radians."""
+"""Lengths of a shift in radii of the ball, or angles of a rotation in radians."""
 SIDES = (8, 16, 32, 64)
 STRAY = ((0.001, 1.0), (0.01, 1.0), (0.1, 1.0), (0.001, 10.0), (0.01, 10.0), (0.1, 10.0), (0.3, 10.0))
-"""Shares of a cloud's points that are replaced, and how far off in radii: in the ball, or ten of them away."""
-BASIS = prepared(basis("ball_uniform", 512, 1.0, 13).float())
+"""Share of the points that are moved, and their distance in radii; 1 stands for random places in the ball."""
+BASIS = prepare_basis(basis("ball_uniform", 512, 1.0, 13).float())
 Encode = Callable[[Tensor], Tensor]
 ENCODINGS: dict[str, Encode] = {
     "512 distances": lambda clouds: encode(clouds, BASIS, ["distance"], "none").features["distance"],
@@ -46,30 +46,33 @@ ENCODINGS: dict[str, Encode] = {
 }
 
 
-def shifted(clouds: Tensor, step: float) -> Tensor:
-    """In a direction of each cloud's own."""
+def shift(clouds: Tensor, step: float) -> Tensor:
+    """Shift each cloud by a step in a random direction."""
     towards = torch.randn(len(clouds), 1, 3, generator=torch.Generator().manual_seed(1))
     return clouds + step * towards / towards.norm(dim=-1, keepdim=True)
 
 
-def turned(clouds: Tensor, step: float) -> Tensor:
-    """About the upright axis."""
+def rotate(clouds: Tensor, step: float) -> Tensor:
+    """Rotate clouds about the upright axis by an angle in radians."""
     cosine, sine = math.cos(step), math.sin(step)
     turn = torch.tensor([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]], dtype=clouds.dtype)
     return clouds @ turn.T
 
 
-def mean(values: Tensor) -> tuple[float, float]:
-    """And its standard error over shapes."""
-    found = values.double()
-    return found.mean().item(), (found.std() / math.sqrt(len(found))).item()
+def mean_and_error(values: Tensor) -> tuple[float, float]:
+    """Return the mean over shapes and its standard error."""
+    numbers = values.double()
+    return numbers.mean().item(), (numbers.std() / math.sqrt(len(numbers))).item()
 
 
-def power(larger: Tensor, smaller: Tensor) -> tuple[float, float]:
-    """Of the step, by which a root mean square over shapes grows over its last decade; its jackknife standard error.
+def growth_power(larger: Tensor, smaller: Tensor) -> tuple[float, float]:
+    """Return the exponent with which a root mean square over shapes grows with the step, and its standard error.
+
+    The standard error is the jackknife estimate.
 
     Args:
-        larger, smaller: squares at both ends of that decade.
+        larger: squared changes of the shapes at the larger step.
+        smaller: squared changes at a step ten times as small.
     """
     whole = (larger.mean() / smaller.mean()).log10().item() / 2
     count = len(larger)
@@ -77,42 +80,42 @@ def power(larger: Tensor, smaller: Tensor) -> tuple[float, float]:
     return whole, math.sqrt((count - 1) / count * ((rest - rest.mean()) ** 2).sum().item())
 
 
-def movement(clouds: Tensor) -> list[dict[str, object]]:
-    """By how much features change, as a share of how much they differ between two shapes (root mean squares)."""
+def measure_movement(clouds: Tensor) -> list[dict[str, object]]:
+    """Measure how much features change with a shift or a rotation, relative to their distance between two shapes."""
     rows: list[dict[str, object]] = []
-    for name, made in ENCODINGS.items():
-        before = made(clouds)
-        apart = (before - before.roll(1, 0)).norm(dim=1).mean()
-        for words, move in (("shift", shifted), ("turn", turned)):
+    for name, encoding in ENCODINGS.items():
+        before = encoding(clouds)
+        shape_distance = (before - before.roll(1, 0)).norm(dim=1).mean()
+        for words, move in (("shift", shift), ("rotation", rotate)):
             row: dict[str, object] = {"encoding": name, "move": words, "synthetic": True}
             sizes, largest = [], []
             for step in STEPS:
-                change = made(move(clouds, step)) - before
-                share = change.norm(dim=1) / apart
-                row[f"share {step:g}"], row[f"share {step:g}_sem"] = mean(share)
+                change = encoding(move(clouds, step)) - before
+                share = change.norm(dim=1) / shape_distance
+                row[f"share {step:g}"], row[f"share {step:g}_sem"] = mean_and_error(share)
                 sizes.append(share.double())
                 largest.append(change.abs().max().item())
-            row["power"], row["power_sem"] = power(sizes[-2].square(), sizes[-1].square())
+            row["power"], row["power_sem"] = growth_power(sizes[-2].square(), sizes[-1].square())
             row["largest"] = largest[-1]
             rows.append(row)
     return rows
 
 
-def empty(clouds: Tensor) -> list[dict[str, object]]:
+def measure_empty(clouds: Tensor) -> list[dict[str, object]]:
     rows: list[dict[str, object]] = []
     for side in SIDES:
-        share, error = mean((occupancy(clouds, side) == 0).double().mean(1))
+        share, error = mean_and_error((occupancy(clouds, side) == 0).double().mean(1))
         rows.append({"encoding": f"{side}³ occupancy", "zero": share, "zero_sem": error, "synthetic": True})
     for name in ("512 distances", "32³ truncated distances"):
-        found = ENCODINGS[name](clouds)
-        nothing = 0.0 if "512" in name else 1.0  # a truncated distance that is cut off
-        share, error = mean((found == nothing).double().mean(1))
+        features = ENCODINGS[name](clouds)
+        empty_value = 0.0 if "512" in name else 1.0  # a truncated distance that is cut off
+        share, error = mean_and_error((features == empty_value).double().mean(1))
         rows.append({"encoding": name, "zero": share, "zero_sem": error, "synthetic": True})
     return rows
 
 
-def strayed(clouds: Tensor, share: float, far: float) -> Tensor:
-    """Some of each cloud's points put elsewhere: within the ball where `far` is 1, else so far off."""
+def move_points(clouds: Tensor, share: float, far: float) -> Tensor:
+    """Move a share of the points of each cloud: to random places in the ball if `far` is 1, else to `far` radii."""
     generator = torch.Generator().manual_seed(2)
     count = math.ceil(share * clouds.shape[1])
     towards = torch.randn(len(clouds), count, 3, generator=generator)
@@ -122,22 +125,22 @@ def strayed(clouds: Tensor, share: float, far: float) -> Tensor:
     return changed
 
 
-def stray(clouds: Tensor) -> list[dict[str, object]]:
-    """Of how many disturbed clouds the code is still nearest to that of the same cloud undisturbed."""
+def measure_recognition(clouds: Tensor) -> list[dict[str, object]]:
+    """Measure the share of disturbed clouds whose features are nearest to those of the same cloud undisturbed."""
     rows: list[dict[str, object]] = []
     order = torch.randperm(clouds.shape[1], generator=torch.Generator().manual_seed(3))
-    clouds = clouds[:, order]  # the points of a generated surface come face by face
-    for how in ("unit_ball", "robust"):
-        normalisation: Normalisation = how  # type: ignore[assignment]
+    clouds = clouds[:, order]  # points of a generated surface are ordered by faces
+    for name in ("unit_ball", "robust"):
+        normalisation: Normalisation = name  # type: ignore[assignment]
         known = encode(clouds, BASIS, ["distance"], normalisation).features["distance"]
-        row: dict[str, object] = {"normalisation": how, "synthetic": True}
+        row: dict[str, object] = {"normalisation": name, "synthetic": True}
         for share, far in STRAY:
-            asked = encode(strayed(clouds, share, far), BASIS, ["distance"], normalisation).features[
+            disturbed = encode(move_points(clouds, share, far), BASIS, ["distance"], normalisation).features[
                 "distance"
             ]
-            found = torch.cdist(asked, known).argmin(1) == torch.arange(len(clouds))
+            recognised = torch.cdist(disturbed, known).argmin(1) == torch.arange(len(clouds))
             key = f"{share:g} {far:g}"
-            row[key], row[f"{key}_sem"] = mean(found)
+            row[key], row[f"{key}_sem"] = mean_and_error(recognised)
         rows.append(row)
     return rows
 
@@ -147,29 +150,42 @@ def main() -> None:
     clouds, _ = shapes(POINTS, 3)
     moved = {
         "encoding": "encoding",
-        "move": "move",
-        **{f"share {step:g}": f"step {step:g}" for step in STEPS},
+        "move": "motion",
+        **{f"share {step:g}": f"change, step {step:g}" for step in STEPS},
         "power": "power of the step",
-        "largest": f"largest change of one number, step {STEPS[-1]:g}",
+        "largest": "largest change of one feature",
     }
+    empty_columns = {"encoding": "encoding", "zero": "share of features without information"}
     disturbed = {"normalisation": "normalisation"} | {
-        f"{share:g} {far:g}": f"{100 * share:g} % {'in the ball' if far == 1 else f'{far:g} radii off'}"
+        f"{share:g} {far:g}": f"{100 * share:g} % {'in the ball' if far == 1 else f'at {far:g} radii'}"
         for share, far in STRAY
     }
     text = (
         "# How encodings change with shift, rotation and stray points (synthetic data)\n\n"
-        f"`python -m reproduction.chapter6.cloud_encodings`: {len(clouds)} synthetic CAD shapes of {POINTS} points, "
-        "in the unit ball. ± is the standard error over shapes.\n\n"
-        "**Shift and rotation** (§6.4.1). The change of the features relative to the mean distance between two shapes' "
-        "features, for steps in radii or radians; and the power of the step with which its root mean square grows over "
-        "the last decade. The power is 1 for smooth features and 0.5 where some features jump with each step.\n\n"
-        f"{markdown(movement(clouds), moved)}\n\n"
-        "**Empty cells** (§6.2, §6.4.1). The share of features without information: empty cells of an occupancy grid, "
-        "distances of 0, truncated distances that are cut off.\n\n"
-        f"{markdown(empty(clouds), {'encoding': 'encoding', 'zero': 'share'})}\n\n"
-        "**Stray points** (§6.5.2). A share of each cloud's points is moved elsewhere. The table shows how many clouds "
-        "are still recognised: their 512 distances are nearest to those of the same cloud without stray points.\n\n"
-        f"{markdown(stray(clouds), disturbed)}\n\n"
+        "This page measures how the features of a point cloud change when the cloud is shifted, rotated or disturbed "
+        "by stray points. It compares basis point sets (distances or vectors to the nearest point of the cloud), "
+        "occupancy grids and grids of truncated distances. The clouds are "
+        f"{len(clouds)} synthetic CAD shapes of {POINTS} points, in the unit ball. ± is the standard error over "
+        "shapes. The command is `python -m reproduction.chapter6.cloud_encodings`.\n\n"
+        "## Shift and rotation (§6.4.1)\n\n"
+        "The columns of steps show the distance between the features before and after the step, divided by the mean "
+        "distance between the features of two different shapes. A step is a shift, in radii of the ball, or a rotation "
+        "about the upright axis, in radians. **Power of the step** is the exponent with which the root mean square of "
+        "this change grows between the steps 0.001 and 0.01. It is 1 for features that change smoothly, and 0.5 if a "
+        "share of the features that is proportional to the step jumps. **Largest change of one feature** is for the "
+        "step 0.001.\n\n"
+        f"{markdown(measure_movement(clouds), moved)}\n\n"
+        "## Empty cells (§6.2, §6.4.1)\n\n"
+        "The table shows the share of features that carry no information: empty cells of an occupancy grid, distances "
+        "of 0, and truncated distances at their upper limit.\n\n"
+        f"{markdown(measure_empty(clouds), empty_columns)}\n\n"
+        "## Stray points (§6.5.2)\n\n"
+        "A share of the points of each cloud is moved elsewhere: to random places in the ball, or to a distance of 10 "
+        "radii. The table shows the share of disturbed clouds that are still recognised. A cloud is recognised if, of "
+        "all undisturbed clouds, its own has the most similar 512 distances. The two rows differ in how clouds are "
+        "normalised before the encoding: `unit_ball` scales by the farthest point, `robust` limits the effect of "
+        "outliers.\n\n"
+        f"{markdown(measure_recognition(clouds), disturbed)}\n\n"
         f"{machine('torch', 'numba')}\n"
     )
     write_page(HERE, text)

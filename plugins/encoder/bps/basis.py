@@ -1,4 +1,4 @@
-"""Sets of basis points (thesis eq. 6.3, §6.4.2), each a function of its parameters alone."""
+"""Sets of basis points (thesis eq. 6.3, §6.4.2), which depend only on the parameters of `basis`."""
 
 import math
 from collections.abc import Callable
@@ -12,8 +12,9 @@ from torch import Tensor
 from framework.errors import ConfigError
 
 Strategy = Literal["ball_uniform", "grid", "ball_grid", "hexagonal"]
-# Positions of the origin in the cell of a lattice: at a point, in the middle of a cell, an edge, a face. The last
-# position is on no symmetry (irrational): no two points are equally far from it, so that a ball can hold any number.
+# Positions of the origin in the cell of a lattice: at a point, in the middle of a cell, of an edge, of a face. The last
+# position is irrational and lies on no symmetry element of the lattice. No two points are equally far from it, so that
+# a ball around it can hold any number of points.
 CENTRES = (
     (0, 0, 0),
     (1 / 2, 1 / 2, 1 / 2),
@@ -21,19 +22,25 @@ CENTRES = (
     (1 / 2, 1 / 2, 0),
     (2**0.5 - 1.3, 3**0.5 - 1.5, 5**0.5 - 1.9),
 )
-GAP = 1e-10  # norms that differ by less count as equal
+GAP = 1e-10  # difference below which norms count as equal
 
 
 def basis(strategy: Strategy, count: int, radius: float, seed: int) -> Float[Tensor, "count 3"]:
     """Return basis points around the origin, float64.
 
-    "ball_uniform": drawn from the uniform density over the ball; they depend on `seed` alone, and a larger set begins
-    with the points of a smaller one. "grid": a rectangular grid over the cube [-radius, radius]³, its faces included, x
-    slowest. "ball_grid", "hexagonal": the points of a cubic lattice, or of hexagonal close packing, that lie in the
-    ball; the lattice is scaled so that their number is `count`.
+    "ball_uniform": points drawn from the uniform density over the ball. They depend only on `seed`, and a larger set
+    begins with the points of a smaller one. "grid": a rectangular grid over the cube [-radius, radius]³ including its
+    faces, where x changes slowest. "ball_grid", "hexagonal": the points of a cubic lattice, or of hexagonal close
+    packing, that lie in the ball; the lattice is scaled so that `count` points lie in the ball.
+
+    Args:
+        strategy: kind of basis.
+        count: number of points.
+        radius: radius of the ball, or half the edge of the cube.
+        seed: seed of "ball_uniform".
 
     Raises:
-        ConfigError: `count` is no cube and the strategy is "grid"; or no lattice can be scaled to `count`.
+        ConfigError: `count` is no cube and the strategy is "grid"; or no scale of the lattice gives `count` points.
     """
     if strategy == "ball_uniform":
         return torch.from_numpy(_ball_uniform(count, seed) * radius)
@@ -47,23 +54,23 @@ def side(count: int) -> int:
     """Return the number of points along each edge of a cubic grid of `count` points.
 
     Raises:
-        ConfigError: `count` is no cube; the message names the nearest ones.
+        ConfigError: `count` is no cube; the message names the nearest cubes.
     """
     below = round(count ** (1 / 3))
     while below**3 > count:
         below -= 1
     if below**3 != count:
         raise ConfigError(
-            f"encoder bps: basis=grid has as many points as a cube, got points={count}; "
-            f"write points={below**3} ({below}³) or points={(below + 1) ** 3} ({below + 1}³)."
+            f"encoder bps: basis=grid requires a cubic number of points, but got points={count}. "
+            f"Set points={below**3} ({below}³) or points={(below + 1) ** 3} ({below + 1}³)."
         )
     return below
 
 
 def _ball_uniform(count: int, seed: int) -> np.ndarray:
-    """Return random directions at radii u^(1/3), since the volume within a radius grows with its cube."""
-    # NumPy guarantees that its legacy generator always gives the same bits. There are two generators, so that a larger
-    # set begins with the points of a smaller one.
+    """Return random directions at radii u^(1/3), because the volume of a ball grows with the cube of its radius."""
+    # NumPy guarantees that its legacy generator always gives the same bits. Directions and radii have separate
+    # generators, so that a larger set begins with the points of a smaller one.
     direction = np.random.RandomState(seed).normal(size=(count, 3))
     share = np.random.RandomState([seed, 1]).random_sample(count)
     return direction / np.linalg.norm(direction, axis=1, keepdims=True) * np.cbrt(share)[:, None]
@@ -99,25 +106,27 @@ def _in_ball(lattice: Callable[[int], np.ndarray], cell: float, count: int) -> n
     """Return the `count` points of a lattice that lie in the unit ball, for the scale at which exactly `count` do.
 
     Args:
-        lattice: function that returns all lattice points within a distance of the origin, and more.
+        lattice: function of a distance; it returns at least all lattice points within this distance of the origin.
         cell: volume per lattice point.
         count: number of points in the ball.
 
     Raises:
-        ConfigError: for every position of the origin, two points that are equally far would be in and out.
+        ConfigError: for every position of the origin, the last point inside is as far from it as the next one outside.
     """
-    radius = (3 * count * cell / (4 * math.pi)) ** (1 / 3)  # of the ball with the volume of `count` cells
+    radius = (3 * count * cell / (4 * math.pi)) ** (
+        1 / 3
+    )  # radius of the ball with the volume of `count` cells
     points = lattice(math.ceil(radius) + 2)
     for centre in CENTRES:
-        about = points - np.array(centre)
-        norm = np.linalg.norm(about, axis=1)
+        shifted = points - np.array(centre)
+        norm = np.linalg.norm(shifted, axis=1)
         order = np.argsort(norm, kind="stable")[: count + 1]
         last, next_one = norm[order[-2:]]
         if next_one - last > GAP:
             chosen = np.sort(order[:count])  # restores the order of the lattice, x slowest
             return (
-                about[chosen] * 2 / (last + next_one)
+                shifted[chosen] * 2 / (last + next_one)
             )  # the ball ends half way between the last point inside and the next one
     raise ConfigError(
-        f"encoder bps: no ball holds exactly points={count} of this lattice, to rounding; write points={count + 1}."
+        f"encoder bps: to rounding, no ball holds exactly points={count} of this lattice. Set points={count + 1}."
     )

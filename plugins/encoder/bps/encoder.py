@@ -12,14 +12,14 @@ from framework.errors import ConfigError
 from framework.geometry.clouds import Normalisation, require_clouds
 from framework.storage.weights import FINITE, require_state
 from plugins.encoder.bps import basis as sets
-from plugins.encoder.bps.encoding import Basis, channels, columns_of, encode, prepared, width
+from plugins.encoder.bps.encoding import Basis, channels, columns_of, encode, prepare_basis, width
 
 
 class BPS(Encoder):
     """Features of the point of a cloud that is nearest to each point of a fixed basis (thesis eq. 6.1-6.5).
 
-    Features are (channels, side, side, side), x slowest, with the basis "grid". With the others they are
-    (channels × points,): all of the first channel, then all of the second. The basis is stored in the checkpoint.
+    With the basis "grid", features are (channels, side, side, side), where x changes slowest. With the other bases,
+    features are (channels × points,), one channel after the other. The basis is stored in the checkpoint.
 
     Args:
         input_shape: (points, columns) of the largest cloud; coordinates in the first three columns.
@@ -30,13 +30,13 @@ class BPS(Encoder):
             cloud.
         features: features of each basis point, in order: "distance" (1 number, eq. 6.4), "delta" (3, eq. 6.5), and of
             the nearest point "color" (3: red, green, blue), "normal" (3), or the name of a column (1).
-        normalise: as `framework.geometry.clouds.normalise_clouds`.
-        basis_seed: seed of "ball_uniform"; the run's seed has no influence on it.
+        normalise: as in `framework.geometry.clouds.normalise_clouds`.
+        basis_seed: seed of "ball_uniform"; the run's seed has no influence.
         rotation_invariant: encode each cloud along its own axes (`plugins.encoder.bps.frame`).
 
     Raises:
-        ConfigError: an input that is no cloud, no feature or one twice, a feature that the clouds do not have, a "grid"
-            whose `points` are no cube.
+        ConfigError: the input is no cloud; a feature is named twice or needs a column that the clouds do not have; or
+            the basis is "grid" and `points` is no cube.
     """
 
     fixed = True
@@ -44,6 +44,7 @@ class BPS(Encoder):
 
     basis: Tensor
 
+    # More than eight parameters: each keyword is a config key that a user sets alone.
     def __init__(
         self,
         input_shape: tuple[int, ...],
@@ -60,15 +61,17 @@ class BPS(Encoder):
         super().__init__()
         require_clouds(input_shape, by="encoder bps")
         if len(set(features)) < len(features):
-            raise ConfigError(f"encoder bps: features={features} names one twice; wanted each once.")
+            raise ConfigError(
+                f"encoder bps: features={features} names a feature twice. Name each feature once."
+            )
         for feature in features:
             columns_of(feature, input_columns)
         self.columns = input_columns
         self.features = features
         self.normalise: Normalisation = normalise
         self.rotation_invariant = rotation_invariant
-        made = sets.basis(basis, points, radius, basis_seed).to(torch.get_default_dtype())
-        self.register_buffer("basis", made)
+        basis_points = sets.basis(basis, points, radius, basis_seed).to(torch.get_default_dtype())
+        self.register_buffer("basis", basis_points)
         require_state(self, basis=FINITE)
         self._prepared: Basis | None = None
         total = sum(width(feature) for feature in features)
@@ -76,23 +79,23 @@ class BPS(Encoder):
 
     def forward(self, inputs: Float[Tensor, "batch points columns"]) -> Float[Tensor, "batch *features"]:
         """Return the features of the clouds."""
-        found = encode(
+        encoding = encode(
             inputs,
-            self.prepared(),
+            self.prepared_basis(),
             self.features,
             self.normalise,
             self.columns,
             rotation_invariant=self.rotation_invariant,
         )
-        return channels(found).reshape(-1, *self.output_shape)
+        return channels(encoding).reshape(-1, *self.output_shape)
 
-    def prepared(self) -> Basis:
+    def prepared_basis(self) -> Basis:
         """Return the basis prepared for search; it is prepared again only if its device, dtype or values changed."""
-        known = self._prepared
-        if known is None or not _same(known.points, self.basis):
-            # a copy, which does not change when the basis is changed in place
-            known = self._prepared = prepared(self.basis.clone())
-        return known
+        cached = self._prepared
+        if cached is None or not _same(cached.points, self.basis):
+            # a copy, which stays as it is if the buffer is changed in place
+            cached = self._prepared = prepare_basis(self.basis.clone())
+        return cached
 
 
 def _same(some: Tensor, other: Tensor) -> bool:

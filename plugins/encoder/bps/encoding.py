@@ -36,8 +36,8 @@ class Encoding(NamedTuple):
     """Features of a batch of clouds, and what `decode` needs to recover points from them.
 
     Attributes:
-        features: (batch, k) or (batch, k, 3), by name.
-        index: index of the point of each cloud that is nearest to each basis point, the first of equally near ones.
+        features: tensors of shape (batch, k) or (batch, k, 3), by name of the feature.
+        index: for each basis point, the index of the nearest point of each cloud; of equally near points the first.
         basis: the basis points.
         centre, scale: centre and scale of each cloud (framework.geometry.clouds.NormalisedClouds).
         frame: each cloud's own axes as columns, if the encoding is rotation-invariant; else None.
@@ -51,7 +51,7 @@ class Encoding(NamedTuple):
     frame: Float[Tensor, "batch 3 3"] | None
 
 
-def prepared(points: Float[Tensor, "k 3"]) -> Basis:
+def prepare_basis(points: Float[Tensor, "k 3"]) -> Basis:
     """Return basis points prepared for `encode`."""
     return Basis(points, prepare(points))
 
@@ -73,16 +73,16 @@ def columns_of(feature: str, columns: Sequence[str]) -> list[int]:
     """
     if feature in ("distance", "delta"):
         return []
-    wanted = GROUPS.get(feature, (feature,))
-    missing = [name for name in wanted if name not in columns]
+    names = GROUPS.get(feature, (feature,))
+    missing = [name for name in names if name not in columns]
     if missing:
         known = ["distance", "delta", *GROUPS, *columns]
         raise ConfigError(
-            f"encoder bps: feature {feature!r} wants a column {missing[0]!r} of the clouds, whose columns are "
+            f"encoder bps: feature {feature!r} requires a column {missing[0]!r} of the clouds, whose columns are "
             f"{', '.join(columns) or 'not named'}.{did_you_mean(feature, known)} Leave the feature out, or choose data "
-            "whose `columns` name it."
+            "whose `columns` name this column."
         )
-    return [columns.index(name) for name in wanted]
+    return [columns.index(name) for name in names]
 
 
 def encode(
@@ -96,78 +96,82 @@ def encode(
 ) -> Encoding:
     """Return the requested features of the point of each cloud that is nearest to each basis point.
 
-    "distance": its distance from the basis point (eq. 6.4). "delta": the vector from the basis point to it (eq. 6.5).
-    "color", "normal", or the name of any column: its attributes, unchanged ("x", "y", "z" normalised). Distances and
-    deltas are in units of the normalised cloud. All features have the basis's dtype. They are differentiable in the
-    clouds, except where another point becomes the nearest.
+    "distance" is the distance of the nearest point from the basis point (eq. 6.4). "delta" is the vector from the basis
+    point to the nearest point (eq. 6.5). "color", "normal" or the name of a column are attributes of the nearest point,
+    unchanged ("x", "y", "z" are normalised). Distances and deltas are in units of the normalised cloud. All features
+    have the basis's dtype. They are differentiable in the clouds, except where another point becomes the nearest.
 
     Args:
         clouds: (batch, points, columns), padded as `framework.geometry.clouds` describes.
-        basis: basis points, as `prepared` returns them.
+        basis: basis points, as `prepare_basis` returns them.
         features: names of the features, in the order of the result.
-        normalise: as of `framework.geometry.clouds.normalise_clouds`.
+        normalise: as in `framework.geometry.clouds.normalise_clouds`.
         columns: names of the clouds' columns, if a feature is an attribute.
-        rotation_invariant: encode each cloud in its own frame (`plugins.encoder.bps.frame`); normals are rotated with
-            it.
+        rotation_invariant: whether to encode each cloud in its own frame (`plugins.encoder.bps.frame`); normals are
+            rotated into this frame too.
 
     Raises:
         ConfigError: a feature needs a column that the clouds do not have.
-        DataError: as `framework.geometry.clouds.sizes`; with "none", clouds that were plainly not normalised.
+        DataError: as `framework.geometry.clouds.sizes`; or `normalise` is "none" and the clouds are clearly not
+            normalised.
     """
-    wanted = {feature: columns_of(feature, columns) for feature in features}
+    columns_by_feature = {feature: columns_of(feature, columns) for feature in features}
     counts = sizes(clouds)
     local, centre, scale = normalise_clouds(clouds, normalise, counts)
-    within = 1.0
+    reach_of_inliers = 1.0
     if normalise == "none":
         reach = max(1.0, float(basis.points.abs().max()))
         require_normalised(local[..., :3], reach, counts, by="encoder bps")
-        within = (
+        reach_of_inliers = (
             LOOSE * reach
-        )  # `require_normalised` takes at most half of the points, beyond it, for outliers
-    axes = frame(local[..., :3], within) if rotation_invariant else None
+        )  # `require_normalised` accepts at most half of the points beyond this norm, as outliers
+    axes = frame(local[..., :3], reach_of_inliers) if rotation_invariant else None
     if axes is not None:
-        local = _turned(local, axes, columns, {place for places in wanted.values() for place in places})
+        local = _rotate_into_frames(
+            local, axes, columns, {column for indices in columns_by_feature.values() for column in indices}
+        )
     coordinates = local[..., :3].to(basis.points.dtype)
-    found = nearest(coordinates.detach(), basis.queries, counts)
+    neighbours = nearest(coordinates.detach(), basis.queries, counts)
     delta = None
-    if "delta" in wanted or ("distance" in wanted and coordinates.requires_grad):
-        delta = _taken(coordinates, found.index) - basis.points  # eq. 6.5
-    made: dict[str, Tensor] = {}
-    for feature, places in wanted.items():
+    if "delta" in columns_by_feature or ("distance" in columns_by_feature and coordinates.requires_grad):
+        delta = _gather_rows(coordinates, neighbours.index) - basis.points  # eq. 6.5
+    values: dict[str, Tensor] = {}
+    for feature, indices in columns_by_feature.items():
         if feature == "distance":
-            made[feature] = found.distance  # eq. 6.4
+            values[feature] = neighbours.distance  # eq. 6.4
             if delta is not None and delta.requires_grad:
                 length = torch.linalg.vector_norm(delta, dim=-1)
-                made[feature] = found.distance + (
+                values[feature] = neighbours.distance + (
                     length - length.detach()
                 )  # adds a gradient and changes no bit
         elif feature == "delta" and delta is not None:
-            made[feature] = delta
+            values[feature] = delta
         else:
-            attribute = _taken(local[..., places], found.index).to(basis.points.dtype)
-            made[feature] = attribute if width(feature) == 3 else attribute[..., 0]
-    return Encoding(made, found.index, basis.points, centre, scale, axes)
+            attribute = _gather_rows(local[..., indices], neighbours.index).to(basis.points.dtype)
+            values[feature] = attribute if width(feature) == 3 else attribute[..., 0]
+    return Encoding(values, neighbours.index, basis.points, centre, scale, axes)
 
 
 def channels(encoding: Encoding) -> Float[Tensor, "batch channels k"]:
-    """Return all features in the order requested, with the components of vectors as separate channels."""
+    """Return all features in the requested order, with the components of vectors as separate channels."""
     parts = [part[:, None] if part.dim() == 2 else part.mT for part in encoding.features.values()]
     return parts[0] if len(parts) == 1 else torch.cat(parts, 1)
 
 
 def decode(encoding: Encoding, *, unique: bool = False) -> Float[Tensor, "batch points 3"]:
-    """Return the cloud points nearest to the basis points, in the clouds' own units (§6.4.1), from "delta".
+    """Return the cloud points nearest to the basis points, in the clouds' own units (§6.4.1).
 
-    The points have the number and the order of the basis points, so that a point may occur several times. With `unique`
-    each occurs once, in the order of the cloud, and the result is padded as clouds are.
+    The points are computed from the feature "delta". There is one point for each basis point, in the order of the
+    basis, so that a point may occur several times. With `unique` each point occurs once, in the order of the cloud, and
+    the result is padded with rows of NaN.
 
     Raises:
-        UserError: the deltas were not encoded.
+        UserError: the encoding has no feature "delta".
     """
     if "delta" not in encoding.features:
         raise UserError(
-            f"An encoding of {', '.join(encoding.features)} does not lead back to points; wanted the feature 'delta'. "
-            "Encode with features=[delta]."
+            f"An encoding of {', '.join(encoding.features)} cannot be decoded to points; the feature 'delta' is "
+            "required. Encode with features=[delta]."
         )
     points = encoding.features["delta"] + encoding.basis
     if encoding.frame is not None:
@@ -175,21 +179,21 @@ def decode(encoding: Encoding, *, unique: bool = False) -> Float[Tensor, "batch 
     points = denormalise_clouds(points, encoding.centre, encoding.scale)
     if not unique or len(points) == 0:
         return points
-    places = [_first_of_each(index) for index in encoding.index]
-    return pad([cloud[place] for cloud, place in zip(points, places, strict=True)])
+    rows_of_clouds = [_first_occurrences(index) for index in encoding.index]
+    return pad([cloud[rows] for cloud, rows in zip(points, rows_of_clouds, strict=True)])
 
 
 def per_point(
     encoding: Encoding, points: Float[Tensor, "batch points 3"]
 ) -> Float[Tensor, "batch points features"]:
-    """Return the input of a network that predicts something for single points, such as a segment (§8.2).
+    """Return the input of a network that predicts a quantity for each point, such as its segment (§8.2).
 
-    For each point these are the features of its whole cloud, as many as `channels` has, then the point's normalised
-    coordinates. Padding stays NaN.
+    For each point, the input holds all features of its cloud (as `channels` returns them, flattened), then the point's
+    normalised coordinates. Padding stays NaN.
 
     Args:
         encoding: encoding of the clouds.
-        points: in the clouds' own units, of the same clouds in the same order.
+        points: points of the same clouds in the same order, in the clouds' own units.
     """
     local = (points.double() - encoding.centre[:, None]) / encoding.scale[:, None, None]
     if encoding.frame is not None:
@@ -198,30 +202,30 @@ def per_point(
     return torch.cat([whole[:, None].expand(-1, points.shape[1], -1), local.to(whole.dtype)], -1)
 
 
-def _taken(numbers: Float[Tensor, "batch points columns"], index: Int[Tensor, "batch k"]) -> Tensor:
-    """Return the rows of each cloud that an index names, (batch, k, columns)."""
+def _gather_rows(numbers: Float[Tensor, "batch points columns"], index: Int[Tensor, "batch k"]) -> Tensor:
+    """Return the rows of each cloud at the given indices, (batch, k, columns)."""
     return numbers.gather(1, index[..., None].expand(-1, -1, numbers.shape[2]))
 
 
-def _turned(
+def _rotate_into_frames(
     local: Float[Tensor, "batch points columns"], axes: Tensor, columns: Sequence[str], read: set[int]
 ) -> Float[Tensor, "batch points columns"]:
-    """Return coordinates, and normals if any of them is read, along each cloud's own axes."""
+    """Return the clouds with coordinates, and normals if `read` holds one, along each cloud's own axes."""
     parts = list(local.unbind(-1))
     vectors = [[0, 1, 2]]
     if read & {columns.index(name) for name in NORMAL if name in columns}:
         vectors.append(columns_of("normal", columns))
-    for places in vectors:
-        vector = local[..., places].double()
-        padding = vector.isnan()  # it must add nothing to the axes' gradient
+    for indices in vectors:
+        vector = local[..., indices].double()
+        padding = vector.isnan()  # padding must add nothing to the axes' gradient
         along = (vector.where(~padding, 0) @ axes).where(~padding, torch.nan).to(local.dtype)
-        for place, part in zip(places, along.unbind(-1), strict=True):
-            parts[place] = part
+        for column, part in zip(indices, along.unbind(-1), strict=True):
+            parts[column] = part
     return torch.stack(parts, -1)
 
 
-def _first_of_each(index: Int[Tensor, "k"]) -> Int[Tensor, "different"]:
-    """Return the first position of each distinct value of an index, by ascending value."""
+def _first_occurrences(index: Int[Tensor, "k"]) -> Int[Tensor, "different"]:
+    """Return the first position of each distinct value of an index, ordered by value."""
     order = index.argsort(stable=True)
     ordered = index[order]
     first = torch.ones_like(ordered, dtype=torch.bool)

@@ -1,4 +1,4 @@
-"""A frame that rotates with its cloud: principal axes, with directions by third moments."""
+"""A frame that rotates with its cloud: principal axes, whose directions are determined by third moments."""
 
 from typing import Any
 
@@ -9,41 +9,46 @@ from torch import Tensor
 from plugins.encoder.bps.symmetric import EQUAL, symmetric_frame
 
 WITHIN = 1 + 1e-6
-"""Norm up to which a point of a normalised cloud counts, to rounding; outliers of a robust normalisation lie beyond."""
+"""Largest norm of a point that influences the axes, with room for rounding.
+
+Outliers of a robust normalisation have larger norms.
+"""
 APART = 1e-9
 """Difference below which eigenvalues, in units of the largest, are equal, so that their axes have no derivative.
 
-An eigenvalue below it is 0: a cloud thinner than 3e-5 of its length is flat.
+An eigenvalue smaller than this share of the largest counts as 0: a cloud thinner than 3e-5 of its length is flat.
 """
 
 SKEWED = 1e-6
 """Skewness above which a third moment determines the direction of the longest axis.
 
-It is larger for a shorter axis, in proportion to the ratio of the lengths, since coordinates are rounded in units of
-the longest.
+The limit for a shorter axis is larger by the ratio of the lengths of the axes, because the rounding error of
+coordinates is relative to the longest axis.
 """
 
 
 def frame(coordinates: Float[Tensor, "batch points 3"], reach: float = 1.0) -> Float[Tensor, "batch 3 3"]:
     """Return rotations whose columns are each cloud's axes, float64; `coordinates @ frame` is rotation-invariant.
 
-    Axes are the eigenvectors of the second moments about the origin, the longest first. An axis points to where the
-    third moment along it is positive. The axis of least skewness, which a mirror plane makes 0, completes a
-    right-handed frame instead, so that the frame of a cloud with mirror planes is determined up to the cloud's own
-    symmetries. `symmetric_frame` chooses where two moments are equal to rounding, as of a cube, or fewer than two axes
-    are skewed, as of a cloud that x → -x does not change. Where two moments are nearly equal, as of points drawn on a
-    cylinder, a small change of the cloud rotates its axes far. The frame is differentiable in the clouds to any order,
-    except where eigenvalues are equal.
+    Axes are the eigenvectors of the second moments about the origin, the longest first. Each axis points in the
+    direction in which the third moment along the axis is positive. The axis with the least skewness is an exception:
+    its direction is the one that makes the frame right-handed. A mirror plane makes this skewness 0, so that the frame
+    of a cloud with mirror planes is determined up to the cloud's own symmetries.
+
+    `symmetric_frame` chooses the frame if two moments are equal to rounding, as for a cube, or if fewer than two axes
+    are skewed, as for a cloud that the reflection x → -x does not change. If two moments are nearly equal, as for
+    points drawn on a cylinder, a small change of the cloud can rotate its axes by a large angle. The frame is
+    differentiable in the clouds to any order, except where eigenvalues are equal.
 
     Args:
-        coordinates: relative to the origin; rows of NaN are padding.
-        reach: norm beyond which points are outliers, which do not count.
+        coordinates: coordinates relative to the origin; rows of NaN are padding.
+        reach: norm beyond which points are outliers, which do not influence the axes.
     """
     points = coordinates.double()
     norm = torch.linalg.vector_norm(points.detach(), dim=-1, keepdim=True)
     inside = norm <= WITHIN * reach  # False for NaN
     points = points.where(inside, 0)
-    # sums, not means: a factor changes no eigenvector, and the skewness below does not depend on it
+    # sums instead of means: a common factor changes neither the eigenvectors nor the skewness below
     second = points.mT @ points
     values, axes = torch.linalg.eigh(second.detach())
     values, axes = values.flip(-1), axes.flip(-1)
@@ -71,10 +76,10 @@ def frame(coordinates: Float[Tensor, "batch points 3"], reach: float = 1.0) -> F
 
 
 class Axes(torch.autograd.Function):
-    """Known eigenvalues and eigenvectors, with derivatives in the matrix that they belong to.
+    """Eigenvalues and eigenvectors that are known already, with their derivatives in the matrix.
 
-    The backward uses only the outputs of the forward, so that it has derivatives in turn. Those of torch.linalg.eigh
-    are not finite where two eigenvalues are equal.
+    The backward pass uses only the outputs of the forward pass, so that it can itself be differentiated. The
+    derivatives of torch.linalg.eigh are not finite where two eigenvalues are equal.
     """
 
     @staticmethod
@@ -88,13 +93,13 @@ class Axes(torch.autograd.Function):
 
     @staticmethod
     def backward(  # type: ignore[override]
-        ctx: Any, of_values: Tensor, of_axes: Tensor
+        ctx: Any, values_gradient: Tensor, axes_gradient: Tensor
     ) -> tuple[Tensor, None, None]:
-        """Return the gradient in the matrix."""
+        """Return the gradient in the matrix, and None for the eigenvalues and eigenvectors."""
         values, axes = ctx.saved_tensors
         # first-order perturbation: d value_j = axis_jᵀ d(second) axis_j, and
         # d axis_j = Σ_i axis_i (axis_iᵀ d(second) axis_j) / (value_j - value_i)
         gap = values[:, None] - values[..., None]
         known = gap.abs() > APART * values[:, :1, None]
-        turn = (axes.mT @ of_axes).where(known, 0) / gap.where(known, 1)
-        return axes @ (turn + of_values.diag_embed()) @ axes.mT, None, None
+        coefficients = (axes.mT @ axes_gradient).where(known, 0) / gap.where(known, 1)
+        return axes @ (coefficients + values_gradient.diag_embed()) @ axes.mT, None, None

@@ -1,4 +1,4 @@
-"""Rows of the contract: each basis, each kind of feature."""
+"""Contract-test cases: each basis and each kind of feature."""
 
 from framework.testing.rows import CloudRow
 

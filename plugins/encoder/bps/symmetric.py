@@ -1,11 +1,11 @@
 """Frames of symmetric clouds, whose second and third moments determine no frame: the best of a few candidates.
 
-A cloud that is its own image under x → -x has no third moments, so that none of its axes has a direction. A cloud with
-equal second moments, such as a cube, has no axes. The candidates are then the remaining directions of the axes, or
-frames through points of the cloud. The candidate with the largest L(F a) is chosen, where F is the candidate, a is a
-constant, and L(s) = mean exp(s·p) is the Laplace transform of the cloud, which holds moments of every order. Two
-candidates have the same value, but for coincidences, only if a symmetry of the cloud maps one to the other; the cloud
-looks the same in both. No rotation of the cloud changes the choice.
+The third moments of a cloud that the reflection x → -x does not change are 0 and determine no direction of an axis. The
+second moments of a cube are equal and determine no axes. The candidates are then the remaining directions of the axes,
+or frames through points of the cloud. The candidate F with the largest value L(F a) is chosen, where a is a constant
+vector and L(s) = mean exp(s·p) is the Laplace transform of the cloud's points p, which depends on moments of every
+order. Apart from coincidences, two candidates have the same value only if a symmetry of the cloud maps one to the
+other; the cloud then has the same coordinates in both. A rotation of the cloud rotates the chosen frame with it.
 """
 
 import torch
@@ -13,13 +13,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 EQUAL = 1e-6
-"""Relative difference, in units of the largest, below which second moments are equal to the rounding of float32."""
+"""Difference of second moments, as a share of the largest, below which they are equal to the rounding of float32."""
 TIED = 1e-6
-"""Difference below which lengths, relative to themselves, and values of L are equal."""
+"""Relative difference below which lengths count as equal, and absolute difference below which values of log L do."""
 GENERIC = (1.3, 0.9, 0.5)
-"""The vector a, in inverse units of the root mean square of a coordinate: its components differ, and none is 0."""
+"""The vector a, in inverse units of the root mean square of a coordinate; the components differ, and none is 0."""
 AT_ONCE = 2**22
-"""Largest number of pairs of a candidate and a point that are held at once."""
+"""Largest number of pairs of a candidate and a point that are in memory at once."""
 FLIPS = ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))
 """Directions of three axes that leave a frame right-handed."""
 
@@ -34,17 +34,18 @@ def symmetric_frame(
     """Return a right-handed frame, as columns, that rotates with the cloud.
 
     Args:
-        points: relative to the origin.
+        points: coordinates relative to the origin.
         axes: principal axes as columns, the longest first, right-handed.
-        fixed: axes whose direction is determined by their third moments; read if no two second moments are equal.
+        fixed: whether the third moments determine the direction of each axis; only used if no two second moments are
+            equal.
         equal: whether the second moments of the first two axes are equal, and those of the last two.
     """
     if bool(equal.all()):
-        frames = _through_two_points(points)
+        frames = _frames_through_points(points)
     elif bool(equal.any()):
         last = bool(equal[0])
         axis = axes[:, 2 if last else 0]
-        frames = torch.cat([_about(points, one, last=last) for one in (axis, -axis)])
+        frames = torch.cat([_frames_about(points, direction, last=last) for direction in (axis, -axis)])
     else:
         flips = torch.tensor(FLIPS, dtype=axes.dtype, device=axes.device)
         flips = flips[(flips[:, fixed] == 1).all(1)]
@@ -53,25 +54,25 @@ def symmetric_frame(
     return frames[_log_transform(points, frames @ generic).argmax()]
 
 
-def _through_two_points(points: Float[Tensor, "points 3"]) -> Float[Tensor, "frame 3 3"]:
+def _frames_through_points(points: Float[Tensor, "points 3"]) -> Float[Tensor, "frame 3 3"]:
     """Return frames through points of the cloud, (frame, 3, 3).
 
-    The first axis leads to one of the farthest points; the second leads towards one of those that are farthest from
-    this axis.
+    The first axis points to one of the points farthest from the origin. The second axis points towards one of the
+    points farthest from the first axis.
     """
     first = points[_farthest(points.norm(dim=1))]
     first = first / first.norm(dim=1, keepdim=True)
     value = _log_transform(points, GENERIC[0] * first)
-    return torch.cat([_about(points, axis) for axis in first[value >= value.max() - TIED]])
+    return torch.cat([_frames_about(points, axis) for axis in first[value >= value.max() - TIED]])
 
 
-def _about(
+def _frames_about(
     points: Float[Tensor, "points 3"], axis: Float[Tensor, "3"], last: bool = False
 ) -> Float[Tensor, "frame 3 3"]:
     """Return frames with `axis` as their first column, or as their last.
 
-    Another axis leads towards one of the points that are farthest from `axis`; of these, towards one that is farthest
-    along it, in either direction.
+    The next axis points towards one of the points that are farthest from `axis`. If several points are equally far, it
+    points towards one of those farthest from the origin along `axis`, in either direction.
     """
     along = points @ axis
     across = points - along[:, None] * axis
@@ -90,9 +91,12 @@ def _farthest(length: Float[Tensor, "points"]) -> Tensor:
 
 
 def _log_transform(
-    points: Float[Tensor, "points 3"], places: Float[Tensor, "place 3"]
-) -> Float[Tensor, "place"]:
-    """Return log L of the points, in units of the root mean square of a coordinate."""
+    points: Float[Tensor, "points 3"], arguments: Float[Tensor, "argument 3"]
+) -> Float[Tensor, "argument"]:
+    """Return log L at each argument s, (argument,), for points in units of the root mean square of a coordinate.
+
+    The result exceeds log L by the constant log(number of points), which changes no comparison.
+    """
     unit = points / points.square().mean().sqrt().clamp(min=torch.finfo(points.dtype).tiny)
-    parts = places.split(max(1, AT_ONCE // max(1, len(unit))))
+    parts = arguments.split(max(1, AT_ONCE // max(1, len(unit))))
     return torch.cat([torch.logsumexp(part @ unit.T, 1) for part in parts])

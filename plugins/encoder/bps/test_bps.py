@@ -14,7 +14,7 @@ from framework.errors import ConfigError, DataError, UserError
 from framework.geometry.clouds import normalise_clouds, pad, sizes
 from plugins.encoder.bps import encoding
 from plugins.encoder.bps.basis import basis
-from plugins.encoder.bps.encoding import channels, decode, encode, per_point, prepared
+from plugins.encoder.bps.encoding import channels, decode, encode, per_point, prepare_basis
 from plugins.encoder.bps.frame import frame
 from plugins.encoder.bps.rows import COLUMNS
 
@@ -32,19 +32,19 @@ def batch_of(lengths, columns=3, dtype=torch.float64):
 
 def by_hand(cloud, points):
     """Return distance, delta and index of the nearest point of one normalised cloud, by loops (eq. 6.4-6.5)."""
-    found = []
+    neighbours = []
     for place in points:
         best, index = math.inf, -1
         for number, point in enumerate(cloud[:, :3]):
             distance = math.dist(place, point)
-            if distance < best:  # so that the first of equally near points stays
+            if distance < best:  # of equally near points the first one stays
                 best, index = distance, number
-        found.append((best, cloud[index, :3] - place, index))
-    distances, deltas, indices = zip(*found, strict=True)
+        neighbours.append((best, cloud[index, :3] - place, index))
+    distances, deltas, indices = zip(*neighbours, strict=True)
     return np.array(distances), np.array(deltas), np.array(indices)
 
 
-def encoder(shape=(40, 3), columns=(), **config):
+def build_encoder(shape=(40, 3), columns=(), **config):
     return build(
         "encoder",
         resolve("encoder", {"name": "bps", **config}),
@@ -86,10 +86,10 @@ def test_a_grid_is_that_of_three_loops():
     "count, near", [(500, r"343 \(7³\) or points=512 \(8³\)"), (2, r"1 \(1³\) or points=8")]
 )
 def test_a_grid_that_is_no_cube_names_the_nearest_ones(count, near):
-    with pytest.raises(ConfigError, match=f"got points={count}; write points={near}"):
+    with pytest.raises(ConfigError, match=f"got points={count}. Set points={near}"):
         basis("grid", count, 1.0, 13)
-    with pytest.raises(ConfigError, match="as many points as a cube"):
-        encoder(basis="grid", points=count)
+    with pytest.raises(ConfigError, match="a cubic number of points"):
+        build_encoder(basis="grid", points=count)
 
 
 ROW = math.sqrt(3) / 2
@@ -113,12 +113,12 @@ def test_exactly_as_many_points_of_a_lattice_lie_in_the_ball(strategy, count):
     distance = np.linalg.norm(points[:, None] - points, axis=-1)
     distance[np.diag_indices(count)] = math.inf
     edge = distance.min()
-    # every lattice point one step away in the ball is there too, so that none was left out
+    # every lattice point that is one step from a chosen point and lies in the ball is chosen too
     for move in MOVES[strategy]:
         for sign in (1, -1):
             for other in points + sign * edge * np.array(move):
-                there = np.linalg.norm(points - other, axis=1).min() < 1e-9
-                assert there or np.linalg.norm(other) >= 1 - 1e-9
+                in_ball = np.linalg.norm(points - other, axis=1).min() < 1e-9
+                assert in_ball or np.linalg.norm(other) >= 1 - 1e-9
     if count >= 512:
         assert count * VOLUME[strategy] * edge**3 == pytest.approx(4 / 3 * math.pi, rel=0.05)
         inner = np.linalg.norm(points, axis=1) < 1 - 1.001 * edge
@@ -136,19 +136,19 @@ def test_features_agree_with_loops(strategy, normalise, dtype):
     clouds = batch_of(lengths, len(COLUMNS), dtype)
     points = basis(strategy, 27, 1.0, 13).to(dtype)
     wanted = ["normal", "distance", "echo", "delta", "color", "z"]
-    found = encode(clouds, prepared(points), wanted, normalise, COLUMNS)
-    assert list(found.features) == wanted
+    encoded = encode(clouds, prepare_basis(points), wanted, normalise, COLUMNS)
+    assert list(encoded.features) == wanted
     local = normalise_clouds(clouds, normalise).clouds
     for number, length in enumerate(lengths):
         cloud = local[number, :length].double().numpy()
         distance, delta, index = by_hand(cloud, points.double().numpy())
-        np.testing.assert_array_equal(found.index[number].numpy(), index)
+        np.testing.assert_array_equal(encoded.index[number].numpy(), index)
         limit = 2.5e-7 if dtype == torch.float32 else 1e-14
-        np.testing.assert_allclose(found.features["distance"][number].numpy(), distance, rtol=0, atol=limit)
-        np.testing.assert_allclose(found.features["delta"][number].numpy(), delta, rtol=0, atol=limit)
+        np.testing.assert_allclose(encoded.features["distance"][number].numpy(), distance, rtol=0, atol=limit)
+        np.testing.assert_allclose(encoded.features["delta"][number].numpy(), delta, rtol=0, atol=limit)
         for feature, places in {"color": [3, 4, 5], "normal": [6, 7, 8], "echo": 9, "z": 2}.items():
-            np.testing.assert_array_equal(found.features[feature][number].numpy(), cloud[index][:, places])
-    assert all(feature.dtype == dtype for feature in found.features.values())
+            np.testing.assert_array_equal(encoded.features[feature][number].numpy(), cloud[index][:, places])
+    assert all(feature.dtype == dtype for feature in encoded.features.values())
 
 
 coordinate = st.floats(-1, 1, width=32)
@@ -176,44 +176,46 @@ WILD = st.one_of(
 def test_wild_clouds(cloud, scale, offset, strategy, count, normalise, dtype):
     clouds = ((torch.tensor(cloud, dtype=torch.float64) + offset) * scale).to(dtype)[None]
     points = basis(strategy, count, 1.0, 13).to(dtype)
-    found = encode(clouds, prepared(points), ["distance", "delta"], normalise)
+    encoded = encode(clouds, prepare_basis(points), ["distance", "delta"], normalise)
     local = normalise_clouds(clouds, normalise).clouds[0].double().numpy()
     distance, _, _ = by_hand(local, points.double().numpy())
     size = max(1.0, np.abs(local).max())  # the largest norm with far outliers
     limit = 2.5e-7 if dtype == torch.float32 else 1e-14
-    np.testing.assert_allclose(found.features["distance"][0].numpy(), distance, rtol=0, atol=limit * size)
-    length = found.features["delta"][0].double().norm(dim=-1).numpy()
+    np.testing.assert_allclose(encoded.features["distance"][0].numpy(), distance, rtol=0, atol=limit * size)
+    length = encoded.features["delta"][0].double().norm(dim=-1).numpy()
     np.testing.assert_allclose(length, distance, rtol=0, atol=limit * size)
-    back = decode(found)[0].double()
-    index = found.index[0]
-    place = limit * float(found.scale[0]) * size + 4e-16 * float(clouds.abs().max())
+    back = decode(encoded)[0].double()
+    index = encoded.index[0]
+    place = limit * float(encoded.scale[0]) * size + 4e-16 * float(clouds.abs().max())
     assert (back - clouds[0, index].double()).abs().max() <= max(place, 1e-7 * float(clouds.abs().max()))
 
 
 def test_equally_near_points_give_the_first():
     clouds = torch.tensor([[[1.0, 0, 0], [0, 1, 0], [1, 0, 0], [-1, 0, 0], [0, -1, 0], [0, 1, 0]]])
-    found = encode(clouds, prepared(torch.zeros(1, 3)), ["delta"], "none")
-    assert found.index.tolist() == [[0]]
-    assert found.features["delta"].tolist() == [[[1, 0, 0]]]
+    encoded = encode(clouds, prepare_basis(torch.zeros(1, 3)), ["delta"], "none")
+    assert encoded.index.tolist() == [[0]]
+    assert encoded.features["delta"].tolist() == [[[1, 0, 0]]]
 
 
 def test_only_what_is_asked_for_is_computed(monkeypatch):
-    clouds, made = batch_of([9, 12]), prepared(basis("ball_uniform", 8, 1.0, 13))
+    clouds, basis_points = batch_of([9, 12]), prepare_basis(basis("ball_uniform", 8, 1.0, 13))
     gathered = []
-    taken = encoding._taken
+    gather_rows = encoding._gather_rows
     monkeypatch.setattr(
-        encoding, "_taken", lambda rows, index: gathered.append(rows.shape[2]) or taken(rows, index)
+        encoding,
+        "_gather_rows",
+        lambda rows, index: gathered.append(rows.shape[2]) or gather_rows(rows, index),
     )
-    assert list(encode(clouds, made).features) == ["distance"]
+    assert list(encode(clouds, basis_points).features) == ["distance"]
     assert gathered == []
-    assert list(encode(clouds, made, ["delta"]).features) == ["delta"]
+    assert list(encode(clouds, basis_points, ["delta"]).features) == ["delta"]
     assert gathered == [3]
 
 
 def test_a_gradient_changes_no_bit_of_the_features():
-    clouds, made = batch_of([9, 12]), prepared(basis("ball_uniform", 30, 1.0, 13))
-    plain = encode(clouds, made, ["distance", "delta"])
-    traced = encode(clouds.clone().requires_grad_(), made, ["distance", "delta"])
+    clouds, basis_points = batch_of([9, 12]), prepare_basis(basis("ball_uniform", 30, 1.0, 13))
+    plain = encode(clouds, basis_points, ["distance", "delta"])
+    traced = encode(clouds.clone().requires_grad_(), basis_points, ["distance", "delta"])
     for feature in plain.features:
         assert traced.features[feature].requires_grad
         assert torch.equal(plain.features[feature], traced.features[feature])
@@ -222,12 +224,14 @@ def test_a_gradient_changes_no_bit_of_the_features():
 @pytest.mark.parametrize("rotation_invariant", [False, True])
 @pytest.mark.parametrize("normalise", ["unit_ball", "robust"])
 def test_gradients_agree_with_finite_differences(normalise, rotation_invariant):
-    made = prepared(basis("ball_uniform", 6, 1.0, 13))
+    basis_points = prepare_basis(basis("ball_uniform", 6, 1.0, 13))
 
     def features(clouds):
         wanted = ["distance", "delta", "color", "normal"]
-        found = encode(clouds, made, wanted, normalise, COLUMNS, rotation_invariant=rotation_invariant)
-        return channels(found)
+        encoded = encode(
+            clouds, basis_points, wanted, normalise, COLUMNS, rotation_invariant=rotation_invariant
+        )
+        return channels(encoded)
 
     clouds = pad([numbers(7, 10, seed=3), numbers(7, 10, seed=4)]).requires_grad_()
     assert torch.autograd.gradcheck(features, (clouds,), eps=1e-7, atol=1e-5)
@@ -235,10 +239,10 @@ def test_gradients_agree_with_finite_differences(normalise, rotation_invariant):
 
 @pytest.mark.parametrize("cloud", [torch.ones(1, 5, 3), torch.tensor([[[-1.0, 0, 0], [0, 0, 0], [1, 0, 0]]])])
 def test_gradients_of_degenerate_clouds_are_finite(cloud):
-    made = prepared(torch.zeros(1, 3))  # the basis point coincides with a point
+    basis_points = prepare_basis(torch.zeros(1, 3))  # the basis point coincides with a point
     clouds = cloud.clone().requires_grad_()
-    found = encode(clouds, made, ["distance", "delta"], rotation_invariant=True)
-    channels(found).sum().backward()
+    encoded = encode(clouds, basis_points, ["distance", "delta"], rotation_invariant=True)
+    channels(encoded).sum().backward()
     assert clouds.grad is not None
     assert clouds.grad.isfinite().all()
 
@@ -250,41 +254,41 @@ def test_gradients_of_degenerate_clouds_are_finite(cloud):
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_deltas_lead_back_to_points_of_the_cloud(dtype, rotation_invariant):
     clouds = batch_of([30, 3], dtype=dtype) * 100
-    made = prepared(basis("ball_uniform", 40, 1.0, 13).to(dtype))
-    found = encode(clouds, made, ["delta"], rotation_invariant=rotation_invariant)
-    points = decode(found)
+    basis_points = prepare_basis(basis("ball_uniform", 40, 1.0, 13).to(dtype))
+    encoded = encode(clouds, basis_points, ["delta"], rotation_invariant=rotation_invariant)
+    points = decode(encoded)
     assert points.dtype == dtype
     limit = 20 * torch.finfo(dtype).eps * float(clouds.nan_to_num().abs().max())
-    wanted = torch.stack([cloud[index] for cloud, index in zip(clouds, found.index, strict=True)])
+    wanted = torch.stack([cloud[index] for cloud, index in zip(clouds, encoded.index, strict=True)])
     torch.testing.assert_close(points, wanted, rtol=0, atol=limit)
-    once = decode(found, unique=True)
+    once = decode(encoded, unique=True)
     for number, cloud in enumerate(clouds):
-        places = np.unique(found.index[number].numpy())
+        places = np.unique(encoded.index[number].numpy())
         assert sizes(once)[number] == len(places)
         torch.testing.assert_close(once[number, : len(places)], cloud[places], rtol=0, atol=limit)
 
 
 def test_distances_alone_do_not_lead_back():
-    found = encode(batch_of([5]), prepared(basis("grid", 8, 1.0, 13)))
+    encoded = encode(batch_of([5]), prepare_basis(basis("grid", 8, 1.0, 13)))
     with pytest.raises(UserError, match=r"encoding of distance .* features=\[delta\]"):
-        decode(found)
+        decode(encoded)
 
 
 def test_single_points_are_joined_with_their_cloud_and_do_not_depend_on_its_place():
     clouds = batch_of([30, 12])
-    made = prepared(basis("ball_uniform", 16, 1.0, 13))
+    basis_points = prepare_basis(basis("ball_uniform", 16, 1.0, 13))
     points = clouds[:, :12]
-    found = encode(clouds, made, ["distance", "delta"])
-    joined = per_point(found, points)
+    encoded = encode(clouds, basis_points, ["distance", "delta"])
+    joined = per_point(encoded, points)
     assert joined.shape == (2, 12, 4 * 16 + 3)
     torch.testing.assert_close(joined[..., -3:], normalise_clouds(clouds, "unit_ball").clouds[:, :12])
-    assert torch.equal(joined[:, 5, :-3], channels(found).flatten(1))
-    moved = per_point(encode(clouds * 7 - 3, made, ["distance", "delta"]), points * 7 - 3)
+    assert torch.equal(joined[:, 5, :-3], channels(encoded).flatten(1))
+    moved = per_point(encode(clouds * 7 - 3, basis_points, ["distance", "delta"]), points * 7 - 3)
     torch.testing.assert_close(moved, joined, rtol=0, atol=1e-12)
     turn = torch.from_numpy(Rotation.random(rng=5).as_matrix())
-    one = per_point(encode(clouds, made, rotation_invariant=True), points)
-    other = per_point(encode(clouds @ turn, made, rotation_invariant=True), points @ turn)
-    torch.testing.assert_close(one, other, rtol=0, atol=1e-10)
+    unrotated = per_point(encode(clouds, basis_points, rotation_invariant=True), points)
+    rotated = per_point(encode(clouds @ turn, basis_points, rotation_invariant=True), points @ turn)
+    torch.testing.assert_close(unrotated, rotated, rtol=0, atol=1e-10)
 
 
 # Rotations
@@ -296,26 +300,26 @@ def turned(cloud, seed):
     return torch.cat([cloud[..., :3] @ turn, cloud[..., 3:6], cloud[..., 6:9] @ turn, cloud[..., 9:]], -1)
 
 
-def invariant(clouds, made):
+def invariant(clouds, basis_points):
     features = ["distance", "delta", "normal", "color"]
-    return channels(encode(clouds, made, features, "unit_ball", COLUMNS, rotation_invariant=True))
+    return channels(encode(clouds, basis_points, features, "unit_ball", COLUMNS, rotation_invariant=True))
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_a_rotation_changes_nothing_where_that_is_asked_for(dtype):
     stretch = torch.tensor([3.0, 2, 1, *[1] * 7], dtype=dtype)
     clouds = (numbers(8, 500, 10).to(dtype).abs() - 0.3) * stretch
-    made = prepared(basis("ball_uniform", 64, 1.0, 13).to(dtype))
-    wanted = invariant(clouds, made)
+    basis_points = prepare_basis(basis("ball_uniform", 64, 1.0, 13).to(dtype))
+    wanted = invariant(clouds, basis_points)
     for seed in range(5):
-        found = invariant(turned(clouds, seed), made)
+        features = invariant(turned(clouds, seed), basis_points)
         # if rounding makes another point the nearest, all features except the distance jump
-        same = (found - wanted).abs().amax(1) <= (1e-5 if dtype == torch.float32 else 1e-12)
+        same = (features - wanted).abs().amax(1) <= (1e-5 if dtype == torch.float32 else 1e-12)
         assert same.double().mean() > (0.995 if dtype == torch.float32 else 1 - 1e-9)
         torch.testing.assert_close(
-            found[:, 0], wanted[:, 0], rtol=0, atol=1e-5 if dtype == torch.float32 else 1e-12
+            features[:, 0], wanted[:, 0], rtol=0, atol=1e-5 if dtype == torch.float32 else 1e-12
         )
-    plain = channels(encode(clouds, made)) - channels(encode(turned(clouds, 0), made))
+    plain = channels(encode(clouds, basis_points)) - channels(encode(turned(clouds, 0), basis_points))
     assert plain.abs().max() > 0.1
 
 
@@ -326,22 +330,22 @@ def test_mirror_planes_do_no_harm(planes):
         mirror = torch.ones(10, dtype=torch.float64)
         mirror[[axis, 6 + axis]] = -1
         cloud = torch.cat([cloud, cloud * mirror])
-    made = prepared(basis("ball_uniform", 64, 1.0, 13))
-    wanted = invariant(cloud[None], made)[:, 0]
+    basis_points = prepare_basis(basis("ball_uniform", 64, 1.0, 13))
+    wanted = invariant(cloud[None], basis_points)[:, 0]
     for seed in range(10):
-        found = invariant(turned(cloud[None], seed), made)[:, 0]
-        torch.testing.assert_close(found, wanted, rtol=0, atol=1e-10)
+        features = invariant(turned(cloud[None], seed), basis_points)[:, 0]
+        torch.testing.assert_close(features, wanted, rtol=0, atol=1e-10)
 
 
 def test_a_mirrored_cloud_is_another():
     cloud = numbers(1, 300, 10).abs() * torch.tensor([3.0, 2, 1, *[1] * 7], dtype=torch.float64)
-    made = prepared(basis("ball_uniform", 64, 1.0, 13))
+    basis_points = prepare_basis(basis("ball_uniform", 64, 1.0, 13))
     mirrored = cloud * torch.tensor([-1.0, *[1] * 9], dtype=torch.float64)
-    assert (invariant(mirrored, made) - invariant(cloud, made))[:, 0].abs().max() > 0.05
+    assert (invariant(mirrored, basis_points) - invariant(cloud, basis_points))[:, 0].abs().max() > 0.05
 
 
 def shape(name, seed=0):
-    """Return 300 points without a mirror plane, unless the name says otherwise."""
+    """Return 300 points; they have no mirror plane unless `name` is a shape with one."""
     cloud = (numbers(300, 3, seed=seed).abs() - 0.3) * torch.tensor([3.0, 2, 1], dtype=torch.float64)
     kind, _, thickness = name.partition(" ")
     if kind in ("bar", "even bar"):
@@ -357,7 +361,7 @@ def shape(name, seed=0):
     return cloud
 
 
-# flat means thinner than 3e-5: the two sides of a thinner even sheet are not told apart
+# Flat means thinner than 3e-5 of the length: the two sides of such an even sheet are not distinguished.
 FLAT = ["sheet", "sheet 1e-9", "sheet 1e-7", "sheet 1e-6", "tilted", "bar"]
 EVEN = [
     "even-bar",
@@ -381,14 +385,14 @@ def rotations(count, seed):
 def test_no_rotation_of_any_shape_changes_its_code(name, seed, dtype):
     cloud = shape(name, seed)
     turned = torch.cat([cloud[None], cloud @ rotations(100, seed)]).to(dtype)
-    made = prepared(basis("ball_uniform", 64, 1.0, 13).to(dtype))
-    found = encode(turned, made, rotation_invariant=True).features["distance"]
+    basis_points = prepare_basis(basis("ball_uniform", 64, 1.0, 13).to(dtype))
+    distances = encode(turned, basis_points, rotation_invariant=True).features["distance"]
     limit = 1e-5 if dtype == torch.float32 or name in ("even-sheet 1e-6", "twice-even 1e-6") else 1e-10
-    torch.testing.assert_close(found, found[:1].expand_as(found), rtol=0, atol=limit)
+    torch.testing.assert_close(distances, distances[:1].expand_as(distances), rtol=0, atol=limit)
 
 
 def copies(group, count, stretch=(1.0, 1.0, 1.0), mirrored=False):
-    """Return points that only a symmetry group of rotations maps to each other, and x → -x if requested."""
+    """Return points that a group of rotations maps to each other; with `mirrored` also the reflection x → -x."""
     points = (numbers(count, 3).abs() - 0.3) * torch.tensor(stretch, dtype=torch.float64)
     turns = torch.from_numpy(Rotation.create_group(group).as_matrix())
     cloud = torch.cat([points @ turn.T for turn in turns])
@@ -427,15 +431,15 @@ SYMMETRIC = {
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("name", SYMMETRIC)
 def test_symmetric_clouds_have_one_code_whatever_their_rotation(name, dtype):
-    """Check clouds whose second or third moments determine no axes, with points in any order."""
+    """Check clouds whose second or third moments determine no frame, with points in any order."""
     cloud = SYMMETRIC[name]
     turned = torch.cat([cloud[None], cloud @ rotations(30, 1)]).to(dtype)
     order = torch.randperm(len(cloud), generator=torch.Generator().manual_seed(0))
-    made = prepared(basis("ball_uniform", 64, 1.0, 13).to(dtype))
-    found = encode(torch.cat([turned, turned[:, order]]), made, rotation_invariant=True)
-    assert found.frame is not None
-    torch.testing.assert_close(torch.linalg.det(found.frame), torch.ones(62).double())
-    distance = found.features["distance"]
+    basis_points = prepare_basis(basis("ball_uniform", 64, 1.0, 13).to(dtype))
+    encoded = encode(torch.cat([turned, turned[:, order]]), basis_points, rotation_invariant=True)
+    assert encoded.frame is not None
+    torch.testing.assert_close(torch.linalg.det(encoded.frame), torch.ones(62).double())
+    distance = encoded.features["distance"]
     limit = 1e-5 if dtype == torch.float32 else 1e-12
     torch.testing.assert_close(distance, distance[:1].expand_as(distance), rtol=0, atol=limit)
 
@@ -443,16 +447,16 @@ def test_symmetric_clouds_have_one_code_whatever_their_rotation(name, dtype):
 @pytest.mark.parametrize("name", FLAT + EVEN + THICK)
 def test_a_mirror_image_is_another_shape_where_no_rotation_leads_to_it(name):
     cloud = shape(name)
-    made = prepared(basis("ball_uniform", 64, 1.0, 13))
+    basis_points = prepare_basis(basis("ball_uniform", 64, 1.0, 13))
     for axis in range(3):
         mirrored = cloud * (1 - 2.0 * torch.eye(3, dtype=torch.float64)[axis])
         both = torch.stack([cloud, mirrored @ rotations(1, axis)[0]])
-        one, other = encode(both, made, rotation_invariant=True).features["distance"]
+        plain, other = encode(both, basis_points, rotation_invariant=True).features["distance"]
         if name in THICK and not name.startswith("even"):
             thickness = float(name.partition(" ")[2] or 1)
-            assert (one - other).abs().max() > 0.05 * thickness
+            assert (plain - other).abs().max() > 0.05 * thickness
         else:  # up to the thickness, which is at most 1e-6 of the extent of a flat cloud
-            torch.testing.assert_close(one, other, rtol=0, atol=1e-5)
+            torch.testing.assert_close(plain, other, rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -461,20 +465,20 @@ def test_a_mirror_image_is_another_shape_where_no_rotation_leads_to_it(name):
 @pytest.mark.parametrize("norm", [0.1, 0.99, 1.0, 1.01, 1.5, 1.8])
 @pytest.mark.parametrize("far", [0, 20])
 def test_a_cloud_that_was_normalised_before_has_a_frame_whatever_its_norms(far, norm, radius, name, dtype):
-    """Check normalised clouds from a shell, with all points beyond 1 or all within, to one with outliers."""
+    """Check clouds on a shell of radius `norm`, inside and outside the unit ball, with and without outliers."""
     cloud = shape(name)
     cloud = cloud * norm * radius / cloud.norm(dim=1, keepdim=True)
     outliers = torch.tensor([[1e3, -2e3, 5e3]], dtype=torch.float64).expand(far, 3)
     whole = torch.cat([cloud, outliers])
     clouds = torch.cat([whole[None], whole @ rotations(20, 1)]).to(dtype)
-    made = prepared(basis("ball_uniform", 64, radius, 13).to(dtype))
-    found = encode(clouds, made, normalise="none", rotation_invariant=True)
-    assert found.frame is not None
-    lengths = (clouds[:, :300].double() @ found.frame).square().sum(1)
+    basis_points = prepare_basis(basis("ball_uniform", 64, radius, 13).to(dtype))
+    encoded = encode(clouds, basis_points, normalise="none", rotation_invariant=True)
+    assert encoded.frame is not None
+    lengths = (clouds[:, :300].double() @ encoded.frame).square().sum(1)
     assert (
         lengths.diff(dim=1) <= 1e-6 * lengths[:, :1]
     ).all()  # the longest axis of the shell alone is first
-    distance = found.features["distance"]
+    distance = encoded.features["distance"]
     limit = (1e-5 if dtype == torch.float32 else 1e-10) * radius
     torch.testing.assert_close(distance, distance[:1].expand_as(distance), rtol=0, atol=limit)
 
@@ -487,8 +491,8 @@ def test_frames_have_derivatives_of_second_order(name):
     sign = frame(clouds.detach())
 
     def axes(clouds):  # noise decides the sign normal to a mirror plane
-        found = frame(clouds)
-        return found * (found.detach() * sign).sum(1, keepdim=True).sign()
+        frames = frame(clouds)
+        return frames * (frames.detach() * sign).sum(1, keepdim=True).sign()
 
     assert torch.autograd.gradcheck(axes, (clouds,), eps=1e-7, atol=1e-5)
     assert torch.autograd.gradgradcheck(axes, (clouds,), eps=1e-7, atol=1e-4, rtol=1e-3)
@@ -496,11 +500,11 @@ def test_frames_have_derivatives_of_second_order(name):
 
 @pytest.mark.parametrize("normalise", ["unit_ball", "robust", "none"])
 def test_codes_have_derivatives_of_second_order(normalise):
-    made = prepared(basis("ball_uniform", 4, 1.0, 13))
+    basis_points = prepare_basis(basis("ball_uniform", 4, 1.0, 13))
 
     def features(clouds):
-        found = encode(clouds, made, ["distance", "delta"], normalise, rotation_invariant=True)
-        return channels(found)
+        encoded = encode(clouds, basis_points, ["distance", "delta"], normalise, rotation_invariant=True)
+        return channels(encoded)
 
     clouds = pad([0.3 * numbers(6, 3, seed=3), 0.3 * numbers(7, 3, seed=4)]).requires_grad_()
     assert torch.autograd.gradgradcheck(features, (clouds,), eps=1e-7, atol=1e-4, rtol=1e-3)
@@ -511,8 +515,10 @@ def test_outliers_turn_no_frame_of_a_robust_encoding():
     cloud = cloud / cloud.norm(dim=-1).median()
     cloud = cloud[:, cloud[0].norm(dim=-1) < 1.5]
     far = torch.cat([cloud, torch.tensor([[[1e3, -2e3, 5e3]] * 20], dtype=torch.float64)], 1)
-    made = prepared(basis("ball_uniform", 64, 1.0, 13))
-    frames = [encode(some, made, normalise="robust", rotation_invariant=True).frame for some in (cloud, far)]
+    basis_points = prepare_basis(basis("ball_uniform", 64, 1.0, 13))
+    frames = [
+        encode(some, basis_points, normalise="robust", rotation_invariant=True).frame for some in (cloud, far)
+    ]
     torch.testing.assert_close(frames[0], frames[1], rtol=0, atol=1e-12)
 
 
@@ -521,71 +527,71 @@ def test_outliers_turn_no_frame_of_a_robust_encoding():
 
 def test_channels_come_one_after_the_other_and_x_is_slowest():
     clouds = batch_of([30, 12])
-    made = encoder(basis="grid", points=8, features=["delta", "distance"]).double()
-    grid = made(clouds)
-    assert grid.shape == (2, *made.output_shape) == (2, 4, 2, 2, 2)
-    found = encode(clouds, made.prepared(), ["delta", "distance"])
+    encoder = build_encoder(basis="grid", points=8, features=["delta", "distance"]).double()
+    grid = encoder(clouds)
+    assert grid.shape == (2, *encoder.output_shape) == (2, 4, 2, 2, 2)
+    encoded = encode(clouds, encoder.prepared_basis(), ["delta", "distance"])
     for number in range(8):
         x, y, z = number // 4, number // 2 % 2, number % 2
-        assert made.basis[number].tolist() == [2 * x - 1, 2 * y - 1, 2 * z - 1]
-        assert torch.equal(grid[:, :3, x, y, z], found.features["delta"][:, number])
-        assert torch.equal(grid[:, 3, x, y, z], found.features["distance"][:, number])
-    flat = encoder(points=8, features=["distance", "delta"]).double()
+        assert encoder.basis[number].tolist() == [2 * x - 1, 2 * y - 1, 2 * z - 1]
+        assert torch.equal(grid[:, :3, x, y, z], encoded.features["delta"][:, number])
+        assert torch.equal(grid[:, 3, x, y, z], encoded.features["distance"][:, number])
+    flat = build_encoder(points=8, features=["distance", "delta"]).double()
     assert flat.output_shape == (32,)
-    wanted = encode(clouds, flat.prepared(), ["distance", "delta"]).features
+    wanted = encode(clouds, flat.prepared_basis(), ["distance", "delta"]).features
     assert torch.equal(flat(clouds)[:, :8], wanted["distance"])
     assert torch.equal(flat(clouds)[:, 8:].unflatten(1, (3, 8)), wanted["delta"].mT)
 
 
 def test_the_basis_is_stored_and_followed_when_it_is_loaded_cast_or_copied():
     clouds = batch_of([30, 12], dtype=torch.float32)
-    made, other = encoder(points=16), encoder(points=16, basis_seed=14)
-    assert set(made.state_dict()) == {"basis"}
-    assert made.fixed
-    assert not list(made.parameters())
+    encoder, other = build_encoder(points=16), build_encoder(points=16, basis_seed=14)
+    assert set(encoder.state_dict()) == {"basis"}
+    assert encoder.fixed
+    assert not list(encoder.parameters())
     before = other(clouds)
-    other.load_state_dict(made.state_dict())
+    other.load_state_dict(encoder.state_dict())
     assert not torch.equal(other(clouds), before)
-    assert torch.equal(other(clouds), made(clouds))
-    assert torch.equal(copy.deepcopy(other)(clouds), made(clouds))
-    double = made.double()(clouds.double())
+    assert torch.equal(other(clouds), encoder(clouds))
+    assert torch.equal(copy.deepcopy(other)(clouds), encoder(clouds))
+    double = encoder.double()(clouds.double())
     assert double.dtype == torch.float64
     torch.testing.assert_close(double, other(clouds).double(), rtol=0, atol=5e-7)
     with torch.inference_mode():
-        assert torch.equal(encoder(points=16)(clouds), other(clouds))
+        assert torch.equal(build_encoder(points=16)(clouds), other(clouds))
 
 
 def test_a_basis_is_prepared_once_and_anew_when_its_numbers_change_in_place():
-    clouds, made = batch_of([30]), encoder(points=16)
-    first = made(clouds)
-    assert made.prepared() is made.prepared()
-    made.basis.data.mul_(0.5)  # autograd's version counter does not see this change
-    halved = encoder(points=16, radius=0.5)(clouds)
-    torch.testing.assert_close(made(clouds), halved, rtol=0, atol=1e-6)
-    assert not torch.equal(made(clouds), first)
+    clouds, encoder = batch_of([30]), build_encoder(points=16)
+    first = encoder(clouds)
+    assert encoder.prepared_basis() is encoder.prepared_basis()
+    encoder.basis.data.mul_(0.5)  # autograd's version counter does not see this change
+    halved = build_encoder(points=16, radius=0.5)(clouds)
+    torch.testing.assert_close(encoder(clouds), halved, rtol=0, atol=1e-6)
+    assert not torch.equal(encoder(clouds), first)
 
 
 def test_the_runs_seed_has_no_part_in_it():
     clouds = batch_of([30])
     torch.manual_seed(1)
-    first = encoder()(clouds)
+    first = build_encoder()(clouds)
     torch.manual_seed(2)
-    assert torch.equal(encoder()(clouds), first)
+    assert torch.equal(build_encoder()(clouds), first)
 
 
 def test_features_that_are_not_there_are_refused():
     with pytest.raises(
-        ConfigError, match=r"'color' wants a column 'red' of the clouds, whose columns are not named"
+        ConfigError, match=r"'color' requires a column 'red' of the clouds, whose columns are not named"
     ):
-        encoder(features=["color"])
-    with pytest.raises(ConfigError, match=r"'nromal' wants .* are x, y, z, red.* Did you mean 'normal'\?"):
-        encoder((40, 10), COLUMNS, features=["nromal"])
-    with pytest.raises(ConfigError, match="names one twice"):
-        encoder(features=["distance", "distance"])
-    with pytest.raises(ConfigError, match="wants a column 'normal_y'"):
+        build_encoder(features=["color"])
+    with pytest.raises(ConfigError, match=r"'nromal' requires .* are x, y, z, red.* Did you mean 'normal'\?"):
+        build_encoder((40, 10), COLUMNS, features=["nromal"])
+    with pytest.raises(ConfigError, match="names a feature twice"):
+        build_encoder(features=["distance", "distance"])
+    with pytest.raises(ConfigError, match="requires a column 'normal_y'"):
         encode(
             batch_of([5], 4),
-            prepared(basis("grid", 8, 1.0, 13)),
+            prepare_basis(basis("grid", 8, 1.0, 13)),
             ["normal_x"],
             columns=("x", "y", "z", "normal_x"),
             rotation_invariant=True,
@@ -605,21 +611,23 @@ def test_features_that_are_not_there_are_refused():
 )
 def test_a_config_out_of_range_is_refused(config):
     with pytest.raises(ConfigError, match=r"encoder\."):
-        encoder(**config)
+        build_encoder(**config)
 
 
 @pytest.mark.parametrize("factor", [1e8, 1e-8])
 def test_clouds_that_were_not_normalised_are_refused_by_none(factor):
     clouds = normalise_clouds(batch_of([30, 12]), "unit_ball").clouds
-    made = encoder(normalise="none").double()
-    torch.testing.assert_close(made(clouds), encoder().double()(clouds), rtol=0, atol=1e-6)
-    with pytest.raises(DataError, match=r"Cloud 0 of the batch reaches .* encoder bps with normalise=none"):
-        made(clouds * factor)
+    encoder = build_encoder(normalise="none").double()
+    torch.testing.assert_close(encoder(clouds), build_encoder().double()(clouds), rtol=0, atol=1e-6)
+    with pytest.raises(
+        DataError, match=r"Cloud 0 of the batch extends to .* encoder bps with normalise=none"
+    ):
+        encoder(clouds * factor)
 
 
 @pytest.mark.parametrize("rotation_invariant", [False, True])
 def test_an_empty_batch_has_no_features(rotation_invariant):
-    made = encoder(
+    encoder = build_encoder(
         basis="grid", points=27, features=["distance", "delta"], rotation_invariant=rotation_invariant
     )
-    assert made(torch.zeros(0, 40, 3)).shape == (0, 4, 3, 3, 3)
+    assert encoder(torch.zeros(0, 40, 3)).shape == (0, 4, 3, 3, 3)

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from framework.encoder import Encoder
 from framework.geometry.clouds import Normalisation, normalise_clouds, require_clouds, sizes
-from plugins.encoder.points.subset import Choice, chosen
+from plugins.encoder.points.subset import Choice, choose_points
 
 
 class Points(Encoder):
@@ -18,13 +18,13 @@ class Points(Encoder):
 
     Args:
         input_shape: (points, columns) of the largest cloud; coordinates in the first three columns.
-        points: number of points; smaller clouds repeat theirs.
+        points: number of points; smaller clouds repeat their points.
         choice: "random", or "farthest" from the points chosen before (`plugins.encoder.points.subset`).
-        normalise: as `framework.geometry.clouds.normalise_clouds`; it reads the whole cloud.
+        normalise: as in `framework.geometry.clouds.normalise_clouds`, applied to the whole cloud.
         seed: seed of "random"; the run's seed has no influence on it.
 
     Raises:
-        ConfigError: an input that is no cloud.
+        ConfigError: the input is no cloud.
     """
 
     fixed = True
@@ -51,5 +51,5 @@ class Points(Encoder):
         """Return the chosen points of the clouds."""
         counts = sizes(inputs)
         clouds = normalise_clouds(inputs, self.normalise, counts).clouds
-        index = chosen(clouds, counts, self.points, self.choice, self.seed)
+        index = choose_points(clouds, counts, self.points, self.choice, self.seed)
         return clouds.gather(1, index[..., None].expand(-1, -1, clouds.shape[2]))

@@ -13,16 +13,16 @@ from framework.geometry.farthest import farthest
 Choice = Literal["random", "farthest"]
 
 
-def chosen(
+def choose_points(
     clouds: Float[Tensor, "batch points columns"],
     counts: Int[Tensor, "batch"],
     count: int,
     choice: Choice,
     seed: int,
 ) -> Int[Tensor, "batch count"]:
-    """Return the indices of the chosen points of each cloud; a cloud with fewer points repeats them in turn.
+    """Return the indices of the chosen points of each cloud; a cloud with fewer points repeats them in the same order.
 
-    "random": drawn without replacement; the choice depends on the seed and the cloud's size alone. "farthest": as
+    "random" chooses without replacement; the choice depends only on the seed and the cloud's size. "farthest" is
     `framework.geometry.farthest`.
 
     Args:
