@@ -1,4 +1,4 @@
-"""Shared functions of the encoders of clouds on a grid over [-1, 1]³: reading clouds, and the way back to points."""
+"""Shared functions of the encoders that represent clouds on a grid over [-1, 1]³: encoding and decoding."""
 
 from collections.abc import Callable
 
@@ -18,17 +18,25 @@ from framework.geometry.clouds import (
 )
 
 
-def on_cells(
+def encode_on_cells(
     clouds: Float[Tensor, "batch points columns"],
     normalise: Normalisation,
     by: str,
     numbers: Callable[[Tensor, int], Tensor],
     side: int,
 ) -> Float[Tensor, "batch 1 side side side"]:
-    """Return the result of `numbers` for normalised clouds on a grid of side³ cells, x slowest, one number per cell.
+    """Return one number per cell of a grid of side³ cells over the normalised clouds, where x changes slowest.
+
+    Args:
+        clouds: (batch, points, columns).
+        normalise: as in `framework.geometry.clouds.normalise_clouds`.
+        by: name of the encoder, for messages.
+        numbers: function of the normalised clouds and of `side` that returns the numbers, (batch, side³).
+        side: number of cells along each edge.
 
     Raises:
-        DataError: as `framework.geometry.clouds.sizes`; with "none", clouds that were plainly not normalised.
+        DataError: as `framework.geometry.clouds.sizes`; or `normalise` is "none" and the clouds are clearly not
+            normalised.
     """
     counts = sizes(clouds)
     local = normalise_clouds(clouds, normalise, counts).clouds
@@ -37,28 +45,28 @@ def on_cells(
     return numbers(local, side).reshape(-1, 1, side, side, side)
 
 
-def centres_of(
-    chosen: Bool[Tensor, "batch cells"], like: Tensor, side: int, normalised: NormalisedClouds, what: str
+def chosen_centres(
+    chosen: Bool[Tensor, "batch cells"], like: Tensor, side: int, normalised: NormalisedClouds, adjective: str
 ) -> Float[Tensor, "batch points 3"]:
     """Return the centres of the chosen cells in the clouds' own units (§6.4.1).
 
-    The result is padded as clouds are, and has the dtype of `like`.
+    The result is padded with rows of NaN.
 
     Args:
-        chosen: whether each cell is chosen, (batch, side³), x slowest.
-        like: tensor whose dtype and device the centres get.
+        chosen: whether each cell is chosen, (batch, side³), where x changes slowest.
+        like: tensor whose dtype and device the result has.
         side: number of cells along each edge.
-        normalised: the encoded clouds; their centre and scale lead back to the clouds' units.
-        what: adjective for a chosen cell in the message, such as "occupied".
+        normalised: the encoded clouds, whose centre and scale convert the centres to the clouds' units.
+        adjective: adjective for a chosen cell in the message, such as "occupied".
 
     Raises:
-        DataError: no cell of a cloud is chosen, since all its points are outside the cube.
+        DataError: no cell of a cloud is chosen, because all points of the cloud are outside the cube.
     """
     empty = (~chosen).all(1).nonzero()
     if len(empty):
         raise DataError(
-            f"No cell of cloud {int(empty[0])} is {what}; wanted one at least. All its points are outside of "
-            "[-1, 1]³: choose normalise=unit_ball."
+            f"No cell of cloud {int(empty[0])} is {adjective}, but at least one is required: all points of this cloud "
+            "are outside [-1, 1]³. Set normalise=unit_ball."
         )
     centres = cell_centres(side).to(like)
     return denormalise_clouds(pad([centres[cells] for cells in chosen]), normalised.centre, normalised.scale)

@@ -1,4 +1,4 @@
-"""Occupancy grids, the thesis's baseline for point-set encodings that fills space with cells."""
+"""Occupancy grids: the thesis's baseline for basis point sets that divides space into cells."""
 
 from typing import Annotated
 
@@ -8,24 +8,25 @@ from torch import Tensor
 
 from framework.encoder import Encoder
 from framework.geometry.clouds import Normalisation, NormalisedClouds, require_clouds
-from plugins.encoder.grids.cells import centres_of, on_cells
+from plugins.encoder.grids.cells import chosen_centres, encode_on_cells
 
 ROUNDING = 1e-6
-"""Largest distance outside of [-1, 1] at which a point still lies in the edge cell: rounding puts a norm above 1."""
+"""Distance outside [-1, 1] up to which a point still lies in the outermost cell, because norms may round above 1."""
 
 
 class Occupancy(Encoder):
     """Occupancy of the cells of a grid over [-1, 1]³ by points of the normalised cloud (thesis §6.4.1, §6.5.1).
 
-    Features are (1, side, side, side), x slowest, 0 or 1, of the clouds' dtype. They have no gradient.
+    Features are (1, side, side, side), where x changes slowest, and are 0 or 1 in the clouds' dtype. They have no
+    gradient.
 
     Args:
         input_shape: (points, columns) of the largest cloud; coordinates in the first three columns.
-        side: cells along each edge.
-        normalise: as `framework.geometry.clouds.normalise_clouds`. With "robust" far outliers lie in no cell.
+        side: number of cells along each edge.
+        normalise: as in `framework.geometry.clouds.normalise_clouds`. With "robust", far outliers lie in no cell.
 
     Raises:
-        ConfigError: an input that is no cloud.
+        ConfigError: the input is no cloud.
     """
 
     fixed = True
@@ -46,30 +47,30 @@ class Occupancy(Encoder):
 
     def forward(self, inputs: Float[Tensor, "batch points columns"]) -> Float[Tensor, "batch *features"]:
         """Return the occupancy of the cells."""
-        return on_cells(inputs.detach(), self.normalise, "encoder occupancy", occupancy, self.side)
+        return encode_on_cells(inputs.detach(), self.normalise, "encoder occupancy", occupancy, self.side)
 
 
 def occupancy(clouds: Float[Tensor, "batch points columns"], side: int) -> Float[Tensor, "batch cells"]:
-    """Return 1 for each of the side³ cells of the cube [-1, 1]³, x slowest, that a point lies in, 0 for the others.
+    """Return the occupancy of the side³ cells of the cube [-1, 1]³: 1 if a point lies in the cell, else 0.
 
-    A cell includes its lower faces; the last cell of a row includes its upper face too. Points outside the cube lie in
-    no cell.
+    In the order of the cells, x changes slowest. A cell includes its lower faces; the last cell of a row includes its
+    upper face too. Points outside the cube lie in no cell.
 
     Args:
-        clouds: normalised; rows of NaN are padding.
+        clouds: normalised clouds; rows of NaN are padding.
         side: number of cells along each edge.
     """
     coordinates = clouds[..., :3].detach()
     inside = (coordinates.abs() <= 1 + ROUNDING).all(-1)  # False for NaN
-    place = ((coordinates.double() + 1) / 2 * side).nan_to_num(0, 0, 0).clamp(0, side - 1).long()
-    cell = (place[..., 0] * side + place[..., 1]) * side + place[..., 2]
+    position = ((coordinates.double() + 1) / 2 * side).nan_to_num(0, 0, 0).clamp(0, side - 1).long()
+    cell = (position[..., 0] * side + position[..., 1]) * side + position[..., 2]
     cell = cell.where(inside, side**3)  # an extra cell collects the points that lie in no cell
-    flags = coordinates.new_zeros(len(clouds), side**3 + 1)
-    return flags.scatter_(1, cell, 1.0)[:, :-1]
+    occupied = coordinates.new_zeros(len(clouds), side**3 + 1)
+    return occupied.scatter_(1, cell, 1.0)[:, :-1]
 
 
 def decode(
-    flags: Float[Tensor, "batch cells"], side: int, normalised: NormalisedClouds
+    occupied: Float[Tensor, "batch cells"], side: int, normalised: NormalisedClouds
 ) -> Float[Tensor, "batch points 3"]:
-    """Return the centres of the occupied cells, as `centres_of` returns them."""
-    return centres_of(flags > 0, flags, side, normalised, "occupied")
+    """Return the centres of the occupied cells, as `chosen_centres` returns them."""
+    return chosen_centres(occupied > 0, occupied, side, normalised, "occupied")

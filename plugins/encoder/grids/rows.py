@@ -1,4 +1,4 @@
-"""Rows of the contract: large and small grids, several truncations, both variants of the convolutions."""
+"""Contract-test cases: large and small grids, several truncations, both variants of the convolutions."""
 
 from framework.testing.rows import CloudRow, EncoderRow
 

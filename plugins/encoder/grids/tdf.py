@@ -1,4 +1,4 @@
-"""Truncated distance fields, the thesis's baseline for point-set encodings that fills space with local distances."""
+"""Truncated distance fields: the thesis's baseline for basis point sets that stores a local distance per cell."""
 
 import itertools
 import math
@@ -11,23 +11,23 @@ from torch import Tensor
 
 from framework.encoder import Encoder
 from framework.geometry.clouds import Normalisation, NormalisedClouds, require_clouds
-from plugins.encoder.grids.cells import centres_of, on_cells
+from plugins.encoder.grids.cells import chosen_centres, encode_on_cells
 
 
 class TDF(Encoder):
-    """Distances of grid cells over [-1, 1]³ from the normalised cloud, truncated within a cell (thesis §6.5.1).
+    """Truncated distances of the cells of a grid over [-1, 1]³ from the normalised cloud (thesis §6.5.1).
 
-    Features are (1, side, side, side), x slowest, of the clouds' dtype. They are unsigned distances as a share of the
-    truncation: 0 at a point, 1 at the truncation and beyond.
+    Features are (1, side, side, side), where x changes slowest, in the clouds' dtype. They are unsigned distances as a
+    share of the truncation: 0 at a point, 1 at the truncation and beyond.
 
     Args:
         input_shape: (points, columns) of the largest cloud; coordinates in the first three columns.
-        side: cells along each edge.
-        truncation: largest distance that is told apart, in edges of a cell.
-        normalise: as `framework.geometry.clouds.normalise_clouds`.
+        side: number of cells along each edge.
+        truncation: largest distance, in edges of a cell; larger distances are set to it.
+        normalise: as in `framework.geometry.clouds.normalise_clouds`.
 
     Raises:
-        ConfigError: an input that is no cloud.
+        ConfigError: the input is no cloud.
     """
 
     fixed = True
@@ -51,35 +51,36 @@ class TDF(Encoder):
     def forward(self, inputs: Float[Tensor, "batch points columns"]) -> Float[Tensor, "batch *features"]:
         """Return the truncated distances of the cells."""
         numbers = partial(truncated_distance, truncation=self.truncation)
-        return on_cells(inputs, self.normalise, "encoder tdf", numbers, self.side)
+        return encode_on_cells(inputs, self.normalise, "encoder tdf", numbers, self.side)
 
 
 def truncated_distance(
     clouds: Float[Tensor, "batch points columns"], side: int, truncation: float
 ) -> Float[Tensor, "batch cells"]:
-    """Return the truncated distance of each of the side³ cells of the cube [-1, 1]³ from the nearest point, x slowest.
+    """Return the truncated distance from the centre of each of the side³ cells of [-1, 1]³ to the nearest point.
 
-    The distance is that of the cell's centre, at most `truncation`, as a share of it: 0 to 1. It is differentiable in
-    the clouds. Only the neighbourhood of each point is computed, so that cells beyond the truncation cost nothing.
+    In the order of the cells, x changes slowest. Distances are shares of the truncation, 0 to 1. They are
+    differentiable in the clouds. Only cells near a point are computed, so that cells beyond the truncation cost
+    nothing.
 
     Args:
-        clouds: normalised; rows of NaN are padding.
+        clouds: normalised clouds; rows of NaN are padding.
         side: number of cells along each edge.
-        truncation: in edges of a cell.
+        truncation: largest distance, in edges of a cell.
     """
     real = ~clouds[..., 0].isnan()
     reach = math.floor(truncation + 1 / 2)
-    squares, numbers = [], []  # along each axis, for each step away from a point's own cell
+    squares, numbers = [], []  # for each axis and each step from a point's own cell along this axis
     for axis, stride in enumerate((side * side, side, 1)):
         # in edges of a cell, from the cube's corner
-        place = (clouds[..., axis].where(real, 0) + 1) / 2 * side
-        home = place.detach().floor().clamp(-side - 1, 2 * side + 1)
+        position = (clouds[..., axis].where(real, 0) + 1) / 2 * side
+        home = position.detach().floor().clamp(-side - 1, 2 * side + 1)
         cells = [home + step for step in range(-reach, reach + 1)]
         inside = [real & (cell >= 0) & (cell < side) for cell in cells]
         squares.append(
             [
-                (place - (cell + 1 / 2)).square().where(there, math.inf)
-                for cell, there in zip(cells, inside, strict=True)
+                (position - (cell + 1 / 2)).square().where(is_inside, math.inf)
+                for cell, is_inside in zip(cells, inside, strict=True)
             ]
         )
         numbers.append([cell.clamp(0, side - 1).long() * stride for cell in cells])
@@ -89,11 +90,11 @@ def truncated_distance(
         if sum(max(abs(step - reach) - 1 / 2, 0) ** 2 for step in (x, y, z)) >= truncation**2:
             continue
         number = numbers[0][x] + numbers[1][y] + numbers[2][z]
-        found = squares[0][x] + squares[1][y] + squares[2][z]
-        if found.requires_grad:
-            square = square.scatter_reduce(1, number, found, "amin")
+        candidate = squares[0][x] + squares[1][y] + squares[2][z]
+        if candidate.requires_grad:
+            square = square.scatter_reduce(1, number, candidate, "amin")
         else:
-            square.scatter_reduce_(1, number, found, "amin")
+            square.scatter_reduce_(1, number, candidate, "amin")
     root = square.where(square > 0, 1).sqrt().where(square > 0, 0)  # the root of 0 has no derivative
     return root / truncation
 
@@ -101,5 +102,5 @@ def truncated_distance(
 def decode(
     field: Float[Tensor, "batch cells"], side: int, normalised: NormalisedClouds
 ) -> Float[Tensor, "batch points 3"]:
-    """Return the centres of the cells that are less than the truncation from a point, as `centres_of` returns them."""
-    return centres_of(field < 1, field, side, normalised, "near a point")
+    """Return the centres of the cells less than the truncation from a point, as `chosen_centres` returns them."""
+    return chosen_centres(field < 1, field, side, normalised, "near a point")

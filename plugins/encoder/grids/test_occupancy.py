@@ -14,7 +14,7 @@ from plugins.encoder.grids.occupancy import decode, occupancy
 DTYPES = [torch.float32, torch.float64]
 
 
-def encoder(shape=(40, 3), **config):
+def build_encoder(shape=(40, 3), **config):
     return build("encoder", resolve("encoder", {"name": "occupancy", **config}), input_shape=shape)
 
 
@@ -26,12 +26,12 @@ def batch_of(lengths, columns=3, dtype=torch.float64):
 
 def by_hand(cloud, side):
     """Return the occupancy by a loop over points: lower faces included, and the upper face of the last cell too."""
-    flags = np.zeros((side, side, side))
+    occupied = np.zeros((side, side, side))
     for point in cloud:
         place = [math.floor((x + 1) / 2 * side) for x in point]
         if all(-1 <= x <= 1 for x in point):
-            flags[tuple(min(axis, side - 1) for axis in place)] = 1
-    return flags
+            occupied[tuple(min(axis, side - 1) for axis in place)] = 1
+    return occupied
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -40,12 +40,12 @@ def by_hand(cloud, side):
 def test_agrees_with_a_loop(normalise, side, dtype):
     lengths = [200, 1, 30]
     clouds = batch_of(lengths, 5, dtype)
-    found = encoder((200, 5), side=side, normalise=normalise)(clouds)
-    assert found.dtype == dtype
-    assert found.shape == (3, 1, side, side, side)
+    features = build_encoder((200, 5), side=side, normalise=normalise)(clouds)
+    assert features.dtype == dtype
+    assert features.shape == (3, 1, side, side, side)
     local = normalise_clouds(clouds, normalise).clouds[..., :3].double().numpy()
     for number, length in enumerate(lengths):
-        np.testing.assert_array_equal(found[number, 0].numpy(), by_hand(local[number, :length], side))
+        np.testing.assert_array_equal(features[number, 0].numpy(), by_hand(local[number, :length], side))
 
 
 coordinate = st.floats(-1, 1, width=32) | st.sampled_from([-1.0, -0.5, 0.0, 0.5, 1.0])
@@ -59,9 +59,9 @@ coordinate = st.floats(-1, 1, width=32) | st.sampled_from([-1.0, -0.5, 0.0, 0.5,
 @settings(max_examples=100, deadline=None)
 def test_wild_clouds_occupy_as_many_cells_as_points_at_most(points, side, scale):
     clouds = torch.tensor(points)[None] * scale
-    flags = encoder(side=side)(clouds)
-    assert set(flags.unique().tolist()) <= {0.0, 1.0}
-    assert 1 <= flags.sum() <= min(len(points), side**3)
+    occupied = build_encoder(side=side)(clouds)
+    assert set(occupied.unique().tolist()) <= {0.0, 1.0}
+    assert 1 <= occupied.sum() <= min(len(points), side**3)
     np.testing.assert_array_equal(
         occupancy(torch.tensor(points)[None], side).reshape(side, side, side).numpy(), by_hand(points, side)
     )
@@ -69,8 +69,8 @@ def test_wild_clouds_occupy_as_many_cells_as_points_at_most(points, side, scale)
 
 def test_points_at_the_edge_are_in_and_beyond_it_out():
     clouds = torch.tensor([[[1.0, 1, 1], [-1, -1, -1], [1 + 6e-8, 0, 0], [1.1, 0, 0], [0, 0, -1.1]]])
-    flags = occupancy(clouds, 2).reshape(2, 2, 2)
-    assert flags.tolist() == [[[1, 0], [0, 0]], [[0, 0], [0, 1]]]
+    occupied = occupancy(clouds, 2).reshape(2, 2, 2)
+    assert occupied.tolist() == [[[1, 0], [0, 0]], [[0, 0], [0, 1]]]
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -78,12 +78,12 @@ def test_cells_lead_back_to_within_half_their_diagonal(dtype):
     lengths, side = [200, 3], 16
     clouds = batch_of(lengths, dtype=dtype)
     local = normalise_clouds(clouds, "unit_ball")
-    flags = occupancy(local.clouds, side)
-    back = decode(flags, side, local)
+    occupied = occupancy(local.clouds, side)
+    back = decode(occupied, side, local)
     assert back.dtype == dtype
     counts = sizes(back)
     for number, length in enumerate(lengths):
-        assert counts[number] == flags[number].sum()
+        assert counts[number] == occupied[number].sum()
         cloud, cells = clouds[number, :length].numpy(), back[number, : counts[number]].numpy()
         distance = np.linalg.norm(cloud[:, None] - cells, axis=-1)
         limit = math.sqrt(3) / side * local.scale[number].item() * (1 + 1e-6)
@@ -94,4 +94,4 @@ def test_cells_lead_back_to_within_half_their_diagonal(dtype):
 @pytest.mark.parametrize("config", [{"side": 0}, {"side": 1000}, {"normalise": "ball"}])
 def test_a_config_out_of_range_is_refused(config):
     with pytest.raises(ConfigError, match=r"encoder\."):
-        encoder(**config)
+        build_encoder(**config)

@@ -14,7 +14,7 @@ from plugins.encoder.grids.tdf import decode, truncated_distance
 DTYPES = [torch.float32, torch.float64]
 
 
-def encoder(shape=(40, 3), **config):
+def build_encoder(shape=(40, 3), **config):
     return build("encoder", resolve("encoder", {"name": "tdf", **config}), input_shape=shape)
 
 
@@ -40,16 +40,16 @@ def by_hand(cloud, side, truncation):
 def test_agrees_with_a_loop(side, truncation, dtype):
     lengths = [100, 1, 30]
     clouds = batch_of(lengths, 5, dtype)
-    found = encoder((100, 5), side=side, truncation=truncation)(clouds)
-    assert found.dtype == dtype
-    assert found.shape == (3, 1, side, side, side)
+    features = build_encoder((100, 5), side=side, truncation=truncation)(clouds)
+    assert features.dtype == dtype
+    assert features.shape == (3, 1, side, side, side)
     local = normalise_clouds(clouds, "unit_ball").clouds[..., :3].double().numpy()
     for number, length in enumerate(lengths):
         wanted = by_hand(local[number, :length], side, truncation)
         limit = (
             1e-5 if dtype == torch.float32 else 1e-12
         )  # as a share of the truncation, which is many cells wide
-        np.testing.assert_allclose(found[number].flatten().numpy(), wanted, rtol=0, atol=limit)
+        np.testing.assert_allclose(features[number].flatten().numpy(), wanted, rtol=0, atol=limit)
 
 
 coordinate = st.floats(-1.5, 1.5, width=32) | st.sampled_from([-1.0, -0.5, 0.0, 0.5, 1.0, 1e6])
@@ -63,20 +63,20 @@ coordinate = st.floats(-1.5, 1.5, width=32) | st.sampled_from([-1.0, -0.5, 0.0, 
 @settings(max_examples=100, deadline=None)
 def test_wild_points_also_outside_of_the_cube(points, side, truncation):
     cloud = torch.tensor(points, dtype=torch.float64)
-    found = truncated_distance(cloud[None], side, truncation)[0].numpy()
-    np.testing.assert_allclose(found, by_hand(cloud.numpy(), side, truncation), rtol=0, atol=1e-7)
+    features = truncated_distance(cloud[None], side, truncation)[0].numpy()
+    np.testing.assert_allclose(features, by_hand(cloud.numpy(), side, truncation), rtol=0, atol=1e-7)
 
 
 def test_padding_and_attributes_change_nothing():
     clouds = batch_of([20, 6], 5)
-    made = encoder(side=8)
-    assert torch.equal(made(clouds)[1], made(clouds[1:, :6, :3])[0])
+    encoder = build_encoder(side=8)
+    assert torch.equal(encoder(clouds)[1], encoder(clouds[1:, :6, :3])[0])
 
 
 def test_the_gradient_agrees_with_finite_differences_and_is_finite_at_a_centre():
     clouds = batch_of([7, 7]).requires_grad_()
     assert torch.autograd.gradcheck(
-        lambda clouds: encoder(side=4, truncation=1.5)(clouds), (clouds,), eps=1e-6, atol=1e-6
+        lambda clouds: build_encoder(side=4, truncation=1.5)(clouds), (clouds,), eps=1e-6, atol=1e-6
     )
     centre = torch.zeros(1, 1, 3, requires_grad=True)
     truncated_distance(centre, 1, 1.0).sum().backward()
@@ -106,4 +106,4 @@ def test_cells_lead_back_to_within_the_truncation():
 )
 def test_a_config_out_of_range_is_refused(config):
     with pytest.raises(ConfigError, match=r"encoder\."):
-        encoder(**config)
+        build_encoder(**config)

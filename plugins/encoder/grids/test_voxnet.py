@@ -8,7 +8,7 @@ from framework.errors import ConfigError
 from plugins.encoder.grids.voxnet import VoxNet
 
 
-def encoder(shape, **config):
+def build_encoder(shape, **config):
     torch.manual_seed(0)
     return build("encoder", resolve("encoder", {"name": "voxnet", **config}), input_shape=shape)
 
@@ -16,8 +16,8 @@ def encoder(shape, **config):
 def convolved(grid, kernel, bias, stride, padding):
     """Return the correlation by SciPy, one filter at a time; every second cell for stride 2."""
     grid = np.pad(grid, [(0, 0)] + [(padding, padding)] * 3)
-    found = np.stack([correlate(grid, filters, "valid", method="direct")[0] for filters in kernel])
-    return found[:, ::stride, ::stride, ::stride] + bias[:, None, None, None]
+    filtered = np.stack([correlate(grid, filters, "valid", method="direct")[0] for filters in kernel])
+    return filtered[:, ::stride, ::stride, ::stride] + bias[:, None, None, None]
 
 
 def pooled(grid):
@@ -26,10 +26,10 @@ def pooled(grid):
     return grid.reshape(len(grid), side, 2, side, 2, side, 2).max((2, 4, 6))
 
 
-def by_hand(made, grid):
+def by_hand(encoder, grid):
     """Return the output of the layers in NumPy and SciPy for one grid, float64."""
     grid = grid.astype(np.float64)
-    for layer in made.convolutions:
+    for layer in encoder.convolutions:
         state = {name: value.double().numpy() for name, value in layer.state_dict().items()}
         if isinstance(layer, torch.nn.Conv3d):
             grid = convolved(grid, state["weight"], state["bias"], layer.stride[0], layer.padding[0])
@@ -44,7 +44,7 @@ def by_hand(made, grid):
         elif isinstance(layer, torch.nn.ReLU):
             grid = np.maximum(grid, 0)
     numbers = grid.reshape(-1)
-    for layer in made.connected:
+    for layer in encoder.connected:
         if isinstance(layer, torch.nn.Linear):
             weight, bias = layer.weight.detach().numpy(), layer.bias.detach().numpy()
             numbers = np.maximum(weight @ numbers + bias, 0)
@@ -61,26 +61,26 @@ def by_hand(made, grid):
     ],
 )
 def test_agrees_with_scipy(shape, config):
-    made = encoder(shape, **config).double()
-    made(
+    encoder = build_encoder(shape, **config).double()
+    encoder(
         torch.randn(6, *shape, dtype=torch.float64) + 0.5
     )  # moves the running moments away from their initial values
     with torch.no_grad():
-        for parameter in made.parameters():
+        for parameter in encoder.parameters():
             parameter.add_(0.05)
     grids = torch.randn(2, *shape, dtype=torch.float64)
-    found = made.eval()(grids).detach().numpy()
-    wanted = np.stack([by_hand(made, grid) for grid in grids.numpy()])
+    features = encoder.eval()(grids).detach().numpy()
+    wanted = np.stack([by_hand(encoder, grid) for grid in grids.numpy()])
     assert np.abs(wanted).max() > 0.01
-    np.testing.assert_allclose(found, wanted, rtol=1e-12, atol=1e-12)
-    single = made.float()(grids.float()).detach().numpy()
+    np.testing.assert_allclose(features, wanted, rtol=1e-12, atol=1e-12)
+    single = encoder.float()(grids.float()).detach().numpy()
     np.testing.assert_allclose(single, wanted, rtol=1e-4, atol=1e-5)
 
 
-def parameters(made, classes=40):
+def parameters(encoder, classes=40):
     """Return the number of parameters with the last linear layer, as tables count them."""
-    count = sum(parameter.numel() for parameter in made.parameters())
-    return count + (made.output_shape[0] + 1) * classes
+    count = sum(parameter.numel() for parameter in encoder.parameters())
+    return count + (encoder.output_shape[0] + 1) * classes
 
 
 def test_voxnet_has_the_published_parameters():
@@ -110,12 +110,12 @@ def test_conv3d_has_the_parameters_of_the_thesis():
     ],
 )
 def test_the_smallest_grid_works_and_a_smaller_one_is_refused(config, side):
-    made = encoder((1, side, side, side), **config).eval()
-    assert made(torch.rand(2, 1, side, side, side)).shape == (2, *made.output_shape)
+    encoder = build_encoder((1, side, side, side), **config).eval()
+    assert encoder(torch.rand(2, 1, side, side, side)).shape == (2, *encoder.output_shape)
     with pytest.raises(
-        ConfigError, match=f"needs a grid of {side} cells a side at least, this one has {side - 1}"
+        ConfigError, match=f"needs a grid of at least {side} cells a side, but got {side - 1}"
     ):
-        encoder((1, side - 1, side - 1, side - 1), **config)
+        build_encoder((1, side - 1, side - 1, side - 1), **config)
 
 
 @pytest.mark.parametrize("shape", [(512,), (3, 48, 48), (1, 32, 32, 30), (2048, 3), (1, 8, 8, 8, 1)])
@@ -129,7 +129,7 @@ def test_refuses_what_is_no_cube(shape):
 )
 def test_refuses_another_number_of_dropout_layers(config):
     with pytest.raises(ConfigError, match="dropout has"):
-        encoder((1, 32, 32, 32), **config)
+        build_encoder((1, 32, 32, 32), **config)
 
 
 @pytest.mark.parametrize(
@@ -143,5 +143,5 @@ def test_refuses_a_config_out_of_range(config):
 
 def test_dropout_is_where_it_is_published():
     for variant, wanted in (("voxnet", [0.2, 0.3, 0.4]), ("conv3d", [0.8, 0.6])):
-        made = VoxNet((1, 32, 32, 32), variant=variant)
-        assert [part.p for part in made.modules() if isinstance(part, torch.nn.Dropout)] == wanted
+        encoder = VoxNet((1, 32, 32, 32), variant=variant)
+        assert [part.p for part in encoder.modules() if isinstance(part, torch.nn.Dropout)] == wanted

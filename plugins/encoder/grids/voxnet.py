@@ -44,13 +44,16 @@ class VoxNet(Encoder):
     Args:
         input_shape: (channels, side, side, side).
         variant: "voxnet" or "conv3d".
-        channels: outputs of each convolution.
-        widths: outputs of each fully connected layer; the last is the length of the features.
-        dropout: probabilities: three in "voxnet", one for each fully connected layer in "conv3d".
-        padding: zeros around the grid that 3 × 3 × 3 convolutions read; with 1 they keep the side.
+        channels: number of outputs of each convolution; None for the published ones.
+        widths: number of outputs of each fully connected layer; the last is the length of the features. None for the
+            published ones.
+        dropout: probabilities: three in "voxnet", one for each fully connected layer in "conv3d". None for the
+            published ones.
+        padding: number of cells with zeros around the grid that 3 × 3 × 3 convolutions read; with 1 the side stays the
+            same.
 
     Raises:
-        ConfigError: the input is no cube of numbers, or is too small, or `dropout` has the wrong length.
+        ConfigError: the input is no cubic grid, or is too small, or `dropout` has the wrong length.
     """
 
     bibtex = "maturana2015voxnet"
@@ -68,28 +71,28 @@ class VoxNet(Encoder):
         super().__init__()
         if len(input_shape) != 4 or len(set(input_shape[1:])) != 1:
             raise ConfigError(
-                "voxnet reads grids of shape (channels, side, side, side), this input has the shape "
-                f"{input_shape}. Put an encoder before it that makes such a grid of a cloud, with a cubic basis."
+                "voxnet reads grids of shape (channels, side, side, side), but got an input of shape "
+                f"{input_shape}. Put an encoder before voxnet that encodes a cloud on a cubic grid, such as occupancy."
             )
         published = PUBLISHED[variant]
         planes, fully = list(channels or published.channels), list(widths or published.widths)
         drops = list(published.dropout if dropout is None else dropout)
-        wanted = 3 if variant == "voxnet" else len(fully)
-        if len(drops) != wanted:
+        dropout_layers = 3 if variant == "voxnet" else len(fully)
+        if len(drops) != dropout_layers:
             raise ConfigError(
                 f"encoder.voxnet.dropout has {len(drops)} probabilities; variant={variant} with {len(fully)} fully "
-                f"connected layers has {wanted} dropout layers. Give as many."
+                f"connected layers has {dropout_layers} dropout layers. Set one probability for each dropout layer."
             )
         body = _voxnet if variant == "voxnet" else _conv3d
         layers, side = body(input_shape[0], input_shape[1], planes, drops, padding)
         if side < 1:
-            least = next(edge for edge in range(1, 4096) if body(1, edge, planes, drops, padding)[1] >= 1)
+            smallest = next(edge for edge in range(1, 4096) if body(1, edge, planes, drops, padding)[1] >= 1)
             raise ConfigError(
-                f"voxnet with variant={variant} and {len(planes)} convolutions needs a grid of {least} cells a side at "
-                f"least, this one has {input_shape[1]}. Make the grid finer, set padding=1, or shorten `channels`."
+                f"voxnet with variant={variant} and {len(planes)} convolutions needs a grid of at least {smallest} "
+                f"cells a side, but got {input_shape[1]}. Make the grid finer, set padding=1, or shorten `channels`."
             )
-        # channels last takes 0.7 of the time of the deeper network on a CPU, forward and in training, but 1.2 of
-        # VoxNet's (README)
+        # on a CPU, channels last takes 0.7 of the time for the deeper network, forward and in training, but 1.2 of the
+        # time for VoxNet
         self.layout = torch.channels_last_3d if variant == "conv3d" else torch.contiguous_format
         self.convolutions = nn.Sequential(*layers).to(memory_format=self.layout)  # pyright: ignore
         length = planes[-1] * side**3
@@ -110,15 +113,15 @@ class VoxNet(Encoder):
 def _voxnet(
     planes: int, side: int, channels: list[int], dropout: list[float], padding: int
 ) -> tuple[list[nn.Module], int]:
-    """Return the layers up to the pooling, and the side of their output, cells; below 1 if the grid is too small."""
-    first, *others = channels
+    """Return the layers up to the pooling, and the side of their output in cells, below 1 if the grid is too small."""
+    first, *later_channels = channels
     layers: list[nn.Module] = [
         nn.Conv3d(planes, first, kernel_size=5, stride=2),
         nn.LeakyReLU(SLOPE),
         nn.Dropout(dropout[0]),
     ]
     side = (side - 5) // 2 + 1
-    for before, after in zip(channels, others, strict=False):
+    for before, after in zip(channels, later_channels, strict=False):
         layers += [nn.Conv3d(before, after, kernel_size=3, padding=padding), nn.LeakyReLU(SLOPE)]
         side += 2 * padding - 2
     return [*layers, nn.MaxPool3d(2), nn.Dropout(dropout[1])], side // 2
@@ -127,7 +130,7 @@ def _voxnet(
 def _conv3d(
     planes: int, side: int, channels: list[int], dropout: list[float], padding: int
 ) -> tuple[list[nn.Module], int]:
-    """Return the layers, and the side of their output, cells, as `_voxnet` does."""
+    """Return the layers before the fully connected ones, and the side of their output, as `_voxnet` does."""
     layers: list[nn.Module] = []
     for index, width in enumerate(channels):
         layers += [
