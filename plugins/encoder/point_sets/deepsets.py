@@ -1,4 +1,4 @@
-"""Deep Sets (Zaheer et al. 2017), in the form for point clouds."""
+"""Deep Sets (Zaheer et al. 2017), in their variant for point clouds."""
 
 from typing import Annotated, Literal
 
@@ -9,7 +9,13 @@ from torch import Tensor, nn
 
 from framework.encoder import Encoder
 from framework.geometry.clouds import Normalisation
-from plugins.encoder.point_sets.point_sets import Reading, columns_read, largest, over_points, to_points
+from plugins.encoder.point_sets.point_sets import (
+    Reading,
+    count_columns,
+    encode_clouds,
+    largest,
+    repeat_for_points,
+)
 
 Width = Annotated[int, Field(gt=0)]
 ACTIVATION = {"tanh": nn.Tanh, "elu": nn.ELU}
@@ -18,26 +24,25 @@ ACTIVATION = {"tanh": nn.Tanh, "elu": nn.ELU}
 class DeepSets(Encoder):
     """Equivariant layers on each point's difference from the maximum over its cloud, then a maximum over the cloud.
 
-    The layer is x ↦ σ(β + (x - 1 max x) Γ), which the paper uses on clouds. The features do not depend on the order of
-    the points or on padding. They do not depend on a value that all points have in common either, such as a shift of
-    the cloud.
+    The equivariant layer is x ↦ σ(β + (x - 1 max x) Γ), as in the paper's network for clouds. The features do not
+    depend on the order of the points or on padding. Adding the same vector to all points does not change the features
+    either.
 
     Args:
         input_shape: (points, columns).
-        channels: outputs of each equivariant layer.
-        widths: outputs of each layer after the maximum; the last is the length of the features.
-        activation: σ.
+        channels: number of outputs of each equivariant layer.
+        widths: number of outputs of each layer after the maximum; the last is the length of the features.
+        activation: the function σ.
         dropout: probability of dropping a number before and after each layer that follows the maximum.
-        points: largest number of points that are read of a cloud, the first ones; None for all. 100 is the thesis's
-            "micro".
-        normalise: as of framework.geometry.clouds.normalise_clouds.
+        points: number of points at the beginning of a cloud that are read; None for all. 100 is the thesis's "micro".
+        normalise: as in `framework.geometry.clouds.normalise_clouds`.
         attributes: whether columns after x, y, z are read too.
 
     Raises:
         ConfigError: the input is no cloud, or has no attributes to read.
     """
 
-    bibtex = "zaheer2017deep"  # noqa: E501
+    bibtex = "zaheer2017deep"
 
     def __init__(
         self,
@@ -52,7 +57,7 @@ class DeepSets(Encoder):
         attributes: bool = False,
     ) -> None:
         super().__init__()
-        columns = columns_read(input_shape, "encoder deepsets", attributes)
+        columns = count_columns(input_shape, "encoder deepsets", attributes)
         self.reading = Reading(columns, points, normalise)
         lengths = [columns, *channels]
         self.equivariant = nn.ModuleList(
@@ -70,18 +75,18 @@ class DeepSets(Encoder):
     def forward(self, inputs: Tensor) -> Float[Tensor, "batch length"]:
         """Return the features of the clouds."""
         dtype = next(self.parameters()).dtype
-        return over_points(self._described, inputs, self.reading, dtype, training=self.training)
+        return encode_clouds(self._describe, inputs, self.reading, dtype, training=self.training)
 
-    def _described(
+    def _describe(
         self, values: Float[Tensor, "point columns"], counts: Int[Tensor, "batch"]
     ) -> Float[Tensor, "batch length"]:
         if torch.is_grad_enabled() and values.device.type == "cpu":
             rows, counts = self._attaining(values, counts)
             values = values.index_select(0, rows)
-        *others, final = self.equivariant
-        for layer in others:
+        *earlier, final = self.equivariant
+        for layer in earlier:
             values = self.activation(layer(below_largest(values, counts)))  # Zaheer et al. 2017, §4.2
-        # σ is increasing, so that it may be applied after the maximum
+        # σ is increasing, so that it can be applied after the maximum
         return self.whole(self.activation(largest(final(below_largest(values, counts)), counts)))
 
     @torch.no_grad()
@@ -94,8 +99,10 @@ class DeepSets(Encoder):
         critical points: Qi et al. 2017, §4.3, theorem 2). Where several points attain a maximum, one is chosen.
         """
         *_, final = self.equivariant
-        found = []
-        for part in values.split(counts.tolist()):  # the numbers of one cloud stay in a CPU's cache
+        attaining_points = []
+        for part in values.split(
+            counts.tolist()
+        ):  # one cloud at a time, so that its numbers stay in a CPU's cache
             most, index = part.mT.max(1, keepdim=True)
             columns, chosen = part.mT, [index]
             for layer in self.equivariant:
@@ -104,14 +111,16 @@ class DeepSets(Encoder):
                 columns = columns if layer is final else self.activation(columns)
                 most, index = columns.max(1, keepdim=True)
                 chosen.append(index)
-            found.append(torch.cat(chosen).unique())
+            attaining_points.append(torch.cat(chosen).unique())
         start = (counts.cumsum(0) - counts).tolist()
-        rows = torch.cat([counts[:0], *(first + index for first, index in zip(start, found, strict=True))])
-        return rows, counts.new_tensor([len(index) for index in found])
+        rows = torch.cat(
+            [counts[:0], *(first + index for first, index in zip(start, attaining_points, strict=True))]
+        )
+        return rows, counts.new_tensor([len(index) for index in attaining_points])
 
 
 def below_largest(
     values: Float[Tensor, "point channels"], counts: Int[Tensor, "batch"]
 ) -> Float[Tensor, "point channels"]:
-    """Return x - 1 max x, with the maximum over each cloud."""
-    return values - to_points(largest(values, counts), counts)
+    """Return x - 1 max x, where the maximum is over the points x of each cloud."""
+    return values - repeat_for_points(largest(values, counts), counts)

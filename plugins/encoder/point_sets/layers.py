@@ -6,9 +6,9 @@ from torch import nn
 
 
 def layers(length: int, widths: Sequence[int]) -> nn.Sequential:
-    """Return linear, batch norm and ReLU layers for each width; the bias is in the batch norm."""
-    found: list[nn.Module] = []
+    """Return a linear layer without bias, batch norm (which has a bias) and ReLU for each width."""
+    modules: list[nn.Module] = []
     for width in widths:
-        found += [nn.Linear(length, width, bias=False), nn.BatchNorm1d(width), nn.ReLU(inplace=True)]
+        modules += [nn.Linear(length, width, bias=False), nn.BatchNorm1d(width), nn.ReLU(inplace=True)]
         length = width
-    return nn.Sequential(*found)
+    return nn.Sequential(*modules)

@@ -1,4 +1,4 @@
-"""Functions of sets: concatenating the points of a batch of clouds, and maxima over each cloud."""
+"""Functions that concatenate the points of a batch of clouds, and that compute maxima over each cloud."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -11,31 +11,41 @@ from framework.errors import ConfigError
 from framework.geometry.clouds import Normalisation, normalise_clouds, require_clouds, sizes
 
 AT_ONCE = 2**12
-"""Number of points that a CPU takes through a network together: more leave its caches (2^16 are half as fast)."""
+"""Largest number of points that a CPU passes through a network together.
+
+More points do not fit into the caches: 2^16 at once are half as fast.
+"""
 AT_ONCE_ON_DEVICE = 2**19
+"""Largest number of points that a GPU passes through a network together."""
 
 
-def columns_read(input_shape: tuple[int, ...], by: str, attributes: bool) -> int:
-    """Return how many columns of its clouds an encoder reads: the coordinates, and the attributes if requested.
+def count_columns(input_shape: tuple[int, ...], by: str, attributes: bool) -> int:
+    """Return the number of columns of a cloud that an encoder reads: 3 coordinates, and the attributes if requested.
+
+    Args:
+        input_shape: (points, columns).
+        by: name of the encoder, for messages.
+        attributes: whether columns after x, y, z are read too.
 
     Raises:
-        ConfigError: the input is no cloud, or has no attributes.
+        ConfigError: the input is no cloud, or attributes are requested and the clouds have none.
     """
     require_clouds(input_shape, by)
     if attributes and input_shape[1] == 3:
         raise ConfigError(
-            f"{by} with attributes=true wants clouds with more columns than x, y, z, these have none. Leave it out."
+            f"{by} with attributes=true requires clouds with columns after x, y, z, but the clouds have no such "
+            "columns. Set attributes=false."
         )
     return input_shape[1] if attributes else 3
 
 
 class Reading(NamedTuple):
-    """The part of its clouds that an encoder reads.
+    """The part of the clouds that an encoder reads, and their normalisation.
 
     Attributes:
-        columns: number of columns, the first ones.
-        most: largest number of points of a cloud, the first ones; None for all.
-        normalise: as of `framework.geometry.clouds.normalise_clouds`.
+        columns: number of first columns that are read.
+        most: number of first points of a cloud that are read; None for all.
+        normalise: as in `framework.geometry.clouds.normalise_clouds`.
     """
 
     columns: int
@@ -43,33 +53,33 @@ class Reading(NamedTuple):
     normalise: Normalisation
 
 
-def over_points(
+def encode_clouds(
     network: Callable[[Tensor, Tensor], Tensor],
     clouds: Float[Tensor, "batch points columns"],
     reading: Reading,
     dtype: torch.dtype,
     *,
     training: bool,
-    held: int = 1,
+    rows_per_point: int = 1,
 ) -> Float[Tensor, "batch features"]:
-    """Return the features that a network computes of clouds, in parts of the batch where possible.
+    """Return the features that a network computes from clouds, for few clouds at a time where possible.
 
     Args:
-        network: function of the points (as `points_of` returns them) and of the number of points of each cloud.
+        network: function of concatenated points (from `concatenate_points`) and of the number of points of each cloud.
         clouds: (batch, points, columns).
         reading: columns, points and normalisation that are read.
         dtype: dtype of the points that the network reads.
-        training: whether the network needs the whole batch at once, as batch norm does.
-        held: as of `in_parts`.
+        training: whether the network needs the whole batch at once, as batch norm in training does.
+        rows_per_point: as in `encode_in_parts`.
     """
     columns, most, normalise = reading
-    values, counts = points_of(clouds, normalise, columns=columns, most=most, dtype=dtype)
+    values, counts = concatenate_points(clouds, normalise, columns=columns, most=most, dtype=dtype)
     if training or torch.is_grad_enabled():
         return network(values, counts)
-    return in_parts(network, values, counts, held)
+    return encode_in_parts(network, values, counts, rows_per_point)
 
 
-def points_of(
+def concatenate_points(
     clouds: Float[Tensor, "batch points columns"],
     normalise: Normalisation,
     *,
@@ -77,14 +87,14 @@ def points_of(
     most: int | None,
     dtype: torch.dtype,
 ) -> tuple[Float[Tensor, "point read"], Int[Tensor, "batch"]]:
-    """Return the points of all clouds, concatenated, normalised and without padding, and the number of points of each.
+    """Return the concatenated points of all normalised clouds without padding, and the number of points of each cloud.
 
     Args:
         clouds: (batch, points, columns).
-        normalise: as of `framework.geometry.clouds.normalise_clouds`; it reads all points.
-        columns: number of columns that are read, the first ones.
-        most: largest number of points that are read of a cloud, the first ones; None for all.
-        dtype: dtype of the points returned.
+        normalise: as in `framework.geometry.clouds.normalise_clouds`, computed from all points.
+        columns: number of first columns that are read.
+        most: number of first points of a cloud that are read; None for all.
+        dtype: dtype of the returned points.
 
     Raises:
         DataError: as `framework.geometry.clouds.sizes`.
@@ -92,7 +102,7 @@ def points_of(
     counts = sizes(clouds)
     points = normalise_clouds(clouds, normalise, counts).clouds[:, :most, :columns].to(dtype)
     counts = counts if most is None else counts.clamp(max=most)
-    if even(counts, points.shape[1]):
+    if all_have(counts, points.shape[1]):
         return points.flatten(0, 1), counts
     real = torch.arange(points.shape[1], device=points.device) < counts[:, None]
     return points[real], counts
@@ -105,13 +115,13 @@ def largest(
     count, channels = len(counts), values.shape[1]
     if count == 0:
         return values.new_zeros(0, channels)
-    if even(counts, len(values) // count):
+    if all_have(counts, len(values) // count):
         return values.unflatten(0, (count, -1)).amax(1)
     return torch.stack([part.amax(0) for part in values.split(counts.tolist())])
 
 
 def first_rows(counts: Int[Tensor, "batch"], most: int) -> Int[Tensor, "found"]:
-    """Return the rows, among all points concatenated, of the first `most` points of each cloud."""
+    """Return the rows, in the concatenated points of all clouds, of the first `most` points of each cloud."""
     if len(counts) == 0:
         return counts
     start = counts.cumsum(0) - counts
@@ -119,36 +129,36 @@ def first_rows(counts: Int[Tensor, "batch"], most: int) -> Int[Tensor, "found"]:
     return (start[:, None] + number)[number < counts[:, None]]
 
 
-def to_points(
+def repeat_for_points(
     values: Float[Tensor, "batch channels"], counts: Int[Tensor, "batch"]
 ) -> Float[Tensor, "point channels"]:
     """Return the values of each cloud, repeated for each of its points."""
     return values.repeat_interleave(counts, 0)
 
 
-def even(counts: Int[Tensor, "batch"], points: int) -> bool:
+def all_have(counts: Int[Tensor, "batch"], points: int) -> bool:
     """Return whether every cloud has `points` points."""
     return bool((counts == points).all())
 
 
-def in_parts(
+def encode_in_parts(
     network: Callable[[Tensor, Tensor], Tensor],
     values: Float[Tensor, "point columns"],
     counts: Int[Tensor, "batch"],
-    held: int = 1,
+    rows_per_point: int = 1,
 ) -> Float[Tensor, "batch features"]:
-    """Return the features of a network of points and counts, computed for few clouds at a time to stay in caches.
+    """Return the features that a network computes, for few clouds at a time, so that their numbers stay in caches.
 
-    It is for evaluation without gradient: a gradient holds all numbers anyway, and batch norm in training needs the
-    whole batch.
+    The function is for evaluation without a gradient: computing a gradient keeps all numbers in memory anyway, and
+    batch norm in training needs the whole batch.
 
     Args:
-        network: as of `over_points`.
+        network: as in `encode_clouds`.
         values: concatenated points.
         counts: number of points of each cloud.
-        held: approximate number of rows of numbers that the network makes of a point.
+        rows_per_point: approximate number of rows of numbers that the network computes for each point.
     """
-    limit = (AT_ONCE if values.device.type == "cpu" else AT_ONCE_ON_DEVICE) // held
+    limit = (AT_ONCE if values.device.type == "cpu" else AT_ONCE_ON_DEVICE) // rows_per_point
     total, groups = 0, [[]]
     for number in counts.tolist():
         if groups[-1] and total + number > limit:

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from framework.encoder import Encoder
 from framework.geometry.clouds import Normalisation
 from plugins.encoder.point_sets.layers import layers
-from plugins.encoder.point_sets.point_sets import Reading, columns_read, over_points
+from plugins.encoder.point_sets.point_sets import Reading, count_columns, encode_clouds
 from plugins.encoder.point_sets.pooled import largest_after
 
 Width = Annotated[int, Field(gt=0)]
@@ -19,22 +19,22 @@ LOCAL = 2
 
 
 class PointNet(Encoder):
-    """Every point passes the same layers; the features of the cloud are the maxima of each channel over its points.
+    """Network that passes every point through the same layers and takes the maximum of each channel over the cloud.
 
     "full" also predicts two matrices from the cloud: a 3 × 3 matrix that every point is multiplied by, and a matrix
     that the features of every point are multiplied by after two layers. The paper adds a term to the loss that keeps
-    the latter near a rotation. An encoder has no loss, so this term is left out here. "vanilla" has no such matrices.
-    Every layer has batch norm and ReLU. Neither the order of the points nor padding changes the features.
+    the second matrix near a rotation. An encoder has no loss, so this term is left out here. "vanilla" has no such
+    matrices. Every layer has batch norm and ReLU. Neither the order of the points nor padding changes the features.
 
     Args:
         input_shape: (points, columns).
         variant: "full" or "vanilla".
-        point_widths: outputs of each layer that every point passes; the matrices are predicted by layers with the
-            widths after the second.
-        widths: outputs of each layer after the maximum; the last is the length of the features.
+        point_widths: number of outputs of each layer that every point passes; the networks that predict the matrices
+            have all of these layers but the first two.
+        widths: number of outputs of each layer after the maximum; the last is the length of the features.
         dropout: probability of dropping an output of the last layer.
-        points: largest number of points that are read of a cloud, the first ones; None for all.
-        normalise: as of framework.geometry.clouds.normalise_clouds.
+        points: number of points at the beginning of a cloud that are read; None for all.
+        normalise: as in `framework.geometry.clouds.normalise_clouds`.
         attributes: whether columns after x, y, z are read too; the first matrix does not change them.
 
     Raises:
@@ -56,7 +56,7 @@ class PointNet(Encoder):
         attributes: bool = False,
     ) -> None:
         super().__init__()
-        columns = columns_read(input_shape, "encoder pointnet", attributes)
+        columns = count_columns(input_shape, "encoder pointnet", attributes)
         self.reading = Reading(columns, points, normalise)
         after = point_widths[LOCAL:]
         full = variant == "full"
@@ -71,17 +71,19 @@ class PointNet(Encoder):
     def forward(self, inputs: Tensor) -> Float[Tensor, "batch length"]:
         """Return the features of the clouds."""
         dtype = next(self.parameters()).dtype
-        return over_points(self._described, inputs, self.reading, dtype, training=self.training)
+        return encode_clouds(self._describe, inputs, self.reading, dtype, training=self.training)
 
-    def _described(
+    def _describe(
         self, values: Float[Tensor, "point columns"], counts: Int[Tensor, "batch"]
     ) -> Float[Tensor, "batch length"]:
         if self.input_matrix is not None:
-            turned = multiplied(values[:, :3], self.input_matrix(values[:, :3], counts), counts)
-            values = torch.cat([turned, values[:, 3:]], 1)
+            transformed = multiply_by_matrices(
+                values[:, :3], self.input_matrix(values[:, :3], counts), counts
+            )
+            values = torch.cat([transformed, values[:, 3:]], 1)
         values = self.local(values)
         if self.feature_matrix is not None:
-            values = multiplied(values, self.feature_matrix(values, counts), counts)
+            values = multiply_by_matrices(values, self.feature_matrix(values, counts), counts)
         return self.dropout(self.whole(largest_after(self.deep, values, counts)))
 
 
@@ -89,9 +91,9 @@ class Matrix(nn.Module):
     """A square matrix that a small PointNet predicts from a cloud; it is near the identity before training.
 
     Args:
-        size: number of rows and columns; also of the numbers of a point.
-        point_widths: outputs of each layer that every point passes.
-        widths: outputs of each layer after the maximum.
+        size: number of rows and of columns of the matrix, and length of a point's vector.
+        point_widths: number of outputs of each layer that every point passes.
+        widths: number of outputs of each layer after the maximum.
     """
 
     def __init__(self, size: int, point_widths: list[int], widths: list[int]) -> None:
@@ -102,7 +104,7 @@ class Matrix(nn.Module):
         self.entries = nn.Linear(widths[-1], size * size)
         with (
             torch.no_grad()
-        ):  # small, not 0 as in the paper: so the gradient reaches the layers before it from the first step
+        ):  # small, not 0 as in the paper, so that the layers before have a gradient from the first step
             self.entries.weight.mul_(0.01)
             self.entries.bias.copy_(torch.eye(size).flatten())
 
@@ -114,7 +116,7 @@ class Matrix(nn.Module):
         return entries.unflatten(1, (self.size, self.size))
 
 
-def multiplied(
+def multiply_by_matrices(
     values: Float[Tensor, "point size"],
     matrices: Float[Tensor, "batch size size"],
     counts: Int[Tensor, "batch"],

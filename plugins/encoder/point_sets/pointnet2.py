@@ -11,9 +11,9 @@ from torch.nn.functional import linear
 from framework.encoder import Encoder
 from framework.geometry.clouds import Normalisation, pad, require_normalised, sizes
 from framework.geometry.farthest import farthest
-from plugins.encoder.point_sets.balls import within
+from plugins.encoder.point_sets.balls import find_within
 from plugins.encoder.point_sets.layers import layers
-from plugins.encoder.point_sets.point_sets import Reading, columns_read, first_rows, largest, over_points
+from plugins.encoder.point_sets.point_sets import Reading, count_columns, encode_clouds, first_rows, largest
 
 Count = Annotated[int, Field(gt=0)]
 
@@ -22,9 +22,9 @@ class Scale(NamedTuple):
     """Balls of one size around the centroids of a level, and the layers that their points pass.
 
     Attributes:
-        radius: in units of the radius of the first level's balls in "single_scale".
-        neighbours: largest number of points of a ball.
-        widths: outputs of each layer.
+        radius: radius of the balls, in units of the first level's radius in "single_scale".
+        neighbours: largest number of points of a ball that are read.
+        widths: number of outputs of each layer.
     """
 
     radius: float
@@ -47,30 +47,33 @@ PUBLISHED = {
 WHOLE, LAST = (256, 512, 1024), (512, 256)
 """Widths of the layers that the last centroids pass, and of the layers after the maximum over them."""
 REACH = 5
-"""Intended largest distance of a cloud from the origin, in radii of the first level's balls: 1 as published."""
+"""Largest distance of a point from the origin for which the balls are intended, in radii of the first level's balls.
+
+The distance is 1 for the published radius of 0.2.
+"""
 
 
 class PointNet2(Encoder):
     """A PointNet on small balls of points, one on larger balls around fewer centroids, and one on the whole cloud.
 
-    Centroids are points that are as far as possible from each other; the first is the farthest from the mean of the
-    cloud (`framework.geometry.farthest`). A ball is described by its points: their positions relative to the centroid,
-    and their features. They all pass the same layers, each with batch norm and ReLU; the maximum of each channel over
-    the ball is the feature of the centroid. If a ball has more points than are read, points that are far from each
-    other are read. Padding changes no feature. The order of the points changes none unless distances are equal, as in a
-    lattice: of equally far points the first is chosen. In evaluation, points that occur twice change no feature if each
-    point does.
+    Centroids are points that are as far as possible from each other; the first one is the farthest from the mean of the
+    cloud (`framework.geometry.farthest`). A ball is described by the positions of its points relative to the centroid
+    and by their features. All points pass the same layers with batch norm and ReLU; the maxima of each channel over the
+    ball are the features of the centroid. If a ball has more points than are read, points that are far from each other
+    are read. Padding does not change the features. The order of the points changes the features only if distances are
+    equal, as in a lattice: of equally far points the first one is chosen. In evaluation, the features do not change if
+    every point occurs twice.
 
     Args:
         input_shape: (points, columns).
         grouping: "single_scale", balls of one size around a centroid; or "multi_scale", balls of three sizes.
-        centroids: numbers of centroids of the two levels; clouds that have fewer points use all.
-        radius: radius of the first level's balls in "single_scale", in units of the normalised cloud; others in
-            proportion.
-        width: factor of the published widths of all layers.
+        centroids: numbers of centroids of the two levels; in a cloud with fewer points, all points are centroids.
+        radius: radius of the first level's balls in "single_scale", in units of the normalised cloud; all other radii
+            change in proportion.
+        width: factor by which the published widths of all layers are multiplied.
         dropout: probability of dropping an output of each of the two last layers.
-        points: largest number of points that are read of a cloud, the first ones; None for all.
-        normalise: as of framework.geometry.clouds.normalise_clouds.
+        points: number of points at the beginning of a cloud that are read; None for all.
+        normalise: as in `framework.geometry.clouds.normalise_clouds`.
         attributes: whether columns after x, y, z are read too.
 
     Raises:
@@ -79,6 +82,7 @@ class PointNet2(Encoder):
 
     bibtex = "qi2017pointnetplusplus"
 
+    # More than eight parameters: each keyword is a config key that a user sets alone.
     def __init__(
         self,
         input_shape: tuple[int, ...],
@@ -93,42 +97,47 @@ class PointNet2(Encoder):
         attributes: bool = False,
     ) -> None:
         super().__init__()
-        columns = columns_read(input_shape, "encoder pointnet2", attributes)
+        columns = count_columns(input_shape, "encoder pointnet2", attributes)
         self.reading = Reading(columns, points, normalise)
         self.radius = radius
         self.levels = nn.ModuleList()
         length = columns - 3
         for count, published in zip(centroids, PUBLISHED[grouping], strict=True):
             self.levels.append(Level(length, count, radius, published, width))
-            length = sum(scaled(scale.widths, width)[-1] for scale in published)
-        *_, after = widths = scaled(WHOLE, width)
+            length = sum(scale_widths(scale.widths, width)[-1] for scale in published)
+        *_, after = widths = scale_widths(WHOLE, width)
         self.whole = layers(3 + length, widths)
-        found: list[nn.Module] = []
-        for last in scaled(LAST, width):
-            found += [*layers(after, [last]), nn.Dropout(dropout)]
+        last_layers: list[nn.Module] = []
+        for last in scale_widths(LAST, width):
+            last_layers += [*layers(after, [last]), nn.Dropout(dropout)]
             after = last
-        self.last = nn.Sequential(*found)
+        self.last = nn.Sequential(*last_layers)
         self.output_shape = (after,)
-        # the numbers of one cloud at a time fit into a CPU's cache, those of several do not
-        self.held = max(scale.neighbours for level in PUBLISHED[grouping] for scale in level)
+        # with this number, a CPU computes one cloud at a time: the numbers of several clouds do not fit into its cache
+        self.rows_per_point = max(scale.neighbours for level in PUBLISHED[grouping] for scale in level)
 
     def forward(self, inputs: Tensor) -> Float[Tensor, "batch length"]:
         """Return the features of the clouds."""
         if self.reading.normalise == "none":
             require_normalised(inputs[..., :3], REACH * self.radius, sizes(inputs), by="encoder pointnet2")
         dtype = next(self.parameters()).dtype
-        return over_points(
-            self._described, inputs, self.reading, dtype, training=self.training, held=self.held
+        return encode_clouds(
+            self._describe,
+            inputs,
+            self.reading,
+            dtype,
+            training=self.training,
+            rows_per_point=self.rows_per_point,
         )
 
-    def _described(
+    def _describe(
         self, values: Float[Tensor, "point columns"], counts: Int[Tensor, "batch"]
     ) -> Float[Tensor, "batch length"]:
-        values = spread(values, counts)
-        places, values = values[:, :3], values[:, 3:]
+        values = order_by_distance(values, counts)
+        positions, values = values[:, :3], values[:, 3:]
         for level in self.levels:
-            places, values, counts = level(places, values, counts)
-        return self.last(largest(self.whole(torch.cat([places, values], 1)), counts))
+            positions, values, counts = level(positions, values, counts)
+        return self.last(largest(self.whole(torch.cat([positions, values], 1)), counts))
 
 
 class Level(nn.Module):
@@ -136,10 +145,10 @@ class Level(nn.Module):
 
     Args:
         length: number of features of a point.
-        centroids: number of points of each cloud that remain.
-        radius: unit of the scales' radii.
-        scales: the balls; the features of the scales are concatenated.
-        width: factor of the scales' widths.
+        centroids: largest number of centroids of a cloud.
+        radius: unit of the scales' radii, in units of the normalised cloud.
+        scales: sizes of the balls, and their layers; the features of all scales are concatenated.
+        width: factor by which the scales' widths are multiplied.
     """
 
     def __init__(
@@ -148,64 +157,77 @@ class Level(nn.Module):
         super().__init__()
         self.centroids = centroids
         self.balls = [(radius * scale.radius, scale.neighbours) for scale in scales]
-        self.networks = nn.ModuleList(layers(3 + length, scaled(scale.widths, width)) for scale in scales)
+        self.networks = nn.ModuleList(
+            layers(3 + length, scale_widths(scale.widths, width)) for scale in scales
+        )
 
     def forward(
         self,
-        places: Float[Tensor, "point 3"],
+        positions: Float[Tensor, "point 3"],
         values: Float[Tensor, "point length"],
         counts: Int[Tensor, "batch"],
     ) -> tuple[Float[Tensor, "centroid 3"], Float[Tensor, "centroid channels"], Int[Tensor, "batch"]]:
-        """Return positions and features of the centroids, and their counts, from points in the order of `spread`."""
-        # The first points in this order are also the centroids, in their order. It is found once for all levels.
-        centres = places[first_rows(counts, self.centroids)]
-        found = []
+        """Return positions and features of the centroids, and the number of centroids of each cloud.
+
+        Args:
+            positions: positions of the points of all clouds, each cloud in the order of `order_by_distance`.
+            values: features of the points.
+            counts: number of points of each cloud.
+        """
+        # The first points in this order are the centroids. They keep the order, so that it is computed only once.
+        centres = positions[first_rows(counts, self.centroids)]
+        features = []
         for (radius, most), network in zip(self.balls, self.networks, strict=True):
-            index = within(places, counts, self.centroids, radius, most)
-            found.append(described(network, places, values, centres, index))
-        return centres, torch.cat(found, 1), counts.clamp(max=self.centroids)
+            index = find_within(positions, counts, self.centroids, radius, most)
+            features.append(describe_balls(network, positions, values, centres, index))
+        return centres, torch.cat(features, 1), counts.clamp(max=self.centroids)
 
 
-def described(
+def describe_balls(
     network: nn.Module,
-    places: Float[Tensor, "point 3"],
+    positions: Float[Tensor, "point 3"],
     values: Float[Tensor, "point length"],
     centres: Float[Tensor, "centroid 3"],
     index: Int[Tensor, "centroid most"],
 ) -> Float[Tensor, "centroid channels"]:
-    """Return the maximum of each channel over the points of each ball, after a network.
+    """Return the maximum of each output channel of a network over the points of each ball.
 
-    The network reads the points' positions relative to the centroid, and their features.
+    Args:
+        network: layers of `layers`, which read a point's position relative to the centroid and the point's features.
+        positions: positions of all points.
+        values: features of all points.
+        centres: positions of the centroids.
+        index: rows of the points of each ball, as `find_within` returns them.
     """
-    enter, *others, last = network.children()
-    weight = enter.get_parameter("weight")
+    first, *middle, last = network.children()
+    weight = first.get_parameter("weight")
     rows = index.flatten()
-    offset = places.index_select(0, rows) - centres.repeat_interleave(index.shape[1], 0)
-    # A linear layer of (offset, value) is the sum of one of the offset and one of the value. The latter is computed
-    # once for each point, not for each ball.
-    found = linear(offset, weight[:, :3])
+    offset = positions.index_select(0, rows) - centres.repeat_interleave(index.shape[1], 0)
+    # The linear layer of (offset, value) is the sum of a linear layer of the offset and one of the value. The latter is
+    # computed once for each point instead of once for each point of each ball.
+    numbers = linear(offset, weight[:, :3])
     if values.shape[1]:
-        found = found + linear(values, weight[:, 3:]).index_select(0, rows)
-    for layer in others:
-        found = layer(found)
-    found = found.unflatten(0, index.shape)
-    # `max` has the faster gradient, `amax` the faster value. The last layer is a ReLU, which may follow the maximum.
-    return last(found.max(1).values if found.requires_grad else found.amax(1))
+        numbers = numbers + linear(values, weight[:, 3:]).index_select(0, rows)
+    for layer in middle:
+        numbers = layer(numbers)
+    numbers = numbers.unflatten(0, index.shape)
+    # `max` has the faster gradient, `amax` the faster value. The last layer, a ReLU, can be applied after the maximum.
+    return last(numbers.max(1).values if numbers.requires_grad else numbers.amax(1))
 
 
-def spread(
+def order_by_distance(
     values: Float[Tensor, "point columns"], counts: Int[Tensor, "batch"]
 ) -> Float[Tensor, "point columns"]:
-    """Return the points of each cloud in an order in which each is as far as possible from the points before it."""
+    """Return the points of each cloud, ordered so that each is as far as possible from the points before it."""
     if len(counts) == 0:
         return values
-    places = pad(values[:, :3].detach().split(counts.tolist()))
-    order = farthest(places, counts, places.shape[1])
+    positions = pad(values[:, :3].detach().split(counts.tolist()))
+    order = farthest(positions, counts, positions.shape[1])
     start = counts.cumsum(0) - counts
-    real = torch.arange(places.shape[1], device=counts.device) < counts[:, None]
+    real = torch.arange(positions.shape[1], device=counts.device) < counts[:, None]
     return values.index_select(0, (start[:, None] + order)[real])
 
 
-def scaled(widths: tuple[int, ...], factor: float) -> tuple[int, ...]:
-    """Return the widths times a factor, rounded, at least 1."""
+def scale_widths(widths: tuple[int, ...], factor: float) -> tuple[int, ...]:
+    """Return the widths times a factor, rounded; each is at least 1."""
     return tuple(max(1, round(factor * width)) for width in widths)

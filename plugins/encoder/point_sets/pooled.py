@@ -1,6 +1,7 @@
-"""Maxima over each cloud after layers of `layers`, without computing the outputs of every point where possible.
+"""Maxima over each cloud of the outputs of `layers`, where possible without computing the outputs of every point.
 
-A step of PointNet then takes a quarter of the time and a third of the memory (benchmarks/clouds/set_steps.md).
+A training step of PointNet then takes a quarter of the time and a third of the memory
+(benchmarks/clouds/set_steps.md).
 """
 
 from typing import cast
@@ -13,35 +14,44 @@ from torch.nn.functional import linear
 from plugins.encoder.point_sets.point_sets import largest
 
 POINTS = 64
-"""Smallest mean number of points of a cloud for which few rows attain a maximum; by count, not by a measured limit."""
+"""Smallest mean number of points of a cloud for which the shortcut of `largest_after` is used.
+
+With fewer points, too large a share of them attains a maximum. The limit is estimated from operations, not measured.
+"""
 
 
 def largest_after(
     network: nn.Sequential, values: Float[Tensor, "point columns"], counts: Int[Tensor, "batch"]
 ) -> Float[Tensor, "batch channels"]:
-    """Return `largest(network(values), counts)`, to rounding, with its gradient.
+    """Return `largest(network(values), counts)` and its gradient, equal up to rounding.
 
-    ReLU and, for one channel, batch norm are monotone. The maximum over a cloud therefore belongs to the point with the
-    largest number before them (the smallest where the norm's factor is negative). In evaluation the norm is folded into
-    the last linear layer. In training its moments over all points follow from those of the layer's inputs, W m and Wᵀ C
-    W, so that only the points which attain a maximum pass the layer with a gradient. Where several points attain a
-    maximum, one of them has the gradient.
+    ReLU is monotone, and so is batch norm in each channel. The maximum over a cloud is therefore attained by the point
+    with the largest number before batch norm (the smallest number if the factor of batch norm is negative). In
+    evaluation, batch norm is folded into the last linear layer. In training, the moments over all points follow from
+    the mean m and the covariance C of the linear layer's inputs: the mean is W m, the variances are the diagonal of
+    W C Wᵀ. Only the points that attain a maximum therefore pass the linear layer with a gradient. If several points
+    attain a maximum, one of them has the gradient.
+
+    Args:
+        network: layers of `layers`.
+        values: concatenated points.
+        counts: number of points of each cloud.
     """
-    *others, final, norm, _ = network.children()
-    for layer in others:
+    *earlier, final, norm, _ = network.children()
+    for layer in earlier:
         values = layer(values)
     final, norm = cast(nn.Linear, final), cast(nn.BatchNorm1d, norm)
     if type(norm) is nn.BatchNorm1d and not norm.training and norm.running_mean is not None:
-        weight, bias = folded(final, norm)
+        weight, bias = fold_norm(final, norm)
         return (largest(linear(values, weight), counts) + bias).relu()
-    found = _of_attaining(final, norm, values, counts) if _pays(final, norm, values, counts) else None
-    return (largest(norm(final(values)), counts) if found is None else found).relu()
+    maxima = _maxima_of_attaining(final, norm, values, counts) if _pays(final, norm, values, counts) else None
+    return (largest(norm(final(values)), counts) if maxima is None else maxima).relu()
 
 
-def folded(
+def fold_norm(
     final: nn.Linear, norm: nn.BatchNorm1d
 ) -> tuple[Float[Tensor, "channels columns"], Float[Tensor, "channels"]]:
-    """Return weight and bias of a linear layer without bias merged with the batch norm after it, by running moments."""
+    """Return weight and bias of the linear layer that equals `final` without bias, then `norm` in evaluation."""
     assert norm.running_mean is not None and norm.running_var is not None
     factor = norm.weight * (norm.running_var + norm.eps).rsqrt()
     return final.weight * factor.unsqueeze(1), norm.bias - norm.running_mean * factor
@@ -50,8 +60,9 @@ def folded(
 def _pays(final: nn.Linear, norm: nn.Module, values: Tensor, counts: Tensor) -> bool:
     """Return whether the shortcut applies and needs less computation.
 
-    It applies with a gradient, on a CPU, in the layer's own precision. The covariance of the inputs takes columns /
-    channels of a pass, the gathered rows clouds / points.
+    The shortcut applies with a gradient, on a CPU, in the layer's own precision. As a share of a pass of all points
+    through the layer, the covariance of the inputs costs columns / channels, and the points that attain a maximum cost
+    clouds / points.
     """
     return (
         torch.is_grad_enabled()
@@ -63,16 +74,15 @@ def _pays(final: nn.Linear, norm: nn.Module, values: Tensor, counts: Tensor) -> 
     )
 
 
-def _of_attaining(
+def _maxima_of_attaining(
     final: nn.Linear,
     norm: nn.BatchNorm1d,
     values: Float[Tensor, "point columns"],
     counts: Int[Tensor, "batch"],
 ) -> Float[Tensor, "batch channels"] | None:
-    """Return the maxima after linear layer and batch norm in training, or None if the variance would be too inexact.
+    """Return the maxima after linear layer and batch norm in training, or None if a variance would be too inexact.
 
-    The covariance of the inputs then leaves too few digits of a channel's variance, which is a small difference of
-    large numbers.
+    A variance is too inexact if it is a small difference of large entries of the inputs' covariance.
     """
     weight = final.weight
     mean = values.mean(0)
@@ -83,28 +93,28 @@ def _of_attaining(
         size = ((weight.abs() @ covariance.abs()) * weight.abs()).sum(1)
         if bool((variance < torch.finfo(values.dtype).eps ** 0.5 * size).any()):
             return None
-        rows = attaining(centred, weight * norm.weight.sign().unsqueeze(1), counts)
-        _moved(norm, weight @ mean, variance, len(values))
+        rows = rows_of_maxima(centred, weight * norm.weight.sign().unsqueeze(1), counts)
+        _update_moments(norm, weight @ mean, variance, len(values))
     chosen = centred.index_select(0, rows.flatten()).unflatten(0, rows.shape)
-    found = (chosen * weight).sum(-1)
-    return found * (norm.weight * (variance + norm.eps).rsqrt()) + norm.bias
+    maxima = (chosen * weight).sum(-1)
+    return maxima * (norm.weight * (variance + norm.eps).rsqrt()) + norm.bias
 
 
-def attaining(
+def rows_of_maxima(
     values: Float[Tensor, "point columns"],
     weight: Float[Tensor, "channels columns"],
     counts: Int[Tensor, "batch"],
 ) -> Int[Tensor, "batch channels"]:
-    """Return for each cloud and channel the row, among all points, with the largest product."""
+    """Return for each cloud and channel the row of the point with the largest product with the channel's weights."""
     start = (counts.cumsum(0) - counts).tolist()
-    parts = values.split(counts.tolist())  # the numbers of one cloud stay in a CPU's cache
+    parts = values.split(counts.tolist())  # one cloud at a time, so that its numbers stay in a CPU's cache
     # transposed, so that the numbers of a channel are contiguous
     return torch.stack(
         [first + (weight @ part.mT).argmax(1) for first, part in zip(start, parts, strict=True)]
     )
 
 
-def _moved(norm: nn.BatchNorm1d, mean: Tensor, variance: Tensor, points: int) -> None:
+def _update_moments(norm: nn.BatchNorm1d, mean: Tensor, variance: Tensor, points: int) -> None:
     """Update the running moments as `nn.BatchNorm1d` does."""
     if norm.running_mean is None or norm.running_var is None or norm.num_batches_tracked is None:
         return

@@ -1,4 +1,4 @@
-"""Rows of the contract: each variant, activation and grouping, with and without attributes."""
+"""Contract-test cases: each variant, activation and grouping, with and without attributes."""
 
 from framework.testing.rows import CloudRow
 
@@ -6,7 +6,7 @@ COLOURED = ("x", "y", "z", "red", "green", "blue")
 
 
 def rows(first: CloudRow, second: CloudRow) -> tuple[CloudRow, ...]:
-    """Return the two rows, and rows of the second's network on attributes and on the first points alone."""
+    """Return the two cases, and two more for the second's network: with attributes, and with only the first points."""
     small = second.config
     return (
         first,
@@ -18,7 +18,7 @@ def rows(first: CloudRow, second: CloudRow) -> tuple[CloudRow, ...]:
             "the first points",
             (30, 3),
             config={**small, "points": 10, "normalise": "none"},
-            leave_out={"points in any order": "the first points are read alone"},
+            leave_out={"points in any order": "only the first points are read"},
         ),
     )
 
@@ -41,7 +41,7 @@ ROWS = {
             (40, 3),
             config={**BALLS, "points": 10, "normalise": "none", "radius": 4.0},
             leave_out={
-                "points in any order": "the first points are read alone",
+                "points in any order": "only the first points are read",
                 "finite on extreme inputs": "clouds that were not normalised are refused",
             },
         ),

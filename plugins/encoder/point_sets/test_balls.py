@@ -5,7 +5,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from plugins.encoder.point_sets.balls import within
+from plugins.encoder.point_sets.balls import find_within
 
 CLOUD = st.lists(st.tuples(*[st.sampled_from([-1.5, -0.5, 0.0, 0.5, 1.0])] * 3), min_size=1, max_size=12)
 """Clouds with equal points, and with distances equal to the radius."""
@@ -34,14 +34,14 @@ def test_a_ball_holds_the_first_points_within_its_radius(points, centroids, radi
     clouds = [np.array(cloud) for cloud in points]
     places = torch.from_numpy(np.concatenate(clouds)).to(dtype)
     counts = torch.tensor([len(cloud) for cloud in clouds])
-    found = within(places, counts, centroids, radius, most)
-    assert found.tolist() == by_hand(clouds, centroids, radius, most)
+    neighbours = find_within(places, counts, centroids, radius, most)
+    assert neighbours.tolist() == by_hand(clouds, centroids, radius, most)
 
 
 def test_no_cloud_has_no_ball():
-    assert within(torch.zeros(0, 3), torch.zeros(0, dtype=torch.int64), 5, 1.0, 4).shape == (0, 4)
+    assert find_within(torch.zeros(0, 3), torch.zeros(0, dtype=torch.int64), 5, 1.0, 4).shape == (0, 4)
 
 
 def test_what_has_a_gradient_is_read_too():
     places = torch.randn(9, 3, requires_grad=True)
-    assert within(places, torch.tensor([4, 5]), 2, 0.5, 3).shape == (4, 3)
+    assert find_within(places, torch.tensor([4, 5]), 2, 0.5, 3).shape == (4, 3)

@@ -10,25 +10,25 @@ from plugins.encoder.point_sets.deepsets import DeepSets, below_largest
 SMALL = {"channels": [8, 10, 12], "widths": [12, 8]}
 
 
-def encoder(shape=(50, 3), **config):
+def build_encoder(shape=(50, 3), **config):
     torch.manual_seed(0)
     return build(
         "encoder", resolve("encoder", {"name": "deepsets", **SMALL, **config}), input_shape=shape
     ).eval()
 
 
-def by_hand(made, cloud, activation):
+def by_hand(encoder, cloud, activation):
     """Return the features of one cloud (points, columns) by loops in NumPy, float64, normalised as eq. 6.2."""
     points = cloud.double().numpy().copy()
     points[:, :3] -= points[:, :3].mean(0)
     points[:, :3] /= np.sqrt((points[:, :3] ** 2).sum(1)).max()
-    points = points[: made.reading.most, : made.reading.columns]
-    for layer in made.equivariant:
+    points = points[: encoder.reading.most, : encoder.reading.columns]
+    for layer in encoder.equivariant:
         weight, bias = layer.weight.detach().double().numpy(), layer.bias.detach().double().numpy()
         most = points.max(0)
         points = np.stack([activation(weight @ (point - most) + bias) for point in points])
     numbers = points.max(0)
-    for layer in made.whole:
+    for layer in encoder.whole:
         if isinstance(layer, torch.nn.Linear):
             weight, bias = layer.weight.detach().double().numpy(), layer.bias.detach().double().numpy()
             numbers = activation(weight @ numbers + bias)
@@ -42,28 +42,28 @@ def by_hand(made, cloud, activation):
     "columns, config", [(3, {}), (6, {}), (6, {"attributes": True}), (3, {"points": 20})], ids=str
 )
 def test_agrees_with_numpy_on_clouds_of_any_size(name, activation, columns, config):
-    made = encoder((50, columns), activation=name, **config)
+    encoder = build_encoder((50, columns), activation=name, **config)
     clouds = [torch.randn(number, columns) * 4 + 7 for number in (50, 2, 13, 30)]
-    wanted = np.stack([by_hand(made, cloud, activation) for cloud in clouds])
-    found = made.double()(pad(clouds).double()).detach().numpy()
-    np.testing.assert_allclose(found, wanted, rtol=1e-10, atol=1e-10)
-    single = made.float()(pad(clouds)).detach().numpy()
+    wanted = np.stack([by_hand(encoder, cloud, activation) for cloud in clouds])
+    features = encoder.double()(pad(clouds).double()).detach().numpy()
+    np.testing.assert_allclose(features, wanted, rtol=1e-10, atol=1e-10)
+    single = encoder.float()(pad(clouds)).detach().numpy()
     np.testing.assert_allclose(single, wanted, rtol=1e-4, atol=1e-5)
 
 
 def test_a_layer_commutes_with_any_reordering():
-    made = encoder().double()
+    encoder = build_encoder().double()
     points, counts = torch.randn(30, 3, dtype=torch.float64), torch.tensor([30])
     order = torch.randperm(30)
-    first = made.equivariant[0](below_largest(points, counts))
-    torch.testing.assert_close(made.equivariant[0](below_largest(points[order], counts)), first[order])
+    first = encoder.equivariant[0](below_largest(points, counts))
+    torch.testing.assert_close(encoder.equivariant[0](below_largest(points[order], counts)), first[order])
 
 
 def test_what_all_points_share_is_not_seen():
-    made = encoder(normalise="none").double()
+    encoder = build_encoder(normalise="none").double()
     cloud = torch.randn(1, 30, 3, dtype=torch.float64)
     torch.testing.assert_close(
-        made(cloud + torch.tensor([5.0, -3.0, 1.0])), made(cloud), rtol=1e-9, atol=1e-9
+        encoder(cloud + torch.tensor([5.0, -3.0, 1.0])), encoder(cloud), rtol=1e-9, atol=1e-9
     )
 
 
@@ -74,7 +74,7 @@ def test_it_is_the_published_network():
 
 
 def test_refuses_attributes_that_are_not_there():
-    with pytest.raises(ConfigError, match="these have none"):
+    with pytest.raises(ConfigError, match="the clouds have no such columns"):
         DeepSets((100, 3), attributes=True)
 
 

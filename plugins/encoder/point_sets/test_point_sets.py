@@ -6,13 +6,13 @@ import torch
 from framework.errors import ConfigError
 from framework.geometry.clouds import pad
 from plugins.encoder.point_sets.point_sets import (
-    columns_read,
-    even,
+    all_have,
+    concatenate_points,
+    count_columns,
+    encode_in_parts,
     first_rows,
-    in_parts,
     largest,
-    points_of,
-    to_points,
+    repeat_for_points,
 )
 
 
@@ -20,7 +20,7 @@ from plugins.encoder.point_sets.point_sets import (
 @pytest.mark.parametrize("most", [None, 1, 3, 100])
 def test_points_are_those_of_each_cloud_in_order(numbers, most):
     clouds = [torch.randn(number, 5) for number in numbers]
-    values, counts = points_of(pad(clouds), "none", columns=4, most=most, dtype=torch.float64)
+    values, counts = concatenate_points(pad(clouds), "none", columns=4, most=most, dtype=torch.float64)
     wanted = [cloud[:most, :4] for cloud in clouds]
     assert counts.tolist() == [len(cloud) for cloud in wanted]
     assert torch.equal(values, torch.cat(wanted).double())
@@ -31,16 +31,16 @@ def test_the_largest_of_each_channel(numbers):
     parts = [torch.randn(number, 3) - 5 for number in numbers]
     values = torch.cat([torch.zeros(0, 3), *parts]).requires_grad_()
     counts = torch.tensor(numbers, dtype=torch.int64)
-    found = largest(values, counts)
-    assert found.shape == (len(numbers), 3)
-    for row, part in zip(found, parts, strict=True):
+    maxima = largest(values, counts)
+    assert maxima.shape == (len(numbers), 3)
+    for row, part in zip(maxima, parts, strict=True):
         assert torch.equal(row, part.max(0).values)
-    spread = to_points(found, counts)
+    spread = repeat_for_points(maxima, counts)
     assert spread.shape == values.shape
     assert (spread >= values).all()
     if not numbers:
         return
-    found.sum().backward()
+    maxima.sum().backward()
     assert values.grad.sum() == 3 * len(numbers)
 
 
@@ -48,29 +48,29 @@ def test_the_largest_of_each_channel(numbers):
 @pytest.mark.parametrize("most", [1, 3, 9])
 def test_first_rows_are_those_of_each_cloud(numbers, most):
     rows = torch.arange(sum(numbers)).split(list(numbers)) if numbers else []
-    found = first_rows(torch.tensor(numbers, dtype=torch.int64), most)
-    assert found.tolist() == [row for part in rows for row in part[:most].tolist()]
+    first = first_rows(torch.tensor(numbers, dtype=torch.int64), most)
+    assert first.tolist() == [row for part in rows for row in part[:most].tolist()]
 
 
 def test_parts_hold_few_points_and_give_what_the_whole_gives():
     counts = torch.tensor([3000, 2000, 2100, 10, 5000, 1])
-    values, seen = torch.randn(int(counts.sum()), 2), []
+    values, counts_of_parts = torch.randn(int(counts.sum()), 2), []
 
     def network(part, numbers):
-        seen.append(numbers.tolist())
+        counts_of_parts.append(numbers.tolist())
         return largest(part, numbers)
 
-    assert torch.equal(in_parts(network, values, counts), largest(values, counts))
-    assert seen == [[3000], [2000], [2100, 10], [5000], [1]]
-    seen.clear()
-    assert torch.equal(in_parts(network, values, counts, held=2), largest(values, counts))
-    assert seen == [[3000], [2000], [2100], [10], [5000], [1]]
-    assert in_parts(network, values[:0], counts[:0]).shape == (0, 2)
+    assert torch.equal(encode_in_parts(network, values, counts), largest(values, counts))
+    assert counts_of_parts == [[3000], [2000], [2100, 10], [5000], [1]]
+    counts_of_parts.clear()
+    assert torch.equal(encode_in_parts(network, values, counts, rows_per_point=2), largest(values, counts))
+    assert counts_of_parts == [[3000], [2000], [2100], [10], [5000], [1]]
+    assert encode_in_parts(network, values[:0], counts[:0]).shape == (0, 2)
 
 
 def test_even_and_what_is_no_cloud():
-    assert even(torch.tensor([3, 3]), 3) and not even(torch.tensor([3, 2]), 3)
-    assert columns_read((10, 6), "an encoder", False) == 3
-    assert columns_read((10, 6), "an encoder", True) == 6
+    assert all_have(torch.tensor([3, 3]), 3) and not all_have(torch.tensor([3, 2]), 3)
+    assert count_columns((10, 6), "an encoder", False) == 3
+    assert count_columns((10, 6), "an encoder", True) == 6
     with pytest.raises(ConfigError, match=r"an encoder got inputs of shape \(10, 2\)"):
-        columns_read((10, 2), "an encoder", False)
+        count_columns((10, 2), "an encoder", False)

@@ -8,49 +8,36 @@ from framework.configuration.schema import build, resolve
 from framework.errors import ConfigError
 from framework.geometry.clouds import pad
 from plugins.encoder.point_sets.pointnet import PointNet
+from plugins.encoder.point_sets.test_pointnet2 import apply_layers
 
 SMALL = {"point_widths": [8, 10, 8, 12], "widths": [12, 8], "dropout": 0.0}
 
 
-def encoder(shape=(50, 3), **config):
+def build_encoder(shape=(50, 3), **config):
     torch.manual_seed(0)
-    made = build("encoder", resolve("encoder", {"name": "pointnet", **SMALL, **config}), input_shape=shape)
-    made(torch.randn(12, *shape))  # moves the running moments away from their initial values
-    return made.eval()
+    encoder = build("encoder", resolve("encoder", {"name": "pointnet", **SMALL, **config}), input_shape=shape)
+    encoder(torch.randn(12, *shape))  # moves the running moments away from their initial values
+    return encoder.eval()
 
 
-def passed(layers, numbers):
-    """Return linear, (x - mean) / √(var + ε) with the running moments, ReLU, in NumPy."""
-    for layer in layers:
-        state = {name: value.double().numpy() for name, value in layer.state_dict().items()}
-        if isinstance(layer, torch.nn.Linear):
-            numbers = numbers @ state["weight"].T
-        elif isinstance(layer, torch.nn.BatchNorm1d):
-            numbers = (numbers - state["running_mean"]) / np.sqrt(state["running_var"] + 1e-5)
-            numbers = numbers * state["weight"] + state["bias"]
-        else:
-            numbers = np.maximum(numbers, 0)
-    return numbers
+def matrix(network, points):
+    entries = apply_layers(network.whole, apply_layers(network.each, points).max(0))
+    entries = network.entries.weight.detach().double().numpy() @ entries
+    return (entries + network.entries.bias.detach().double().numpy()).reshape(network.size, network.size)
 
 
-def matrix(made, points):
-    entries = passed(made.whole, passed(made.each, points).max(0))
-    entries = made.entries.weight.detach().double().numpy() @ entries
-    return (entries + made.entries.bias.detach().double().numpy()).reshape(made.size, made.size)
-
-
-def by_hand(made, cloud):
+def by_hand(encoder, cloud):
     """Return the features of one cloud (points, columns) in NumPy, float64, normalised as eq. 6.2."""
     points = cloud.double().numpy().copy()
     points[:, :3] -= points[:, :3].mean(0)
     points[:, :3] /= np.sqrt((points[:, :3] ** 2).sum(1)).max()
-    points = points[: made.reading.most, : made.reading.columns]
-    if made.input_matrix is not None:
-        points[:, :3] = points[:, :3] @ matrix(made.input_matrix, points[:, :3])
-    points = passed(made.local, points)
-    if made.feature_matrix is not None:
-        points = points @ matrix(made.feature_matrix, points)
-    return passed(made.whole, passed(made.deep, points).max(0))
+    points = points[: encoder.reading.most, : encoder.reading.columns]
+    if encoder.input_matrix is not None:
+        points[:, :3] = points[:, :3] @ matrix(encoder.input_matrix, points[:, :3])
+    points = apply_layers(encoder.local, points)
+    if encoder.feature_matrix is not None:
+        points = points @ matrix(encoder.feature_matrix, points)
+    return apply_layers(encoder.whole, apply_layers(encoder.deep, points).max(0))
 
 
 @pytest.mark.parametrize("variant", ["full", "vanilla"])
@@ -58,52 +45,52 @@ def by_hand(made, cloud):
     "columns, config", [(3, {}), (6, {}), (6, {"attributes": True}), (3, {"points": 20})], ids=str
 )
 def test_agrees_with_numpy_on_clouds_of_any_size(variant, columns, config):
-    made = encoder((50, columns), variant=variant, **config)
+    encoder = build_encoder((50, columns), variant=variant, **config)
     clouds = [torch.randn(number, columns) * 4 + 7 for number in (50, 1, 13, 30)]
-    wanted = np.stack([by_hand(made.double(), cloud) for cloud in clouds[:1] + clouds[2:]])
-    found = made(pad(clouds).double()).detach().numpy()
-    assert np.isfinite(found).all()
-    np.testing.assert_allclose(found[[0, 2, 3]], wanted, rtol=1e-9, atol=1e-9)
-    single = made.float()(pad(clouds)).detach().numpy()[[0, 2, 3]]
+    wanted = np.stack([by_hand(encoder.double(), cloud) for cloud in clouds[:1] + clouds[2:]])
+    features = encoder(pad(clouds).double()).detach().numpy()
+    assert np.isfinite(features).all()
+    np.testing.assert_allclose(features[[0, 2, 3]], wanted, rtol=1e-9, atol=1e-9)
+    single = encoder.float()(pad(clouds)).detach().numpy()[[0, 2, 3]]
     np.testing.assert_allclose(single, wanted, rtol=1e-4, atol=1e-5)
 
 
 def test_padding_does_not_enter_the_moments_of_batch_norm():
     clouds = [torch.randn(number, 3) for number in (9, 9, 9)]
-    made, other = encoder(), encoder()
-    made.train()(torch.stack(clouds))
+    encoder, other = build_encoder(), build_encoder()
+    encoder.train()(torch.stack(clouds))
     other.train()(torch.cat([torch.stack(clouds), torch.full((3, 5, 3), math.nan)], 1))
-    for name, value in made.state_dict().items():
+    for name, value in encoder.state_dict().items():
         torch.testing.assert_close(other.state_dict()[name], value, msg=name)
 
 
 def test_few_clouds_at_a_time_give_what_all_at_once_give():
-    made = encoder((3000, 3))
+    encoder = build_encoder((3000, 3))
     clouds = pad([torch.randn(number, 3) for number in (3000, 2000, 2100, 10, 2999)])
-    whole = made(clouds)
+    whole = encoder(clouds)
     with torch.no_grad():
-        torch.testing.assert_close(made(clouds), whole, rtol=1e-5, atol=1e-6)
-        assert made(clouds[:0]).shape == (0, 8)
+        torch.testing.assert_close(encoder(clouds), whole, rtol=1e-5, atol=1e-6)
+        assert encoder(clouds[:0]).shape == (0, 8)
 
 
 def test_it_is_the_published_network():
     for variant, wanted in (("vanilla", 0.8e6), ("full", 3.5e6)):
-        made = PointNet((1024, 3), variant=variant)
-        count = sum(parameter.numel() for parameter in made.parameters()) + 257 * 40
+        encoder = PointNet((1024, 3), variant=variant)
+        count = sum(parameter.numel() for parameter in encoder.parameters()) + 257 * 40
         assert count == pytest.approx(wanted, rel=0.025)  # Qi et al. 2017, Table 6
-    assert made.output_shape == (256,)
+    assert encoder.output_shape == (256,)
 
 
 def test_matrices_begin_near_the_identity():
-    made = PointNet((30, 3)).eval()
+    encoder = PointNet((30, 3)).eval()
     points, counts = torch.randn(60, 3), torch.tensor([30, 30])
-    found = made.input_matrix(points, counts)
-    torch.testing.assert_close(found, torch.eye(3).expand(2, 3, 3), rtol=0, atol=0.05)
-    assert not torch.equal(found[0], found[1])
+    matrices = encoder.input_matrix(points, counts)
+    torch.testing.assert_close(matrices, torch.eye(3).expand(2, 3, 3), rtol=0, atol=0.05)
+    assert not torch.equal(matrices[0], matrices[1])
 
 
 def test_refuses_attributes_that_are_not_there():
-    with pytest.raises(ConfigError, match="these have none"):
+    with pytest.raises(ConfigError, match="the clouds have no such columns"):
         PointNet((100, 3), attributes=True)
 
 

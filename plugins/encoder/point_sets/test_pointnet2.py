@@ -17,15 +17,17 @@ BALLS = {  # radius, neighbours of each scale of each level, in SMALL's units; Q
 }
 
 
-def encoder(shape=(150, 3), **config):
+def build_encoder(shape=(150, 3), **config):
     torch.manual_seed(0)
-    made = build("encoder", resolve("encoder", {"name": "pointnet2", **SMALL, **config}), input_shape=shape)
-    made(torch.randn(6, *shape) / 3)  # moves the running moments away from their initial values
-    return made.eval()
+    encoder = build(
+        "encoder", resolve("encoder", {"name": "pointnet2", **SMALL, **config}), input_shape=shape
+    )
+    encoder(torch.randn(6, *shape) / 3)  # moves the running moments away from their initial values
+    return encoder.eval()
 
 
-def passed(layers, numbers):
-    """Return linear, (x - mean) / √(var + ε) with the running moments, ReLU, in NumPy."""
+def apply_layers(layers, numbers):
+    """Return numbers after linear layers, batch norm with the running moments, and ReLU, in NumPy."""
     for layer in layers:
         state = {name: value.double().numpy() for name, value in layer.state_dict().items()}
         if isinstance(layer, torch.nn.Linear):
@@ -38,8 +40,8 @@ def passed(layers, numbers):
     return numbers
 
 
-def spread(places, start):
-    """Return an order in which each point is as far as possible from those before it, by all distances."""
+def order_by_distance(places, start):
+    """Return an order in which each point is as far as possible from those before it, from all distances."""
     order = [start]
     while len(order) < len(places):
         distance = np.linalg.norm(places[:, None] - places[order], axis=-1).min(1)
@@ -48,25 +50,27 @@ def spread(places, start):
     return order
 
 
-def by_hand(made, cloud, balls):
+def by_hand(encoder, cloud, balls):
     """Return the features of one cloud (points, columns) ball by ball in NumPy, float64, normalised as eq. 6.2."""
     points = cloud.double().numpy().copy()
     points[:, :3] -= points[:, :3].mean(0)
     points[:, :3] /= np.sqrt((points[:, :3] ** 2).sum(1)).max()
-    points = points[: made.reading.most, : made.reading.columns]
+    points = points[: encoder.reading.most, : encoder.reading.columns]
     mean = points[:, :3].mean(0)
-    points = points[spread(points[:, :3], int(np.linalg.norm(points[:, :3] - mean, axis=1).argmax()))]
-    for level, scales in zip(made.levels, balls, strict=True):
-        points = points[spread(points[:, :3], 0)]
+    points = points[
+        order_by_distance(points[:, :3], int(np.linalg.norm(points[:, :3] - mean, axis=1).argmax()))
+    ]
+    for level, scales in zip(encoder.levels, balls, strict=True):
+        points = points[order_by_distance(points[:, :3], 0)]
         places, described = points[:, :3], []
         for centre in places[: level.centroids]:
             numbers = []
             for network, (radius, most) in zip(level.networks, scales, strict=True):
                 near = points[np.linalg.norm(places - centre, axis=1) <= radius][:most]
-                numbers.append(passed(network, np.hstack([near[:, :3] - centre, near[:, 3:]])).max(0))
+                numbers.append(apply_layers(network, np.hstack([near[:, :3] - centre, near[:, 3:]])).max(0))
             described.append(np.concatenate([centre, *numbers]))
         points = np.stack(described)
-    return passed(made.last, passed(made.whole, points).max(0))
+    return apply_layers(encoder.last, apply_layers(encoder.whole, points).max(0))
 
 
 @pytest.mark.parametrize("grouping", ["single_scale", "multi_scale"])
@@ -74,12 +78,12 @@ def by_hand(made, cloud, balls):
     "columns, config", [(3, {}), (6, {}), (6, {"attributes": True}), (3, {"points": 40})], ids=str
 )
 def test_agrees_with_numpy_on_clouds_of_any_size(grouping, columns, config):
-    made = encoder((150, columns), grouping=grouping, **config)
+    encoder = build_encoder((150, columns), grouping=grouping, **config)
     clouds = [torch.randn(number, columns) * 4 + 7 for number in (150, 2, 13, 30)]
-    wanted = np.stack([by_hand(made, cloud, BALLS[grouping]) for cloud in clouds])
-    found = made.double()(pad(clouds).double()).detach().numpy()
-    np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-9)
-    single = made.float()(pad(clouds)).detach().numpy()
+    wanted = np.stack([by_hand(encoder, cloud, BALLS[grouping]) for cloud in clouds])
+    features = encoder.double()(pad(clouds).double()).detach().numpy()
+    np.testing.assert_allclose(features, wanted, rtol=1e-9, atol=1e-9)
+    single = encoder.float()(pad(clouds)).detach().numpy()
     np.testing.assert_allclose(single, wanted, rtol=1e-4, atol=1e-5)
 
 
@@ -105,100 +109,100 @@ def test_agrees_with_numpy_on_clouds_of_any_size(grouping, columns, config):
     ],
 )
 def test_parameters_of_the_published_networks(grouping, chains, total, megabytes):
-    """Check that the multi-scale network has Table 6.2's parameters; Table 6.3's 5.8 MB are nearer the other's."""
-    made = PointNet2((1024, 3), grouping=grouping)
+    """Check that "multi_scale" has the parameters of Table 6.2; the 5.8 MB of Table 6.3 are nearer "single_scale"."""
+    encoder = PointNet2((1024, 3), grouping=grouping)
     weights = sum(before * after for chain in chains for before, after in itertools.pairwise(chain))
     moments = sum(sum(chain[1:]) for chain in chains)
     assert weights + 2 * moments + 257 * 40 == total
-    assert sum(parameter.numel() for parameter in made.parameters()) + 257 * 40 == total
-    stored = sum(tensor.numel() * tensor.element_size() for tensor in made.state_dict().values())
+    assert sum(parameter.numel() for parameter in encoder.parameters()) + 257 * 40 == total
+    stored = sum(tensor.numel() * tensor.element_size() for tensor in encoder.state_dict().values())
     assert (stored + 4 * 257 * 40) / 1e6 == pytest.approx(megabytes, abs=0.05)
-    assert made.output_shape == (256,)
+    assert encoder.output_shape == (256,)
 
 
 @pytest.mark.parametrize("grouping", ["single_scale", "multi_scale"])
 def test_the_gradient_is_that_of_differences(grouping):
-    made = encoder((12, 4), grouping=grouping, attributes=True, width=0.03).double()
+    encoder = build_encoder((12, 4), grouping=grouping, attributes=True, width=0.03).double()
     clouds = pad([torch.randn(12, 4), torch.randn(7, 4)]).double()
     clouds[1, 7:] = math.nan
     rows = [torch.cat([clouds[0], clouds[1, :7]]).requires_grad_()]
 
     def features(values):
         padding = values.new_full((5, 4), math.nan)
-        return made(torch.stack([values[:12], torch.cat([values[12:], padding])]))
+        return encoder(torch.stack([values[:12], torch.cat([values[12:], padding])]))
 
     assert torch.autograd.gradcheck(features, rows, eps=1e-6, atol=1e-6, fast_mode=True)
 
 
 @pytest.mark.parametrize("grouping", ["single_scale", "multi_scale"])
 def test_order_place_size_and_company_of_a_cloud_change_nothing(grouping):
-    made = encoder(grouping=grouping).double()
+    encoder = build_encoder(grouping=grouping).double()
     clouds = [torch.randn(number, 3, dtype=torch.float64) for number in (150, 40, 3)]
-    wanted = made(pad(clouds))
+    wanted = encoder(pad(clouds))
     for index, cloud in enumerate(clouds):
         turned = cloud[torch.randperm(len(cloud))]
         for changed in (turned, cloud + 100, cloud * 3, torch.cat([cloud, cloud.new_full((9, 3), math.nan)])):
-            torch.testing.assert_close(made(changed[None])[0], wanted[index], rtol=1e-9, atol=1e-9)
-        assert torch.equal(made(cloud[None]), made(cloud[None]))
+            torch.testing.assert_close(encoder(changed[None])[0], wanted[index], rtol=1e-9, atol=1e-9)
+        assert torch.equal(encoder(cloud[None]), encoder(cloud[None]))
 
 
 @pytest.mark.parametrize("grouping", ["single_scale", "multi_scale"])
 def test_of_a_lattice_the_order_decides_and_padding_does_not(grouping):
-    made = encoder(grouping=grouping).double()
+    encoder = build_encoder(grouping=grouping).double()
     axis = torch.arange(5, dtype=torch.float64)
     cloud = torch.cartesian_prod(axis, axis, axis)
-    wanted = made(cloud[None])
+    wanted = encoder(cloud[None])
     padded = torch.cat([cloud, cloud.new_full((9, 3), math.nan)])
-    torch.testing.assert_close(made(padded[None]), wanted, rtol=1e-9, atol=1e-9)
-    assert (made(cloud.flip(0)[None]) - wanted).abs().max() > 1e-6  # as the docstring says
+    torch.testing.assert_close(encoder(padded[None]), wanted, rtol=1e-9, atol=1e-9)
+    assert (encoder(cloud.flip(0)[None]) - wanted).abs().max() > 1e-6  # as the docstring says
 
 
 @pytest.mark.parametrize("grouping", ["single_scale", "multi_scale"])
 @pytest.mark.parametrize("number", [5, 19, 150])
 def test_points_that_all_come_twice_change_nothing(grouping, number):
-    """Check duplicated points, which come last in the order and only fill places that would be filled anyway."""
-    made = encoder((300, 3), grouping=grouping).double()
+    """Check duplicated points, which come last in the order and only replace repetitions of a ball's first point."""
+    encoder = build_encoder((300, 3), grouping=grouping).double()
     cloud = torch.randn(number, 3, dtype=torch.float64)
     twice = torch.cat([cloud, cloud[torch.randperm(number)]])
-    torch.testing.assert_close(made(twice[None]), made(cloud[None]), rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(encoder(twice[None]), encoder(cloud[None]), rtol=1e-9, atol=1e-9)
 
 
 def test_points_in_one_place_and_one_point_alone_are_the_same_cloud():
-    made = encoder()
-    found = made(torch.full((1, 150, 3), 4.0))
-    assert torch.isfinite(found).all()
-    torch.testing.assert_close(found, made(torch.zeros(1, 1, 3)))
+    encoder = build_encoder()
+    features = encoder(torch.full((1, 150, 3), 4.0))
+    assert torch.isfinite(features).all()
+    torch.testing.assert_close(features, encoder(torch.zeros(1, 1, 3)))
 
 
 def test_padding_does_not_enter_the_moments_of_batch_norm():
     clouds = [torch.randn(number, 3) for number in (9, 9, 9)]
-    made, other = encoder(), encoder()
-    made.train()(torch.stack(clouds))
+    encoder, other = build_encoder(), build_encoder()
+    encoder.train()(torch.stack(clouds))
     other.train()(torch.cat([torch.stack(clouds), torch.full((3, 5, 3), math.nan)], 1))
-    for name, value in made.state_dict().items():
+    for name, value in encoder.state_dict().items():
         torch.testing.assert_close(other.state_dict()[name], value, msg=name)
 
 
 def test_few_clouds_at_a_time_give_what_all_at_once_give():
-    made = encoder((300, 3), grouping="multi_scale")
+    encoder = build_encoder((300, 3), grouping="multi_scale")
     clouds = pad([torch.randn(number, 3) for number in (300, 20, 21, 10, 299)])
-    whole = made(clouds)
+    whole = encoder(clouds)
     with torch.no_grad():
-        torch.testing.assert_close(made(clouds), whole, rtol=1e-5, atol=1e-6)
-        assert made(clouds[:0]).shape == (0, 32)
+        torch.testing.assert_close(encoder(clouds), whole, rtol=1e-5, atol=1e-6)
+        assert encoder(clouds[:0]).shape == (0, 32)
 
 
 def test_refuses_clouds_for_which_its_balls_mean_nothing():
-    made = encoder(normalise="none", radius=0.2)
+    encoder = build_encoder(normalise="none", radius=0.2)
     clouds = torch.randn(3, 150, 3) / 3
-    assert torch.isfinite(made(clouds)).all()
+    assert torch.isfinite(encoder(clouds)).all()
     clouds[1] *= 100
-    with pytest.raises(DataError, match=r"Cloud 1 of the batch reaches .* encoder pointnet2"):
-        made(clouds)
+    with pytest.raises(DataError, match=r"Cloud 1 of the batch extends to .* encoder pointnet2"):
+        encoder(clouds)
 
 
 def test_refuses_attributes_that_are_not_there():
-    with pytest.raises(ConfigError, match="these have none"):
+    with pytest.raises(ConfigError, match="the clouds have no such columns"):
         PointNet2((100, 3), attributes=True)
 
 
