@@ -15,7 +15,7 @@ from benchmarks.rendering.rasterizer import DISTANCE, FOCAL, HEIGHT, WIDTH, figu
 from benchmarks.rendering.rasterizer_growth import milliseconds, slope
 from framework.configuration.schema import build, resolve
 from framework.geometry.camera import look_from
-from plugins.encoder.projection.encoder import Projection, gathered, project, seen_in_torch
+from plugins.encoder.projection.encoder import Projection, gather_images, project, visible_points_in_torch
 
 RINGS = ((82, 84), (165, 168), (328, 336), (1000, 1000))
 """Bodies of 6,890, 27,722, 110,210 and 1,000,002 points; the thesis has 6,890 and 27,578."""
@@ -41,7 +41,7 @@ def made(levels: int = 1, splat: int = 0) -> Projection:
 
 
 def in_torch(encoder: Projection, clouds: Tensor) -> Tensor:
-    return gathered(clouds, seen_in_torch(clouds, encoder.view), encoder.view)
+    return gather_images(clouds, visible_points_in_torch(clouds, encoder.view), encoder.view)
 
 
 def both_ways(encoder: Projection, clouds: Tensor) -> None:
@@ -50,10 +50,10 @@ def both_ways(encoder: Projection, clouds: Tensor) -> None:
 
 def lowest(calls: list[Callable[[], object]]) -> list[float]:
     """Of each call the lowest of `ROUNDS` medians, all in turn: what else the machine does only adds to them."""
-    found = [math.inf] * len(calls)
+    times = [math.inf] * len(calls)
     for _ in range(ROUNDS):
-        found = [min(known, milliseconds(call)) for known, call in zip(found, calls, strict=True)]
-    return found
+        times = [min(known, milliseconds(call)) for known, call in zip(times, calls, strict=True)]
+    return times
 
 
 def best(call: Callable[[], object], threads: int) -> float:
@@ -82,18 +82,18 @@ def report() -> str:
             assert torch.equal(encoder(cloud), in_torch(encoder, cloud))
             assert torch.equal(encoder(cloud), project(cloud.clone().requires_grad_(), encoder.view).detach())
         ways = [plain, partial(in_torch, plain)]
-        calls = [partial(way, given) for given in (cloud, batch) for way in ways]
+        calls = [partial(way, inputs) for inputs in (cloud, batch) for way in ways]
         calls += [partial(three, cloud), partial(both_ways, plain, cloud), partial(splats, cloud)]
-        one, one_torch, many, many_torch, pyramid, learning, filled = lowest(calls)
-        ours.append(one)
+        compiled, torch_time, many, many_torch, pyramid, learning, filled = lowest(calls)
+        ours.append(compiled)
         rows.append(
-            f"| {cloud.shape[1]:,} | {share:.0%} | {one:.2f} | {one_torch:.1f} | {one_torch / one:.0f} | {many:.2f} | "
+            f"| {cloud.shape[1]:,} | {share:.0%} | {compiled:.2f} | {torch_time:.1f} | {torch_time / compiled:.0f} | {many:.2f} | "
             f"{many_torch:.1f} | {many_torch / many:.0f} | {pyramid:.2f} | {learning:.1f} | {filled:.1f} |"
         )
         single, double = (best(partial(project, batch, plain.view), threads) for threads in (1, 2))
         threaded.append(f"| {cloud.shape[1]:,} | {single:.2f} | {double:.2f} | {single / double:.2f} |")
     counts = [float(cloud.shape[1]) for cloud in clouds]
-    held = ", ".join(
+    targets = ", ".join(
         f"{time:.2f} of {limit} ms at {count:,.0f} points"
         for time, limit, count in zip(ours, TARGETS, counts, strict=False)
     )
@@ -105,7 +105,7 @@ def report() -> str:
             f"lowest of {ROUNDS} medians. The whole encoder is timed, with its check of what comes. In this run all "
             "ways gave the same bits.",
             "",
-            f"Against the targets: {held}.",
+            f"Against the targets: {targets}.",
             "",
             "| points | pixels hit | compiled | torch | ratio | compiled, batch of 8 | torch, batch of 8 | ratio | "
             f"compiled, 3 levels | with gradient, and back | splats of {SPLAT} pixels |",

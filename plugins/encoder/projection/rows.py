@@ -1,4 +1,4 @@
-"""Rows of the contract: one level and several, sizes even and odd, with splats and without."""
+"""Contract-test cases: one level and several, sizes even and odd, with splats and without."""
 
 from typing import Any
 

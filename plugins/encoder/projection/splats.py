@@ -1,7 +1,7 @@
-"""The surface between projected points, computed from the points alone, for networks of neural pixels to refine.
+"""The surface between projected points, computed from the points alone, as input of a network that refines the image.
 
-Splats follow the idea of Zwicker, Pfister, van Baar & Gross, "EWA Splatting", IEEE TVCG 8(3), 2002, in pixels: a pixel
-shows a weighted mean of the points around it that no nearer surface hides.
+Splats follow the idea of Zwicker, Pfister, van Baar & Gross, "EWA Splatting", IEEE TVCG 8(3), 2002, in image space: a
+pixel shows a weighted mean of the points around the pixel that no nearer surface hides.
 """
 
 from functools import cache
@@ -18,14 +18,14 @@ from plugins.encoder.projection import compiled
 CHANNELS = 5
 """Number of channels: red, green, blue and depth of the surface, and the distance to the nearest point."""
 THICK = 4.0
-"""Thickness of a surface, in widths of a pixel: points up to this far behind the nearest surface belong to it."""
+"""Thickness of a surface, in widths of a pixel: points behind the surface within this distance belong to it."""
 LEAST_WIDTH, SHARE = 0.45, 0.6
 """Terms of a splat's standard deviation, pixels: a constant, and a share of the distance to the nearest point."""
 
 
 @cache
 def disc(radius: int) -> np.ndarray:
-    """Return (row, column) of the offsets around a pixel that lie in a disc, row by row, (places, 2)."""
+    """Return (row, column) of the offsets around a pixel that lie in a disc, row by row, (offsets, 2)."""
     side = np.arange(-radius, radius + 1)
     rows, columns = np.meshgrid(side, side, indexing="ij")
     within = rows**2 + columns**2 <= radius * (radius + 1)
@@ -34,99 +34,104 @@ def disc(radius: int) -> np.ndarray:
 
 @cache
 def weights(radius: int) -> np.ndarray:
-    """Return a point's weight, indexed by its squared distance and that of the nearest point, in squared pixels."""
+    """Return the table of a point's weight, indexed by the squared distances of the point and of the nearest point.
+
+    Squared distances are in squared pixels, 0 to radius · (radius + 1).
+    """
     square = np.arange(radius * (radius + 1) + 1)
     width = LEAST_WIDTH + SHARE * np.sqrt(square)
     return np.exp(-square[:, None] / (2 * width**2))
 
 
-def closing(radius: int) -> int:
-    """Return the radius, pixels, of the closing of holes; it closes gaps up to twice this radius."""
+def closing_radius(radius: int) -> int:
+    """Return the radius, pixels, of the morphological closing, which closes gaps up to twice this radius."""
     return (3 * radius + 2) // 5
 
 
-def splatted(
-    pictures: Float[Tensor, "batch 4 height width"], limits: tuple[float, float], focal: float, radius: int
+def compute_surface(
+    images: Float[Tensor, "batch 4 height width"], limits: tuple[float, float], focal: float, radius: int
 ) -> Float[Tensor, "batch 5 height width"]:
-    """Return the surface through the points that the images of `encoder.project` show.
+    """Return images of the surface through the points that the images of `encoder.project` show.
 
-    A cone around each point hides what is behind it. Its depth grows by the width of a pixel with each pixel. The first
-    cone that a pixel meets gives the depth of the surface, and the distance to the nearest of its points. The fifth
-    channel is this distance as a share of radius + 1; it is 1 where no point is within `radius`. The pixel shows the
-    mean of the points of that surface within `radius`. The mean is weighted by a Gaussian, which is wider where the
-    nearest point is farther away. All channels are 1 outside the outline. The outline is that of the points with holes
-    closed (a morphological closing).
+    Each point has a cone of radius `radius` around itself, which hides the points behind the cone. With each pixel of
+    distance from the point, the depth of the cone grows by the width of a pixel. In each pixel, the nearest cone gives
+    the depth of the surface and the distance, in pixels, to the cone's point. The fifth channel is this distance as a
+    share of radius + 1, or 1 if no point is within `radius`. The first four channels are the mean of the points of the
+    surface within `radius`, weighted by a Gaussian that is wider if the cone's point is farther away. They are 1
+    outside the outline of the subject, which is a morphological closing of the pixels that show a point.
 
-    The function is compiled on the CPU if no gradient is wanted; all ways give the same bits. It is differentiable in
-    the channels, not in which points are seen.
+    On the CPU the function is compiled unless a gradient is required. All implementations give the same bits. It is
+    differentiable in the channels of the images, but not in the set of visible points.
 
     Args:
-        pictures: images of `encoder.project` at one level, (batch, 4, height, width).
+        images: images of `encoder.project` at one level, (batch, 4, height, width).
         limits: nearest and farthest depth, metres, at which the fourth channel is 0 and 1.
-        focal: pixels.
-        radius: pixels, 1 or more.
+        focal: focal length, pixels.
+        radius: radius of a splat, pixels, at least 1.
     """
-    if pictures.device.type != "cpu" or (pictures.requires_grad and torch.is_grad_enabled()):
-        return in_torch(pictures, limits, focal, radius)
-    found = pictures.new_empty(len(pictures), CHANNELS, *pictures.shape[2:])
-    given, filled = pictures.detach().contiguous().numpy(), found.numpy()
+    if images.device.type != "cpu" or (images.requires_grad and torch.is_grad_enabled()):
+        return compute_surface_in_torch(images, limits, focal, radius)
+    surfaces = images.new_empty(len(images), CHANNELS, *images.shape[2:])
+    arrays, filled = images.detach().contiguous().numpy(), surfaces.numpy()
     nearest, farthest = limits
 
     def draw(number: int) -> None:
         compiled.splat(
-            given[number],
+            arrays[number],
             nearest,
             farthest - nearest,
             focal,
             THICK,
             disc(radius),
-            disc(closing(radius)),
+            disc(closing_radius(radius)),
             weights(radius),
             filled[number],
         )
 
-    POOL.share(draw, len(given), torch.get_num_threads())
-    return found
+    POOL.share(draw, len(arrays), torch.get_num_threads())
+    return surfaces
 
 
-def in_torch(pictures: Tensor, limits: tuple[float, float], focal: float, radius: int) -> Tensor:
-    """Return the result of `splatted` by operations on tensors, on any device."""
+def compute_surface_in_torch(
+    images: Tensor, limits: tuple[float, float], focal: float, radius: int
+) -> Tensor:
+    """Return the result of `compute_surface` by operations on tensors, on any device."""
     nearest, farthest = limits
-    height, width = pictures.shape[2:]
-    seen = pictures[:, 3] < 1
-    numbers = pictures.double()
-    depth = (nearest + (farthest - nearest) * numbers[:, 3]).detach().where(seen, torch.inf)
+    height, width = images.shape[2:]
+    shown = images[:, 3] < 1
+    numbers = images.double()
+    depth = (nearest + (farthest - nearest) * numbers[:, 3]).detach().where(shown, torch.inf)
 
-    def moved(maps: Tensor, place: np.ndarray, beyond: float) -> Tensor:
-        """Return the maps shifted so that each pixel holds the value at the offset `place` from it."""
-        row, column = (int(each) + radius for each in place)
+    def shift(maps: Tensor, offset: np.ndarray, beyond: float) -> Tensor:
+        """Return the maps shifted so that each pixel has the value of the pixel at `offset` from it."""
+        row, column = (int(component) + radius for component in offset)
         wide = functional.pad(maps, (radius,) * 4, value=beyond)
         return wide[..., row : row + height, column : column + width]
 
     first = torch.full_like(depth, torch.inf)
     square = torch.full_like(depth, radius * (radius + 1) + 1)
-    for place in disc(radius):
-        away = int((place**2).sum())
-        cone = moved(depth, place, torch.inf) * (1 + away**0.5 / focal)
-        ahead = (cone < first) | ((cone == first) & (away < square))
-        first, square = cone.where(ahead, first), square.where(~ahead, away)
+    for offset in disc(radius):
+        squared_distance = int((offset**2).sum())
+        cone = shift(depth, offset, torch.inf) * (1 + squared_distance**0.5 / focal)
+        ahead = (cone < first) | ((cone == first) & (squared_distance < square))
+        first, square = cone.where(ahead, first), square.where(~ahead, squared_distance)
     reached = first < torch.inf
     behind = first * (1 + THICK / focal)
     table = torch.from_numpy(weights(radius)).to(depth.device)
     own = square.long().clamp(max=radius * (radius + 1))
     total, mass = torch.zeros_like(numbers), torch.zeros_like(depth)
-    for place in disc(radius):
-        one = table[int((place**2).sum())][own].where(moved(depth, place, torch.inf) < behind, 0.0)
-        total = total + one[:, None] * moved(numbers, place, 0.0)
-        mass = mass + one
-    near = torch.zeros_like(seen)
-    for place in disc(closing(radius)):
-        near = near | (moved(seen.double(), place, 0.0) > 0)
+    for offset in disc(radius):
+        weight = table[int((offset**2).sum())][own].where(shift(depth, offset, torch.inf) < behind, 0.0)
+        total = total + weight[:, None] * shift(numbers, offset, 0.0)
+        mass = mass + weight
+    near = torch.zeros_like(shown)
+    for offset in disc(closing_radius(radius)):
+        near = near | (shift(shown.double(), offset, 0.0) > 0)
     inside = near
-    for place in disc(closing(radius)):
-        inside = inside & (moved(near.double(), place, 1.0) > 0)
+    for offset in disc(closing_radius(radius)):
+        inside = inside & (shift(near.double(), offset, 1.0) > 0)
     surface = (total / mass.where(inside, 1.0)[:, None]).where(inside[:, None], 1.0)
-    # not `square.sqrt()`: torch calls MKL's square root, which errs in the last bit on some processors
+    # not `square.sqrt()`, because torch calls MKL's square root, whose last bit is wrong on some processors
     roots = torch.from_numpy(np.sqrt(np.arange(radius * (radius + 1) + 2))).to(depth.device)
     distance = (roots[square.long()] / (radius + 1)).where(reached, 1.0)
-    return torch.cat([surface, distance[:, None]], 1).to(pictures.dtype)
+    return torch.cat([surface, distance[:, None]], 1).to(images.dtype)

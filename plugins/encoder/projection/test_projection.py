@@ -15,12 +15,12 @@ from framework.errors import ConfigError, DataError
 from framework.geometry.camera import Camera
 from framework.geometry.clouds import pad
 from framework.geometry.rotation import viewpoint_rotation
-from plugins.encoder.projection.encoder import View, gathered, project, seen_in_torch
+from plugins.encoder.projection.encoder import CameraView, gather_images, project, visible_points_in_torch
 
 LIMITS = (1.0, 5.0)
 
 
-def encoder(shape=(40, 6), columns=(), **config):
+def build_encoder(shape=(40, 6), columns=(), **config):
     return build(
         "encoder",
         resolve("encoder", {"name": "projection", **config}),
@@ -29,19 +29,19 @@ def encoder(shape=(40, 6), columns=(), **config):
     )
 
 
-def every_way(clouds: Tensor, view: View) -> list[Tensor]:
-    """Return the results of one compiled pass, of an index for the gradient, and of plain torch."""
+def every_way(clouds: Tensor, view: CameraView) -> list[Tensor]:
+    """Return the images of the compiled single pass, of the compiled index with a gradient, and of torch operations."""
     return [
         project(clouds, view),
         project(clouds.clone().requires_grad_(), view).detach(),
-        gathered(clouds, seen_in_torch(clouds, view), view),
+        gather_images(clouds, visible_points_in_torch(clouds, view), view),
     ]
 
 
-def by_hand(cloud: list[list[float]], view: View, kind: type) -> np.ndarray:
-    """Project each point of each level on its own, with that level's camera: u' = (u + 1/2) / 2^level - 1/2."""
+def by_hand(cloud: list[list[float]], view: CameraView, kind: type) -> np.ndarray:
+    """Return the image by a loop over points, with the camera of each level: u' = (u + 1/2) / 2^level - 1/2."""
     nearest, farthest = view.limits
-    picture = np.ones((4 * view.levels, view.height, view.width), kind)
+    image = np.ones((4 * view.levels, view.height, view.width), kind)
     for level in range(view.levels):
         best: dict[tuple[int, int], np.float32] = {}
         for x, y, z, red, green, blue in cloud:
@@ -57,8 +57,8 @@ def by_hand(cloud: list[list[float]], view: View, kind: type) -> np.ndarray:
                 rows, columns = (slice(2**level * start, 2**level * (start + 1)) for start in place)
                 shown = (red, green, blue, (z - nearest) / (farthest - nearest))
                 for channel, number in enumerate(shown, start=4 * level):
-                    picture[channel, rows, columns] = kind(number)
-    return picture
+                    image[channel, rows, columns] = kind(number)
+    return image
 
 
 DEPTHS = [2.0] * 24 + [2.0 + 1e-12] * 12 + [1.0, 3.7, 4.999999, 5.0, 0.999999, 0.0, -2.0, 1e-45, 1e30, 3e38]
@@ -68,11 +68,11 @@ PARTS, SCENES = 5, 8
 """Number of bytes that describe a point, and number of scenes in a batch; bytes are drawn faster than numbers."""
 
 
-def cloud_of(said: bytes, height: int, width: int, kind: type) -> np.ndarray:
-    """Return points behind, beyond, on edges of pixels and image, equally far, several in a pixel, not finite."""
-    cloud = np.ones((len(said) // PARTS, 6))
+def cloud_of(bytes_of_points: bytes, height: int, width: int, kind: type) -> np.ndarray:
+    """Return points decoded from bytes: behind the camera, too far, on edges of pixels, equally far or not finite."""
+    cloud = np.ones((len(bytes_of_points) // PARTS, 6))
     for point in range(len(cloud)):
-        across, down, depth, stray, no_color = said[PARTS * point : PARTS * (point + 1)]
+        across, down, depth, stray, no_color = bytes_of_points[PARTS * point : PARTS * (point + 1)]
         z = DEPTHS[depth % len(DEPTHS)]
         # in half pixels, from before the image's edge to beyond it: on pixel centres and between them
         cloud[point, 0] = (across % (2 * width + 2) - 1 - width) / 2 * z / height + STRAY[stray % len(STRAY)]
@@ -91,17 +91,17 @@ def cloud_of(said: bytes, height: int, width: int, kind: type) -> np.ndarray:
     st.integers(1, 3),
     st.sampled_from([np.float32, np.float64]),
 )
-def test_projections_are_those_of_a_loop_over_points(said, height, width, levels, kind):
-    clouds = [cloud_of(one, height, width, kind) for one in said]
-    view = View(height, width, LIMITS, levels)
+def test_projections_are_those_of_a_loop_over_points(bytes_of_points, height, width, levels, kind):
+    clouds = [cloud_of(points, height, width, kind) for points in bytes_of_points]
+    view = CameraView(height, width, LIMITS, levels)
     wanted = np.stack([by_hand(cloud.tolist(), view, kind) for cloud in clouds])
-    for found in every_way(pad([torch.from_numpy(cloud) for cloud in clouds]), view):
-        np.testing.assert_array_equal(found.numpy(), wanted)
+    for images in every_way(pad([torch.from_numpy(cloud) for cloud in clouds]), view):
+        np.testing.assert_array_equal(images.numpy(), wanted)
 
 
 @pytest.mark.parametrize("size", [(33, 21), (8, 12), (1, 1)])
 def test_float32_points_are_seen_where_exact_fractions_say(size):
-    """Check points on edges of pixels, and one rounding to either side of them."""
+    """Check points on edges of pixels, and the neighbouring float32 numbers on either side."""
     (height, width), count = size, 400
     generator = torch.Generator().manual_seed(0)
     depth = 1 + 4 * torch.rand(count, generator=generator)
@@ -113,12 +113,12 @@ def test_float32_points_are_seen_where_exact_fractions_say(size):
     rest = torch.tensor([0.25, 0.5, 0.75]).expand(count, 3)
     clouds = torch.cat([torch.stack([across, torch.zeros(count), depth], 1), rest], 1)[:, None]
     wanted = torch.ones(count, height, width)
-    for picture, x, z in zip(wanted, across.tolist(), depth.tolist(), strict=True):
+    for image, x, z in zip(wanted, across.tolist(), depth.tolist(), strict=True):
         column = math.floor(Fraction(x) * height / Fraction(z) + Fraction(width, 2))
         if 0 <= column < width:
-            picture[height // 2, column] = 0.25
-    for found in every_way(clouds, View(height, width, LIMITS)):
-        assert torch.equal(found[:, 0], wanted)
+            image[height // 2, column] = 0.25
+    for images in every_way(clouds, CameraView(height, width, LIMITS)):
+        assert torch.equal(images[:, 0], wanted)
 
 
 @pytest.mark.parametrize("same", [False, True])
@@ -127,13 +127,13 @@ def test_of_thousands_in_one_pixel_the_nearest_is_seen_and_of_equally_near_ones_
     clouds = torch.rand(2, 20_000, 6, generator=generator)
     clouds[..., :2] *= 1e-3
     clouds[..., 2] = 2.0 if same else (1.5 + clouds[..., 2]).mul(100).round() / 100
-    view = View(5, 5, LIMITS, levels=2)
-    for found in every_way(clouds, view):
-        for picture, cloud in zip(found, clouds, strict=True):
+    view = CameraView(5, 5, LIMITS, levels=2)
+    for images in every_way(clouds, view):
+        for image, cloud in zip(images, clouds, strict=True):
             first = int(cloud[:, 2].min(0).values.eq(cloud[:, 2]).nonzero()[0])
-            assert torch.equal(picture[:3, 2, 2], cloud[first, 3:])
-            assert torch.equal(picture[4:7, 2:4, 2:4], cloud[first, 3:, None, None].expand(3, 2, 2))
-            assert (picture[:4] < 1).any(0).sum() == 1
+            assert torch.equal(image[:3, 2, 2], cloud[first, 3:])
+            assert torch.equal(image[4:7, 2:4, 2:4], cloud[first, 3:, None, None].expand(3, 2, 2))
+            assert (image[:4] < 1).any(0).sum() == 1
 
 
 def test_a_camera_sees_points_where_the_encoder_shows_its_canonical_points():
@@ -146,15 +146,15 @@ def test_a_camera_sees_points_where_the_encoder_shows_its_canonical_points():
     for _ in range(40):
         height, width = (int(side) for side in 5 + 60 * some(2))
         focal, principal = height * (0.5 + some(2)), torch.tensor([width, height]) * some(2)
-        turned = viewpoint_rotation(some(3) - 0.5)
-        camera = Camera(turned, torch.tensor([0.0, 0, 3]), focal, principal, height, width)
+        rotation = viewpoint_rotation(some(3) - 0.5)
+        camera = Camera(rotation, torch.tensor([0.0, 0, 3]), focal, principal, height, width)
         world, color = 2 * some(30, 3) - 1, some(30, 3)
         pixels, depth = camera.project(world)
         clear = ((pixels - pixels.floor() - 0.5).abs() > 1e-6).all(
             1
         )  # away from edges, where rounding may decide
         world, color, pixels, depth = world[clear], color[clear], pixels[clear].round().long(), depth[clear]
-        found = encoder((30, 6), height=height, width=width)(
+        image = build_encoder((30, 6), height=height, width=width)(
             torch.cat([camera.to_canonical(world), color], 1)[None]
         )[0]
         wanted = torch.ones(4, height, width, dtype=torch.float64)
@@ -163,7 +163,7 @@ def test_a_camera_sees_points_where_the_encoder_shows_its_canonical_points():
             if 1 <= depth[number] < 5 and 0 <= column < width and 0 <= row < height:
                 wanted[:, row, column] = torch.cat([color[number], (depth[number, None] - 1) / 4])
                 compared += 1
-        torch.testing.assert_close(found, wanted, rtol=1e-12, atol=0)
+        torch.testing.assert_close(image, wanted, rtol=1e-12, atol=0)
     assert compared > 300
 
 
@@ -175,21 +175,21 @@ def test_the_gradient_is_that_of_colours_and_depths_of_what_is_seen(levels):
     clouds[..., 2] = 0.5 + 5 * clouds[..., 2]
     clouds[1, 40:] = math.nan
     clouds.requires_grad_()
-    view = View(9, 7, LIMITS, levels)
-    picture = project(clouds, view)
-    weights = torch.rand(picture.shape, generator=generator, dtype=torch.float64)
-    (found,) = torch.autograd.grad((weights * picture).sum(), clouds)
+    view = CameraView(9, 7, LIMITS, levels)
+    image = project(clouds, view)
+    weights = torch.rand(image.shape, generator=generator, dtype=torch.float64)
+    (gradient,) = torch.autograd.grad((weights * image).sum(), clouds)
     wanted = torch.zeros_like(clouds)
     for level in range(levels):
-        index = seen_in_torch(clouds, View(9, 7, LIMITS, levels))[level]
+        index = visible_points_in_torch(clouds, CameraView(9, 7, LIMITS, levels))[level]
         for cloud, row, column in np.ndindex(2, 9, 7):
             point = index[cloud, row >> level, column >> level]
             if point >= 0:
                 along = weights[cloud, 4 * level : 4 * level + 4, row, column]
                 wanted[cloud, point, 3:6] += along[:3]
                 wanted[cloud, point, 2] += along[3] / 4
-    torch.testing.assert_close(found, wanted, rtol=1e-12, atol=0)
-    assert not found[..., :2].any() and not found[1, 40:].any() and found[..., 2:6].any()
+    torch.testing.assert_close(gradient, wanted, rtol=1e-12, atol=0)
+    assert not gradient[..., :2].any() and not gradient[1, 40:].any() and gradient[..., 2:6].any()
 
 
 def test_clouds_of_a_batch_are_those_alone_on_any_number_of_threads():
@@ -197,37 +197,37 @@ def test_clouds_of_a_batch_are_those_alone_on_any_number_of_threads():
     clouds = [torch.randn(count, 6, generator=generator) + 2 for count in (300, 1, 0, 77, 200, 9, 300)]
     batch, before = pad(clouds), torch.get_num_threads()
     for levels in (1, 2):
-        view = View(40, 31, (0.5, 4.0), levels)
+        view = CameraView(40, 31, (0.5, 4.0), levels)
         wanted = torch.cat([project(cloud[None], view) for cloud in clouds])
         assert (wanted < 1).any()
         try:
             for threads in (1, 2, 3):
                 torch.set_num_threads(threads)
-                assert all(torch.equal(found, wanted) for found in every_way(batch, view))
+                assert all(torch.equal(images, wanted) for images in every_way(batch, view))
         finally:
             torch.set_num_threads(before)
         assert torch.equal(project(batch.mT.contiguous().mT, view), wanted)  # strides
 
 
 def test_what_cannot_be_projected_is_refused_and_nothing_in_view_is_the_background():
-    with pytest.raises(ConfigError, match=r"shape \(40, 5\); wanted clouds.*x, y, z, red, green, blue"):
-        encoder((40, 5))
+    with pytest.raises(ConfigError, match=r"shape \(40, 5\), but clouds.*x, y, z, red, green, blue"):
+        build_encoder((40, 5))
     with pytest.raises(ConfigError, match="columns x, y, z, normal_x"):
-        encoder((40, 6), ("x", "y", "z", "normal_x", "normal_y", "normal_z"))
-    with pytest.raises(ConfigError, match="nearest=3 and farthest=3; wanted nearest below"):
-        encoder(nearest=3.0, farthest=3.0)
+        build_encoder((40, 6), ("x", "y", "z", "normal_x", "normal_y", "normal_z"))
+    with pytest.raises(ConfigError, match="nearest=3 and farthest=3, but nearest must be smaller"):
+        build_encoder(nearest=3.0, farthest=3.0)
     for config in ({"height": 0}, {"width": 0}, {"nearest": 0.0}, {"farthest": math.inf}, {"levels": 0}):
         with pytest.raises(ConfigError, match=r"encoder\."):
-            encoder(**config)
-    made = encoder(height=4, width=6)
-    with pytest.raises(DataError, match=r"\(1, 2, 5\); wanted .*red, green, blue"):
-        made(torch.zeros(1, 2, 5))
-    with pytest.raises(DataError, match=r"Cloud 0 .*column 4 of its point 1"):
-        made(torch.tensor([[[0.0, 0, 2, 0, 0, 0], [0, 0, 2, 0, math.inf, 0]]]))
+            build_encoder(**config)
+    encoder = build_encoder(height=4, width=6)
+    with pytest.raises(DataError, match=r"\(1, 2, 5\), but .*red, green, blue"):
+        encoder(torch.zeros(1, 2, 5))
+    with pytest.raises(DataError, match=r"Cloud 0 .*column 4 of point 1"):
+        encoder(torch.tensor([[[0.0, 0, 2, 0, 0, 0], [0, 0, 2, 0, math.inf, 0]]]))
     behind = torch.tensor([[[0.0, 0, -2, 0, 0, 0], [0, 0, 0, 0, 0, 0], [9, 0, 2, 0, 0, 0]]])
-    for found in (made(behind), *every_way(behind[:, :0], made.view)):
-        assert torch.equal(found, torch.ones(1, 4, 4, 6))
-    assert made.fixed and not made.state_dict() and made(behind[:0]).shape == (0, 4, 4, 6)
+    for images in (encoder(behind), *every_way(behind[:, :0], encoder.view)):
+        assert torch.equal(images, torch.ones(1, 4, 4, 6))
+    assert encoder.fixed and not encoder.state_dict() and encoder(behind[:0]).shape == (0, 4, 4, 6)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
@@ -236,5 +236,5 @@ def test_a_gpu_shows_the_same_bits(dtype):
     generator = torch.Generator().manual_seed(0)
     clouds = torch.randn(3, 100_000, 6, generator=generator, dtype=dtype) + 2
     clouds[1, 5000:] = math.nan
-    view = View(410, 308, LIMITS, 4)
+    view = CameraView(410, 308, LIMITS, 4)
     assert torch.equal(project(clouds.cuda(), view).cpu(), project(clouds, view))
