@@ -1,4 +1,4 @@
-"""Input and output of a U-Net: reading images, restricting computation to the subject's box, forming colours."""
+"""Input and output of a U-Net: reading images, restricting computation to the subject's box, computing colours."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -10,27 +10,28 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from framework.errors import ConfigError
-from plugins.encoder.unets.layers import Layer, Step, convolved
+from plugins.encoder.unets.layers import Layer, Step, convolve
 
 Precision = Literal["auto", "float32", "bfloat16"]
 
 
 WHITE = 6.0
-"""Slope of the colours, which are sigmoid(WHITE (1 + raw)).
+"""Factor in the colours sigmoid(WHITE (1 + raw)), where raw is the output of the last convolution.
 
-A raw 0 is white but for 0.6 of 255, -1 is grey, -2 black. An empty image is therefore white from the start, also in
-regions where training sees nothing because they are far from a subject. A colour leaves white in steps of usual size.
+A raw output of 0 is white up to 0.6 of 255, -1 is grey, -2 is black. An empty image is therefore white before training,
+also in regions far from a subject, from which training learns nothing. Steps of usual size change a colour away from
+white.
 """
 EMPTY_LOG_SCALE = -5.0
-"""Initial value of the logarithms of scales: a scale of 0.007, near the error of that white.
+"""Initial value of the logarithms of scales: a scale of 0.007, near the error of an untrained network's white.
 
-The reason is the one for `WHITE`: outside the subject's box evaluation returns the bias alone, which training hardly
-changes, and exp(0) would be the whole range of colours.
+Outside the subject's box evaluation returns the bias of the last convolution. Training hardly changes this bias, and a
+bias of 0 would be a scale of 1, the whole range of colours.
 """
 
 
 class Box(NamedTuple):
-    """A box with rows from `top` to before `bottom`, columns from `left` to before `right`."""
+    """A box of pixels: rows from `top` up to but not including `bottom`, columns from `left` up to but not `right`."""
 
     top: int
     bottom: int
@@ -39,14 +40,14 @@ class Box(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Report:
-    """The areas that were computed of a batch of images.
+class CropReport:
+    """The areas of a batch of images that a cropped evaluation computed.
 
     Attributes:
-        boxes: the area of each image that the network ran on, None if the image is empty; a box may end beyond the
-            border, at a multiple of the network's stride.
-        computed: number of pixels in the boxes.
-        left_out: number of pixels of the images outside the boxes; they have the value for an empty image.
+        boxes: box of each image that the network computed, or None for an empty image; a box may end beyond the border
+            of the image, at a multiple of the network's stride.
+        computed: number of pixels in all boxes.
+        left_out: number of pixels of the images outside the boxes; their output is that of an empty image.
     """
 
     boxes: tuple[Box | None, ...]
@@ -55,7 +56,7 @@ class Report:
 
 
 Maps = Callable[[Tensor, Iterator[Step]], Tensor]
-"""Function of images and layers that returns the maps that the head reads.
+"""Function of images and layers that returns the maps that the last convolution reads.
 
 The images are differences from the empty ground, and their sides are multiples of the stride.
 """
@@ -66,12 +67,12 @@ class Canvas:
     """Settings of a U-Net's input and output: colours, padding, crop, precision and unshuffling.
 
     Attributes:
-        colors: number of outputs that are colours; the others stay raw.
-        stride: pixels; the sides of the images that a network reads are multiples of it. Images are padded with empty
-            ground to the next multiple.
+        colors: number of first outputs that are colours; the other outputs stay raw.
+        stride: number of pixels. The network reads images whose sides are multiples of this number; other images are
+            padded with empty ground.
         crop: margin around the subject's box, pixels; None computes everything.
         precision: precision of evaluation, for float32 weights.
-        shuffle: side, pixels, of the squares for which the head predicts all values at once.
+        shuffle: side, pixels, of the squares whose values the last convolution returns as channels.
         residual: whether colours are the sum of the input's first channels and the network's output.
     """
 
@@ -82,80 +83,87 @@ class Canvas:
     shuffle: int = 1
     residual: bool = False
 
-    def painted(
+    def compute(
         self,
         inputs: Shaped[Tensor, "batch channels height width"],
         maps: Maps,
         layers: nn.ModuleList,
         head: nn.Conv2d,
         training: bool,
-    ) -> tuple[Float[Tensor, "batch outputs height width"], Report | None]:
-        """Return the outputs of the network, and the report of a cropped evaluation, None otherwise.
+    ) -> tuple[Float[Tensor, "batch outputs height width"], CropReport | None]:
+        """Return the outputs of the network, and the report of a cropped evaluation, or None without a crop.
 
-        In evaluation normalisation is folded into the convolutions in every call. That costs less than to check that no
-        weight has changed.
+        In evaluation, each call folds the normalisation into the convolutions again. This costs less than checking
+        whether a weight has changed.
+
+        Args:
+            inputs: images; integers are divided by 255.
+            maps: function that returns the maps that `head` reads.
+            layers: layers of the network, in the order in which `maps` uses them.
+            head: last convolution.
+            training: whether the network is in training; everything is then computed.
         """
         weight, bias = head.weight, head.bias
         assert bias is not None
         if not len(inputs):
             outputs = head.out_channels // self.shuffle**2
             return weight.new_zeros(0, outputs, *inputs.shape[2:]), None
-        pictures = inputs.to(weight.dtype)
+        images = inputs.to(weight.dtype)
         if not inputs.is_floating_point():
-            pictures = pictures / 255
-        pictures = pictures - 1
-        kind = weight.dtype if training else self._kind(weight)
+            images = images / 255
+        images = images - 1
+        dtype = weight.dtype if training else self._evaluation_dtype(weight)
         steps: list[Step] = [
-            layer if training else layer.folded(kind) for layer in layers if isinstance(layer, Layer)
+            layer if training else layer.fold(dtype) for layer in layers if isinstance(layer, Layer)
         ]
-        head_weight, head_bias = weight.to(kind), bias.to(kind)
+        head_weight, head_bias = weight.to(dtype), bias.to(dtype)
 
-        def answer(pictures: Tensor) -> Tensor:
-            height, width = pictures.shape[2:]
-            whole = functional.pad(pictures.to(kind), (0, -width % self.stride, 0, -height % self.stride))
-            raw = convolved(maps(whole, iter(steps)), head_weight, head_bias)
-            answers = functional.pixel_shuffle(raw, self.shuffle)[..., :height, :width].to(weight)
-            return self._colored(answers, pictures)
+        def evaluate(images: Tensor) -> Tensor:
+            height, width = images.shape[2:]
+            whole = functional.pad(images.to(dtype), (0, -width % self.stride, 0, -height % self.stride))
+            raw = convolve(maps(whole, iter(steps)), head_weight, head_bias)
+            raw_outputs = functional.pixel_shuffle(raw, self.shuffle)[..., :height, :width].to(weight)
+            return self._color(raw_outputs, images)
 
         if training or self.crop is None:
-            return answer(pictures), None
+            return evaluate(images), None
         empty = functional.pixel_shuffle(head_bias[None, :, None, None], self.shuffle)
-        boxes = tuple(subject(picture, self.stride, self.crop) for picture in pictures)
-        ground = pictures.new_zeros(1, pictures.shape[1], *empty.shape[2:])
-        return self._in_boxes(pictures, boxes, answer, self._colored(empty.to(weight), ground))
+        boxes = tuple(subject_box(image, self.stride, self.crop) for image in images)
+        ground = images.new_zeros(1, images.shape[1], *empty.shape[2:])
+        return self._in_boxes(images, boxes, evaluate, self._color(empty.to(weight), ground))
 
     def _in_boxes(
-        self, pictures: Tensor, boxes: tuple[Box | None, ...], answer: Step, empty: Tensor
-    ) -> tuple[Tensor, Report]:
-        """Return the outputs and the report, one box at a time, so that no image depends on the rest of the batch."""
-        count, _, height, width = pictures.shape
+        self, images: Tensor, boxes: tuple[Box | None, ...], evaluate: Step, empty: Tensor
+    ) -> tuple[Tensor, CropReport]:
+        """Return outputs and report, computed one box at a time, so that no image depends on the rest of the batch."""
+        count, _, height, width = images.shape
         side = empty.shape[-1]
-        answers = empty.new_empty(count, empty.shape[1], height, width)
+        outputs = empty.new_empty(count, empty.shape[1], height, width)
         for row in range(min(side, height)):
             line = empty[:, :, row : row + 1].repeat(1, 1, 1, -(-width // side))
-            answers[:, :, row::side] = line[..., :width]
+            outputs[:, :, row::side] = line[..., :width]
         computed, left_out = 0, count * height * width
         for index, box in enumerate(boxes):
             if box is None:
                 continue
             rows, columns = slice(box.top, box.bottom), slice(box.left, box.right)
-            found = answer(pictures[index : index + 1, :, rows, columns])[0]
-            answers[index, :, rows, columns] = found
+            part = evaluate(images[index : index + 1, :, rows, columns])[0]
+            outputs[index, :, rows, columns] = part
             computed += (box.bottom - box.top) * (box.right - box.left)
-            left_out -= found[0].numel()
-        return answers, Report(boxes, computed, left_out)
+            left_out -= part[0].numel()
+        return outputs, CropReport(boxes, computed, left_out)
 
-    def _colored(self, raw: Tensor, pictures: Tensor) -> Tensor:
-        """Return colours and raw scales from the network's output and the images (as differences from empty ground)."""
+    def _color(self, raw: Tensor, images: Tensor) -> Tensor:
+        """Return colours and raw scales from the network's output and the images, which are differences from 1."""
         if self.residual:
             # Colours may lie a little beyond [0, 1]. They are not clamped: a clamped colour that should become darker
             # than its input would have no gradient.
-            colors = 1 + pictures[:, : self.colors] + raw[:, : self.colors]
+            colors = 1 + images[:, : self.colors] + raw[:, : self.colors]
         else:
             colors = (WHITE + WHITE * raw[:, : self.colors]).sigmoid()
         return colors if raw.shape[1] == self.colors else torch.cat([colors, raw[:, self.colors :]], 1)
 
-    def _kind(self, weight: Tensor) -> torch.dtype:
+    def _evaluation_dtype(self, weight: Tensor) -> torch.dtype:
         """Return the dtype in which evaluation computes."""
         if weight.dtype != torch.float32 or self.precision == "float32":
             return weight.dtype
@@ -171,37 +179,40 @@ def fast_bfloat16(device: torch.device) -> bool:
     return torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported()
 
 
-def subject(picture: Float[Tensor, "channels height width"], stride: int, margin: int) -> Box | None:
-    """Return the box of the pixels that are not empty (0 in every channel), with a margin, widened to whole strides."""
-    most = picture.detach().abs().amax(0)  # NaN where any channel is NaN
+def subject_box(image: Float[Tensor, "channels height width"], stride: int, margin: int) -> Box | None:
+    """Return the box around the pixels that are not 0 in every channel, or None if there are none.
+
+    The box is widened by `margin` pixels within the image, then to multiples of `stride`.
+    """
+    magnitude = image.detach().abs().amax(0)  # NaN where any channel is NaN
     ends: list[int] = []
-    for line in (most.amax(1), most.amax(0)):
-        where = line.nonzero()
-        if len(where) == 0:
+    for line in (magnitude.amax(1), magnitude.amax(0)):
+        positions = line.nonzero()
+        if len(positions) == 0:
             return None
-        first, last = int(where[0]) - margin, int(where[-1]) + 1 + margin
+        first, last = int(positions[0]) - margin, int(positions[-1]) + 1 + margin
         ends += [max(0, first // stride * stride), -(-min(last, len(line)) // stride) * stride]
     return Box(*ends)
 
 
-def head(
-    channels: int, size: int, colors: int, scales: int, places: int = 1, *, residual: bool = False
+def build_head(
+    channels: int, size: int, colors: int, scales: int, pixels: int = 1, *, residual: bool = False
 ) -> nn.Conv2d:
-    """Return the last convolution, from maps to colours and scales at `places` pixels of each position.
+    """Return the last convolution, from maps to the colours and scales of `pixels` pixels at each position.
 
-    Before training its output for an empty image is 0, and EMPTY_LOG_SCALE for scales. With `residual` its output is
-    then the same for any image.
+    Before training, its output for an empty image is 0 for colours and EMPTY_LOG_SCALE for scales. With `residual`,
+    this is its output for every image before training.
     """
-    made = nn.Conv2d(channels, (colors + scales) * places, size)
-    assert made.bias is not None
-    nn.init.zeros_(made.bias)
-    nn.init.constant_(made.bias[colors * places :], EMPTY_LOG_SCALE)
+    convolution = nn.Conv2d(channels, (colors + scales) * pixels, size)
+    assert convolution.bias is not None
+    nn.init.zeros_(convolution.bias)
+    nn.init.constant_(convolution.bias[colors * pixels :], EMPTY_LOG_SCALE)
     if residual:
-        nn.init.zeros_(made.weight)
-    return made
+        nn.init.zeros_(convolution.weight)
+    return convolution
 
 
-def require_pictures(
+def require_images(
     name: str, input_shape: tuple[int, ...], normalisation: str, crop: int | None, least: int = 1
 ) -> None:
     """Require images with enough channels, and compatible settings of crop and normalisation.
@@ -209,25 +220,26 @@ def require_pictures(
     Args:
         name: name of the encoder, for messages.
         input_shape: (channels, height, width).
-        normalisation: as of `unet.UNet`.
-        crop: as of `unet.UNet`.
-        least: smallest number of channels of the input.
+        normalisation: as in `unet.UNet`.
+        crop: as in `unet.UNet`.
+        least: smallest allowed number of channels of the input.
 
     Raises:
         ConfigError: the input is no image, or has too few channels, or crop and normalisation exclude each other.
     """
     if len(input_shape) != 3 or min(input_shape) < 1:
         raise ConfigError(
-            f"{name} reads images of shape (channels, height, width), one pixel at least; this input has the shape "
-            f"{input_shape}. Choose another encoder for it, or put one before it that makes an image."
+            f"{name} reads images of shape (channels, height, width) with at least one pixel, but got an input of "
+            f"shape {input_shape}. Choose another encoder for this input, or put one before {name} that returns an "
+            "image."
         )
     if input_shape[0] < least:
         raise ConfigError(
-            f"encoder.{name}.residual adds to {least} colours of its input, which has {input_shape[0]} channels. Set "
-            "residual=false, or put an encoder before it that draws colours."
+            f"encoder.{name}.residual=true adds to {least} colours of the input, but the input has {input_shape[0]} "
+            f"channels. Set residual=false, or put an encoder before {name} that returns colours."
         )
     if normalisation == "group" and crop is not None:
         raise ConfigError(
-            f"encoder.{name}.normalisation=group normalises by all of a picture, and crop={crop} computes a part "
-            "of it: the colours would depend on the box. Set crop=null, or normalisation=renorm."
+            f"encoder.{name}.normalisation=group normalises by the whole image, but crop={crop} computes only a part "
+            "of the image, so that the colours would depend on this part. Set crop=null, or normalisation=renorm."
         )

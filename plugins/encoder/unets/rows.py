@@ -1,4 +1,4 @@
-"""Rows of the contract: sizes even and odd, every normalisation, with and without crop."""
+"""Contract-test cases: sizes even and odd, every normalisation, with and without crop."""
 
 from framework.testing.rows import EncoderRow
 

@@ -1,4 +1,4 @@
-"""A U-Net made for processors: few pixels, dense 3×3 convolutions, channels in whole vectors."""
+"""A U-Net for CPUs: few pixels, dense 3×3 convolutions, and numbers of channels that fill vector registers."""
 
 from collections.abc import Iterator
 from itertools import pairwise
@@ -11,28 +11,30 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from framework.encoder import Encoder
-from plugins.encoder.unets.canvas import Canvas, Precision, Report, head, require_pictures
+from plugins.encoder.unets.canvas import Canvas, CropReport, Precision, build_head, require_images
 from plugins.encoder.unets.layers import Layer, Normalisation, Step
 
 Channels = Annotated[int, Field(gt=0)]
 
 
 class Slim(Encoder):
-    """A small U-Net that first folds squares of `unshuffle`² pixels into channels (Shi et al. 2016, in reverse).
+    """A small U-Net that first rearranges squares of `unshuffle`² pixels as channels (the inverse of Shi et al. 2016).
 
-    Each level has one 3×3 convolution on the way down and one on the way up. A 2×2 convolution of stride 2 leads down.
-    On the way up, a 3×3 convolution gives the channels of the upper level, each number is repeated on 2×2 pixels, and
-    the maps of that level are added. An input of 1 in every channel is empty ground, and so is everything beyond the
-    border: sides are padded with empty ground to a multiple of unshuffle × 2 ** (levels - 1) pixels.
+    Each level has one 3×3 convolution on the way down and one on the way up. A 2×2 convolution of stride 2 leads to the
+    next lower level. On the way up, a 3×3 convolution gives the channels of the upper level, each number is repeated on
+    2×2 pixels, and the upper level's maps from the way down are added.
+
+    An input of 1 in every channel is empty ground, and so is everything beyond the border: sides are padded with empty
+    ground to a multiple of unshuffle × 2 ** (levels - 1) pixels.
 
     Args:
-        input_shape: (channels, height, width), any size; images of other sizes are read too.
-        widths: channels of each level. Processors compute 16 at once: 24 cost as much as 32.
+        input_shape: (channels, height, width); the network also reads images of other heights and widths.
+        widths: channels of each level. Processors compute 16 channels at once, so that 24 cost as much as 32.
         unshuffle: side of a square, pixels.
-        normalisation, colors, scales, crop, precision, residual: as of `unet.UNet`.
+        normalisation, colors, scales, crop, precision, residual: as in `unet.UNet`.
 
     Attributes:
-        report: areas that evaluation computed of the last batch; None after training, and without crop.
+        report: areas of the last batch that evaluation computed; None after training, and without crop.
 
     Raises:
         ConfigError: the input is no image, or `crop` with `normalisation="group"`.
@@ -40,8 +42,9 @@ class Slim(Encoder):
 
     bibtex = "shi2016realtime"
 
-    report: Report | None = None
+    report: CropReport | None = None
 
+    # More than eight parameters: each keyword is a config key that a user sets alone.
     def __init__(
         self,
         input_shape: tuple[int, ...],
@@ -56,26 +59,26 @@ class Slim(Encoder):
         residual: bool = False,
     ) -> None:
         super().__init__()
-        require_pictures("slim", input_shape, normalisation, crop, colors if residual else 1)
+        require_images("slim", input_shape, normalisation, crop, colors if residual else 1)
         self.unshuffle = unshuffle
         self.levels = len(widths)
-        first, places = widths[0], unshuffle**2
-        shapes = [(input_shape[0] * places, first, 3)]
+        first, pixels = widths[0], unshuffle**2
+        shapes = [(input_shape[0] * pixels, first, 3)]
         for upper, lower in pairwise(widths):
             shapes += [(upper, lower, 2), (lower, lower, 3)]
         shapes += [(lower, upper, 3) for upper, lower in reversed(list(pairwise(widths)))]
         shapes += [(first, first, 3)]
         self.layers = nn.ModuleList(Layer(*shape, normalisation) for shape in shapes)
-        self.head = head(first, 3, colors, scales, places, residual=residual)
+        self.head = build_head(first, 3, colors, scales, pixels, residual=residual)
         self.canvas = Canvas(
             colors, unshuffle * 2 ** (self.levels - 1), crop, precision, unshuffle, residual=residual
         )
         self.output_shape = (colors + scales, *input_shape[1:])
         self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
-    def maps(self, pictures: Tensor, layers: Iterator[Step]) -> Tensor:
-        """Return the maps that the head reads."""
-        maps = next(layers)(unshuffled(pictures, self.unshuffle))
+    def maps(self, images: Tensor, layers: Iterator[Step]) -> Tensor:
+        """Return the maps that the last convolution reads."""
+        maps = next(layers)(unshuffle_pixels(images, self.unshuffle))
         across = [maps]
         for _ in range(self.levels - 1):
             maps = next(layers)(maps)
@@ -87,14 +90,14 @@ class Slim(Encoder):
 
     def forward(self, inputs: Tensor) -> Float[Tensor, "batch outputs height width"]:
         """Return colours and scales of the images."""
-        answers, self.report = self.canvas.painted(inputs, self.maps, self.layers, self.head, self.training)
-        return answers
+        outputs, self.report = self.canvas.compute(inputs, self.maps, self.layers, self.head, self.training)
+        return outputs
 
 
-def unshuffled(pictures: Float[Tensor, "batch channels height width"], side: int) -> Tensor:
-    """Return `functional.pixel_unshuffle` with channels last, in a third of its time."""
-    batch, channels, height, width = pictures.shape
-    squares = pictures.reshape(batch, channels, height // side, side, width // side, side)
+def unshuffle_pixels(images: Float[Tensor, "batch channels height width"], side: int) -> Tensor:
+    """Return the result of `functional.pixel_unshuffle` with channels last, in a third of the time."""
+    batch, channels, height, width = images.shape
+    squares = images.reshape(batch, channels, height // side, side, width // side, side)
     planes = squares.permute(0, 1, 3, 5, 2, 4).reshape(
         batch, channels * side**2, height // side, width // side
     )

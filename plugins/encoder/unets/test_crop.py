@@ -1,8 +1,8 @@
 import pytest
 import torch
 
-from plugins.encoder.unets.canvas import Box, Canvas, subject
-from plugins.encoder.unets.test_networks import SMALL, network, pictures
+from plugins.encoder.unets.canvas import Box, Canvas, subject_box
+from plugins.encoder.unets.test_networks import SMALL, build_network, images
 
 SHAPE = (4, 203, 150)
 SUBJECTS = {
@@ -20,8 +20,11 @@ REACH = 64
 @pytest.mark.parametrize("box", SUBJECTS.values(), ids=SUBJECTS)
 @pytest.mark.parametrize("name", SMALL)
 def test_with_a_margin_as_wide_as_a_pixel_acts_it_is_the_whole_frame(name, box):
-    inputs = pictures(1, SHAPE, box)
-    whole, cropped = network(name, SHAPE, crop=None, scales=3), network(name, SHAPE, crop=REACH, scales=3)
+    inputs = images(1, SHAPE, box)
+    whole, cropped = (
+        build_network(name, SHAPE, crop=None, scales=3),
+        build_network(name, SHAPE, crop=REACH, scales=3),
+    )
     torch.testing.assert_close(cropped(inputs), whole(inputs), rtol=0, atol=1e-5)
     assert (cropped.report.left_out > 0) == (box != SUBJECTS["everything"])
     assert whole.report is None
@@ -29,62 +32,62 @@ def test_with_a_margin_as_wide_as_a_pixel_acts_it_is_the_whole_frame(name, box):
 
 @pytest.mark.parametrize("name", SMALL)
 def test_a_sample_does_not_see_its_batch_and_the_report_counts(name):
-    made = network(name, SHAPE, crop=5, scales=1)
+    network = build_network(name, SHAPE, crop=5, scales=1)
     boxes = list(SUBJECTS.values())
-    inputs = pictures(len(boxes), SHAPE, *boxes)
-    together, report = made(inputs), made.report
-    stride = made.canvas.stride
+    inputs = images(len(boxes), SHAPE, *boxes)
+    together, report = network(inputs), network.report
+    stride = network.canvas.stride
     computed, inside = 0, 0
-    for index, (box, answer) in enumerate(zip(boxes, together, strict=True)):
-        assert torch.equal(made(inputs[index : index + 1])[0], answer)
-        found = made.report.boxes[0]
-        assert report.boxes[index] == found
+    for index, (box, output) in enumerate(zip(boxes, together, strict=True)):
+        assert torch.equal(network(inputs[index : index + 1])[0], output)
+        computed_box = network.report.boxes[0]
+        assert report.boxes[index] == computed_box
         rest = torch.ones(SHAPE[1:], dtype=torch.bool)
         if box[1] == 0:
-            assert found is None
+            assert computed_box is None
         else:
             wanted = []
             for first, last, side in ((*box[:2], SHAPE[1]), (*box[2:], SHAPE[2])):
                 wanted += [max(0, first - 5) // stride * stride, -(-min(side, last + 5) // stride) * stride]
-            assert found == Box(*wanted)
-            computed += (found.bottom - found.top) * (found.right - found.left)
-            rest[found.top : found.bottom, found.left : found.right] = False
+            assert computed_box == Box(*wanted)
+            computed += (computed_box.bottom - computed_box.top) * (computed_box.right - computed_box.left)
+            rest[computed_box.top : computed_box.bottom, computed_box.left : computed_box.right] = False
         inside += int((~rest).sum())
-        empty = made(torch.ones(1, *SHAPE))[0]
-        assert torch.equal(answer[:, rest], empty[:, rest])
+        empty = network(torch.ones(1, *SHAPE))[0]
+        assert torch.equal(output[:, rest], empty[:, rest])
     assert (report.computed, report.left_out) == (computed, inputs[:, 0].numel() - inside)
 
 
 @pytest.mark.parametrize("name", SMALL)
 def test_gradients_are_those_of_the_whole_frame(name):
     def slopes(crop):
-        made = network(name, SHAPE, crop=crop).double()
-        inputs = pictures(2, SHAPE, SUBJECTS["middle"], SUBJECTS["corner"]).double().requires_grad_()
-        made(inputs)[:, :, 10:180:3].square().sum().backward()
-        return [parameter.grad for parameter in made.parameters()], inputs.grad * (inputs != 1)
+        network = build_network(name, SHAPE, crop=crop).double()
+        inputs = images(2, SHAPE, SUBJECTS["middle"], SUBJECTS["corner"]).double().requires_grad_()
+        network(inputs)[:, :, 10:180:3].square().sum().backward()
+        return [parameter.grad for parameter in network.parameters()], inputs.grad * (inputs != 1)
 
     torch.testing.assert_close(slopes(REACH), slopes(None))
 
 
 def test_training_computes_everything_and_says_so():
-    made = network("slim", SHAPE, crop=0)
-    made(torch.ones(1, *SHAPE))
-    assert made.report.computed == 0
-    made.train()(torch.ones(2, *SHAPE))
-    assert made.report is None
+    network = build_network("slim", SHAPE, crop=0)
+    network(torch.ones(1, *SHAPE))
+    assert network.report.computed == 0
+    network.train()(torch.ones(2, *SHAPE))
+    assert network.report is None
 
 
 def test_what_is_not_finite_is_not_empty():
-    picture = torch.zeros(2, 9, 9)
-    picture[0, 3, 5] = torch.nan
-    picture[1, 4, 5] = -torch.inf
-    assert subject(picture, 1, 0) == Box(3, 5, 5, 6)
-    assert subject(torch.zeros(2, 9, 9), 1, 3) is None
+    image = torch.zeros(2, 9, 9)
+    image[0, 3, 5] = torch.nan
+    image[1, 4, 5] = -torch.inf
+    assert subject_box(image, 1, 0) == Box(3, 5, 5, 6)
+    assert subject_box(torch.zeros(2, 9, 9), 1, 3) is None
 
 
 def test_margin_and_stride_keep_to_the_frame():
-    picture = torch.zeros(1, 10, 10)
-    picture[0, 9, 0] = 1
-    assert subject(picture, 4, 1) == Box(8, 12, 0, 4)
-    assert subject(picture, 4, 100) == Box(0, 12, 0, 12)
+    image = torch.zeros(1, 10, 10)
+    image[0, 9, 0] = 1
+    assert subject_box(image, 4, 1) == Box(8, 12, 0, 4)
+    assert subject_box(image, 4, 100) == Box(0, 12, 0, 12)
     assert Canvas(3, 4, 1, "float32").shuffle == 1

@@ -1,4 +1,4 @@
-"""The U-Net of the thesis: the reference among networks that complete images of projected vertices."""
+"""The U-Net of the thesis, the reference network for completing images of projected vertices."""
 
 from collections.abc import Iterator
 from typing import Annotated, Literal
@@ -10,32 +10,36 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from framework.encoder import Encoder
-from plugins.encoder.unets.canvas import Canvas, Precision, Report, head, require_pictures
+from plugins.encoder.unets.canvas import Canvas, CropReport, Precision, build_head, require_images
 from plugins.encoder.unets.layers import Layer, Normalisation, Step
 
 
 class UNet(Encoder):
     """Five levels of two 3×3 convolutions each, with skip connections (thesis §7.3.2; Ronneberger et al. 2015).
 
-    Max-pooling leads down. Bilinear interpolation and a 3×3 convolution lead up, without the checkerboard patterns of
-    transposed convolutions. An input of 1 in every channel is empty ground, and so is everything beyond the border:
-    sides are padded with empty ground to a multiple of 2 ** (levels - 1) pixels.
+    Max-pooling leads to the next lower level. Bilinear interpolation and a 3×3 convolution lead to the next upper
+    level, without the checkerboard patterns of transposed convolutions.
+
+    An input of 1 in every channel is empty ground, and so is everything beyond the border: sides are padded with empty
+    ground to a multiple of 2 ** (levels - 1) pixels.
 
     Args:
-        input_shape: (channels, height, width), any size; images of other sizes are read too.
-        width: channels of the first level; each further level has twice as many.
-        normalisation: by running moments of batches (`batch`); by those, with training corrected towards them
-            (`renorm`); or by the moments of each image's groups of channels (`group`). See `layers.Layer`.
+        input_shape: (channels, height, width); the network also reads images of other heights and widths.
+        width: channels of the first level; each further level has twice as many as the one above.
+        levels: number of levels.
+        normalisation: "batch", by the moments of the batch; "renorm", the same corrected towards the running moments;
+            or "group", by the moments of each image's groups of channels. See `layers.Layer`.
         colors: number of outputs that are colours, 0 to 1.
-        scales: number of further outputs, any real numbers: logarithms of scales.
+        scales: number of further outputs, the logarithms of scales.
         crop: margin, pixels, around the subject's box outside which evaluation computes nothing; None computes
             everything.
-        precision: precision of evaluation; `auto` is bfloat16 on processors that are made for it.
-        residual: whether the input's first `colors` channels are colours, to which the network adds. Before training
-            the output is then the input. This is for rasterised meshes; colours may lie a little beyond [0, 1].
+        precision: precision of evaluation; "auto" is bfloat16 on processors with fast bfloat16 matrix products, else
+            float32.
+        residual: whether the network's output is added to the input's first `colors` channels, which are colours of a
+            rasterised mesh. Before training the output is then the input. Colours may lie a little beyond [0, 1].
 
     Attributes:
-        report: areas that evaluation computed of the last batch; None after training, and without crop.
+        report: areas of the last batch that evaluation computed; None after training, and without crop.
 
     Raises:
         ConfigError: the input is no image, or `crop` with `normalisation="group"`.
@@ -43,8 +47,9 @@ class UNet(Encoder):
 
     bibtex = "prokudin2021smplpix, ronneberger2015unet"
 
-    report: Report | None = None
+    report: CropReport | None = None
 
+    # More than eight parameters: each keyword is a config key that a user sets alone.
     def __init__(
         self,
         input_shape: tuple[int, ...],
@@ -59,7 +64,7 @@ class UNet(Encoder):
         residual: bool = False,
     ) -> None:
         super().__init__()
-        require_pictures("unet", input_shape, normalisation, crop, colors if residual else 1)
+        require_images("unet", input_shape, normalisation, crop, colors if residual else 1)
         self.levels = levels
         widths = [width * 2**level for level in range(levels)]
         sides: list[tuple[int, int]] = []
@@ -71,14 +76,14 @@ class UNet(Encoder):
             sides += [(before, after), (2 * after, after), (after, after)]
             before = after
         self.layers = nn.ModuleList(Layer(*pair, 3, normalisation) for pair in sides)
-        self.head = head(width, 1, colors, scales, residual=residual)
+        self.head = build_head(width, 1, colors, scales, residual=residual)
         self.canvas = Canvas(colors, 2 ** (levels - 1), crop, precision, residual=residual)
         self.output_shape = (colors + scales, *input_shape[1:])
         self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
-    def maps(self, pictures: Tensor, layers: Iterator[Step]) -> Tensor:
-        """Return the maps that the head reads."""
-        maps = pictures.contiguous(memory_format=torch.channels_last)
+    def maps(self, images: Tensor, layers: Iterator[Step]) -> Tensor:
+        """Return the maps that the last convolution reads."""
+        maps = images.contiguous(memory_format=torch.channels_last)
         across: list[Tensor] = []
         for level in range(self.levels):
             maps = functional.max_pool2d(maps, 2) if level else maps
@@ -86,18 +91,18 @@ class UNet(Encoder):
             maps = next(layers)(maps)
             across.append(maps)
         for same_size in reversed(across[:-1]):
-            maps = torch.cat([same_size, next(layers)(doubled(maps))], 1)
+            maps = torch.cat([same_size, next(layers)(double_size(maps))], 1)
             maps = next(layers)(maps)
             maps = next(layers)(maps)
         return maps
 
     def forward(self, inputs: Tensor) -> Float[Tensor, "batch outputs height width"]:
         """Return colours and scales of the images."""
-        answers, self.report = self.canvas.painted(inputs, self.maps, self.layers, self.head, self.training)
-        return answers
+        outputs, self.report = self.canvas.compute(inputs, self.maps, self.layers, self.head, self.training)
+        return outputs
 
 
-def doubled(maps: Float[Tensor, "batch channels height width"]) -> Tensor:
+def double_size(maps: Float[Tensor, "batch channels height width"]) -> Tensor:
     """Return the maps at twice the size by bilinear interpolation; beyond the border lies the empty ground."""
     wide = functional.pad(maps, (1, 1, 1, 1))
     return functional.interpolate(wide, scale_factor=2.0, mode="bilinear")[..., 2:-2, 2:-2]
