@@ -12,7 +12,7 @@ from framework.flights.estimation import Prior, covariance_root, estimate_states
 from framework.flights.frames import PARTS
 from framework.flights.physics import Constants
 from framework.flights.trajectories import simulate_with_jacobian
-from plugins.encoder.flights.extrapolation import frames_of
+from plugins.encoder.flights.extrapolation import count_frames
 
 LARGEST = 1e4
 """Bound on the magnitude of inputs and features; larger ones are clamped."""
@@ -21,19 +21,21 @@ LARGEST = 1e4
 class BallisticEncoder(Encoder):
     """Predicted flight of the ball by its differential equation, as features.
 
-    Features, from metres: x, y and z at each future frame, the logarithms of their standard deviations, and the
-    observed frames (frame by frame as `PARTS`).
+    Features: x, y and z at each future frame, m; the logarithms of their standard deviations; and the observed frames
+    (frame by frame as `PARTS`).
 
-    The constants are those of the config, or those that a run of `density_head=ballistic` found. Nothing is learnt.
+    The constants are those of the config, or those that a run of `density_head=ballistic` has fitted. Nothing is
+    learnt.
 
     Args:
-        future, step: as of the data.
+        future: number of future frames, as in the data.
+        step: time from frame to frame, s, as in the data.
         spin: prior standard deviation of each component of the spin, rad/s.
-        noise: standard deviation of a coordinate, m.
+        noise: standard deviation of an observed coordinate, m.
         constants: constants of the ball and the table.
 
     Raises:
-        ConfigError: inputs are no frames of `PARTS`, flattened.
+        ConfigError: the inputs are not flattened frames of `PARTS`.
     """
 
     bibtex = "mulling2011biomimetic"
@@ -50,7 +52,7 @@ class BallisticEncoder(Encoder):
         constants: Constants,
     ) -> None:
         super().__init__()
-        length = len(PARTS) * frames_of(input_shape, "encoder ballistic")
+        length = len(PARTS) * count_frames(input_shape, "encoder ballistic")
         self.future, self.step, self.noise = future, step, noise
         self.prior = Prior(spin=spin)
         self.constants = constants
@@ -61,14 +63,16 @@ class BallisticEncoder(Encoder):
         """Return the features of the flights."""
         dtype = inputs.dtype if inputs.is_floating_point() else torch.get_default_dtype()
         frames = inputs.double().clamp(-LARGEST, LARGEST).cpu()
-        seen = observed_frames(frames.unflatten(-1, (-1, len(PARTS))), self.step)
-        estimate = estimate_states(seen, self.constants, self.noise, self.prior)
+        observed = observed_frames(frames.unflatten(-1, (-1, len(PARTS))), self.step)
+        estimate = estimate_states(observed, self.constants, self.noise, self.prior)
         moments = self.step * torch.arange(1, self.future + 1, dtype=torch.float64)
-        times = torch.cat([seen.times, moments.expand(len(frames), -1)], 1)
-        places, slopes = simulate_with_jacobian(estimate.state, times, self.constants)
-        spread = (
-            (slopes[:, -self.future :].flatten(1, 2) @ covariance_root(estimate.covariance)).square().sum(-1)
+        times = torch.cat([observed.times, moments.expand(len(frames), -1)], 1)
+        positions, jacobian = simulate_with_jacobian(estimate.state, times, self.constants)
+        log_deviation = (
+            (jacobian[:, -self.future :].flatten(1, 2) @ covariance_root(estimate.covariance))
+            .square()
+            .sum(-1)
         )
-        spread = (spread + self.noise**2).log() / 2
-        found = torch.cat([places[:, -self.future :].flatten(1), spread, frames], 1)
-        return found.clamp(-LARGEST, LARGEST).to(inputs.device, dtype)
+        log_deviation = (log_deviation + self.noise**2).log() / 2
+        features = torch.cat([positions[:, -self.future :].flatten(1), log_deviation, frames], 1)
+        return features.clamp(-LARGEST, LARGEST).to(inputs.device, dtype)

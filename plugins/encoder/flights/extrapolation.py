@@ -13,34 +13,38 @@ from framework.encoder import Encoder
 from framework.errors import ConfigError
 from framework.flights.estimation import ObservedFrames, observed_frames
 from framework.flights.frames import GRAVITY, PARTS
-from plugins.encoder.flights.parabolas_compiled import described
+from plugins.encoder.flights.parabolas_compiled import fill_features
 
 SPANS = (1.0, 0.7, 0.5, 0.35)
-"""Shares of the frames that a parabola is fitted to; the longest that fits is used, so that a bounce is left out."""
-SPEED, GROWTH = (0.4, 0.4, 3.0), (0.5, 0.5, 6.0)
-"""Growth of the unit of features with time, m/s, and with its square, m/s², for each axis.
+"""Shares of the frames, counted from the last one, that parabolas are fitted to.
 
-The values of z are larger, since a bounce reverses its velocity, and one may have been in the last frames.
+The longest span that a parabola fits is used, so that a bounce is left out.
+"""
+SPEED, GROWTH = (0.4, 0.4, 3.0), (0.5, 0.5, 6.0)
+"""Growth of a coordinate's unit with time, m/s, and with the square of time, m/s², for x, y and z.
+
+The values of z are larger, because a bounce reverses the velocity along z, and the last frames may hold a bounce.
 """
 FURTHER = 24
-"""Number of features beside the two of each predicted number and those of each frame."""
+"""Number of features beside the two for each predicted coordinate and the seven for each observed frame."""
 
 
 class ExtrapolationEncoder(Encoder):
     """Extrapolated positions of the ball on a robust parabola through its last frames.
 
-    Features, from metres: x, y and z at each future frame; the logarithms of the units in which a head says how far the
-    ball is from there; and the observed frames, relative to the parabola.
+    Features: x, y and z on the parabola at each future frame, m; the logarithms of the units in which a density head
+    expresses how far the ball is from these positions; and the observed frames, relative to the parabola.
 
-    Each coordinate is a parabola in time, fitted to the last frames by least squares with Cauchy's weights, so that an
-    outlier has little influence. Drag, spin, table and bounce are not modelled. Nothing is learnt.
+    Each coordinate is a parabola in time. It is fitted to the last frames by least squares with Cauchy's weights, so
+    that an outlier has little influence. Drag, spin, table and bounce are not modelled. Nothing is learnt.
 
     Args:
-        future, step: as of the data.
+        future: number of future frames, as in the data.
+        step: time from frame to frame, s, as in the data.
         noise: standard deviation of a coordinate, m.
 
     Raises:
-        ConfigError: inputs are no frames of `PARTS`, flattened.
+        ConfigError: the inputs are not flattened frames of `PARTS`.
     """
 
     bibtex = "holland1977robust"
@@ -55,7 +59,7 @@ class ExtrapolationEncoder(Encoder):
         noise: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 0.003,
     ) -> None:
         super().__init__()
-        frames = frames_of(input_shape, "encoder extrapolation")
+        frames = count_frames(input_shape, "encoder extrapolation")
         self.future, self.step, self.noise = future, step, noise
         self.output_shape = (6 * future + FURTHER + 7 * frames,)
 
@@ -63,13 +67,13 @@ class ExtrapolationEncoder(Encoder):
     def forward(self, inputs: Tensor) -> Float[Tensor, "batch length"]:
         """Return the features of the flights."""
         dtype = inputs.dtype if inputs.is_floating_point() else torch.get_default_dtype()
-        seen = observed_frames(inputs.double().unflatten(-1, (-1, len(PARTS))), self.step)
-        seen = ObservedFrames(*(part.cpu() for part in seen))
+        observed = observed_frames(inputs.double().unflatten(-1, (-1, len(PARTS))), self.step)
+        observed = ObservedFrames(*(part.cpu() for part in observed))
         moments = self.step * np.arange(1, self.future + 1)
-        spans = np.array([max(3, round(share * seen.times.shape[1])) for share in SPANS])
+        spans = np.array([max(3, round(share * observed.times.shape[1])) for share in SPANS])
         features = torch.empty(len(inputs), *self.output_shape, dtype=torch.float64)
-        described(
-            *(part.contiguous().numpy() for part in (seen.times, seen.places, seen.observed)),
+        fill_features(
+            *(part.contiguous().numpy() for part in (observed.times, observed.places, observed.observed)),
             GRAVITY,
             spans,
             self.noise,
@@ -81,16 +85,16 @@ class ExtrapolationEncoder(Encoder):
         return features.to(inputs.device, dtype)
 
 
-def frames_of(input_shape: tuple[int, ...], by: str) -> int:
+def count_frames(input_shape: tuple[int, ...], by: str) -> int:
     """Return the number of frames of a sample.
 
     Raises:
-        ConfigError: the shape is not that of a sample of frames.
+        ConfigError: the shape is not that of flattened frames of `PARTS`.
     """
     length = math.prod(input_shape)
     if len(input_shape) != 1 or length % len(PARTS) or not length:
         raise ConfigError(
-            f"{by} got samples of shape {input_shape}; wanted frames of {', '.join(PARTS)}, flattened. Choose "
+            f"{by} got samples of shape {input_shape}, but flattened frames of {', '.join(PARTS)} are required. Set "
             "data=table_tennis."
         )
     return length // len(PARTS)

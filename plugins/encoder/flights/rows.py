@@ -1,4 +1,4 @@
-"""Rows of the contract: observed frames of thrown balls."""
+"""Contract-test cases: observed frames of thrown balls."""
 
 from framework.testing.flights import falling_balls
 from framework.testing.rows import EncoderRow
