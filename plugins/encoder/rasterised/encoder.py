@@ -1,4 +1,4 @@
-"""Encoder `rasterised`: the rendered image of a registered mesh, as a baseline or as input of a learned renderer."""
+"""The rendered image of a registered mesh as features: a baseline, or the input of a learned renderer."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,10 +39,10 @@ class Picture:
     """Settings of the rendered image.
 
     Attributes:
-        height, width: pixels.
+        height, width: size of the image, pixels.
         ground: whether a single channel, the share of a pixel that the mesh leaves free, replaces the colours.
         depth: whether there is a further channel, 0 at `nearest` and 1 at `farthest` and beyond.
-        nearest, farthest: metres.
+        nearest, farthest: range of the depth channel, metres from the camera.
     """
 
     height: Annotated[int, Field(ge=8, le=4096)] = 256
@@ -55,7 +55,7 @@ class Picture:
 
 @dataclass(frozen=True, kw_only=True)
 class MeshSettings:
-    """Mesh whose vertices are the input; the settings have the names and meanings of those of the data."""
+    """Mesh whose vertices are the input; the settings have the same names and meanings as in `human_scans`."""
 
     topology: Name = "7k"
     root: FilePath | None = None
@@ -67,21 +67,21 @@ class Rasterised(Encoder):
 
     Inputs are those of `human_scans`, whose vertices are in the order of the topology. Colours are interpolated and
     averaged in linear RGB. Textures lie in the folder of the data and are read when they are first drawn. Features are
-    (3, height, width), sRGB numbers as files hold them, in the inputs' dtype; with `depth` (4, height, width), as those
-    of `encoder=projection`. A network may read them in place of points. With `ground` the image is the silhouette
-    alone, black on white.
+    (3, height, width), sRGB numbers in [0, 1], in the inputs' dtype; with `depth` they are (4, height, width), like
+    those of `encoder=projection`. A network can read them instead of projected points. With `ground` the image is only
+    the silhouette, black on white.
 
     Args:
         input_shape: (points, columns).
         input_columns: names of the columns, if the data name them.
         renderer: renderer that draws the mesh.
-        textures: the `human_scans` with the textures of all subjects that occur; None: vertex colours are drawn.
+        textures: `human_scans` with the textures of all subjects in the data; None to draw the vertex colours.
         picture, mesh: settings of the image and of the mesh.
 
     Raises:
-        ConfigError: the input is no cloud of coloured points, the renderer lacks a channel, or `textures` is other
-            data.
-        DataError: the mesh is not available; or, from `forward`, a texture.
+        ConfigError: the input is no cloud of coloured points, the renderer lacks a channel, `textures` is not
+            `human_scans`, or the range of depths is empty.
+        DataError: the mesh is not available; `forward` raises it if a texture is not available.
     """
 
     fixed = True
@@ -105,8 +105,8 @@ class Rasterised(Encoder):
             )
         if textures is not None and not isinstance(textures, SubjectFolder):
             raise ConfigError(
-                f"encoder.rasterised.textures = {type(textures).__name__} has no textures; expected human_scans, for "
-                f"example ${{data}}."
+                f"encoder.rasterised.textures = {type(textures).__name__} has no textures; expected human_scans. "
+                "Set textures=${data} if the data are human_scans, or textures=null."
             )
         if missing := {"color", "depth", *(["uv"] if textures else [])} - renderer.channels:
             raise ConfigError(
@@ -115,8 +115,9 @@ class Rasterised(Encoder):
             )
         if not picture.nearest < picture.farthest:
             raise ConfigError(
-                f"encoder rasterised got nearest={picture.nearest:g} and farthest={picture.farthest:g}; expected "
-                "nearest below farthest, metres from the camera."
+                f"encoder rasterised got nearest={picture.nearest:g} and farthest={picture.farthest:g}, but nearest "
+                "must be smaller than farthest. Set both, in metres from the camera, so that the subject is between "
+                "them."
             )
         self.renderer = renderer
         self.people, self.topology = textures, mesh.topology
@@ -124,12 +125,12 @@ class Rasterised(Encoder):
         self.camera = canonical_camera(picture.height, picture.width)
         self.ground, self.depth = picture.ground, picture.depth
         self.limits = (picture.nearest, picture.farthest)
-        self.faces = faces_of(mesh)  # no buffer: meshes are drawn on the CPU on any device of the model
+        self.faces = load_faces(mesh)  # no buffer: meshes are drawn on the CPU on any device of the model
         self.output_shape = ((1 if picture.ground else 3) + picture.depth, picture.height, picture.width)
 
     @torch.no_grad()
     def forward(self, inputs: Float[Tensor, "batch points columns"]) -> Float[Tensor, "batch *features"]:
-        sizes(inputs)  # refuses inputs that are no clouds
+        sizes(inputs)  # raises DataError for inputs that are no clouds
         if len(inputs) and inputs.shape[1] <= int(self.faces.max()):
             raise DataError(
                 f"Got a mesh of {inputs.shape[1]} vertices, but the topology has {int(self.faces.max()) + 1} vertices. "
@@ -149,7 +150,7 @@ class Rasterised(Encoder):
         return features
 
     def _scene(self, cloud: Float[Tensor, "points columns"], row: int) -> Scene:
-        """Return the scene of a cloud; a fourth colour channel of 1 renders as the share of a pixel that is covered."""
+        """Return the scene of a cloud; the fourth colour channel is 1 and renders as each pixel's covered share."""
         vertices, colors = cloud[:, :3].float(), cloud[:, 3:6].float()
         if self.people is None:
             paint = torch.cat([linear_from_srgb(colors), colors.new_ones(len(colors), 1)], 1)
@@ -157,14 +158,14 @@ class Rasterised(Encoder):
         if self.textures is None:
             longest = TEXELS * max(self.camera.height, self.camera.width)
             self.textures = Textures(self.people.place, self.topology, self.faces, longest)
-        return Scene(vertices, self.faces, None, self.camera, self.textures.of(colors, row))
+        return Scene(vertices, self.faces, None, self.camera, self.textures.look_up(colors, row))
 
 
-def faces_of(mesh: MeshSettings) -> Tensor:
-    """Return the triangles of a topology: of generated people, or of the first registration in a folder.
+def load_faces(mesh: MeshSettings) -> Tensor:
+    """Return the triangles, (faces, 3): of the body model's topology, or of a registration if `mesh.root` is set.
 
     Raises:
-        DataError: the body, or the folder's meshes, are not available.
+        DataError: the body, or the meshes in the folder, are not available.
     """
     if mesh.root is None:
         chosen, _ = load_body(mesh.body)

@@ -37,7 +37,7 @@ ROWS = {
                 "textures": {"name": "human_scans", **SCANNED},
             },
             leave_out={
-                "finite on extreme inputs": "of constant colours there is nobody; test_textures.py has others"
+                "finite on extreme inputs": "no subject has constant colours; test_textures.py checks other extremes"
             },
             inputs=inputs_of,
         ),

@@ -22,7 +22,7 @@ HEIGHT, WIDTH, SAMPLES = 24, 18, 4
 PEOPLE = ("ann", "bob", "cleo", "dan", "eve", "fay")
 
 
-def encoder(root, height=HEIGHT, width=WIDTH, **config):
+def build_encoder(root, height=HEIGHT, width=WIDTH, **config):
     config_of_encoder = {
         "name": "rasterised",
         "root": str(root),
@@ -42,10 +42,10 @@ def root(tmp_path):
 
 
 def globe(root, sides):
-    """Write the subjects as a bumpy ball with a texture seam, and the first one's texture of smooth colours.
+    """Write all subjects as a bumpy ball with a texture seam, and a texture of smooth colours for the first subject.
 
-    `sides` is the (height, width) of the texture, texels. Returns vertices, faces, texture coordinates, their faces and
-    pixels.
+    `sides` is the (height, width) of the texture, texels. The function returns the vertices, the faces, the texture
+    coordinates, the faces of the texture coordinates, and the pixels of the texture.
     """
     rows, columns = 7, 9
     turn, rise = np.meshgrid(np.arange(columns + 1) / columns, np.arange(rows + 1) / rows)
@@ -124,26 +124,26 @@ def traced(vertices, faces, places, uv_faces, texels):
 
 @pytest.mark.parametrize("times", [1, 2])
 def test_a_textured_mesh_is_what_a_ray_through_every_sample_sees(root, times):
-    """Check also a texture finer than the largest size that is drawn, which is averaged in linear RGB."""
+    """Check a texture of the largest size, and a finer one, which is averaged in linear RGB."""
     vertices, faces, places, uv_faces, pixels = globe(root, (32 * times, 96 * times))
     texels = light(pixels).reshape(32, times, 96, times, 3).mean((1, 3))
     placed = vertices + np.array([0.1, -0.05, 2.0])
     colors = np.random.default_rng(0).integers(0, 256, (len(vertices), 3), np.uint8)
     cloud = torch.from_numpy(np.concatenate([placed, colors / 255], 1)).float()
-    rendered = encoder(root)(cloud[None])[0].movedim(0, -1).numpy()
+    rendered = build_encoder(root)(cloud[None])[0].movedim(0, -1).numpy()
     wanted = traced(placed, faces, places, uv_faces, texels)
     differences = np.abs(rendered - wanted).max(-1)
     assert 0.3 < (wanted < 0.99).any(-1).mean() < 0.9
     assert np.median(differences) < 1e-3 and (differences > 1 / 255).mean() < 0.02, (
         differences.max()
     )  # corners move by 1/512 sample
-    plain = encoder(root, textures=None)(cloud[None])[0].movedim(0, -1).numpy()
+    plain = build_encoder(root, textures=None)(cloud[None])[0].movedim(0, -1).numpy()
     assert np.abs(plain - wanted).max() > 0.1
 
 
 def test_everybody_wears_their_own_texture_however_lists_are_ordered(root):
     inputs = inputs_of(6)
-    before = encoder(root)(inputs)
+    before = build_encoder(root)(inputs)
     assert all(not torch.equal(before[0], other) for other in before[1:])
     scan_layout.write_splits(
         root, {"train": ["zoe", "fay"], "validation": ["ann"], "test": ["cleo", "bob", "dan", "eve"]}
@@ -151,13 +151,15 @@ def test_everybody_wears_their_own_texture_however_lists_are_ordered(root):
     shutil.copytree(
         root / "subjects/bob", root / "subjects/zoe"
     )  # subjects with the same colours and the same texture are accepted
-    assert torch.equal(encoder(root)(inputs), before)
-    assert torch.equal(encoder(root)(inputs[[4, 1]].double()), before[[4, 1]].double())
+    assert torch.equal(build_encoder(root)(inputs), before)
+    assert torch.equal(build_encoder(root)(inputs[[4, 1]].double()), before[[4, 1]].double())
 
 
 @pytest.mark.parametrize("kind", [{}, {"textures": None}], ids=["texture", "colours"])
 def test_meshes_are_drawn_on_the_cpu_wherever_the_model_is(root, kind):
-    assert torch.equal(encoder(root, **kind).to("meta")(inputs_of(2)), encoder(root, **kind)(inputs_of(2)))
+    assert torch.equal(
+        build_encoder(root, **kind).to("meta")(inputs_of(2)), build_encoder(root, **kind)(inputs_of(2))
+    )
 
 
 def test_a_stranger_is_refused_by_the_row(root):
@@ -166,11 +168,11 @@ def test_a_stranger_is_refused_by_the_row(root):
     with pytest.raises(
         DataError, match=r"Row 2 of the batch has the vertex colours of no subject in .*scans;"
     ):
-        encoder(root)(inputs)
+        build_encoder(root)(inputs)
 
 
 def test_extreme_vertices_leave_a_finite_picture(root):
-    rasterised, inputs = encoder(root), inputs_of(1)
+    rasterised, inputs = build_encoder(root), inputs_of(1)
     for spoilt in (1e30, -1e30, 1e-30, 0.0, -5.0):
         inputs[0, :3, 2] = spoilt
         assert rasterised(inputs).isfinite().all()
@@ -225,7 +227,7 @@ WRONG = {
 
 @pytest.mark.parametrize("spoil, words", WRONG.values(), ids=WRONG)
 def test_what_is_wrong_is_said(root, spoil, words):
-    rasterised = encoder(root)  # built before the fault, as in a model that is loaded later
+    rasterised = build_encoder(root)  # built before the fault, as in a model that is loaded later
     spoil(root)
     with pytest.raises(DataError) as caught:
         rasterised(inputs_of(1))
@@ -235,9 +237,9 @@ def test_what_is_wrong_is_said(root, spoil, words):
 
 def test_what_lacks_textures_is_refused(root, monkeypatch):
     with pytest.raises(ConfigError, match="expected human_scans"):
-        encoder(root, textures={"name": "registration"})
+        build_encoder(root, textures={"name": "registration"})
     renderer = type(build("renderer", resolve("renderer", "rasterizer")))
     monkeypatch.setattr(renderer, "channels", renderer.channels - {"uv"})
     with pytest.raises(ConfigError, match="does not draw the channels uv"):
-        encoder(root)
-    encoder(root, textures=None)
+        build_encoder(root)
+    build_encoder(root, textures=None)
