@@ -18,11 +18,12 @@ class BiternionVGG(Encoder):
 
     The layers are those of Beyer et al. 2015: convolutions without padding, each followed by batch norm; 2×2
     max-pooling after every second convolution except the last; dropout; a fully connected layer; ReLU; dropout. ReLU
-    comes after the pooling where there is one, as in their code: both orders give the same numbers, and this order
-    computes ReLU on a quarter of them. Convolutions have no bias, since the batch norm after them would subtract it.
+    comes after the pooling where there is one, as in the authors' code: both orders give the same numbers, and this
+    order computes ReLU on a quarter of them. Convolutions have no bias, since the batch norm after them would subtract
+    the bias.
 
     Images are read in [0, 1] and not normalised further. Nothing is padded, so that the first batch norm removes any
-    scale and offset that they have.
+    scale and offset of the images.
 
     Args:
         input_shape: (channels, height, width), 1 or 3 channels; at least 32 × 32 pixels for six convolutions.
@@ -49,8 +50,8 @@ class BiternionVGG(Encoder):
         super().__init__()
         if len(input_shape) != 3 or input_shape[0] not in (1, 3):
             raise ConfigError(
-                "biternion_vgg reads images of shape (1 or 3 channels, height, width), this input has the "
-                f"shape {input_shape}. Choose another encoder for it, such as `mlp`."
+                "biternion_vgg reads images of shape (1 or 3 channels, height, width), but got an input of shape "
+                f"{input_shape}. Choose another encoder for this input, such as `mlp`."
             )
         pooled = range(1, len(channels) - 1, 2)
         planes, *sides = input_shape
@@ -66,7 +67,7 @@ class BiternionVGG(Encoder):
         if min(sides) < 1:
             raise ConfigError(
                 f"biternion_vgg with {len(channels)} convolutions needs images of at least "
-                f"{_smallest(len(channels))} × {_smallest(len(channels))} pixels, these have "
+                f"{_smallest(len(channels))} × {_smallest(len(channels))} pixels, but got images of "
                 f"{input_shape[1]} × {input_shape[2]}. Make the images larger, or shorten `channels`."
             )
         # channels_last: 0.7 of the time of a training step on a CPU (README)

@@ -1,4 +1,4 @@
-"""Rows of the contract: colour and grey images, six convolutions and fewer."""
+"""Contract-test cases: colour and grey images, six convolutions and fewer."""
 
 from framework.testing.rows import EncoderRow
 

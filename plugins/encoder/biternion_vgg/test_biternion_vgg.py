@@ -46,10 +46,12 @@ def test_agrees_with_numpy(shape, channels):
     encoder = build("encoder", config, input_shape=shape)
     encoder(torch.rand(8, *shape) * 2 - 1)  # moves the running moments away from their initial values
     images = torch.rand(2, *shape)
-    found = encoder.eval()(images)
-    assert found.shape == (2, 20)
-    assert found.dtype == torch.float32
-    np.testing.assert_allclose(found.detach().numpy(), by_hand(encoder, images.numpy()), rtol=1e-4, atol=1e-5)
+    features = encoder.eval()(images)
+    assert features.shape == (2, 20)
+    assert features.dtype == torch.float32
+    np.testing.assert_allclose(
+        features.detach().numpy(), by_hand(encoder, images.numpy()), rtol=1e-4, atol=1e-5
+    )
 
 
 def test_is_the_published_network():
@@ -79,7 +81,9 @@ def test_the_smallest_image_works_and_a_smaller_one_is_refused(convolutions, sid
     channels = [2] * convolutions
     encoder = BiternionVGG((1, side, side), channels=channels, features=4).eval()
     assert encoder(torch.rand(1, 1, side, side)).shape == (1, 4)
-    with pytest.raises(ConfigError, match=f"at least {side} × {side} pixels, these have {side - 1} × {side}"):
+    with pytest.raises(
+        ConfigError, match=f"at least {side} × {side} pixels, but got images of {side - 1} × {side}"
+    ):
         BiternionVGG((1, side - 1, side), channels=channels)
 
 

@@ -1,4 +1,4 @@
-"""Blocks of fully connected layers, each block's output beside its input; a narrow last layer on request."""
+"""Blocks of fully connected layers that append their output to their input, with an optional narrow last layer."""
 
 import math
 from typing import Annotated
@@ -24,13 +24,13 @@ class DenseBlocks(Encoder):
         blocks, layers: number of blocks, and number of layers in each.
         width: outputs of a layer.
         dropout: probability of dropping an output of a layer.
-        standardise: whether each feature is first brought to mean 0 and deviation 1, by its moments over all of
-            training (during training by those of the batch). Without it, features that hardly vary around a mean train
-            many times slower.
+        standardise: whether each feature is first brought to mean 0 and deviation 1, by the moments over all training
+            batches (during training by those of the current batch). Without standardisation, training takes many times
+            longer if the features hardly vary around their mean.
         batch_norm: whether layers normalise over the batch. With this or `standardise`, training needs batches of at
             least two.
-        bottleneck: length of a last linear layer without activation; None for none. The linear layer in front of a
-            density head with very many distribution parameters then has this rank, and is smaller and faster in
+        bottleneck: length of a last linear layer without activation; None for no such layer. The linear layer in front
+            of a density head with very many distribution parameters then has this rank, and is smaller and faster in
             proportion.
 
     Raises:
@@ -55,10 +55,10 @@ class DenseBlocks(Encoder):
         length = math.prod(input_shape)
         if length == 0:
             raise ConfigError(
-                f"dense_blocks got samples of shape {input_shape}, which hold no numbers; wanted at least one. "
-                "Check what `data` yields, or the encoder before it."
+                f"dense_blocks got samples of shape {input_shape}, which hold no numbers, but at least one number is "
+                "required. Check the samples of `data`, or the encoder before this one."
             )
-        # momentum=None: older batches do not decay; affine=False: nothing is learnt
+        # momentum=None: all batches have equal weight; affine=False: nothing is learnt
         self.standard = nn.BatchNorm1d(length, affine=False, momentum=None) if standardise else nn.Identity()
         self.blocks = nn.ModuleList()
         for _ in range(blocks):

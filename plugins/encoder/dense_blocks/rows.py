@@ -1,4 +1,4 @@
-"""Rows of the contract: features and a cloud, with and without batch norm and the narrow last layer."""
+"""Contract-test cases: features and a cloud, with and without batch norm and the narrow last layer."""
 
 from framework.testing.rows import EncoderRow
 

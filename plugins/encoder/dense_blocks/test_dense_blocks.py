@@ -8,7 +8,7 @@ from plugins.encoder.dense_blocks.encoder import DenseBlocks
 
 
 def by_hand(encoder, inputs):
-    """Return the blocks in NumPy, float64: linear, (x - mean) / √(var + ε), ReLU, concatenated to the input."""
+    """Return the features in NumPy, float64: linear layers, batch norm by running moments, ReLU, concatenation."""
     numbers = inputs.reshape(len(inputs), -1).astype(np.float64)
     for block in encoder.blocks:
         inner = numbers
@@ -39,11 +39,11 @@ def test_agrees_with_numpy(shape, blocks, layers, batch_norm, bottleneck, dtype,
         torch.randn(50, *shape, dtype=dtype) * 3 + 1
     )  # moves the running moments away from their initial values
     inputs = torch.randn(6, *shape, dtype=dtype)
-    found = encoder.eval()(inputs)
-    assert found.shape == (6, *encoder.output_shape)
-    assert found.dtype == dtype
+    features = encoder.eval()(inputs)
+    assert features.shape == (6, *encoder.output_shape)
+    assert features.dtype == dtype
     wanted = by_hand(encoder, inputs.double().numpy())
-    np.testing.assert_allclose(found.detach().numpy(), wanted, rtol=tolerance, atol=tolerance)
+    np.testing.assert_allclose(features.detach().numpy(), wanted, rtol=tolerance, atol=tolerance)
 
 
 def test_features_are_standardised_by_the_moments_of_all_of_training():
@@ -53,10 +53,10 @@ def test_features_are_standardised_by_the_moments_of_all_of_training():
     for batch in batches:
         encoder(batch)
     inputs = torch.randn(6, 3, dtype=torch.float64)
-    found = encoder.eval()(inputs)[:, :3].detach().numpy()
+    features = encoder.eval()(inputs)[:, :3].detach().numpy()
     mean = np.mean([batch.numpy().mean(0) for batch in batches], 0)
     variance = np.mean([batch.numpy().var(0, ddof=1) for batch in batches], 0)
-    np.testing.assert_allclose(found, (inputs.numpy() - mean) / np.sqrt(variance + 1e-5), rtol=1e-10)
+    np.testing.assert_allclose(features, (inputs.numpy() - mean) / np.sqrt(variance + 1e-5), rtol=1e-10)
 
 
 def test_its_lengths_are_those_of_the_thesis():
@@ -76,8 +76,8 @@ def test_the_layer_after_the_narrow_one_has_its_rank():
     torch.manual_seed(0)
     encoder = DenseBlocks((6,), width=16, bottleneck=2).double()
     wide = torch.nn.Linear(2, 30).double()
-    found = wide(encoder(torch.randn(40, 6, dtype=torch.float64))).detach()
-    assert torch.linalg.matrix_rank(found - wide.bias.detach()) == 2
+    outputs = wide(encoder(torch.randn(40, 6, dtype=torch.float64))).detach()
+    assert torch.linalg.matrix_rank(outputs - wide.bias.detach()) == 2
 
 
 def test_bytes_are_read_as_0_to_1():
@@ -90,8 +90,8 @@ def test_dropout_acts_in_training_alone():
     torch.manual_seed(0)
     encoder = DenseBlocks((4,), blocks=1, layers=1, width=2000, dropout=0.25)
     inputs = torch.ones(1, 4)
-    kept, dropped = encoder.eval()(inputs)[:, 4:], encoder.train()(inputs)[:, 4:]
-    alive = kept > 0
+    undropped, dropped = encoder.eval()(inputs)[:, 4:], encoder.train()(inputs)[:, 4:]
+    alive = undropped > 0
     assert (dropped[alive] == 0).double().mean().item() == pytest.approx(0.25, abs=0.07)
 
 

@@ -22,14 +22,15 @@ from plugins.encoder.inception_resnet_v2.layers import (
 )
 
 SMALLEST = 75
+"""Smallest height and width of an image, pixels."""
 
 
 class InceptionResNetV2(Encoder):
     """Inception-ResNet-v2 for large images: 54.3 million parameters, random or from a local weight file.
 
-    Its weights have the names and shapes of timm's `inception_resnet_v2`, so that such a file loads name by name; the
-    classifier's weights are left out. Images are scaled to [-1, 1], as that file needs them. A single channel is
-    repeated to three.
+    The weights have the names and shapes of timm's `inception_resnet_v2`, so that a weight file of timm loads name by
+    name; the classifier's weights are left out. Images are scaled to [-1, 1], as timm's weights require. A single
+    channel is repeated to three.
 
     Args:
         input_shape: (channels, height, width), 1 or 3 channels, at least 75 × 75 pixels; the published network reads
@@ -39,7 +40,7 @@ class InceptionResNetV2(Encoder):
 
     Raises:
         ConfigError: the input is not an image, or too small; or the weight file does not exist.
-        CheckpointError: the weights do not fit, or are damaged.
+        CheckpointError: the weights in the file do not fit the network, or the file is damaged.
     """
 
     initial = frozenset({"weights"})
@@ -55,12 +56,12 @@ class InceptionResNetV2(Encoder):
         super().__init__()
         if len(input_shape) != 3 or input_shape[0] not in (1, 3):
             raise ConfigError(
-                "inception_resnet_v2 reads images of shape (1 or 3 channels, height, width), this input has "
-                f"the shape {input_shape}. Choose another encoder for it, such as `mlp`."
+                "inception_resnet_v2 reads images of shape (1 or 3 channels, height, width), but got an input of "
+                f"shape {input_shape}. Choose another encoder for this input, such as `mlp`."
             )
         if min(input_shape[1:]) < SMALLEST:
             raise ConfigError(
-                f"inception_resnet_v2 needs images of at least {SMALLEST} × {SMALLEST} pixels, these have "
+                f"inception_resnet_v2 needs images of at least {SMALLEST} × {SMALLEST} pixels, but got images of "
                 f"{input_shape[1]} × {input_shape[2]}. Make the images larger, or choose `biternion_vgg`."
             )
         self.conv2d_1a = ConvNorm(3, 32, 3, stride=2, padding="valid")

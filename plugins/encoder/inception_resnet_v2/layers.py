@@ -50,7 +50,7 @@ class Residual(nn.Module):
     """The scaled Inception-ResNet block ReLU(x + scale · conv(branches(x))) of Szegedy et al. 2017.
 
     Args:
-        relu: whether the sum is rectified; that of the last block is not.
+        relu: whether the sum is rectified; the last block of the network does not rectify its sum.
     """
 
     def __init__(
@@ -77,7 +77,7 @@ def mixed_5b() -> Branches:
         ConvNorm(192, 96),
         nn.Sequential(ConvNorm(192, 48), ConvNorm(48, 64, 5)),
         nn.Sequential(ConvNorm(192, 64), ConvNorm(64, 96, 3), ConvNorm(96, 96, 3)),
-        # the mean excludes padding, as in the TensorFlow code that the published weights come from
+        # the mean excludes padding, as in the TensorFlow code with which the published weights were trained
         nn.Sequential(nn.AvgPool2d(3, stride=1, padding=1, count_include_pad=False), ConvNorm(192, 64)),
     )
 

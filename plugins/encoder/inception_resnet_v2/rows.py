@@ -1,4 +1,4 @@
-"""Rows of the contract: one, with the smallest grey images, since each check takes seconds.
+"""Contract-test cases: only one, with small grey images, because each check takes seconds.
 
 The comparison of colour images with timm's features is in test_inception_resnet_v2.py.
 """

@@ -12,12 +12,12 @@ from plugins.encoder.inception_resnet_v2.layers import ConvNorm, Residual, mixed
 
 
 def known(state):
-    """Return weights that depend on the order of their names and on their shapes alone."""
-    generator, found = np.random.default_rng(0), {}
+    """Return weights that depend only on the order of their names and on their shapes."""
+    generator, weights = np.random.default_rng(0), {}
     for name in sorted(state):
         shape = tuple(state[name].shape)
         if name.endswith("num_batches_tracked"):
-            found[name] = torch.tensor(0)
+            weights[name] = torch.tensor(0)
             continue
         values = generator.normal(size=shape)
         if name.endswith("running_var"):
@@ -28,8 +28,8 @@ def known(state):
             values = values * np.sqrt(2 / np.prod(shape[1:]))
         else:
             values = values / 4
-        found[name] = torch.tensor(values, dtype=torch.float32)
-    return found
+        weights[name] = torch.tensor(values, dtype=torch.float32)
+    return weights
 
 
 @pytest.fixture(scope="module")
@@ -66,14 +66,14 @@ def test_features_are_timms_from_a_weight_file(encoder, tmp_path):
     config = resolve("encoder", {"name": "inception_resnet_v2", "weights": str(file)})
     images = torch.tensor(np.random.default_rng(1).uniform(size=(2, 3, 107, 75)), dtype=torch.float32)
     with torch.no_grad():
-        found = build("encoder", config, input_shape=(3, 107, 75)).eval()(images)
-    assert found.shape == (2, 1536)
-    assert found.dtype == torch.float32
+        features = build("encoder", config, input_shape=(3, 107, 75)).eval()(images)
+    assert features.shape == (2, 1536)
+    assert features.dtype == torch.float32
     # timm 1.0.31, forward_features(2 x - 1).mean((2, 3)) with the same weights in float64
-    assert found.double().mean().item() == pytest.approx(4.572326056955698, rel=1e-5)
-    assert found.double().std().item() == pytest.approx(7.109568968236445, rel=1e-5)
+    assert features.double().mean().item() == pytest.approx(4.572326056955698, rel=1e-5)
+    assert features.double().std().item() == pytest.approx(7.109568968236445, rel=1e-5)
     expected = [[0, 5.778700616481, 0, 0.214286141430], [0, 5.473244922087, 0, 0.336070947979]]
-    np.testing.assert_allclose(found[:, ::400].numpy(), expected, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(features[:, ::400].numpy(), expected, rtol=1e-4, atol=1e-5)
 
 
 def test_a_grey_image_is_read_as_three_equal_channels(encoder):
@@ -89,11 +89,11 @@ def test_a_residual_block_is_its_formula():
         4, 5, ConvNorm(4, 2), nn.Sequential(ConvNorm(4, 2), ConvNorm(2, 3, (1, 3))), scale=0.3
     ).eval()
     inputs = torch.randn(2, 4, 5, 6)
-    kept = inputs.clone()
+    unchanged = inputs.clone()
     joined = torch.cat([block.branch0(inputs), block.branch1(inputs)], 1)
     expected = (inputs + 0.3 * block.conv2d(joined)).clamp(min=0)
     torch.testing.assert_close(block(inputs), expected)
-    assert torch.equal(inputs, kept)
+    assert torch.equal(inputs, unchanged)
     unrectified = Residual(4, 2, ConvNorm(4, 2), scale=1.0, relu=False).eval()
     assert (unrectified(inputs) < 0).any()
 
@@ -130,5 +130,5 @@ def test_refuses_what_is_no_image(shape):
 
 
 def test_refuses_small_images():
-    with pytest.raises(ConfigError, match="at least 75 × 75 pixels, these have 299 × 74"):
+    with pytest.raises(ConfigError, match="at least 75 × 75 pixels, but got images of 299 × 74"):
         InceptionResNetV2((3, 299, 74))

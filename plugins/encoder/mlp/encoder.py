@@ -25,12 +25,12 @@ class MLP(Encoder):
         input_shape: any; a sample is flattened.
         widths: output length of each layer; with an empty list the features are the flattened input.
         dropout: probability of dropping an output of a layer; one number for all layers, or one for each.
-        batch_norm: whether to normalise over the batch, before the activation or after it; training then needs batches
-            of at least two.
-        activation: rectified, or exponential linear units.
+        batch_norm: whether to normalise over the batch: True before the activation, "after_relu" after it; training
+            then needs batches of at least two samples.
+        activation: "relu" (rectified linear units) or "elu" (exponential linear units).
 
     Raises:
-        ConfigError: a sample holds no numbers, or the number of probabilities differs from that of layers.
+        ConfigError: a sample holds no numbers, or the number of probabilities differs from the number of layers.
     """
 
     bibtex = "rumelhart1986learning"
@@ -48,14 +48,14 @@ class MLP(Encoder):
         length = math.prod(input_shape)
         if length == 0:
             raise ConfigError(
-                f"mlp got samples of shape {input_shape}, which hold no numbers; wanted at least one. "
-                "Check what `data` yields, or the encoder before it."
+                f"mlp got samples of shape {input_shape}, which hold no numbers, but at least one number is required. "
+                "Check the samples of `data`, or the encoder before this one."
             )
         drops = dropout if isinstance(dropout, list) else [dropout] * len(widths)
         if len(drops) != len(widths):
             raise ConfigError(
-                f"encoder.mlp.dropout has {len(drops)} probabilities for {len(widths)} layers; give as many, or one "
-                "number for all."
+                f"encoder.mlp.dropout has {len(drops)} probabilities for {len(widths)} layers. Set one probability for "
+                "each layer, or one number for all layers."
             )
         layers: list[nn.Module] = []
         before, after = batch_norm is True, batch_norm == "after_relu"
@@ -70,14 +70,14 @@ class MLP(Encoder):
             layers.append(nn.Dropout(drop))
             length = width
         self.layers = nn.Sequential(*layers)
-        self.vectorises = not batch_norm  # its running moments are buffers
+        self.vectorises = not batch_norm  # the running moments of batch norm are buffers
         self.output_shape = (length,)
 
     def forward(self, inputs: Tensor) -> Float[Tensor, "batch length"]:
         """Return the features of the flattened inputs."""
         numbers = inputs.flatten(1)
-        own = inputs.dtype if inputs.is_floating_point() else torch.get_default_dtype()
-        dtype = next((parameter.dtype for parameter in self.parameters()), own)
+        default = inputs.dtype if inputs.is_floating_point() else torch.get_default_dtype()
+        dtype = next((parameter.dtype for parameter in self.parameters()), default)
         if inputs.dtype == torch.uint8:
             numbers = numbers.to(dtype) / 255
         return self.layers(numbers.to(dtype))

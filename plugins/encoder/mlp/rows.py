@@ -1,4 +1,4 @@
-"""Rows of the contract: vectors and flattened images, with and without batch norm."""
+"""Contract-test cases: vectors and flattened images, with and without batch norm."""
 
 from framework.testing.rows import EncoderRow
 

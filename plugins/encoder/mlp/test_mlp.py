@@ -8,7 +8,7 @@ from plugins.encoder.mlp.encoder import MLP
 
 
 def by_hand(encoder, inputs):
-    """Return the layers in NumPy: linear, (x - mean) / √(var + ε) with the running moments, ReLU."""
+    """Return the features in NumPy: linear layers, batch norm with the running moments, activations."""
     state = {name: value.double().numpy() for name, value in encoder.state_dict().items()}
     numbers = inputs.reshape(len(inputs), -1).astype(np.float64)
     for index, layer in enumerate(encoder.layers):
@@ -38,10 +38,12 @@ def test_agrees_with_numpy(shape, widths, batch_norm, activation, units):
     assert kinds == ["Linear", *order, "Dropout"] * len(widths)
     encoder(torch.randn(50, *shape) * 3 + 1)  # moves the running moments away from their initial values
     inputs = torch.randn(6, *shape)
-    found = encoder.eval()(inputs)
-    assert found.shape == (6, *encoder.output_shape)
-    assert found.dtype == torch.float32
-    np.testing.assert_allclose(found.detach().numpy(), by_hand(encoder, inputs.numpy()), rtol=1e-4, atol=1e-5)
+    features = encoder.eval()(inputs)
+    assert features.shape == (6, *encoder.output_shape)
+    assert features.dtype == torch.float32
+    np.testing.assert_allclose(
+        features.detach().numpy(), by_hand(encoder, inputs.numpy()), rtol=1e-4, atol=1e-5
+    )
 
 
 @pytest.mark.parametrize("batch_norm", [False, True, "after_relu"])
@@ -55,13 +57,13 @@ def test_dropout_acts_in_training_alone(dropout):
     torch.manual_seed(0)
     encoder = MLP((4,), widths=[1000], dropout=dropout)
     inputs = torch.ones(1, 4)
-    kept = encoder.eval()(inputs)
+    undropped = encoder.eval()(inputs)
     dropped = encoder.train()(inputs)
-    alive = kept > 0
+    alive = undropped > 0
     share = (dropped[alive] == 0).double().mean().item()
     assert share == pytest.approx(0.25, abs=0.1)  # about 500 units: five standard errors
     still = alive & (dropped > 0)
-    torch.testing.assert_close(dropped[still], kept[still] / 0.75)
+    torch.testing.assert_close(dropped[still], undropped[still] / 0.75)
 
 
 def test_each_layer_has_its_dropout():
