@@ -354,7 +354,7 @@ TEXTS = [
 
 
 def motions(whole: bytes) -> list[bytes]:
-    """Of a BVH file: counts that lie, joints that end before they begin, numbers that are none."""
+    """Return faulty variants of a BVH file: wrong counts, misplaced brackets, and texts in the place of numbers."""
     changes = [
         (b"CHANNELS 3", b"CHANNELS -2"), (b"CHANNELS 3", b"CHANNELS 99999999999"), (b"CHANNELS 3", b"CHANNELS 3_0"),
         (b"Zrotation", b"Qrotation"), (b"Zrotation", b"Yrotation"), (b"Zrotation", b"Wrotation"), (b"Spine", b""),

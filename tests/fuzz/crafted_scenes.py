@@ -41,7 +41,7 @@ def _places(value: Any) -> Iterator[tuple[Any, Any]]:
 
 
 def crafted() -> Iterator[bytes]:
-    """Of small size and large promises, with references to other files, and with circles."""
+    """Yield small GLB files that state huge sizes, refer to other files, or contain circular references."""
     content, parts = quad()
     whole, binary = describe(content, parts)
 

@@ -24,14 +24,15 @@ SEED = 13
 MEMORY = 2**30
 """Bytes that reading may take beyond what the process has."""
 SECONDS = 2.0
-"""Of processor time that one file may take."""
+"""Limit of the processor time for reading one file, seconds."""
 BLOCKED = 20.0
 """Seconds without any progress until a process counts as blocked."""
 LONGEST_MESSAGE = 1500
 OUT_OF_MEMORY = re.compile(
     r"not enough memory|unable to allocate|can't allocate|bad_alloc|out of memory", re.IGNORECASE
 )
-"""What libraries say who wanted more than MEMORY; a sentence that is made of it is no bound."""
+"""Messages of libraries that failed to allocate memory; an error made from such a message shows that no limit was
+checked."""
 CANARY = (16, 64, 256, 1024, 4096, 16384) * 8
 """Sizes of arrays that nothing else than an access out of bounds changes."""
 EXTREME = (
@@ -67,7 +68,7 @@ WORDS = (
 
 
 class Silent(Exception):
-    """What was damaged is taken as if it were whole, and answers with other numbers."""
+    """Exception for a damaged file that was read without an error, but with other numbers."""
 
 
 Damage = Callable[[bytes, np.random.Generator], bytes]
@@ -108,7 +109,8 @@ class Reader:
 
 @dataclass
 class Tally:
-    """What became of the files, and the first of each kind of fault: (number, text)."""
+    """Counts of the outcomes of the files of one reader; `faults` holds the number and message of the first fault of
+    each kind."""
 
     files: int = 0
     read: int = 0
@@ -321,7 +323,8 @@ def outcome_of(reader: Reader, file: Path) -> tuple[int, str]:
 
 
 def wanted_memory(error: BaseException | None) -> bool:
-    """Whether an error came of more memory than MEMORY; Python's parser says so of what is nested too deep."""
+    """Return whether an error comes from a failed allocation; a MemoryError of Python's parser only means too deep
+    nesting."""
     while error is not None:
         trace = error.__traceback__
         while trace is not None and trace.tb_next is not None:

@@ -72,7 +72,7 @@ def in_png(content: bytes, random: np.random.Generator) -> bytes:
 
 
 def in_gzip(content: bytes, random: np.random.Generator) -> bytes:
-    """What is packed, its checksum made right."""
+    """Damage the content inside a gzip file, and pack it again with a right checksum."""
     return gzip.compress(spoilt(gzip.decompress(content), random), 1)
 
 
@@ -295,7 +295,7 @@ def dales(packed: bool) -> bytes:
 
 
 def z_spectra() -> dict[str, Any]:
-    """Of 3 × 4 voxels, 2 of them outside the mask, in two regions."""
+    """Return Z-spectra of 3 × 4 voxels in two regions, 2 voxels of them outside the mask."""
     offsets = np.linspace(-4.0, 4.0, 9)
     lines = 1 - 0.8 / (1 + offsets**2)
     mask, region = np.ones((3, 4)), np.zeros((3, 4))

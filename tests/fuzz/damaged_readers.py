@@ -100,7 +100,7 @@ def value(file: Path) -> object:
 
 
 def readers() -> Iterator[Reader]:
-    """In the order of the report."""
+    """Yield all readers in the order of the report."""
     yield from clouds()
     yield from subjects()
     yield from people()
@@ -139,7 +139,7 @@ def clouds() -> Iterator[Reader]:
 
 
 def subjects() -> Iterator[Reader]:
-    """What a command draws, and the files beside it."""
+    """Yield readers of the scenes that a command draws, and of the files that belong to them."""
     square = scenes.quad()
     camera = b'{"K": [[9, 0, 4], [0, 9, 4], [0, 0, 1]], "R": [[1,0,0], [0,1,0], [0,0,1]], "t": [0,0,2], "size": [9, 9]}'
     made = [*crafted_scenes.crafted()]
@@ -217,7 +217,7 @@ def people() -> Iterator[Reader]:
 
 
 def pairs(file: Path) -> object:
-    """Of the scans that a challenge asks for."""
+    """Read the list of pairs of scans of the FAUST challenge."""
     folder = file.parents[2]
     for number in range(3):
         scan = faust.test_scan(folder, number)

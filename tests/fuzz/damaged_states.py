@@ -67,7 +67,7 @@ class Subject:
     columns: tuple[str, ...] = ()
 
     def checkpoint(self) -> bytes:
-        """Of the model, fitted and calibrated, as a run writes it."""
+        """Return the checkpoint of the fitted and calibrated model in the form that a run writes."""
         predictor = build_predictor(
             self.parts, self.target, tuple(self.inputs.shape[1:]), 0, self.columns
         ).eval()
@@ -144,7 +144,7 @@ def stored(group: str, name: str) -> tuple[bytes, ...]:
 
 
 def whole(content: bytes) -> dict[str, Any]:
-    """What is in a checkpoint, or in a file of weights, of ours."""
+    """Return the content of an undamaged checkpoint or file of weights."""
     return torch.load(io.BytesIO(content), weights_only=True)
 
 
@@ -168,7 +168,8 @@ class Forged:
 
 
 def structured(array: Tensor, random: np.random.Generator) -> Any:
-    """What torch stores beside dense arrays, with insides that are not whole, and arrays beyond their storage."""
+    """Return one of the other kinds of tensors that torch stores (sparse, nested, quantised, …), with invalid
+    content."""
     flat = array.reshape(-1).float()
     far = torch.tensor([EXTREMES[int(random.integers(len(EXTREMES)))]])
     some = flat[:1] if len(flat) else torch.zeros(1)
@@ -297,7 +298,7 @@ def in_arrays(content: bytes, random: np.random.Generator) -> bytes:
 
 
 def wanted_of(array: Tensor, made: Any, kind: Callable[..., Any]) -> str:
-    """What must become of an array that stands for another."""
+    """Return the required outcome for an array that replaces another: "refused", "any" or the like."""
     if isinstance(made, Forged):
         try:
             made = whole(saved(lambda stream: torch.save({"state_dict": {"a": made}}, stream)))["state_dict"][
@@ -324,7 +325,7 @@ def signature(packed: bytes) -> bytes:
 
 
 def states() -> Iterator[Reader]:
-    """Of every plugin that stores arrays: its models are loaded, and predict."""
+    """Yield readers that load a model with each plugin that stores arrays, and predict with it."""
     for group in MAKERS:
         for name in installed(group):
             yield Reader(
@@ -352,7 +353,7 @@ def states() -> Iterator[Reader]:
 
 
 def predicted(file: Path) -> object:
-    """What a stored model answers."""
+    """Load a stored model, and return its predictions."""
     content = checkpoints.read(file)
     predictor, description = loading.load_with_description(file, paths=said_again(content))
     told = content[TOLD] if isinstance(content.get(TOLD), dict) else {}
@@ -403,7 +404,7 @@ def weights() -> bytes:
 
 
 def filled(file: Path) -> object:
-    """What a network answers with the weights of a file."""
+    """Fill a network with the weights of a file, and compare its outputs with the stored outputs."""
     made = network()
     fill_from_file(made, str(file), ignored=())
     told = torch.load(file, weights_only=True)[TOLD]
@@ -468,7 +469,7 @@ def in_data(content: bytes, random: np.random.Generator) -> bytes:
 
 
 def asked(file: Path) -> object:
-    """What a stored model answers to what its user has."""
+    """Load a stored model, and return its log-densities for raw input."""
     predictor = loading.load(file)
     data = loading.reader(loading.read_stored(file)[0])
     try:

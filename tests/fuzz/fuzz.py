@@ -2,18 +2,19 @@
 
     python -m tests.fuzz.fuzz
 
-Writes fuzz.md beside this file. A file may be read or refused with a sentence; a crash, more than two seconds of
-processor time, more than 1 GiB, another error, a message that does not name the file, drowns in damage or has control
-characters is a fault, and so are silently other numbers: an array elsewhere that changed, or damage that answers as if
-it were whole. Beside bytes that are flipped, cut, repeated, swapped and put in, lengths and counts are changed, and
-half of the files of formats with checksums or compression are damaged inside them, so that the checksum is right.
+The script writes fuzz.md beside this file. A reader may read a damaged file, or refuse it with an error message.
+These outcomes are faults: a crash; more than two seconds of processor time or 1 GiB of memory; another exception; a
+message that does not name the file, is too long or has control characters; and silently other numbers. Silently other
+numbers means that an undamaged array has changed, or that damaged content was accepted as if it were undamaged. Bytes
+are flipped, cut, repeated, swapped and inserted, and lengths and counts are changed. In formats with checksums or
+compression, half of the files are damaged inside, and the checksum is made right again.
 
-Of every plugin that stores arrays a model is fitted and stored, one array damaged (numbers at the limits, cycles,
-another type or shape, sparse, nested, quantised and expanded tensors, places beyond their storage), and the checkpoint
-loaded to predict.
+For every plugin that stores arrays, a model is fitted and stored. One array of its checkpoint is damaged: numbers at
+the limits, cycles, another type or shape, sparse, nested, quantised and expanded tensors, positions beyond their
+storage. Then the checkpoint is loaded, and the model predicts.
 
-`--files 400 --check` is the short form for tests: it writes nothing and ends with 1 where there is a fault.
-`--only NAME` chooses readers, `--replay NUMBER` reads one file of the only one here, for whoever mends its fault.
+`--files 400 --check` is the short form for tests: it writes nothing and exits with 1 if there is a fault. `--only
+NAME` chooses readers. `--replay NUMBER` reads one file of the chosen reader again, to find the cause of a fault.
 """
 
 import argparse
@@ -67,7 +68,7 @@ def main() -> int:
 
 
 def whole(reader: Reader, folder: Path) -> None:
-    """What is not damaged is read."""
+    """Require that a reader reads its undamaged samples."""
     file = folder / reader.file
     file.parent.mkdir(parents=True, exist_ok=True)
     for content in reader.samples:
@@ -76,7 +77,7 @@ def whole(reader: Reader, folder: Path) -> None:
 
 
 def irregular(reader: Reader, folder: Path) -> None:
-    """A pipe, which would block, a device that goes on without end, and a folder are refused, or left out.
+    """Require that a reader refuses or leaves out a pipe, which would block, an endless device, and a folder.
 
     Raises:
         AssertionError: one is read.
@@ -121,16 +122,23 @@ def report(found: dict[str, Tally], minutes: float, files: int) -> None:
     table = "\n".join(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *rows))
     text = f"""# Damaged files
 
-{files:,} damaged files for each reader, each read with 1 GiB of memory beyond what the process has and two seconds of
-processor time; see `fuzz.py` for how they are damaged. A message that does not name the file counts among other errors,
-and so do one of more than 1,500 characters, one with control characters, and one that was made of a failed allocation.
-"Silently other numbers" are arrays elsewhere that changed, and damage to a type, shape or structure that is taken.
-"Arrays of" are checkpoints of every plugin that stores some, one of them damaged, loaded and asked to predict; those of
-inception_resnet_v2 (218 MB) are left out, since they are read as the weights of every network are.
+This page shows what each reader does with {files:,} randomly damaged files. `fuzz.py` describes how the files are
+damaged. Each file may use two seconds of processor time, and 1 GiB of memory in addition to what the process already
+has.
+
+- *refused with a sentence*: the reader raises an error whose message names the file.
+- *other errors*: any other exception. An error message counts here too if it does not name the file, has more than
+  1,500 characters, contains control characters, or reports a failed allocation of memory.
+- *silently other numbers*: the reader returns without an error, but arrays that were not damaged have changed, or a
+  damaged type, shape or structure was accepted.
+
+In the rows "arrays of …", one array in the checkpoint of a model with that plugin is damaged. The model is then
+loaded and predicts. All plugins that store arrays are included, except `inception_resnet_v2` (218 MB), whose weights
+are read by the same code as those of other networks.
 
 {table}
 
-{minutes:.0f} minutes on {machine("numpy", "pillow", "h5py", "torch")}
+Measured by `python -m tests.fuzz.fuzz` in {minutes:.0f} minutes on {machine("numpy", "pillow", "h5py", "torch")}
 """
     write_page(__file__, text)
 

@@ -1,9 +1,10 @@
-"""Kill ranks, sweeps and fork servers at random moments, and compare what resumes.
+"""Kill ranks, sweeps and fork servers at random moments, and compare the resumed results.
 
     python -m tests.fuzz.kills
 
-A run or a sweep is killed a few times, goes on after each, and ends; its checkpoints and journals are then compared, to
-the last bit, with those of one that nobody killed. Writes kills.md beside this file.
+The script kills a run or sweep a few times, resumes it after each kill, and lets it finish. Then it compares the
+checkpoints and journals, to the last bit, with those of the same command without a kill. It writes kills.md beside this
+file.
 """
 
 import argparse
@@ -28,11 +29,11 @@ from benchmarks.pages import machine, write_page
 
 ROOT = Path(__file__).resolve().parents[2]
 ALLOWED = 10.0
-"""Seconds within which every process has to end."""
+"""Time within which every process has to end, seconds."""
 IN_A_ROW = 4
-"""Kills of one run or sweep, most."""
+"""Largest number of kills of one run or sweep."""
 MARK = "FRAMEWORK_KILLS"
-"""Environment variable by which the processes of a command are found, whatever has become of their parents."""
+"""Environment variable that marks the processes of a command, also those whose parents have ended."""
 RUN = (
     "experiment=moons/vanilla_128",
     "trainer.max_epochs=200",
@@ -45,7 +46,7 @@ RUN = (
 )
 RANKS = ("trainer=ddp", "trainer.devices=2", "trainer.accelerator=cpu")
 SCRIPT = "import sys; from benchmarks.commands import carry_out; carry_out(sys.argv[1:])"
-"""What thesis_tables.py does with each of its sweeps."""
+"""Script that runs a command in the same way as `thesis_tables.py` runs its sweeps."""
 
 
 @dataclass(frozen=True)
@@ -59,12 +60,12 @@ class Process:
 
 
 class Command:
-    """A command of the framework that runs, with all processes that come of it.
+    """Running command of the framework, with all processes that it has started.
 
     Args:
-        words: of the command.
-        folder: working directory; its output goes to `output.txt` there.
-        more: further environment.
+        words: arguments of the command.
+        folder: working directory; the output goes to `output.txt` in this folder.
+        more: further environment variables.
     """
 
     def __init__(self, words: Sequence[str], folder: Path, **more: str) -> None:
@@ -77,7 +78,7 @@ class Command:
             )
 
     def alive(self) -> list[Process]:
-        """Those of its processes that have not ended."""
+        """Return the processes of the command that have not ended."""
         self.process.poll()
         entry, found = f"{MARK}={self.mark}".encode(), []
         for place in Path("/proc").iterdir():
@@ -94,7 +95,8 @@ class Command:
         return found
 
     def seconds_until_gone(self, patience: float, some: Set[int] | None = None) -> float:
-        """Seconds until none (of some) is alive; infinite where one is after so many, which then are killed."""
+        """Wait until no process of the command (or none of `some`) is alive, and return the seconds. After
+        `patience` seconds the remaining processes are killed and the result is infinite."""
         start = time.monotonic()
         while alive := [one for one in self.alive() if some is None or one.number in some]:
             if time.monotonic() - start > patience:
@@ -108,10 +110,10 @@ class Command:
 
 
 def numbers(run: Path) -> dict[tuple[str, int], str]:
-    """The numbers of a run by name and step, but for its costs.
+    """Return the numbers in the journal of a run by name and step, without its costs.
 
     Raises:
-        ValueError: one of a step stands there twice.
+        ValueError: the journal holds a number of one step twice.
     """
     found: dict[tuple[str, int], str] = {}
     for line in (run / "journal.jsonl").read_text(encoding="utf-8").splitlines():
@@ -126,7 +128,7 @@ def numbers(run: Path) -> dict[tuple[str, int], str]:
 
 
 def differences(run: Path, whole: Path) -> list[str]:
-    """In what a run's checkpoint and journal differ from another's; nothing where all bits are the same."""
+    """Return the names of tensors and numbers in which two runs differ; the list is empty if all bits are equal."""
     states: list[dict[str, Any]] = [
         torch.load(one / "checkpoints" / "model.ckpt", weights_only=True)["state_dict"]
         for one in (run, whole)
@@ -144,13 +146,13 @@ def differences(run: Path, whole: Path) -> list[str]:
 
 
 def status(run: Path) -> str | None:
-    """What run.json says; None before the run was opened."""
+    """Return the status in run.json, or None before the run was opened."""
     path = run / "run.json"
     return json.loads(path.read_text(encoding="utf-8"))["status"] if path.is_file() else None
 
 
 Choose = Callable[[Command], list[int]]
-"""From a command to the processes that may be killed now."""
+"""Function from a running command to the ids of the processes that may be killed now."""
 
 
 def first(command: Command) -> list[int]:
@@ -158,7 +160,7 @@ def first(command: Command) -> list[int]:
 
 
 def rank(number: int) -> Choose:
-    """Of a training with several processes; not what loads data for it, or watches it."""
+    """Choose the process of a rank, without the processes that load its data or watch it."""
 
     def chosen(command: Command) -> list[int]:
         found = [
@@ -173,7 +175,7 @@ def rank(number: int) -> Choose:
 
 
 def fork_server(command: Command) -> list[int]:
-    """Once it has forked."""
+    """Choose the fork server, once it has forked a job."""
     forks = [one for one in command.alive() if "framework.sweeps.fork_server" in one.command]
     numbers = {one.number for one in forks}
     return sorted({one.parent for one in forks} & numbers)
@@ -181,16 +183,16 @@ def fork_server(command: Command) -> list[int]:
 
 @dataclass(frozen=True)
 class Kind:
-    """What is killed.
+    """Kind of process to kill, and the command in which it runs.
 
     Attributes:
-        name: for the page.
-        words: of the command, but for the folder.
-        choose: the process to kill.
-        numbers: signals, in turns.
+        name: name in the page.
+        words: arguments of the command, without its folder.
+        choose: function that chooses the process to kill.
+        numbers: signals to send, one after the other.
         sweep: whether the command is a sweep.
-        script: whether the command runs in a script as `thesis_tables.py`.
-        goes_on: whether the command itself is to end as ever, and only children of what is killed are not.
+        script: whether a script runs the command, as `thesis_tables.py` does.
+        goes_on: whether the command itself must complete, and only the children of the killed process end.
     """
 
     name: str
@@ -229,7 +231,7 @@ KINDS = (
 
 @dataclass
 class Tally:
-    """What became of the kills of a kind with one signal."""
+    """Counts of the outcomes of all kills of one kind with one signal."""
 
     kills: int = 0
     ended: int = 0
@@ -245,7 +247,7 @@ def runs(kind: Kind, folder: Path) -> list[Path]:
 def killed(
     kind: Kind, folder: Path, whole: Path, duration: float, kills: int, draw: random.Random, tallies: dict[int, Tally]
 ) -> None:  # fmt: skip
-    """Kill one run or sweep so many times, let it end, and compare it with the whole one."""
+    """Kill one run or sweep `kills` times, let it finish, and compare it with the run that was not killed."""
     folder.mkdir(parents=True)
     done: list[int] = []
     while len(done) < kills:
@@ -258,7 +260,7 @@ def killed(
             time.sleep(0.01)
         if command.process.poll() is not None:
             if all(status(run) == "FINISHED" for run in runs(kind, folder / "it")):
-                break  # it was faster; what was killed before counts
+                break  # the command finished before the kill; earlier kills count
             raise RuntimeError(f"{kind.name} ended by itself: {command.output}")
         some = {one.number for one in command.alive() if one.parent == victims[0]} if kind.goes_on else None
         with suppress(ProcessLookupError):
@@ -287,7 +289,7 @@ def killed(
 
 
 def measure(kind: Kind, kills: int, draw: random.Random, base: Path) -> list[str]:
-    """Lines of the page."""
+    """Kill commands of one kind, and return the lines of the page."""
     whole = base / "whole" / "it"
     whole.parent.mkdir(parents=True)
     start = time.monotonic()
@@ -310,7 +312,9 @@ def measure(kind: Kind, kills: int, draw: random.Random, base: Path) -> list[str
 
 def main() -> None:
     arguments = argparse.ArgumentParser(description=__doc__)
-    arguments.add_argument("--kills", type=int, default=4, help="of each kind with each of its signals")
+    arguments.add_argument(
+        "--kills", type=int, default=4, help="number of kills of each kind with each of its signals"
+    )
     arguments.add_argument("--seed", type=int, default=0)
     given = arguments.parse_args()
     lines = []
@@ -328,18 +332,25 @@ def page(lines: Sequence[str], kills: int, seed: int) -> str:
         [
             "# Killed ranks, sweeps and fork servers",
             "",
-            f"`python -m tests.fuzz.kills --kills {kills} --seed {seed}`: each kill comes at a random moment of the "
-            "command, from its start on; after up to four the run or sweep is left to end. Ended: no process of the "
-            f"command is alive {ALLOWED:.0f} s later (in brackets, the slowest); where the process whose forks are "
-            "jobs is killed, none of those jobs, since the sweep goes on. Closed: no run.json says RUNNING then. "
-            "Bit-equal: the weights of every checkpoint and every number of every journal are those of the same "
-            f"command without a kill. Runs: `{' '.join(RUN)}`, ranks with `{' '.join(RANKS)}`.",
+            f"The numbers were measured by `python -m tests.fuzz.kills --kills {kills} --seed {seed}`. Each kill comes "
+            f"at a random moment after the start of the command. After at most {IN_A_ROW} kills, the resumed run or "
+            "sweep is left to finish.",
+            "",
+            f"- *all ended*: no process of the command is alive {ALLOWED:.0f} s after the kill; the longest time is in "
+            "brackets. If only the process whose forks are jobs is killed, the sweep continues, and the column counts "
+            "the jobs that were forks of that process.",
+            "- *closed*: afterwards, no `run.json` has the status RUNNING.",
+            "- *resumed bit-equal*: the weights of every checkpoint and every number of every journal equal those of "
+            "the same command without a kill.",
+            "",
+            f"The commands are runs of `{' '.join(RUN)}`. Ranks are tested with `{' '.join(RANKS)}`.",
             "",
             "| killed | signal | kills | all ended | closed | resumed bit-equal |",
             "|---|---|---:|---:|---:|---:|",
             *lines,
             "",
-            f"{machine('torch', 'pytorch-lightning', 'hydra-core')} Load average at the end: {os.getloadavg()[2]:.0f}.",
+            f"{machine('torch', 'pytorch-lightning', 'hydra-core')} The load average at the end was "
+            f"{os.getloadavg()[2]:.0f}.",
             "",
         ]
     )
