@@ -42,11 +42,11 @@ from framework.target import Target
 from framework.testing.contract import contract
 
 HUGE = (20_000, 30_000_000)
-"""What stands in place of each whole number; of lists so many items."""
+"""Values that replace each whole number of a config."""
 LONG = 5000
 REALS = Target("real", ("x", "y"))
 SECONDS = 10.0
-"""Of the processor, after which a case is ended."""
+"""Limit of the processor time of one case, seconds."""
 
 
 def case(name: str, action: Callable[[], object]) -> None:
@@ -145,7 +145,7 @@ def models(only: str = "") -> Iterator[Model]:
 
 
 def predicted(file: Path, inputs: torch.Tensor | None) -> None:
-    """What a stranger's model is first asked for."""
+    """Load a model of somebody else, and predict with it."""
     model = framework.load(file)
     if inputs is not None:
         density = model(inputs)
@@ -153,7 +153,7 @@ def predicted(file: Path, inputs: torch.Tensor | None) -> None:
 
 
 def numbers(value: Any, place: tuple[Any, ...] = ()) -> Iterator[tuple[tuple[Any, ...], list[Any]]]:
-    """Where numbers stand in a config, and what is put there."""
+    """Yield the place of each number and list in a config, with the values to try there."""
     if isinstance(value, dict):
         for key, item in value.items():
             yield from numbers(item, (*place, key))
@@ -202,7 +202,7 @@ def stored_parameters(folder: Path) -> None:
 
 
 def stored_fields(folder: Path) -> None:
-    """What else a checkpoint says of its model."""
+    """Write checkpoints whose input shape, target or other descriptions are far too large."""
     model = next(models("encoder mlp"))
     weights, file = model.weights(), folder / "model.ckpt"
     target, many = asdict(model.target), [f"x{number}" for number in range(110_000)]

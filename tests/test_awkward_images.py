@@ -34,7 +34,7 @@ from plugins.renderer.rasterizer.sample_scenes import OBJ, PARTS, QUAD, glb
 
 SIDE = 32
 COLOURS = np.array([[255, 0, 0], [0, 200, 100], [40, 80, 250], [10, 30, 90]])
-"""Of the squares, row by row; in images with transparency the last one is transparent."""
+"""Colours of the squares, row by row; the last square is transparent in images with transparency."""
 GREYS = np.array([0, 85, 170, 255])
 WHITE = (255, 255, 255)
 
@@ -103,7 +103,7 @@ def png(values: np.ndarray, bits: int, kind: int, *chunks: bytes, interlaced: bo
 
 
 def key(*values: int) -> bytes:
-    """Which colour is transparent."""
+    """Return the PNG chunk that marks one colour as transparent."""
     return chunk(b"tRNS", struct.pack(f">{len(values)}H", *values))
 
 

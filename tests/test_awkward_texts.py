@@ -175,12 +175,12 @@ NOT_NUMBERS = (
     *("NA", "1.5.2", "1#5", "0.5#c", "1/2", "abc", "-"),
     *("1.#IND", "-1.#IND00", "1.#INF", "-1.#INF", "1.#QNAN", "1.#J", "nan", "-inf", "1e999"),
 )
-"""What is refused by every reader, or says that there is no number."""
+"""Texts that every reader refuses, or reads as a missing value."""
 NUMBERS = {
     "0.5": 0.5, "+.5": 0.5, "5e-1": 0.5, "5E-001": 0.5, "0.05D+1": 0.5, "5.d-01": 0.5, "5D-1": 0.5,
     "\N{MINUS SIGN}0.5": -0.5, "5e\N{MINUS SIGN}1": 0.5, "\N{EN DASH}0.5": -0.5,
 }  # fmt: skip
-"""What means one number alone: read by every reader, or refused."""
+"""Texts with only one possible meaning as a number, which a reader reads with this value or refuses."""
 
 
 def write(folder: Path, reader: TextReader, word: str) -> Path:

@@ -95,7 +95,7 @@ def test_a_process_of_others_is_seen() -> None:
 
 
 def test_every_command_names_a_script_that_is_there() -> None:
-    """In pages, scripts and READMEs."""
+    """Check the commands in pages, scripts and READMEs."""
     documents = [
         path
         for pattern in (

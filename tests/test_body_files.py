@@ -106,7 +106,10 @@ def changed(**changes):
         (changed(weights=None, f=None), "weights, f are missing; the file contains v_template"),
         (changed(shapedirs=np.zeros((3, 3, 3))), r"do not fit together: .*shapedirs \(3, 3, 3\)"),
         (changed(J_regressor=np.zeros((JOINTS, 3))), r"do not fit together: .*J_regressor \(4, 3\)"),
-        (changed(v_template=np.full((VERTICES, 3), np.inf)), "v_template has the type float64 .* other than finite numbers"),
+        (
+            changed(v_template=np.full((VERTICES, 3), np.inf)),
+            "v_template has the type float64 .* other than finite numbers",
+        ),
         (changed(weights=np.zeros((VERTICES, JOINTS))), "sum to 0; expected no weight below 0"),
         (changed(posedirs=np.zeros((VERTICES, 3, 7))), r"pose_shapes has the shape \(12, 3, 7\)"),
         (changed(kintree_table=np.zeros((2, JOINTS), int)), "form no tree"),

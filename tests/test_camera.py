@@ -1,4 +1,4 @@
-"""Where a camera sees a point: against OpenCV's documented formula and kornia's camera."""
+"""Projections of points by a camera, compared with OpenCV's documented formula and kornia's camera."""
 
 import math
 from dataclasses import replace

@@ -143,7 +143,7 @@ def test_moments_are_bessel_quotients():
 
 @pytest.mark.parametrize("concentration", [0.1, 5.0, 100.0, 1000.0, 3500.0, 5000.0, 2e4])
 def test_rounding_calls_no_finer_grid(concentration):
-    """Of float32 the moments at the grid's end are rounding, up to 2e-6; masses of arcs are as exact as its numbers."""
+    """The last moments of a float32 density are rounding noise up to 2e-6, and must not request a finer grid."""
     mean = torch.linspace(-3, 3, 50)
     raw = torch.stack([mean.cos(), mean.sin(), torch.full_like(mean, 4 * (concentration**0.25 - 1))], -1)
     density = around(raw)

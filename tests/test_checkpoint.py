@@ -355,7 +355,7 @@ STRUCTURED: dict[str, Callable[[], Any]] = {
     "a path": lambda: Path("a"),
     "bytes": lambda: bytearray(b"a"),
 }
-"""What torch stores beside dense arrays of plain numbers, and arrays that are not stored number by number."""
+"""Objects that torch stores and that are no dense arrays of plain numbers, stored number by number."""
 
 
 @pytest.mark.filterwarnings("ignore")  # of torch, about kinds of tensors that are beta or deprecated

@@ -1,4 +1,4 @@
-"""Which samples stand on the contact sheet of a classifier, and what is said below each."""
+"""Selection and captions of the samples on the contact sheet of a classifier."""
 
 import numpy as np
 import pytest

@@ -110,7 +110,7 @@ REFUSED = {
     "dales": "data.root is not set",
     "smplpix/thesis": "objective.perceptual.weights is null",
 }
-"""What wants a user's files says so; by the beginnings of experiments' names."""
+"""Messages of the experiments that require files of the user, by the beginning of the experiment's name."""
 
 
 HUGE = {"registration/large"}

@@ -30,7 +30,7 @@ def normal(mean, scale, dtype=WIDE):
 
 
 def about_zero(concentration, dtype=WIDE, mean=0.0):
-    """Of this concentration, about `mean`: raw numbers are a pair of that length and direction, and 0."""
+    """Return the von Mises density with this concentration and mean, from the raw parameters of a head."""
     head = build("density_head", resolve("density_head", "von_mises"), target=Target("angle", ("a",))).to(
         dtype
     )

@@ -100,7 +100,7 @@ OWN_FILES = {
     "framework/tracking/watch.py": "/proc",
     "plugins/data/cest/data.py": "the cache, fitted again where it cannot be read",
 }
-"""Who opens a file beside `framework.storage`, and which."""
+"""Modules outside `framework.storage` that open files, and the files that they open."""
 WHO_READS = """
 import sys
 from tests.fuzz.damage import scratch
@@ -267,7 +267,7 @@ STATES = {
         (None, "16", 0, -16, 16.0, float("nan"), 2**24, 10**400, [16], True),
     ),
 }
-"""What data sets keep with a model, and what no value of it can be."""
+"""States that data sets store with a model, and invalid values of these states."""
 
 
 @pytest.mark.parametrize("name", STATES)

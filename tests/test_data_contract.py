@@ -281,7 +281,7 @@ ALSO = {
     "read wants prepare": {"damaged own files are named"},
     "the scaling stays behind": {"own files"},
 }
-"""What else a fault breaks."""
+"""Further contract tests that a planted fault breaks."""
 
 
 @pytest.mark.parametrize("fault", FAULTS)

@@ -128,7 +128,7 @@ class Made:
 
     @property
     def slow(self) -> bool:
-        """Whether each value takes draws of its own: nobody waits for a grid of them."""
+        """Return whether each log-density needs its own random draws, so that a grid of values takes too long."""
         return bool((estimate(self.parts[0], self.value).samples > 0).any()) and not isinstance(
             self.parts[0], Mixture
         )
@@ -147,7 +147,7 @@ def there_and_back(density: Distribution) -> Distribution:
 
 
 def restricted(name: str, row: HeadRow) -> bool:
-    """Whether the head's densities are spread over a part of the torus."""
+    """Return whether the support of the head's densities is a part of the torus."""
     return Made(name, row).parts[0].support.ranges is not None
 
 
@@ -176,7 +176,8 @@ def close(found: Tensor, wanted: Tensor, limit: float = 1e-9) -> None:
 
 
 def item_of(name: str, made: Made, answer) -> Tensor | None:
-    """What a structure's log-density, mass or distance must be, from those of its parts: log where `answer` is."""
+    """Return the value that a structure must have, computed from the values of its parts; a logarithm if `answer`
+    returns one."""
     log_parts = [answer(part, made.value) for part in made.parts]
     if any(part is None for part in log_parts):
         return None
@@ -557,7 +558,7 @@ def moments(kind: str, made: Made, density: Distribution) -> None:
 
 
 def combined(kind: str, made: Made, number: Tensor) -> Tensor:
-    """What a structure has of a number that mixtures average, from that of each part, (item, part, *event)."""
+    """Return the number of a structure from the numbers of its parts, (item, part, *event), which mixtures average."""
 
     def mixed(weights: Tensor, number: Tensor) -> Tensor:
         return (share(weights).reshape(*weights.shape, *[1] * (number.dim() - 2)) * number).sum(1)
@@ -893,7 +894,7 @@ DRAWN["categorical"] = Target("class", ("a", "b", "c"))
 
 @pytest.mark.parametrize("name", DRAWN)
 def test_structures_show_what_is_drawn_inside_or_refuse(name: str) -> None:
-    """Where the point prediction is one of a part's, that part's images; of several parts none."""
+    """A structure shows the images of the part that makes its point prediction, and refuses if several parts do."""
     made = Made(name, HeadRow("", DRAWN[name]))
     places, size = torch.randn(3, BATCH, 2).double(), (5, 7)
     made.parts = [Ball(part, place, size) for part, place in zip(made.parts, places, strict=True)]
@@ -926,7 +927,7 @@ def test_structures_show_what_is_drawn_inside_or_refuse(name: str) -> None:
 
 @pytest.mark.parametrize("kind", [Normal, Laplace])
 def test_a_density_over_images_shows_its_mean(kind: type) -> None:
-    """Of mixtures the weighted sum over components, with the variance by the law of total variance."""
+    """A mixture shows the weighted mean of its components; its variance follows the law of total variance."""
     torch.manual_seed(0)
     means, spreads = torch.rand(2, 3, BATCH, 5, 7, 3).double()
     parts = [Independent(kind(*each), 3) for each in zip(means, 0.1 + spreads, strict=True)]
@@ -963,8 +964,10 @@ CHARTS = [(name, row) for name, row in ROWS if row.target.kind == "angle" and re
 
 @pytest.mark.parametrize("name, row", CHARTS, ids=ids(CHARTS))
 def test_every_structure_over_a_chart_is_a_density_there(name: str, row: HeadRow) -> None:
-    """Where the support is a part of the torus every structure integrates to 1 over it, and samples lie inside; so does
-    every marginal. By Gauss and Legendre across a part of a turn, by the trapezium rule around a whole one."""
+    """If the support is a part of the torus, each structure and marginal integrates to 1 over it; samples lie inside.
+
+    The integrals use Gauss-Legendre quadrature over a part of the circle, and the trapezium rule over the whole circle.
+    """
     with torch.no_grad():
         made = Made(name, row, spread=0.3)
         for kind, density in made.structures().items():
@@ -1017,13 +1020,15 @@ SPREADS = {
 }
 SEEDS, ITEMS = 20, 100
 FACTOR, OF_MEAN = 1.3, 1.8
-"""How far the root mean square of the told errors may be from that of the spread over 20 seeds: of all items together,
-and of the mean over items, whose spread 20 seeds know to 16 %."""
+"""Largest ratio between the root mean square of the reported errors and that of the spread over 20 seeds.
+
+The first is for all items together. The second is for the mean over items, whose spread 20 seeds determine to 16 %.
+"""
 
 
 @pytest.mark.parametrize("case", SPREADS)
 def test_told_errors_are_the_spread_over_seeds(case: str) -> None:
-    """Of three members, as `ensemble` predicts them, also stacked one by one, folded, with another temperature."""
+    """Compare with repeated estimates, for three members of an ensemble and for structures of their densities."""
     target, config = SPREADS[case]
     torch.manual_seed(0)
 

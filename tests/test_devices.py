@@ -1,4 +1,4 @@
-"""What `mode=check` takes for a mixture of devices, and that the framework's own densities and answers make none."""
+"""Detection of mixed devices by `mode=check`, and its silence about the framework's own densities."""
 
 from collections.abc import Callable
 

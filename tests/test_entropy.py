@@ -253,7 +253,8 @@ def test_of_more_peaks_than_can_be_compared_draws_tell_it(
 
 @pytest.mark.parametrize("kind", [VonMises, Normal], ids=["angle", "real"])
 def test_drawn_entropies_have_the_gradient_of_the_entropy(kind: type) -> None:
-    """Of two humps, each many times, whose scale is learned: that of -log_prob at fixed draws is 0 in the mean."""
+    """Compare the gradients for two peaks and for many copies of them; -log_prob at fixed draws would have a mean
+    gradient of 0."""
     gradients = []
     for count in (2, 6000):
         spread = torch.tensor(4.0 if kind is VonMises else 0.5, dtype=torch.float64, requires_grad=True)

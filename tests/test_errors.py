@@ -1,4 +1,4 @@
-"""What an error says stays what it says, wherever it is raised."""
+"""Messages of errors, which stay unchanged wherever the error is raised."""
 
 import pickle
 import re

@@ -25,7 +25,7 @@ NAMES = [
     b"\\\\xe9", "日本 ü".encode(), b"a,b;c", b"per%20cent", b"#1", b"{x}=[1]", b"$HOME", b"q?", b"cr\r",
     b"\xed\xa0\x80",
 ]  # fmt: skip
-"""Of files, without their suffix."""
+"""File names without their suffix."""
 BYTES = st.binary(min_size=1, max_size=20).filter(lambda name: not {0, 47} & set(name))
 
 

@@ -1,4 +1,4 @@
-"""What a run of one's own data shows: its pictures name the data and the model, and its work says how far it is."""
+"""Output of a run on the user's own data: figures name the data and the model, and long work shows its progress."""
 
 import math
 import re

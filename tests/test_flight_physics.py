@@ -15,7 +15,7 @@ TIMES = 0.016 * np.arange(60)
 
 
 def starts(count: int) -> np.ndarray:
-    """With spins of every direction; most of them land."""
+    """Return random starts of flights with spins in all directions; most of these flights land on the table."""
     random = np.random.default_rng(0)
     return START + random.normal(size=(count, 9)) * [0.2, 0.1, 0.1, 0.5, 0.5, 0.4, 80, 80, 80]
 

@@ -89,7 +89,7 @@ def test_the_mode_is_no_lower_than_any_component_s_nor_than_what_is_near(
 @pytest.mark.parametrize("numbers", [1, 2])
 @pytest.mark.parametrize("kind", KINDS[:2])
 def test_hardly_any_density_is_higher_elsewhere(kind: str, numbers: int) -> None:
-    """Of mixtures of five, by a grid; the best component's mode is often 1e-3 nats too low."""
+    """Compare the modes of mixtures of five with a grid; the best mode of a component is often 1e-3 nats too low."""
     missed = before = 0
     seeds = range(10 if numbers == 1 else 3)
     for seed in seeds:

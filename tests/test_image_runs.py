@@ -120,7 +120,7 @@ def people(folder: Path) -> tuple[str, ...]:
 def test_images_are_predicted_loaded_frozen_served_and_trained_further(
     framework: Framework, tmp_path: Path
 ) -> None:
-    """From a user's coloured mesh to the picture, by every road the same one."""
+    """Every way from a user's coloured mesh to an image gives the same image."""
     done = framework(*people(tmp_path), folder="first")
     assert done.code == 0, done.out
     files = list(colored_meshes(tmp_path))

@@ -106,7 +106,7 @@ def mixed(logits: Tensor, loc: Tensor, scale: Tensor, exact: Any, base: Any) -> 
 
 
 def close(found: Tensor, wanted: tuple[float, float], note: str) -> None:
-    """Within 0.1 % of the width, which is asked for; and here within 1e-6 of it, but for the type's rounding."""
+    """Require that an interval agrees to 1e-6 of its width, apart from rounding; the contract requires 0.1 %."""
     width = wanted[1] - wanted[0]
     np.testing.assert_allclose(
         found.numpy(), wanted, rtol=0, atol=1e-6 * width + 8e-15 * max(map(abs, wanted)), err_msg=note
@@ -152,7 +152,7 @@ def test_frames_numbers_and_batches_of_other_shapes(dtype: torch.dtype) -> None:
 
 
 def two_halves(found: Interval, law: Callable[[float, float], float], mass: float, note: str) -> None:
-    """From the middle either half of an arc has half of the mass, and the middle parts the circle."""
+    """Require that the middle of an arc halves the mass of the arc and the mass of the circle."""
     low, high = found.low.item(), found.high.item()
     assert -math.pi <= low < math.pi and low < high <= low + 2 * math.pi + 1e-12, note
     assert law(low, high) == pytest.approx(mass, rel=1e-6), note

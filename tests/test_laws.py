@@ -20,7 +20,7 @@ MATHEMATICS = {"points", "projection", "temperature", "mixture", "categorical", 
 
 
 def faults(paths: list[Path], find: Callable[[Path], Iterable[object]]) -> dict[str, list[object]]:
-    """What `find` says of each file, of those of which it says anything."""
+    """Return the findings of `find` by file, for the files with at least one finding."""
     found = {str(path.relative_to(ROOT)): list(find(path)) for path in paths}
     return {name: lines for name, lines in found.items() if lines}
 
@@ -232,7 +232,7 @@ def test_plugin_folders_explain_themselves() -> None:
 
 
 def test_tests_import_mlflow_without_a_change_to_others() -> None:
-    """What a test file imports while it is collected changes the process in which all other tests run."""
+    """An import at the top of a test file changes the process in which all other tests run."""
     files = [
         *sorted((ROOT / "tests").rglob("*.py")),
         *(path for path in PLUGINS if path.name.startswith("test_")),

@@ -131,7 +131,7 @@ def test_a_model_that_sums_up_by_itself_is_fitted_alike_and_keeps_its_numbers():
 
 
 def test_units_do_not_matter():
-    """Of parameters in micrometres and megametres, too."""
+    """Parameters in micrometres and megametres give the same fit."""
     measured, _ = decays(20, 0.05)
     model, unit = Decays(measured), torch.tensor([1e-6, 1e6, 1e3]).double()
 

@@ -18,7 +18,7 @@ def test_light_is_that_of_another_library_and_comes_back() -> None:
 
 @pytest.mark.parametrize("kind", [torch.float32, torch.float64])
 def test_white_and_black_are_exact_and_numbers_rise_with_light(kind: torch.dtype) -> None:
-    """What is white is told from what is not, as ground from figure."""
+    """White and black must be exact, since a white background is recognised by its value."""
     ends = torch.tensor([0.0, 1.0], dtype=kind)
     assert torch.equal(srgb_from_linear(ends), ends)
     assert torch.equal(linear_from_srgb(ends), ends)

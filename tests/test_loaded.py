@@ -147,7 +147,7 @@ def follows_the_scan(model: Predictor, frozen: Frozen, file: Path, lines: list[s
 @pytest.mark.parametrize("unit", [(0.0, 1.0), (1e6, 1e-3), (-3e-9, 1e-12), (0.0, 1e30)])
 @pytest.mark.parametrize("head", ["gaussian", "mixture", "extra_trees", "cvae"])
 def test_reals_are_fitted_and_given_back_in_any_unit(head: str, unit: tuple[float, float]) -> None:
-    """What is learned is the same law, moved and scaled; log-densities differ by the logarithm of the scale."""
+    """The fitted density is shifted and scaled with the unit; log-densities differ by the logarithm of the scale."""
     random = torch.Generator().manual_seed(0)
     inputs = torch.rand(64, 2, generator=random)
     law = torch.stack([inputs.sum(-1), inputs[:, 0] - 1], -1).double() + 0.1 * torch.rand(

@@ -226,7 +226,8 @@ def test_points_that_are_not_finite_are_named_or_dropped(tmp_path):
 ODD = [
     chr(code) for code in (0x0B, 0x0C, 0x1C, 0x1D, 0x1E, 0x1F, 0x85, 0xA0, 0xC5, 0xE0, 0x2028, 0x2029, 0x3000)
 ]
-"""What ends a line of Python's text or is a blank in it, and letters that hold such bytes: Å is C3 85, à C3 A0."""
+"""Characters that Python reads as line ends or blanks, and letters whose UTF-8 contains such bytes: Å is C3 85, à is
+C3 A0."""
 
 
 def written(letter):

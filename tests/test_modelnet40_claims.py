@@ -22,7 +22,11 @@ def method(*runs):
 
 
 def test_one_run_each_is_mcnemars_difference():
-    """Of n clouds b are right for the first alone, c for the other: (b - c) / n ± √(b + c - (b - c)² / n) / n."""
+    """The difference has McNemar's standard error.
+
+    If b of n clouds are right only with the first method and c only with the other, the difference is
+    (b - c) / n ± √(b + c - (b - c)² / n) / n.
+    """
     random = np.random.default_rng(0)
     first, other = random.random((2, 500)) < [[0.8], [0.7]]
     b, c, n = (first & ~other).sum(), (~first & other).sum(), 500

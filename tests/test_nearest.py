@@ -22,7 +22,7 @@ from framework.geometry.nearest.streamed import Middle, Reach, Stream, normalise
 
 DTYPES = pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
 EXACT = {torch.float32: 2.5e-7, torch.float64: 1e-15}
-"""Of the largest coordinate or distance."""
+"""Tolerance by type, relative to the largest coordinate or distance."""
 THREADS = torch.get_num_threads()
 
 
@@ -369,7 +369,7 @@ def by_loops(a, b):
     "exponent", [-310, -200, -160, -45, -40, -30, -23, -19, -15, 0, 15, 18, 19, 20, 30, 38, 150, 160, 300]
 )
 def test_chamfer_is_right_wherever_a_number_can_hold_it(exponent, share, padded, dtype):
-    """Beside an ordinary pair of clouds; where none can, a sentence and never infinity or 0."""
+    """An extreme pair beside an ordinary pair gets the right distance, or an error, but never infinity or 0."""
     limit = torch.finfo(dtype)
     if not limit.tiny * limit.eps < 10.0**exponent < limit.max / 10:
         return

@@ -53,7 +53,7 @@ def test_movements_bend_what_they_name(body_model):
 
 def test_slopes_are_those_of_the_vertices(body_model):
     at, chosen, step = numbers(body_model), torch.arange(0, len(body_model.colors), 7), 1e-3
-    slopes = body_model.slopes(at, chosen)
+    slopes = body_model.derivatives(at, chosen)
     for column in range(len(at)):
         aside = torch.zeros_like(at)
         aside[column] = step

@@ -1,4 +1,4 @@
-"""What figures show: scales, words, and how many of each thing, read from the artists."""
+"""Content of figures: scales, texts and numbers of elements, read from matplotlib's artists."""
 
 import math
 import re
@@ -99,7 +99,7 @@ def test_samples_that_cannot_be_compared_are_refused() -> None:
 @settings(deadline=None, max_examples=60)
 @given(st.floats(-4, 4), st.floats(-4, 4), st.integers(0, 5))
 def test_an_error_is_to_the_nearest_true_angle(truth: float, point: float, symmetry: int) -> None:
-    """Against a loop over all that are true; where every angle is, nothing is an error."""
+    """Compare with a loop over all true angles; if every angle is true, the error is 0."""
     found = deviation(
         *(torch.tensor([value], dtype=torch.float64) for value in (truth, point)), torch.tensor([symmetry])
     )

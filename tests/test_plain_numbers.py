@@ -22,7 +22,7 @@ from plugins.renderer.rasterizer.gltf import read as read_gltf
 from plugins.renderer.rasterizer.turntable import read_camera
 
 NO_NUMBERS = [True, "1_0", "nan", "0x10", " 1 ", "1", None, [], {}]
-"""What is no number, though Python or NumPy makes one of most of them."""
+"""Values that are no numbers, although Python or NumPy converts most of them to one."""
 CAMERA = {"K": [[10.0, 0, 5], [0, 10, 5], [0, 0, 1]], "R": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "t": [0, 0, 2]}
 
 

@@ -23,7 +23,7 @@ from tests.planted_questions import FURTHER_FAULTS
 from tests.right_heads import HEADS, right_findings
 
 ALONE = {fault.only.rpartition(": ")[2] for fault in (*ALL_FAULTS, *FURTHER_FAULTS)}
-"""Of a mixture or a power of the density the property is the same."""
+"""Names of the properties that the planted faults break, without the structure (mixture, power) of the density."""
 
 
 @pytest.mark.parametrize("fault", ALL_FAULTS, ids=lambda fault: fault.name)
@@ -56,7 +56,7 @@ def test_the_fault_is_found_by_the_property_that_is_for_it(fault: Fault) -> None
     ids=lambda part: part if isinstance(part, str) else str(len(part.names)),
 )
 def test_a_right_head_of_somebody_else_is_not_refused(name: str, target: Target) -> None:
-    """With one seed of what is drawn; benchmarks/framework/check.py tries more."""
+    """Check with one seed of the random draws; benchmarks/framework/check.py tries more seeds."""
     require(*right_findings(name, target))
 
 

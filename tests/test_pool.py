@@ -391,8 +391,8 @@ def test_jobs_of_a_killed_sweep_close_and_the_next_sweep_waits_for_them(app: App
 
 @LINUX
 def test_jobs_end_with_the_process_they_are_forks_of_and_the_next_ones_get_another(tmp_path: Path) -> None:
+    """The record states how each job ended: one closes its run, one ignores the signal and completes, one is killed."""
     app = App(tmp_path, fork=True)
-    """How they end is known: one closes, one ends as if nothing were, one dies of it."""
     jobs = ["what=hold,stubborn,sleep,ok", "hydra.launcher.jobs=3"]
     process = app.start("-m", "hydra/launcher=pool", *jobs)
     try:

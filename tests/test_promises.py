@@ -1,4 +1,4 @@
-"""What a wrapper promises is what predictions, the served and the frozen model, and the tables say."""
+"""Agreement of the conformal prediction sets of predictions, served models, frozen models and tables."""
 
 import json
 import math

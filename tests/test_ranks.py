@@ -121,7 +121,7 @@ KILLS = {
     "1|collective|SIGKILL": "KILLED",
     "0|testing|SIGKILL": "KILLED",
 }
-"""How the run is closed when a rank ends at a moment in some way, from its start to its end."""
+"""Status of the run after a rank ended, by rank, moment and cause."""
 
 
 @pytest.mark.slow

@@ -89,12 +89,14 @@ SLIVERS: dict[str, Callable[[], Scene]] = {
     "slivers": lambda: soup(seen(), 150, 1.0, 0.01, (1.0, 4.0)),
     "slivers that the near plane cuts": lambda: soup(replace(seen(), near=0.3), 150, 1.0, 0.02, (-0.5, 2.0)),
 }
-"""Of which most pixels lie beside an edge."""
+"""Scenes in which most pixels lie close to an edge."""
 
 
 def ends(corners: Tensor, near: float) -> Tensor:
-    """Of edges of (faces, 3, 3) in camera coordinates what lies at `near` or beyond, and where the near plane cuts
-    faces: segments (number, 2, 3)."""
+    """Return the visible edges of faces, (faces, 3, 3), in camera coordinates, as segments, (number, 2, 3).
+
+    These are the parts of the edges at `near` or beyond, and the cuts of the near plane through faces.
+    """
     edges = torch.stack([corners, corners.roll(-1, 1)], 2)  # (faces, 3, 2, 3)
     depth = edges[..., 2]
     share = ((near - depth[..., 0]) / (depth[..., 1] - depth[..., 0]))[..., None]
@@ -106,7 +108,7 @@ def ends(corners: Tensor, near: float) -> Tensor:
 
 
 def to_the_nearest_edge(corners: Tensor, camera: Camera, pixels: Tensor) -> Tensor:
-    """How far (pixels, 2) lie from the edges of all faces, as the camera sees them, pixels."""
+    """Return the distance of each pixel, (pixels, 2), from the nearest projected edge of a face, in pixels."""
     focal, principal = (torch.tensor(part).double() for part in (camera.focal, camera.principal))
     found = ends(corners, camera.near)
     place = focal * found[..., :2] / found[..., 2:] + principal
@@ -117,7 +119,8 @@ def to_the_nearest_edge(corners: Tensor, camera: Camera, pixels: Tensor) -> Tens
 
 
 def apart(corners: Tensor, faces: tuple[Tensor, Tensor], camera: Camera, pixels: Tensor) -> Tensor:
-    """How many pixels both of two faces would have to be shifted for one depth at the pixel; inf where one is none."""
+    """Return by how many pixels two faces would have to be shifted to have equal depth at the pixel; inf without two
+    faces."""
     focal, principal = (torch.tensor(part).double() for part in (camera.focal, camera.principal))
     ray = torch.cat([(pixels - principal) / focal, torch.ones(len(pixels), 1).double()], -1)
     inverse, slope = [], []
@@ -132,7 +135,7 @@ def apart(corners: Tensor, faces: tuple[Tensor, Tensor], camera: Camera, pixels:
 
 
 def shown_around(renderer: Renderer, scene: Scene, row: int, column: int) -> Tensor:
-    """What is seen within WITHIN of a pixel's centre, in 16 directions: (17, channels)."""
+    """Return the colours at WITHIN from a pixel's centre in 16 directions, and at the centre: (17, channels)."""
     camera = scene.camera
     x, y = (float(part) - at for part, at in zip(camera.principal, (column, row), strict=True))
     found = []
@@ -145,7 +148,8 @@ def shown_around(renderer: Renderer, scene: Scene, row: int, column: int) -> Ten
 
 
 def compared(scene: Scene, caster: Renderer) -> tuple[int, list[str]]:
-    """How many pixels differ by more than 1/255, and those of them that no edge, tie or steep colour explains."""
+    """Return the number of pixels that differ by more than 1/255, and those not explained by edges, ties or steep
+    colours."""
     channels = ("color", "face", "normal")
     found = build("renderer", resolve("renderer", {"name": "rasterizer"}))(scene, channels)
     wanted = caster(scene, channels)
@@ -173,8 +177,11 @@ def compared(scene: Scene, caster: Renderer) -> tuple[int, list[str]]:
 
 
 def test_pictures_are_those_of_rays_but_for_edges(stranger: ModuleType) -> None:
-    """To 1/255, on 99.99 % of pixels; the others lie within 1/128 pixel of an edge, of where two surfaces pass through
-    one another, or, of one surface, of the colour that is shown."""
+    """Rasterised and ray-cast images agree to 1/255 on 99.99 % of the pixels.
+
+    Each other pixel lies within 1/128 pixel of an edge, of an intersection of two surfaces, or of a place on the same
+    surface that has the rasterised colour.
+    """
     caster = stranger.RayCaster()
     different = 0
     for name, make in SCENES.items():

@@ -35,7 +35,8 @@ NOT_OURS = ("=mine", "=theirs", "X=", "resume=", "--")
 
 
 def commands(readme: Path) -> list[str]:
-    """What follows `python -m framework`, in code blocks and between backticks, lines that go on joined."""
+    """Return the arguments of each `python -m framework` in code blocks and between backticks, with continued lines
+    joined."""
     text = re.sub("<[^>\n]*>", "X", readme.read_text(encoding="utf-8").replace("\\\n", " "))
     found = re.findall(r"python -m framework((?: [^`\n]*)?)", text)
     return list(dict.fromkeys(line.partition("   #")[0].partition(" # ")[0].strip() for line in found))

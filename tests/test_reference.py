@@ -29,7 +29,7 @@ def test_errors_are_numpys() -> None:
 
 
 def test_the_error_of_the_error_is_its_scatter_over_repetitions() -> None:
-    """Of many experiments the standard deviation of the error, which the delta method gives from each one."""
+    """Compare the delta method's standard error with the standard deviation over many experiments."""
     generator = np.random.default_rng(1)
     truth = np.zeros(4)
     reference = Reference(99, torch.zeros(4, dtype=torch.float64), 0.0, 0.0, 2)

@@ -80,7 +80,7 @@ STATES = {
     "shared objects": "git clone -q --shared . ../other; cd ../other; git gc -q; touch -d 2001-01-01 a.txt",
     "bare by its configuration": "git config core.bare true",
 }
-"""What a user's repository may be in, each as commands in one with a commit, a.txt and inside/b.txt."""
+"""Shell commands that create each state of a repository with one commit, a.txt and inside/b.txt."""
 
 
 @pytest.fixture(autouse=True)
@@ -197,7 +197,7 @@ PLACES = {
         mv .git/config .git/config.worktree; printf '[core]\nrepositoryformatversion = 1\n' > .git/config
         printf '[extensions]\nworktreeConfig = true\n' >> .git/config""",
 }
-"""Where a repository's settings can stand."""
+"""Places of a repository's settings, with the commands that move the settings there."""
 
 
 @pytest.mark.parametrize("place", PLACES)

@@ -33,7 +33,7 @@ with importing_mlflow():
     from mlflow.pyfunc import load_model, scoring_server
 
 SECONDS = 6
-"""What a request may take here."""
+"""Limit of the time of one request, seconds."""
 ROW = {"number": 3.0, "square": 9.0}
 TABULAR, IMAGES = "tabular", "images_with_angles"
 JSON, CSV = "application/json", "text/csv"

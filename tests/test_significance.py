@@ -1,4 +1,4 @@
-"""What tables call significant, against SciPy's Welch test and against chance."""
+"""Marks of significance in tables, compared with SciPy's Welch test and with chance."""
 
 import math
 
@@ -43,7 +43,7 @@ def test_the_scale_does_not_matter(scale: float) -> None:
 @pytest.mark.parametrize("runs", [1, 2, 3, 5, 10])
 @pytest.mark.parametrize("methods", [2, 3])
 def test_of_equal_methods_at_most_one_table_in_twenty_has_a_bold_row(runs: int, methods: int) -> None:
-    """Of 10,000 tables; a single run has the standard error over its test samples."""
+    """Count over 10,000 random tables; a single run has the standard error over its test samples."""
     random = np.random.default_rng(0)
     draws = random.normal(size=(10_000, max(runs, 2), methods))
     bold = 0

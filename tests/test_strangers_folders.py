@@ -38,7 +38,7 @@ COMMANDS: dict[str, list[str]] = {
     "sweep": ["-m", *TINY, "trainer.max_epochs=1", "seed=0", "logger=none", "hydra.sweep.dir={sweep}"],
     "sweep with a store": ["-m", *TINY, "trainer.max_epochs=1", "seed=0", "hydra.sweep.dir={sweep}"],
 }
-"""Those that read a run folder, or write into it."""
+"""Commands that read a run folder or write into it."""
 
 
 @dataclass

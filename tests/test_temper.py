@@ -219,7 +219,7 @@ def test_stacked_and_reshaped_are_tempered_inside():
 
 @pytest.mark.parametrize("temperature", [0.05, 0.4, 2.0, 20.0])
 def test_any_density_of_one_angle_is_normalised_on_a_grid(temperature):
-    """Against adaptive quadrature; powers below 1 have a cusp where the cardioid has its zero."""
+    """Compare with adaptive quadrature; powers below 1 have a cusp at the zero of the cardioid."""
     place = torch.tensor([[0.0], [2.9], [-40.0]]).double()
     warm = temper(Cardioid(place), hot(temperature))
     assert isinstance(warm, CircularPower) and warm.support is circular
@@ -313,7 +313,7 @@ POWERS = {
 @pytest.mark.parametrize("kind", POWERS)
 @pytest.mark.parametrize("temperature", [0.4, 3.0])
 def test_draws_of_a_power_are_those_of_its_density(kind, dtype, temperature, monkeypatch):
-    """At equally spaced shares the draws are quantiles; their spread and entropy are those of quadrature."""
+    """Draws at equally spaced probabilities are the quantiles; compare their spread and entropy with quadrature."""
     density = OneAngle(*POWERS[kind], dtype)
     if dtype == torch.float32 and density.concentration.max() > 1e6:
         pytest.skip("float32 shows no angle to a tenth of its standard deviation")

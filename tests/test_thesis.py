@@ -15,7 +15,7 @@ from tests.conftest import Framework
 from tests.test_composition import composed
 
 CLASSES = Target("class", tuple(f"class {number}" for number in range(40)))
-"""Of ModelNet40."""
+"""Target of ModelNet40."""
 PARAMETERS = {
     # Table 6.1, in the order of its rows
     "voxnet": "9e5",
@@ -44,7 +44,7 @@ PARAMETERS = {
 
 
 def encoders_of(name: str) -> list[dict[str, Any]]:
-    """What an experiment on ModelNet40 says of its encoders; without Hydra, which takes a second to compose it."""
+    """Return the encoder settings of an experiment on ModelNet40, read without Hydra, which would take a second."""
     said = yaml.safe_load((folder() / "experiment/modelnet40" / f"{name}.yaml").read_text(encoding="utf-8"))
     chosen = next(one["override /encoder"] for one in said["defaults"] if "override /encoder" in one)
     return [{"name": one, **said.get("encoder", {}).get(one, {})} for one in chosen]
@@ -52,7 +52,7 @@ def encoders_of(name: str) -> list[dict[str, Any]]:
 
 @pytest.mark.parametrize("name", PARAMETERS)
 def test_a_network_has_the_parameters_that_the_thesis_gives(name: str) -> None:
-    """To less than one in the last digit printed: 4,452,840 is 4.4e6 there."""
+    """Require agreement to less than one unit of the last printed digit: the thesis prints 4,452,840 as 4.4e6."""
     shape: tuple[int, ...] = (2048, 3)
     encoders = []
     for chosen in encoders_of(name):
@@ -149,7 +149,7 @@ def test_a_preset_is_what_the_thesis_says(experiment: str) -> None:
     ],
 )
 def test_a_preset_trains(experiment: str, framework: Framework) -> None:
-    """Those of the other data sets: test_composition.py."""
+    """Train with these presets; test_composition.py tests the presets of the other data sets."""
     run = ("preset=thesis", "debug=fast", "logger=none", "pictures=false", "threads=1")
     done = framework(*f"experiment={experiment}".split(), *run)
     assert done.code == 0, done.out

@@ -1,4 +1,4 @@
-"""What `reproduction/thesis_tables.md` says of runs that are here, half done, or on another machine."""
+"""Content of `reproduction/thesis_tables.md` for runs that are finished, unfinished, or from another machine."""
 
 import datetime
 import itertools
@@ -67,14 +67,14 @@ def test_runs_that_go_alone_count_by_the_clock(runs: Path) -> None:
 
 def test_a_whole_is_told_of_tables_that_all_have_run() -> None:
     lines = ["| 3.3 | a | b | 16 of 72 | 65 | 3.0 | c |", "| 6.4 | a | b | 2 of 2 | 20 | 1.0 | c |"]
-    assert thesis_tables.hours(lines) == pytest.approx((65 * 72 / 16 + 3 + 20 + 1) / 60)
+    assert thesis_tables.total_hours(lines) == pytest.approx((65 * 72 / 16 + 3 + 20 + 1) / 60)
     for line in (
         "| 6.4 | a | b | 0 of 1 | 0 | 1.0 | c |",
         "| 6.4 | a | b | 1 of 1 | not available | 1.0 | c |",
         "| 6.4 | a | b | 1 of 1 | 20 | not available | c |",
         "| 6.4 | a | b | 1 of 1 | 20 | of a page as it was before |",
     ):
-        assert math.isnan(thesis_tables.hours([*lines, line]))
+        assert math.isnan(thesis_tables.total_hours([*lines, line]))
 
 
 def test_what_ran_under_another_definition_is_put_aside(runs: Path) -> None:
@@ -113,15 +113,15 @@ def test_where_no_seed_is_named_runs_of_every_seed_belong_to_the_table(runs: Pat
 
 
 def test_nothing_that_a_table_asks_for_is_put_aside(runs: Path) -> None:
-    """Of every table, the runs as Hydra tells them."""
+    """Check the runs of every table, with the overrides that Hydra records."""
     for name, table in thesis_tables.TABLES.items():
         for jobs, bfloat16 in itertools.product((1, 2), (False, True)):
             for command in thesis_tables.commands(name, 5, jobs, bfloat16)[0]:
                 folder = runs / Path(command[-1].partition("=")[2]).name
                 told = [word for word in command[4:] if not word.startswith("hydra.")]
-                for number, overrides in enumerate(thesis_tables.each(told)):
+                for number, overrides in enumerate(thesis_tables.expand_sweep(told)):
                     job(folder, number, overrides=overrides)
-                words = (*table.sweeps[folder.name], *thesis_tables.said(table, jobs, bfloat16))
+                words = (*table.sweeps[folder.name], *thesis_tables.common_overrides(table, jobs, bfloat16))
                 thesis_tables.put_aside(folder, words)
                 assert len(list(folder.iterdir())) == number + 1
                 shutil.rmtree(folder)
@@ -137,7 +137,7 @@ def test_nothing_that_a_table_asks_for_is_put_aside(runs: Path) -> None:
     ],
 )
 def test_how_many_runs_a_sweep_has(words: tuple[str, ...], count: int) -> None:
-    assert thesis_tables.choices(words, 5) == count
+    assert thesis_tables.count_runs(words, 5) == count
 
 
 @pytest.mark.parametrize(

@@ -409,7 +409,7 @@ FOREIGN = [
     ),
     *("sqlite:////anywhere/mlflow.db", "sqlite:///mlflow.db", "file:///tmp/store", "", "\x1b[2J"),
 ]
-"""What a run.json of somebody else may name; no setting of the user's does."""
+"""Addresses that a run.json of somebody else may name and that no setting of the user names."""
 
 
 @pytest.mark.parametrize("own", [None, "http://localhost:5001", "https://mine.example", "sqlite:///mine.db"])

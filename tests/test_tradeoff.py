@@ -248,7 +248,7 @@ def test_batches_may_come_once(model: Model, pairs: list[Batch]) -> None:
 
 
 def test_no_two_estimates_share_random_numbers(model: Model, pairs: list[Batch]) -> None:
-    """At equal knob values the estimates would be equal if they did."""
+    """Estimates with equal knob values would be equal if they shared random numbers."""
     found = curve_of(model, pairs, values=(10, 10), reference=10, repeats=2)
     assert len({*numbers(found, "log_likelihood_nats"), found.reference.mean}) == 3
 

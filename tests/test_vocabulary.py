@@ -1,4 +1,4 @@
-"""How docstrings begin: with a verb in the imperative or with a noun phrase that can stand alone."""
+"""Beginnings of docstrings, which are a verb in the imperative or a noun phrase, and names that say nothing."""
 
 import ast
 from collections.abc import Iterator

@@ -14,7 +14,7 @@ NUMBERS = {"normal": 3, "barycentric": 3, "uv": 2}
 
 
 class Hits(NamedTuple):
-    """What each ray sees first.
+    """First face that each ray hits.
 
     Attributes:
         face: (rays) int64, -1: nothing.
@@ -36,7 +36,7 @@ def rays(camera: Camera) -> Tensor:
 
 
 def cross(one: Tensor, other: Tensor) -> Tensor:
-    """Of rows of three; exchanged, its arguments give exactly the opposite."""
+    """Return the cross products of rows; exchanged arguments give exactly the negative result."""
     a, b, c = one.unbind(-1)
     x, y, z = other.unbind(-1)
     return torch.stack([b * z - c * y, c * x - a * z, a * y - b * x], -1)
@@ -56,8 +56,11 @@ def sides(corners: Tensor, ray: Tensor) -> list[Tensor]:
 
 
 def possible(corners: Tensor, ray: Tensor) -> Tensor:
-    """Which faces rays within a rectangle may hit, by its four corners: no product or sum, rounded, grows where what
-    goes into it falls, so that a side which is positive, or negative, at all four is so between them."""
+    """Return which faces the rays within a rectangle may hit, tested with the rays at its four corners.
+
+    Rounded products and sums are monotonic. So a side that has the same sign at all four corners has this sign at every
+    ray of the rectangle.
+    """
     low, high = ray.amin(0), ray.amax(0)
     ends = torch.stack([low[0], high[0], low[0], high[0]]), torch.stack([low[1], low[1], high[1], high[1]])
     found = sides(corners, torch.stack([*ends, torch.ones(4, dtype=ray.dtype)], -1))
@@ -90,7 +93,10 @@ def first(corners: Tensor, ray: Tensor, near: float) -> Tensor:
 
 
 def cast(corners: Tensor, ray: Tensor, near: float) -> Hits:
-    """What (rows, columns, 3) rays see first of faces (faces, 3, 3) in camera coordinates; tile by tile, for memory."""
+    """Return the first hits of rays, (rows, columns, 3), on faces, (faces, 3, 3), in camera coordinates.
+
+    The rays are cast tile by tile to save memory.
+    """
     face = torch.full(ray.shape[:2], -1)
     good = (corners.isfinite().all(-1).all(-1) & (corners[..., 2] >= near).any(-1)).nonzero()[:, 0]
     for top in range(0, len(face), TILE):
@@ -116,7 +122,7 @@ def normals(corners: Tensor) -> Tensor:
 
 
 def texel(place: Tensor, count: int, wrap: str) -> Tensor:
-    """Which of `count` texels in a row stands at a whole number."""
+    """Return the index of the texel at a whole number, in a row of `count` texels."""
     if wrap == "clamp":
         return place.clamp(0, count - 1)
     place = place.remainder(count if wrap == "repeat" else 2 * count)
