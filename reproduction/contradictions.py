@@ -1,10 +1,10 @@
 """Remove the suspected cause of each contradicted claim and run its models again.
 
-    python -m reproduction.thesis_tables            (first: it is compared with their runs)
+    python -m reproduction.thesis_tables            (first: its runs are needed for comparison)
     python -m reproduction.contradictions
 
-Less than an hour of two cores; what has run in outputs/contradictions does not run again. Writes contradictions.md
-beside this file.
+The script takes less than an hour on two cores. Runs that are complete in outputs/contradictions are not repeated. It
+writes contradictions.md beside this file.
 """
 
 import json
@@ -30,8 +30,8 @@ HERE = Path(__file__).resolve()
 FOLDER = ROOT / "outputs/contradictions"
 NOISY = FOLDER / "noisy_heads"
 NOISE_DEG = 6.0
-"""Standard deviation of the angles' errors."""
-COMMON = (*thesis_tables.SAID, "threads=1")
+"""Standard deviation of the errors that are added to the angles, in degrees."""
+COMMON = (*thesis_tables.COMMON_OVERRIDES, "threads=1")
 MOONS = {
     "ece": "ECE",
     "brier": "Brier",
@@ -41,21 +41,21 @@ MOONS = {
 }
 CLASSES = {"accuracy": "accuracy", "nll": "NLL (nats)", "ece": "ECE"}
 VIEWS = {"log_likelihood": "log-likelihood (nats)", "acc_pi_6": "Acc π/6", "mederr_deg": "MedErr °"}
-SPLIT = {"log_likelihood": "log-likelihood (nats)", "mode_mass_min": "mass at the weaker azimuth"}
+SPLIT = {"log_likelihood": "log-likelihood (nats)", "mode_mass_min": "probability at the weaker azimuth"}
 HEADS = {"log_likelihood": "log-likelihood (nats)", "maad_deg": "MAAD °"}
 LONGER = "trainer.max_epochs=40"
 
 
 class Part(NamedTuple):
-    """A question, what is run for it, and the rows that answer.
+    """A section of the page: a suspected cause, the runs without it, and the rows of the table.
 
     Attributes:
-        text: the question.
-        claims: those of claims.md that it is about.
-        sweep: its folder in outputs/contradictions.
-        words: what its multirun is told.
-        rows: by label, the folder of a sweep, of the tables or this one's, and words that its runs have been told.
-        columns: key → header.
+        text: Suspected cause and change.
+        claims: Numbers of the claims in claims.md.
+        sweep: Folder of the new runs in outputs/contradictions.
+        words: Overrides of the new runs.
+        rows: For each label the folder of a sweep, new or of the tables, and overrides that select its runs.
+        columns: Headings by key of the result.
     """
 
     text: str
@@ -68,8 +68,10 @@ class Part(NamedTuple):
 
 PARTS = (
     Part(
-        "Outliers drawn from the whole square also lie among the data. `clearance` leaves out those that are nearer "
-        "to a sample of the batch.",
+        "Outlier exposure trains on outliers that are drawn from the whole square, so that some lie among the data. "
+        "The suspected cause is that these teach doubt where the model should be sure. The setting `clearance` "
+        "leaves out outliers that are closer than this distance to a sample of the batch. The entropies are of the "
+        "predictions for the test points and for the outliers.",
         "2-48, 2-49, 2-51",
         "clearance",
         (
@@ -78,24 +80,26 @@ PARTS = (
             "seed=0,1,2,3,4",
         ),
         {
-            "a network, 512": ("moons", "experiment=moons/vanilla_512"),
+            "one network, 512 units": ("moons", "experiment=moons/vanilla_512"),
             "outlier exposure": ("moons", "experiment=moons/outlier_exposure"),
-            "… clearance 0.25": ("clearance", "objective.outlier_exposure.clearance=0.25"),
-            "… clearance 0.5": ("clearance", "objective.outlier_exposure.clearance=0.5"),
+            "outlier exposure, clearance 0.25": ("clearance", "objective.outlier_exposure.clearance=0.25"),
+            "outlier exposure, clearance 0.5": ("clearance", "objective.outlier_exposure.clearance=0.5"),
         },
         MOONS,
     ),
     Part(
-        "Distances are truncated after the edge of one cell, which is four times as long in 8³ cells as in 32³; four "
-        "edges of a small cell are the one of a large cell.",
+        "A grid of truncated distances cuts every distance off at the edge length of one cell. This length is four "
+        "times as long in a grid of 8³ cells as in one of 32³ cells. The suspected cause of the lower accuracy of "
+        "the 32³ grid is its shorter length. The change truncates its distances at four edge lengths, which is the "
+        "length of the 8³ grid.",
         "6-30, 6-34",
         "truncation",
         ("experiment=modelnet40/tdf_mlp_32", "encoder.tdf.truncation=4", "seed=0,1,2"),
         {
-            "8³, one edge": ("modelnet40_quick", "experiment=modelnet40/tdf_mlp_8"),
-            "32³, one edge": ("modelnet40_quick", "experiment=modelnet40/tdf_mlp_32"),
-            "32³, four edges": ("truncation",),
-            "32³, not truncated (basis points)": (
+            "8³ cells, one edge length": ("modelnet40_quick", "experiment=modelnet40/tdf_mlp_8"),
+            "32³ cells, one edge length": ("modelnet40_quick", "experiment=modelnet40/tdf_mlp_32"),
+            "32³ cells, four edge lengths": ("truncation",),
+            "32³ basis points, not truncated": (
                 "modelnet40_quick",
                 "experiment=modelnet40/bps_mlp_grid_32",
             ),
@@ -103,8 +107,11 @@ PARTS = (
         CLASSES,
     ),
     Part(
-        "Labels of drawn heads are exact, those of real ones are not. To every angle of both splits a normal error of "
-        f"{NOISE_DEG:g}° is added.",
+        "The labels of generated heads are exact, but those of real heads are not. The change adds a normal error with "
+        f"a standard deviation of {NOISE_DEG:g}° to every angle of the training and test labels, in a copy of the "
+        "images "
+        'to which data.root is set. "Noise" marks the rows with this error. MAAD is the mean absolute angular '
+        "deviation.",
         "3-32, 3-33, 3-34",
         "label_noise",
         (
@@ -127,7 +134,9 @@ PARTS = (
         HEADS,
     ),
     Part(
-        "Twice as many epochs: cars, which look different from every side.",
+        "The suspected cause is that sCVAE is trained for too few epochs. The change is twice as many epochs. The "
+        "data are the viewpoints of cars, which look different from every side. Acc π/6 is the share of predictions "
+        "less than 30° from the true rotation, and MedErr is the median angle between them.",
         "3-11",
         "cars",
         ("experiment=pascal3d/scvae", "data.category=car", LONGER, "seed=0,1,2"),
@@ -139,7 +148,9 @@ PARTS = (
         VIEWS,
     ),
     Part(
-        "The same of tables, which look alike after half a turn.",
+        "The suspected cause is again too few epochs, and the change is twice as many. The data are the viewpoints "
+        "of dining tables, which look the same after a rotation by 180°. The last column of results is the smaller "
+        "of the two probabilities within 45° of a true azimuth; 0.5 is best.",
         "3-27",
         "tables",
         ("experiment=pascal3d/cvae,pascal3d/scvae", "data.category=diningtable", LONGER, "seed=0,1,2"),
@@ -151,20 +162,21 @@ PARTS = (
         SPLIT,
     ),
     Part(
-        "The row's boosting has 50 rounds, each of a fiftieth of the features, to take minutes. Four times as many "
-        "rounds.",
+        "The boosted trees of Table 6.1 have only 50 boosting rounds here, each on a fiftieth of the features, so "
+        "that a run takes minutes. The change is 200 boosting rounds.",
         "6-42",
         "boosting",
         ("experiment=modelnet40/bps_xgboost", "density_head.rounds=200", "seed=0"),
         {
-            "50 rounds": ("modelnet40_quick", "experiment=modelnet40/bps_xgboost"),
-            "200 rounds": ("boosting",),
+            "boosting, 50 rounds": ("modelnet40_quick", "experiment=modelnet40/bps_xgboost"),
+            "boosting, 200 rounds": ("boosting",),
             "extremely randomised trees": ("modelnet40_quick", "experiment=modelnet40/bps_extra_trees"),
         },
         CLASSES,
     ),
     Part(
-        "Twice as many epochs of DeepSets, beside the networks that it is compared with.",
+        "The suspected cause is that DeepSets is trained for too few epochs. The change is twice as many. The other "
+        "rows are the networks with which the thesis compares DeepSets.",
         "6-52, 6-56, 6-57",
         "deepsets",
         ("experiment=modelnet40/deepsets", LONGER, "seed=0"),
@@ -172,8 +184,11 @@ PARTS = (
             "DeepSets, 20 epochs": ("modelnet40_slow", "experiment=modelnet40/deepsets"),
             "DeepSets, 40 epochs": ("deepsets",),
             "PointNet, 20 epochs": ("modelnet40_slow", "experiment=modelnet40/pointnet"),
-            "basis points, two layers of 400": ("modelnet40_quick", "experiment=modelnet40/bps_mlp_400"),
-            "basis points, two layers of 512, four turns": ("modelnet40_turned",),
+            "basis points, two layers of 400 units": (
+                "modelnet40_quick",
+                "experiment=modelnet40/bps_mlp_400",
+            ),
+            "basis points, two layers of 512 units, four rotated copies": ("modelnet40_turned",),
         },
         CLASSES,
     ),
@@ -181,78 +196,90 @@ PARTS = (
 
 
 def write_noisy_heads() -> None:
-    """The drawn heads' figures, and their labels with errors, unless they are there."""
+    """Copy the generated heads with errors in their labels, unless the copy exists."""
     if (NOISY / LABELS).exists():
         return
-    drawn = Idiap().source.folder()
+    generated = Idiap().source.folder()
     random = np.random.default_rng(0)
-    shutil.copytree(drawn, NOISY, dirs_exist_ok=True, ignore=shutil.ignore_patterns(LABELS))
+    shutil.copytree(generated, NOISY, dirs_exist_ok=True, ignore=shutil.ignore_patterns(LABELS))
     labels = {
-        split: [Label(label.name, wrong(label.angles, random)) for label in some]
-        for split, some in read_labels(drawn / LABELS, "radians").items()
+        split: [Label(label.name, add_label_noise(label.angles, random)) for label in split_labels]
+        for split, split_labels in read_labels(generated / LABELS, "radians").items()
     }
     unfinished = NOISY / f"{LABELS}.unfinished"
     write_labels(unfinished, labels)
     unfinished.replace(NOISY / LABELS)
 
 
-def wrong(angles: tuple[float, float, float], random: np.random.Generator) -> tuple[float, float, float]:
-    """Of radians."""
+def add_label_noise(
+    angles: tuple[float, float, float], random: np.random.Generator
+) -> tuple[float, float, float]:
+    """Add a normal error to three angles in radians."""
     pan, tilt, roll = random.normal(angles, math.radians(NOISE_DEG))
     return float(pan), float(tilt), float(roll)
 
 
-def runs(part: Part, label: str) -> list[Path]:
-    """Of a row.
+def find_runs(part: Part, label: str) -> list[Path]:
+    """Return the run folders of a row.
 
     Raises:
-        DataError: there is none.
+        DataError: No run matches the row.
     """
     sweep, *words = part.rows[label]
     folder = (FOLDER if sweep == part.sweep else thesis_tables.FOLDER) / sweep
     paths = [path.parent for path in sorted(folder.glob("*/results.json"))]
-    told = {path: set(record(path)["overrides"]) for path in paths}
-    # what is compared has one precision
-    found = [path for path in paths if set(words) <= told[path] and thesis_tables.BFLOAT16 not in told[path]]
-    if not found:
+    overrides = {path: set(record(path)["overrides"]) for path in paths}
+    # only runs in float32 are compared
+    matching = [
+        path
+        for path in paths
+        if set(words) <= overrides[path] and thesis_tables.BFLOAT16 not in overrides[path]
+    ]
+    if not matching:
         raise DataError(
-            f"{folder}: no run of {' '.join(words) or 'it'} in float32; wanted one. Run thesis_tables.py first, "
-            "without --bfloat16."
+            f"{folder} holds no run in float32{' with ' + ' '.join(words) if words else ''}. Run "
+            "`python -m reproduction.thesis_tables` without --bfloat16 first."
         )
-    return found
+    return matching
 
 
-def answers(part: Part) -> Iterator[Row]:
-    """Results of its rows, each under its label."""
+def result_rows(part: Part) -> Iterator[Row]:
+    """Yield the results of each run of a section, with the label of its row."""
     for label in part.rows:
-        for run in runs(part, label):
-            found = json.loads((run / "results.json").read_text(encoding="utf-8"))
+        for run in find_runs(part, label):
+            results = json.loads((run / "results.json").read_text(encoding="utf-8"))
             wanted = {"seed", "synthetic", *part.columns, *(f"{key}_sem" for key in part.columns)}
-            kept = {key: value for key, value in found.items() if key in wanted}
-            yield {"method": label, **kept}
+            selected = {key: value for key, value in results.items() if key in wanted}
+            yield {"method": label, **selected}
 
 
 def section(part: Part) -> str:
-    rows = aggregate(list(answers(part)), ["method"])
-    columns = {"method": "", "n": "seeds", **part.columns}
+    rows = aggregate(list(result_rows(part)), ["method"])
+    columns = {"method": "method", "n": "seeds", **part.columns}
     words = " ".join(word for word in part.words if not word.startswith("data.root"))
-    return f"## Claims {part.claims}\n\n{part.text} `{words}`\n\n{markdown(rows, columns)}"
+    return (
+        f"## Claims {part.claims}\n\n{part.text}\n\nCommand: `python -m framework -m {words}`\n\n"
+        f"{markdown(rows, columns)}"
+    )
 
 
 def main() -> None:
-    for part in PARTS:  # what is compared with is wanted before an hour of runs, not after
+    for part in PARTS:  # a missing run for comparison is reported now, not after an hour of training
         for label, (sweep, *_) in part.rows.items():
             if sweep != part.sweep:
-                runs(part, label)
+                find_runs(part, label)
     write_noisy_heads()
     for part in PARTS:
         thesis_tables.put_aside(FOLDER / part.sweep, (*part.words, *COMMON))
-        told = [sys.executable, "-m", "framework", "-m", *part.words, *COMMON]
-        carry_out([*told, "hydra.launcher.jobs=2", f"hydra.sweep.dir={FOLDER / part.sweep}"])
+        command = [sys.executable, "-m", "framework", "-m", *part.words, *COMMON]
+        carry_out([*command, "hydra.launcher.jobs=2", f"hydra.sweep.dir={FOLDER / part.sweep}"])
     text = (
         "# Contradicted claims, with the suspected cause removed (synthetic data)\n\n"
-        "`python -m reproduction.contradictions`. Numbers of the claims in [claims.md](claims.md), which draws the "
-        "conclusions; rows without a change are the runs of [its tables](thesis_tables.md).\n\n"
+        "Some claims of the thesis are contradicted by our runs. For each of them this page removes the suspected "
+        "cause and trains the models again. [claims.md](claims.md) numbers the claims and draws the conclusions. The "
+        "command is `python -m reproduction.contradictions`.\n\n"
+        "Each section states the suspected cause, the change, and the command of the new runs. Rows without the change "
+        "are runs of [the tables of the thesis](thesis_tables.md).\n\n"
         + "\n".join(section(part) for part in PARTS)
         + f"\n{machine('torch', 'pytorch-lightning')}\n"
     )

@@ -2,8 +2,9 @@
 
     python -m reproduction.thesis_tables [2.1 3.3 ...] [--seeds 5] [--jobs 2] [--bfloat16]
 
-Without numbers all of them. What has run in outputs/thesis_tables does not run again, so that the same command goes on
-where it was stopped. Each table's own script writes its page; thesis_tables.md says what ran and for how long.
+Without numbers, the command makes all tables. Runs that are complete in outputs/thesis_tables are not repeated, so that
+the same command continues after an interruption. The script of each table writes its page; thesis_tables.md lists what
+ran and for how long.
 """
 
 import argparse
@@ -25,49 +26,49 @@ from framework.reports.table import NOT_AVAILABLE, format_number
 
 HERE = Path(__file__).resolve()
 FOLDER = ROOT / "outputs/thesis_tables"
-SAID = ("pictures=false", "logger=none")
+COMMON_OVERRIDES = ("pictures=false", "logger=none")
 FIGURES = "| 3.7-3.8 |"
 AT_ONCE = 2
-"""Runs, for the minutes that the page says."""
+"""Number of runs that work at the same time, for the minutes on the page."""
 RUNS, MINUTES, PAGES = 3, 4, 5
-"""Columns of the page."""
+"""Numbers of the columns of the page that the script reads again."""
 BFLOAT16 = "trainer.precision=bf16-mixed"
-"""For convolutions, where asked for: it pays on a processor that has avx512_bf16."""
+"""Override of `--bfloat16`, for convolutional networks; it saves time on processors with avx512_bf16."""
 CLASSES = (
     *("aeroplane", "bicycle", "boat", "bottle", "bus", "car", "chair", "diningtable", "motorbike", "sofa"),
     *("train", "tvmonitor"),
 )
-"""Table 3.3's."""
-SOME = ("bottle", "car", "diningtable")
-"""One that looks alike from everywhere, one from nowhere, one after half a turn: every method, three seeds. Of the
-other classes three methods, one seed."""
+"""Classes of Table 3.3."""
+THREE_SEED_CLASSES = ("bottle", "car", "diningtable")
+"""Classes with every method and three seeds: one that looks the same from every side, one that looks different from
+every side, one that looks the same after a rotation by 180°. The other classes have three methods and one seed."""
 BY_HAND = ("bps_conv3d_ensemble", "pointnet2")
-"""Two rows of Table 6.2, ten convolutional networks and PointNet++ of three sizes of balls, that take two to three
-hours of one core each: not in what is run here, but `modelnet40.py` takes their runs."""
+"""Two rows of Table 6.2 that take two to three hours of one core each: ten convolutional networks, and PointNet++ with
+balls of three sizes. This script does not run them, but `modelnet40.py` accepts their runs."""
 MODELNET = sorted(
     path.stem
     for path in (ROOT / "conf/experiment/modelnet40").glob("*.yaml")
     if path.stem not in ("base", *BY_HAND)
 )
-SLOW = (
+ONE_SEED_METHODS = (
     *("pointnet2_single", "bps_conv3d_delta", "bps_conv3d", "bps_conv3d_unpadded"),
     *("pointnet", "deepsets", "pointnet_vanilla"),
 )
-"""Rows of Tables 6.1 to 6.3 that take more than five minutes of a core: one seed, three of the others. The longest
-first, so that no core waits long for the last of them."""
+"""Rows of Tables 6.1 to 6.3 that take more than five minutes of a core. They have one seed, the others three. The
+longest runs come first, so that both cores finish at about the same time."""
 
 
 class Table(NamedTuple):
-    """Runs and the page that is made of them.
+    """The runs of a table and the script that writes its page.
 
     Attributes:
-        about: what it is, where other than the thesis's.
-        sweeps: arguments of each multirun, by its folder.
-        script: module of reproduction; it is given the folders of its sweeps, or of the only run of each where `alone`.
-        seeds: most that are run of each sweep that does not name its own.
-        alone: whether each sweep has one run, which then has as many threads as others have runs at once.
-        convolves: whether `--bfloat16` is for it.
-        also: further scripts, each with a page of the same runs.
+        about: Description of the table and its data.
+        sweeps: Overrides of each sweep, by its folder.
+        script: Module of reproduction. It receives the folders of the sweeps, or of the single runs if `alone`.
+        seeds: Largest number of seeds of a sweep that does not name its seeds.
+        alone: Whether each sweep has one run, with as many threads as other tables have runs at the same time.
+        convolves: Whether `--bfloat16` applies to the table.
+        also: Further scripts that write a page from the same runs.
     """
 
     about: str
@@ -84,10 +85,10 @@ def methods(group: str, *names: str) -> str:
 
 
 SMALL = "data.image_size=50"
-"""IDIAP's heads in half of their pixels, as large as the other two sets'; `preset=thesis` keeps 75."""
+"""Override that reduces the IDIAP images to the size of the other two sets; `preset=thesis` keeps 75 pixels."""
 HEADS = (methods("idiap", "fixed_kappa", "von_mises", "cvae"), "data.angles=[pan],[tilt],[roll]", SMALL)
 SHORT, SHORTER = "trainer.max_epochs=20", "trainer.max_epochs=15"
-"""Two thirds of the experiments' epochs and half of them, so that two cores are done in four hours."""
+"""Two thirds and half of the epochs of the experiments, so that two cores need four hours for everything."""
 
 TABLES = {
     "2.1": Table(
@@ -123,7 +124,7 @@ TABLES = {
         convolves=True,
     ),
     "3.7-3.8": Table(
-        "the pan of those heads of IDIAP under blur; its other runs are Table 3.1's",
+        "the pan angle of the generated IDIAP heads under blur, with the runs of Table 3.1",
         {
             "idiap": HEADS,
             "idiap_more": (methods("idiap", "mixture", "scvae"), "data.angles=[pan]", SMALL),
@@ -136,12 +137,12 @@ TABLES = {
         {
             "pascal3d": (
                 methods("pascal3d", "fixed_kappa", "von_mises", "mixture", "cvae", "scvae"),
-                f"data.category={','.join(SOME)}",
+                f"data.category={','.join(THREE_SEED_CLASSES)}",
                 SHORT,
             ),
             "pascal3d_classes": (
                 methods("pascal3d", "fixed_kappa", "von_mises", "scvae"),
-                f"data.category={','.join(name for name in CLASSES if name not in SOME)}",
+                f"data.category={','.join(name for name in CLASSES if name not in THREE_SEED_CLASSES)}",
                 SHORT,
                 "seed=0",
             ),
@@ -154,9 +155,11 @@ TABLES = {
     "6.1-6.3": Table(
         "classes of generated CAD models",
         {
-            "modelnet40_quick": (methods("modelnet40", *(name for name in MODELNET if name not in SLOW)),),
+            "modelnet40_quick": (
+                methods("modelnet40", *(name for name in MODELNET if name not in ONE_SEED_METHODS)),
+            ),
             "modelnet40_turned": (methods("modelnet40", "bps_mlp"), "data.rotations=4"),
-            "modelnet40_slow": (methods("modelnet40", *SLOW), "seed=0"),
+            "modelnet40_slow": (methods("modelnet40", *ONE_SEED_METHODS), "seed=0"),
         },
         "chapter6.modelnet40",
         seeds=3,
@@ -176,30 +179,34 @@ def main() -> None:
     arguments = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    arguments.add_argument("tables", nargs="*", metavar="TABLE", help=f"of {', '.join(TABLES)}; none: all")
-    arguments.add_argument("--seeds", type=int, default=5, help="at most, for each table")
-    arguments.add_argument("--jobs", type=int, default=2, help="runs at once")
+    arguments.add_argument(
+        "tables", nargs="*", metavar="TABLE", help=f"tables to make: {', '.join(TABLES)} (default: all)"
+    )
+    arguments.add_argument("--seeds", type=int, default=5, help="largest number of seeds of each table")
+    arguments.add_argument("--jobs", type=int, default=2, help="number of runs at the same time")
     arguments.add_argument("--bfloat16", action="store_true", help="train convolutions in mixed precision")
     arguments.add_argument("--tell", action="store_true", help="print the commands, run nothing")
-    given = arguments.parse_args()
-    unknown = [name for name in given.tables if name not in TABLES]
+    options = arguments.parse_args()
+    unknown = [name for name in options.tables if name not in TABLES]
     if unknown:
-        arguments.error(f"no table {', '.join(unknown)}; there are {', '.join(TABLES)}")
-    for name in given.tables or TABLES:
-        sweeps, pages = commands(name, given.seeds, given.jobs, given.bfloat16)
-        if not given.tell:
+        arguments.error(f"There is no table {', '.join(unknown)}. Choose from {', '.join(TABLES)}.")
+    for name in options.tables or TABLES:
+        sweeps, pages = commands(name, options.seeds, options.jobs, options.bfloat16)
+        if not options.tell:
             for sweep, words in TABLES[name].sweeps.items():
-                put_aside(FOLDER / sweep, (*words, *said(TABLES[name], given.jobs, given.bfloat16)))
-        told(sweeps, run=not given.tell)
+                put_aside(
+                    FOLDER / sweep, (*words, *common_overrides(TABLES[name], options.jobs, options.bfloat16))
+                )
+        run_commands(sweeps, run=not options.tell)
         began = time.perf_counter()
-        told(pages, run=not given.tell)
-        if not given.tell:  # after each: who stops it during the next loses nothing
+        run_commands(pages, run=not options.tell)
+        if not options.tell:  # after each table, so that an interruption loses nothing
             page = HERE.with_suffix(".md")
             written = {name: (time.perf_counter() - began) / 60}
             page.write_text(report(page.read_text(encoding="utf-8"), written), encoding="utf-8")
 
 
-def told(commands: Sequence[Sequence[str]], *, run: bool) -> None:
+def run_commands(commands: Sequence[Sequence[str]], *, run: bool) -> None:
     for command in commands:
         sys.stdout.write(" ".join(command[1:]) + "\n")
         sys.stdout.flush()
@@ -207,19 +214,19 @@ def told(commands: Sequence[Sequence[str]], *, run: bool) -> None:
             carry_out(command)
 
 
-def said(table: Table, jobs: int, bfloat16: bool) -> tuple[str, ...]:
-    """What every run of a table is told."""
+def common_overrides(table: Table, jobs: int, bfloat16: bool) -> tuple[str, ...]:
+    """Return the overrides that all runs of a table have."""
     precision = (BFLOAT16,) if bfloat16 and table.convolves else ()
-    return (*precision, *SAID, f"threads={jobs if table.alone else 1}")
+    return (*precision, *COMMON_OVERRIDES, f"threads={jobs if table.alone else 1}")
 
 
 def commands(name: str, seeds: int, jobs: int, bfloat16: bool) -> tuple[list[list[str]], list[list[str]]]:
-    """Of a table: its sweeps; its pages, which are made of them."""
+    """Return the commands of the sweeps of a table, and the commands that write its pages."""
     table = TABLES[name]
-    found = [
+    sweep_commands = [
         [
             *(sys.executable, "-m", "framework", "-m", *with_seeds(words, seeds, table.seeds)),
-            *said(table, jobs, bfloat16),
+            *common_overrides(table, jobs, bfloat16),
             *(f"hydra.launcher.jobs={jobs}", f"hydra.sweep.dir={folder_of(sweep)}"),
         ]
         for sweep, words in table.sweeps.items()
@@ -228,32 +235,32 @@ def commands(name: str, seeds: int, jobs: int, bfloat16: bool) -> tuple[list[lis
     pages = [
         [sys.executable, "-m", f"reproduction.{script}", *folders] for script in (table.script, *table.also)
     ]
-    return found, pages
+    return sweep_commands, pages
 
 
 def with_seeds(words: Sequence[str], seeds: int, most: int) -> list[str]:
-    """What a multirun is told, its seeds too: of those that it names, or of as many as a table has at most."""
+    """Return the overrides of a sweep with at most `seeds` seeds: of those that it names, or of 0 to `most` - 1."""
     named = [word for word in words if word.startswith("seed=")]
-    drawn = options(named[0].partition("=")[2]) if named else [str(seed) for seed in range(most)]
-    return [*(word for word in words if word not in named), f"seed={','.join(drawn[:seeds])}"]
+    values = split_values(named[0].partition("=")[2]) if named else [str(seed) for seed in range(most)]
+    return [*(word for word in words if word not in named), f"seed={','.join(values[:seeds])}"]
 
 
 def put_aside(sweep: Path, words: Sequence[str]) -> None:
-    """Move what ran under another definition of a sweep to a folder beside, where no page meets it.
+    """Move the runs that do not belong to the present definition of a sweep to the folder aside, which no page reads.
 
     Args:
-        sweep: its folder.
-        words: what its runs are told now; where they name no seed, of any seed they belong to it.
+        sweep: Folder of the sweep.
+        words: Present overrides of the sweep. If they name no seed, runs with any seed belong to the sweep.
     """
-    asked = {key: options(told) for key, _, told in (word.partition("=") for word in words)}
+    wanted = {key: split_values(values) for key, _, values in (word.partition("=") for word in words)}
     for path in sorted(sweep.glob("*/job.json")):
         job = record(path.parent)
-        told = dict(word.split("=", 1) for word in job["overrides"])
-        if "seed" not in asked:
-            told.pop("seed", None)
+        overrides = dict(word.split("=", 1) for word in job["overrides"])
+        if "seed" not in wanted:
+            overrides.pop("seed", None)
         if job["status"] == "running" or (
-            told.keys() == asked.keys()
-            and all({value, value.lower()} & {*asked[key]} for key, value in told.items())
+            overrides.keys() == wanted.keys()
+            and all({value, value.lower()} & {*wanted[key]} for key, value in overrides.items())
         ):
             continue
         for number in itertools.count():
@@ -263,7 +270,8 @@ def put_aside(sweep: Path, words: Sequence[str]) -> None:
         aside.parent.mkdir(exist_ok=True)
         path.parent.rename(aside)
         sys.stdout.write(
-            f"{sweep.name}/{path.parent.name} is of another definition of the sweep: now {aside}\n"
+            f"The run {sweep.name}/{path.parent.name} has other overrides than the sweep has now. It was moved to "
+            f"{aside}.\n"
         )
 
 
@@ -272,62 +280,77 @@ def folder_of(sweep: str) -> str:
 
 
 def report(page: str, written: Mapping[str, float]) -> str:
-    """The page anew; of tables whose runs are not on this machine it keeps what it said.
+    """Return the page with the present runs; it keeps the lines of tables whose runs are not on this machine.
 
     Args:
-        page: what it was.
-        written: minutes that the pages of a table took; of others it keeps what it said too.
+        page: Text of the page before.
+        written: Minutes that the pages of a table took; the page keeps the minutes of the other tables.
     """
     before = {line.split(" | ")[0].removeprefix("| "): line for line in page.splitlines()}
     lines, counted = [], set[str]()
     for name, table in TABLES.items():
-        own = [sweep for sweep in table.sweeps if sweep not in counted]
-        counted.update(own)
-        done = [job for sweep in own for job in completed(FOLDER / sweep)]
-        if not done and name in before:
+        own_sweeps = [sweep for sweep in table.sweeps if sweep not in counted]
+        counted.update(own_sweeps)
+        finished = [job for sweep in own_sweeps for job in completed_jobs(FOLDER / sweep)]
+        if not finished and name in before:
             lines.append(before[name])
             continue
-        asked = sum(choices(table.sweeps[sweep], table.seeds) for sweep in own)
-        shown = ", ".join(link(script) for script in (table.script, *table.also))
-        seconds = sum(wall_seconds(job) if table.alone else processor_seconds(job) / AT_ONCE for job in done)
+        planned = sum(count_runs(table.sweeps[sweep], table.seeds) for sweep in own_sweeps)
+        links = ", ".join(link(script) for script in (table.script, *table.also))
+        seconds = sum(
+            wall_seconds(job) if table.alone else processor_seconds(job) / AT_ONCE for job in finished
+        )
         on_pages = written.get(name, cell(before.get(name, ""), PAGES))
-        told = [one_decimal(seconds / 60), one_decimal(on_pages)]
-        cells = [name, table.about, shown, f"{len(done)} of {asked}", *told, when(done)]
+        minutes = [one_decimal(seconds / 60), one_decimal(on_pages)]
+        cells = [
+            name,
+            table.about,
+            links,
+            f"{len(finished)} of {planned}",
+            *minutes,
+            machine_and_day(finished),
+        ]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(
         [
             "# The thesis's tables, run (synthetic data)",
             "",
-            "Commands: `python -m reproduction.thesis_tables --tell` prints them. Minutes of runs: half of their "
-            "processor time, for two run at once, on one thread each; of Table 6.4, whose runs have two threads, by "
-            "the clock. Minutes of pages, which a script makes of the runs: by the clock. Each page says of which "
-            "runs it is: of a table not yet run whole, of some of these, or of older ones.",
+            "This page lists which tables and figures of the thesis have been repeated, when, and how long the runs "
+            "took. `python -m reproduction.thesis_tables` makes all of them, and with `--tell` it only prints the "
+            "commands.",
             "",
-            "| table | data | page | runs | minutes of runs | of pages | on |",
+            "- **Runs, complete** is the number of complete runs, of all runs that the table needs. Runs that a table "
+            "shares with an earlier row are counted there.",
+            "- **Minutes of runs** is half of their processor time, because two runs work at the same time on one "
+            "thread each. The runs of Table 6.4 have two threads, so that their elapsed time is given.",
+            "- **Minutes of pages** is the elapsed time of the scripts that evaluate the runs and write the pages.",
+            "",
+            "| table or figure | data | page | runs, complete | minutes of runs | minutes of pages | processor; last "
+            "run |",
             "|---|---|---|---:|---:|---:|---|",
             *lines,
             "",
-            f"Hours that the whole takes two cores: {format_number(hours(lines))}; without Figures 3.7 and 3.8 "
-            f"{format_number(hours([line for line in lines if not line.startswith(FIGURES)]))}. "
-            f"{machine('torch', 'pytorch-lightning')}",
+            f"Everything together takes {format_number(total_hours(lines))} hours on two cores, and "
+            f"{format_number(total_hours([line for line in lines if not line.startswith(FIGURES)]))} hours without "
+            f"Figures 3.7 and 3.8. {machine('torch', 'pytorch-lightning')}",
             "",
         ]
     )
 
 
-def hours(lines: Sequence[str]) -> float:
-    """Of all runs and pages; NaN where those of a table are not known."""
-    return sum(minutes_of(line) + cell(line, PAGES) for line in lines) / 60
+def total_hours(lines: Sequence[str]) -> float:
+    """Return the hours of all runs and pages, or NaN if the minutes of a table are not known."""
+    return sum(run_minutes(line) + cell(line, PAGES) for line in lines) / 60
 
 
-def minutes_of(line: str) -> float:
-    """What all runs of a table would take, by those that have run; NaN where none has."""
-    done, _, asked = line.split(" | ")[RUNS].partition(" of ")
-    return cell(line, MINUTES) * int(asked) / int(done) if int(done) > 0 else math.nan
+def run_minutes(line: str) -> float:
+    """Estimate the minutes of all runs of a table from the complete ones; return NaN if none is complete."""
+    finished, _, planned = line.split(" | ")[RUNS].partition(" of ")
+    return cell(line, MINUTES) * int(planned) / int(finished) if int(finished) > 0 else math.nan
 
 
 def cell(line: str, column: int) -> float:
-    """NaN where there is no number."""
+    """Return the number in a column of a table line, or NaN if it holds no number."""
     cells = line.split(" | ")
     known = len(cells) > column and re.fullmatch(r"[\d.]+", cells[column])
     return float(cells[column]) if known else math.nan
@@ -337,8 +360,8 @@ def one_decimal(minutes: float) -> str:
     return NOT_AVAILABLE if math.isnan(minutes) else f"{minutes:.1f}"
 
 
-def when(jobs: Sequence[Mapping[str, Any]]) -> str:
-    """Processor, and the day on which the last of them ended."""
+def machine_and_day(jobs: Sequence[Mapping[str, Any]]) -> str:
+    """Return the processor and the day on which the last job ended."""
     if not jobs:
         return NOT_AVAILABLE
     day = datetime.date.fromtimestamp(max(job["ended"] for job in jobs))
@@ -346,31 +369,36 @@ def when(jobs: Sequence[Mapping[str, Any]]) -> str:
 
 
 def link(script: str) -> str:
-    """Return a link to the page of a script, or its name where no page is there."""
+    """Return a link to the page of a script, or its name if the page does not exist."""
     page = Path(*script.split(".")).with_suffix(".md")
     return f"[{page.name}]({page.as_posix()})" if (HERE.parent / page).exists() else page.name
 
 
-def choices(words: Sequence[str], seeds: int) -> int:
-    """How many runs a multirun has."""
-    return len(each(words)) * (1 if any(word.startswith("seed=") for word in words) else seeds)
+def count_runs(words: Sequence[str], seeds: int) -> int:
+    """Return the number of runs of a sweep."""
+    return len(expand_sweep(words)) * (1 if any(word.startswith("seed=") for word in words) else seeds)
 
 
-def each(words: Sequence[str]) -> list[list[str]]:
-    """What every run of a multirun is told, in Hydra's order."""
-    taken = [(key, options(told)) for key, _, told in (word.partition("=") for word in words)]
+def expand_sweep(words: Sequence[str]) -> list[list[str]]:
+    """Return the overrides of every run of a sweep, in the order of Hydra."""
+    choices_by_key = [
+        (key, split_values(values)) for key, _, values in (word.partition("=") for word in words)
+    ]
     return [
-        list(run) for run in itertools.product(*([f"{key}={one}" for one in told] for key, told in taken))
+        list(run)
+        for run in itertools.product(
+            *([f"{key}={value}" for value in values] for key, values in choices_by_key)
+        )
     ]
 
 
-def options(told: str) -> list[str]:
-    """What a multirun is told of one setting, taken apart: "[a,b],c" to "[a,b]" and "c"."""
-    return re.findall(r"\[[^]]*\]|[^,]+", told)
+def split_values(text: str) -> list[str]:
+    """Split the values of one setting of a sweep: "[a,b],c" gives "[a,b]" and "c"."""
+    return re.findall(r"\[[^]]*\]|[^,]+", text)
 
 
-def completed(sweep: Path) -> list[dict[str, Any]]:
-    """Jobs of a sweep."""
+def completed_jobs(sweep: Path) -> list[dict[str, Any]]:
+    """Return the records of the completed jobs of a sweep."""
     jobs = [record(path.parent) for path in sorted(sweep.glob("*/job.json"))]
     return [job for job in jobs if job["status"] == "completed"]
 

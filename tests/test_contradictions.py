@@ -15,10 +15,13 @@ def test_rows_are_runs_that_are_made_and_no_run_is_left_out(part: Part) -> None:
     assert part.sweep not in sweeps
     sweeps[part.sweep] = part.words
     for label, (sweep, *words) in part.rows.items():
-        assert any(set(words) <= set(told) for told in thesis_tables.expand_sweep(sweeps[sweep])), label
+        assert any(set(words) <= set(overrides) for overrides in thesis_tables.expand_sweep(sweeps[sweep])), (
+            label
+        )
     own = [set(words) for sweep, *words in part.rows.values() if sweep == part.sweep]
     assert all(
-        sum(words <= set(told) for words in own) == 1 for told in thesis_tables.expand_sweep(part.words)
+        sum(words <= set(overrides) for words in own) == 1
+        for overrides in thesis_tables.expand_sweep(part.words)
     )
 
 

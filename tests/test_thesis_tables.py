@@ -18,7 +18,7 @@ PAGE = """
 
 
 def job(folder: Path, number: int, **record: object) -> None:
-    told = {
+    fields = {
         "status": "completed",
         "started": 1.8e9 - 600,
         "ended": 1.8e9,
@@ -26,7 +26,7 @@ def job(folder: Path, number: int, **record: object) -> None:
     } | record
     path = folder / str(number) / "job.json"
     path.parent.mkdir(parents=True)
-    path.write_text(json.dumps(told), encoding="utf-8")
+    path.write_text(json.dumps(fields), encoding="utf-8")
 
 
 @pytest.fixture
@@ -52,8 +52,8 @@ def test_a_table_whose_runs_are_not_here_keeps_its_line(runs: Path) -> None:
 
 
 def test_only_completed_jobs_count_and_unknown_times_say_so(runs: Path) -> None:
-    for number, told in enumerate([{}, {"status": "died"}, {"status": "running", "ended": None}]):
-        job(runs / "pascal3d", number, **told)
+    for number, fields in enumerate([{}, {"status": "died"}, {"status": "running", "ended": None}]):
+        job(runs / "pascal3d", number, **fields)
     job(runs / "moons", 0, processor_seconds=None)
     page = thesis_tables.report("", {})
     assert row(page, "3.3")[3:6] == ["1 of 72", "1.5", "not available"]
@@ -65,7 +65,7 @@ def test_runs_that_go_alone_count_by_the_clock(runs: Path) -> None:
     assert row(thesis_tables.report("", {}), "6.4")[3:5] == ["1 of 2", "10.0"]
 
 
-def test_a_whole_is_told_of_tables_that_all_have_run() -> None:
+def test_hours_are_known_only_if_every_table_has_run() -> None:
     lines = ["| 3.3 | a | b | 16 of 72 | 65 | 3.0 | c |", "| 6.4 | a | b | 2 of 2 | 20 | 1.0 | c |"]
     assert thesis_tables.total_hours(lines) == pytest.approx((65 * 72 / 16 + 3 + 20 + 1) / 60)
     for line in (
@@ -78,31 +78,31 @@ def test_a_whole_is_told_of_tables_that_all_have_run() -> None:
 
 
 def test_what_ran_under_another_definition_is_put_aside(runs: Path) -> None:
-    """Each way in which a definition changes: a choice less, a setting more or less or other, a seed that is named."""
+    """Runs are moved if a choice, a setting or a named seed of the sweep has changed."""
     words = ("experiment=a/b,a/c", "data.angles=[pan],[Tilt]", "seed=0,7", "pictures=false", "threads=1")
-    kept = [
+    matching = [
         ["experiment=a/b", "data.angles=[pan]", "seed=0", "pictures=False", "threads=1"],
         ["experiment=a/c", "data.angles=[Tilt]", "seed=7", "pictures=False", "threads=1"],
     ]
-    other = [
-        ["experiment=a/d", *kept[0][1:]],
-        [*kept[0], "trainer.max_epochs=3"],
-        [*kept[0][:2], *kept[0][3:4]],
-        [*kept[0][:-1], "threads=2"],
-        [*kept[0][:2], "seed=1", *kept[0][3:]],
+    outdated = [
+        ["experiment=a/d", *matching[0][1:]],
+        [*matching[0], "trainer.max_epochs=3"],
+        [*matching[0][:2], *matching[0][3:4]],
+        [*matching[0][:-1], "threads=2"],
+        [*matching[0][:2], "seed=1", *matching[0][3:]],
     ]
-    for number, overrides in enumerate([*kept, *other]):
+    for number, overrides in enumerate([*matching, *outdated]):
         job(runs / "a", number, overrides=overrides)
-    job(runs / "a", 9, overrides=other[0], status="running", ended=None)
-    job(runs / "b", 0, overrides=other[0])
+    job(runs / "a", 9, overrides=outdated[0], status="running", ended=None)
+    job(runs / "b", 0, overrides=outdated[0])
     for _ in range(2):
         thesis_tables.put_aside(runs / "a", words)
         assert sorted(path.name for path in (runs / "a").iterdir()) == ["0", "1", "9"]
-        assert len(list((runs / "aside").iterdir())) == len(other)
+        assert len(list((runs / "aside").iterdir())) == len(outdated)
         assert (runs / "b" / "0").exists()
-    job(runs / "a", 2, overrides=other[0])
+    job(runs / "a", 2, overrides=outdated[0])
     thesis_tables.put_aside(runs / "a", words)
-    assert len(list((runs / "aside").iterdir())) == len(other) + 1
+    assert len(list((runs / "aside").iterdir())) == len(outdated) + 1
 
 
 def test_where_no_seed_is_named_runs_of_every_seed_belong_to_the_table(runs: Path) -> None:
@@ -118,9 +118,9 @@ def test_nothing_that_a_table_asks_for_is_put_aside(runs: Path) -> None:
         for jobs, bfloat16 in itertools.product((1, 2), (False, True)):
             for command in thesis_tables.commands(name, 5, jobs, bfloat16)[0]:
                 folder = runs / Path(command[-1].partition("=")[2]).name
-                told = [word for word in command[4:] if not word.startswith("hydra.")]
-                for number, overrides in enumerate(thesis_tables.expand_sweep(told)):
-                    job(folder, number, overrides=overrides)
+                overrides = [word for word in command[4:] if not word.startswith("hydra.")]
+                for number, run_overrides in enumerate(thesis_tables.expand_sweep(overrides)):
+                    job(folder, number, overrides=run_overrides)
                 words = (*table.sweeps[folder.name], *thesis_tables.common_overrides(table, jobs, bfloat16))
                 thesis_tables.put_aside(folder, words)
                 assert len(list(folder.iterdir())) == number + 1
@@ -141,7 +141,7 @@ def test_how_many_runs_a_sweep_has(words: tuple[str, ...], count: int) -> None:
 
 
 @pytest.mark.parametrize(
-    "words, seeds, told",
+    "words, seeds, expected",
     [
         ((), 9, "0,1,2"),
         ((), 2, "0,1"),
@@ -149,5 +149,5 @@ def test_how_many_runs_a_sweep_has(words: tuple[str, ...], count: int) -> None:
         (("seed=0,4",), 1, "0"),
     ],
 )
-def test_no_more_seeds_than_asked_for_or_named(words: tuple[str, ...], seeds: int, told: str) -> None:
-    assert thesis_tables.with_seeds(("a=1,2", *words), seeds, 3) == ["a=1,2", f"seed={told}"]
+def test_no_more_seeds_than_asked_for_or_named(words: tuple[str, ...], seeds: int, expected: str) -> None:
+    assert thesis_tables.with_seeds(("a=1,2", *words), seeds, 3) == ["a=1,2", f"seed={expected}"]
