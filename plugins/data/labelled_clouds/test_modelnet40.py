@@ -8,7 +8,7 @@ import torch
 
 from framework.errors import DataError
 from framework.geometry.meshes import READERS, read, sample, stream
-from plugins.data.labelled_clouds.shapes import solids
+from framework.geometry.solids import box
 from plugins.data.labelled_clouds.shapes.generator import CLASSES, as_off
 
 NAME = "modelnet40"
@@ -17,7 +17,7 @@ SIZES = {"train_models": 4, "test_models": 2}
 
 def write_cubes(folder, *names):
     """Write unit cubes as `<folder>/<name>`, with the broken header of some official files."""
-    text = as_off(solids.box(1.0, 1.0, 1.0)).replace("OFF\n", "OFF", 1)
+    text = as_off(box(1.0, 1.0, 1.0)).replace("OFF\n", "OFF", 1)
     for name in names:
         file = folder / name
         file.parent.mkdir(parents=True, exist_ok=True)

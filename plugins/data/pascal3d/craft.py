@@ -3,20 +3,10 @@
 import numpy as np
 from numpy.random import Generator
 
+from framework.geometry.round_solids import bar, wheel
+from framework.geometry.solids import Solid, block, loft, loft_rectangles, plate, side_plate
 from plugins.data.pascal3d.paint import DARK, GLASS, METAL, RUBBER, paint, shade
-from plugins.data.pascal3d.shapes import (
-    Array,
-    Body,
-    Solid,
-    box,
-    loft,
-    loft_rectangles,
-    offset_point,
-    plate,
-    rod,
-    side_plate,
-    wheel,
-)
+from plugins.data.pascal3d.shapes import Array, Body, offset_point
 
 
 def aeroplane(random: Generator) -> Body:
@@ -30,8 +20,8 @@ def aeroplane(random: Generator) -> Body:
     nose, tail = -0.45 * length, 0.55 * length
     body.add(_fuselage(length, nose, radius), skin)
     screen = (1.2 * radius, 0.035 * length, 0.45 * radius)
-    body.add(box(screen, (0, nose + 0.085 * length, 0.62 * radius)), GLASS)
-    body.pair(box((0.06, 0.5 * length, 0.3 * radius), (radius, -0.02 * length, 0.15 * radius)), mark)
+    body.add(block(screen, (0, nose + 0.085 * length, 0.62 * radius)), GLASS)
+    body.pair(block((0.06, 0.5 * length, 0.3 * radius), (radius, -0.02 * length, 0.15 * radius)), mark)
 
     span = length * random.uniform(0.42, 0.52)
     sweep = length * (random.uniform(0.14, 0.24) if jet else random.uniform(0.0, 0.03))
@@ -69,9 +59,9 @@ def aeroplane(random: Generator) -> Body:
             engine = np.array([share * span, along, height + share * lift - 0.55 * radius])
             front = offset_point(engine, 0, -0.6 * chord, 0)
             behind = offset_point(engine, 0, 0.35 * chord, 0)
-            body.pair(rod(front, behind, 0.42 * radius, 0.3 * radius, sides=10), METAL)
+            body.pair(bar(front, behind, 0.42 * radius, 0.3 * radius, sides=10), METAL)
             body.pair(
-                rod(
+                bar(
                     offset_point(front, 0, -0.02, 0),
                     offset_point(front, 0, -0.05, 0),
                     0.34 * radius,
@@ -81,12 +71,12 @@ def aeroplane(random: Generator) -> Body:
             )
     else:
         hub = np.array([0, nose - 0.15, -0.2 * radius])
-        body.add(rod(offset_point(hub, 0, -0.15, 0), offset_point(hub, 0, 0.25, 0), 0.05, 0.3 * radius), mark)
+        body.add(bar(offset_point(hub, 0, -0.15, 0), offset_point(hub, 0, 0.25, 0), 0.05, 0.3 * radius), mark)
         angle = random.uniform(0, np.pi)
         blade = np.array([np.cos(angle), 0, np.sin(angle)]) * length * 0.13
-        body.add(rod(hub - blade, hub + blade, 0.07), DARK)
+        body.add(bar(hub - blade, hub + blade, 0.07), DARK)
         axle = np.array([0.9, -0.15 * length, -2.0 * radius])
-        body.pair(rod((0, -0.15 * length, -0.8 * radius), axle, 0.06), METAL)
+        body.pair(bar((0, -0.15 * length, -0.8 * radius), axle, 0.06), METAL)
         body.pair(wheel(offset_point(axle, 0, 0, -0.1 * radius), 0.3, 0.2, 10), RUBBER)
     return body
 
@@ -101,7 +91,7 @@ def _fuselage(length: float, nose: float, radius: float) -> Solid:
         radius * girth * circle + (0, nose + station * length, rise * radius)
         for station, girth, rise in zip(stations, girths, rises, strict=True)
     ]
-    return loft(rings, smooth=True)
+    return loft(rings, "rims")
 
 
 def boat(random: Generator) -> Body:
@@ -126,11 +116,11 @@ def boat(random: Generator) -> Body:
         main = [(mast + 0.1, boom), (mast + 0.44 * length, boom), (mast + 0.1, depth + 0.97 * high)]
         bow = (-0.49 * length, 1.45 * depth)
         jib = [(mast - 0.08, depth + 0.85 * high), bow, (mast - 0.08, 1.5 * depth)]
-        body.add(rod((0, mast, depth), (0, mast, depth + high), 0.06, sides=8), METAL)
-        body.add(rod((0, mast, boom), (0, mast + 0.46 * length, boom), 0.05), METAL)
+        body.add(bar((0, mast, depth), (0, mast, depth + high), 0.06, sides=8), METAL)
+        body.add(bar((0, mast, boom), (0, mast + 0.46 * length, boom), 0.05), METAL)
         body.add(side_plate(main, 0, 0.05), sail)
         body.add(side_plate(jib, 0, 0.05), shade(sail, 0.93))
-        body.add(box((0.4 * beam, 0.28 * length, 0.5 * depth), (0, 0.02 * length, 1.25 * depth)), deck)
+        body.add(block((0.4 * beam, 0.28 * length, 0.5 * depth), (0, 0.02 * length, 1.25 * depth)), deck)
     elif kind < 0.85:  # motor boat
         front, behind = -0.16 * length, random.uniform(0.1, 0.25) * length
         floor, high = 0.95 * depth, depth * random.uniform(1.3, 1.9)
@@ -144,19 +134,19 @@ def boat(random: Generator) -> Body:
         body.add(loft_rectangles([level(0.0), level(1.0)]), (0.93, 0.93, 0.92))
         body.add(loft_rectangles([level(0.45, 0.02), level(0.79, 0.02)]), GLASS)
         size = (0.66 * beam, behind - front - 0.06 * length, 0.1)
-        body.add(box(size, (0, (front + behind) / 2 + 0.06 * length, roof)), hull)
-        body.add(rod((0, behind - 0.2, roof), (0, behind - 0.1, roof + 0.7 * high), 0.04), METAL)
-        body.add(box((0.3, 0.35, 0.5), (0, 0.53 * length, 0.85 * depth)), DARK)  # outboard motor
+        body.add(block(size, (0, (front + behind) / 2 + 0.06 * length, roof)), hull)
+        body.add(bar((0, behind - 0.2, roof), (0, behind - 0.1, roof + 0.7 * high), 0.04), METAL)
+        body.add(block((0.3, 0.35, 0.5), (0, 0.53 * length, 0.85 * depth)), DARK)  # outboard motor
         for share in (-0.42, -0.32, -0.22):  # railing
             foot = np.array([0.85 * np.interp(share * length, along, half), share * length, depth])
-            body.pair(rod(foot, offset_point(foot, 0, 0, 0.9 * depth), 0.035), METAL)
+            body.pair(bar(foot, offset_point(foot, 0, 0, 0.9 * depth), 0.035), METAL)
     else:  # rowing boat
         for share in (-0.2, 0.05, 0.3):
             wide = 1.8 * float(np.interp(share * length, along, half))
-            body.add(box((wide, 0.3, 0.08), (0, share * length, 1.06 * depth)), shade(deck, 0.6))
+            body.add(block((wide, 0.3, 0.08), (0, share * length, 1.06 * depth)), shade(deck, 0.6))
         blade = (1.25 * beam, 0.25 * length, 0.3 * depth)
-        body.pair(rod((0.25 * beam, 0.02 * length, 1.5 * depth), blade, 0.05), shade(deck, 0.8))
-        body.pair(box((0.5, 0.25, 0.06), blade), shade(deck, 0.8))
+        body.pair(bar((0.25 * beam, 0.02 * length, 1.5 * depth), blade, 0.05), shade(deck, 0.8))
+        body.pair(block((0.5, 0.25, 0.06), blade), shade(deck, 0.8))
     return body
 
 
@@ -174,4 +164,4 @@ def _hull(along: Array, half: Array, rim: Array, keel: Array) -> Solid:
         side = [(1.0, high), (0.92, 0.45 * high + 0.55 * max(low, 0.0)), (0.5, low)]
         outline = side + [(-x, z) for x, z in reversed(side)]
         rings.append([(wide * x, y, z) for x, z in outline])
-    return loft(rings)
+    return loft(rings, "sharp")

@@ -3,18 +3,10 @@
 import numpy as np
 from numpy.random import Generator
 
+from framework.geometry.round_solids import bar, ellipsoid, revolution
+from framework.geometry.solids import Solid, block, loft_rectangles
 from plugins.data.pascal3d.paint import DARK, METAL, paint, shade, wood
-from plugins.data.pascal3d.shapes import (
-    Body,
-    Color,
-    Solid,
-    box,
-    ellipsoid,
-    lathe,
-    loft_rectangles,
-    rod,
-    transform,
-)
+from plugins.data.pascal3d.shapes import Body, Color
 
 BOTTLE_GLASS: tuple[Color, ...] = ((0.1, 0.28, 0.12), (0.35, 0.18, 0.06), (0.55, 0.72, 0.8), (0.2, 0.3, 0.6))
 
@@ -42,10 +34,10 @@ def bottle(random: Generator) -> Body:
         (1.15 * thin, 0.975 * height),
         (1.15 * thin, height),
     ]
-    body.add(lathe(profile), glass)
+    body.add(revolution(profile, edges="rims"), glass)
 
     def band(radius: float, low: float, high: float, color: Color) -> None:
-        body.add(lathe([(radius, low), (radius, high)]), color)
+        body.add(revolution([(radius, low), (radius, high)], edges="rims"), color)
 
     label = paint(random) if random.random() < 0.6 else (0.93, 0.92, 0.86)
     low, high = random.uniform(0.1, 0.18) * height, shoulder - random.uniform(0.04, 0.12) * height
@@ -67,10 +59,10 @@ def chair(random: Generator) -> Body:
     seat, top = random.uniform(0.42, 0.48), random.uniform(0.82, 1.02)
     thick, lean = random.uniform(0.035, 0.05), random.uniform(0.03, 0.1)
     x, front, rear = width / 2 - thick / 2, -depth / 2 + thick / 2, depth / 2 - thick / 2
-    body.add(box((width, depth, 0.045), (0, 0, seat)), cloth)
-    body.pair(rod((x, front, 0), (x, front, seat), 0.7 * thick, sides=4), frame)
-    body.pair(rod((x, rear + 0.03, 0), (x, rear, seat), 0.7 * thick, sides=4), frame)
-    body.pair(rod((x, rear, seat), (x, rear + lean, top), 0.65 * thick, sides=4), frame)
+    body.add(block((width, depth, 0.045), (0, 0, seat)), cloth)
+    body.pair(bar((x, front, 0), (x, front, seat), 0.7 * thick, sides=4), frame)
+    body.pair(bar((x, rear + 0.03, 0), (x, rear, seat), 0.7 * thick, sides=4), frame)
+    body.pair(bar((x, rear, seat), (x, rear + lean, top), 0.65 * thick, sides=4), frame)
 
     def board(low: float, high: float, half: float, middle: float = 0.0) -> Solid:
         """Return a board of half width `half` about x = `middle`, in the inclined plane of the back."""
@@ -92,11 +84,11 @@ def chair(random: Generator) -> Body:
             body.add(board(z, z + 0.06, x), frame)
     if random.random() < 0.3:
         arm = seat + random.uniform(0.18, 0.24)
-        body.pair(rod((x, front + 0.03, seat), (x, front + 0.03, arm), 0.6 * thick, sides=4), frame)
-        body.pair(box((0.05, depth, 0.035), (x, 0.01, arm)), frame)
+        body.pair(bar((x, front + 0.03, seat), (x, front + 0.03, arm), 0.6 * thick, sides=4), frame)
+        body.pair(block((0.05, depth, 0.035), (x, 0.01, arm)), frame)
     if random.random() < 0.4:
-        body.pair(box((0.02, depth - 0.05, 0.03), (x, 0, 0.2)), frame)
-        body.add(box((width - 0.05, 0.02, 0.03), (0, front, 0.25)), frame)
+        body.pair(block((0.02, depth - 0.05, 0.03), (x, 0, 0.2)), frame)
+        body.add(block((width - 0.05, 0.02, 0.03), (0, front, 0.25)), frame)
     return body
 
 
@@ -114,28 +106,30 @@ def diningtable(random: Generator) -> Body:
     inset = leg / 2 + random.uniform(0.02, 0.12)
     x, y = width / 2 - inset, depth / 2 - inset
     under = height - thick
-    half.add(box((width / 2, depth, thick), (width / 4, 0, height - thick / 2)), color)
-    half.add(box((0.03, 2 * y, 0.09), (x, 0, under - 0.045)), shade(legs, 0.85))
+    half.add(block((width / 2, depth, thick), (width / 4, 0, height - thick / 2)), color)
+    half.add(block((0.03, 2 * y, 0.09), (x, 0, under - 0.045)), shade(legs, 0.85))
     for side in (-y, y):
-        half.add(rod((x, side, 0), (x, side, under), 0.5 * leg, 0.7 * leg, sides=4), legs)
-        half.add(box((x, 0.03, 0.09), (x / 2, side, under - 0.045)), shade(legs, 0.85))
+        half.add(bar((x, side, 0), (x, side, under), 0.5 * leg, 0.7 * leg, sides=4), legs)
+        half.add(block((x, 0.03, 0.09), (x / 2, side, under - 0.045)), shade(legs, 0.85))
     if random.random() < 0.4:  # a runner along the middle
-        half.add(box((width / 2 + 0.005, 0.35 * depth, 0.008), (width / 4, 0, height + 0.004)), paint(random))
+        half.add(
+            block((width / 2 + 0.005, 0.35 * depth, 0.008), (width / 4, 0, height + 0.004)), paint(random)
+        )
     if random.random() < 0.45:  # plates
         china = shade((0.95, 0.95, 0.93), random.uniform(0.85, 1.0))
-        dish = lathe([(0.07, height), (0.13, height + 0.02), (0.12, height + 0.022)], 16)
+        dish = revolution([(0.07, height), (0.13, height + 0.02), (0.12, height + 0.022)], 16, "rims")
         for side in (-0.3 * depth, 0.3 * depth):
-            half.add(transform(dish, shift=(0.3 * width, side, 0)), china)
+            half.add(dish.move(0.3 * width, side), china)
     if random.random() < 0.5:  # chairs along the sides
         paintwork = wood(random) if random.random() < 0.6 else paint(random)
         away = depth / 2 + random.uniform(0.0, 0.25)
         for middle in (-0.24 * width, 0.24 * width) if random.random() < 0.7 else (0.0,):
-            half.add(box((0.42, 0.4, 0.04), (middle, away, 0.45)), paintwork)
-            half.add(box((0.42, 0.035, 0.36), (middle, away + 0.2, 0.78)), paintwork)
+            half.add(block((0.42, 0.4, 0.04), (middle, away, 0.45)), paintwork)
+            half.add(block((0.42, 0.035, 0.36), (middle, away + 0.2, 0.78)), paintwork)
             for side in (middle - 0.18, middle + 0.18):
                 foot = away + 0.2
-                half.add(rod((side, foot, 0), (side, foot, 0.65), 0.025, sides=4), paintwork)
-                half.add(rod((side, foot - 0.37, 0), (side, foot - 0.37, 0.45), 0.025, sides=4), paintwork)
+                half.add(bar((side, foot, 0), (side, foot, 0.65), 0.025, sides=4), paintwork)
+                half.add(bar((side, foot - 0.37, 0), (side, foot - 0.37, 0.45), 0.025, sides=4), paintwork)
     return half.rotated_copies(0.0, np.pi)
 
 
@@ -150,15 +144,15 @@ def sofa(random: Generator) -> Body:
     front, rear, inner = -depth / 2, depth / 2, width - 2 * arm_wide
     base = seat - 0.14
     x = width / 2 - arm_wide / 2
-    body.add(box((width, depth, base - foot), (0, 0, (base + foot) / 2)), shade(cloth, 0.8))
-    body.add(box((width, 0.2, top - foot), (0, rear - 0.1, (top + foot) / 2)), shade(cloth, 0.85))
-    body.pair(box((arm_wide, depth, arm - foot), (x, 0, (arm + foot) / 2)), shade(cloth, 0.9))
+    body.add(block((width, depth, base - foot), (0, 0, (base + foot) / 2)), shade(cloth, 0.8))
+    body.add(block((width, 0.2, top - foot), (0, rear - 0.1, (top + foot) / 2)), shade(cloth, 0.85))
+    body.pair(block((arm_wide, depth, arm - foot), (x, 0, (arm + foot) / 2)), shade(cloth, 0.9))
     if random.random() < 0.5:  # rolled arms
-        body.pair(rod((x, front - 0.01, arm), (x, rear - 0.05, arm), 0.62 * arm_wide, sides=12), cloth)
+        body.pair(bar((x, front - 0.01, arm), (x, rear - 0.05, arm), 0.62 * arm_wide, sides=12), cloth)
     wide = inner / seats
     for index in range(seats):
         middle = -inner / 2 + (index + 0.5) * wide
-        body.add(box((0.96 * wide, depth - 0.2, 0.15), (middle, -0.12, seat - 0.06)), shade(cloth, 1.15))
+        body.add(block((0.96 * wide, depth - 0.2, 0.15), (middle, -0.12, seat - 0.06)), shade(cloth, 1.15))
         levels = [
             (0.47 * wide, rear - 0.36, rear - 0.18, seat),
             (0.47 * wide, rear - 0.29, rear - 0.11, top + 0.04),
@@ -169,7 +163,7 @@ def sofa(random: Generator) -> Body:
         body.pair(pillow, paint(random, vivid=True))
     stand = DARK if random.random() < 0.5 else wood(random)
     for y in (front + 0.08, rear - 0.08):
-        body.pair(rod((x, y, 0), (x, y, foot), 0.03), stand)
+        body.pair(bar((x, y, 0), (x, y, foot), 0.03), stand)
     return body
 
 
@@ -183,7 +177,7 @@ def tvmonitor(random: Generator) -> Body:
     edge = width * random.uniform(0.035, 0.07)
     low = 0.03 if old else width * random.uniform(0.12, 0.22)
     middle, thick = low + height / 2, (0.18 if old else 0.07) * width
-    body.add(box((width, thick, height), (0, 0, middle)), case)
+    body.add(block((width, thick, height), (0, 0, middle)), case)
 
     sky, land = shade(paint(random, vivid=True), 1.2), paint(random)
     on = random.random() < 0.65
@@ -191,9 +185,9 @@ def tvmonitor(random: Generator) -> Body:
         land, sky = (0.1, 0.11, 0.13), (0.16, 0.17, 0.2)
     face, wide, bottom, tall = -thick / 2, width - 2 * edge, low + edge, height - 2 * edge
     split = random.uniform(0.3, 0.7) * tall
-    body.add(box((wide, 0.02, split), (0, face, bottom + split / 2)), land)
-    body.add(box((wide, 0.02, tall - split), (0, face, bottom + (tall + split) / 2)), sky)
-    body.add(box((0.03, 0.03, 0.015), (0, face - 0.005, low + edge / 2)), (0.2, 0.9, 0.3) if on else METAL)
+    body.add(block((wide, 0.02, split), (0, face, bottom + split / 2)), land)
+    body.add(block((wide, 0.02, tall - split), (0, face, bottom + (tall + split) / 2)), sky)
+    body.add(block((0.03, 0.03, 0.015), (0, face - 0.005, low + edge / 2)), (0.2, 0.9, 0.3) if on else METAL)
     if old:
         deep = width * random.uniform(0.5, 0.7)
         half, high = 0.46 * width, 0.46 * height
@@ -205,12 +199,12 @@ def tvmonitor(random: Generator) -> Body:
         lying = loft_rectangles(tube)  # the stack runs backwards: (x, y, z) becomes (x, z, y)
         back = Solid(lying.vertices[:, [0, 2, 1]] * (1, deep, 1) + (0, thick / 2, middle), lying.faces)
         body.add(back, shade(case, 0.85))
-        body.add(box((0.6 * width, 0.5 * deep, 0.04), (0, 0.3 * deep, 0.02)), shade(case, 0.6))
+        body.add(block((0.6 * width, 0.5 * deep, 0.04), (0, 0.3 * deep, 0.02)), shade(case, 0.6))
     else:
         back = (0, 0.055 * width, middle - 0.05 * height)
-        body.add(box((0.5 * width, 0.06 * width, 0.5 * height), back), shade(case, 0.8))
+        body.add(block((0.5 * width, 0.06 * width, 0.5 * height), back), shade(case, 0.8))
         neck = (0, 0.03 * width, (low + 0.1) / 2)
-        body.add(box((0.1 * width, 0.05 * width, low + 0.1), neck), shade(case, 0.9))
-        foot = lathe([(0.2 * width, 0.0), (0.2 * width, 0.012), (0.07 * width, 0.03)], 18)
-        body.add(transform(foot, scale=(1.2, 0.8, 1.0), shift=(0, 0.03 * width, 0)), case)
+        body.add(block((0.1 * width, 0.05 * width, low + 0.1), neck), shade(case, 0.9))
+        foot = revolution([(0.2 * width, 0.0), (0.2 * width, 0.012), (0.07 * width, 0.03)], 18, "rims")
+        body.add(foot.scale(1.2, 0.8, 1.0).move(0, 0.03 * width), case)
     return body

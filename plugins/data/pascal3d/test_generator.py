@@ -11,13 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-import trimesh
 
 from framework.configuration import schema
 from framework.errors import ConfigError, DataError
 from framework.renderer import Renderer, Scene
 from framework.storage import generated
-from plugins.data.pascal3d import generator, shapes
+from plugins.data.pascal3d import generator
 from plugins.data.pascal3d.families import FAMILIES
 from plugins.data.pascal3d.layout import CLASSES
 from plugins.data.pascal3d.scene import (
@@ -39,65 +38,7 @@ def renderer() -> Renderer:
     return schema.build("renderer", schema.resolve("renderer", "rasterizer"))
 
 
-# ---- shapes and families ---------------------------------------------------------------------------------
-
-
-def weld(solid: shapes.Solid) -> trimesh.Trimesh:
-    """Return the solid as a mesh with outward faces, in which equal vertices are merged."""
-    body = shapes.Body()
-    body.add(solid, (1.0, 1.0, 1.0))
-    faces = body.mesh().faces
-    mesh = trimesh.Trimesh(solid.vertices, faces, process=True, merge_norm=True, merge_tex=True)
-    mesh.update_faces(mesh.nondegenerate_faces())  # at the tip of a cone
-    return mesh
-
-
-SQUARE = [(0.0, 0.0), (2.0, 0.0), (2.0, 1.0), (0.0, 1.0)]
-POLYGON_24 = (
-    24 / 2 * math.sin(2 * math.pi / 24)
-)  # area of the 24-sided polygon that approximates a unit circle
-SOLIDS = {
-    "box": (shapes.box((1, 2, 3), (4, 5, 6)), 6.0, (4, 5, 6)),
-    "mirrored box": (
-        shapes.transform(shapes.box((1, 2, 3), (4, 5, 6)), scale=(-1, 1, 1)),
-        6.0,
-        (-4, 5, 6),
-    ),
-    "lathe": (shapes.lathe([(2, 0), (2, 3)], 24), 12 * POLYGON_24, (0, 0, 1.5)),
-    "cone": (shapes.lathe([(3, 0), (0, 3)], 24), 9 * POLYGON_24, (0, 0, 0.75)),
-    "rod along x": (shapes.rod((0, 0, 0), (5, 0, 0), 1.0, sides=24), 5 * POLYGON_24, (2.5, 0, 0)),
-    "rod askew": (shapes.rod((1, 1, 1), (1, 4, 5), 2.0, sides=24), 20 * POLYGON_24, (1, 2.5, 3)),
-    "wheel": (shapes.wheel((1, 2, 3), 1.0, 0.5, 24), 0.5 * POLYGON_24, (1, 2, 3)),
-    "side plate": (shapes.side_plate(SQUARE, 3.0, 0.5), 1.0, (3, 1, 0.5)),
-    "rectangles": (
-        shapes.loft_rectangles([(1, -1, 1, 0), (0.5, -0.5, 0.5, 3)]),
-        3 / 3 * (4 + 1 + math.sqrt(4)),
-        (0, 0, 33 / 28),  # h/4 (A + 2√(AB) + 3B) / (A + √(AB) + B)
-    ),
-    "bevelled": (
-        shapes.loft([shapes.bevelled(4, 0, 2, y, 0.5) for y in (0, 3)]),
-        3 * (8 - 4 * 0.5**2 / 2),
-        (0, 1.5, 1),
-    ),
-}
-
-
-@pytest.mark.parametrize("name", SOLIDS)
-def test_solid_is_closed_and_has_its_volume_and_center(name: str) -> None:
-    solid, volume, center = SOLIDS[name]
-    mesh = weld(solid)
-    assert mesh.is_watertight
-    assert mesh.volume == pytest.approx(volume)
-    np.testing.assert_allclose(mesh.center_mass, center, atol=1e-9)
-
-
-def test_round_solids_approach_their_ideals() -> None:
-    torus = weld(shapes.ring((1, 2, 3), 2.0, 1.0, sides=96, around=48))
-    ellipsoid = weld(shapes.ellipsoid((1, 2, 3), (1, 2, 3), sides=96, layers=49))
-    assert torus.is_watertight
-    assert torus.volume == pytest.approx(2 * math.pi**2 * 2 * 0.5**2, rel=0.01)
-    assert np.ptp(torus.vertices, axis=0) == pytest.approx([1, 5, 5], rel=0.01)  # its axis is x
-    assert ellipsoid.volume == pytest.approx(4 / 3 * math.pi * 6, rel=0.01)
+# ---- families -------------------------------------------------------------------------------------------
 
 
 def test_families_are_the_classes_of_the_release() -> None:

@@ -3,18 +3,10 @@
 import numpy as np
 from numpy.random import Generator
 
+from framework.geometry.round_solids import bar, wheel
+from framework.geometry.solids import bevelled, block, loft, loft_rectangles, plate
 from plugins.data.pascal3d.paint import DARK, GLASS, LAMP, METAL, RUBBER, TAIL_LAMP, paint, shade
-from plugins.data.pascal3d.shapes import (
-    Body,
-    bevelled,
-    box,
-    loft,
-    loft_rectangles,
-    offset_point,
-    plate,
-    rod,
-    wheel,
-)
+from plugins.data.pascal3d.shapes import Body, offset_point
 
 
 def bus(random: Generator) -> Body:
@@ -27,31 +19,31 @@ def bus(random: Generator) -> Body:
     if two_decks:
         length, height = 0.85 * length, 4.0
     front, rear, roof = -length / 2, length / 2, ground + height
-    body.add(loft([bevelled(width, ground, roof, y, 0.15) for y in (front, rear)]), skin)
-    body.add(box((width + 0.04, length * 0.996, 0.35), (0, 0, ground + 0.18)), second)
+    body.add(loft([bevelled(width, ground, roof, y, 0.15) for y in (front, rear)], "sharp"), skin)
+    body.add(block((width + 0.04, length * 0.996, 0.35), (0, 0, ground + 0.18)), second)
     for low in (0.2, 0.62) if two_decks else (0.42,):
         z, tall = ground + (low + 0.13) * height, (0.2 if two_decks else 0.32) * height
         count = int(random.integers(5, 8))
         pitch = (length - 1.3) / count
         for index in range(count):
             y = front + 0.9 + (index + 0.5) * pitch
-            body.pair(box((0.06, 0.85 * pitch, tall), (width / 2, y, z)), GLASS)
-        body.add(box((0.9 * width, 0.06, 1.35 * tall), (0, front, z - 0.1 * tall)), GLASS)
-        body.add(box((0.7 * width, 0.06, 0.6 * tall), (0, rear, z + 0.1 * tall)), GLASS)
+            body.pair(block((0.06, 0.85 * pitch, tall), (width / 2, y, z)), GLASS)
+        body.add(block((0.9 * width, 0.06, 1.35 * tall), (0, front, z - 0.1 * tall)), GLASS)
+        body.add(block((0.7 * width, 0.06, 0.6 * tall), (0, rear, z + 0.1 * tall)), GLASS)
     sign = (0.95, 0.75, 0.2) if random.random() < 0.6 else DARK
-    body.add(box((0.7 * width, 0.08, 0.22), (0, front, roof - 0.22)), sign)
-    body.pair(box((0.35, 0.08, 0.22), (0.38 * width, front, ground + 0.5)), LAMP)
-    body.pair(box((0.22, 0.08, 0.5), (0.42 * width, rear, ground + 0.7)), TAIL_LAMP)
-    body.add(box((0.5 * width, 0.07, 0.3), (0, front, ground + 0.45)), DARK)
-    body.add(box((0.65 * width, 0.07, 0.5), (0, rear, ground + 0.75)), shade(skin, 0.45))
+    body.add(block((0.7 * width, 0.08, 0.22), (0, front, roof - 0.22)), sign)
+    body.pair(block((0.35, 0.08, 0.22), (0.38 * width, front, ground + 0.5)), LAMP)
+    body.pair(block((0.22, 0.08, 0.5), (0.42 * width, rear, ground + 0.7)), TAIL_LAMP)
+    body.add(block((0.5 * width, 0.07, 0.3), (0, front, ground + 0.45)), DARK)
+    body.add(block((0.65 * width, 0.07, 0.5), (0, rear, ground + 0.75)), shade(skin, 0.45))
     arm = np.array([width / 2 + 0.28, front - 0.25, roof - 0.6])
-    body.pair(rod((width / 2, front + 0.1, roof - 0.5), arm, 0.04), DARK)
-    body.pair(box((0.12, 0.08, 0.4), offset_point(arm, 0, 0, -0.25)), DARK)  # mirrors
+    body.pair(bar((width / 2, front + 0.1, roof - 0.5), arm, 0.04), DARK)
+    body.pair(block((0.12, 0.08, 0.4), offset_point(arm, 0, 0, -0.25)), DARK)  # mirrors
     for y in (front + 1.7, rear - 2.0):
         body.pair(wheel((width / 2 - 0.1, y, 0.5), 0.5, 0.36), RUBBER)
         body.pair(wheel((width / 2 + 0.09, y, 0.5), 0.25, 0.04, 10), METAL)
     if random.random() < 0.5:
-        body.add(box((1.4, 1.8, 0.25), (0, random.uniform(-1, 2), roof + 0.1)), second)
+        body.add(block((1.4, 1.8, 0.25), (0, random.uniform(-1, 2), roof + 0.1)), second)
     return body
 
 
@@ -80,7 +72,7 @@ def car(random: Generator) -> Body:
         bevelled(0.97 * width, ground + 0.02, trunk - 0.04, rear - 0.12, 0.3),
         bevelled(0.9 * width, ground + 0.1, trunk - 0.15, rear, 0.4),
     ]
-    body.add(loft(lower), skin)
+    body.add(loft(lower, "sharp"), skin)
 
     start, rake = front + random.uniform(0.25, 0.3) * length, random.uniform(0.45, 0.7)
     room, slope = CAR_REAR[kind]
@@ -107,11 +99,11 @@ def car(random: Generator) -> Body:
         ]
         body.pair(plate(outline, (0.03, 0, 0)), skin)
     for along in (0.0, 1.0):
-        body.pair(rod(*pillar(0.0, 1.0, along, 0.015), 0.055, sides=4), skin)
+        body.pair(bar(*pillar(0.0, 1.0, along, 0.015), 0.055, sides=4), skin)
     if kind == "pickup":
         middle, space = (rear + end) / 2, rear - end
-        body.add(box((0.8 * width, space - 0.25, 0.06), (0, middle, belt - 0.01)), DARK)
-        body.pair(box((0.07, space - 0.1, 0.16), (0.46 * width, middle, belt + 0.05)), skin)
+        body.add(block((0.8 * width, space - 0.25, 0.06), (0, middle, belt - 0.01)), DARK)
+        body.pair(block((0.07, space - 0.1, 0.16), (0.46 * width, middle, belt + 0.05)), skin)
 
     radius = random.uniform(0.31, 0.36)
     for y in (front + 0.19 * length, rear - 0.2 * length):
@@ -119,13 +111,13 @@ def car(random: Generator) -> Body:
         body.pair(wheel((0.47 * width, y, radius), radius, 0.2), RUBBER)
         body.pair(wheel((0.47 * width + 0.1, y, radius), 0.6 * radius, 0.03, 10), METAL)
     lamp = (random.uniform(0.24, 0.34), 0.16, 0.15)
-    body.pair(box(lamp, (0.33 * width, front + 0.05, hood - 0.27)), LAMP)
-    body.add(box((0.34 * width, 0.1, 0.14), (0, front + 0.02, hood - 0.29)), DARK)  # grille
-    body.add(box((0.92 * width, 0.14, 0.13), (0, front, ground + 0.17)), shade(skin, 0.45))
-    body.add(box((0.92 * width, 0.14, 0.13), (0, rear, ground + 0.17)), shade(skin, 0.45))
-    body.pair(box((0.2, 0.12, 0.17), (0.36 * width, rear - 0.03, trunk - 0.26)), TAIL_LAMP)
-    body.add(box((0.42, 0.04, 0.12), (0, rear + 0.02, trunk - 0.36)), (0.9, 0.9, 0.85))  # number plate
-    body.pair(box((0.14, 0.09, 0.12), (0.54 * width, start + 0.35, belt + 0.07)), skin)  # mirrors
+    body.pair(block(lamp, (0.33 * width, front + 0.05, hood - 0.27)), LAMP)
+    body.add(block((0.34 * width, 0.1, 0.14), (0, front + 0.02, hood - 0.29)), DARK)  # grille
+    body.add(block((0.92 * width, 0.14, 0.13), (0, front, ground + 0.17)), shade(skin, 0.45))
+    body.add(block((0.92 * width, 0.14, 0.13), (0, rear, ground + 0.17)), shade(skin, 0.45))
+    body.pair(block((0.2, 0.12, 0.17), (0.36 * width, rear - 0.03, trunk - 0.26)), TAIL_LAMP)
+    body.add(block((0.42, 0.04, 0.12), (0, rear + 0.02, trunk - 0.36)), (0.9, 0.9, 0.85))  # number plate
+    body.pair(block((0.14, 0.09, 0.12), (0.54 * width, start + 0.35, belt + 0.07)), skin)  # mirrors
     return body
 
 
@@ -145,17 +137,17 @@ def train(random: Generator) -> Body:
         for size, position in zip(share, along, strict=True)
     ]
     rear = front + length
-    body.add(loft([*rings, bevelled(width, ground, roof, rear, 0.3)]), skin)
+    body.add(loft([*rings, bevelled(width, ground, roof, rear, 0.3)], "sharp"), skin)
     coach = rear + 0.5
     tail = coach + random.uniform(5, 9)
-    body.add(loft([bevelled(width, ground, roof, y, 0.3) for y in (coach, tail)]), shade(skin, 0.9))
-    body.add(box((0.7 * width, 0.6, 0.7 * height), (0, rear + 0.25, ground + 0.45 * height)), DARK)
+    body.add(loft([bevelled(width, ground, roof, y, 0.3) for y in (coach, tail)], "sharp"), shade(skin, 0.9))
+    body.add(block((0.7 * width, 0.6, 0.7 * height), (0, rear + 0.25, ground + 0.45 * height)), DARK)
     for start, stop in ((front + nose + 0.3, rear), (coach, tail)):
-        body.add(box((width + 0.05, stop - start, 0.45), (0, (start + stop) / 2, ground + 0.3)), second)
+        body.add(block((width + 0.05, stop - start, 0.45), (0, (start + stop) / 2, ground + 0.3)), second)
         count = int((stop - start - 1) / 1.5)
         for index in range(count):
             y = start + 1.1 + (index + 0.5) * (stop - start - 1.4) / count
-            body.pair(box((0.06, 0.9, 0.75), (width / 2, y, ground + 0.66 * height)), GLASS)
+            body.pair(block((0.06, 0.9, 0.75), (width / 2, y, ground + 0.66 * height)), GLASS)
 
     # the windscreen: on the slope of a streamlined nose, upright on a flat one
     low, high = (0.45, 0.75) if streamlined else (0.0, 0.0)
@@ -168,21 +160,21 @@ def train(random: Generator) -> Body:
     screen += [(-0.4 * wide, y_high, z_high), (0.4 * wide, y_high, z_high)]
     body.add(plate(screen, (0, -0.2, 0.2 if streamlined else 0.0)), GLASS)
     first = width * share[0]
-    body.pair(box((0.4, 0.12, 0.3), (0.33 * first, front, ground + 0.25 * height * share[0])), LAMP)
-    body.add(box((0.9 * first, 0.16, 0.35), (0, front - 0.02, ground + 0.08 * height)), (0.9, 0.75, 0.1))
-    body.pair(box((0.35, 0.1, 0.35), (0.35 * width, tail, ground + 0.3 * height)), TAIL_LAMP)
-    body.add(box((0.9, 0.1, 0.62 * height), (0, tail, ground + 0.4 * height)), DARK)  # the gangway door
+    body.pair(block((0.4, 0.12, 0.3), (0.33 * first, front, ground + 0.25 * height * share[0])), LAMP)
+    body.add(block((0.9 * first, 0.16, 0.35), (0, front - 0.02, ground + 0.08 * height)), (0.9, 0.75, 0.1))
+    body.pair(block((0.35, 0.1, 0.35), (0.35 * width, tail, ground + 0.3 * height)), TAIL_LAMP)
+    body.add(block((0.9, 0.1, 0.62 * height), (0, tail, ground + 0.4 * height)), DARK)  # the gangway door
 
     under = front + nose
-    body.add(box((0.7 * width, tail - under, 0.4), (0, (tail + under) / 2, ground - 0.1)), DARK)
+    body.add(block((0.7 * width, tail - under, 0.4), (0, (tail + under) / 2, ground - 0.1)), DARK)
     for y in (under + 0.7, under + 2.1, rear - 2.1, rear - 0.7, coach + 0.9, tail - 0.9):
         body.pair(wheel((0.7, y, 0.45), 0.45, 0.2, 12), RUBBER)
     if random.random() < 0.5:  # pantograph
         y = random.uniform(0.2, 0.6) * rear
-        body.pair(rod((0.4, y, roof), (0.3, y + 0.9, roof + 0.6), 0.06), DARK)
-        body.pair(rod((0.3, y + 0.9, roof + 0.6), (0.3, y + 0.1, roof + 1.2), 0.06), DARK)
-        body.add(rod((-0.9, y + 0.1, roof + 1.2), (0.9, y + 0.1, roof + 1.2), 0.06), DARK)
-    body.pair(box((0.15, tail - front + 1.5, 0.12), (0.72, (front + tail) / 2, -0.06)), METAL)
+        body.pair(bar((0.4, y, roof), (0.3, y + 0.9, roof + 0.6), 0.06), DARK)
+        body.pair(bar((0.3, y + 0.9, roof + 0.6), (0.3, y + 0.1, roof + 1.2), 0.06), DARK)
+        body.add(bar((-0.9, y + 0.1, roof + 1.2), (0.9, y + 0.1, roof + 1.2), 0.06), DARK)
+    body.pair(block((0.15, tail - front + 1.5, 0.12), (0.72, (front + tail) / 2, -0.06)), METAL)
     for y in np.arange(front - 0.5, tail + 0.6, 1.5):
-        body.add(box((2.6, 0.4, 0.1), (0, y, -0.15)), (0.35, 0.26, 0.2))
+        body.add(block((2.6, 0.4, 0.1), (0, y, -0.15)), (0.35, 0.26, 0.2))
     return body

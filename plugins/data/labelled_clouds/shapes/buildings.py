@@ -4,21 +4,8 @@ import math
 
 import numpy as np
 
-from plugins.data.labelled_clouds.shapes.solids import (
-    Number,
-    Solid,
-    ball,
-    box,
-    cylinder,
-    frustum,
-    join,
-    revolution,
-    ribbon,
-    rod,
-    side_prism,
-    tray,
-    with_mirror,
-)
+from framework.geometry.round_solids import ball, cylinder, revolution, rod
+from framework.geometry.solids import Number, Solid, box, frustum, join, ribbon, side_prism, tray, with_mirror
 
 Random = np.random.Generator
 

@@ -6,21 +6,9 @@ from itertools import pairwise
 
 import numpy as np
 
+from framework.geometry.round_solids import ball, cylinder, rod, tube
+from framework.geometry.solids import Number, Point, Solid, box, frustum, join, tray, with_mirror
 from plugins.data.labelled_clouds.shapes.furniture import legs
-from plugins.data.labelled_clouds.shapes.solids import (
-    Number,
-    Point,
-    Solid,
-    ball,
-    box,
-    cylinder,
-    frustum,
-    join,
-    rod,
-    tray,
-    tube,
-    with_mirror,
-)
 
 Random = np.random.Generator
 

@@ -2,16 +2,8 @@
 
 import numpy as np
 
-from plugins.data.labelled_clouds.shapes.solids import (
-    Solid,
-    box,
-    cylinder,
-    frustum,
-    join,
-    ring,
-    rod,
-    with_mirror,
-)
+from framework.geometry.round_solids import cylinder, ring, rod
+from framework.geometry.solids import Solid, box, frustum, join, with_mirror
 
 Random = np.random.Generator
 

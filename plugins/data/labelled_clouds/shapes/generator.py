@@ -12,10 +12,10 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
+from framework.geometry.solids import Solid, drop_degenerate
 from framework.storage import cache
 from framework.storage.generated import draw_all, ensure_generated
 from plugins.data.labelled_clouds.shapes import buildings, cabinets, furniture, things, vessels
-from plugins.data.labelled_clouds.shapes.solids import Solid, drop_degenerate
 
 VERSION = 2
 """Version of the generator; increase it if the output changes, so that a new folder is written."""

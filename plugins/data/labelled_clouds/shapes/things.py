@@ -4,22 +4,8 @@ import math
 
 import numpy as np
 
-from plugins.data.labelled_clouds.shapes.solids import (
-    Number,
-    Solid,
-    ball,
-    box,
-    cylinder,
-    frustum,
-    join,
-    prism,
-    revolution,
-    rod,
-    side_prism,
-    slab,
-    tube,
-    with_mirror,
-)
+from framework.geometry.round_solids import ball, cylinder, revolution, rod, tube
+from framework.geometry.solids import Number, Solid, box, frustum, join, prism, side_prism, slab, with_mirror
 from plugins.data.labelled_clouds.shapes.vessels import smooth_profile, vessel
 
 Random = np.random.Generator

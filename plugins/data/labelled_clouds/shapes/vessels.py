@@ -5,24 +5,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from framework.geometry.round_solids import ball, cylinder, revolution, ring, rod, tube
+from framework.geometry.solids import Number, Point, Solid, box, frustum, join, slab, tray, with_mirror
 from plugins.data.labelled_clouds.shapes.cabinets import fronts
-from plugins.data.labelled_clouds.shapes.solids import (
-    Number,
-    Point,
-    Solid,
-    ball,
-    box,
-    cylinder,
-    frustum,
-    join,
-    revolution,
-    ring,
-    rod,
-    slab,
-    tray,
-    tube,
-    with_mirror,
-)
 
 Random = np.random.Generator
 
