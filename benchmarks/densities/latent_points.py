@@ -1,4 +1,4 @@
-"""Variance of three quasi-random sequences relative to independent points, for `latent.py`."""
+"""Comparison of the variance of three quasi-random sequences with that of independent points, for `latent.py`."""
 
 from collections.abc import Callable
 
@@ -10,7 +10,7 @@ from plugins.density_head.latent.monte_carlo import lattice
 
 
 def kronecker(count: int, dimensions: int) -> Tensor:
-    """i (g⁻¹, g⁻², …) mod 1 with g^(d+1) = g + 1 (Roberts 2018)."""
+    """Return the points i (g⁻¹, g⁻², …) mod 1 with g^(d+1) = g + 1 (Roberts 2018), (count, dimensions)."""
     root = 1.5
     for _ in range(100):
         root = (1 + root) ** (1 / (dimensions + 1))
@@ -19,6 +19,7 @@ def kronecker(count: int, dimensions: int) -> Tensor:
 
 
 def sobol(count: int, dimensions: int) -> Tensor:
+    """Return the first points of the Sobol sequence, (count, dimensions)."""
     return torch.quasirandom.SobolEngine(dimensions).draw(count, dtype=torch.float64)
 
 
@@ -37,7 +38,10 @@ INTEGRANDS: tuple[Callable[[Tensor], Tensor], ...] = (
 
 
 def sequences(repeats: int = 400) -> list[dict[str, object]]:
-    """Variance of independent points over that of each sequence, randomly shifted: mean of five, and worst."""
+    """Return the variance of independent points divided by that of each randomly shifted sequence.
+
+    A row has the geometric mean of this ratio over the integrands, and the smallest ratio.
+    """
     rows: list[dict[str, object]] = []
     torch.manual_seed(0)
     for dimensions in (1, 2, 4, 8):
@@ -45,11 +49,11 @@ def sequences(repeats: int = 400) -> list[dict[str, object]]:
             shift = torch.rand(repeats, 1, dimensions, dtype=torch.float64)
             row: dict[str, object] = {"dimensions": dimensions, "points": count}
             z = torch.randn(4 * repeats, count, dimensions, dtype=torch.float64)
-            plain = torch.stack([integrand(z).mean(1).var() for integrand in INTEGRANDS])
+            independent = torch.stack([integrand(z).mean(1).var() for integrand in INTEGRANDS])
             for name, sequence in SEQUENCES.items():
                 z = normal_quantile(torch.remainder(sequence(count, dimensions) + shift, 1.0))
-                ratios = plain / torch.stack([integrand(z).mean(1).var() for integrand in INTEGRANDS])
-                # a gain of a million is exact for any purpose
+                ratios = independent / torch.stack([integrand(z).mean(1).var() for integrand in INTEGRANDS])
+                # ratios above a million count as a million, so that they do not dominate the mean
                 row[name] = float(ratios.clamp(max=1e6).log().mean().exp())
                 row[f"{name}, worst"] = float(ratios.min())
             rows.append(row)
