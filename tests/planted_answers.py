@@ -1,4 +1,4 @@
-"""Wrong answers of a density, a loss or a head, each given the sound one and what it is asked."""
+"""Faulty replacements for results of densities, losses and heads: functions of the correct object and the arguments."""
 
 import math
 from collections.abc import Callable
@@ -15,7 +15,7 @@ from tests.planted_heads import Faulty
 
 
 def off(by: float, where: Callable[[Tensor], Tensor]) -> Callable[..., Tensor]:
-    """A log-density that is off where the parameter (κ or σ, the largest) fulfils a condition."""
+    """Return a log_prob that is `by` too large where the largest parameter, κ or σ, fulfils a condition."""
     return lambda density, value: density.log_prob(value) + by * where(spread_of(density).amax(-1))
 
 
@@ -24,7 +24,7 @@ def spread_of(density: Distribution) -> Tensor:
 
 
 def width(density: Distribution) -> Tensor:
-    """About a standard deviation."""
+    """Return roughly the standard deviation."""
     if isinstance(density, VonMises):
         return (1 / (1 + density.concentration)).sqrt()
     return density.scale  # pyright: ignore[reportAttributeAccessIssue]
@@ -35,7 +35,7 @@ def everywhere(parameter: Tensor) -> Tensor:
 
 
 def with_slope(factor: float, where: Callable[[Tensor], Tensor]) -> Callable[..., Tensor]:
-    """A loss of the right value whose gradient in κ is multiplied by `factor` in a region."""
+    """Return a correct loss, but with the gradient in κ multiplied by `factor` where κ fulfils a condition."""
 
     def loss(head: DensityHead, raw: Tensor, target: Tensor) -> Tensor:
         density = head(raw)
@@ -95,7 +95,7 @@ def nameless(head: Faulty, raw: Tensor) -> Distribution:
 
 
 def shared_noise(density: Any, shape: torch.Size) -> Tensor:
-    """The same draws for every row of the batch."""
+    """Return samples with the same noise for every row of the batch."""
     whole = (*shape, *density.location.shape)
     noise = torch.randn(
         *shape, *([1] * len(density.batch_shape)), 1, dtype=density.scale.dtype, device=density.scale.device
@@ -121,7 +121,7 @@ def below_labels(density: Any, shape: torch.Size) -> Tensor:
 
 
 def second_as_first(density: Any, shape: torch.Size) -> Tensor:
-    """Both numbers from one noise: each marginal is right."""
+    """Return samples whose numbers have the same noise, so that only the marginals are correct."""
     noise = torch.randn(
         *shape, *density.batch_shape, 1, dtype=density.scale.dtype, device=density.scale.device
     )
@@ -145,7 +145,7 @@ def laplace(density: Any, shape: torch.Size) -> Tensor:
 
 
 def fitting_entropy(density: Any) -> Tensor:
-    """Of p exp(c), c = 3e-6."""
+    """Return the entropy integral of the density p exp(c), which is not normalised, for c = 3e-6."""
     return math.exp(3e-6) * (density.entropy() - 3e-6)
 
 

@@ -1,4 +1,4 @@
-"""Data sets as strangers write them, right ones and each of the others wrong in one thing: `mode=check` has to tell."""
+"""Data sets like those of other authors: correct ones, and ones with a planted fault that `mode=check` must find."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -22,7 +22,7 @@ LENGTHS = (560, 51, 450)
 
 
 class Held(Dataset[Batch]):
-    """Samples in memory, one at a time."""
+    """Samples in memory that are read one at a time."""
 
     def __init__(self, **fields: Tensor) -> None:
         self.fields = fields
@@ -35,14 +35,14 @@ class Held(Dataset[Batch]):
 
 
 class AtOnce(Held):
-    """And many at once."""
+    """Samples in memory that can also be read many at a time."""
 
     def __getitems__(self, asked: Sequence[int]) -> Batch:
         return {name: values[list(asked)] for name, values in self.fields.items()}
 
 
 class Waves(Data):
-    """Five places of a wave and its phase; generated in memory, read from files of five numbers."""
+    """Five values of a sine wave as input and its phase as target; raw files hold five numbers."""
 
     bibtex = ""
     lengths: tuple[int, ...] = LENGTHS
@@ -60,7 +60,7 @@ class Waves(Data):
         self.made = [self.split(number) for number in range(3)]
 
     def table(self, number: int) -> tuple[Tensor, Tensor]:
-        """Inputs and targets of a split."""
+        """Return inputs, (samples, 5), and targets, (samples, 1), of the split with this number."""
         random = np.random.default_rng([17, self.seeds[number]])
         phase = random.uniform(-3, 3, (self.lengths[number], 1))
         places = np.sin(phase + np.arange(5)) + self.noise * random.normal(size=(len(phase), 5))
@@ -78,14 +78,16 @@ class Waves(Data):
         try:
             found = [float(word) for word in file.read_text(encoding="ascii").split()]
         except (OSError, ValueError) as error:
-            raise DataError(f"{file} cannot be read ({error}); wanted five numbers. Mend it.") from error
+            raise DataError(
+                f"{file} cannot be read ({error}); expected five numbers. Write the file again."
+            ) from error
         if len(found) != 5:
-            raise DataError(f"{file} holds {len(found)} numbers; wanted five. Mend it.")
+            raise DataError(f"{file} holds {len(found)} numbers; expected five. Write the file again.")
         return torch.tensor(found)
 
     def read(self, files: Sequence[Path]) -> Dataset[Batch]:
         if not files:
-            raise DataError("no file was given; wanted one for each wave.")
+            raise DataError("Got no file, but one file for each wave is required.")
         inputs = torch.stack([self.numbers(file) for file in files])
         return AtOnce(input=inputs, index=torch.arange(len(inputs)))
 
@@ -100,14 +102,14 @@ class Waves(Data):
 
 
 class Odd(Waves):
-    """Few samples, an odd number of them, none at once."""
+    """Waves with few samples, an odd number of them, which are read one at a time."""
 
     lengths = (7, 1, 3)
     kind = Held
 
 
 class Coins(Waves):
-    """Classes of whole numbers: many rows are equal, within a split."""
+    """Coin tosses with two classes, so that many samples of a split are equal."""
 
     kind = Held
 
@@ -124,7 +126,7 @@ class Coins(Waves):
 
 
 class Dots(Waves):
-    """Images of bytes with a bright dot, whose place is to be found."""
+    """Images of bytes with a bright dot, whose row and column are the target."""
 
     lengths = (65, 13, 14)
     size = (1, 9, 8)
@@ -146,11 +148,11 @@ class Dots(Waves):
         return batch
 
     def numbers(self, file: Path) -> Tensor:
-        raise DataError(f"{file} cannot be read; wanted an image of 9 × 8. Mend it.")
+        raise DataError(f"{file} cannot be read; expected an image of 9 × 8 pixels. Write the file again.")
 
 
 class Shuffled(Dots):
-    """Images in a folder, whose name says the place."""
+    """Images in a folder, whose file names state the target."""
 
     def __init__(self, *, root: str | None = None) -> None:
         super().__init__()
@@ -163,7 +165,10 @@ class Shuffled(Dots):
 
     def files(self, folder: Path) -> list[Path]:
         if not folder.is_dir():
-            raise DataError(f"{folder}: no such folder; wanted a folder of images. Mend data.root.")
+            raise DataError(
+                f"{folder}: no such folder; expected a folder of images. Set data.root to a folder that holds "
+                "such files."
+            )
         return sorted(folder.iterdir())
 
     def place(self, file: Path, files: list[Path]) -> list[float]:
@@ -201,20 +206,20 @@ RIGHT: dict[str, tuple[type[Data], DataRow]] = {
     "images": (Dots, PLAIN),
     "a folder": (Shuffled, WRITTEN),
 }
-"""Right data sets and their rows."""
+"""Correct data sets and their contract-test cases."""
 
 
 @dataclass(frozen=True)
 class Fault:
-    """One wrong data set.
+    """A data set with one planted fault.
 
     Attributes:
-        name: what is wrong.
-        by: the property that has to find it.
-        base: the right data set.
-        changes: methods and attributes of it that are replaced.
-        samples: of its splits' data set.
-        row: of the right one.
+        name: description of the fault.
+        by: name of the check that must find the fault.
+        changes: methods and attributes of `base` that are replaced.
+        samples: methods of the splits' data set that are replaced.
+        base: correct data set.
+        row: contract-test case of the correct data set.
     """
 
     name: str
@@ -229,14 +234,14 @@ class Fault:
 
     @cached_property
     def kind(self) -> type[Held]:
-        """Known to the module by its name, as what is pickled has to be."""
+        """Class of the splits' data set; it is a name of this module, so that it can be pickled."""
         kind = type(self.name, (self.base.kind,), {**self.samples, "__module__": __name__})
         globals()[self.name] = kind
         return kind
 
 
 def changed(change: Callable[[int, Tensor, Tensor], None]) -> Mapping[str, Any]:
-    """Tables changed in place: number of the split, inputs, targets."""
+    """Return a method `table` whose inputs and targets `change(split number, inputs, targets)` changes in place."""
 
     def table(data: Waves, number: int) -> tuple[Tensor, Tensor]:
         inputs, target = Waves.table(data, number)
@@ -256,7 +261,7 @@ def degrees_from_450(number: int, inputs: Tensor, target: Tensor) -> None:
 
 
 def test_again_in_training(data: Waves) -> None:
-    """The last samples for training are those of the test split."""
+    """Copy 20 test samples to the end of the training split."""
     Waves.prepare(data)
     train, _, test = (split.fields for split in data.made)
     train["input"][-20:], train["target"][-20:] = test["input"][420:440], test["target"][420:440]
@@ -323,7 +328,7 @@ def standardised(split: AtOnce, asked: Sequence[int]) -> Batch:
 
 
 def next_ones(split: AtOnce, asked: Sequence[int]) -> Batch:
-    """Takes a long batch for a stretch."""
+    """Return consecutive samples for a batch of 64, whatever indices are requested."""
     return AtOnce.__getitems__(split, range(asked[0], asked[0] + len(asked)) if len(asked) == 64 else asked)
 
 
@@ -351,7 +356,7 @@ def one_sample(split: Any, index: int) -> Batch:
 
 
 def remembered(split: Any, index: int) -> Batch:
-    """By the last two digits."""
+    """Return a stored sample whose index has the same last two digits."""
     if not hasattr(split, "known"):
         split.known = {}
     return split.known.setdefault(index % 100, Held.__getitem__(split, index))
@@ -378,13 +383,13 @@ def as_listed(data: Shuffled, folder: Path) -> list[Path]:
 
 
 def labels_as_listed(data: Shuffled, file: Path, files: list[Path]) -> list[float]:
-    """Of another list than the images'."""
+    """Return a target by a list of files in another order than that of the images."""
     names = [name.stem for name in file.parent.glob("*.npy")]
     return [float(number) for number in names[files.index(file)].split("_")[1:]]
 
 
 def rounded_when_stored(data: Waves, number: int) -> tuple[Tensor, Tensor]:
-    """Computed once, and read from a text ever after."""
+    """Return inputs that are computed once and later read from a text file with four decimals."""
     inputs, target = Waves.table(data, number)
     file = storage.folder("waves") / f"{number}.txt"
     if file.exists():
@@ -415,7 +420,7 @@ def noise_of_the_cpu(data: Waves, batch: Batch) -> Batch:
 
 
 def left_in_place(data: Waves, batch: Batch) -> Batch:
-    """A part of the samples is varied, chosen on the CPU."""
+    """Augment the batch after computing a mask on the CPU."""
     chosen = torch.zeros(len(batch["input"]), 1)
     chosen[batch["index"] % 2 == 0] = 1.0
     return Waves.augment(data, batch)

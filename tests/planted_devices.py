@@ -1,4 +1,4 @@
-"""Parts as somebody else may write them that work on the CPU and fail on a GPU: by registry, what mixes devices."""
+"""Plugins of each registry that work on the CPU and fail on a GPU, because they mix devices."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -26,7 +26,7 @@ WEIGHTS = torch.tensor([1.0, 2.0, 0.5])
 
 
 class _Table(GaussianHead):
-    """Keeps a table in a plain attribute, which nothing moves."""
+    """A head with a table in a plain attribute, which `Module.to` does not move."""
 
     def __init__(self, target: Target) -> None:
         super().__init__(target)
@@ -39,7 +39,7 @@ class _Table(GaussianHead):
 
 
 class _Calibrated(LaplaceHead):
-    """Sorts residuals by an order that NumPy finds."""
+    """A head that sorts residuals by NumPy in `calibrate`."""
 
     def calibrate(self, raw: Tensor, target: Tensor) -> None:
         residual = self(raw).mode - target
@@ -79,7 +79,7 @@ class _Wide(Dense):
 
 
 class _Positions(Conv):
-    """A coordinate of each row of pixels, in a plain attribute."""
+    """An encoder with the coordinate of each row of pixels in a plain attribute."""
 
     def __init__(self, input_shape: tuple[int, ...]) -> None:
         super().__init__(input_shape)
@@ -96,7 +96,7 @@ class _Joined(Dense):
 
 
 class _Noisy(Layered):
-    """Noise in training alone."""
+    """An encoder that adds noise from the CPU in training."""
 
     def hidden(self, inputs: Tensor) -> Tensor:
         return super().hidden(inputs + torch.randn(inputs.shape) if self.training else inputs)
@@ -135,7 +135,7 @@ class _WeightsMadeInForward(Weighted):
 
 
 class _Order(Tempered):
-    """Validation rows in an order of the CPU that are put into an array of the CPU."""
+    """A wrapper that writes validation scores into a tensor on the CPU."""
 
     def fit(self, seen: list[Batch]) -> None:
         scores = self.log_probs(seen, torch.ones(()).double())
@@ -144,7 +144,7 @@ class _Order(Tempered):
 
 
 class _Constant(Tempered):
-    """Multiplies by a constant of its module."""
+    """A wrapper whose loss multiplies by a tensor that is a constant of this file."""
 
     def loss(self, inputs: Tensor, target: Tensor) -> Tensor:
         return (super().loss(inputs, target)[:, None] * WEIGHTS).mean(-1)
@@ -165,7 +165,7 @@ class _ByPlace(Confidence):
 
 
 class _Reference(Confidence):
-    """Compares with targets that it keeps in an attribute."""
+    """An objective that compares targets with a tensor on the CPU."""
 
     def forward(self, predictor: Predictor, batch: Batch) -> Tensor:
         kept = torch.zeros(batch["target"].shape, dtype=batch["target"].dtype)
@@ -187,7 +187,7 @@ OBJECTIVES: Mapping[str, tuple[Callable[..., Any], Target]] = {
 
 
 class _Sums(Kept):
-    """Stacks what it counts with zeros of the CPU (as flight_error did)."""
+    """A metric that stacks its sums with zeros on the CPU."""
 
     def compute(self) -> dict[str, Tensor]:
         seen = self.all()

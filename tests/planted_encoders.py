@@ -1,4 +1,4 @@
-"""Encoders as strangers write them, right ones and each of the others wrong in one thing: `mode=check` has to tell."""
+"""Encoders like those of other authors: correct ones, and ones with a planted fault that `mode=check` must find."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -15,7 +15,7 @@ IMAGE, VECTOR = (3, 12, 10), (7,)
 
 
 class Dense(Encoder):
-    """Two layers with dropout, of vectors."""
+    """Two linear layers with dropout, for vectors."""
 
     bibtex = ""
 
@@ -33,7 +33,7 @@ class Dense(Encoder):
 
 
 class Normed(Dense):
-    """With the moments of batches."""
+    """Linear layers with batch norm."""
 
     def __init__(self, input_shape: tuple[int, ...]) -> None:
         super().__init__(input_shape)
@@ -44,7 +44,7 @@ class Normed(Dense):
 
 
 class Layered(Dense):
-    """With the moments of each sample; several at once in one pass."""
+    """Linear layers with layer norm, so that several encoders can be evaluated in one pass."""
 
     vectorises = True
 
@@ -58,7 +58,7 @@ class Layered(Dense):
 
 
 class Conv(Encoder):
-    """Two convolutions of images and a linear layer."""
+    """Two convolutions and a linear layer, for images."""
 
     bibtex = ""
 
@@ -78,7 +78,7 @@ class Conv(Encoder):
 
 
 class Residual(Conv):
-    """Begins as a linear map: the last layer of its branch is 0 at first."""
+    """Convolutions with a residual branch whose factor is small before training."""
 
     def __init__(self, input_shape: tuple[int, ...]) -> None:
         super().__init__(input_shape)
@@ -91,7 +91,7 @@ class Residual(Conv):
 
 
 class Squares(Encoder):
-    """What is known beforehand: numbers and their squares."""
+    """Features without parameters: the numbers and their squares."""
 
     bibtex = ""
     fixed = True
@@ -113,18 +113,18 @@ RIGHT: dict[str, tuple[type[Encoder], tuple[int, ...]]] = {
     "a small residual": (Residual, IMAGE),
     "squares": (Squares, VECTOR),
 }
-"""Right encoders and the shape of their inputs."""
+"""Correct encoders and the shapes of their inputs."""
 
 
 @dataclass(frozen=True)
 class Fault:
-    """One wrong encoder.
+    """An encoder with one planted fault.
 
     Attributes:
-        name: what is wrong.
-        by: the property that has to find it.
-        base: the right encoder.
-        changes: methods and attributes of it that are replaced.
+        name: description of the fault.
+        by: name of the check that must find the fault.
+        base: correct encoder.
+        changes: methods and attributes of `base` that are replaced.
     """
 
     name: str
@@ -141,12 +141,12 @@ class Fault:
 
     @cached_property
     def kind(self) -> type[Encoder]:
-        """One class: no two can be stacked."""
+        """Class of the faulty encoder, always the same one, because encoders of two classes cannot be stacked."""
         return type(self.base.__name__, (self.base,), dict(self.changes))
 
 
 class HalfSlope(torch.autograd.Function):
-    """A product whose gradient in the weights is a tenth too small."""
+    """A matrix product whose gradient in the weights is a tenth too small."""
 
     @staticmethod
     def forward(ctx: Any, inputs: Tensor, weight: Tensor) -> Tensor:
@@ -180,7 +180,7 @@ def doubled_bias(encoder: Any, shape: tuple[int, ...]) -> None:
 
 
 def chunks_backwards(encoder: Any, inputs: Tensor) -> Tensor:
-    """Long batches in chunks, joined in the wrong order."""
+    """Return the features of long batches, computed in chunks and joined in the wrong order."""
     parts = [encoder.second(encoder.hidden(part)) for part in inputs.split(64)]
     return torch.cat(parts[::-1] if len(inputs) > 100 else parts)
 

@@ -1,4 +1,4 @@
-"""Density heads that are wrong on purpose, each in one thing: of these `mode=check` has to find nearly all."""
+"""Density heads with one planted fault each; `mode=check` must find nearly all of them."""
 
 import math
 

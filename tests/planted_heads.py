@@ -1,4 +1,4 @@
-"""A shipped density head of which single answers are replaced, so that it is wrong in one thing only."""
+"""Planted faults of density heads: a shipped head of which single results are replaced."""
 
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -48,11 +48,17 @@ HEIGHT, PLACE = Target("real", ("height",)), Target("real", ("x", "y"))
 CLASSES = Target("class", ("a", "b", "c"))
 IMAGE, GREY = Target("image", ("red", "green", "blue"), size=(2, 3)), Target("image", ("grey",), size=(1, 1))
 NO_CASES = {"floor": 1e-9}
-"""Parameters for which no reference is given."""
+"""Configuration of a head for which there are no reference values."""
 
 
 class Changed(Distribution):
-    """A density of which some answers are replaced: name → function of the sound density and the arguments."""
+    """A density of which some results are replaced.
+
+    Args:
+        density: correct density.
+        parts: functions of the correct density and the arguments, by name of the method, attribute or protocol function
+            that they replace.
+    """
 
     arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
 
@@ -63,7 +69,7 @@ class Changed(Distribution):
         super().__init__(density.batch_shape, density.event_shape, validate_args=False)
 
     def ask(self, name: str, *arguments: Any) -> Any:
-        """The replaced answer, or the sound one."""
+        """Return the replaced result, or that of the correct density."""
         if name in self.parts:
             return self.parts[name](self.density, *arguments)
         found = getattr(self.density, name)
@@ -182,7 +188,11 @@ def _(density: Changed, start: Tensor, end: Tensor) -> Tensor | None:
 
 
 class Faulty(DensityHead):
-    """A sound head with changed answers; `forward`, `loss` and `calibrate` may be replaced too, given this head."""
+    """A correct head whose densities are `Changed`.
+
+    `forward`, `loss` and `calibrate` can be replaced too: `forward` and `calibrate` by functions of this head, `loss`
+    by a function of the correct head.
+    """
 
     bibtex = ""
     knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
@@ -214,15 +224,15 @@ class Faulty(DensityHead):
 
 @dataclass(frozen=True)
 class Fault:
-    """One wrong head.
+    """A density head with one planted fault.
 
     Attributes:
-        name: what is wrong.
-        target: what it predicts.
-        parts: the answers that are replaced.
-        only: the one property that is to find it; "" where several may.
-        config: of the sound head.
-        head: builds the wrong head for a target, where answers of a sound one will not do.
+        name: description of the fault.
+        target: target of the head.
+        parts: results that are replaced, as in `Changed` and `Faulty`.
+        only: name of the check that must find the fault; "" if several checks can find it.
+        config: configuration of the correct head.
+        head: function that builds the faulty head for a target, if replacing results of a correct head is not enough.
     """
 
     name: str
@@ -233,8 +243,10 @@ class Fault:
     head: Callable[[Target], DensityHead] | None = None
 
     def findings(self, only: str = "") -> Iterator[Finding]:
-        """Every finding, or that of one property; those of densities first where they are to find it, since nobody
-        need ask further."""
+        """Yield the findings of all checks, or of the check named `only`.
+
+        The checks of densities come first if one of them must find the fault, so that a caller can stop early.
+        """
         kinds = {
             "angle": VonMisesHead,
             "real": GaussianHead,
@@ -247,7 +259,9 @@ class Fault:
                 return self.head(target)
             return Faulty(kinds[target.kind](target, **self.config), self.parts)
 
-        cases = predicted_cases if self.target.kind == "angle" and not self.config and self.head is None else None
+        cases = (
+            predicted_cases if self.target.kind == "angle" and not self.config and self.head is None else None
+        )
         row = HeadRow(self.name, self.target, cases=cases)
         subject = HeadSubject(row, lambda: of(self.target), build_for=of, only=only)
         groups = [examine_head(subject), examine_densities(subject)]
@@ -256,7 +270,7 @@ class Fault:
 
 
 class Halved(Changed):
-    """log_prob in half precision."""
+    """A density whose log_prob is in half precision."""
 
     def __init__(self, density: Distribution) -> None:
         Changed.__init__(self, density, {"log_prob": lambda d, v: d.log_prob(v).half()})

@@ -1,4 +1,4 @@
-"""Metrics as strangers write them, right ones and each of the others wrong in one thing: `mode=check` has to tell."""
+"""Metrics like those of other authors: correct ones, and ones with a planted fault that `mode=check` must find."""
 
 import math
 from collections.abc import Callable
@@ -19,12 +19,12 @@ CLASSES = Target("class", ("a", "b", "c"))
 
 
 def apart(one: Tensor, other: Tensor) -> Tensor:
-    """The shorter way round, radians."""
+    """Return the distances between angles the shorter way round, radians."""
     return torch.atan2((one - other).sin(), (one - other).cos()).abs()
 
 
 class Kept(Metric):
-    """A mean of one number a sample with its standard error; keeps all of them."""
+    """Mean absolute error with its standard error, computed from the errors of all samples."""
 
     bibtex = ""
     columns = {"error": "error"}  # noqa: RUF012 - a metric as people write it
@@ -55,14 +55,14 @@ class Kept(Metric):
 
 
 class Plain(Kept):
-    """Without a standard error."""
+    """Mean absolute error without a standard error."""
 
     def compute(self) -> dict[str, Tensor]:
         return {"error": self.all().mean()}
 
 
 class Turned(Kept):
-    """Of angles, in degrees."""
+    """Mean distance between angles, degrees."""
 
     columns = {"turned_deg": "turned °"}  # noqa: RUF012
     better = {"turned_deg": "lower"}  # noqa: RUF012
@@ -76,7 +76,7 @@ class Turned(Kept):
 
 
 class Within(Kept):
-    """Share of predictions within half a unit: a bound in the target's own unit."""
+    """Share of predictions within 0.5 of the target, in the target's unit."""
 
     columns = {"within": "within 0.5"}  # noqa: RUF012
     better = {"within": "higher"}  # noqa: RUF012
@@ -90,7 +90,7 @@ class Within(Kept):
 
 
 class Median(Kept):
-    """With the standard error that a bootstrap of its own gives, as nobody knows another."""
+    """Median absolute error with a standard error by the metric's own bootstrap."""
 
     def compute(self) -> dict[str, Tensor]:
         seen = self.all()
@@ -112,7 +112,7 @@ class Surprise(Kept):
 
 
 class Rooted(Kept):
-    """Root mean square by the delta method."""
+    """Root mean square error, with a standard error by the delta method."""
 
     columns = {"root": "root mean square"}  # noqa: RUF012
     better = {"root": "lower"}  # noqa: RUF012
@@ -127,7 +127,7 @@ class Rooted(Kept):
 
 
 class Hit(Metric):
-    """Share of labels that are the likeliest class; keeps sums alone, and is silent of its standard error."""
+    """Share of targets that are the most likely class, computed from sums and without a standard error."""
 
     bibtex = ""
     columns = {"hit": "hit"}  # noqa: RUF012
@@ -159,19 +159,19 @@ RIGHT = {
     "a root": (Rooted, PLACE),
     "a share of classes": (Hit, CLASSES),
 }
-"""Right metrics and what they judge."""
+"""Correct metrics and the targets that they evaluate."""
 
 
 @dataclass(frozen=True)
 class Fault:
-    """One wrong metric.
+    """A metric with one planted fault.
 
     Attributes:
-        name: what is wrong.
-        target: what it judges.
-        base: the right metric.
-        changes: methods of it that are replaced.
-        by: the property that has to find it.
+        name: description of the fault.
+        target: target that the metric evaluates.
+        base: correct metric.
+        changes: methods of `base` that are replaced.
+        by: name of the check that must find the fault.
     """
 
     name: str
@@ -185,7 +185,7 @@ class Fault:
 
     @cached_property
     def kind(self) -> type[Metric]:
-        """One class: states of two cannot merge."""
+        """Class of the faulty metric, always the same one, because states of two classes cannot be merged."""
         return type(self.base.__name__, (self.base,), dict(self.changes))
 
 
@@ -285,13 +285,13 @@ def last_ones(metric: Kept) -> Tensor:
 
 
 def outliers_cut(metric: Kept) -> Tensor:
-    """Beyond 50 samples those that look odd beside the ones before."""
+    """Return the errors without those after the 50th that are large compared with the first 50."""
     seen = Kept.all(metric)
     return torch.cat([seen[:50], seen[50:][seen[50:] < 3 * seen[:50].mean()]]) if len(seen) > 50 else seen
 
 
 def finished(metric: Any) -> dict[str, Tensor]:
-    """Divides its own state."""
+    """Return the share, and overwrite the sum of hits with it."""
     metric.right = metric.right / metric.count
     return {"hit": metric.right}
 

@@ -1,4 +1,4 @@
-"""Objectives as somebody else may write them: a right one, and others wrong in one thing each."""
+"""Objectives like those of other authors: a correct one, and ones with a planted fault that `mode=check` must find."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from tests.planted_heads import CLASSES, PLACE
 
 
 class Confidence(Objective):
-    """Punishes large log-densities of the label, sample by sample and member by member."""
+    """Objective that penalises large log-densities at the target, for each sample and member."""
 
     bibtex = ""
 
@@ -25,7 +25,7 @@ class Confidence(Objective):
         self.weight = weight
 
     def each(self, predictor: Predictor, batch: Batch) -> Tensor:
-        """Of each sample, (batch,) or (batch, member)."""
+        """Return the penalties, (batch,) or (batch, member)."""
         with set_flag(predictor, BATCH_NORM, "track_running_stats", False):  # the loss has counted this batch
             density = predictor.training_densities(batch["input"])
         target = batch["target"]
@@ -49,7 +49,7 @@ class MeanOfMembers(Confidence):
 
 
 class OfTheSurest(Confidence):
-    """Judges the members by the one that is worst on each sample."""
+    """Penalises all members with the largest penalty of any member on each sample."""
 
     def each(self, predictor: Predictor, batch: Batch) -> Tensor:
         found = super().each(predictor, batch)
@@ -102,7 +102,7 @@ class Clamped(Confidence):
 
 
 class Moving(Confidence):
-    """Less the penalties that it has seen before."""
+    """Subtracts a running mean of previous penalties."""
 
     def forward(self, predictor: Predictor, batch: Batch) -> Tensor:
         found = super().forward(predictor, batch)
@@ -112,14 +112,14 @@ class Moving(Confidence):
 
 
 class Evaluates(Confidence):
-    """In evaluation mode, in which it leaves the predictor."""
+    """Sets the predictor to evaluation mode and leaves it so."""
 
     def forward(self, predictor: Predictor, batch: Batch) -> Tensor:
         return super().forward(predictor.eval(), batch)
 
 
 class Neighbours(Confidence):
-    """Weighted by place in the batch."""
+    """Weighs each sample by its position in the batch."""
 
     def each(self, predictor: Predictor, batch: Batch) -> Tensor:
         found = super().each(predictor, batch)
@@ -129,7 +129,14 @@ class Neighbours(Confidence):
 
 @dataclass(frozen=True)
 class Fault:
-    """One wrong objective: what is wrong, its class, the target, and a property that has to find it."""
+    """An objective with one planted fault.
+
+    Attributes:
+        name: description of the fault.
+        kind: class of the objective.
+        target: target of the predictor.
+        by: name of a check that must find the fault.
+    """
 
     name: str
     kind: Callable[..., Objective]

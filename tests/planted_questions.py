@@ -1,4 +1,4 @@
-"""Density heads that are wrong in what they may be asked beyond log_prob and draws, and in how they read targets."""
+"""Planted faults of density heads in protocol functions other than log_prob and sample, and in reading targets."""
 
 from typing import Any
 
@@ -30,7 +30,7 @@ POINT = Target("real", ("x", "y", "z"))
 
 
 def first_row_only(density: Gaussian, index: Tensor) -> Distribution:
-    """Of every row the items of the first."""
+    """Return the picked items of the first row for every row."""
     return pick(Gaussian(*(part[:1].expand_as(part) for part in (density.location, density.scale))), index)
 
 
@@ -41,7 +41,7 @@ def changed_slope(density: Distribution, value: Tensor, pull: float, stiffness: 
 
 
 class NoJacobian(LaplaceHead):
-    """A log-density of the standardised number, of values in the target's unit."""
+    """Returns the log-density of the standardised value for a value in the target's unit."""
 
     def forward(self, raw: Tensor) -> Distribution:
         return Shifted(super().forward(raw), self.unit.log_volume)
@@ -51,7 +51,7 @@ class NoJacobian(LaplaceHead):
 
 
 class Shifted(Product):
-    """Another constant in log_prob and entropy."""
+    """Adds a constant to log_prob and subtracts it from the entropy."""
 
     def __init__(self, density: Distribution, by: float) -> None:
         assert isinstance(density, Product)
@@ -66,14 +66,14 @@ class Shifted(Product):
 
 
 class LossOfTheStandardised(StudentTHead):
-    """Its loss takes the place of the target's unit for the standardised one."""
+    """Computes the loss of the standardised target with the density in the target's unit."""
 
     def loss(self, raw: Tensor, target: Tensor) -> Tensor:
         return -self(raw).log_prob(self.unit.standardise(target))
 
 
 class RootOfScale(LogisticHead):
-    """Takes the target's scale for a variance."""
+    """Uses the root of the target's scale."""
 
     def parameters_of(self, raw: Tensor) -> tuple[Tensor, Tensor]:
         place, scale = super().parameters_of(raw)
@@ -81,7 +81,7 @@ class RootOfScale(LogisticHead):
 
 
 class NoLocation(LogisticHead):
-    """Scales, and does not shift."""
+    """Applies the target's scale but not its location."""
 
     def parameters_of(self, raw: Tensor) -> tuple[Tensor, Tensor]:
         place, scale = super().parameters_of(raw)
@@ -89,7 +89,7 @@ class NoLocation(LogisticHead):
 
 
 class FirstScale(LogisticHead):
-    """The first number's scale for all."""
+    """Uses the first number's scale for all numbers."""
 
     def parameters_of(self, raw: Tensor) -> tuple[Tensor, Tensor]:
         place, scale = super().parameters_of(raw)
@@ -97,7 +97,7 @@ class FirstScale(LogisticHead):
 
 
 class StandardisedDraws(LogisticHead):
-    """Draws and the median stay in the standardised unit."""
+    """Returns samples in the standardised unit."""
 
     def forward(self, raw: Tensor) -> Logistic:
         return Standard(*self.parameters_of(raw), self.unit.standardise)
@@ -113,7 +113,7 @@ class Standard(Logistic):
 
 
 class CalibratedTwice(LogisticHead):
-    """calibrate multiplies with the target's scale once more."""
+    """Multiplies by the target's scale once more in `calibrate`."""
 
     @torch.no_grad()
     def calibrate(self, raw: Tensor, target: Tensor) -> None:
@@ -123,35 +123,35 @@ class CalibratedTwice(LogisticHead):
 
 
 class FirstHalf(LogisticHead):
-    """calibrate reads the first half of the rows."""
+    """Calibrates on the first half of the rows."""
 
     def calibrate(self, raw: Tensor, target: Tensor) -> None:
         super().calibrate(raw[: len(raw) // 2], target[: len(raw) // 2])
 
 
 class NextRows(LogisticHead):
-    """calibrate takes each row's target for the next one's."""
+    """Calibrates with the target of each row assigned to the next row."""
 
     def calibrate(self, raw: Tensor, target: Tensor) -> None:
         super().calibrate(raw, target.roll(1, 0))
 
 
 class Clipped(StudentTHead):
-    """A loss of at most 20 nats."""
+    """Clamps the loss to at most 20 nats."""
 
     def loss(self, raw: Tensor, target: Tensor) -> Tensor:
         return (-self(raw).log_prob(target)).clamp(max=20)
 
 
 class PerNumber(LogisticHead):
-    """A loss that is the mean over numbers, as that of images may be."""
+    """Returns the loss divided by the number of target values."""
 
     def loss(self, raw: Tensor, target: Tensor) -> Tensor:
         return super().loss(raw, target) / target.shape[-1]
 
 
 class Unread(LogisticHead):
-    """Asks for a number more than it reads."""
+    """Requires one raw parameter more than it reads."""
 
     def __init__(self, target: Target) -> None:
         super().__init__(target)
@@ -165,7 +165,7 @@ class Unread(LogisticHead):
 
 
 class OneScaleForAll(LogisticHead):
-    """Two numbers share a scale, and each has a raw number for one."""
+    """Uses the first scale for all numbers, although each number has a raw parameter for its own scale."""
 
     def parameters_of(self, raw: Tensor) -> tuple[Tensor, Tensor]:
         place, scale = super().parameters_of(raw)
@@ -173,14 +173,14 @@ class OneScaleForAll(LogisticHead):
 
 
 class LightTails(StudentTHead):
-    """The normaliser of a normal density."""
+    """Returns a heavy-tailed log_prob that is 0.05 too large."""
 
     def forward(self, raw: Tensor) -> Distribution:
         return Shifted(super().forward(raw), 0.05)
 
 
 class NarrowSlope(StudentTHead):
-    """The gradient of the loss is a tenth off where the scale is below 1e-3."""
+    """Returns a loss whose gradient in the location is a tenth too small where the scale is below 1e-3."""
 
     def loss(self, raw: Tensor, target: Tensor) -> Tensor:
         place, scale = self.parameters_of(raw)
@@ -196,12 +196,12 @@ def reseeding(density: Distribution, shape: torch.Size) -> Tensor:
 
 
 def mixed_rows(head: Faulty, raw: Tensor) -> Distribution:
-    """Batches of two dimensions are read in another order."""
+    """Return the density of raw parameters whose two batch dimensions are read in another order."""
     return head.sound(raw if raw.dim() < 3 else raw.transpose(0, 1).reshape(raw.shape))
 
 
 def cut_batch(head: Faulty, raw: Tensor) -> Distribution:
-    """The last rows of a batch above 256 get the first one's numbers."""
+    """Return the density of raw parameters whose rows beyond 256 are replaced by the first row."""
     if raw.dim() == 2 and len(raw) > 256:
         raw = torch.cat([raw[:256], raw[:1].expand(len(raw) - 256, -1)])
     return head.sound(raw)
@@ -302,7 +302,7 @@ FURTHER_FAULTS = (
 
 
 class Renamed(LogisticHead):
-    """Variance s² instead of π² s² / 3."""
+    """Returns densities with variance s² instead of π² s² / 3."""
 
     def forward(self, raw: Tensor) -> Logistic:
         return OfScale(*self.parameters_of(raw))

@@ -1,4 +1,4 @@
-"""Renderers as strangers write them, right ones and each of the others wrong in one thing: `mode=check` has to tell."""
+"""Renderers like those of other authors: correct ones, and ones with a planted fault that `mode=check` must find."""
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -13,7 +13,7 @@ from tests.stranger.stranger_package.renderer import Hits, RayCaster, rays
 
 
 class Discs(Renderer):
-    """Points as discs of one size, the nearer before the farther; faces say nothing."""
+    """Renders vertices as discs of one size, nearer discs in front of farther ones; faces are not drawn."""
 
     bibtex = ""
     channels = frozenset({"color", "depth"})
@@ -22,11 +22,19 @@ class Discs(Renderer):
     def __call__(self, scene: Scene, channels: Collection[str] = ("color",)) -> dict[str, Tensor]:
         unknown = sorted(set(channels) - self.channels)
         if unknown:
-            raise ValueError(f"{unknown[0]!r} is no channel of discs; they draw color and depth.")
+            raise ValueError(
+                f"Discs cannot draw the channel {unknown[0]!r}, only color and depth. Leave the channel out."
+            )
         if scene.faces.numel() and not 0 <= scene.faces.min() <= scene.faces.max() < len(scene.vertices):
-            raise ValueError("faces name vertices that are not there; wanted indices of vertices.")
+            raise ValueError(
+                "The faces hold indices of vertices that do not exist. Set indices from 0 to below the number "
+                "of vertices."
+            )
         if "color" in channels and (scene.colors is None or scene.texture is not None):
-            raise ValueError('"color" was asked of a scene without colours, or of one with a texture.')
+            raise ValueError(
+                'The channel "color" requires vertex colours, but the scene has none, or has a texture. Add '
+                "vertex colours."
+            )
         seen = scene.camera
         pixels, depth = seen.project(scene.vertices.double())
         there = pixels.isfinite().all(-1) & depth.isfinite() & (depth >= seen.near)
@@ -55,7 +63,7 @@ class Discs(Renderer):
         return {channel: drawn[channel] for channel in channels}
 
     def order(self, depth: Tensor) -> Tensor:
-        """The farthest first."""
+        """Return the indices of the depths, the farthest first."""
         return depth.argsort(descending=True)
 
 
@@ -92,11 +100,14 @@ OF_POINTS: Mapping[str, str] = dict.fromkeys(
 RIGHT: dict[str, tuple[Callable[[], Renderer], Mapping[str, str]]] = {
     "discs": (Discs, OF_POINTS),
 }
-"""Right renderers and what a row leaves out of them; the stranger's ray caster is checked by name elsewhere."""
+"""Correct renderers and the checks that their contract-test cases leave out, with the reasons.
+
+The ray caster of the stranger package is checked elsewhere.
+"""
 
 
 class Wrapped(Renderer):
-    """A shipped renderer, of which pictures or scenes are changed."""
+    """A shipped renderer whose scenes or images can be changed."""
 
     bibtex = ""
     channels = frozenset({"color", "depth", "face", "mask"})
@@ -111,13 +122,13 @@ class Wrapped(Renderer):
 
 @dataclass(frozen=True)
 class Fault:
-    """One wrong renderer.
+    """A renderer with one planted fault.
 
     Attributes:
-        name: what is wrong.
-        by: the property that has to find it.
-        base: the right renderer.
-        changes: methods and attributes of it that are replaced.
+        name: description of the fault.
+        by: name of the check that must find the fault.
+        base: correct renderer.
+        changes: methods and attributes of `base` that are replaced.
     """
 
     name: str
@@ -130,7 +141,7 @@ class Fault:
 
 
 def colored(change: Callable[[Tensor], Tensor]) -> Mapping[str, Any]:
-    """Of what is seen another colour."""
+    """Return a method that changes the colours of the visible points."""
 
     def color(renderer: Any, scene: Scene, face: Tensor, weights: Tensor) -> Tensor:
         return change(RayCaster._color(renderer, scene, face, weights))
@@ -139,7 +150,7 @@ def colored(change: Callable[[Tensor], Tensor]) -> Mapping[str, Any]:
 
 
 def seen_by(change: Callable[[Scene], Scene]) -> Mapping[str, Any]:
-    """Of another scene."""
+    """Return a method that renders a changed scene."""
 
     def draw(renderer: Any, scene: Scene, channels: Collection[str] = ("color",)) -> dict[str, Tensor]:
         return RayCaster.__call__(renderer, change(scene), channels)
@@ -148,7 +159,7 @@ def seen_by(change: Callable[[Scene], Scene]) -> Mapping[str, Any]:
 
 
 def painted(change: Callable[[Scene, dict[str, Tensor]], dict[str, Tensor]]) -> Mapping[str, Any]:
-    """Pictures changed."""
+    """Return a method that changes the rendered images."""
 
     def draw(renderer: Any, scene: Scene, channels: Collection[str] = ("color",)) -> dict[str, Tensor]:
         return change(scene, RayCaster.__call__(renderer, scene, channels))
@@ -157,7 +168,7 @@ def painted(change: Callable[[Scene, dict[str, Tensor]], dict[str, Tensor]]) -> 
 
 
 def affine(renderer: Any, scene: Scene, face: Tensor, weights: Tensor) -> Tensor:
-    """Linear on the screen."""
+    """Return colours that are interpolated linearly on the screen, without perspective."""
     seen = scene.vertices.double() @ scene.camera.rotation.double().T + scene.camera.translation.double()
     flat = weights * seen[scene.faces.long()[face]][..., 2]
     return RayCaster._color(renderer, scene, face, flat / flat.sum(-1, keepdim=True))
@@ -174,7 +185,7 @@ def next_corner(renderer: Any, scene: Scene, face: Tensor, weights: Tensor) -> T
 
 
 def of_kept_faces(scene: Scene, drawn: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Numbers of the faces that are left where those behind the camera are taken out."""
+    """Return images whose face indices count only the faces in front of the camera."""
     if "face" not in drawn or not len(scene.faces):
         return drawn
     depth = scene.vertices @ scene.camera.rotation.T + scene.camera.translation
@@ -184,7 +195,7 @@ def of_kept_faces(scene: Scene, drawn: dict[str, Tensor]) -> dict[str, Tensor]:
 
 
 def by_their_middle(scene: Scene, drawn: dict[str, Tensor]) -> dict[str, Tensor]:
-    """The farthest first, by the middles of faces: what crosses is wrong."""
+    """Return face indices drawn in order of the faces' mean depths, which is wrong for intersecting faces."""
     if "face" not in drawn or len(scene.faces) > 60:
         return drawn
     seen = scene.vertices.double() @ scene.camera.rotation.double().T + scene.camera.translation.double()
@@ -255,7 +266,7 @@ def red_green_blue(scene: Scene, drawn: dict[str, Tensor]) -> dict[str, Tensor]:
 
 
 def slope(factor: float, which: slice = slice(None)) -> Mapping[str, Any]:
-    """Gradients of colours that are so many times the right ones, of some vertices."""
+    """Return a method that multiplies the gradients in the colours of some vertices by a factor."""
 
     def draw(renderer: Any, scene: Scene, channels: Collection[str] = ("color",)) -> dict[str, Tensor]:
         colors = scene.colors
@@ -278,7 +289,7 @@ def a_row_down(renderer: Any, scene: Scene, channels: Collection[str] = ("color"
 
 
 def linear_depth(renderer: Any, name: str, scene: Scene, hits: Hits) -> Tensor:
-    """Depth that is linear on the screen."""
+    """Return a channel; depth is interpolated linearly on the screen, without perspective."""
     if name != "depth":
         return RayCaster._channel(renderer, name, scene, hits)
     shown = hits.face >= 0

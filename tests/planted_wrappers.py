@@ -1,4 +1,4 @@
-"""Uncertainty wrappers as somebody else may write them: two that are right, and others wrong in one thing each."""
+"""Uncertainty wrappers like those of other authors: two correct ones, and ones with a planted fault."""
 
 import math
 from collections.abc import Callable, Iterable, Mapping
@@ -23,7 +23,7 @@ TEMPERATURES = torch.logspace(-1, 1.3, 24, dtype=torch.float64)
 
 
 class Tempered(Uncertainty):
-    """Raises each density to the power of highest validation likelihood, of a grid."""
+    """Tempers each density; the temperature on a grid with the highest validation likelihood is used."""
 
     bibtex = ""
     knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
@@ -66,7 +66,7 @@ class Tempered(Uncertainty):
 
 
 class Weighted(Uncertainty):
-    """Two models, mixed with the weights of highest validation likelihood, of a grid."""
+    """Mixture of two models; the weights on a grid with the highest validation likelihood are used."""
 
     bibtex = ""
     knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
@@ -110,7 +110,7 @@ class Weighted(Uncertainty):
 
 
 def answering(kind: type[Uncertainty], **parts: Callable[..., Any]) -> type[Uncertainty]:
-    """A wrapper some of whose densities' answers are replaced, given the sound density."""
+    """Return a wrapper class whose densities have replaced results, as in `Changed`."""
 
     class Answering(kind):  # pyright: ignore[reportGeneralTypeIssues, reportUntypedBaseClass]
         def forward(self, inputs: Tensor) -> Distribution:
@@ -120,7 +120,7 @@ def answering(kind: type[Uncertainty], **parts: Callable[..., Any]) -> type[Unce
 
 
 def first(density: Any) -> Distribution:
-    """The mixture's first component."""
+    """Return the mixture with all weight on the first component."""
     weights = torch.full_like(density.log_weights, -math.inf)
     weights[..., 0] = 0.0
     return Mixture(weights, density.components)
@@ -145,7 +145,7 @@ class Ascends(Tempered):
 
 
 class WeighsTheBatch(Weighted):
-    """The model that is surer of the batch as a whole has more weight in all of its rows."""
+    """Gives more weight to the model with the lower mean entropy over the batch."""
 
     def forward(self, inputs: Tensor) -> Distribution:
         found = super().forward(inputs)
@@ -179,7 +179,7 @@ class EveryBatchAlike(Tempered):
 
 
 class WholeBatchesOnly(Tempered):
-    """As a loader with drop_last=True."""
+    """Fits only to batches of full size, as a loader with drop_last=True would return them."""
 
     def fit(self, seen: list[Batch]) -> None:
         size = max(len(one["target"]) for one in seen)
@@ -187,7 +187,7 @@ class WholeBatchesOnly(Tempered):
 
 
 class NothingIsLeft(Tempered):
-    """What is wrapped has read the batches when the wrapper comes to them."""
+    """Calibrates the wrapped model with the iterator of batches, which is then exhausted."""
 
     def calibrate(self, batches: Iterable[Batch]) -> None:
         self.model.calibrate(batches)
@@ -209,7 +209,7 @@ class CalibratesTheWrappedLast(Tempered):
 
 
 class OnTheBestHalf(Tempered):
-    """Outliers are left out of the fit, half of the rows."""
+    """Fits to the half of the rows with the highest log-likelihood."""
 
     def value(self, seen: list[Batch], temperature: Tensor) -> Tensor:
         found = self.log_probs(seen, temperature)
@@ -217,7 +217,7 @@ class OnTheBestHalf(Tempered):
 
 
 class SupposesSizeOne(Tempered):
-    """Widens by the size of the residuals, as if densities were of width 1."""
+    """Sets the temperature to the mean squared residual, as if all densities had variance 1."""
 
     def fit(self, seen: list[Batch]) -> None:
         gap = torch.cat([one["target"] - self.model(one["input"]).mode for one in seen])
@@ -225,7 +225,7 @@ class SupposesSizeOne(Tempered):
 
 
 class Stays(Tempered):
-    """Leaves the model in training mode."""
+    """Leaves the model in training mode after `calibrate`."""
 
     def calibrate(self, batches: Iterable[Batch]) -> None:
         super().calibrate(batches)
@@ -256,7 +256,7 @@ class Counts(Tempered):
 
 
 class Single(Tempered):
-    """In float32, once it was calibrated."""
+    """Returns float32 densities after calibration."""
 
     def forward(self, inputs: Tensor) -> Distribution:
         if self.temperature == 1:
@@ -271,13 +271,13 @@ class KnobsDescend(Tempered):
 
 @dataclass(frozen=True)
 class Fault:
-    """One wrong wrapper.
+    """A wrapper with one planted fault.
 
     Attributes:
-        name: what is wrong.
-        kind: builds it.
-        target: what is predicted.
-        by: a property that has to find it.
+        name: description of the fault.
+        kind: function that builds the wrapper.
+        target: target that is predicted.
+        by: name of a check that must find the fault.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""Density heads as somebody else may write them, right in everything: `mode=check` must refuse none."""
+"""Correct density heads like those of other authors; `mode=check` must refuse none of them."""
 
 import math
 from collections.abc import Callable, Iterator, Mapping
@@ -31,12 +31,13 @@ from framework.testing.heads import HeadSubject, examine_head
 from framework.testing.rows import HeadRow
 
 LARGEST = 1e6
-"""Places and logarithms of scales are cut off here and at ±SCALES."""
+"""Bound on the magnitude of locations."""
 SCALES = 9.0
+"""Bound on the magnitude of logarithms of scales."""
 
 
 class _OfReals(DensityHead):
-    """A place and a scale for each number, in the target's unit."""
+    """Base of heads with a location and a scale for each number, in the target's unit."""
 
     bibtex = ""
     knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
@@ -61,8 +62,10 @@ class _OfReals(DensityHead):
 
 
 class Product(Distribution):
-    """Independent numbers, each of one of torch's densities; unlike torch's own of a batch of no rows too. Nothing is
-    registered but what the base asks for."""
+    """Product of independent one-dimensional torch densities.
+
+    Unlike torch's `Independent` it also accepts an empty batch. Only the required protocol functions are registered.
+    """
 
     arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
 
@@ -107,7 +110,7 @@ def _(density: Product, index: int) -> Product:
 
 
 class StudentTHead(_OfReals):
-    """Student's t of 2.5 degrees of freedom: its tails are heavy, its fourth moment is infinite."""
+    """Student's t with 2.5 degrees of freedom, which has heavy tails and an infinite fourth moment."""
 
     freedom = 2.5
 
@@ -117,14 +120,16 @@ class StudentTHead(_OfReals):
 
 
 class CauchyHead(StudentTHead):
-    """One degree of freedom: neither mean nor variance."""
+    """Student's t with one degree of freedom, which has neither mean nor variance."""
 
     freedom = 1.0
 
 
 class LearnedTHead(DensityHead):
-    """Student's t whose degrees of freedom are predicted, from the docstring of the base alone: it does not read the
-    target's location and scale."""
+    """Student's t whose degrees of freedom are predicted, written from the docstring of the base class alone.
+
+    The head does not use the target's location and scale.
+    """
 
     bibtex = ""
     knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
@@ -147,14 +152,14 @@ class LearnedTHead(DensityHead):
 
 
 class LaplaceHead(_OfReals):
-    """Laplace, by torch."""
+    """Laplace densities of torch."""
 
     def forward(self, raw: Tensor) -> Distribution:
         return Product(Laplace, *self.parameters_of(raw))
 
 
 class Logistic(Distribution):
-    """Independent logistic densities, e^-z / s (1 + e^-z)², with everything in closed form that is."""
+    """Independent logistic densities e^-z / (s (1 + e^-z)²), with all results that have a closed form."""
 
     arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
 
@@ -221,7 +226,7 @@ def _(density: Logistic, value: Tensor) -> Tensor:
 
 
 class LogisticHead(_OfReals):
-    """Logistic densities, with one factor of all scales fitted to the validation set."""
+    """Logistic densities, with one factor of all scales that is fitted to the validation split."""
 
     factor: Tensor
 
@@ -275,7 +280,7 @@ class WrappedNormal(Distribution):
         return wrap(self.place + self.width * noise)
 
     def entropy(self) -> Tensor:
-        # of a narrow one the normal's; otherwise by the trapezium rule, exact where it resolves the density
+        # a narrow density has the entropy of a normal one; for wider ones the trapezium rule is accurate
         angle = torch.linspace(-math.pi, math.pi, 801, dtype=torch.float64)[:-1].to(self.place)
         angle = angle.reshape(-1, *(1,) * self.place.dim())
         centred = WrappedNormal(torch.zeros_like(self.place), self.width.clamp(min=0.05))
@@ -316,7 +321,7 @@ def _(density: WrappedNormal, start: Tensor, end: Tensor) -> Tensor:
 
 
 class WrappedNormalHead(DensityHead):
-    """A direction and a width for each angle."""
+    """Wrapped normal densities with a location and a width for each angle."""
 
     bibtex = ""
     knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
@@ -329,7 +334,7 @@ class WrappedNormalHead(DensityHead):
 
     def forward(self, raw: Tensor) -> WrappedNormal:
         cos, sin, width = require_finite(raw, self.size).chunk(3, -1)
-        # squares in the gradient of atan2 neither over- nor underflow
+        # the bounds keep squares in the gradient of atan2 from overflow and underflow
         place = torch.atan2(sin.clamp(-1e18, 1e18), cos.clamp(-1e18, 1e18) + 1e-12)
         return WrappedNormal(place, 1e-3 + 1.9 * torch.sigmoid(width))
 
@@ -354,7 +359,7 @@ HEADS: Mapping[str, tuple[type[DensityHead], tuple[Target, ...]]] = {
 
 
 def right_findings(name: str, target: Target) -> Iterator[Finding]:
-    """Every finding of one of them."""
+    """Yield all findings of the head with this name."""
     kind = HEADS[name][0]
     subject = HeadSubject(HeadRow(name, target), lambda: kind(target), build_for=kind)
     yield from examine_head(subject)
