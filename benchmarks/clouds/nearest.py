@@ -104,7 +104,7 @@ def samplers() -> dict[str, Callable[[int, np.random.Generator], Array]]:
 
 
 def clouds(points: int, count: int) -> list[Array]:
-    """Return clouds in the unit ball (eq. 6.2), of each shape in turn.
+    """Return clouds in the unit ball (eq. 6.2); one after the other, they have the shapes of `samplers`.
 
     All clouds differ, so that the processor cannot learn the branches of one cloud.
     """
@@ -193,7 +193,7 @@ def time_on_one_core(
 
 
 def time_hard_clouds(points: int = 100_000, basis_points: int = 1000) -> str:
-    """Return a table of milliseconds for clouds that are difficult for grids and trees, ours and pykdtree."""
+    """Return a table of the times of our search and of pykdtree for clouds that are difficult for grids and trees."""
     generator = np.random.default_rng(7)
     plain = torus(points, generator)
     nested = 100.0 ** -generator.integers(0, 10, points)[:, None] * generator.normal(size=(points, 3))
@@ -386,7 +386,8 @@ def streaming(total: int = 10**8, size: int = 10**6, basis_points: int = 1000) -
         f"points of a synthetic torus are generated chunk by chunk and read three times on one core: for their mean, "
         "for the largest distance from the mean (largest norm), and for the point that is nearest to each of "
         f"{basis_points:,} basis points.\n\n"
-        f"The processor times are: {times}. The peak memory was {peak / 2**10:.0f} MiB; {base / 2**10:.0f} MiB of it "
+        f"The processor times are: {times}. The time of generating the points is the sum over all three readings. "
+        f"The peak memory was {peak / 2**10:.0f} MiB; {base / 2**10:.0f} MiB of it "
         "were in use before the first chunk was read (libraries and one chunk). All points together would take "
         f"{12 * total / 2**20:.0f} MiB. The results are: centre {[round(x, 4) for x in middle.mean.tolist()]}, "
         f"largest norm {reach.norm:.4f}, mean distance {float(result.distance.mean()):.6f}.\n\n"

@@ -186,7 +186,7 @@ def set_knob(head: DensityHead, knob: str, value: float) -> None:
         head.samples, head.tolerance = 64, value
 
 
-def curve(method: str, encoder: nn.Module, head: DensityHead) -> list[dict[str, object]]:
+def measure_head(method: str, encoder: nn.Module, head: DensityHead) -> list[dict[str, object]]:
     """Return the rows of one head, for every kind of points and every value of the knobs."""
     x, value = sample(ITEMS, 2)
     with torch.no_grad():
@@ -258,7 +258,7 @@ def draw_figure(rows: list[dict[str, object]]) -> None:
     figure = titled_figure((11, 8.5), "Log-likelihoods of latent-variable models on a toy of two modes", True)
     axes = figure.subplots(2, 2, sharex=True, sharey="row")
     for column, (key, name) in enumerate((("scvae", "sCVAE"), ("cvae", "CVAE"))):
-        for line in curves(rows, key):
+        for line in styled_curves(rows, key):
             for axis, quantity in zip(axes[:, column], ("error_nats", "excess_nats"), strict=True):
                 draw_curve(axis, line, quantity)
         axes[0, column].set_title(f"{name}: error of the estimate", fontsize=11)
@@ -305,7 +305,7 @@ def draw_figure(rows: list[dict[str, object]]) -> None:
     save_figure(figure, HERE.with_suffix(""), True)
 
 
-def curves(
+def styled_curves(
     rows: list[dict[str, object]], key: str
 ) -> Iterator[tuple[list[dict[str, object]], dict[str, Any]]]:
     """Yield the rows and the style of each curve of a kind of head."""
@@ -337,7 +337,7 @@ def main() -> None:
     assert NormalPoints is not IndependentPoints
     rows: list[dict[str, object]] = []
     for method, config in HEADS.items():
-        rows += curve(method, *train(config))
+        rows += measure_head(method, *train(config))
     mark_pareto(rows)
     table.write_csv(rows, [*COLUMNS, "family_excess_nats"], HERE.with_suffix(".csv"))
     draw_figure(rows)
@@ -362,8 +362,8 @@ def main() -> None:
         "quasi-Monte-Carlo points of the framework, and `independent` points are plain Monte Carlo;\n"
         "- knob, value: the number of points z (`samples`), or the estimated error in nats until which the number of "
         "points is doubled (`tolerance`);\n"
-        "- error of one log-likelihood: root mean square difference, over test samples and seeds, from the head's own "
-        "integral, which was computed by quadrature;\n"
+        "- error of one log-likelihood: root mean square difference, over test samples and seeds, from the exact value "
+        "of the head's integral, which was computed by quadrature;\n"
         "- error of the mean: the same for the mean log-likelihood of the test samples, over seeds;\n"
         "- bias: mean of the difference, over test samples and seeds; an estimate is on average too low (Jensen's "
         "inequality). After correction, half of the squared reported error has been added to each estimate;\n"
