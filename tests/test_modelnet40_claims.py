@@ -1,4 +1,4 @@
-"""Standard errors and verdicts of `reproduction/chapter6/modelnet40.py`, against counts and simulation."""
+"""Standard errors and verdicts of `reproduction/chapter6/modelnet40.py`, compared with counts and simulation."""
 
 import math
 
@@ -37,7 +37,7 @@ def test_one_run_each_is_mcnemars_difference():
 
 @pytest.mark.parametrize("spread", [0.0, 0.03])
 def test_errors_are_those_of_new_clouds_and_new_seeds(spread):
-    """Accuracy of a run is the cloud's own plus the seed's own plus chance: simulated again and again."""
+    """Standard errors agree with repeated simulations, in which accuracy is a cloud's share plus a seed's plus chance."""
     random = np.random.default_rng(1)
     values, variances, components = [], [], []
     for _ in range(400):
@@ -86,11 +86,13 @@ def test_every_claim_is_of_rows_of_the_tables_and_is_printed():
     text = claims_table(runs)
     assert text.count("\n") == 1 + len(CLAIMS) + sum(map(len, CLAIMS.values()))
     verdicts = [line.rsplit("**", 2)[1] for line in text.splitlines() if "| **" in line]
-    found = dict(zip(CLAIMS, verdicts, strict=True))
-    contradicted = [claim for claim, verdict in found.items() if verdict == "contradicted"]
+    verdict_by_claim = dict(zip(CLAIMS, verdicts, strict=True))
+    contradicted = [claim for claim, verdict in verdict_by_claim.items() if verdict == "contradicted"]
     assert contradicted == ["3D convolutions are better than the plain network (§6.5.1)"]
-    held = {claim.partition(" (")[0] for claim, verdict in found.items() if verdict == "held"}
-    assert held == {
+    held_claims = {
+        claim.partition(" (")[0] for claim, verdict in verdict_by_claim.items() if verdict == "held"
+    }
+    assert held_claims == {
         "Basis point sets are better than occupancy and truncated distances",
         "A plain network on basis point sets is better than VoxNet on occupancy",
         "A small grid of basis points costs little accuracy",

@@ -40,14 +40,15 @@ PARAMETERS = {
     "bps_mlp_400": "3.8e5",
     "bps_conv3d_unpadded": "4.4e6",
 }
-"""As printed; of VoxNet's and vanilla PointNet's zeros after the point the papers they come from say nothing."""
+"""Numbers of parameters as the thesis prints them; VoxNet and vanilla PointNet without zeros after the decimal point,
+which their papers do not give."""
 
 
 def encoders_of(name: str) -> list[dict[str, Any]]:
     """Return the encoder settings of an experiment on ModelNet40, read without Hydra, which would take a second."""
-    said = yaml.safe_load((folder() / "experiment/modelnet40" / f"{name}.yaml").read_text(encoding="utf-8"))
-    chosen = next(one["override /encoder"] for one in said["defaults"] if "override /encoder" in one)
-    return [{"name": one, **said.get("encoder", {}).get(one, {})} for one in chosen]
+    config = yaml.safe_load((folder() / "experiment/modelnet40" / f"{name}.yaml").read_text(encoding="utf-8"))
+    names = next(line["override /encoder"] for line in config["defaults"] if "override /encoder" in line)
+    return [{"name": name, **config.get("encoder", {}).get(name, {})} for name in names]
 
 
 @pytest.mark.parametrize("name", PARAMETERS)
@@ -60,11 +61,11 @@ def test_a_network_has_the_parameters_that_the_thesis_gives(name: str) -> None:
         encoders.append(build("encoder", config, input_shape=shape, input_columns=("x", "y", "z")))
         shape = encoders[-1].output_shape
     model = Model(encoders, build("density_head", resolve("density_head", "categorical"), target=CLASSES))
-    found = sum(parameter.numel() for parameter in model.parameters())
+    parameters = sum(parameter.numel() for parameter in model.parameters())
     printed = PARAMETERS[name]
     digits, exponent = printed.split("e")
     step = 10.0 ** (int(exponent) - len(digits.partition(".")[2]))
-    assert abs(found - float(printed)) < step, found
+    assert abs(parameters - float(printed)) < step, parameters
 
 
 def test_the_ensemble_of_table_62_is_of_its_network() -> None:
@@ -72,7 +73,7 @@ def test_the_ensemble_of_table_62_is_of_its_network() -> None:
 
 
 HEADS = {"optimizer.name": "adam", "trainer.max_epochs": 1000, "trainer.patience": 200, "data.jitter": 0.0}
-SAID = {
+THESIS_SETTINGS = {
     # §3.6.1
     "pascal3d/scvae encoder.inception_resnet_v2.weights=null": {
         "optimizer.name": "adam",
@@ -123,17 +124,17 @@ SAID = {
         "encoder.dense_blocks.bottleneck": None,
     },
 }
-"""Experiment, and what the thesis says of its training."""
+"""Settings of training that the thesis states, by experiment."""
 
 
-@pytest.mark.parametrize("experiment", SAID)
+@pytest.mark.parametrize("experiment", THESIS_SETTINGS)
 def test_a_preset_is_what_the_thesis_says(experiment: str) -> None:
     values = plain(composed(*command_line([*f"experiment={experiment}".split(), "preset=thesis"])))
-    for key, wanted in SAID[experiment].items():
-        found: Any = values
+    for key, expected in THESIS_SETTINGS[experiment].items():
+        value: Any = values
         for part in key.split("."):
-            found = found[part]
-        assert found == wanted, key
+            value = value[part]
+        assert value == expected, key
 
 
 @pytest.mark.parametrize(
@@ -151,9 +152,9 @@ def test_a_preset_is_what_the_thesis_says(experiment: str) -> None:
 def test_a_preset_trains(experiment: str, framework: Framework) -> None:
     """Train with these presets; test_composition.py tests the presets of the other data sets."""
     run = ("preset=thesis", "debug=fast", "logger=none", "pictures=false", "threads=1")
-    done = framework(*f"experiment={experiment}".split(), *run)
-    assert done.code == 0, done.out
-    results = json.loads((done.folder / "results.json").read_text(encoding="utf-8"))
+    finished_run = framework(*f"experiment={experiment}".split(), *run)
+    assert finished_run.code == 0, finished_run.out
+    results = json.loads((finished_run.folder / "results.json").read_text(encoding="utf-8"))
     assert results["synthetic"]
     if "pascal3d" in experiment:
         assert results["parameters"] == pytest.approx(54_306_464 + 1537 * 9)
