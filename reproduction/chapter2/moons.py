@@ -59,7 +59,7 @@ COLUMNS = {
     "ood_entropy": "OOD entropy",
     "auroc": "AUROC",
     "milliseconds_per_sample": "ms / sample",
-    "seconds": "whole run, processor s",
+    "seconds": "processor time of the run, s",
     "n": "seeds",
 }
 BETTER: Better = {
@@ -320,7 +320,7 @@ def main() -> None:
         "- **OOD entropy** is the mean entropy of the predictions for outliers, in nats; it is at most 0.693. "
         "**AUROC** is the probability that an outlier has a higher entropy than a test point.\n"
         "- **ms / sample** is the time of one prediction in a batch of 100, measured on one thread while no other "
-        "model runs. The next column is the processor time of the whole run, in seconds.\n\n"
+        "model runs. The processor time is that of the whole run.\n\n"
         "The number of epochs, the batch size and the learning rate were chosen such that the two vanilla networks "
         "overfit as in the thesis. The settings of the last row were chosen on further data of the same generator. "
         "Before that, a first combination (5 networks, no dropout, λ = 1) had missed the best rows of the table on the "

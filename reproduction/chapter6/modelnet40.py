@@ -78,7 +78,7 @@ COLUMNS = {
     "megabytes": "checkpoint, MB",
     "one_ms": "ms, batch of 1",
     "many_ms": "ms / cloud, batch of 256",
-    "seconds": "whole run, processor s",
+    "seconds": "processor time of the run, s",
     "epochs": "epochs",
     "n": "seeds",
     "thesis": "thesis: accuracy (ModelNet40), FLOPs, parameters",

@@ -92,11 +92,14 @@ def measure_speeds(data) -> list[tuple[str, float]]:
     )
     rows = [
         (
-            "pose one body of 64 (linear blend skinning)",
+            "pose one body, in a batch of 64 (linear blend skinning)",
             processor_ms(lambda: split.model(shape, pose), 20) / 64,
         ),
-        ("pose and scan one body of 32", processor_ms(lambda: split.__getitems__(range(32)), 10) / 32),
-        (f"encode {cloud.shape[1]} points, 1024 basis points", processor_ms(lambda: encoder(cloud))),
+        (
+            "pose and scan one body, in a batch of 32",
+            processor_ms(lambda: split.__getitems__(range(32)), 10) / 32,
+        ),
+        (f"encode {cloud.shape[1]} points with 1024 basis points", processor_ms(lambda: encoder(cloud))),
     ]
     features = encoder(cloud)
     numbers = len(data.target.names)
