@@ -1,5 +1,9 @@
-"""Milliseconds a frame of the renderer rasterizer, what is saved, threads, growth, and other renderers; written beside
-this file: `python -m benchmarks.rendering.rasterizer`."""
+"""Measure the run time of the renderer rasterizer, its savings, batches and growth, and that of other renderers.
+
+    python -m benchmarks.rendering.rasterizer
+
+The script writes rasterizer.md, rasterizer_growth.csv and rasterizer_growth.png beside this file.
+"""
 
 import math
 import time
@@ -22,25 +26,25 @@ from framework.renderer import Renderer, Scene, join_scenes
 HEIGHT, WIDTH = 410, 308
 FOCAL = 600  # pixels
 DISTANCE = 2.6  # metres
-ASKED = (("mask",), ("depth",), ("color",), ("color", "depth"))
+CHANNELS = (("mask",), ("depth",), ("color",), ("color", "depth"))
 LEARNED = ("vertices", "colors")
 ALONE = ("view", "box")
-"""Savings of images that nothing came before."""
+"""Savings that do not depend on the previous image."""
 SCENES = 32
 ROUNDS = 8
 FIRST_CALL = """
 import time, torch
 from benchmarks.rendering.rasterizer import DISTANCE, figure, scene
 from plugins.renderer.rasterizer.renderer import Rasterizer
-drawn = scene(*figure(), distance=DISTANCE)
+view = scene(*figure(), distance=DISTANCE)
 start = time.perf_counter()
-Rasterizer()(drawn, ("color", "depth", "face", "mask"))
+Rasterizer()(view, ("color", "depth", "face", "mask"))
 print(time.perf_counter() - start)
 """
 
 
 def figure(rings: int = 82, segments: int = 84) -> tuple[np.ndarray, np.ndarray]:
-    """A closed body like a standing person 1.7 m tall, z up: rings × segments + 2 vertices.
+    """Return a closed body like a standing person, 1.7 m tall: rings × segments + 2 vertices, and faces.
 
     The default has 6,890 vertices and 13,776 faces.
     """
@@ -48,7 +52,8 @@ def figure(rings: int = 82, segments: int = 84) -> tuple[np.ndarray, np.ndarray]
     around = 2 * np.pi * np.arange(segments) / segments
     up = 0.85 * np.cos(polar)
     heights = [-0.85, -0.8, -0.45, 0.0, 0.2, 0.45, 0.55, 0.62, 0.75, 0.85]
-    halves = [0.10, 0.16, 0.17, 0.21, 0.18, 0.24, 0.17, 0.08, 0.11, 0.0]  # half the breadth there, metres
+    # half the breadth at each height, metres
+    halves = [0.10, 0.16, 0.17, 0.21, 0.18, 0.24, 0.17, 0.08, 0.11, 0.0]
     breadth = np.interp(up, heights, halves)
     rings_of = np.stack(
         [
@@ -60,18 +65,18 @@ def figure(rings: int = 82, segments: int = 84) -> tuple[np.ndarray, np.ndarray]
     )
     vertices = np.concatenate([rings_of.reshape(-1, 3), [[0, 0, 0.85], [0, 0, -0.85]]])
     start = np.arange(rings - 1)[:, None] * segments
-    here = np.arange(segments)
-    following = (here + 1) % segments
-    a, b = (start + here).ravel(), (start + following).ravel()
+    columns = np.arange(segments)
+    following = (columns + 1) % segments
+    a, b = (start + columns).ravel(), (start + following).ravel()
     c, d = a + segments, b + segments
     last = (rings - 1) * segments
     top, bottom = np.full(segments, len(vertices) - 2), np.full(segments, len(vertices) - 1)
-    faces = [(a, c, d), (a, d, b), (top, here, following), (bottom, last + following, last + here)]
+    faces = [(a, c, d), (a, d, b), (top, columns, following), (bottom, last + following, last + columns)]
     return vertices, np.concatenate([np.stack(corners, 1) for corners in faces])
 
 
-def subdivided(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Each face cut into four at the middles of its edges."""
+def subdivide(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Divide each face into four at the middles of its edges."""
     edges = np.sort(np.stack([faces, np.roll(faces, -1, 1)], -1).reshape(-1, 2), 1)
     unique, which = np.unique(edges, axis=0, return_inverse=True)
     a, b, c = faces.T
@@ -83,7 +88,7 @@ def subdivided(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.
 
 
 def scene(vertices: np.ndarray, faces: np.ndarray, distance: float) -> Scene:
-    """The body, coloured by position, from `distance` metres; behind the camera where that is negative."""
+    """Return a scene of the body, coloured by position, at a distance (m); a negative one is behind the camera."""
     camera = look_from(0.4, 0.15, 0.05, distance, 2 * math.atan(HEIGHT / 2 / FOCAL), (HEIGHT, WIDTH))
     low, high = vertices.min(0), vertices.max(0)
     colors = torch.tensor((vertices - low) / (high - low), dtype=torch.float32)
@@ -91,46 +96,51 @@ def scene(vertices: np.ndarray, faces: np.ndarray, distance: float) -> Scene:
 
 
 def lowest(calls: Sequence[Callable[[], object]]) -> list[float]:
-    """Of each call the lowest of `ROUNDS` medians of 40, all in turn: what else the machine does only adds to them, and
-    for seconds at a time."""
-    found = [math.inf] * len(calls)
+    """Return for each call the lowest of `ROUNDS` medians of 40 repetitions, ms. The calls are interleaved.
+
+    Other processes can only make a call slower, and they do so for seconds at a time. The lowest median is therefore
+    the least disturbed one.
+    """
+    times = [math.inf] * len(calls)
     for _ in range(ROUNDS):
         for number, call in enumerate(calls):
-            found[number] = min(found[number], milliseconds(call, 40))
-    return found
+            times[number] = min(times[number], milliseconds(call, 40))
+    return times
 
 
-def cells(drawing: Renderer, drawn: Scene) -> list[Callable[[], object]]:
-    asked = [partial(drawing, drawn, channels) for channels in ASKED]
-    return [*asked, *(partial(both_ways, drawing, drawn, what) for what in LEARNED)]
+def calls_of_row(drawing: Renderer, scene: Scene) -> list[Callable[[], object]]:
+    """Return the calls of one table row: the channels, and the colours with their gradients."""
+    calls = [partial(drawing, scene, channels) for channels in CHANNELS]
+    return [*calls, *(partial(render_with_gradient, drawing, scene, name) for name in LEARNED)]
 
 
-def both_ways(renderer: Renderer, drawn: Scene, learned: str) -> None:
-    """An image, and the slopes of a loss in the vertices or in the colours."""
-    part = getattr(drawn, learned).clone().requires_grad_()
-    renderer(replace(drawn, **{learned: part}), ("color",))["color"].sum().backward()
+def render_with_gradient(renderer: Renderer, scene: Scene, learned: str) -> None:
+    """Render an image and the gradient of its sum with respect to the vertices or the colours."""
+    part = getattr(scene, learned).clone().requires_grad_()
+    renderer(replace(scene, **{learned: part}), ("color",))["color"].sum().backward()
 
 
-def renderer(**config: Any) -> Renderer:
+def build_renderer(**config: Any) -> Renderer:
+    """Return a rasterizer that keeps nothing from one image to the next."""
     return build("renderer", resolve("renderer", {"name": "rasterizer", "savings": ALONE, **config}))
 
 
-def crowd(drawn: Scene) -> Scene:
-    """Five bodies behind one another, the farthest first."""
-    back = torch.tensor([0.0, 0.0, 1.0]) @ drawn.camera.rotation
+def crowd(scene: Scene) -> Scene:
+    """Return a scene of five bodies behind one another, the farthest first."""
+    back = torch.tensor([0.0, 0.0, 1.0]) @ scene.camera.rotation
     return join_scenes(
-        [replace(drawn, vertices=drawn.vertices + 0.5 * step * back) for step in (4, 3, 2, 1, 0)]
+        [replace(scene, vertices=scene.vertices + 0.5 * step * back) for step in (4, 3, 2, 1, 0)]
     )
 
 
-def savings(drawn: Scene) -> list[str]:
-    """With everything left out that may be, and without one saving at a time."""
-    away = replace(drawn, vertices=drawn.vertices + 100)
-    many = crowd(drawn)
-    found = [
-        ("back", "one body, colour", drawn, ("color",), {"cull": True}, {"cull": False}),
+def savings(body: Scene) -> list[str]:
+    """Return the table rows that compare the run time with and without each saving."""
+    away = replace(body, vertices=body.vertices + 100)
+    many = crowd(body)
+    cases = [
+        ("back", "one body, colour", body, ("color",), {"cull": True}, {"cull": False}),
         ("view", "out of view, mask", away, ("mask",), {}, {"savings": ("box",)}),
-        ("box", "one body, colour", drawn, ("color",), {"cull": True}, {"cull": True, "savings": ("view",)}),
+        ("box", "one body, colour", body, ("color",), {"cull": True}, {"cull": True, "savings": ("view",)}),
         (
             "hidden",
             "five bodies behind one another, depth",
@@ -141,39 +151,44 @@ def savings(drawn: Scene) -> list[str]:
         ),
         (
             "unchanged",
-            "one body whose colours alone change, colour",
-            drawn,
+            "one body, of which only the colours change, colour",
+            body,
             ("color",),
             {"cull": True, "savings": (*ALONE, "unchanged")},
             {"cull": True},
         ),
     ]
-    pairs = [(renderer(**with_it), renderer(**without_it)) for *_, with_it, without_it in found]
-    plain = renderer(cull=True)
+    pairs = [(build_renderer(**with_it), build_renderer(**without_it)) for *_, with_it, without_it in cases]
+    plain = build_renderer(cull=True)
     calls = [
-        partial(one, seen, asked)
-        for pair, (_, _, seen, asked, _, _) in zip(pairs, found, strict=True)
-        for one in pair
+        partial(drawing, scene, channels)
+        for pair, (_, _, scene, channels, _, _) in zip(pairs, cases, strict=True)
+        for drawing in pair
     ]
-    calls += [partial(plain, drawn, ("mask",)), partial(plain, drawn, sorted(plain.channels - {"uv"}))]
+    calls += [partial(plain, body, ("mask",)), partial(plain, body, sorted(plain.channels - {"uv"}))]
     times = lowest(calls)
     lines = []
-    for number, (name, what, *_) in enumerate(found):
+    for number, (name, scene_label, *_) in enumerate(cases):
         report = pairs[number][0].report
         assert report is not None
-        left = ", ".join(f"{count:,} {reason}" for reason, count in report.left_out.items()) or "none"
-        again = f"; again used: {', '.join(sorted(report.reused))}" if report.reused else ""
+        left_out = ", ".join(f"{count:,} {reason}" for reason, count in report.left_out.items()) or "none"
+        reused = f"; reused: {', '.join(sorted(report.reused))}" if report.reused else ""
         first, second = times[2 * number : 2 * number + 2]
-        lines.append(f"| {name} | {what} | {second:.2f} | {first:.2f} | {left}{again} |")
-    lines.append(f"| channels | one body, mask alone for all but uv | {times[-1]:.2f} | {times[-2]:.2f} | |")
+        lines.append(f"| {name} | {scene_label} | {second:.2f} | {first:.2f} | {left_out}{reused} |")
+    lines.append(
+        f"| channels | one body, all channels but uv, or mask alone | {times[-1]:.2f} | {times[-2]:.2f} | |"
+    )
     return lines
 
 
-def side_by_side(drawn: Scene) -> list[str]:
-    """Images a second of wall clock, all kept: one by one, in batches on one thread and on two; the best of 25, in
-    turn."""
-    scenes = [replace(drawn, vertices=drawn.vertices + 0.001 * number) for number in range(SCENES)]
-    plain = renderer(cull=True)
+def batch_table(body: Scene) -> list[str]:
+    """Return the table of images per second: one by one, and in batches on one and two threads.
+
+    Each number is the best of 25 repetitions of wall time. The ways are interleaved, and all images of a repetition are
+    kept.
+    """
+    scenes = [replace(body, vertices=body.vertices + 0.001 * number) for number in range(SCENES)]
+    plain = build_renderer(cull=True)
 
     def one_by_one() -> list[dict[str, torch.Tensor]]:
         return [plain(scene, ("color",)) for scene in scenes]
@@ -187,84 +202,114 @@ def side_by_side(drawn: Scene) -> list[str]:
             draw()
             best[number] = min(best[number], time.perf_counter() - start)
     torch.set_num_threads(1)
-    single, one, two = (SCENES / seconds for seconds in best)
+    single, one_thread, two_threads = (SCENES / seconds for seconds in best)
     return [
-        "| | images a second | ratio |",
+        "| way | images a second | ratio |",
         "|---|---|---|",
         f"| {SCENES} one by one | {single:.0f} | 1 |",
-        f"| batch of {SCENES}, 1 thread | {one:.0f} | {one / single:.2f} |",
-        f"| batch of {SCENES}, 2 threads | {two:.0f} | {two / single:.2f} |",
+        f"| batch of {SCENES}, 1 thread | {one_thread:.0f} | {one_thread / single:.2f} |",
+        f"| batch of {SCENES}, 2 threads | {two_threads:.0f} | {two_threads / single:.2f} |",
     ]
 
 
 def report() -> str:
+    """Measure everything, and return the page."""
     torch.set_num_threads(1)
     plain, culling, inside = (
-        renderer(**config) for config in ({}, {"cull": True}, {"cull": True, "gradient": "interior"})
+        build_renderer(**config) for config in ({}, {"cull": True}, {"cull": True, "gradient": "interior"})
     )
-    bodies = [figure(), subdivided(*figure())]
+    bodies = [figure(), subdivide(*figure())]
     scenes = [scene(*body, distance=DISTANCE) for body in bodies]
     cover = plain(scenes[0], ("mask",))["mask"].float().mean().item()
     kinds: list[tuple[str, Renderer, Scene]] = []
-    for (vertices, faces), seen in zip(bodies, scenes, strict=True):
+    for (vertices, faces), view in zip(bodies, scenes, strict=True):
         size = f"{len(vertices):,} / {len(faces):,}"
-        kinds += [(f"{size}, in view", plain, seen), (f"{size}, in view, culled", culling, seen)]
-        kinds += [(f"{size}, in view, culled, interior", inside, seen)]
+        kinds += [(f"{size}, in view", plain, view), (f"{size}, in view, culled", culling, view)]
+        kinds += [(f"{size}, in view, culled, interior", inside, view)]
         kinds += [(f"{size}, out of view", plain, scene(vertices, faces, distance=-DISTANCE))]
-    times = lowest([call for _, drawing, seen in kinds for call in cells(drawing, seen)])
-    wide = len(ASKED) + len(LEARNED)
+    times = lowest([call for _, drawing, view in kinds for call in calls_of_row(drawing, view)])
+    wide = len(CHANNELS) + len(LEARNED)
     rows = [
-        f"| {name} | {' | '.join(f'{each:.2f}' for each in times[wide * number : wide * (number + 1)])} |"
+        f"| {name} | {' | '.join(f'{time_ms:.2f}' for time_ms in times[wide * number : wide * (number + 1)])} |"
         for number, (name, _, _) in enumerate(kinds)
     ]
     cold, warm = first_calls(FIRST_CALL, NUMBA_CACHE_DIR="{}")
-    ours = " / ".join(
-        f"{milliseconds(partial(culling, seen, ('color',)), 100, time.process_time):.2f}" for seen in scenes
+    own_times = " / ".join(
+        f"{milliseconds(partial(culling, view, ('color',)), 100, time.process_time):.2f}" for view in scenes
     )
     return "\n".join(
         [
-            "# rasterizer: milliseconds a frame",
+            "# rasterizer: run time of an image",
             "",
-            f"A synthetic closed body in {HEIGHT} rows × {WIDTH} columns, of which it covers {cover:.0%}; "
-            f"one thread; processor time, the lowest of {ROUNDS} medians of 40 calls. Nothing is kept from one "
-            "image to the next.",
+            "This page measures the processor time that the renderer `rasterizer` needs for one image. It compares "
+            "the channels of the image, the number of vertices, and forward rendering with gradients.",
             "",
-            f"| vertices / faces | {' | '.join(' + '.join(asked) for asked in ASKED)} | "
-            + " | ".join(f"color, and back to {what}" for what in LEARNED)
+            f"The image has {HEIGHT} rows × {WIDTH} columns and shows a synthetic closed body, which covers "
+            f"{cover:.0%} of the pixels. A time is the lowest of {ROUNDS} medians of 40 calls on one thread. The "
+            "renderer keeps nothing from one image to the next.",
+            "",
+            "The first column holds the number of vertices and faces and the kind of image. `in view`: the body is in "
+            "front of the camera. `out of view`: the body is behind the camera. `culled`: faces seen from behind are "
+            "left out (`cull=True`). `interior`: the gradient leaves out the movement of edges (`gradient=interior`). "
+            "The other columns hold the time in ms for the named channels. The last two columns include the gradient "
+            "of the colours with respect to the vertices or to the vertex colours.",
+            "",
+            f"| vertices / faces, kind of image | {' | '.join(' + '.join(names) + ', ms' for names in CHANNELS)} | "
+            + " | ".join(f"color with gradient of {name}, ms" for name in LEARNED)
             + " |",
-            "|---|" + "---|" * (len(ASKED) + len(LEARNED)),
+            "|---|" + "---|" * wide,
             *rows,
             "",
-            f"First call in a process, all channels: {cold:.1f} s where everything is compiled, "
-            f"{warm:.2f} s where the compiled code is read from the cache.",
+            f"The first image of a process, with the channels color, depth, face and mask, takes {cold:.1f} s if the "
+            f"code must be compiled. It takes {warm:.2f} s if the compiled code is read from the cache.",
             "",
-            "## What is left out",
+            "## Savings",
+            "",
+            "The renderer can skip work without changing the image. The table shows how much time each of these "
+            "savings brings. For each row one saving is switched off and on. `back` is the culling of faces seen from "
+            "behind; the other savings are explained at the parameter `savings` of the class `Rasterizer`. `channels` "
+            "compares an image of the channel `mask` with an image of all channels except `uv`. The last column "
+            "counts the faces that are left out: `flat` faces cover no area, `back` faces are seen from behind, "
+            "`outside` faces do not lie in the image, and `hidden` faces lie behind others. It also names what is "
+            "reused from the previous image: checked `faces`, or the `places` of projected vertices.",
             "",
             "| saving | scene | without it, ms | with it, ms | faces left out |",
             "|---|---|---|---|---|",
             *savings(scenes[0]),
             "",
-            "## Side by side",
+            "## Batches",
             "",
-            *side_by_side(scenes[0]),
+            "`Renderer.batch` renders several images at once. The table compares the number of images per second of "
+            "wall time with that of single images. It holds the best of 25 repetitions. `ratio` is the number of "
+            "images per second divided by that of the first row.",
             "",
-            "## Growth",
+            *batch_table(scenes[0]),
+            "",
+            "## Growth with the number of faces and pixels",
+            "",
+            "The time of an image of a synthetic ball is measured for different numbers of faces and pixels. Each "
+            "entry of the table is the number of faces or pixels, followed by the time in ms. `slope` is the slope of "
+            "the time on double logarithmic axes, over the upper half of the numbers: 1 means that the time is "
+            "proportional to the number.",
             "",
             *rasterizer_growth.report(Path(__file__).with_name("rasterizer_growth.png")),
             "",
-            "## Others",
+            "## Other renderers",
             "",
-            f"The same two scenes, milliseconds of processor time of all threads, {len(bodies[0][0]):,} / "
-            f"{len(bodies[1][0]):,} vertices:",
+            "Other renderers draw the same two scenes. The table holds milliseconds of processor time of all threads, "
+            f"for {len(bodies[0][0]):,} / {len(bodies[1][0]):,} vertices.",
             "",
-            "| in this run | |",
+            "| renderer | processor time, ms |",
             "|---|---|",
-            f"| rasterizer (culled) | {ours} |",
+            f"| rasterizer (culled) | {own_times} |",
             *rasterizer_peers.rows(scenes),
             "",
-            "| measured elsewhere, on two cores of a Sapphire Rapids Xeon | |",
+            "The following renderers were not run for this page. Their times were measured on another machine, two "
+            "cores of a Sapphire Rapids Xeon.",
+            "",
+            "| renderer | processor time, ms |",
             "|---|---|",
-            *(f"| {name} | {told} |" for name, told in rasterizer_peers.ELSEWHERE.items()),
+            *(f"| {name} | {times_text} |" for name, times_text in rasterizer_peers.ELSEWHERE.items()),
             "",
             f"{machine('torch', 'numba', 'numpy')} Command: `python -m benchmarks.rendering.rasterizer`.",
             "",

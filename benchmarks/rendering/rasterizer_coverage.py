@@ -1,4 +1,4 @@
-"""Count pixels of a surface that are covered by no triangle or by several.
+"""Count pixels of a surface that no triangle or several triangles cover.
 
 python -m benchmarks.rendering.rasterizer_coverage
 """
@@ -10,7 +10,7 @@ import numpy as np
 from scipy.ndimage import binary_erosion, binary_fill_holes
 
 from benchmarks.pages import machine, write_page
-from benchmarks.rendering.rasterizer import DISTANCE, FOCAL, HEIGHT, WIDTH, figure, scene, subdivided
+from benchmarks.rendering.rasterizer import DISTANCE, FOCAL, HEIGHT, WIDTH, figure, scene, subdivide
 from framework.geometry.camera import look_from
 from plugins.renderer.rasterizer.renderer import Rasterizer
 from plugins.renderer.rasterizer.test_coverage import PixelCounts, sum_counts, views
@@ -19,57 +19,72 @@ CAMERAS = 10_000
 VIEWS = 40
 
 
-def around() -> tuple[int, int, int]:
-    """Of a closed body of 27,554 vertices: pixels covered; holes in its outline; and pixels farther than one from the
-    outline that show another face where faces seen from behind are left out, as through a crack."""
-    body = scene(*subdivided(*figure()), distance=DISTANCE)
+def count_holes() -> tuple[int, int, int]:
+    """Count pixels of a closed body of 27,554 vertices.
+
+    Returns:
+        Number of covered pixels, of holes inside of the outline, and of cracks. A crack is a pixel that shows another
+        face if faces seen from behind are left out, and that is not next to the outline.
+    """
+    body = scene(*subdivide(*figure()), distance=DISTANCE)
     random = np.random.default_rng(0)
-    whole, front = Rasterizer(), Rasterizer(cull=True)
+    all_faces, front_faces = Rasterizer(), Rasterizer(cull=True)
     covered = holes = cracks = 0
     for _ in range(VIEWS):
         azimuth, elevation, tilt = random.uniform([0, -1.5, -3], [6.3, 1.5, 3]).tolist()
         camera = look_from(azimuth, elevation, tilt, float(random.uniform(1.2, 4)), 0.5, (HEIGHT, WIDTH))
-        seen = replace(body, camera=replace(camera, focal=(float(FOCAL), float(FOCAL))))
-        drawn, culled = whole(seen, ("mask", "face")), front(seen, ("face",))
-        mask = drawn["mask"].numpy()
+        view = replace(body, camera=replace(camera, focal=(float(FOCAL), float(FOCAL))))
+        rendered, culled = all_faces(view, ("mask", "face")), front_faces(view, ("face",))
+        mask = rendered["mask"].numpy()
         inner = binary_erosion(mask, np.ones((3, 3)))
         covered += int(mask.sum())
         holes += int((binary_fill_holes(mask) & ~mask).sum())
-        cracks += int((inner & (drawn["face"] != culled["face"]).numpy()).sum())
+        cracks += int((inner & (rendered["face"] != culled["face"]).numpy()).sum())
     return covered, holes, cracks
 
 
 def report() -> str:
+    """Count, and return the page."""
     start = time.perf_counter()
-    found = list(views(CAMERAS))
+    counts = list(views(CAMERAS))
     seconds = time.perf_counter() - start
     rows = []
     for name in ("regular", "loose"):
-        chosen = [one for one in found if one[0].startswith(name)]
-        seen: PixelCounts = sum_counts(chosen)
-        cells = (len(chosen), seen.inside, seen.holes, seen.doubled, seen.strays, seen.other)
+        chosen = [count for count in counts if count[0].startswith(name)]
+        total: PixelCounts = sum_counts(chosen)
+        cells = (len(chosen), total.inside, total.holes, total.doubled, total.strays, total.other)
         rows.append(f"| {name} | " + " | ".join(f"{cell:,}" for cell in cells) + " |")
-    covered, holes, cracks = around()
+    covered, holes, cracks = count_holes()
     return "\n".join(
         [
             "# rasterizer: each pixel of a surface is covered once",
             "",
-            f"A tessellated plane of 8 × 8 m under {CAMERAS:,} random cameras: any azimuth, elevation and tilt, 0.05 "
-            "to 10,000 m away, focal lengths of 0.001 to 1,000,000 pixels, principal points in and out of the image, 1 "
-            "to 64 pixels a side, with what the near plane cuts; a third of them square on, with edges through pixel "
-            "centres. Faces are drawn one by one and counted; where the plane lies is computed by rays, and pixels "
-            "within 1/128 pixel of its border are left out.",
+            "This page checks that the renderer `rasterizer` covers each pixel of a surface exactly once. Pixels that "
+            "no triangle covers would appear as holes. Pixels that two triangles cover would be drawn twice.",
             "",
-            "| plane | cameras | pixels on it | covered by none | by more than one | pixels off it that are covered | "
-            "other than the whole image |",
+            f"The surface is a tessellated plane of 8 × 8 m under {CAMERAS:,} random cameras. The cameras have any "
+            "azimuth, elevation and tilt, distances of 0.05 to 10,000 m, focal lengths of 0.001 to 1,000,000 pixels, "
+            "and images of 1 to 64 pixels a side. Their principal points may lie outside of the image, and the near "
+            "plane may cut the surface. A third of the cameras look straight at the plane, so that edges run through "
+            "pixel centres. Each face is drawn alone, and the faces that cover a pixel are counted. Rays decide which "
+            "pixels show the plane. Pixels within 1/128 pixel of its border are left out.",
+            "",
+            "`regular` is a plane of equal squares that are divided into triangles, and `loose` is a plane of random "
+            "triangles. The other columns are counts of cameras and pixels. `pixels on the plane` must be covered "
+            "once. `differs from the whole mesh` counts the pixels whose coverage changes if all faces are drawn "
+            "together.",
+            "",
+            "| plane | cameras | pixels on the plane | pixels without a face | pixels with several faces | covered "
+            "pixels outside of the plane | differs from the whole mesh |",
             "|---|---|---|---|---|---|---|",
             *rows,
             "",
-            f"In {seconds:.0f} s.",
+            f"The count took {seconds:.0f} s.",
             "",
-            f"A closed body of 27,554 vertices, {VIEWS} views of {HEIGHT} × {WIDTH} pixels: {covered:,} pixels "
-            f"covered, {holes} holes; {cracks} pixels, farther than one from its outline, that show another face when "
-            "faces seen from behind are left out.",
+            f"The second test draws a closed body of 27,554 vertices in {VIEWS} views of {HEIGHT} × {WIDTH} pixels. "
+            f"It covers {covered:,} pixels and has {holes} holes. {cracks} pixels show another face if faces seen "
+            "from behind are left out; pixels at the outline and their neighbours are not counted. Such a pixel would "
+            "be a crack between two faces.",
             "",
             f"{machine('numba', 'numpy')} Command: `python -m benchmarks.rendering.rasterizer_coverage`.",
             "",

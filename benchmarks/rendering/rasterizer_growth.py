@@ -1,8 +1,9 @@
-"""Time of an image against its faces and pixels, for `rasterizer.py`.
+"""Measure the time of an image against its numbers of faces and pixels, for `rasterizer.py`.
 
     python -m benchmarks.rendering.rasterizer_growth --draw
 
-draws rasterizer_growth.png again from rasterizer_growth.csv, which `benchmarks/rendering/rasterizer.py` writes.
+This command draws rasterizer_growth.png again from rasterizer_growth.csv, which `benchmarks/rendering/rasterizer.py`
+writes.
 """
 
 import math
@@ -26,20 +27,20 @@ from framework.testing.scenes import sphere
 
 FACES = (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000)
 PIXELS = (100, 200, 400, 800, 1_600, 4_000)
-"""Along each side."""
+"""Numbers of pixels along each side."""
 CHANNELS = {"mask": "silhouette alone (mask)", "color": "colours"}
 PANELS = {"faces": "faces of the ball (400 × 400 pixels)", "pixels": "pixels of the image (10,000 faces)"}
 
 
 def ball(faces: int, side: int) -> Scene:
-    """A closed sphere that fills most of a square image."""
+    """Return a scene of a closed sphere that fills most of a square image."""
     return replace(
         sphere(int(math.sqrt(faces / 4))), camera=look_from(0.3, 0.2, 0.1, 4.0, 0.55, (side, side))
     )
 
 
 def milliseconds(call: Callable[[], object]) -> float:
-    """Median processor time of the calling thread: of calls for half a second, three at least."""
+    """Return the median processor time of a call, ms, over half a second of calls but at least three."""
     call()
     times: list[float] = []
     while len(times) < 3 or sum(times) < 0.5:
@@ -50,17 +51,17 @@ def milliseconds(call: Callable[[], object]) -> float:
 
 
 def slope(sizes: Sequence[float], times: Sequence[float]) -> float:
-    """Of the line through the upper half of the points, on double logarithmic axes."""
+    """Return the slope of the line through the upper half of the points, on double logarithmic axes."""
     half = len(sizes) // 2
     return float(np.polyfit(np.log(sizes[half:]), np.log(times[half:]), 1)[0])
 
 
-def report(picture: Path) -> list[str]:
-    """Lines of Markdown; writes the table and draws the figure beside."""
+def report(figure_path: Path) -> list[str]:
+    """Measure, write the csv table, draw the figure at the path, and return the lines of the page."""
     renderer = build(
         "renderer", resolve("renderer", {"name": "rasterizer", "cull": True, "savings": ("view", "box")})
     )
-    lines, rows = [], []
+    lines, rows = ["| channel | varied number | number: time in ms | slope |", "|---|---|---|---|"], []
     for name, scenes in (
         ("faces", [ball(count, 400) for count in FACES]),
         ("pixels", [ball(10_000, side) for side in PIXELS]),
@@ -69,19 +70,27 @@ def report(picture: Path) -> list[str]:
         for channel in CHANNELS:
             times = [milliseconds(partial(renderer, scene, (channel,))) for scene in scenes]
             rows += [
-                {"channel": channel, "against": name, "size": size, "milliseconds": each, "synthetic": True}
-                for size, each in zip(sizes, times, strict=True)
+                {
+                    "channel": channel,
+                    "against": name,
+                    "size": size,
+                    "milliseconds": milliseconds_a_call,
+                    "synthetic": True,
+                }
+                for size, milliseconds_a_call in zip(sizes, times, strict=True)
             ]
-            told = ", ".join(f"{size:.3g}: {each:.2f}" for size, each in zip(sizes, times, strict=True))
-            lines.append(
-                f"- {channel} against {name}, ms: {told}; slope of the upper half {slope(sizes, times):.2f}"
+            times_text = ", ".join(
+                f"{size:.3g}: {milliseconds_a_call:.2f}"
+                for size, milliseconds_a_call in zip(sizes, times, strict=True)
             )
-    write_csv(rows, None, picture.with_suffix(".csv"))
-    drawn(rows, picture)
-    return [*lines, "", f"![Milliseconds against faces and pixels]({picture.name})"]
+            lines.append(f"| {channel} | {name} | {times_text} | {slope(sizes, times):.2f} |")
+    write_csv(rows, None, figure_path.with_suffix(".csv"))
+    draw_figure(rows, figure_path)
+    return [*lines, "", f"![Time of an image against faces and pixels]({figure_path.name})"]
 
 
-def drawn(rows: Sequence[Row], picture: Path) -> None:
+def draw_figure(rows: Sequence[Row], figure_path: Path) -> None:
+    """Save the figure of time against faces and pixels."""
     figure = titled_figure((9, 4), "Time of an image of a ball", True)
     panels = figure.subplots(1, 2, sharey=True)
     for axes, (against, label) in zip(panels, PANELS.items(), strict=True):
@@ -94,11 +103,13 @@ def drawn(rows: Sequence[Row], picture: Path) -> None:
         axes.spines[["top", "right"]].set_visible(False)
     panels[0].set_ylabel("median processor time (ms, one core)")
     panels[0].legend(frameon=False, fontsize=9)
-    save_figure(figure, picture.with_suffix(""), True)
+    save_figure(figure, figure_path.with_suffix(""), True)
 
 
 if __name__ == "__main__":
     if sys.argv[1:] != ["--draw"]:
-        sys.exit("Wanted --draw; benchmarks/rendering/rasterizer.py measures.")
+        sys.exit(
+            "This script needs the argument --draw. To measure, run python -m benchmarks.rendering.rasterizer."
+        )
     own = Path(__file__).resolve()
-    drawn(read_rows(own.with_suffix(".csv")), own.with_suffix(".png"))
+    draw_figure(read_rows(own.with_suffix(".csv")), own.with_suffix(".png"))

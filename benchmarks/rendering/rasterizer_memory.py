@@ -15,7 +15,7 @@ from torch import Tensor
 
 from benchmarks.commands import ROOT
 from benchmarks.pages import machine, write_page
-from benchmarks.rendering.rasterizer import DISTANCE, HEIGHT, WIDTH, figure, scene, subdivided
+from benchmarks.rendering.rasterizer import DISTANCE, HEIGHT, WIDTH, figure, scene, subdivide
 from framework.renderer import Scene
 from plugins.renderer.rasterizer.drawing import Gradient
 from plugins.renderer.rasterizer.renderer import Rasterizer
@@ -23,41 +23,44 @@ from plugins.renderer.rasterizer.renderer import Rasterizer
 MEBIBYTE = 2**20
 
 
-def status(name: str) -> int:
-    """A number of bytes that Linux tells of this process."""
+def read_status(name: str) -> int:
+    """Return a number of bytes that Linux reports about this process."""
     lines = Path("/proc/self/status").read_text().splitlines()
     return 1024 * int(next(line for line in lines if line.startswith(name)).split()[1])
 
 
-def both_ways(drawn: Scene, renderer: Rasterizer) -> list[Tensor]:
-    """An image and its slopes in vertices and colours: outputs, and copies of inputs."""
-    assert drawn.colors is not None
-    learned = [drawn.vertices.clone().requires_grad_(), drawn.colors.clone().requires_grad_()]
-    color = renderer(replace(drawn, vertices=learned[0], colors=learned[1]))["color"]
+def render_with_gradient(scene: Scene, renderer: Rasterizer) -> list[Tensor]:
+    """Return an image, copies of vertices and colours, and the gradients of the image's sum with respect to them."""
+    assert scene.colors is not None
+    learned = [scene.vertices.clone().requires_grad_(), scene.colors.clone().requires_grad_()]
+    color = renderer(replace(scene, vertices=learned[0], colors=learned[1]))["color"]
     color.sum().backward()
     return [color, *learned, *[part.grad for part in learned if part.grad is not None]]
 
 
-def measured(gradient: Gradient) -> str:
-    """Of a renderer's first image of the body, in a process that has compiled all before: what the process grew by at
-    most, and what NumPy and Python had allocated at most, without inputs and outputs, MiB."""
+def measure(gradient: Gradient) -> str:
+    """Return the table row of a gradient: peak memory for a renderer's first image of the body, MiB."""
     torch.set_num_threads(1)
-    body, small = (scene(*shape, distance=DISTANCE) for shape in (subdivided(*figure()), figure(8, 8)))
-    both_ways(replace(small, camera=replace(small.camera, height=8, width=8)), Rasterizer(gradient=gradient))
+    body, small = (scene(*shape, distance=DISTANCE) for shape in (subdivide(*figure()), figure(8, 8)))
+    render_with_gradient(
+        replace(small, camera=replace(small.camera, height=8, width=8)), Rasterizer(gradient=gradient)
+    )
     renderer = Rasterizer(gradient=gradient)
-    Path("/proc/self/clear_refs").write_text("5")  # the peak counts from here on
-    before = status("VmRSS")
-    kept = both_ways(body, renderer)
-    grown = status("VmHWM") - before
-    own = sum(part.nbytes for part in kept)
-    del kept, renderer
+    Path("/proc/self/clear_refs").write_text("5")  # resets the peak memory of the process
+    before = read_status("VmRSS")
+    tensors = render_with_gradient(body, renderer)
+    growth = read_status("VmHWM") - before
+    own_bytes = sum(part.nbytes for part in tensors)
+    del tensors, renderer
     tracemalloc.start()
-    both_ways(body, Rasterizer(gradient=gradient))
+    render_with_gradient(body, Rasterizer(gradient=gradient))
     traced = tracemalloc.get_traced_memory()[1]
-    return f"| {gradient} | {(grown - own) / MEBIBYTE:.1f} | {traced / MEBIBYTE:.1f} | {own / MEBIBYTE:.1f} |"
+    cells = (f"{number / MEBIBYTE:.1f}" for number in (growth - own_bytes, traced, own_bytes))
+    return f"| {gradient} | {' | '.join(cells)} |"
 
 
 def report() -> str:
+    """Measure each gradient in a process of its own, and return the page."""
     rows = [
         subprocess.run(
             [sys.executable, "-m", "benchmarks.rendering.rasterizer_memory", gradient],
@@ -70,13 +73,19 @@ def report() -> str:
     ]
     return "\n".join(
         [
-            "# rasterizer: peak memory, MiB",
+            "# rasterizer: peak memory",
             "",
-            f"An image (`color`, {HEIGHT} × {WIDTH}) of a body of 27,554 vertices and its slopes in vertices and "
-            "colours, the first of a renderer; each in a process of its own that has drawn a small image before.",
+            "This page measures the peak memory that the renderer `rasterizer` needs for one image and its gradient.",
             "",
-            "| gradient | process grew by, beyond inputs and outputs | allocated by NumPy and Python, outputs too | "
-            "inputs and outputs |",
+            f"The image (`color`, {HEIGHT} × {WIDTH} pixels) shows a synthetic body of 27,554 vertices. The gradient "
+            "is with respect to vertices and vertex colours. The image is the first one of its renderer. Each row is "
+            "measured in a new process that has drawn a small image before, so that all code is compiled.",
+            "",
+            "`growth of the process` is the increase of the peak memory of the process, without inputs and outputs. "
+            "`NumPy and Python` is the peak of the memory that these two allocate, with outputs. `inputs and outputs` "
+            "is the size of the arrays that the caller holds.",
+            "",
+            "| gradient | growth of the process, MiB | NumPy and Python, MiB | inputs and outputs, MiB |",
             "|---|---|---|---|",
             *rows,
             "",
@@ -88,6 +97,6 @@ def report() -> str:
 
 if __name__ == "__main__":
     if len(sys.argv) > 1:
-        sys.stdout.write(measured(sys.argv[1]))  # type: ignore[arg-type]
+        sys.stdout.write(measure(sys.argv[1]))  # type: ignore[arg-type]
     else:
         write_page(__file__, report())

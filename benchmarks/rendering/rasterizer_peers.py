@@ -1,7 +1,7 @@
-"""Other renderers on the scene of `rasterizer.py`, where they are installed: milliseconds of processor time.
+"""Run times of other renderers for the scenes of `rasterizer.py`, if they are installed.
 
-None of them is a dependency of the project: `pip install moderngl trimesh embreex mitsuba`, and for moderngl Mesa's
-EGL (Debian: libegl1, libgl1-mesa-dri).
+None of them is a dependency of the project. They are installed with `pip install moderngl trimesh embreex mitsuba`;
+moderngl also needs Mesa's EGL (Debian: libegl1, libgl1-mesa-dri).
 """
 
 import os
@@ -28,14 +28,17 @@ Draw = Callable[[], np.ndarray]
 
 
 def moderngl_egl(scene: Scene) -> tuple[str, Draw]:
-    """Vertices sent, drawn culled with perspective-correct colours, 8 bits, and read back; rows from the bottom."""
+    """Return the name and the call of moderngl.
+
+    The call sends the vertices, draws an 8-bit image with culling and perspective-correct colours, and reads it back.
+    """
     os.environ.setdefault("LP_NUM_THREADS", "0")
     import moderngl  # pyright: ignore[reportMissingImports]
 
     context = moderngl.create_context(standalone=True, backend="egl")
     camera, height, width = scene.camera, scene.camera.height, scene.camera.width
     (fx, fy), (cx, cy), near, far = camera.focal, camera.principal, 0.1, 100.0
-    # pixel centres at whole numbers; y upwards, so that the first row is at the bottom
+    # pixel centres are at whole numbers, and y points upwards: the first row is at the bottom
     projection = np.array(
         [
             [2 * fx / width, 0, (2 * cx + 1) / width - 1, 0],
@@ -78,7 +81,10 @@ def moderngl_egl(scene: Scene) -> tuple[str, Draw]:
 
 
 def embree(scene: Scene) -> tuple[str, Draw]:
-    """Which face each pixel's ray meets first; the tree over the faces is made before."""
+    """Return the name and the call of Embree, which finds the first face on the ray of each pixel.
+
+    The tree over the faces is built before the call.
+    """
     import embreex  # pyright: ignore[reportMissingImports]
     import trimesh
     from trimesh.ray.ray_pyembree import RayMeshIntersector
@@ -102,7 +108,7 @@ def embree(scene: Scene) -> tuple[str, Draw]:
 
 
 def mitsuba_llvm(scene: Scene) -> tuple[str, Draw]:
-    """Colours without light, one sample a pixel."""
+    """Return the name and the call of Mitsuba, which draws colours without lighting, with one sample a pixel."""
     import mitsuba  # pyright: ignore[reportMissingImports]
 
     mitsuba.set_variant("llvm_ad_rgb")
@@ -140,15 +146,15 @@ PEERS = (moderngl_egl, embree, mitsuba_llvm)
 
 
 def rows(scenes: list[Scene]) -> list[str]:
-    """One of a table for each that is here."""
-    found = []
+    """Return a table row for each renderer, with its times or the reason why it did not run."""
+    lines = []
     for peer in PEERS:
         cells, name = [], peer.__name__
         try:
             for scene in scenes:
                 name, draw = peer(scene)
                 cells.append(f"{milliseconds(draw, 100, time.process_time):.2f}")
-        except Exception as error:  # a peer that is not here, or does not run here, is said
-            cells = [f"not here ({type(error).__name__})"]
-        found.append(f"| {name} | {' / '.join(cells)} |")
-    return found
+        except Exception as error:  # the renderer is not installed, or it does not run on this machine
+            cells = [f"not available ({type(error).__name__})"]
+        lines.append(f"| {name} | {' / '.join(cells)} |")
+    return lines

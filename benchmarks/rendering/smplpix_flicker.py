@@ -1,11 +1,11 @@
-"""Measure the temporal stability (flicker) of images of a walking person: mesh, trained network, photographs.
+"""Measure the temporal stability (flicker) of images of walking people: mesh, trained network, photographs.
 
     python -m framework experiment=smplpix/quick
     python -m benchmarks.rendering.smplpix_flicker <run> <walk.bvh>
 
-Of a generated person that the run never saw. Each image is brought along to the next by the flow of the registered
-mesh, which is known exactly, and compared with it where a point is seen in both. Writes smplpix_flicker.md and .png
-beside this file.
+The people are generated and not in the training data of the run. Each image is moved to the next one by the flow of the
+registered mesh, which is known exactly, and compared with it at pixels whose point is visible in both images. The
+script writes smplpix_flicker.md and .png beside this file.
 """
 
 import json
@@ -38,19 +38,19 @@ SUBJECTS = ("test_0000", "test_0003", "test_0005")
 FRAMES, START, AZIMUTH = 20, 0.5, math.radians(35)
 PAIRS = FRAMES - 1
 SHOWN = 8
-"""Frame of the image."""
+"""Index of the frame that the figure shows."""
 LOOPS = 60
 BRIGHT = 60.0
-"""Of 255: white in the maps."""
-Pictures = dict[str, list[Tensor]]
+"""Difference, of 255, that is drawn in the brightest colour."""
+Images = dict[str, list[Tensor]]
 
 
 def rendered(name: str, **config: Any) -> Renderer:
     return build("renderer", resolve("renderer", {"name": name, **config}))
 
 
-def walk(run: str, file: Path, subject: str) -> tuple[Pictures, list[Scene]]:
-    """Images of each way, as files hold them, 0…255; and what they are of."""
+def walk(run: str, file: Path, subject: str) -> tuple[Images, list[Scene]]:
+    """Return the images of a walking subject by way to draw them, values 0 to 255, and the scenes that they show."""
     description, _ = read_stored(run)
     data = data_of(description)
     height, width = description.target.size
@@ -61,106 +61,121 @@ def walk(run: str, file: Path, subject: str) -> tuple[Pictures, list[Scene]]:
         "mesh, 4 × 4 samples": rendered("rasterizer", supersampling=4),
         "SMPLpix": rendered("smplpix", checkpoint=run),
     }
-    found: Pictures = {name: [] for name in (*ways, "photograph")}
+    images: Images = {name: [] for name in (*ways, "photograph")}
     scenes = [who.scene(moment, camera) for moment, camera in zip(moments, cameras, strict=True)]
     for moment, scene in zip(moments, scenes, strict=True):
         for name, renderer in ways.items():
-            found[name].append(torch.from_numpy(on_white(renderer, scene)).double())
+            images[name].append(torch.from_numpy(on_white(renderer, scene)).double())
         assert moment.scan is not None
-        found["photograph"].append(
+        images["photograph"].append(
             torch.from_numpy(photograph(data.renderer, moment.scan, scene.camera)).double()
         )
-    return found, scenes
+    return images, scenes
 
 
-def differences(pictures: Pictures, scenes: list[Scene]) -> tuple[dict[str, list[Tensor]], list[Tensor]]:
-    """Of each way and pair of images the difference, of 255, NaN where a point is not seen in both; and that mask."""
+def differences(images: Images, scenes: list[Scene]) -> tuple[dict[str, list[Tensor]], list[Tensor]]:
+    """Compare each image with the next one.
+
+    Returns:
+        Differences by way to draw, (height, width) for each pair, NaN at pixels whose point is not visible in both
+        images; and the masks of the other pixels.
+    """
     renderer = rendered("rasterizer")
-    drawn = [renderer(scene, flow.CHANNELS) for scene in scenes]
-    found: dict[str, list[Tensor]] = {name: [] for name in pictures}
+    rendered_channels = [renderer(scene, flow.CHANNELS) for scene in scenes]
+    changes: dict[str, list[Tensor]] = {name: [] for name in images}
     masks = []
-    for number, (one, other) in enumerate(pairwise(range(len(scenes)))):
-        place, seen = flow.flow(scenes[one], scenes[other], drawn[one], drawn[other])
-        masks.append(seen)
-        for name, frames in pictures.items():
-            off = (frames[other] - flow.warp(frames[one], place)).abs().mean(-1)
-            found[name].append(off.where(seen, math.nan))
-        assert seen.any(), f"pair {number}"
-    return found, masks
+    for number, (first, second) in enumerate(pairwise(range(len(scenes)))):
+        place, visible = flow.flow(
+            scenes[first], scenes[second], rendered_channels[first], rendered_channels[second]
+        )
+        masks.append(visible)
+        for name, frames in images.items():
+            change = (frames[second] - flow.warp(frames[first], place)).abs().mean(-1)
+            changes[name].append(change.where(visible, math.nan))
+        assert visible.any(), f"No point is visible in both images of pair {number}."
+    return changes, masks
 
 
-def judged(per_subject: list[dict[str, list[Tensor]]]) -> dict[str, dict[str, float]]:
-    """Of each way, over all pixels of all pairs of all subjects: mean, 95th percentile, and mean's SD over subjects."""
+def summarise(per_subject: list[dict[str, list[Tensor]]]) -> dict[str, dict[str, float]]:
+    """Return for each way to draw the mean, the 95th percentile, and the mean's standard deviation over subjects."""
     rows = {}
     for name in per_subject[0]:
-        each = [torch.cat([off[~off.isnan()] for off in found[name]]) for found in per_subject]
-        every = torch.cat(each)
+        by_subject = [
+            torch.cat([change[~change.isnan()] for change in changes[name]]) for changes in per_subject
+        ]
+        all_pixels = torch.cat(by_subject)
         rows[name] = {
-            "mean": every.mean().item(),
-            "high": np.quantile(every.numpy(), 0.95).item(),
-            "spread": statistics.stdev(one.mean().item() for one in each),
+            "mean": all_pixels.mean().item(),
+            "high": np.quantile(all_pixels.numpy(), 0.95).item(),
+            "spread": statistics.stdev(values.mean().item() for values in by_subject),
         }
     return rows
 
 
-def drawing(pictures: Pictures, found: dict[str, list[Tensor]]) -> Figure:
+def draw_figure(images: Images, changes: dict[str, list[Tensor]]) -> Figure:
+    """Return the figure of one image of each way, and of its difference to the next image."""
     figure = titled_figure((9.5, 6.5), "A walk, and how much of each image flickers", True)
-    axes = figure.subplots(2, len(pictures))
-    for column, name in enumerate(pictures):
-        axes[0, column].imshow(pictures[name][SHOWN].byte().numpy())
+    axes = figure.subplots(2, len(images))
+    for column, name in enumerate(images):
+        axes[0, column].imshow(images[name][SHOWN].byte().numpy())
         axes[0, column].set_title(name, fontsize=9)
-        off = found[name][SHOWN - 1].nan_to_num(0.0)
-        shown = axes[1, column].imshow(off.numpy(), cmap="magma", vmin=0, vmax=BRIGHT)
+        change = changes[name][SHOWN - 1].nan_to_num(0.0)
+        color_map = axes[1, column].imshow(change.numpy(), cmap="magma", vmin=0, vmax=BRIGHT)
         for axis in axes[:, column]:
             axis.set_axis_off()
-    bar = figure.colorbar(shown, ax=axes[1], extend="max")
+    bar = figure.colorbar(color_map, ax=axes[1], extend="max")
     bar.set_label("|difference| to the next image\nafter the flow (of 255)")
     return figure
 
 
 def rates(run: str, scene: Scene) -> list[str]:
-    """Milliseconds of processor time an image in plain loops of one thread, beside what the run measured of itself."""
+    """Return the lines with the run time of the trained network: measured here in loops, and by the run itself."""
     results = json.loads((find_checkpoint(run).parent.parent / "results.json").read_text())
     assert scene.colors is not None
     points = torch.cat(
         [scene.camera.to_canonical(scene.vertices), srgb_from_linear(scene.colors)], 1
     ).numpy()[None]
     loaded, frozen = framework.load(run), framework.freeze(run)
-    drawn = rendered("smplpix", checkpoint=run)
+    renderer = rendered("smplpix", checkpoint=run)
 
     @torch.no_grad()
     def predicted() -> object:
         return loaded(points).mean
 
-    # on one frozen sample the mean of the image is what the renderer paints, but as files hold it
-    apart = np.abs(bytes_from_linear(drawn(scene)["color"]).numpy() - (frozen(points)[0] * 255).round()).max()
+    # the mean of the frozen model's density is the image of the renderer, in sRGB values
+    largest_difference = np.abs(
+        bytes_from_linear(renderer(scene)["color"]).numpy() - (frozen(points)[0] * 255).round()
+    ).max()
     calls: dict[str, Callable[[], object]] = {
         "`framework.freeze(run)(points)`": lambda: frozen(points),
         "`framework.load(run)(points)`": predicted,
-        "`renderer=smplpix`, scene to light": lambda: drawn(scene),
+        "`renderer=smplpix`, from a scene to linear RGB": lambda: renderer(scene),
     }
-    took: dict[str, list[float]] = {name: [] for name in calls}
+    times_by_name: dict[str, list[float]] = {name: [] for name in calls}
     for _ in range(LOOPS + 5):
-        for name, call in calls.items():  # in turn, so that a busy machine slows all of them
+        for name, call in calls.items():  # the calls alternate, so that other processes slow all of them
             start = time.process_time()
             call()
-            took[name].append(1e3 * (time.process_time() - start))
+            times_by_name[name].append(1e3 * (time.process_time() - start))
     lines = [
         f"| {name} | {statistics.median(times[5:]):.1f} | {min(times[5:]):.1f} |"
-        for name, times in took.items()
+        for name, times in times_by_name.items()
     ]
     return [
-        "| plain loop, processor time | median ms | least ms |",
+        "The table holds the processor time of one image in a loop on one thread. The last row is the wall time that "
+        "the run measured itself.",
+        "",
+        "| way to predict | median, ms | shortest, ms |",
         "|---|---|---|",
         *lines,
-        f"| the run of itself, one sample alone, wall clock | {results['latency_milliseconds']:.1f} | |",
+        f"| latency of one sample, measured by the run | {results['latency_milliseconds']:.1f} | |",
         "",
-        f"Frozen and drawn images differ by {apart:g} of 255 at most.",
+        f"The images of `framework.freeze` and of `renderer=smplpix` differ by at most {largest_difference:g} of 255.",
     ]
 
 
 def training(run: str) -> str:
-    """What the network is and how it was trained, in a sentence."""
+    """Return a sentence about the network and its training."""
     description, _ = read_stored(run)
     results = json.loads((find_checkpoint(run).parent.parent / "results.json").read_text())
     journal = (find_checkpoint(run).parent.parent / "journal.jsonl").read_text().splitlines()
@@ -173,43 +188,57 @@ def training(run: str) -> str:
 
 
 def report(run: str, file: Path) -> str:
+    """Measure, save the figure, and return the page."""
     torch.set_num_threads(1)
     per_subject, covered = [], []
     for subject in SUBJECTS:
-        pictures, scenes = walk(run, file, subject)
-        found, masks = differences(pictures, scenes)
-        per_subject.append(found)
+        images, scenes = walk(run, file, subject)
+        changes, masks = differences(images, scenes)
+        per_subject.append(changes)
         covered += [mask.float().mean().item() for mask in masks]
         if subject == SUBJECTS[0]:
-            drawing(pictures, found).savefig(Path(__file__).with_suffix(".png"), dpi=110)
-    rows = judged(per_subject)
+            draw_figure(images, changes).savefig(Path(__file__).with_suffix(".png"), dpi=110)
+    rows = summarise(per_subject)
     floor = rows["photograph"]["mean"]
     rate = rates(run, scenes[0])
     return "\n".join(
         [
-            "# Temporal stability (flicker) of a walking person (synthetic people)",
+            "# Temporal stability (flicker) of walking people (synthetic people)",
             "",
-            f"The network: {training(run)}",
+            "This page measures the temporal stability (flicker) of images of walking people: how much consecutive "
+            "images differ after the known motion is removed. It compares renders of a mesh, images of a neural "
+            "network (SMPLpix), and photographs. All people and photographs are synthetic.",
             "",
-            f"{len(SUBJECTS)} generated test subjects walk as `{file.name}` says, {FRAMES} images each at {SPEED} a "
-            f"second, {scenes[0].camera.height} × {scenes[0].camera.width} pixels. Each image is brought to the next "
-            "by the flow of the registered mesh (visible face and barycentric weights, exact), bilinear; the "
-            "difference of sRGB numbers, of 255, mean of the channels, is taken where a point is seen in both images "
-            f"and no outline is near: {statistics.mean(covered):.1%} of a frame. Photographs say what a true image "
-            "has of it: fine patterns that interpolation blurs, cloth that moves beside the registered body, light "
-            "that changes as the body turns. A mesh with fixed colours of its vertices has less of all three, and may "
-            "be below.",
+            f"The network and its training are: {training(run)}",
             "",
-            "| | mean | SD over subjects | 95th percentile | mean over that of photographs |",
+            f"{len(SUBJECTS)} generated people who are not in the training data walk as the motion file `{file.name}` "
+            f"says. There are {FRAMES} images of each, at {SPEED} images a second, with {scenes[0].camera.height} × "
+            f"{scenes[0].camera.width} pixels. Each image is moved to the next one with bilinear interpolation. The "
+            "optical flow for this is known exactly, because it is computed from the visible faces and barycentric "
+            "weights of the registered mesh. The difference of the two images is then taken at pixels whose point is "
+            f"visible in both images and that are not near an outline. These are {statistics.mean(covered):.1%} of a "
+            "frame.",
+            "",
+            "`mean difference` is the mean over these pixels, all pairs of images and all people, on the scale of 0 "
+            "to 255 of sRGB values. `SD over people` says how much this mean differs between the people. `95th "
+            "percentile` is over the same pixels as the mean. The last column is the mean divided by that of the "
+            "photographs. The rows `mesh` are renders of the registered mesh with 1 or 4 × 4 samples a pixel.",
+            "",
+            "The photographs show how much of the difference is present in a true image. Interpolation blurs fine "
+            "patterns, cloth moves differently from the registered body, and the light changes when the body turns. A "
+            "mesh whose vertices have fixed colours shows less of all three. Its difference may therefore be smaller "
+            "than that of the photographs.",
+            "",
+            "| way to draw | mean difference | SD over people | 95th percentile | mean relative to photographs |",
             "|---|---|---|---|---|",
             *(
                 f"| {name} | {row['mean']:.2f} | {row['spread']:.2f} | {row['high']:.1f} | {row['mean'] / floor:.2f} |"
                 for name, row in rows.items()
             ),
             "",
-            "![](smplpix_flicker.png)",
+            "![Images of the walk and their differences to the next image](smplpix_flicker.png)",
             "",
-            "## Rate of the trained network alone",
+            "## Run time of the trained network",
             "",
             *rate,
             "",

@@ -1,9 +1,9 @@
-"""Time images against the vertices of their mesh: rasterised, and drawn by networks from projected vertices.
+"""Measure the run time of images against the vertices of their mesh: rendered, and drawn by networks.
 
     python -m benchmarks.rendering.smplpix_growth
     python -m benchmarks.rendering.smplpix_growth --draw
 
-Writes smplpix_growth.md, .csv and .png beside this file; `--draw` draws the figure again from the table.
+The script writes smplpix_growth.md, .csv and .png beside this file. `--draw` draws the figure again from the csv file.
 """
 
 import math
@@ -33,7 +33,7 @@ ROUNDS = 3
 
 
 def person(name: Name) -> Tensor:
-    """(points, 6): the default body at rest in a topology, coloured by place, before the canonical camera."""
+    """Return the default body in the rest pose: points (1, points, 6), coloured by position, in camera coordinates."""
     body, _ = load_body(None)
     whole = sheet(body)
     rows = topology(body, whole, name).rows
@@ -44,7 +44,8 @@ def person(name: Name) -> Tensor:
     ]
 
 
-def encoder(name: str, shape: tuple[int, ...], **config: object) -> Encoder:
+def build_encoder(name: str, shape: tuple[int, ...], **config: object) -> Encoder:
+    """Return an encoder with random weights of a fixed seed, in evaluation mode."""
     torch.manual_seed(0)
     return build(
         "encoder", resolve("encoder", {"name": name, **config}), input_shape=shape, input_columns=()
@@ -52,22 +53,22 @@ def encoder(name: str, shape: tuple[int, ...], **config: object) -> Encoder:
 
 
 def ways(shape: tuple[int, ...], name: str) -> dict[str, Callable[[Tensor], Tensor]]:
-    """An image from coloured points, by how it is drawn."""
+    """Return the functions that draw an image from coloured points, by name of the way."""
     height, width = SIZE
     size = {"height": height, "width": width}
-    projection = encoder("projection", shape, **size)
+    projection = build_encoder("projection", shape, **size)
 
-    def meshed(samples: int, **more: object) -> Encoder:
+    def mesh_encoder(samples: int, **more: object) -> Encoder:
         drawing = {"name": "rasterizer", "supersampling": samples}
-        return encoder("rasterised", shape, topology=name, renderer=drawing, **size, **more)
+        return build_encoder("rasterised", shape, topology=name, renderer=drawing, **size, **more)
 
-    # emulated, bfloat16 takes eight times as long: no way that anybody would go
+    # bfloat16 is left out if the processor emulates it, because it then takes eight times as long
     precisions = ("float32", "bfloat16")[: 1 + fast_bfloat16(torch.device("cpu"))]
-    networks = {precision: encoder("slim", (4, *SIZE), precision=precision) for precision in precisions}
-    best, with_depth = precisions[-1], meshed(1, depth=True)
+    networks = {precision: build_encoder("slim", (4, *SIZE), precision=precision) for precision in precisions}
+    best, with_depth = precisions[-1], mesh_encoder(1, depth=True)
     return {
-        "rasterised, 1 sample a pixel": meshed(1),
-        "rasterised, 4 × 4 samples": meshed(4),
+        "rasterised, 1 sample a pixel": mesh_encoder(1),
+        "rasterised, 4 × 4 samples": mesh_encoder(4),
         "projection alone": projection,
         **{
             f"SMPLpix (slim, {precision})": lambda points, network=network: network(projection(points))
@@ -78,51 +79,63 @@ def ways(shape: tuple[int, ...], name: str) -> dict[str, Callable[[Tensor], Tens
 
 
 @torch.inference_mode()
-def report(picture: Path) -> str:
+def report(figure_path: Path) -> str:
+    """Measure, write the csv table, draw the figure at the path, and return the page."""
     torch.set_num_threads(1)
     people = {name: person(name) for name in TOPOLOGIES}
     calls = {name: ways(tuple(points.shape[1:]), name) for name, points in people.items()}
     covered = float((calls["7k"]["rasterised, 1 sample a pixel"](people["7k"]) < 1).any(1).float().mean())
-    found = {way: [math.inf] * len(TOPOLOGIES) for way in calls["7k"]}
+    lowest = {way: [math.inf] * len(TOPOLOGIES) for way in calls["7k"]}
     for _ in range(ROUNDS):
-        for way, times in found.items():
+        for way, times in lowest.items():
             for place, name in enumerate(TOPOLOGIES):
-                took = milliseconds(partial(calls[name][way], people[name]))
-                times[place] = min(times[place], took)
+                time_of_call = milliseconds(partial(calls[name][way], people[name]))
+                times[place] = min(times[place], time_of_call)
     counts = [points.shape[1] for points in people.values()]
     measured = [
-        {"way": way, "vertices": count, "milliseconds": each, "synthetic": True}
-        for way, times in found.items()
-        for count, each in zip(counts, times, strict=True)
+        {"way": way, "vertices": count, "milliseconds": time_ms, "synthetic": True}
+        for way, times in lowest.items()
+        for count, time_ms in zip(counts, times, strict=True)
     ]
-    write_csv(measured, None, picture.with_suffix(".csv"))
-    drawn(measured, picture)
+    write_csv(measured, None, figure_path.with_suffix(".csv"))
+    draw_figure(measured, figure_path)
     rows = [
-        f"| {way} | {' | '.join(f'{each:.2f}' for each in times)} | {times[-1] / times[0]:.1f} | "
+        f"| {way} | {' | '.join(f'{time_ms:.2f}' for time_ms in times)} | {times[-1] / times[0]:.1f} | "
         f"{slope([float(count) for count in counts], times):.2f} |"
-        for way, times in found.items()
+        for way, times in lowest.items()
     ]
     return "\n".join(
         [
             "# Run time of an image against the vertices of its mesh",
             "",
-            f"The default body (synthetic colours), {SIZE[0]} × {SIZE[1]} pixels, of which it covers {covered:.0%}; "
-            f"one thread; processor time, the lowest of {ROUNDS} medians, all in turn, ms. Networks compute the "
-            "subject's box alone; their weights are drawn, which changes no time. Slope: on double logarithmic axes, "
-            "over the last two.",
+            "This page measures how the run time of an image grows with the number of vertices of its mesh. It "
+            "compares rendering of the mesh with neural networks (SMPLpix) that draw the image from projected "
+            "vertices. Networks should depend less on the number of vertices.",
             "",
-            f"| vertices | {' | '.join(f'{count:,}' for count in counts)} | last over first | slope |",
+            f"The images have {SIZE[0]} × {SIZE[1]} pixels and show the default body with synthetic colours, which "
+            f"covers {covered:.0%} of the pixels. All numbers except the last two columns are processor times in ms "
+            f"on one thread: the lowest of {ROUNDS} medians. The ways to draw alternate. Networks compute only the "
+            "box around the subject. Their weights are random, which does not change the run time.",
+            "",
+            "`rasterised` is rendering of the mesh. `projection alone` only projects the vertices into the image. "
+            "`SMPLpix` is projection followed by the network `slim`. `slim over the mesh` is the network on a "
+            "rendered mesh with depth. `last / first` is the time with the most vertices divided by that with the "
+            "fewest. `slope` is the slope of the time between the last two columns of vertices, on double logarithmic "
+            "axes: 1 means that the time is proportional to the number of vertices.",
+            "",
+            f"| way to draw | {' | '.join(f'{count:,} vertices, ms' for count in counts)} | last / first | slope |",
             f"|---|{'---|' * (len(counts) + 2)}",
             *rows,
             "",
-            f"![Milliseconds against vertices]({picture.name})",
+            f"![Time of an image against vertices]({figure_path.name})",
             "",
             f"{machine('torch', 'numpy')} Command: `python -m benchmarks.rendering.smplpix_growth`.",
         ]
     )
 
 
-def drawn(rows: Sequence[Row], picture: Path) -> None:
+def draw_figure(rows: Sequence[Row], figure_path: Path) -> None:
+    """Save the figure of time against vertices."""
     figure = titled_figure(
         (8, 4.4), f"Time of an image of {SIZE[0]} × {SIZE[1]} pixels against vertices", True
     )
@@ -142,13 +155,13 @@ def drawn(rows: Sequence[Row], picture: Path) -> None:
     axes.grid(alpha=0.3)
     axes.spines[["top", "right"]].set_visible(False)
     figure.legend(loc="outside right center", frameon=False, fontsize=9)
-    save_figure(figure, picture.with_suffix(""), True)
+    save_figure(figure, figure_path.with_suffix(""), True)
 
 
 if __name__ == "__main__":
     place = Path(__file__).resolve().with_suffix(".md")
     if sys.argv[1:] == ["--draw"]:
-        drawn(read_rows(place.with_suffix(".csv")), place.with_suffix(".png"))
+        draw_figure(read_rows(place.with_suffix(".csv")), place.with_suffix(".png"))
     else:
         text = report(place.with_suffix(".png"))
         write_page(__file__, text)
