@@ -26,8 +26,7 @@ class BPS(Encoder):
         input_columns: names of the columns, if features are attributes.
         basis: choice of basis points (`plugins.encoder.bps.basis`).
         points: number of basis points, k; side³ for a "grid".
-        radius: radius of the ball that holds the basis points; half the edge of a "grid". In units of the normalised
-            cloud.
+        radius: radius of the ball of basis points, or half the edge of a "grid", in units of the normalised cloud.
         features: features of each basis point, in order: "distance" (1 number, eq. 6.4), "delta" (3, eq. 6.5), and of
             the nearest point "color" (3: red, green, blue), "normal" (3), or the name of a column (1).
         normalise: as in `framework.geometry.clouds.normalise_clouds`.

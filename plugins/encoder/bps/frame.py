@@ -8,12 +8,12 @@ from torch import Tensor
 
 from plugins.encoder.bps.symmetric import EQUAL, symmetric_frame
 
-WITHIN = 1 + 1e-6
+LARGEST_NORM = 1 + 1e-6
 """Largest norm of a point that influences the axes, with room for rounding.
 
 Outliers of a robust normalisation have larger norms.
 """
-APART = 1e-9
+EIGENVALUE_GAP = 1e-9
 """Difference below which eigenvalues, in units of the largest, are equal, so that their axes have no derivative.
 
 An eigenvalue smaller than this share of the largest counts as 0: a cloud thinner than 3e-5 of its length is flat.
@@ -46,7 +46,7 @@ def frame(coordinates: Float[Tensor, "batch points 3"], reach: float = 1.0) -> F
     """
     points = coordinates.double()
     norm = torch.linalg.vector_norm(points.detach(), dim=-1, keepdim=True)
-    inside = norm <= WITHIN * reach  # False for NaN
+    inside = norm <= LARGEST_NORM * reach  # False for NaN
     points = points.where(inside, 0)
     # sums instead of means: a common factor changes neither the eigenvectors nor the skewness below
     second = points.mT @ points
@@ -57,7 +57,7 @@ def frame(coordinates: Float[Tensor, "batch points 3"], reach: float = 1.0) -> F
     skewness = third / along.square().mean(1).clamp(min=torch.finfo(torch.float64).tiny).pow(1.5)
     # A flat cloud is its own mirror image. Along its normal there are only rounding errors, whose skewness may be the
     # largest.
-    skewness = skewness.where(values > APART * values[:, :1], 0)
+    skewness = skewness.where(values > EIGENVALUE_GAP * values[:, :1], 0)
     direction = torch.ones_like(third).where(third >= 0, -1)
     axes = axes * direction[:, None]
     weakest = skewness.abs().argmin(-1, keepdim=True)
@@ -66,7 +66,7 @@ def frame(coordinates: Float[Tensor, "batch points 3"], reach: float = 1.0) -> F
     tiny = torch.finfo(torch.float64).tiny
     skewed = skewness.abs() > SKEWED * (values[:, :1] / values.clamp(min=tiny)).sqrt()
     equal = values[:, :-1] - values[:, 1:] <= EQUAL * values[:, :1]
-    equal &= values[:, 1:] > APART * values[:, :1]
+    equal &= values[:, 1:] > EIGENVALUE_GAP * values[:, :1]
     for number in ((skewed.sum(1) < 2) | equal.any(1)).nonzero()[:, 0].tolist():
         cloud = points[number].detach()[inside[number, :, 0]]
         axes[number] = symmetric_frame(cloud, axes[number], skewed[number], equal[number])
@@ -100,6 +100,6 @@ class Axes(torch.autograd.Function):
         # first-order perturbation: d value_j = axis_jᵀ d(second) axis_j, and
         # d axis_j = Σ_i axis_i (axis_iᵀ d(second) axis_j) / (value_j - value_i)
         gap = values[:, None] - values[..., None]
-        known = gap.abs() > APART * values[:, :1, None]
+        known = gap.abs() > EIGENVALUE_GAP * values[:, :1, None]
         coefficients = (axes.mT @ axes_gradient).where(known, 0) / gap.where(known, 1)
         return axes @ (coefficients + values_gradient.diag_embed()) @ axes.mT, None, None

@@ -14,11 +14,11 @@ from torch import Tensor
 
 EQUAL = 1e-6
 """Difference of second moments, as a share of the largest, below which they are equal to the rounding of float32."""
-TIED = 1e-6
+TIE = 1e-6
 """Relative difference below which lengths count as equal, and absolute difference below which values of log L do."""
 GENERIC = (1.3, 0.9, 0.5)
 """The vector a, in inverse units of the root mean square of a coordinate; the components differ, and none is 0."""
-AT_ONCE = 2**22
+PAIRS_IN_MEMORY = 2**22
 """Largest number of pairs of a candidate and a point that are in memory at once."""
 FLIPS = ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))
 """Directions of three axes that leave a frame right-handed."""
@@ -63,7 +63,7 @@ def _frames_through_points(points: Float[Tensor, "points 3"]) -> Float[Tensor, "
     first = points[_farthest(points.norm(dim=1))]
     first = first / first.norm(dim=1, keepdim=True)
     value = _log_transform(points, GENERIC[0] * first)
-    return torch.cat([_frames_about(points, axis) for axis in first[value >= value.max() - TIED]])
+    return torch.cat([_frames_about(points, axis) for axis in first[value >= value.max() - TIE]])
 
 
 def _frames_about(
@@ -78,7 +78,7 @@ def _frames_about(
     across = points - along[:, None] * axis
     distance = across.norm(dim=1)
     far = _farthest(distance)
-    far = far[along[far].abs() >= along[far].abs().max() - TIED * distance.max()]
+    far = far[along[far].abs() >= along[far].abs().max() - TIE * distance.max()]
     towards = across[far] / distance[far, None]
     axis = axis.expand_as(towards)
     third = torch.linalg.cross(axis, towards)
@@ -87,7 +87,7 @@ def _frames_about(
 
 def _farthest(length: Float[Tensor, "points"]) -> Tensor:
     """Return the indices of the largest lengths."""
-    return (length >= (1 - TIED) * length.max()).nonzero()[:, 0]
+    return (length >= (1 - TIE) * length.max()).nonzero()[:, 0]
 
 
 def _log_transform(
@@ -98,5 +98,5 @@ def _log_transform(
     The result exceeds log L by the constant log(number of points), which changes no comparison.
     """
     unit = points / points.square().mean().sqrt().clamp(min=torch.finfo(points.dtype).tiny)
-    parts = arguments.split(max(1, AT_ONCE // max(1, len(unit))))
+    parts = arguments.split(max(1, PAIRS_IN_MEMORY // max(1, len(unit))))
     return torch.cat([torch.logsumexp(part @ unit.T, 1) for part in parts])

@@ -294,13 +294,13 @@ def test_single_points_are_joined_with_their_cloud_and_do_not_depend_on_its_plac
 # Rotations
 
 
-def turned(cloud, seed):
+def rotate(cloud, seed):
     """Return rotated coordinates and normals."""
     turn = torch.from_numpy(Rotation.random(rng=seed).as_matrix()).to(cloud.dtype)
     return torch.cat([cloud[..., :3] @ turn, cloud[..., 3:6], cloud[..., 6:9] @ turn, cloud[..., 9:]], -1)
 
 
-def invariant(clouds, basis_points):
+def encode_invariant(clouds, basis_points):
     features = ["distance", "delta", "normal", "color"]
     return channels(encode(clouds, basis_points, features, "unit_ball", COLUMNS, rotation_invariant=True))
 
@@ -310,16 +310,16 @@ def test_a_rotation_changes_nothing_where_that_is_asked_for(dtype):
     stretch = torch.tensor([3.0, 2, 1, *[1] * 7], dtype=dtype)
     clouds = (numbers(8, 500, 10).to(dtype).abs() - 0.3) * stretch
     basis_points = prepare_basis(basis("ball_uniform", 64, 1.0, 13).to(dtype))
-    wanted = invariant(clouds, basis_points)
+    wanted = encode_invariant(clouds, basis_points)
     for seed in range(5):
-        features = invariant(turned(clouds, seed), basis_points)
+        features = encode_invariant(rotate(clouds, seed), basis_points)
         # if rounding makes another point the nearest, all features except the distance jump
         same = (features - wanted).abs().amax(1) <= (1e-5 if dtype == torch.float32 else 1e-12)
         assert same.double().mean() > (0.995 if dtype == torch.float32 else 1 - 1e-9)
         torch.testing.assert_close(
             features[:, 0], wanted[:, 0], rtol=0, atol=1e-5 if dtype == torch.float32 else 1e-12
         )
-    plain = channels(encode(clouds, basis_points)) - channels(encode(turned(clouds, 0), basis_points))
+    plain = channels(encode(clouds, basis_points)) - channels(encode(rotate(clouds, 0), basis_points))
     assert plain.abs().max() > 0.1
 
 
@@ -331,9 +331,9 @@ def test_mirror_planes_do_no_harm(planes):
         mirror[[axis, 6 + axis]] = -1
         cloud = torch.cat([cloud, cloud * mirror])
     basis_points = prepare_basis(basis("ball_uniform", 64, 1.0, 13))
-    wanted = invariant(cloud[None], basis_points)[:, 0]
+    wanted = encode_invariant(cloud[None], basis_points)[:, 0]
     for seed in range(10):
-        features = invariant(turned(cloud[None], seed), basis_points)[:, 0]
+        features = encode_invariant(rotate(cloud[None], seed), basis_points)[:, 0]
         torch.testing.assert_close(features, wanted, rtol=0, atol=1e-10)
 
 
@@ -341,7 +341,9 @@ def test_a_mirrored_cloud_is_another():
     cloud = numbers(1, 300, 10).abs() * torch.tensor([3.0, 2, 1, *[1] * 7], dtype=torch.float64)
     basis_points = prepare_basis(basis("ball_uniform", 64, 1.0, 13))
     mirrored = cloud * torch.tensor([-1.0, *[1] * 9], dtype=torch.float64)
-    assert (invariant(mirrored, basis_points) - invariant(cloud, basis_points))[:, 0].abs().max() > 0.05
+    assert (encode_invariant(mirrored, basis_points) - encode_invariant(cloud, basis_points))[
+        :, 0
+    ].abs().max() > 0.05
 
 
 def shape(name, seed=0):

@@ -25,8 +25,8 @@ SPEED, GROWTH = (0.4, 0.4, 3.0), (0.5, 0.5, 6.0)
 
 The values of z are larger, because a bounce reverses the velocity along z, and the last frames may hold a bounce.
 """
-FURTHER = 24
-"""Number of features beside the two for each predicted coordinate and the seven for each observed frame."""
+OTHER_FEATURES = 24
+"""Number of features in addition to two for each predicted coordinate and seven for each observed frame."""
 
 
 class ExtrapolationEncoder(Encoder):
@@ -61,7 +61,7 @@ class ExtrapolationEncoder(Encoder):
         super().__init__()
         frames = count_frames(input_shape, "encoder extrapolation")
         self.future, self.step, self.noise = future, step, noise
-        self.output_shape = (6 * future + FURTHER + 7 * frames,)
+        self.output_shape = (6 * future + OTHER_FEATURES + 7 * frames,)
 
     @torch.no_grad()
     def forward(self, inputs: Tensor) -> Float[Tensor, "batch length"]:

@@ -15,7 +15,7 @@ A parabola fits a span of frames if at most MOST_OUTLIERS of them are outliers.
 """
 ROUNDS = 8
 """Number of alternating updates of weights and parabola."""
-BELIEF = (10.0, 10.0, 4.0)
+PRIOR_DEVIATIONS = (10.0, 10.0, 4.0)
 """Prior standard deviations of position, velocity and acceleration beyond gravity: m, m/s, m/s²."""
 
 
@@ -78,7 +78,7 @@ def fit_parabolas(times, positions, visible, spans, noise, long, short, covarian
                 precision[:] = 0.0
                 coefficients[:] = 0.0
                 for row in range(3):
-                    precision[row, row] = 1 / BELIEF[row] ** 2
+                    precision[row, row] = 1 / PRIOR_DEVIATIONS[row] ** 2
                 for frame in range(first, count):
                     if visible[flight, frame]:
                         share = weight[frame] / noise**2

@@ -13,14 +13,14 @@ def build_encoder(shape, **config):
     return build("encoder", resolve("encoder", {"name": "voxnet", **config}), input_shape=shape)
 
 
-def convolved(grid, kernel, bias, stride, padding):
+def correlate_filters(grid, kernel, bias, stride, padding):
     """Return the correlation by SciPy, one filter at a time; every second cell for stride 2."""
     grid = np.pad(grid, [(0, 0)] + [(padding, padding)] * 3)
     filtered = np.stack([correlate(grid, filters, "valid", method="direct")[0] for filters in kernel])
     return filtered[:, ::stride, ::stride, ::stride] + bias[:, None, None, None]
 
 
-def pooled(grid):
+def max_pool(grid):
     side = grid.shape[1] // 2
     grid = grid[:, : 2 * side, : 2 * side, : 2 * side]
     return grid.reshape(len(grid), side, 2, side, 2, side, 2).max((2, 4, 6))
@@ -32,13 +32,13 @@ def by_hand(encoder, grid):
     for layer in encoder.convolutions:
         state = {name: value.double().numpy() for name, value in layer.state_dict().items()}
         if isinstance(layer, torch.nn.Conv3d):
-            grid = convolved(grid, state["weight"], state["bias"], layer.stride[0], layer.padding[0])
+            grid = correlate_filters(grid, state["weight"], state["bias"], layer.stride[0], layer.padding[0])
         elif isinstance(layer, torch.nn.BatchNorm3d):
             scale = state["weight"] / np.sqrt(state["running_var"] + 1e-5)
             shift = state["bias"] - state["running_mean"] * scale
             grid = grid * scale[:, None, None, None] + shift[:, None, None, None]
         elif isinstance(layer, torch.nn.MaxPool3d):
-            grid = pooled(grid)
+            grid = max_pool(grid)
         elif isinstance(layer, torch.nn.LeakyReLU):
             grid = np.where(grid > 0, grid, 0.1 * grid)
         elif isinstance(layer, torch.nn.ReLU):

@@ -11,7 +11,7 @@ from plugins.encoder.inception_resnet_v2.encoder import InceptionResNetV2
 from plugins.encoder.inception_resnet_v2.layers import ConvNorm, Residual, mixed_5b
 
 
-def known(state):
+def make_weights(state):
     """Return weights that depend only on the order of their names and on their shapes."""
     generator, weights = np.random.default_rng(0), {}
     for name in sorted(state):
@@ -58,7 +58,7 @@ def test_parameters_are_as_published(encoder):
 
 def test_features_are_timms_from_a_weight_file(encoder, tmp_path):
     file = tmp_path / "weights.pth"
-    weights = known(encoder.state_dict()) | {
+    weights = make_weights(encoder.state_dict()) | {
         "classif.weight": torch.zeros(1000, 1536),
         "classif.bias": torch.zeros(1000),
     }

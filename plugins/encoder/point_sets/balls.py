@@ -21,7 +21,7 @@ def find_within(
     radius: float,
     most: int,
 ) -> Int[Tensor, "centroid most"]:
-    """Return the rows of the first `most` points of a centroid's cloud that lie within a radius of the centroid.
+    """Return for each centroid the rows of the first `most` points of its cloud that lie within a radius of it.
 
     The first `centroids` points of each cloud are its centroids, or all points if the cloud has fewer. If fewer than
     `most` points are within the radius, the row of the first of them is repeated. The distances are computed in float64

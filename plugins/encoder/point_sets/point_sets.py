@@ -10,12 +10,12 @@ from torch import Tensor
 from framework.errors import ConfigError
 from framework.geometry.clouds import Normalisation, normalise_clouds, require_clouds, sizes
 
-AT_ONCE = 2**12
+POINTS_ON_CPU = 2**12
 """Largest number of points that a CPU passes through a network together.
 
 More points do not fit into the caches: 2^16 at once are half as fast.
 """
-AT_ONCE_ON_DEVICE = 2**19
+POINTS_ON_GPU = 2**19
 """Largest number of points that a GPU passes through a network together."""
 
 
@@ -158,7 +158,7 @@ def encode_in_parts(
         counts: number of points of each cloud.
         rows_per_point: approximate number of rows of numbers that the network computes for each point.
     """
-    limit = (AT_ONCE if values.device.type == "cpu" else AT_ONCE_ON_DEVICE) // rows_per_point
+    limit = (POINTS_ON_CPU if values.device.type == "cpu" else POINTS_ON_GPU) // rows_per_point
     total, groups = 0, [[]]
     for number in counts.tolist():
         if groups[-1] and total + number > limit:

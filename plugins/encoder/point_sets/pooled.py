@@ -23,7 +23,7 @@ With fewer points, too large a share of them attains a maximum. The limit is est
 def largest_after(
     network: nn.Sequential, values: Float[Tensor, "point columns"], counts: Int[Tensor, "batch"]
 ) -> Float[Tensor, "batch channels"]:
-    """Return `largest(network(values), counts)` and its gradient, equal up to rounding.
+    """Return `largest(network(values), counts)` up to rounding, with the same gradient.
 
     ReLU is monotone, and so is batch norm in each channel. The maximum over a cloud is therefore attained by the point
     with the largest number before batch norm (the smallest number if the factor of batch norm is negative). In
@@ -44,7 +44,11 @@ def largest_after(
     if type(norm) is nn.BatchNorm1d and not norm.training and norm.running_mean is not None:
         weight, bias = fold_norm(final, norm)
         return (largest(linear(values, weight), counts) + bias).relu()
-    maxima = _maxima_of_attaining(final, norm, values, counts) if _pays(final, norm, values, counts) else None
+    maxima = (
+        _maxima_of_attaining(final, norm, values, counts)
+        if _shortcut_pays(final, norm, values, counts)
+        else None
+    )
     return (largest(norm(final(values)), counts) if maxima is None else maxima).relu()
 
 
@@ -57,7 +61,7 @@ def fold_norm(
     return final.weight * factor.unsqueeze(1), norm.bias - norm.running_mean * factor
 
 
-def _pays(final: nn.Linear, norm: nn.Module, values: Tensor, counts: Tensor) -> bool:
+def _shortcut_pays(final: nn.Linear, norm: nn.Module, values: Tensor, counts: Tensor) -> bool:
     """Return whether the shortcut applies and needs less computation.
 
     The shortcut applies with a gradient, on a CPU, in the layer's own precision. As a share of a pass of all points

@@ -10,7 +10,7 @@ from plugins.encoder.point_sets.deepsets import DeepSets
 from plugins.encoder.point_sets.layers import layers
 from plugins.encoder.point_sets.point_sets import largest
 from plugins.encoder.point_sets.pointnet import PointNet
-from plugins.encoder.point_sets.pooled import _pays, largest_after, rows_of_maxima
+from plugins.encoder.point_sets.pooled import _shortcut_pays, largest_after, rows_of_maxima
 
 NUMBERS = {"even": (70, 70, 70), "uneven": (90, 1, 150, 40), "one": (80,)}
 
@@ -53,7 +53,7 @@ def test_value_gradients_and_moments_are_those_of_every_point(numbers, training,
     network = build_network(dtype=dtype).train(training)
     values, counts = torch.randn(sum(numbers), 5, dtype=dtype) + 3, torch.tensor(numbers)
     hidden = network[:3](values)
-    assert _pays(network[3], network[4], hidden, counts) == (sum(numbers) >= 64 * len(numbers))
+    assert _shortcut_pays(network[3], network[4], hidden, counts) == (sum(numbers) >= 64 * len(numbers))
     wanted = outcome(plain, network, values, counts)
     for name, results in outcome(largest_after, network, values, counts).items():
         torch.testing.assert_close(
@@ -85,7 +85,7 @@ def test_a_variance_that_the_covariance_does_not_show_is_taken_from_every_point(
         network[0].weight[:] = torch.tensor([1.0, -1.0])
     large = torch.randn(200, 1) * 1e3
     values, counts = torch.cat([large, large + torch.randn(200, 1) * 0.01], 1), torch.tensor([100, 100])
-    assert _pays(network[0], network[1], values, counts)
+    assert _shortcut_pays(network[0], network[1], values, counts)
     wanted, results = outcome(plain, network, values, counts), outcome(largest_after, network, values, counts)
     assert (wanted["value"] > 0).all()
     for name in wanted:

@@ -46,7 +46,7 @@ class CameraView:
     def lens(self) -> tuple[float, tuple[float, float]]:
         """Focal length, and (column, row) of the principal point from the upper left corner of the image, pixels.
 
-        The camera counts from the centre of the first pixel, which lies half a pixel from that corner.
+        `Camera.principal` is measured from the centre of the first pixel, half a pixel from this corner.
         """
         camera = canonical_camera(self.height, self.width)
         across, down = camera.principal
@@ -208,8 +208,8 @@ class Projection(Encoder):
         input_columns: names of the columns, if the data name them.
         height, width: size of the image, pixels.
         nearest, farthest: range of depths, metres. Points in [nearest, farthest) are visible, and their depth channel
-            runs from 0 to 1. The thesis's scanner sees 0.1 to 0.7 m, so that a value of 1 marks the background
-            (§7.3.1). If people stand farther away, a depth in metres would not distinguish them from this value.
+            runs from 0 to 1, so that 1 marks the background. The thesis uses depths in metres, where 1 marks the
+            background because the thesis's scanner sees 0.1 to 0.7 m (§7.3.1).
         levels: number of images, four channels each. Each image has half the size of the previous one and is enlarged
             again by repetition, so that a pixel between sparse points shows a point at some level.
         splat: radius, pixels, of splats that fill the surface between points; 0 for no splats. Splats add five channels

@@ -18,7 +18,7 @@ from plugins.encoder.projection import compiled
 CHANNELS = 5
 """Number of channels: red, green, blue and depth of the surface, and the distance to the nearest point."""
 THICK = 4.0
-"""Thickness of a surface, in widths of a pixel: points behind the surface within this distance belong to it."""
+"""Thickness of a surface, in widths of a pixel: points up to this distance behind the surface belong to it."""
 LEAST_WIDTH, SHARE = 0.45, 0.6
 """Terms of a splat's standard deviation, pixels: a constant, and a share of the distance to the nearest point."""
 

@@ -29,7 +29,7 @@ def build_encoder(shape=(40, 6), columns=(), **config):
     )
 
 
-def every_way(clouds: Tensor, view: CameraView) -> list[Tensor]:
+def project_every_way(clouds: Tensor, view: CameraView) -> list[Tensor]:
     """Return the images of the compiled single pass, of the compiled index with a gradient, and of torch operations."""
     return [
         project(clouds, view),
@@ -95,7 +95,7 @@ def test_projections_are_those_of_a_loop_over_points(bytes_of_points, height, wi
     clouds = [cloud_of(points, height, width, kind) for points in bytes_of_points]
     view = CameraView(height, width, LIMITS, levels)
     wanted = np.stack([by_hand(cloud.tolist(), view, kind) for cloud in clouds])
-    for images in every_way(pad([torch.from_numpy(cloud) for cloud in clouds]), view):
+    for images in project_every_way(pad([torch.from_numpy(cloud) for cloud in clouds]), view):
         np.testing.assert_array_equal(images.numpy(), wanted)
 
 
@@ -117,7 +117,7 @@ def test_float32_points_are_seen_where_exact_fractions_say(size):
         column = math.floor(Fraction(x) * height / Fraction(z) + Fraction(width, 2))
         if 0 <= column < width:
             image[height // 2, column] = 0.25
-    for images in every_way(clouds, CameraView(height, width, LIMITS)):
+    for images in project_every_way(clouds, CameraView(height, width, LIMITS)):
         assert torch.equal(images[:, 0], wanted)
 
 
@@ -128,7 +128,7 @@ def test_of_thousands_in_one_pixel_the_nearest_is_seen_and_of_equally_near_ones_
     clouds[..., :2] *= 1e-3
     clouds[..., 2] = 2.0 if same else (1.5 + clouds[..., 2]).mul(100).round() / 100
     view = CameraView(5, 5, LIMITS, levels=2)
-    for images in every_way(clouds, view):
+    for images in project_every_way(clouds, view):
         for image, cloud in zip(images, clouds, strict=True):
             first = int(cloud[:, 2].min(0).values.eq(cloud[:, 2]).nonzero()[0])
             assert torch.equal(image[:3, 2, 2], cloud[first, 3:])
@@ -203,7 +203,7 @@ def test_clouds_of_a_batch_are_those_alone_on_any_number_of_threads():
         try:
             for threads in (1, 2, 3):
                 torch.set_num_threads(threads)
-                assert all(torch.equal(images, wanted) for images in every_way(batch, view))
+                assert all(torch.equal(images, wanted) for images in project_every_way(batch, view))
         finally:
             torch.set_num_threads(before)
         assert torch.equal(project(batch.mT.contiguous().mT, view), wanted)  # strides
@@ -225,7 +225,7 @@ def test_what_cannot_be_projected_is_refused_and_nothing_in_view_is_the_backgrou
     with pytest.raises(DataError, match=r"Cloud 0 .*column 4 of point 1"):
         encoder(torch.tensor([[[0.0, 0, 2, 0, 0, 0], [0, 0, 2, 0, math.inf, 0]]]))
     behind = torch.tensor([[[0.0, 0, -2, 0, 0, 0], [0, 0, 0, 0, 0, 0], [9, 0, 2, 0, 0, 0]]])
-    for images in (encoder(behind), *every_way(behind[:, :0], encoder.view)):
+    for images in (encoder(behind), *project_every_way(behind[:, :0], encoder.view)):
         assert torch.equal(images, torch.ones(1, 4, 4, 6))
     assert encoder.fixed and not encoder.state_dict() and encoder(behind[:0]).shape == (0, 4, 4, 6)
 

@@ -41,7 +41,7 @@ def root(tmp_path):
     return tmp_path / "scans"
 
 
-def globe(root, sides):
+def write_globe(root, sides):
     """Write all subjects as a bumpy ball with a texture seam, and a texture of smooth colours for the first subject.
 
     `sides` is the (height, width) of the texture, texels. The function returns the vertices, the faces, the texture
@@ -80,13 +80,13 @@ def globe(root, sides):
     return vertices, np.array(faces), places, np.array(uv_faces), pixels
 
 
-def light(stored):
+def decode_srgb(stored):
     """Return linear RGB of 8-bit sRGB numbers (IEC 61966-2-1)."""
     share = stored / 255
     return np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
 
 
-def traced(vertices, faces, places, uv_faces, texels):
+def trace_rays(vertices, faces, places, uv_faces, texels):
     """Return the image by one ray per sample: the texture of the nearest triangle that the ray meets.
 
     Intersections follow Möller & Trumbore (1997); texels are interpolated between the four nearest.
@@ -125,13 +125,13 @@ def traced(vertices, faces, places, uv_faces, texels):
 @pytest.mark.parametrize("times", [1, 2])
 def test_a_textured_mesh_is_what_a_ray_through_every_sample_sees(root, times):
     """Check a texture of the largest size, and a finer one, which is averaged in linear RGB."""
-    vertices, faces, places, uv_faces, pixels = globe(root, (32 * times, 96 * times))
-    texels = light(pixels).reshape(32, times, 96, times, 3).mean((1, 3))
+    vertices, faces, places, uv_faces, pixels = write_globe(root, (32 * times, 96 * times))
+    texels = decode_srgb(pixels).reshape(32, times, 96, times, 3).mean((1, 3))
     placed = vertices + np.array([0.1, -0.05, 2.0])
     colors = np.random.default_rng(0).integers(0, 256, (len(vertices), 3), np.uint8)
     cloud = torch.from_numpy(np.concatenate([placed, colors / 255], 1)).float()
     rendered = build_encoder(root)(cloud[None])[0].movedim(0, -1).numpy()
-    wanted = traced(placed, faces, places, uv_faces, texels)
+    wanted = trace_rays(placed, faces, places, uv_faces, texels)
     differences = np.abs(rendered - wanted).max(-1)
     assert 0.3 < (wanted < 0.99).any(-1).mean() < 0.9
     assert np.median(differences) < 1e-3 and (differences > 1 / 255).mean() < 0.02, (
@@ -180,7 +180,7 @@ def test_extreme_vertices_leave_a_finite_picture(root):
     assert torch.equal(rasterised(padded), rasterised(inputs_of(1)))
 
 
-def places(**change):
+def change_arrays(**change):
     def spoil(root):
         arrays = dict(np.load(root / "topology_7k.npz"))
         np.savez(
@@ -190,12 +190,12 @@ def places(**change):
     return spoil
 
 
-def alike(root):
+def write_equal_colors(root):
     for name in ("ann", "dan"):
         scan_layout.write_registration(root / f"subjects/{name}/registration_7k.ply", colored_mesh(2))
 
 
-def gone(root):
+def remove_folder(root):
     shutil.rmtree(root)
 
 
@@ -210,18 +210,18 @@ WRONG = {
         for kind in DAMAGES
     },
     "another mesh's": (
-        places(faces=lambda faces: faces[::-1]),
+        change_arrays(faces=lambda faces: faces[::-1]),
         "are not the 2 faces of the registered meshes",
     ),
     "fewer faces": (
-        places(faces=lambda faces: faces[:1], uv_faces=lambda faces: faces[:1]),
+        change_arrays(faces=lambda faces: faces[:1], uv_faces=lambda faces: faces[:1]),
         "the 1 faces in",
     ),
-    "no such place": (places(uv_faces=lambda faces: faces + 1), "does not fit"),
-    "in space": (places(uv=lambda uv: np.pad(uv, ((0, 0), (0, 1)))), "topology_7k.npz"),
-    "nowhere": (places(uv=lambda uv: uv * np.nan), "does not fit"),
-    "colours of another": (alike, "have the same vertex colours"),
-    "gone": (gone, "no such folder"),
+    "no such place": (change_arrays(uv_faces=lambda faces: faces + 1), "does not fit"),
+    "in space": (change_arrays(uv=lambda uv: np.pad(uv, ((0, 0), (0, 1)))), "topology_7k.npz"),
+    "nowhere": (change_arrays(uv=lambda uv: uv * np.nan), "does not fit"),
+    "colours of another": (write_equal_colors, "have the same vertex colours"),
+    "gone": (remove_folder, "no such folder"),
 }
 
 

@@ -57,7 +57,7 @@ class Plain:
         )
         kernel = self.state["head.weight"]
         around = kernel.shape[-1] // 2
-        raw = functional.conv2d(padded(maps - white, 0 * white, around), kernel, self.state["head.bias"])
+        raw = functional.conv2d(pad_maps(maps - white, 0 * white, around), kernel, self.state["head.bias"])
         raw = functional.pixel_shuffle(raw, 1 if self.name == "unet" else 2)[..., :height, :width]
         return torch.cat([(6 * (1 + raw[:, :colors])).sigmoid(), raw[:, colors:]], 1)
 
@@ -68,7 +68,7 @@ class Plain:
         )
         self.step += 1
         stride, around = (2, 0) if weight.shape[-1] == 2 else (1, 1)
-        raw = functional.conv2d(padded(maps, white, around), weight, stride=stride)
+        raw = functional.conv2d(pad_maps(maps, white, around), weight, stride=stride)
         ground = functional.conv2d(white.expand(-1, -1, *weight.shape[2:]), weight)
         moments = (mean + ground[0, :, 0, 0], variance)
         return (
@@ -76,7 +76,7 @@ class Plain:
         )
 
     def double_size(self, maps, white):
-        wide = functional.interpolate(padded(maps, white, 1), scale_factor=2, mode="bilinear")
+        wide = functional.interpolate(pad_maps(maps, white, 1), scale_factor=2, mode="bilinear")
         return wide[..., 2:-2, 2:-2], white
 
     def unet(self, maps, white):
@@ -104,7 +104,7 @@ class Plain:
         return self.layer(maps, white)
 
 
-def padded(maps, white, around):
+def pad_maps(maps, white, around):
     return functional.pad(maps - white, (around,) * 4) + white
 
 
