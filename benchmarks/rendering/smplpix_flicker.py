@@ -45,7 +45,7 @@ BRIGHT = 60.0
 Images = dict[str, list[Tensor]]
 
 
-def rendered(name: str, **config: Any) -> Renderer:
+def build_renderer(name: str, **config: Any) -> Renderer:
     return build("renderer", resolve("renderer", {"name": name, **config}))
 
 
@@ -57,9 +57,9 @@ def walk(run: str, file: Path, subject: str) -> tuple[Images, list[Scene]]:
     who, moments = follow_motion(generated_person(data, subject), file, FRAMES, START)
     cameras = orbit(moments, [AZIMUTH] * FRAMES, (height, width))
     ways = {
-        "mesh, 1 sample": rendered("rasterizer"),
-        "mesh, 4 × 4 samples": rendered("rasterizer", supersampling=4),
-        "SMPLpix": rendered("smplpix", checkpoint=run),
+        "mesh, 1 sample": build_renderer("rasterizer"),
+        "mesh, 4 × 4 samples": build_renderer("rasterizer", supersampling=4),
+        "SMPLpix": build_renderer("smplpix", checkpoint=run),
     }
     images: Images = {name: [] for name in (*ways, "photograph")}
     scenes = [who.scene(moment, camera) for moment, camera in zip(moments, cameras, strict=True)]
@@ -80,7 +80,7 @@ def differences(images: Images, scenes: list[Scene]) -> tuple[dict[str, list[Ten
         Differences by way to draw, (height, width) for each pair, NaN at pixels whose point is not visible in both
         images; and the masks of the other pixels.
     """
-    renderer = rendered("rasterizer")
+    renderer = build_renderer("rasterizer")
     rendered_channels = [renderer(scene, flow.CHANNELS) for scene in scenes]
     changes: dict[str, list[Tensor]] = {name: [] for name in images}
     masks = []
@@ -136,7 +136,7 @@ def rates(run: str, scene: Scene) -> list[str]:
         [scene.camera.to_canonical(scene.vertices), srgb_from_linear(scene.colors)], 1
     ).numpy()[None]
     loaded, frozen = framework.load(run), framework.freeze(run)
-    renderer = rendered("smplpix", checkpoint=run)
+    renderer = build_renderer("smplpix", checkpoint=run)
 
     @torch.no_grad()
     def predicted() -> object:
@@ -174,15 +174,16 @@ def rates(run: str, scene: Scene) -> list[str]:
     ]
 
 
-def training(run: str) -> str:
-    """Return a sentence about the network and its training."""
+def describe_training(run: str) -> str:
+    """Return the encoders of a network, how they were trained, and the PSNR; the text continues a sentence."""
     description, _ = read_stored(run)
     results = json.loads((find_checkpoint(run).parent.parent / "results.json").read_text())
     journal = (find_checkpoint(run).parent.parent / "journal.jsonl").read_text().splitlines()
     epochs = 1 + max(json.loads(line).get("epoch") or 0 for line in journal)
     names = " + ".join(part["name"] for part in description.config["encoder"])
     return (
-        f"{names}, {epochs} epochs of {results['experiment']}; on unseen subjects PSNR {results['psnr_db']:.1f} dB, "
+        f"the encoders {names}, trained for {epochs} epochs with `experiment={results['experiment']}`. For subjects "
+        f"who are not in the training data, the PSNR is {results['psnr_db']:.1f} dB in the whole image and "
         f"{results['psnr_masked_db']:.1f} dB inside the subject."
     )
 
@@ -209,7 +210,7 @@ def report(run: str, file: Path) -> str:
             "images differ after the known motion is removed. It compares renders of a mesh, images of a neural "
             "network (SMPLpix), and photographs. All people and photographs are synthetic.",
             "",
-            f"The network and its training are: {training(run)}",
+            f"The network SMPLpix consists of {describe_training(run)}",
             "",
             f"{len(SUBJECTS)} generated people who are not in the training data walk as the motion file `{file.name}` "
             f"says. There are {FRAMES} images of each, at {SPEED} images a second, with {scenes[0].camera.height} × "

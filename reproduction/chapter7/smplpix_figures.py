@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from benchmarks.pages import machine, write_page
-from benchmarks.rendering.smplpix_flicker import rendered, training
+from benchmarks.rendering.smplpix_flicker import build_renderer, describe_training
 from framework.bodies import poses
 from framework.bodies.shape_space import reduce_shapes
 from framework.configuration.loading import read_stored
@@ -83,10 +83,10 @@ def main(runs: Sequence[str]) -> None:
     description, _ = read_stored(runs[0])
     data = data_of(description)
     height, width = description.target.size or (256, 192)
-    renderers = {"mesh": rendered("rasterizer", supersampling=4)}
+    renderers = {"mesh": build_renderer("rasterizer", supersampling=4)}
     for run in runs:
         method = read_stored(run)[0].method
-        renderers[NAMES.get(method, method)] = rendered("smplpix", checkpoint=run)
+        renderers[NAMES.get(method, method)] = build_renderer("smplpix", checkpoint=run)
     methods = DrawingMethods(renderers, data.renderer, (height, width))
     people = [generated_person(data, name) for name in SUBJECTS]
     figures = {
@@ -105,7 +105,9 @@ def main(runs: Sequence[str]) -> None:
         draw_sheet(images_by_shot, title).savefig(path)
         lines += [f"## {title}", "", f"![{title}]({path.name})", "", psnr_sentence(images_by_shot), ""]
     about = ABOUT.format(height=height, width=width, vertices=len(people[0].registration.vertices))
-    trained = [f"- {name}: {training(run)}" for name, run in zip(list(renderers)[1:], runs, strict=True)]
+    trained = [
+        f"- {name}: {describe_training(run)}" for name, run in zip(list(renderers)[1:], runs, strict=True)
+    ]
     footer = f"{machine('torch', 'numpy')} Command: `python -m reproduction.chapter7.smplpix_figures <runs>`."
     text = [
         "# Qualitative results of SMPLpix, as in Figures 7.2 to 7.5 (synthetic people)",
