@@ -158,8 +158,8 @@ def main() -> None:
             "",
             "## Dropout at test time",
             "",
-            "The wrapper `mc_dropout` averages the predictions under S random dropout masks. In brackets follows how "
-            "many times faster this is than S predictions with one mask each.",
+            "The wrapper `mc_dropout` returns a mixture of the densities under S random dropout masks. In brackets "
+            "follows how many times faster this is than S predictions with one mask each.",
             "",
             f"| network | {' | '.join(f'S = {samples}' for samples in SAMPLES)} |",
             f"|---|{'---:|' * len(SAMPLES)}",
