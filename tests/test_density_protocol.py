@@ -41,30 +41,13 @@ from torch.distributions import Categorical, Dirichlet, Distribution, Independen
 
 from framework.configuration.registry import installed
 from framework.configuration.schema import build, resolve
+from framework.distributions import protocol
 from framework.distributions.affine import AffineDensity
 from framework.distributions.batch_shapes import Reshaped, Stacked
 from framework.distributions.circular import Circular
 from framework.distributions.circular_moments import circular_moments
 from framework.distributions.class_probabilities import class_probabilities
 from framework.distributions.density import Mixture
-from framework.distributions.protocol import (
-    arc_probability,
-    cdf,
-    estimate,
-    images,
-    mahalanobis,
-    marginal,
-    marginal_cdfs,
-    median,
-    mode_candidates,
-    normals,
-    peak_widths,
-    pick,
-    quadratic_bound,
-    recentre,
-    tempered_density,
-    value_set,
-)
 from framework.distributions.tempering import CircularPower, temper
 from framework.errors import UserError
 from framework.geometry.srgb import linear_from_srgb
@@ -129,7 +112,7 @@ class Made:
     @property
     def slow(self) -> bool:
         """Return whether each log-density needs its own random draws, so that a grid of values takes too long."""
-        return bool((estimate(self.parts[0], self.value).samples > 0).any()) and not isinstance(
+        return bool((protocol.estimate(self.parts[0], self.value).samples > 0).any()) and not isinstance(
             self.parts[0], Mixture
         )
 
@@ -254,9 +237,9 @@ def ids(rows) -> Iterator[str]:
 
 def shown_or_refused(part: Distribution, density: Distribution) -> None:
     """Images of each item of the batch, of a density that draws some; else a sentence that says how to."""
-    draws = images.dispatch(type(part)) is not images.dispatch(Distribution)
+    draws = protocol.images.dispatch(type(part)) is not protocol.images.dispatch(Distribution)
     try:
-        found = images(density, {"mask", "color"})
+        found = protocol.images(density, {"mask", "color"})
     except UserError as error:
         assert re.search(r"provides no color, mask.*protocol\.images\.register", str(error))
         return
@@ -266,7 +249,7 @@ def shown_or_refused(part: Distribution, density: Distribution) -> None:
 
 def pictured(kind: str, made: Made, density: Distribution) -> None:
     """An image over every structure: the light of one density's mean, of several the mean of theirs."""
-    found = images(density, {"color"})["color"]
+    found = protocol.images(density, {"color"})["color"]
     parts = torch.stack([linear_from_srgb(part.mean) for part in made.parts], -1)
     wanted = parts[..., 0] if kind in ("itself", "with a set", "mixture of one") else None
     if kind == "stacked":
@@ -303,15 +286,15 @@ def test_every_question_to_every_structure_of_every_head(name: str, row: HeadRow
             if row.target.kind == "image":
                 pictured(kind, made, density)
             elif row.target.kind != "class":
-                here = marginal(density, 0)
+                here = protocol.marginal(density, 0)
                 assert tuple(here.event_shape) == (1,)
-                other = marginal(theirs[kind], 0)
+                other = protocol.marginal(theirs[kind], 0)
                 never_silently_exact(here, other, value[..., :1], warm=kind in ("itself", "mixture"))
 
 
 def densities(kind: str, made: Made, density: Distribution, value: Tensor) -> None:
     """log_prob, estimate, marginal, tempered."""
-    found = estimate(density, value)
+    found = protocol.estimate(density, value)
     close(found.log_mean, density.log_prob(value), 1e-12)
     wanted = log_mixed(kind, made, lambda part, at: part.log_prob(at))
     if wanted is not None:
@@ -338,8 +321,8 @@ def densities(kind: str, made: Made, density: Distribution, value: Tensor) -> No
             close(warm.log_prob(value), power.log_softmax(0).gather(0, value.unsqueeze(0))[0])
         return
     try:
-        warm = tempered_density(density, WARM)
-        parts = [tempered_density(part, WARM) for part in made.parts]
+        warm = protocol.tempered_density(density, WARM)
+        parts = [protocol.tempered_density(part, WARM) for part in made.parts]
     except UserError as error:
         assert "protocol.tempered_density.register" in str(error)
         return
@@ -357,7 +340,7 @@ def one_number(kind: str, made: Made, density: Distribution, value: Tensor, inde
     here = slice(index, index + 1)
 
     def log_prob(part: Distribution, at: Tensor) -> Tensor:
-        return marginal(part, index).log_prob(at[..., here])
+        return protocol.marginal(part, index).log_prob(at[..., here])
 
     try:
         found = log_prob(density, value)
@@ -369,7 +352,7 @@ def one_number(kind: str, made: Made, density: Distribution, value: Tensor, inde
         close(found, (0.9 * log_prob(made.parts[0], made.value).exp() + 0.1 * uniform).log())
         return
     if kind == "with a set" and density.event_shape == (1,):
-        assert marginal(density, 0) is density
+        assert protocol.marginal(density, 0) is density
         return
     wanted = log_mixed(kind, made, log_prob)
     if wanted is not None:
@@ -377,12 +360,12 @@ def one_number(kind: str, made: Made, density: Distribution, value: Tensor, inde
 
 
 def sampled(made: Made) -> bool:
-    return bool((estimate(made.parts[0], made.value).samples > 0).any())
+    return bool((protocol.estimate(made.parts[0], made.value).samples > 0).any())
 
 
 def errors(kind: str, made: Made, found) -> None:
     """Monte Carlo errors by the delta method, item by item; samples add up."""
-    parts = [estimate(part, made.value) for part in made.parts]
+    parts = [protocol.estimate(part, made.value) for part in made.parts]
     error = torch.stack([part.standard_error for part in parts], -1)
     count = torch.stack([part.samples for part in parts], -1)
     logs = torch.stack([part.log_mean for part in parts], -1)
@@ -408,32 +391,35 @@ def errors(kind: str, made: Made, found) -> None:
 def draws(kind: str, made: Made, density: Distribution) -> None:
     """median, pick, peaks, value_set."""
     torch.manual_seed(3)
-    found = median(density, 20)
+    found = protocol.median(density, 20)
     assert found.shape == density.batch_shape + density.event_shape
     torch.manual_seed(3)
     # a floor moves no median where every point is as far from it as any other: not elevations
     flat = not getattr(density.support, "ranges", None)
     if kind in ("with a set", "mixture of one", "itself") or (kind == "floored" and flat):
-        assert torch.equal(found, median(made.parts[0], 20))
+        assert torch.equal(found, protocol.median(made.parts[0], 20))
     elif kind == "moved there and back":
-        close(found, median(made.parts[0], 20))
+        close(found, protocol.median(made.parts[0], 20))
     elif kind == "stacked":
-        assert torch.equal(found, torch.stack([median(part, 20) for part in made.parts], 1))
+        assert torch.equal(found, torch.stack([protocol.median(part, 20) for part in made.parts], 1))
     elif kind == "reshaped":
-        assert torch.equal(found, median(made.parts[0], 20).reshape(found.shape))
+        assert torch.equal(found, protocol.median(made.parts[0], 20).reshape(found.shape))
     elif made.target.kind == "image":  # of several nothing is drawn
         assert torch.equal(found, density.mean)
     else:
-        assert torch.equal(found, median.dispatch(Distribution)(density, 20))
+        assert torch.equal(found, protocol.median.dispatch(Distribution)(density, 20))
     # the last batch dimension read as components: 300 draws of each
     count, components = 300, density.batch_shape[-1]
     index = torch.arange(components).expand(count, components)
     if len(density.batch_shape) == 1:
-        picked = torch.stack([pick(density, column).sample() for column in index.unbind(1)], 1)
+        picked = torch.stack([protocol.pick(density, column).sample() for column in index.unbind(1)], 1)
     else:
         first = density.batch_shape[0]
         picked = torch.stack(
-            [pick(density, column.unsqueeze(1).expand(count, first)).sample() for column in index.unbind(1)],
+            [
+                protocol.pick(density, column.unsqueeze(1).expand(count, first)).sample()
+                for column in index.unbind(1)
+            ],
             2,
         )
     whole = density.sample(torch.Size((count,)))
@@ -442,9 +428,9 @@ def draws(kind: str, made: Made, density: Distribution) -> None:
     noise = (features(picked, made).var(0) + features(whole, made).var(0)).div(count).sqrt()
     assert (gap <= 6 * noise + 0.02).all(), f"{kind}: picked {gap.max()}"
     if made.target.kind != "class":
-        humps = mode_candidates(density)
+        humps = protocol.mode_candidates(density)
         assert humps.shape[1:] == density.batch_shape + density.event_shape
-        wanted = [mode_candidates(part) for part in made.parts]
+        wanted = [protocol.mode_candidates(part) for part in made.parts]
         if kind in ("mixture", "mixture of mixtures"):
             assert all((humps == peak).flatten(2).all(2).any(0).all() for part in wanted for peak in part)
         elif kind == "stacked":
@@ -453,13 +439,17 @@ def draws(kind: str, made: Made, density: Distribution) -> None:
             assert torch.equal(humps, wanted[0])
         elif kind == "moved there and back":
             close(humps, wanted[0])
-    assert (value_set(density) is density) if kind == "with a set" else value_set(density) is None
+    assert (
+        (protocol.value_set(density) is density)
+        if kind == "with a set"
+        else protocol.value_set(density) is None
+    )
 
 
 def bounds(made: Made, density: Distribution, value: Tensor) -> None:
     """slope: where the parts know theirs, the density's own, and what it promises of the density elsewhere."""
-    found = quadratic_bound(density, value)
-    if any(quadratic_bound(part, made.value) is None for part in made.parts):
+    found = protocol.quadratic_bound(density, value)
+    if any(protocol.quadratic_bound(part, made.value) is None for part in made.parts):
         assert found is None
         return
     close(found.log_prob, density.log_prob(value), 1e-12)
@@ -493,31 +483,37 @@ def closed_forms(kind: str, made: Made, density: Distribution, value: Tensor) ->
         each_number(kind, made, density, value)
         return
     each_number(kind, made, density, value)
-    one, at = marginal(density, 0), value[..., :1]
+    one, at = protocol.marginal(density, 0), value[..., :1]
     if one is density and kind == "with a set":
-        one = marginal(density.components, 0)  # that of a latent-variable density is of its mixture
+        one = protocol.marginal(density.components, 0)  # that of a latent-variable density is of its mixture
         one = Mixture(density.log_weights, one)
     if made.target.kind == "real":
-        assert arc_probability(one, at, at) is None
-        mass = mass_of(kind, made, lambda part, y: cdf(marginal(part, 0), y[..., :1]))
-        agree(cdf(one, at), mass)
-        known = normals(one)
+        assert protocol.arc_probability(one, at, at) is None
+        mass = mass_of(kind, made, lambda part, y: protocol.cdf(protocol.marginal(part, 0), y[..., :1]))
+        agree(protocol.cdf(one, at), mass)
+        known = protocol.normals(one)
         if kind != "mixture of mixtures":  # whose parts are of different numbers of normals
-            assert (known is None) == (normals(marginal(made.parts[0], 0)) is None)
+            assert (known is None) == (protocol.normals(protocol.marginal(made.parts[0], 0)) is None)
         if known is not None:
             log_prob = (known.log_weights + Normal(known.mean, known.scale).log_prob(at)).logsumexp(-1)
             close(log_prob, one.log_prob(at), 1e-6)
-        squared = mahalanobis(density, value)
-        wanted = item_of(kind, made, mahalanobis)
+        squared = protocol.mahalanobis(density, value)
+        wanted = item_of(kind, made, protocol.mahalanobis)
         assert (squared is None) == (wanted is None), kind
         agree(squared, wanted)
         moments(kind, made, density)
         return
-    assert cdf(one, at) is None and normals(one) is None and mahalanobis(one, at) is None
-    mass = mass_of(
-        kind, made, lambda part, y: arc_probability(marginal(part, 0), y[..., :1], y[..., :1] + 2.0)
+    assert (
+        protocol.cdf(one, at) is None
+        and protocol.normals(one) is None
+        and protocol.mahalanobis(one, at) is None
     )
-    found = arc_probability(one, at, at + 2.0)
+    mass = mass_of(
+        kind,
+        made,
+        lambda part, y: protocol.arc_probability(protocol.marginal(part, 0), y[..., :1], y[..., :1] + 2.0),
+    )
+    found = protocol.arc_probability(one, at, at + 2.0)
     if mass is not None and kind == "floored":
         mass = 0.9 * mass + 0.1 * 2.0 / (2 * math.pi)
     agree(found, mass)
@@ -529,14 +525,17 @@ def closed_forms(kind: str, made: Made, density: Distribution, value: Tensor) ->
 
 def each_number(kind: str, made: Made, density: Distribution, value: Tensor) -> None:
     """each_cdf: of an image of the parts' by plain sums, of a few numbers that of each marginal; or None as of them."""
-    found = marginal_cdfs(density, value)
+    found = protocol.marginal_cdfs(density, value)
     if made.target.kind == "image":
-        parts = torch.stack([marginal_cdfs(part, made.value) for part in made.parts], 1)
+        parts = torch.stack([protocol.marginal_cdfs(part, made.value) for part in made.parts], 1)
         assert found is not None and found.shape == value.shape and found.dtype == torch.float64
         if kind not in ("tempered", "mixture of a fold"):  # densities, or at values, of their own
             close(found, combined(kind, made, parts))
         return
-    parts = [cdf(marginal(density, index), value[..., index : index + 1]) for index in event(made)]
+    parts = [
+        protocol.cdf(protocol.marginal(density, index), value[..., index : index + 1])
+        for index in event(made)
+    ]
     assert (found is None) == any(part is None for part in parts)
     agree(found, None if found is None else torch.stack(parts, -1))
 
@@ -609,10 +608,10 @@ def never_silently_exact(
     """Made twice with other seeds: where log-densities differ, neither says that nothing was drawn."""
     for one, two in ((density, other), *(warm_of(density, other) if warm else ())):
         differs = one.log_prob(value) != two.log_prob(value)
-        for found in (estimate(one, value), estimate(two, value)):
+        for found in (protocol.estimate(one, value), protocol.estimate(two, value)):
             assert not (differs & (found.standard_error == 0)).any(), type(one).__name__
         if not bool(differs.any()):
-            assert not estimate(one, value).standard_error.any()  # and nothing here is unknown
+            assert not protocol.estimate(one, value).standard_error.any()  # and nothing here is unknown
 
 
 def warm_of(density: Distribution, other: Distribution) -> list[tuple[Distribution, Distribution]]:
@@ -627,7 +626,7 @@ class Untold(Cardioid):
     """A stranger's density: only log_prob, sample and mode, and not a word on how log_prob comes about."""
 
 
-estimate.register(Untold, estimate.dispatch(Distribution))
+protocol.estimate.register(Untold, protocol.estimate.dispatch(Distribution))
 
 
 def test_defaults_do_not_claim_to_be_exact() -> None:
@@ -646,24 +645,24 @@ def test_defaults_do_not_claim_to_be_exact() -> None:
         (Independent(Untold(torch.randn(4, 3, 1).double()), 1), value.unsqueeze(1).expand(4, 3, 1)),
     ]
     for one, at in structures:
-        found = estimate(one, at)
+        found = protocol.estimate(one, at)
         assert torch.equal(found.log_mean, one.log_prob(at))
         assert (found.standard_error.isnan() | (found.standard_error == 0)).all()
         assert found.standard_error.isnan().any() and not found.samples.any()
     # a weight of nothing silences what is not known
     ruled_out = Mixture(torch.tensor([[0.0, -math.inf]]).expand(4, 2), Stacked([Cardioid(value), density]))
-    assert not estimate(ruled_out, value).standard_error.any()
+    assert not protocol.estimate(ruled_out, value).standard_error.any()
     for question in (
-        lambda: cdf(density, value),
-        lambda: arc_probability(density, value, value),
-        lambda: normals(density),
+        lambda: protocol.cdf(density, value),
+        lambda: protocol.arc_probability(density, value, value),
+        lambda: protocol.normals(density),
     ):
         assert question() is None
-    assert mahalanobis(density, value) is value_set(density) is None
+    assert protocol.mahalanobis(density, value) is protocol.value_set(density) is None
     with pytest.raises(UserError, match=r"protocol\.marginal\.register"):
-        marginal(Dirichlet(torch.ones(3)), 0)
+        protocol.marginal(Dirichlet(torch.ones(3)), 0)
     with pytest.raises(UserError, match=r"protocol\.tempered_density\.register"):
-        tempered_density(Dirichlet(torch.ones(3)), WARM)
+        protocol.tempered_density(Dirichlet(torch.ones(3)), WARM)
 
 
 LOC = torch.linspace(-2, 3, 12, dtype=torch.float64).reshape(2, 2, 3)
@@ -715,7 +714,7 @@ def test_the_marginal_of_a_product_is_its_factor(family: str) -> None:
         total = torch.zeros(4, *batch, dtype=torch.float64)
         wide = value if batch == (2, 2) else value.unsqueeze(1)
         for index in range(3):
-            factor = marginal(one, index)
+            factor = protocol.marginal(one, index)
             assert (factor.batch_shape, tuple(factor.event_shape)) == (batch, (1,))
             here = wide[..., index : index + 1]
             found = factor.log_prob(here)
@@ -734,7 +733,7 @@ def test_one_of_several_products_is_picked_without_drawing_the_others(family: st
     base, _ = FAMILIES[family]
     density = Independent(base, 1)
     index = torch.tensor([[0, 1], [1, 0], [1, 1]])
-    picked = pick(density, index)
+    picked = protocol.pick(density, index)
     assert isinstance(picked, Independent)
     torch.manual_seed(0)
     every = density.sample()
@@ -754,7 +753,11 @@ def test_what_was_asked_of_a_product_before_changes_no_marginal(kind: type, give
     assert asked.base_dist.probs.shape == asked.base_dist.logits.shape
     value = torch.zeros(2, 2, 1, dtype=torch.float64)
     for index in range(3):
-        close(marginal(asked, index).log_prob(value), marginal(fresh, index).log_prob(value), 1e-12)
+        close(
+            protocol.marginal(asked, index).log_prob(value),
+            protocol.marginal(fresh, index).log_prob(value),
+            1e-12,
+        )
 
 
 class Own(Laplace):
@@ -796,7 +799,7 @@ class Own(Laplace):
 )
 def test_a_product_whose_factors_are_not_known_says_what_to_do(density: Distribution) -> None:
     with pytest.raises(UserError, match=r"has no marginal .*protocol\.marginal\.register"):
-        marginal(density, 1)
+        protocol.marginal(density, 1)
 
 
 def test_the_marginal_of_a_subclass_is_as_its_base_says() -> None:
@@ -805,12 +808,16 @@ def test_the_marginal_of_a_subclass_is_as_its_base_says() -> None:
     for index in range(3):
         here = slice(index, index + 1)
         close(
-            marginal(density, index).log_prob(value[..., here]),
+            protocol.marginal(density, index).log_prob(value[..., here]),
             Laplace(WIDE, WIDE).log_prob(value)[..., index],
             1e-12,
         )
     joint = Independent(distributions.MultivariateNormal(LOC, torch.diag_embed(WIDE.square())), 0)
-    close(marginal(joint, 2).log_prob(LOC[..., 2:] + 1), Normal(LOC, WIDE).log_prob(LOC + 1)[..., 2], 1e-12)
+    close(
+        protocol.marginal(joint, 2).log_prob(LOC[..., 2:] + 1),
+        Normal(LOC, WIDE).log_prob(LOC + 1)[..., 2],
+        1e-12,
+    )
 
 
 @pytest.mark.parametrize(
@@ -820,8 +827,10 @@ def test_the_distribution_function_of_a_product_is_that_of_its_factors(family: s
     base, reference = FAMILIES[family]
     density = Independent(base, 1)
     value = LOC + torch.tensor([-1e3, -2.0, 0.0, 0.3, 50.0], dtype=torch.float64).reshape(5, 1, 1, 1)
-    found = marginal_cdfs(density, value)
-    columns = [cdf(marginal(density, index), value[..., index : index + 1]) for index in range(3)]
+    found = protocol.marginal_cdfs(density, value)
+    columns = [
+        protocol.cdf(protocol.marginal(density, index), value[..., index : index + 1]) for index in range(3)
+    ]
     if family == "gamma":
         assert found is None and columns == [None] * 3
         return
@@ -832,13 +841,13 @@ def test_the_distribution_function_of_a_product_is_that_of_its_factors(family: s
     close(found, torch.stack([column for column in columns if column is not None], -1), 1e-12)
     if family != "student":  # which has a third parameter
         single = Independent(type(base)(base.loc.float(), base.scale.float()), 1)
-        assert marginal_cdfs(single, value).dtype == torch.float64
+        assert protocol.marginal_cdfs(single, value).dtype == torch.float64
 
 
 def test_what_draws_nothing_says_so() -> None:
     density = Independent(Normal(torch.zeros(4, 1), torch.ones(4, 1)), 1)
     value = torch.randn(4, 1)
-    found = estimate(density, value)
+    found = protocol.estimate(density, value)
     assert torch.equal(found.log_mean, density.log_prob(value))
     assert torch.equal(found.debiased, found.log_mean)
     assert found.standard_error.tolist() == found.samples.tolist() == [0] * 4
@@ -864,16 +873,16 @@ def test_a_moved_normal_density_is_the_normal_density_there() -> None:
             lambda one: one.mode,
             lambda one: one.mean,
             lambda one: one.variance,
-            lambda one: median(one, 10),
-            lambda one, value=value: marginal(one, value.shape[-1] - 1).log_prob(value[..., -1:]),
-            lambda one, value=value: cdf(marginal(one, 0), value[..., :1]),
-            lambda one, value=value: mahalanobis(one, value),
+            lambda one: protocol.median(one, 10),
+            lambda one, value=value: protocol.marginal(one, value.shape[-1] - 1).log_prob(value[..., -1:]),
+            lambda one, value=value: protocol.cdf(protocol.marginal(one, 0), value[..., :1]),
+            lambda one, value=value: protocol.mahalanobis(one, value),
             lambda one, value=value: temper(one, WARM).log_prob(value),
-            lambda one: mode_candidates(one),
-            lambda one: peak_widths(marginal(one, 0)),
-            lambda one, value=value: torch.stack(list(normals(marginal(one, 0)))[1:]),
-            lambda one, value=value: recentre(
-                marginal(one, 0), (torch.tensor([0, 3]),), value[[0, 3], :1]
+            lambda one: protocol.mode_candidates(one),
+            lambda one: protocol.peak_widths(protocol.marginal(one, 0)),
+            lambda one, value=value: torch.stack(list(protocol.normals(protocol.marginal(one, 0)))[1:]),
+            lambda one, value=value: protocol.recentre(
+                protocol.marginal(one, 0), (torch.tensor([0, 3]),), value[[0, 3], :1]
             ).log_prob(torch.full((2, 1), 1e-3).double()),
         ]
         for question in questions:
@@ -881,9 +890,9 @@ def test_a_moved_normal_density_is_the_normal_density_there() -> None:
         chosen = torch.tensor([[0, 1, 2], [4, 0, 3]])
         for one, seed in ((found, 7), (wanted, 7)):
             torch.manual_seed(seed)
-            drawn = pick(one, chosen).sample()
+            drawn = protocol.pick(one, chosen).sample()
             torch.manual_seed(seed)
-            close(drawn, pick(wanted, chosen).sample())
+            close(drawn, protocol.pick(wanted, chosen).sample())
     with pytest.raises(ValueError, match="expected the same shape"):
         AffineDensity(wanted, location[:1], unit)
 
@@ -903,7 +912,7 @@ def test_structures_show_what_is_drawn_inside_or_refuse(name: str) -> None:
     for kind, density in made.structures().items():
         for channels in ({"color"}, CHANNELS):
             try:
-                found = images(density, channels)
+                found = protocol.images(density, channels)
             except UserError as error:
                 assert "provides no color" in str(error)
                 continue
@@ -948,12 +957,12 @@ def test_a_density_over_images_shows_its_mean(kind: type) -> None:
         folded: torch.einsum("bk,bkhwc->bhwc", share(weights[:2, :2]), means[0].reshape(2, 2, 5, 7, 3)),
     }
     for density, color in wanted.items():
-        found = images(density, {"color"})
+        found = protocol.images(density, {"color"})
         assert found.keys() == {"color"}
         close(found["color"], color)
         for channels in ({"mask"}, {"color", "depth"}):
             with pytest.raises(UserError, match=f"provides no {', '.join(sorted(channels))}"):
-                images(density, channels)
+                protocol.images(density, channels)
     squares = torch.stack([part.variance for part in parts]) + means.square()
     close(inner.mean, mean)
     close(inner.variance, torch.einsum("bk,kbhwc->bhwc", share(weights), squares) - mean.square())
@@ -983,7 +992,7 @@ def test_every_structure_over_a_chart_is_a_density_there(name: str, row: HeadRow
             drawn = density.sample(torch.Size((200,)))
             for index, (low, high) in enumerate(ranges):
                 assert ((drawn[..., index] >= low) & (drawn[..., index] <= high)).all(), kind
-                one = marginal(density, index)
+                one = protocol.marginal(density, index)
                 at, share = nodes(low, high)
                 log_prob = one.log_prob(at.reshape(-1, *(1,) * len(batch), 1).expand(-1, *batch, 1))
                 mass = torch.einsum("n,n...->...", share, log_prob.exp())
@@ -1053,14 +1062,14 @@ def test_told_errors_are_the_spread_over_seeds(case: str) -> None:
             density = wrapper(inputs)
             again = wrapper(inputs)
             told = {
-                "ensemble": estimate(density, value),
-                "folded": estimate(
+                "ensemble": protocol.estimate(density, value),
+                "folded": protocol.estimate(
                     Reshaped(density, (ITEMS // 4, 4)), value.reshape(ITEMS // 4, 4, *value.shape[1:])
                 ),
-                "mixture of ensembles": estimate(
+                "mixture of ensembles": protocol.estimate(
                     Mixture(torch.zeros(ITEMS, 2), Stacked([density, again])), value
                 ),
-                "tempered": estimate(temper(density, WARM), value),
+                "tempered": protocol.estimate(temper(density, WARM), value),
             }
             for what, one in told.items():
                 found.setdefault(what, []).append(one)

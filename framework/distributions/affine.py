@@ -7,28 +7,8 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution, constraints
 
+from framework.distributions import protocol
 from framework.distributions.description import one_line
-from framework.distributions.protocol import (
-    Estimate,
-    Normals,
-    QuadraticBound,
-    ValueSet,
-    cdf,
-    estimate,
-    images,
-    mahalanobis,
-    marginal,
-    median,
-    mode_candidates,
-    normals,
-    peak_widths,
-    pick,
-    quadratic_bound,
-    recentre,
-    take,
-    tempered_density,
-    value_set,
-)
 
 
 class AffineDensity(Distribution):
@@ -95,93 +75,97 @@ class AffineDensity(Distribution):
         return self.density.entropy() + self.log_volume
 
 
-@marginal.register
+@protocol.marginal.register
 def _(density: AffineDensity, index: int) -> AffineDensity:
     column = slice(index, index + 1)
-    inner = marginal(density.density, index)
+    inner = protocol.marginal(density.density, index)
     return AffineDensity(inner, density.location[..., column], density.scale[..., column])
 
 
-@median.register
+@protocol.median.register
 def _(density: AffineDensity, samples: int) -> Tensor:
-    return density.outer(median(density.density, samples))
+    return density.outer(protocol.median(density.density, samples))
 
 
-@pick.register
+@protocol.pick.register
 def _(density: AffineDensity, index: Tensor) -> AffineDensity:
-    parameters = (take(number, index) for number in (density.location, density.scale))
-    return AffineDensity(pick(density.density, index), *parameters)
+    parameters = (protocol.take(number, index) for number in (density.location, density.scale))
+    return AffineDensity(protocol.pick(density.density, index), *parameters)
 
 
-@recentre.register
+@protocol.recentre.register
 def _(density: AffineDensity, index: tuple[Tensor, ...], origin: Tensor) -> AffineDensity:
     # X - origin = scale · (Y - y) with y = (origin - location) / scale
     location, scale = (number.double()[index] for number in (density.location, density.scale))
-    inner = recentre(density.density, index, (origin - location) / scale)
+    inner = protocol.recentre(density.density, index, (origin - location) / scale)
     scale = scale.expand((*inner.batch_shape, 1))
     return AffineDensity(inner, torch.zeros_like(scale), scale)
 
 
-@tempered_density.register
+@protocol.tempered_density.register
 def _(density: AffineDensity, temperature: Tensor) -> AffineDensity:
-    return AffineDensity(tempered_density(density.density, temperature), density.location, density.scale)
+    return AffineDensity(
+        protocol.tempered_density(density.density, temperature), density.location, density.scale
+    )
 
 
-@estimate.register
-def _(density: AffineDensity, value: Tensor) -> Estimate:
-    inner_estimate = estimate(density.density, density.inner(value))
+@protocol.estimate.register
+def _(density: AffineDensity, value: Tensor) -> protocol.Estimate:
+    inner_estimate = protocol.estimate(density.density, density.inner(value))
     down = density.log_volume
     return inner_estimate._replace(
         log_mean=inner_estimate.log_mean - down, debiased=inner_estimate.debiased - down
     )
 
 
-@cdf.register
+@protocol.cdf.register
 def _(density: AffineDensity, value: Tensor) -> Tensor | None:
-    return cdf(density.density, density.inner(value))
+    return protocol.cdf(density.density, density.inner(value))
 
 
-@normals.register
-def _(density: AffineDensity) -> Normals | None:
-    inner_normals = normals(density.density)
+@protocol.normals.register
+def _(density: AffineDensity) -> protocol.Normals | None:
+    inner_normals = protocol.normals(density.density)
     if inner_normals is None:
         return None
     location, scale = density.location.double(), density.scale.double()
-    return Normals(
+    return protocol.Normals(
         inner_normals.log_weights, location + scale * inner_normals.mean, scale * inner_normals.scale
     )
 
 
-@mahalanobis.register
+@protocol.mahalanobis.register
 def _(density: AffineDensity, value: Tensor) -> Tensor | None:
-    return mahalanobis(density.density, density.inner(value))
+    return protocol.mahalanobis(density.density, density.inner(value))
 
 
-@quadratic_bound.register
-def _(density: AffineDensity, value: Tensor) -> QuadraticBound | None:
-    inner_bound = quadratic_bound(density.density, density.inner(value))
+@protocol.quadratic_bound.register
+def _(density: AffineDensity, value: Tensor) -> protocol.QuadraticBound | None:
+    inner_bound = protocol.quadratic_bound(density.density, density.inner(value))
     if inner_bound is None:
         return None
     pull, stiffness = inner_bound.pull / density.scale, inner_bound.stiffness / density.scale.square()
-    return QuadraticBound(inner_bound.log_prob - density.log_volume, pull, stiffness)
+    return protocol.QuadraticBound(inner_bound.log_prob - density.log_volume, pull, stiffness)
 
 
-@images.register
+@protocol.images.register
 def _(density: AffineDensity, channels: Collection[str]) -> dict[str, Tensor]:
-    return images(density.density, channels)  # the transform changes numbers, not what an image shows
+    return protocol.images(
+        density.density, channels
+    )  # the transform changes numbers, not what an image shows
 
 
-@mode_candidates.register
+@protocol.mode_candidates.register
 def _(density: AffineDensity) -> Tensor:
-    return density.outer(mode_candidates(density.density))
+    return density.outer(protocol.mode_candidates(density.density))
 
 
-@peak_widths.register
+@protocol.peak_widths.register
 def _(density: AffineDensity) -> Tensor:
-    return peak_widths(density.density) * density.scale[..., 0]
+    return protocol.peak_widths(density.density) * density.scale[..., 0]
 
 
-class AffineSet(ValueSet):
+class AffineSet(protocol.ValueSet):
     """The set of Y, transformed by X = location + scale · Y.
 
     Args:
@@ -189,7 +173,7 @@ class AffineSet(ValueSet):
         density: the density of X.
     """
 
-    def __init__(self, inner: ValueSet, density: AffineDensity) -> None:
+    def __init__(self, inner: protocol.ValueSet, density: AffineDensity) -> None:
         self.inner = inner
         self.density = density
         self.stated_probability = inner.stated_probability
@@ -214,7 +198,7 @@ class AffineSet(ValueSet):
         return [[(at + by * part[0], at + by * part[1]) for part in parts] for parts, at, by in frames]  # type: ignore[index]
 
 
-@value_set.register
+@protocol.value_set.register
 def _(density: AffineDensity) -> AffineSet | None:
-    inner_set = value_set(density.density)
+    inner_set = protocol.value_set(density.density)
     return None if inner_set is None else AffineSet(inner_set, density)

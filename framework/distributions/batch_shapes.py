@@ -7,26 +7,8 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution, constraints
 
+from framework.distributions import protocol
 from framework.distributions.description import one_line
-from framework.distributions.protocol import (
-    Estimate,
-    Normals,
-    QuadraticBound,
-    arc_probability,
-    cdf,
-    estimate,
-    images,
-    mahalanobis,
-    marginal,
-    marginal_cdfs,
-    median,
-    mode_candidates,
-    normals,
-    peak_widths,
-    quadratic_bound,
-    recentre,
-    tempered_density,
-)
 
 
 class Stacked(Distribution):
@@ -161,173 +143,173 @@ class Reshaped(Distribution):
         return self.density.entropy().reshape(self.batch_shape)
 
 
-@marginal.register
+@protocol.marginal.register
 def _(density: Stacked, index: int) -> Stacked:
-    return Stacked([marginal(inner, index) for inner in density.densities])
+    return Stacked([protocol.marginal(inner, index) for inner in density.densities])
 
 
-@marginal.register
+@protocol.marginal.register
 def _(density: Reshaped, index: int) -> Reshaped:
-    return Reshaped(marginal(density.density, index), density.batch_shape)
+    return Reshaped(protocol.marginal(density.density, index), density.batch_shape)
 
 
-@tempered_density.register
+@protocol.tempered_density.register
 def _(density: Stacked, temperature: Tensor) -> Distribution:
-    return Stacked([tempered_density(inner, temperature) for inner in density.densities])
+    return Stacked([protocol.tempered_density(inner, temperature) for inner in density.densities])
 
 
-@tempered_density.register
+@protocol.tempered_density.register
 def _(density: Reshaped, temperature: Tensor) -> Distribution:
-    return Reshaped(tempered_density(density.density, temperature), density.batch_shape)
+    return Reshaped(protocol.tempered_density(density.density, temperature), density.batch_shape)
 
 
-@median.register
+@protocol.median.register
 def _(density: Stacked, samples: int) -> Tensor:
     axis = -1 - len(density.event_shape)
-    return torch.stack([median(inner, samples) for inner in density.densities], axis)
+    return torch.stack([protocol.median(inner, samples) for inner in density.densities], axis)
 
 
-@median.register
+@protocol.median.register
 def _(density: Reshaped, samples: int) -> Tensor:
-    return median(density.density, samples).reshape(*density.batch_shape, *density.event_shape)
+    return protocol.median(density.density, samples).reshape(*density.batch_shape, *density.event_shape)
 
 
-@estimate.register
-def _(density: Stacked, value: Tensor) -> Estimate:
-    parts = [estimate(inner, part) for inner, part in density.pair_with_values(value)]
-    return Estimate(*(torch.stack(fields, -1) for fields in zip(*parts, strict=True)))
+@protocol.estimate.register
+def _(density: Stacked, value: Tensor) -> protocol.Estimate:
+    parts = [protocol.estimate(inner, part) for inner, part in density.pair_with_values(value)]
+    return protocol.Estimate(*(torch.stack(fields, -1) for fields in zip(*parts, strict=True)))
 
 
-@estimate.register
-def _(density: Reshaped, value: Tensor) -> Estimate:
+@protocol.estimate.register
+def _(density: Reshaped, value: Tensor) -> protocol.Estimate:
     flat, shape = density.inner(value)
-    return estimate(density.density, flat).map_fields(lambda field: field.reshape(shape))
+    return protocol.estimate(density.density, flat).map_fields(lambda field: field.reshape(shape))
 
 
-@cdf.register
+@protocol.cdf.register
 def _(density: Stacked, value: Tensor) -> Tensor | None:
-    return _stack([cdf(inner, part) for inner, part in density.pair_with_values(value)])
+    return _stack([protocol.cdf(inner, part) for inner, part in density.pair_with_values(value)])
 
 
-@cdf.register
+@protocol.cdf.register
 def _(density: Reshaped, value: Tensor) -> Tensor | None:
     flat, shape = density.inner(value)
-    return _reshape(cdf(density.density, flat), shape)
+    return _reshape(protocol.cdf(density.density, flat), shape)
 
 
-@marginal_cdfs.register
+@protocol.marginal_cdfs.register
 def _(density: Stacked, value: Tensor) -> Tensor | None:
     return _stack(
-        [marginal_cdfs(inner, part) for inner, part in density.pair_with_values(value)],
+        [protocol.marginal_cdfs(inner, part) for inner, part in density.pair_with_values(value)],
         -1 - len(density.event_shape),
     )
 
 
-@marginal_cdfs.register
+@protocol.marginal_cdfs.register
 def _(density: Reshaped, value: Tensor) -> Tensor | None:
     flat, shape = density.inner(value)
-    return _reshape(marginal_cdfs(density.density, flat), shape + density.event_shape)
+    return _reshape(protocol.marginal_cdfs(density.density, flat), shape + density.event_shape)
 
 
-@arc_probability.register
+@protocol.arc_probability.register
 def _(density: Stacked, start: Tensor, end: Tensor) -> Tensor | None:
     both = zip(density.pair_with_values(start), density.pair_with_values(end), strict=True)
-    return _stack([arc_probability(inner, first, last) for (inner, first), (_, last) in both])
+    return _stack([protocol.arc_probability(inner, first, last) for (inner, first), (_, last) in both])
 
 
-@arc_probability.register
+@protocol.arc_probability.register
 def _(density: Reshaped, start: Tensor, end: Tensor) -> Tensor | None:
     start, end = torch.broadcast_tensors(start, end)
     flat, shape = density.inner(start)
-    return _reshape(arc_probability(density.density, flat, density.inner(end)[0]), shape)
+    return _reshape(protocol.arc_probability(density.density, flat, density.inner(end)[0]), shape)
 
 
-@mahalanobis.register
+@protocol.mahalanobis.register
 def _(density: Stacked, value: Tensor) -> Tensor | None:
-    return _stack([mahalanobis(inner, part) for inner, part in density.pair_with_values(value)])
+    return _stack([protocol.mahalanobis(inner, part) for inner, part in density.pair_with_values(value)])
 
 
-@mahalanobis.register
+@protocol.mahalanobis.register
 def _(density: Reshaped, value: Tensor) -> Tensor | None:
     flat, shape = density.inner(value)
-    return _reshape(mahalanobis(density.density, flat), shape)
+    return _reshape(protocol.mahalanobis(density.density, flat), shape)
 
 
-@normals.register
-def _(density: Stacked) -> Normals | None:
-    parts = [part for part in map(normals, density.densities) if part is not None]
+@protocol.normals.register
+def _(density: Stacked) -> protocol.Normals | None:
+    parts = [part for part in map(protocol.normals, density.densities) if part is not None]
     if len(parts) < len(density.densities) or len({part.mean.shape for part in parts}) > 1:
         return None
-    return Normals(*(torch.stack(numbers, -2) for numbers in zip(*parts, strict=True)))
+    return protocol.Normals(*(torch.stack(numbers, -2) for numbers in zip(*parts, strict=True)))
 
 
-@normals.register
-def _(density: Reshaped) -> Normals | None:
-    parts = normals(density.density)
+@protocol.normals.register
+def _(density: Reshaped) -> protocol.Normals | None:
+    parts = protocol.normals(density.density)
     if parts is None:
         return None
-    return Normals(*(number.reshape(*density.batch_shape, number.shape[-1]) for number in parts))
+    return protocol.Normals(*(number.reshape(*density.batch_shape, number.shape[-1]) for number in parts))
 
 
-@quadratic_bound.register
-def _(density: Stacked, value: Tensor) -> QuadraticBound | None:
-    parts = [quadratic_bound(inner, part) for inner, part in density.pair_with_values(value)]
+@protocol.quadratic_bound.register
+def _(density: Stacked, value: Tensor) -> protocol.QuadraticBound | None:
+    parts = [protocol.quadratic_bound(inner, part) for inner, part in density.pair_with_values(value)]
     known = [part for part in parts if part is not None]
     if len(known) < len(parts):
         return None
     log_prob, *bounds = zip(*known, strict=True)
-    return QuadraticBound(torch.stack(log_prob, -1), *(torch.stack(field, -2) for field in bounds))
+    return protocol.QuadraticBound(torch.stack(log_prob, -1), *(torch.stack(field, -2) for field in bounds))
 
 
-@quadratic_bound.register
-def _(density: Reshaped, value: Tensor) -> QuadraticBound | None:
+@protocol.quadratic_bound.register
+def _(density: Reshaped, value: Tensor) -> protocol.QuadraticBound | None:
     flat, shape = density.inner(value)
-    bound = quadratic_bound(density.density, flat)
+    bound = protocol.quadratic_bound(density.density, flat)
     if bound is None:
         return None
     log_prob, *bounds = bound
-    return QuadraticBound(
+    return protocol.QuadraticBound(
         log_prob.reshape(shape), *(field.reshape(*shape, *density.event_shape) for field in bounds)
     )
 
 
-@images.register
+@protocol.images.register
 def _(density: Stacked, channels: Collection[str]) -> dict[str, Tensor]:
-    parts = [images(inner, channels) for inner in density.densities]
+    parts = [protocol.images(inner, channels) for inner in density.densities]
     axis = len(density.batch_shape) - 1
     return {name: torch.stack([part[name] for part in parts], axis) for name in parts[0]}
 
 
-@images.register
+@protocol.images.register
 def _(density: Reshaped, channels: Collection[str]) -> dict[str, Tensor]:
     inner_dimensions = len(density.density.batch_shape)
-    inner_images = images(density.density, channels)
+    inner_images = protocol.images(density.density, channels)
     return {
         name: image.reshape(*density.batch_shape, *image.shape[inner_dimensions:])
         for name, image in inner_images.items()
     }
 
 
-@mode_candidates.register
+@protocol.mode_candidates.register
 def _(density: Stacked) -> Tensor:
     return _stack_padded(
-        [mode_candidates(inner) for inner in density.densities], -1 - len(density.event_shape)
+        [protocol.mode_candidates(inner) for inner in density.densities], -1 - len(density.event_shape)
     )
 
 
-@mode_candidates.register
+@protocol.mode_candidates.register
 def _(density: Reshaped) -> Tensor:
-    return mode_candidates(density.density).reshape(-1, *density.batch_shape, *density.event_shape)
+    return protocol.mode_candidates(density.density).reshape(-1, *density.batch_shape, *density.event_shape)
 
 
-@peak_widths.register
+@protocol.peak_widths.register
 def _(density: Stacked) -> Tensor:
-    return _stack_padded([peak_widths(inner) for inner in density.densities], -1)
+    return _stack_padded([protocol.peak_widths(inner) for inner in density.densities], -1)
 
 
-@peak_widths.register
+@protocol.peak_widths.register
 def _(density: Reshaped) -> Tensor:
-    return peak_widths(density.density).reshape(-1, *density.batch_shape)
+    return protocol.peak_widths(density.density).reshape(-1, *density.batch_shape)
 
 
 def _stack_padded(candidates: list[Tensor], axis: int) -> Tensor:
@@ -340,23 +322,23 @@ def _stack_padded(candidates: list[Tensor], axis: int) -> Tensor:
     return torch.stack(padded, axis)
 
 
-@recentre.register
+@protocol.recentre.register
 def _(density: Stacked, index: tuple[Tensor, ...], origin: Tensor) -> Distribution:
     *item, number = index
     every = torch.arange(len(density.densities), device=number.device)
     if number.shape != every.shape or any(part.shape[-1:] != (1,) for part in (*item, origin[..., 0])):
-        return recentre.dispatch(Distribution)(density, index, origin)
+        return protocol.recentre.dispatch(Distribution)(density, index, origin)
     item = tuple(part.squeeze(-1) for part in item)
-    return Stacked([recentre(inner, item, origin.squeeze(-2)) for inner in density.densities])
+    return Stacked([protocol.recentre(inner, item, origin.squeeze(-2)) for inner in density.densities])
 
 
-@recentre.register
+@protocol.recentre.register
 def _(density: Reshaped, index: tuple[Tensor, ...], origin: Tensor) -> Distribution:
     item = torch.zeros((), dtype=torch.int64, device=origin.device)
     for part, size in zip(index, density.batch_shape, strict=True):
         item = item * size + part
     inner = density.density
-    return recentre(inner, torch.unravel_index(item, inner.batch_shape), origin)
+    return protocol.recentre(inner, torch.unravel_index(item, inner.batch_shape), origin)
 
 
 def _stack(parts: list[Tensor | None], axis: int = -1) -> Tensor | None:

@@ -10,40 +10,21 @@ from torch import Tensor
 from torch import distributions as torchs
 from torch.distributions import Categorical, Distribution, Independent, MultivariateNormal, Normal
 
+from framework.distributions import protocol
 from framework.distributions.description import CategoricalDensity
-from framework.distributions.protocol import (
-    Estimate,
-    Normals,
-    QuadraticBound,
-    cdf,
-    estimate,
-    exact_estimate,
-    images,
-    mahalanobis,
-    marginal,
-    marginal_cdfs,
-    median,
-    normals,
-    one_normal,
-    pick,
-    quadratic_bound,
-    recentre,
-    take,
-    tempered_density,
-)
 
 for _kind in (
     *(torchs.ExponentialFamily, torchs.Categorical, torchs.OneHotCategorical, torchs.MultivariateNormal),
     *(torchs.LowRankMultivariateNormal, torchs.Cauchy, torchs.Gumbel, torchs.HalfNormal, torchs.Laplace),
     *(torchs.StudentT, torchs.Uniform, torchs.VonMises, torchs.Weibull),
 ):
-    estimate.register(_kind, exact_estimate)
+    protocol.estimate.register(_kind, protocol.exact_estimate)
 
 
-@estimate.register
-def _(density: Independent, value: Tensor) -> Estimate:
+@protocol.estimate.register
+def _(density: Independent, value: Tensor) -> protocol.Estimate:
     """Return the estimate of a product of independent factors; the squared errors of their logarithms add up."""
-    factors = estimate(density.base_dist, value)
+    factors = protocol.estimate(density.base_dist, value)
     count = density.reinterpreted_batch_ndims
     if count:
         factors = factors.map_fields(lambda field: field.flatten(-count))
@@ -51,7 +32,7 @@ def _(density: Independent, value: Tensor) -> Estimate:
         factors = factors.map_fields(lambda field: field.unsqueeze(-1))
     log_mean, debiased = factors.log_mean.sum(-1), factors.debiased.sum(-1)
     error = factors.standard_error.square().sum(-1).sqrt()
-    return Estimate(log_mean, debiased, error, factors.samples.sum(-1), factors.unresolved.any(-1))
+    return protocol.Estimate(log_mean, debiased, error, factors.samples.sum(-1), factors.unresolved.any(-1))
 
 
 _ON_THE_LINE = (Normal, torchs.Laplace, torchs.Cauchy, torchs.Gumbel, torchs.StudentT)
@@ -61,16 +42,16 @@ The distribution function of torch's other densities is wrong outside of their s
 """
 
 
-@marginal.register
+@protocol.marginal.register
 def _(density: Independent, index: int) -> Distribution:
     """Return the factor itself as the marginal of a product."""
     if density.event_shape == (1,) and index == 0:
         return density
     if density.reinterpreted_batch_ndims == 0:
-        return marginal(density.base_dist, index)
+        return protocol.marginal(density.base_dist, index)
     base = _change_parameters(density.base_dist, lambda parameter: parameter[..., index : index + 1])
     if base is None or density.reinterpreted_batch_ndims != 1:
-        return marginal.dispatch(Distribution)(density, index)
+        return protocol.marginal.dispatch(Distribution)(density, index)
     return Independent(base, 1, validate_args=False)
 
 
@@ -106,24 +87,34 @@ def _distribution_function(base: Distribution, value: Tensor) -> Tensor:
     return torch.from_numpy(stdtr(freedom.cpu().numpy(), standard.cpu().numpy())).to(value.device)
 
 
-@marginal_cdfs.register
+@protocol.marginal_cdfs.register
 def _(density: Independent, value: Tensor) -> Tensor | None:
     if isinstance(density.base_dist, _ON_THE_LINE):
         base = _change_parameters(density.base_dist, Tensor.double)
         if base is not None:
             return _distribution_function(base, value.double())
-    return None if len(density.event_shape) == 3 else marginal_cdfs.dispatch(Distribution)(density, value)
+    return (
+        None
+        if len(density.event_shape) == 3
+        else protocol.marginal_cdfs.dispatch(Distribution)(density, value)
+    )
 
 
-@cdf.register
+@protocol.cdf.register
 def _(density: Independent, value: Tensor) -> Tensor | None:
     known = isinstance(density.base_dist, _ON_THE_LINE) and density.event_shape == (1,)
     # `normals` also handles a normal density of width 0
-    probabilities = marginal_cdfs(density, value) if known and normals(density) is None else None
-    return cdf.dispatch(Distribution)(density, value) if probabilities is None else probabilities.squeeze(-1)
+    probabilities = (
+        protocol.marginal_cdfs(density, value) if known and protocol.normals(density) is None else None
+    )
+    return (
+        protocol.cdf.dispatch(Distribution)(density, value)
+        if probabilities is None
+        else probabilities.squeeze(-1)
+    )
 
 
-@marginal.register
+@protocol.marginal.register
 def _(density: MultivariateNormal, index: int) -> MultivariateNormal:
     if density.event_shape == (1,) and index == 0:
         return density
@@ -132,85 +123,85 @@ def _(density: MultivariateNormal, index: int) -> MultivariateNormal:
     return MultivariateNormal(density.loc[..., column], scale_tril=scale, validate_args=False)
 
 
-@median.register
+@protocol.median.register
 def _(density: MultivariateNormal, samples: int) -> Tensor:
     # each number's marginal is symmetric about its mean
     return density.loc
 
 
-@pick.register
+@protocol.pick.register
 def _(density: Categorical, index: Tensor) -> Distribution:
-    return CategoricalDensity(logits=take(density.logits, index), validate_args=False)
+    return CategoricalDensity(logits=protocol.take(density.logits, index), validate_args=False)
 
 
-@pick.register
+@protocol.pick.register
 def _(density: Independent, index: Tensor) -> Distribution:
-    base = _change_parameters(density.base_dist, lambda parameter: take(parameter, index))
+    base = _change_parameters(density.base_dist, lambda parameter: protocol.take(parameter, index))
     if base is None or density.reinterpreted_batch_ndims != 1:
-        return pick.dispatch(Distribution)(density, index)
+        return protocol.pick.dispatch(Distribution)(density, index)
     return Independent(base, 1, validate_args=False)
 
 
-@quadratic_bound.register
-def _(density: Independent, value: Tensor) -> QuadraticBound | None:
+@protocol.quadratic_bound.register
+def _(density: Independent, value: Tensor) -> protocol.QuadraticBound | None:
     base = density.base_dist
     if not isinstance(base, Normal) or density.reinterpreted_batch_ndims != 1:
         return None
     stiffness = base.scale.square().reciprocal().expand(torch.broadcast_shapes(value.shape, base.scale.shape))
-    return QuadraticBound(density.log_prob(value), (base.loc - value) * stiffness, stiffness)
+    return protocol.QuadraticBound(density.log_prob(value), (base.loc - value) * stiffness, stiffness)
 
 
-@recentre.register
+@protocol.recentre.register
 def _(density: Independent, index: tuple[Tensor, ...], origin: Tensor) -> Distribution:
     base = density.base_dist
     if not isinstance(base, Normal) or density.reinterpreted_batch_ndims != 1:
-        return recentre.dispatch(Distribution)(density, index, origin)
+        return protocol.recentre.dispatch(Distribution)(density, index, origin)
     loc, scale = (parameter.double()[index] for parameter in (base.loc, base.scale))
     return Independent(Normal(loc - origin, scale, validate_args=False), 1, validate_args=False)
 
 
-@tempered_density.register
+@protocol.tempered_density.register
 def _(density: Independent, temperature: Tensor) -> Distribution:
     # the power of a product is the product of the powers
-    base = tempered_density(density.base_dist, temperature)
+    base = protocol.tempered_density(density.base_dist, temperature)
     return Independent(base, density.reinterpreted_batch_ndims, validate_args=False)
 
 
-@tempered_density.register
+@protocol.tempered_density.register
 def _(density: Normal, temperature: Tensor) -> Distribution:
     # exp(-d²/2σ²)^(1/T) = exp(-d²/2σ²T)
     return Normal(density.loc, density.scale * temperature.sqrt(), validate_args=False)
 
 
-@tempered_density.register
+@protocol.tempered_density.register
 def _(density: MultivariateNormal, temperature: Tensor) -> Distribution:
     scale = density.scale_tril * temperature.sqrt()
     return MultivariateNormal(density.loc, scale_tril=scale, validate_args=False)
 
 
-@images.register
+@protocol.images.register
 def _(density: Independent, channels: Collection[str]) -> dict[str, Tensor]:
     if len(density.event_shape) != 3 or set(channels) != {"color"}:
-        return images.dispatch(Distribution)(density, channels)
+        return protocol.images.dispatch(Distribution)(density, channels)
     return {"color": density.mean}
 
 
-@normals.register
-def _(density: Independent) -> Normals | None:
+@protocol.normals.register
+def _(density: Independent) -> protocol.Normals | None:
     base = density.base_dist
     if not isinstance(base, Normal) or tuple(density.event_shape) != (1,):
         return None
-    return one_normal(base.loc, base.scale)
+    return protocol.one_normal(base.loc, base.scale)
 
 
-@normals.register
-def _(density: MultivariateNormal) -> Normals | None:
+@protocol.normals.register
+def _(density: MultivariateNormal) -> protocol.Normals | None:
     if tuple(density.event_shape) != (1,):
         return None
-    return one_normal(density.loc, density.variance.sqrt())
+    return protocol.one_normal(density.loc, density.variance.sqrt())
 
 
-@mahalanobis.register
+@protocol.mahalanobis.register
 def _(density: Independent, value: Tensor) -> Tensor | None:
     base = density.base_dist
     if not isinstance(base, Normal) or len(density.event_shape) != 1:
@@ -218,7 +209,7 @@ def _(density: Independent, value: Tensor) -> Tensor | None:
     return ((value.double() - base.loc.double()) / base.scale.double()).square().sum(-1)
 
 
-@mahalanobis.register
+@protocol.mahalanobis.register
 def _(density: MultivariateNormal, value: Tensor) -> Tensor:
     residual = (value.double() - density.loc.double()).unsqueeze(-1)
     standard = torch.linalg.solve_triangular(density.scale_tril.double(), residual, upper=False)

@@ -8,33 +8,13 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution, constraints
 
+from framework.distributions import protocol
 from framework.distributions.batch_shapes import Reshaped
 from framework.distributions.circular import Circular, circular, grid
 from framework.distributions.description import one_line
 from framework.distributions.highest import crossings, highest
 from framework.distributions.panels import entropy_of_one, has_range
 from framework.distributions.picked import PickedMixture
-from framework.distributions.protocol import (
-    Estimate,
-    Normals,
-    QuadraticBound,
-    arc_probability,
-    cdf,
-    estimate,
-    estimate_with_error,
-    images,
-    mahalanobis,
-    marginal,
-    marginal_cdfs,
-    median,
-    mode_candidates,
-    normals,
-    peak_widths,
-    pick,
-    quadratic_bound,
-    recentre,
-    take,
-)
 
 __all__ = [
     "CHUNK",
@@ -44,10 +24,6 @@ __all__ = [
     "circular_entropy",
     "circular_grid",
     "estimate_of_sum",
-    "marginal",
-    "median",
-    "pick",
-    "take",
 ]  # some of these are defined in other files now; the old import path keeps working
 
 circular_entropy = entropy_of_one
@@ -123,7 +99,7 @@ class Mixture(Distribution):
         if self.log_weights.shape[-1] == 1:
             return self.components.sample(shape).squeeze(-1 - len(self.event_shape))
         which = self._which(shape)
-        return pick(self.components, which).sample()
+        return protocol.pick(self.components, which).sample()
 
     def _which(self, shape: torch.Size) -> Tensor:
         whole = shape + self.batch_shape
@@ -143,7 +119,7 @@ class Mixture(Distribution):
             return support.gather(0, self.log_prob(support).argmax(0, keepdim=True)).squeeze(0)
         # take the candidates of every component, also of nested mixtures: a lower peak of one component may become
         # the highest point together with a peak of another component
-        starts = mode_candidates(self)
+        starts = protocol.mode_candidates(self)
         if self.event_shape.numel() > 1 and self.log_weights.shape[-1] <= CROSSED:
             modes = self.components.mode.movedim(-1 - event, 0)  # (K, *batch, *event)
             starts = torch.cat([starts, crossings(self.components, modes)])
@@ -218,7 +194,7 @@ class Mixture(Distribution):
         return self.components.log_prob(samples) - mixed
 
 
-def estimate_of_sum(parts: Estimate, log_terms: Tensor, log_sum: Tensor) -> Estimate:
+def estimate_of_sum(parts: protocol.Estimate, log_terms: Tensor, log_sum: Tensor) -> protocol.Estimate:
     """Return the estimate of log Σ_k t_k, summed along the last dimension, from estimates of the terms.
 
     The terms must be drawn independently of one another. By the delta method, the squared relative error of the sum is
@@ -236,16 +212,16 @@ def estimate_of_sum(parts: Estimate, log_terms: Tensor, log_sum: Tensor) -> Esti
         # a term with no share adds no error, not even an infinite one; an unknown error stays unknown
         silent = (error == 0) | ((share == 0) & ~error.isnan())
         error = torch.where(silent, 0.0, share * error).square().sum(-1).sqrt()
-    return estimate_with_error(log_sum, error, parts.samples.sum(-1), parts.unresolved.any(-1))
+    return protocol.estimate_with_error(log_sum, error, parts.samples.sum(-1), parts.unresolved.any(-1))
 
 
-@estimate.register
-def _(density: Mixture, value: Tensor) -> Estimate:
+@protocol.estimate.register
+def _(density: Mixture, value: Tensor) -> protocol.Estimate:
     """Return the estimate of a mixture of independent components; for one component its estimate, to the last bit."""
     several = density.split_values(value)
     if len(several) > 1:
-        return concatenate_estimates([estimate(density, part) for part in several])
-    parts = estimate(density.components, value.unsqueeze(-1 - len(density.event_shape)))
+        return concatenate_estimates([protocol.estimate(density, part) for part in several])
+    parts = protocol.estimate(density.components, value.unsqueeze(-1 - len(density.event_shape)))
     if density.log_weights.shape[-1] == 1:
         return parts.map_fields(lambda field: field.squeeze(-1))
     error = parts.standard_error.masked_fill(density.log_weights == -math.inf, 0.0)
@@ -253,17 +229,17 @@ def _(density: Mixture, value: Tensor) -> Estimate:
     return estimate_of_sum(parts._replace(standard_error=error), log_terms, torch.logsumexp(log_terms, -1))
 
 
-def concatenate_estimates(parts: Sequence[Estimate]) -> Estimate:
+def concatenate_estimates(parts: Sequence[protocol.Estimate]) -> protocol.Estimate:
     """Return the estimates of several batches as one, concatenated along the first dimension."""
-    return Estimate(*map(torch.cat, zip(*parts, strict=True)))
+    return protocol.Estimate(*map(torch.cat, zip(*parts, strict=True)))
 
 
-@marginal.register
+@protocol.marginal.register
 def _(density: Mixture, index: int) -> Distribution:
-    return Mixture(density.log_weights, marginal(density.components, index))
+    return Mixture(density.log_weights, protocol.marginal(density.components, index))
 
 
-@median.register
+@protocol.median.register
 def _(density: Mixture, samples: int) -> Tensor:
     """Return the median of a single component; otherwise the median of draws, as by default.
 
@@ -271,33 +247,33 @@ def _(density: Mixture, samples: int) -> Tensor:
     distribution function takes a second of processor time.
     """
     if density.log_weights.shape[-1] == 1:
-        return median(density.components, samples).squeeze(-1 - len(density.event_shape))
+        return protocol.median(density.components, samples).squeeze(-1 - len(density.event_shape))
     if len(density.event_shape) == 3:
         return density.mean
-    return median.dispatch(Distribution)(density, samples)
+    return protocol.median.dispatch(Distribution)(density, samples)
 
 
-@cdf.register
+@protocol.cdf.register
 def _(density: Mixture, value: Tensor) -> Tensor | None:
-    probabilities = cdf.dispatch(Distribution)(density, value)
+    probabilities = protocol.cdf.dispatch(Distribution)(density, value)
     if probabilities is not None:
         return probabilities
-    return _weighted_mean(density, cdf(density.components, value.unsqueeze(-2)))
+    return _weighted_mean(density, protocol.cdf(density.components, value.unsqueeze(-2)))
 
 
-@marginal_cdfs.register
+@protocol.marginal_cdfs.register
 def _(density: Mixture, value: Tensor) -> Tensor | None:
     axis = -1 - len(density.event_shape)
-    parts = marginal_cdfs(density.components, value.unsqueeze(axis))
+    parts = protocol.marginal_cdfs(density.components, value.unsqueeze(axis))
     return _weighted_mean(
         density, None if parts is None else parts.movedim(axis, -1), len(density.event_shape)
     )
 
 
-@arc_probability.register
+@protocol.arc_probability.register
 def _(density: Mixture, start: Tensor, end: Tensor) -> Tensor | None:
     return _weighted_mean(
-        density, arc_probability(density.components, start.unsqueeze(-2), end.unsqueeze(-2))
+        density, protocol.arc_probability(density.components, start.unsqueeze(-2), end.unsqueeze(-2))
     )
 
 
@@ -310,65 +286,65 @@ def _weighted_mean(density: Mixture, parts: Tensor | None, numbers: int = 0) -> 
     return torch.where(weights > 0, weights * parts, 0.0).sum(-1).clamp(0, 1)
 
 
-@normals.register
-def _(density: Mixture) -> Normals | None:
-    parts = normals(density.components)  # (*batch, K, k)
+@protocol.normals.register
+def _(density: Mixture) -> protocol.Normals | None:
+    parts = protocol.normals(density.components)  # (*batch, K, k)
     if parts is None:
         return None
     # normalise again: float32 weights sum to 1 only to 1e-7
     log_weights = density.log_weights.double().log_softmax(-1).unsqueeze(-1) + parts.log_weights
-    return Normals(*(number.flatten(-2) for number in (log_weights, parts.mean, parts.scale)))
+    return protocol.Normals(*(number.flatten(-2) for number in (log_weights, parts.mean, parts.scale)))
 
 
-@mahalanobis.register
+@protocol.mahalanobis.register
 def _(density: Mixture, value: Tensor) -> Tensor | None:
     if density.log_weights.shape[-1] > 1:
         return None
-    distance = mahalanobis(density.components, value.unsqueeze(-2))
+    distance = protocol.mahalanobis(density.components, value.unsqueeze(-2))
     return None if distance is None else distance.squeeze(-1)
 
 
-@quadratic_bound.register
-def _(density: Mixture, value: Tensor) -> QuadraticBound | None:
-    parts = quadratic_bound(density.components, value.unsqueeze(-1 - len(density.event_shape)))
+@protocol.quadratic_bound.register
+def _(density: Mixture, value: Tensor) -> protocol.QuadraticBound | None:
+    parts = protocol.quadratic_bound(density.components, value.unsqueeze(-1 - len(density.event_shape)))
     if parts is None:
         return None
     log_terms = density.log_weights + parts.log_prob
     share = log_terms.softmax(-1).unsqueeze(-1)
     means = (torch.where(share > 0, share * part, 0.0).sum(-2) for part in parts[1:])
-    return QuadraticBound(torch.logsumexp(log_terms, -1), *means)
+    return protocol.QuadraticBound(torch.logsumexp(log_terms, -1), *means)
 
 
-@pick.register
+@protocol.pick.register
 def _(density: Mixture, index: Tensor) -> Distribution:
     return PickedMixture(density.log_weights, density.components, index, density.rows)
 
 
-@pick.register
+@protocol.pick.register
 def _(density: Reshaped, index: Tensor) -> Distribution:
     """Return the picked items of the inner density, whose batch is flattened; no draw is discarded."""
     inner = density.density
     # a picked mixture draws from all its items for each pick; here these would be the items of the whole batch
     if len(inner.batch_shape) != 1 or isinstance(inner, Mixture):
-        return pick.dispatch(Distribution)(density, index)
+        return protocol.pick.dispatch(Distribution)(density, index)
     # items in the order of (*batch, K): the item of batch index b and component k is b·K + k
     lead = index.shape[: index.dim() - len(density.batch_shape) + 1]
     count = density.batch_shape[-1]
     first = torch.arange(density.batch_shape[:-1].numel(), device=index.device) * count
     items = first.reshape(density.batch_shape[:-1]) + index
     # `pick` reads the last batch dimension as the components; a batch of one line has no other dimension
-    return Reshaped(pick(inner, items.reshape(-1)), (*lead, *density.batch_shape[:-1]))
+    return Reshaped(protocol.pick(inner, items.reshape(-1)), (*lead, *density.batch_shape[:-1]))
 
 
-@mode_candidates.register
+@protocol.mode_candidates.register
 def _(density: Mixture) -> Tensor:
-    candidates = mode_candidates(density.components).movedim(
+    candidates = protocol.mode_candidates(density.components).movedim(
         -1 - len(density.event_shape), 0
     )  # (K, peak, *batch, *event)
     return candidates.flatten(0, 1)
 
 
-@images.register
+@protocol.images.register
 def _(density: Mixture, channels: Collection[str]) -> dict[str, Tensor]:
     """Return the images of a single component; for several components over images, their mean.
 
@@ -377,23 +353,25 @@ def _(density: Mixture, channels: Collection[str]) -> dict[str, Tensor]:
     """
     if density.log_weights.shape[-1] == 1:
         axis = len(density.batch_shape)
-        return {name: image.squeeze(axis) for name, image in images(density.components, channels).items()}
+        return {
+            name: image.squeeze(axis) for name, image in protocol.images(density.components, channels).items()
+        }
     if len(density.event_shape) != 3 or set(channels) != {"color"}:
-        return images.dispatch(Distribution)(density, channels)
-    component_images = images(density.components, channels)["color"]
+        return protocol.images.dispatch(Distribution)(density, channels)
+    component_images = protocol.images(density.components, channels)["color"]
     weights = density.log_weights.exp()[..., None, None, None]
     return {"color": (weights * component_images).sum(len(density.batch_shape))}
 
 
-@peak_widths.register
+@protocol.peak_widths.register
 def _(density: Mixture) -> Tensor:
-    return peak_widths(density.components).movedim(-1, 0).flatten(0, 1)
+    return protocol.peak_widths(density.components).movedim(-1, 0).flatten(0, 1)
 
 
-@recentre.register
+@protocol.recentre.register
 def _(density: Mixture, index: tuple[Tensor, ...], origin: Tensor) -> Distribution:
     every = torch.arange(density.log_weights.shape[-1], device=origin.device)
-    components = recentre(
+    components = protocol.recentre(
         density.components, (*(part.unsqueeze(-1) for part in index), every), origin.unsqueeze(-2)
     )
     return Mixture(density.log_weights.double()[index].expand(components.batch_shape), components)

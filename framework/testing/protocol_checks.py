@@ -8,26 +8,9 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
+from framework.distributions import protocol
 from framework.distributions.circular import Circular, wrap
 from framework.distributions.density import Mixture
-from framework.distributions.protocol import (
-    arc_probability,
-    cdf,
-    estimate,
-    images,
-    mahalanobis,
-    marginal,
-    marginal_cdfs,
-    median,
-    mode_candidates,
-    normals,
-    peak_widths,
-    pick,
-    quadratic_bound,
-    recentre,
-    tempered_density,
-    value_set,
-)
 from framework.errors import UserError
 from framework.testing.finding import SEED, Worst, seed
 
@@ -67,7 +50,7 @@ def check_estimate(density: Distribution, worst: Worst) -> None:
     value = draws_and_mode(density)
     expected = seeded_log_prob(density, value)
     seed(SEED)
-    stated = estimate(density, value)
+    stated = protocol.estimate(density, value)
     for name, field in stated._asdict().items():
         worst.same(f"shape of {name}", tuple(field.shape), tuple(expected.shape))
     worst.same("dtype of samples", stated.samples.dtype, torch.int64)
@@ -112,7 +95,7 @@ def check_powers(density: Distribution, worst: Worst) -> None:
     log_prob = density.log_prob(value).double()
     for temperature in TEMPERATURES:
         try:
-            power = tempered_density(density, torch.tensor(temperature, dtype=torch.float64))
+            power = protocol.tempered_density(density, torch.tensor(temperature, dtype=torch.float64))
         except UserError:
             worst.count(False, "the density has no powers")
             return
@@ -136,7 +119,7 @@ def apply_to_powers(
     """Apply a check to the density tempered with each of TEMPERATURES."""
     for temperature in TEMPERATURES:
         try:
-            power = tempered_density(density, torch.tensor(temperature, dtype=torch.float64))
+            power = protocol.tempered_density(density, torch.tensor(temperature, dtype=torch.float64))
         except UserError:
             worst.count(False, "the density has no powers")
             return
@@ -147,7 +130,7 @@ def check_pick(density: Distribution, worst: Worst) -> None:
     """Check that `pick(density, index)` draws from the item with that index; batch_shape is (rows, 2)."""
     rows, count = density.batch_shape
     index = (torch.arange(MANY).unsqueeze(-1) + torch.arange(rows)) % count
-    draws = pick(density, index).sample()
+    draws = protocol.pick(density, index).sample()
     worst.same("shape of the draws", tuple(draws.shape), (MANY, rows, *density.event_shape))
     alone = density.sample(torch.Size((MANY // count,)))
     for row in range(rows):
@@ -186,7 +169,7 @@ def check_quadratic_bound(density: Distribution, worst: Worst) -> None:
         log_prob = density.log_prob(value)
         (gradient,) = torch.autograd.grad(log_prob.sum(), value)
     value = value.detach()
-    bound_at_value = quadratic_bound(density, value)
+    bound_at_value = protocol.quadratic_bound(density, value)
     if bound_at_value is None:
         worst.count(False, "quadratic_bound is not known")
         return
@@ -221,7 +204,7 @@ def check_recentre(density: Distribution, worst: Worst) -> None:
     index = torch.arange(2 * rows + 1) % rows
     width = known_widths(density)
     place = density.mode.double()[index] + 0.3 * width[index].unsqueeze(-1)
-    moved = recentre(density, (index,), place)
+    moved = protocol.recentre(density, (index,), place)
     offset = torch.tensor([-3.0, -0.5, 0.0, 0.2, 2.0], dtype=torch.float64)[:, None] * width[index]
     actual = moved.log_prob(offset.unsqueeze(-1)).double()
     value = (place + offset.unsqueeze(-1)).to(density.mode.dtype)  # (5, item, 1)
@@ -248,14 +231,14 @@ def check_normals(density: Distribution, worst: Worst) -> None:
     value = draws_and_mode(density)
     log_prob = density.log_prob(value).double()
     size = log_prob.abs().clamp(min=1)
-    if density.event_shape == (1,) and (known := normals(density)) is not None:
+    if density.event_shape == (1,) and (known := protocol.normals(density)) is not None:
         standard = (value.double() - known.mean) / known.scale
         parts = known.log_weights - standard.square() / 2 - known.scale.log() - math.log(2 * math.pi) / 2
         worst.record(
             (parts.logsumexp(-1) - log_prob).abs() / (1e-6 * size),
             "normals: the log-density differs from log_prob",
         )
-    distance = mahalanobis(density, value)
+    distance = protocol.mahalanobis(density, value)
     if distance is not None:
         rest = log_prob + distance / 2
         worst.record((rest - rest[-1]).abs() / (1e-6 * size), "mahalanobis: log p + m/2 is not constant")
@@ -264,12 +247,12 @@ def check_normals(density: Distribution, worst: Worst) -> None:
 
 def check_mode_candidates(density: Distribution, worst: Worst) -> None:
     """Check that `mode_candidates` and `peak_widths` are finite, have the documented shapes, and widths above 0."""
-    places = mode_candidates(density)
+    places = protocol.mode_candidates(density)
     shape = (*density.batch_shape, *density.event_shape)
     worst.same("shape of a mode candidate", tuple(places.shape[1:]), shape)
     worst.finite("mode_candidates", places)
     if density.event_shape == (1,):
-        widths = peak_widths(density)
+        widths = protocol.peak_widths(density)
         worst.same("shape of the peak widths", tuple(widths.shape), tuple(places.shape[:-1]))
         worst.count(~(widths > 0) | widths.isnan(), "a peak width not above 0")
 
@@ -277,7 +260,7 @@ def check_mode_candidates(density: Distribution, worst: Worst) -> None:
 def check_marginal_cdfs(density: Distribution, worst: Worst) -> None:
     """Check that `marginal_cdfs` is the share of draws below a value for each number; the unit is a standard error."""
     value = draws_and_mode(density)
-    stated = marginal_cdfs(density, value)
+    stated = protocol.marginal_cdfs(density, value)
     if stated is None:
         worst.count(False, "marginal_cdfs is not known")
         return
@@ -321,7 +304,7 @@ def check_medians(density: Distribution, worst: Worst) -> None:
     For angles the two sides are the half turns before and after the median.
     """
     seed(SEED)
-    chosen = median(density, MANY // 2)
+    chosen = protocol.median(density, MANY // 2)
     draws = density.sample(torch.Size((MANY,)))
     offset = draws - chosen
     offset = wrap(offset) if isinstance(density.support, Circular) else offset
@@ -338,7 +321,7 @@ def check_marginals(density: Distribution, worst: Worst) -> None:
     draws = density.sample(torch.Size((MANY // 2,)))
     for number in range(density.event_shape[0]):
         try:
-            marginal_density = marginal(density, number)
+            marginal_density = protocol.marginal(density, number)
         except UserError:
             worst.count(isinstance(density.support, Circular), "the density has no marginals")
             return
@@ -382,31 +365,33 @@ def protocol_calls(
     yield "entropy", lambda: density.entropy()
     yield "mean", lambda: density.mean
     yield "variance", lambda: density.variance
-    yield "estimate", lambda: estimate(density, value)
-    yield "cdf", lambda: cdf(density, value)
-    yield "marginal_cdfs", lambda: marginal_cdfs(density, value)
-    yield "arc_probability", lambda: arc_probability(density, value - 0.1, value + 0.1)
-    yield "marginal", lambda: evaluate(marginal(density, 0))
-    yield "median", lambda: median(density, 50)
+    yield "estimate", lambda: protocol.estimate(density, value)
+    yield "cdf", lambda: protocol.cdf(density, value)
+    yield "marginal_cdfs", lambda: protocol.marginal_cdfs(density, value)
+    yield "arc_probability", lambda: protocol.arc_probability(density, value - 0.1, value + 0.1)
+    yield "marginal", lambda: evaluate(protocol.marginal(density, 0))
+    yield "median", lambda: protocol.median(density, 50)
     if density.event_shape == (1,):
         rows = index[:, 0]
         yield (
             "recentre",
-            lambda: recentre(density, (rows,), value[0].double()[rows]).log_prob(value[:, :1].double()),
+            lambda: protocol.recentre(density, (rows,), value[0].double()[rows]).log_prob(
+                value[:, :1].double()
+            ),
         )
-    yield "tempered_density", lambda: evaluate(tempered_density(density, temperature))
-    yield "normals", lambda: normals(density)
-    yield "mahalanobis", lambda: mahalanobis(density, value)
-    yield "mode_candidates", lambda: mode_candidates(density)
-    yield "peak_widths", lambda: peak_widths(density)
-    yield "quadratic_bound", lambda: quadratic_bound(density, value)
-    yield "images", lambda: images(density, {"color"})
+    yield "tempered_density", lambda: evaluate(protocol.tempered_density(density, temperature))
+    yield "normals", lambda: protocol.normals(density)
+    yield "mahalanobis", lambda: protocol.mahalanobis(density, value)
+    yield "mode_candidates", lambda: protocol.mode_candidates(density)
+    yield "peak_widths", lambda: protocol.peak_widths(density)
+    yield "quadratic_bound", lambda: protocol.quadratic_bound(density, value)
+    yield "images", lambda: protocol.images(density, {"color"})
     yield "value_set", lambda: _evaluate_set(density, value)
     yield "expand", lambda: evaluate(density.expand(torch.Size((2, *density.batch_shape))))
     yield "enumerate_support", lambda: density.enumerate_support()
 
 
 def _evaluate_set(density: Distribution, value: Tensor) -> None:
-    sets = value_set(density)
+    sets = protocol.value_set(density)
     if sets is not None:
         _ = sets.contains(value), sets.size(), sets.empty(), sets.parts()

@@ -8,23 +8,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.distributions import Distribution, constraints
 
+from framework.distributions import protocol
 from framework.distributions.description import one_line
-from framework.distributions.protocol import (
-    Normals,
-    QuadraticBound,
-    estimate,
-    exact_estimate,
-    mahalanobis,
-    marginal,
-    median,
-    normals,
-    one_normal,
-    pick,
-    quadratic_bound,
-    recentre,
-    take,
-    tempered_density,
-)
 
 
 class Gaussian(Distribution):
@@ -141,57 +126,61 @@ def _times(matrix: Tensor, vector: Tensor) -> Tensor:
     return (matrix * vector.unsqueeze(-2)).sum(-1)
 
 
-estimate.register(Gaussian, exact_estimate)
+protocol.estimate.register(Gaussian, protocol.exact_estimate)
 
 
-@marginal.register
+@protocol.marginal.register
 def _(density: Gaussian, index: int) -> Gaussian:
     part = slice(index, index + 1)
     return Gaussian(density.location[..., part], density.stddev[..., part])
 
 
-@pick.register
+@protocol.pick.register
 def _(density: Gaussian, index: Tensor) -> Gaussian:
     coefficients = density.coefficients
     if coefficients is not None:
         size = coefficients.shape[-1]
-        coefficients = take(coefficients.flatten(-2), index).unflatten(-1, (size, size))
-    return Gaussian(take(density.location, index), take(density.scale, index), coefficients)
+        coefficients = protocol.take(coefficients.flatten(-2), index).unflatten(-1, (size, size))
+    return Gaussian(protocol.take(density.location, index), protocol.take(density.scale, index), coefficients)
 
 
-@quadratic_bound.register
-def _(density: Gaussian, value: Tensor) -> QuadraticBound:
+@protocol.quadratic_bound.register
+def _(density: Gaussian, value: Tensor) -> protocol.QuadraticBound:
     residual = value - density.location
     stiffness = density.scale.square().reciprocal().expand(residual.shape)
     if density.coefficients is None:
-        return QuadraticBound(density.log_prob(value), -residual * stiffness, stiffness)
+        return protocol.QuadraticBound(density.log_prob(value), -residual * stiffness, stiffness)
     # Σ⁻¹ = Aᵀ A, A = (I - φ)/σ; the sums of the absolute values of its rows are a diagonal matrix that is an upper
     # bound (Gershgorin)
     identity = torch.eye(residual.shape[-1], dtype=residual.dtype, device=residual.device)
     root = (identity - density.coefficients) / density.scale.unsqueeze(-1)
     pull = -_times(root.mT, _times(root, residual))
     precision = (root.unsqueeze(-1) * root.unsqueeze(-2)).sum(-3)
-    return QuadraticBound(density.log_prob(value), pull, precision.abs().sum(-1).expand(residual.shape))
+    return protocol.QuadraticBound(
+        density.log_prob(value), pull, precision.abs().sum(-1).expand(residual.shape)
+    )
 
 
-@recentre.register
+@protocol.recentre.register
 def _(density: Gaussian, index: tuple[Tensor, ...], place: Tensor) -> Gaussian:
     location = density.location.double()[index] - place
     return Gaussian(location, density.scale.double()[index].expand_as(location))
 
 
-@median.register
+@protocol.median.register
 def _(density: Gaussian, samples: int) -> Tensor:
     # each number's marginal is symmetric about its mean
     return density.location
 
 
-@normals.register
-def _(density: Gaussian) -> Normals | None:
-    return one_normal(density.location, density.scale) if tuple(density.event_shape) == (1,) else None
+@protocol.normals.register
+def _(density: Gaussian) -> protocol.Normals | None:
+    return (
+        protocol.one_normal(density.location, density.scale) if tuple(density.event_shape) == (1,) else None
+    )
 
 
-@mahalanobis.register
+@protocol.mahalanobis.register
 def _(density: Gaussian, value: Tensor) -> Tensor:
     residual = value.double() - density.location.double()
     if density.coefficients is not None:
@@ -199,7 +188,7 @@ def _(density: Gaussian, value: Tensor) -> Tensor:
     return (residual / density.scale.double()).square().sum(-1)
 
 
-@tempered_density.register
+@protocol.tempered_density.register
 def _(density: Gaussian, temperature: Tensor) -> Gaussian:
     # every e_i is an independent N(0, σ_i²), and exp(-e²/2σ²)^(1/T) = exp(-e²/2σ²T)
     return Gaussian(density.location, density.scale * temperature.sqrt(), density.coefficients)

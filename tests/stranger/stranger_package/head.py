@@ -10,7 +10,8 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from framework.density_head import DensityHead
-from framework.distributions.density import circular, marginal, median
+from framework.distributions.circular import circular
+from framework.distributions.protocol import marginal, median
 from framework.heads.parameters import require_finite
 from framework.target import Target
 
