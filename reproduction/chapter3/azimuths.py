@@ -182,6 +182,7 @@ def main() -> None:
         "A number is the mean over classes, and ± is its standard error over classes. The value of a class is the mean "
         "over its seeds. A dash means that the concentration, and so the entropy, is the same for all images. Classes "
         f"with every method: {', '.join(classes) or 'none'}.\n\n"
+        "- **Methods** are described on the page of Table 3.3.\n"
         "- The **error** is the angle between the true azimuth and the predicted one. The predicted azimuth is the "
         f"median: of {SAMPLES} samples of the density, the one with the least expected deviation (eq. 3.24).\n"
         "- The **rank correlation** (Spearman) is that of the entropy of the density with the error, or with the "

@@ -214,7 +214,9 @@ def main(sweeps: list[Path], root: str | None) -> None:
     text = (
         f"# Log-likelihood of the pan under Gaussian blur: {label}\n\n"
         "This page measures how the log-likelihood of the pan angle of a head falls when the test images are blurred. "
-        "The models are trained without blur.\n\n"
+        "The models are trained without blur. "
+        "The methods are von Mises densities with a fixed or a predicted concentration, a finite mixture of them, "
+        "and conditional variational autoencoders (CVAE, and sCVAE in simplified form).\n\n"
         f"A number is the mean log-likelihood of the true pan angle over {len(fields['target'])} test images of "
         f"{fields['input'].shape[-1]} pixels, in nats. ± is the standard deviation over seeds. σ is the standard "
         f"deviation of the Gaussian blur, in pixels of an image of {SIDE} pixels. A uniform density has a "

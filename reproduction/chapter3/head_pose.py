@@ -127,8 +127,9 @@ def main() -> None:
     text = (
         "# Tables 3.1 and 3.2: head poses (synthetic data)\n\n"
         "This page repeats Tables 3.1 and 3.2 of the thesis: networks predict the angles of heads from images. The "
-        "images are generated in the layouts of the data sets IDIAP, CAVIAR and TownCentre. The tables compare density "
-        "heads with a fixed concentration κ, with a predicted κ, and with several modes.\n\n"
+        "images are generated in the layouts of the data sets IDIAP, CAVIAR and TownCentre. "
+        "The methods are von Mises densities with a fixed or a predicted concentration κ, a finite mixture of "
+        "them, and a conditional variational autoencoder (CVAE).\n\n"
         f"One model is trained for each angle, on images of {size} pixels, for {epochs} epochs in batches of {batch}, "
         f"with precision {precision}. ± is the standard deviation over seeds, or the standard error over test images "
         "if there is one seed. MAAD is the mean absolute angular deviation of the point prediction. The time of a "

@@ -164,14 +164,17 @@ def nearest_window_errors(data: Data) -> np.ndarray:
     Windows are compared by the last position of the ball and by the eight last positions relative to it.
     """
 
-    def alike(fields: dict[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
+    def window_features(fields: dict[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
         frames = fields["input"].unflatten(1, (-1, len(PARTS)))
         train_last = frames[:, -1:, 1:4]
         path = torch.where(frames[:, -8:, 4:] > 0.5, frames[:, -8:, 1:4] - train_last, 0.0)
         return train_last, torch.cat([train_last.flatten(1), 3 * path.flatten(1)], 1)
 
     train_fields, test_fields = (getattr(data.splits(), name).fields for name in ("train", "test"))
-    (train_last, train_features), (test_last, test_features) = alike(train_fields), alike(test_fields)
+    (train_last, train_features), (test_last, test_features) = (
+        window_features(train_fields),
+        window_features(test_fields),
+    )
     nearest = torch.cdist(test_features, train_features).topk(5, largest=False).indices
     ahead = train_fields["target"].unflatten(1, (-1, 3)) - train_last
     error = test_last + ahead[nearest].mean(1) - test_fields["target"].unflatten(1, (-1, 3))

@@ -422,6 +422,8 @@ def main() -> None:
         "- **Method** names the encoding and the network: Occ is occupancy, TDF truncated distances, BPS a basis point "
         "set. Deltas are the vectors to the nearest points, in place of distances. MLP is a multilayer perceptron and "
         "Conv3D a convolutional network.\n"
+        "- **Micro** means 100 points per cloud, **unpadded** convolutions without zeros around the grid, and **ERT** "
+        "extremely randomised trees.\n"
         '- **Table, row** is the place of the method in the thesis; "beyond" means that the thesis has no such '
         "row.\n"
         "- **FLOPs** are per cloud and count matrix products and convolutions.\n"

@@ -19,7 +19,8 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from benchmarks.pages import machine, write_page
-from benchmarks.rendering.smplpix_flicker import build_renderer, describe_training
+from benchmarks.rendering.builders import build_renderer
+from benchmarks.rendering.smplpix_flicker import describe_training
 from framework.bodies import poses
 from framework.bodies.shape_space import reduce_shapes
 from framework.configuration.loading import read_stored

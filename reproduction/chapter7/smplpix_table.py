@@ -268,10 +268,10 @@ def group_by_row(results: Sequence[dict[str, Any]]) -> dict[Row, list[dict[str, 
             )
     order = {method: place for place, method in enumerate(NAMES)}
 
-    def place(row: Row) -> tuple[int, str, int]:
+    def sort_key(row: Row) -> tuple[int, str, int]:
         return order.get(row.method, len(order)), row.change, int(row.topology.removesuffix("k"))
 
-    return {row: rows[row] for row in sorted(rows, key=place)}
+    return {row: rows[row] for row in sorted(rows, key=sort_key)}
 
 
 def have_equal_numbers(results: Sequence[dict[str, Any]]) -> bool:
@@ -296,13 +296,15 @@ def evaluate_images(predictor: Predictor, data: Data, lpips: str | None) -> Eval
         metrics.append(build("metric", resolve("metric", {"name": name, **weights}), target=data.target))
     subjects: list[Tensor] = []
 
-    def noted() -> Iterator[Batch]:
+    def subject_batches() -> Iterator[Batch]:
         for batch in Batches(data, batch_size=BLOCK, workers=0, seed=0).test_dataloader():
             subjects.append(batch["subject"])
             yield batch
 
     cpu = torch.device("cpu")
-    evaluation = evaluate(predictor, noted(), metrics, groups=["all"], samples=1, seed=0, device=cpu)
+    evaluation = evaluate(
+        predictor, subject_batches(), metrics, groups=["all"], samples=1, seed=0, device=cpu
+    )
     numbers: dict[str, np.ndarray] = {}
     for metric in evaluation.metrics:
         image_metric: Any = metric  # the metrics derived from PerImage keep the numbers of each image
