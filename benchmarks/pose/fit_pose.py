@@ -18,11 +18,11 @@ from matplotlib.lines import Line2D
 from torch import Tensor
 
 from benchmarks.pages import machine, write_page
+from benchmarks.rendering.builders import build_renderer
 from framework.configuration.schema import build, resolve
 from framework.figures.style import COLOURS, GREY, titled_figure
 from framework.geometry.srgb import bytes_from_linear
 from framework.heads.posed_body import scene_of
-from framework.renderer import Renderer
 from plugins.data.pose_from_image.data import PoseFromImage
 from plugins.density_head.fit_pose.descent import Descent
 from plugins.metric.pose_error.metric import place_errors
@@ -39,11 +39,6 @@ GRADIENTS: dict[str, dict[str, Any]] = {
 take four times as long with 4 × 4 samples."""
 OPTIONS: dict[str, Any] = {"steps": 30, "restarts": 1, "enough": 0.003}
 """Default settings of the density head."""
-
-
-def build_renderer(**config: object) -> Renderer:
-    """Return a rasteriser."""
-    return build("renderer", resolve("renderer", {"name": "rasterizer", **config}))
 
 
 def load_data() -> PoseFromImage:
@@ -63,7 +58,7 @@ def measure(gradient: str) -> None:
     test = source.splits().test
     descent = Descent(
         source.body_model,
-        build_renderer(**GRADIENTS[gradient]),
+        build_renderer("rasterizer", **GRADIENTS[gradient]),
         source.body_model.camera(*source.input_shape[1:]),
         **OPTIONS,
     )
@@ -144,7 +139,7 @@ def draw_figure(results: dict[str, list[dict[str, np.ndarray]]], start_index: in
     """
     source = load_data()
     camera = source.body_model.camera(*source.input_shape[1:])
-    fine = build_renderer(supersampling=8)
+    fine = build_renderer("rasterizer", supersampling=8)
 
     def draw(numbers: np.ndarray) -> np.ndarray:
         scene = scene_of(source.body_model, torch.from_numpy(numbers).double(), camera)

@@ -18,8 +18,8 @@ import torch
 
 from benchmarks.pages import machine, write_page
 from benchmarks.rendering import rasterizer_growth, rasterizer_peers
+from benchmarks.rendering.builders import build_renderer
 from benchmarks.timing import first_calls, milliseconds
-from framework.configuration.schema import build, resolve
 from framework.geometry.camera import look_from
 from framework.renderer import Renderer, Scene, join_scenes
 
@@ -120,9 +120,9 @@ def render_with_gradient(renderer: Renderer, scene: Scene, learned: str) -> None
     renderer(replace(scene, **{learned: part}), ("color",))["color"].sum().backward()
 
 
-def build_renderer(**config: Any) -> Renderer:
+def build_rasterizer(**config: Any) -> Renderer:
     """Return a rasterizer that keeps nothing from one image to the next."""
-    return build("renderer", resolve("renderer", {"name": "rasterizer", "savings": ALONE, **config}))
+    return build_renderer("rasterizer", **{"savings": ALONE, **config})
 
 
 def crowd(scene: Scene) -> Scene:
@@ -158,8 +158,10 @@ def savings(body: Scene) -> list[str]:
             {"cull": True},
         ),
     ]
-    pairs = [(build_renderer(**with_it), build_renderer(**without_it)) for *_, with_it, without_it in cases]
-    plain = build_renderer(cull=True)
+    pairs = [
+        (build_rasterizer(**with_it), build_rasterizer(**without_it)) for *_, with_it, without_it in cases
+    ]
+    plain = build_rasterizer(cull=True)
     calls = [
         partial(drawing, scene, channels)
         for pair, (_, _, scene, channels, _, _) in zip(pairs, cases, strict=True)
@@ -188,7 +190,7 @@ def batch_table(body: Scene) -> list[str]:
     kept.
     """
     scenes = [replace(body, vertices=body.vertices + 0.001 * number) for number in range(SCENES)]
-    plain = build_renderer(cull=True)
+    plain = build_rasterizer(cull=True)
 
     def one_by_one() -> list[dict[str, torch.Tensor]]:
         return [plain(scene, ("color",)) for scene in scenes]
@@ -216,7 +218,7 @@ def report() -> str:
     """Measure everything, and return the page."""
     torch.set_num_threads(1)
     plain, culling, inside = (
-        build_renderer(**config) for config in ({}, {"cull": True}, {"cull": True, "gradient": "interior"})
+        build_rasterizer(**config) for config in ({}, {"cull": True}, {"cull": True, "gradient": "interior"})
     )
     bodies = [figure(), subdivide(*figure())]
     scenes = [scene(*body, distance=DISTANCE) for body in bodies]

@@ -82,9 +82,9 @@ def report() -> str:
             f"The count took {seconds:.0f} s.",
             "",
             f"The second test draws a closed body of 27,554 vertices in {VIEWS} views of {HEIGHT} × {WIDTH} pixels. "
-            f"It covers {covered:,} pixels and has {holes} holes. {cracks} pixels show another face if faces seen "
-            "from behind are left out; pixels at the outline and their neighbours are not counted. Such a pixel would "
-            "be a crack between two faces.",
+            f"It covers {covered:,} pixels and has {holes} holes. Then the faces seen from behind are left out, and "
+            f"{cracks} pixels show another face than before. Such a pixel would be a crack between two faces. Pixels "
+            "at the outline and their neighbours are not counted.",
             "",
             f"{machine('numba', 'numpy')} Command: `python -m benchmarks.rendering.rasterizer_coverage`.",
             "",

@@ -17,10 +17,10 @@ import torch
 from torch import Tensor
 
 from benchmarks.pages import machine, write_page
+from benchmarks.rendering.builders import build_renderer
 from benchmarks.rendering.rasterizer import DISTANCE, HEIGHT, WIDTH, figure
 from benchmarks.rendering.rasterizer import scene as figure_scene
 from benchmarks.timing import milliseconds
-from framework.configuration.schema import build, resolve
 from framework.renderer import Renderer
 from framework.reports.tradeoff_picture import error_against_run_time
 from plugins.renderer.rasterizer.test_gradient import KINDS, VIEWS, blob, parameters, scene
@@ -39,11 +39,6 @@ STEP = 2e-3
 BODY = blob()
 TEXTURED = (False, True)
 """Whether the body has a texture instead of colours."""
-
-
-def build_renderer(**config: object) -> Renderer:
-    """Return a rasteriser."""
-    return build("renderer", resolve("renderer", {"name": "rasterizer", **config}))
 
 
 def loss(
@@ -99,7 +94,7 @@ def fit_step(drawing: Renderer) -> Callable[[], None]:
     """Return a call that renders a body and the gradient of its vertices, for a target 3 cm beside it."""
     shown = figure_scene(*figure(), distance=DISTANCE)
     aside = replace(shown, vertices=shown.vertices + torch.tensor([0.03, 0.0, 0.02]))
-    target = build_renderer()(aside)["color"]
+    target = build_renderer("rasterizer")(aside)["color"]
 
     def step() -> None:
         vertices = shown.vertices.clone().requires_grad_()
@@ -115,14 +110,14 @@ def blob_step(drawing: Renderer, target: Tensor) -> Callable[[], None]:
 
 def measure() -> list[dict[str, Any]]:
     """Return the errors and run times of all gradients, one row for each value of a knob."""
-    finest = build_renderer(supersampling=16)
+    finest = build_renderer("rasterizer", supersampling=16)
     with torch.no_grad():
         aims = targets(finest)
         references = differences(finest, aims)
     rows = []
     for method, (config, knob, values) in METHODS.items():
         for value in values:
-            drawing = build_renderer(**config, **{knob: value})
+            drawing = build_renderer("rasterizer", **config, **{knob: value})
             gradients = compute_gradients(drawing, aims)
             row: dict[str, Any] = {"method": method, "knob": knob, "value": value}
             for name in gradients:

@@ -16,7 +16,6 @@ import time
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -25,11 +24,11 @@ from torch import Tensor
 
 import framework
 from benchmarks.pages import machine, write_page
+from benchmarks.rendering.builders import build_renderer
 from framework.configuration.loading import find_checkpoint, read_stored
-from framework.configuration.schema import build, resolve
 from framework.figures.style import titled_figure
 from framework.geometry.srgb import bytes_from_linear, srgb_from_linear
-from framework.renderer import Renderer, Scene
+from framework.renderer import Scene
 from plugins.data.human_scans import flow
 from plugins.data.human_scans.animate import SPEED, data_of, follow_motion, generated_person
 from plugins.data.human_scans.animation import on_white, orbit, photograph
@@ -43,10 +42,6 @@ LOOPS = 60
 BRIGHT = 60.0
 """Difference, of 255, that is drawn in the brightest colour."""
 Images = dict[str, list[Tensor]]
-
-
-def build_renderer(name: str, **config: Any) -> Renderer:
-    return build("renderer", resolve("renderer", {"name": name, **config}))
 
 
 def walk(run: str, file: Path, subject: str) -> tuple[Images, list[Scene]]:

@@ -17,10 +17,10 @@ import torch
 from torch import Tensor
 
 from benchmarks.pages import machine, read_rows, write_page
+from benchmarks.rendering.builders import build_encoder
 from benchmarks.rendering.rasterizer_growth import milliseconds, slope
 from framework.bodies.people import load_body
 from framework.bodies.topologies import Name, sheet, topology
-from framework.configuration.schema import build, resolve
 from framework.encoder import Encoder
 from framework.figures.style import COLOURS, MARKERS, save_figure, titled_figure
 from framework.reports.table import Row, write_csv
@@ -42,14 +42,6 @@ def person(name: Name) -> Tensor:
     return torch.cat([in_front(vertices, *SIZE).to_canonical(vertices), (vertices - low) / (high - low)], 1)[
         None
     ]
-
-
-def build_encoder(name: str, shape: tuple[int, ...], **config: object) -> Encoder:
-    """Return an encoder with random weights of a fixed seed, in evaluation mode."""
-    torch.manual_seed(0)
-    return build(
-        "encoder", resolve("encoder", {"name": name, **config}), input_shape=shape, input_columns=()
-    ).eval()
 
 
 def ways(shape: tuple[int, ...], name: str) -> dict[str, Callable[[Tensor], Tensor]]:

@@ -21,8 +21,8 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from benchmarks.commands import ROOT, carry_out
 from benchmarks.pages import machine, replace_section, write_page
+from benchmarks.rendering.builders import build_encoder
 from benchmarks.rendering.rasterizer import figure
-from benchmarks.rendering.smplpix_growth import build_encoder
 from benchmarks.timing import ROUNDS, Rounds, milliseconds, require_idle, time_interleaved
 from framework.configuration.loading import load_with_description, reader
 from framework.encoder import Encoder
@@ -259,9 +259,9 @@ def frames_section() -> str:
     lines, times, cover = measure_frames()
     return "\n".join(
         [
-            f"The images show a synthetic body of {body().shape[1]:,} points. The points are projected with splats of "
-            f"{SPLAT} pixels, as in `experiment=smplpix/quick`. The body covers {cover[0]:.0%} of the larger image "
-            f"and {cover[1]:.0%} of the smaller one.",
+            f"The images show a synthetic body of {body().shape[1]:,} points. The points are projected with splats, "
+            f"which are discs around the points with a radius of {SPLAT} pixels, as in `experiment=smplpix/quick`. "
+            f"The body covers {cover[0]:.0%} of the larger image and {cover[1]:.0%} of the smaller one.",
             "",
             f"A time is processor time of one thread: the median of {ROUNDS} rounds (least to largest). The networks "
             "alternate. In the rows `projection` only the projection is measured, without or with splats. In the "
@@ -296,8 +296,8 @@ def report() -> str:
             "# unet and slim: run time and accuracy (synthetic people)",
             "",
             "This page compares `unet` and `slim`, two neural networks that draw an image of a person from projected "
-            "points. It measures their run time, their training, and the errors of two measures that save time: the "
-            "crop to the subject and the number format bfloat16. All people are synthetic.",
+            "points. It measures their run time, their training, and the errors of two ways to save time: the crop to "
+            "the subject and the number format bfloat16. All people are synthetic.",
             "",
             FRAMES,
             "",

@@ -104,7 +104,7 @@ def report() -> str:
         threaded.append(f"| {cloud.shape[1]:,} | {single:.2f} | {double:.2f} | {single / double:.2f} |")
     counts = [float(cloud.shape[1]) for cloud in clouds]
     targets = ", ".join(
-        f"{time:.2f} ms of {limit} ms at {count:,.0f} points"
+        f"{time:.2f} ms at {count:,.0f} points (target: at most {limit} ms)"
         for time, limit, count in zip(ours, TARGETS, counts, strict=False)
     )
     return "\n".join(
@@ -119,7 +119,7 @@ def report() -> str:
             f"columns. A time is the processor time of one call on one thread, in ms: the lowest of {ROUNDS} medians. "
             "It includes the check of the encoder's input. All implementations gave bitwise equal images in this run.",
             "",
-            f"The targets of the project are met if the times below are smaller than the limits: {targets}.",
+            f"The following times are compared with the targets of the project: {targets}.",
             "",
             "`pixels hit` is the share of pixels that show a point. `compiled` and `PyTorch` are the times of the two "
             f"implementations, and `ratio` is the time of PyTorch divided by the compiled one. `batch of {BATCH}` is "
