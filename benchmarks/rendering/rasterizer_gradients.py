@@ -38,7 +38,7 @@ STEP = 2e-3
 """Step of the central differences, in units of the parameters."""
 BODY = blob()
 TEXTURED = (False, True)
-"""Whether the body has a texture instead of colours."""
+"""Values of the option that gives the body a texture instead of colours."""
 
 
 def loss(

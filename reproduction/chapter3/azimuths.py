@@ -43,7 +43,7 @@ SURE, NEAR = 0.9, math.radians(45)
 
 
 class ImageScores(NamedTuple):
-    """For each test image: errors of median and mode in degrees, entropy in nats, probability near the median, blur."""
+    """Results for each test image: errors of median and mode (degrees), entropy (nats), mass near the median, blur."""
 
     median_error: np.ndarray
     mode_error: np.ndarray

@@ -35,7 +35,7 @@ class PerImage(Metric, HasFigure):
 
     keys: tuple[str, ...]
     masked: bool
-    """Whether `judge` receives the true masks."""
+    """True if `judge` receives the true masks."""
     numbers: list[Tensor]
     pairs: list[Tensor]
     facts: list[Tensor]

@@ -28,7 +28,7 @@ If the samples need more, they are computed in parts.
 
 
 class Layout(NamedTuple):
-    """How the samples of a model are computed.
+    """Way in which the samples of a model are computed.
 
     Attributes:
         vectorised: whether `torch.vmap` runs the network; layers before the first dropout are then computed only once.
