@@ -15,9 +15,9 @@ from pathlib import Path
 
 import torch
 
+from benchmarks.framework.check_parts import change_seed
 from benchmarks.pages import machine, write_page
 from framework.configuration.registry import installed
-from framework.testing import finding
 from framework.testing.contract import contract
 from tests.planted_faults import ALL_FAULTS
 from tests.planted_questions import FURTHER_FAULTS
@@ -40,12 +40,7 @@ def examine_faults() -> list[str]:
 
 def find_alarms(seed: int) -> list[str]:
     """Return the failed tests of correct density heads with a random seed."""
-    before = finding.SEED
-    for module in list(sys.modules.values()):  # every module that imported SEED has a copy of it
-        if getattr(module, "SEED", None) == before and module.__name__.startswith(
-            ("framework.testing", "plugins")
-        ):
-            module.SEED = seed  # pyright: ignore[reportAttributeAccessIssue]
+    change_seed(seed)
     failed = []
     for name in installed("density_head"):
         whole = contract("density_head", name)
