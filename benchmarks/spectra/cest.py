@@ -223,9 +223,8 @@ def draw_maps(network: Predictor, data: CEST, file: Path) -> None:
         methods[name] = slice_of(maps_of(volume, names, point, deviation), volume)
     figure = maps_figure(methods, f"{file.name}: amplitudes of the lines")
     path = save_figure(figure, HERE.with_name("cest_maps"), True)
-    Image.open(path).convert("RGB").quantize(256).save(
-        path, optimize=True
-    )  # reduces the file to a third of its size
+    # 256 colours reduce the file to a third of its size
+    Image.open(path).convert("RGB").quantize(256).save(path, optimize=True)
 
 
 @torch.no_grad()
