@@ -1,4 +1,4 @@
-"""Checks of the raw parameters that a density head reads, and of a mixture's component."""
+"""Checks of the raw parameters that a density head reads or is fitted to, and of a mixture's component."""
 
 import math
 
@@ -28,6 +28,22 @@ def require_finite(raw: Tensor, size: int) -> Tensor:
             f"The raw parameters are not finite in batch row {row[0] if len(row) == 1 else row}."
         )
     return raw.float() if raw.dtype in (torch.float16, torch.bfloat16) else raw
+
+
+def require_validation(raw: Tensor, fitted: str) -> None:
+    """Check that `calibrate` got samples.
+
+    Args:
+        raw: raw parameters of the validation split, (sample, size).
+        fitted: what is fitted, with its verb: "A fixed covariance is".
+
+    Raises:
+        ValueError: the split is empty.
+    """
+    if len(raw) == 0:
+        raise ValueError(
+            f"{fitted} fitted to the validation split, but this split is empty. Use data with a validation split."
+        )
 
 
 def require_trained(component: DensityHead) -> DensityHead:

@@ -1,7 +1,6 @@
 """The Bernoulli image head: the probability that each number of an image is 1 and not 0."""
 
 import math
-from collections.abc import Mapping
 from typing import ClassVar
 
 import torch
@@ -10,7 +9,7 @@ from torch import Tensor
 from torch.nn.functional import hardtanh
 
 from framework.density_head import DensityHead
-from framework.heads.parameters import require_finite
+from framework.heads.parameters import require_finite, require_validation
 from framework.storage.weights import require_state
 from framework.target import Target
 from plugins.density_head.bernoulli_image.density import BernoulliImage
@@ -35,7 +34,6 @@ class BernoulliImageHead(DensityHead):
     to the validation split.
     """
 
-    knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
     direct: ClassVar[bool] = True
     bibtex = "guo2017calibration"
 
@@ -63,11 +61,7 @@ class BernoulliImageHead(DensityHead):
     def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
         """Fit the factor of log-odds by maximum likelihood."""
         # the log-likelihood is concave in the factor, so that its derivative has a single zero
-        if len(raw) == 0:
-            raise ValueError(
-                "The factor of the log-odds is fitted to the validation split, but this split is empty. Use data with "
-                "a validation split."
-            )
+        require_validation(raw, "The factor of the log-odds is")
         low, high = math.log(LEAST), math.log(MOST)
         for _ in range(ROUNDS):
             middle = (low + high) / 2

@@ -1,8 +1,5 @@
 """Class probabilities: any number of classes by softmax, two by a logistic."""
 
-from collections.abc import Mapping
-from typing import ClassVar
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -18,7 +15,6 @@ from framework.target import Target
 class CategoricalHead(DensityHead):
     """Class probabilities by softmax; trains by cross-entropy."""
 
-    knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
     bibtex = "bridle1990probabilistic"
 
     def __init__(self, target: Target) -> None:
@@ -34,7 +30,6 @@ class CategoricalHead(DensityHead):
 class BernoulliHead(DensityHead):
     """Two classes by a logistic (thesis eq. 2.9-2.11); trains by binary cross-entropy."""
 
-    knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
     bibtex = "cox1958regression"
 
     def __init__(self, target: Target) -> None:

@@ -1,8 +1,7 @@
 """A recurrent network that predicts a flight frame by frame; each prediction is the input of the next one."""
 
 import math
-from collections.abc import Mapping
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
@@ -35,7 +34,6 @@ class LSTMHead(DensityHead):
         hidden: width of the network.
     """
 
-    knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
     direct = True
     bibtex = "hochreiter1997long"
 

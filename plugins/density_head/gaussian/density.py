@@ -6,13 +6,13 @@ from functools import cached_property
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.distributions import Distribution, constraints
+from torch.distributions import constraints
 
 from framework.distributions import protocol
-from framework.distributions.description import one_line
+from framework.distributions.symmetric import Symmetric
 
 
-class Gaussian(Distribution):
+class Gaussian(Symmetric):
     """A Gaussian with a full covariance, written as regressions of each number on the previous ones.
 
     With d = y - μ, every e_i = d_i - Σ_{j<i} φ_ij d_j is an independent N(0, σ_i²): the modified Cholesky factors of
@@ -25,9 +25,7 @@ class Gaussian(Distribution):
         coefficients: (*batch, number, number), φ strictly below the diagonal, 0 elsewhere; None if all are 0.
     """
 
-    arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
     has_rsample = True
-    __repr__ = one_line
 
     def __init__(
         self,
@@ -44,16 +42,6 @@ class Gaussian(Distribution):
     def support(self) -> constraints.Constraint:
         """Support of the density."""
         return constraints.real_vector
-
-    @property
-    def mean(self) -> Tensor:
-        """Mean of each number."""
-        return self.location
-
-    @property
-    def mode(self) -> Tensor:
-        """Value of highest density, which is the mean."""
-        return self.location
 
     @property
     def variance(self) -> Tensor:
@@ -165,12 +153,6 @@ def _(density: Gaussian, value: Tensor) -> protocol.QuadraticBound:
 def _(density: Gaussian, index: tuple[Tensor, ...], place: Tensor) -> Gaussian:
     location = density.location.double()[index] - place
     return Gaussian(location, density.scale.double()[index].expand_as(location))
-
-
-@protocol.median.register
-def _(density: Gaussian, samples: int) -> Tensor:
-    # each number's marginal is symmetric about its mean
-    return density.location
 
 
 @protocol.normals.register

@@ -1,8 +1,7 @@
 """The Gaussian head: a mean and standard deviations for each input."""
 
 import math
-from collections.abc import Mapping
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Float
@@ -11,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import hardtanh, mse_loss
 
 from framework.density_head import DensityHead
-from framework.heads.parameters import require_finite
+from framework.heads.parameters import require_finite, require_validation
 from framework.heads.unit import Unit
 from framework.storage.weights import require_state
 from framework.target import Target
@@ -42,7 +41,6 @@ class GaussianHead(DensityHead):
             values.
     """
 
-    knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
     bibtex = "nix1994estimating"
 
     scale: Tensor
@@ -102,11 +100,7 @@ class GaussianHead(DensityHead):
         """Fit a fixed covariance by maximum likelihood; do nothing if it is predicted."""
         if self.predicted:
             return
-        if len(raw) == 0:
-            raise ValueError(
-                "A fixed covariance is fitted to the validation split, but this split is empty. Use data with a "
-                "validation split."
-            )
+        require_validation(raw, "A fixed covariance is")
         residual = (
             self.unit.standardise(target).double() - self._mean(require_finite(raw, self.size)).double()
         )

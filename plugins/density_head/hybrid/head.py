@@ -1,7 +1,6 @@
 """A density around a mean that an encoder gives, such as a physical model; a network predicts its shape."""
 
-from collections.abc import Mapping
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
@@ -35,7 +34,6 @@ class HybridHead(DensityHead):
         component: the head whose density is shifted and scaled.
     """
 
-    knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
     direct = True
     bibtex = "psichogios1992hybrid"
 

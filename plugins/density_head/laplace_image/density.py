@@ -8,21 +8,20 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.distributions import Distribution, constraints
 
-from framework.distributions.description import one_line
 from framework.distributions.protocol import (
     estimate,
     exact_estimate,
     images,
     marginal_cdfs,
-    median,
     pick,
     take,
     tempered_density,
 )
+from framework.distributions.symmetric import Symmetric
 from framework.geometry.srgb import linear_from_srgb
 
 
-class LaplaceImage(Distribution):
+class LaplaceImage(Symmetric):
     """Independent Laplace densities of the numbers of an image: log p is -|y - μ|/b - log 2b.
 
     With one b for all numbers, the negative log-likelihood is the L1 distance between images, up to a factor and a
@@ -33,9 +32,7 @@ class LaplaceImage(Distribution):
         scale: b > 0, broadcastable to `location`.
     """
 
-    arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
     has_rsample = True
-    __repr__ = one_line
 
     def __init__(
         self, location: Float[Tensor, "*batch height width number"], scale: Float[Tensor, "*any"]
@@ -48,16 +45,6 @@ class LaplaceImage(Distribution):
     def support(self) -> constraints.Constraint:
         """Support of the density."""
         return constraints.independent(constraints.real, 3)
-
-    @property
-    def mean(self) -> Tensor:
-        """Mean of each number."""
-        return self.location
-
-    @property
-    def mode(self) -> Tensor:
-        """Image of highest density, which is the location."""
-        return self.location
 
     @property
     def variance(self) -> Tensor:
@@ -85,12 +72,6 @@ class LaplaceImage(Distribution):
 
 
 estimate.register(LaplaceImage, exact_estimate)
-
-
-@median.register
-def _(density: LaplaceImage, samples: int) -> Tensor:
-    # the density of each number is symmetric around its location
-    return density.location
 
 
 @marginal_cdfs.register

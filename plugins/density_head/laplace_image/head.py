@@ -1,7 +1,6 @@
 """The Laplace image head: an image, and the scale of the error of each of its numbers."""
 
 import math
-from collections.abc import Mapping
 from typing import Annotated, ClassVar, Literal
 
 import torch
@@ -11,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import hardtanh
 
 from framework.density_head import DensityHead
-from framework.heads.parameters import require_finite
+from framework.heads.parameters import require_finite, require_validation
 from framework.storage.weights import require_state
 from framework.target import Target
 from plugins.density_head.laplace_image.density import LaplaceImage
@@ -55,7 +54,6 @@ class LaplaceImageHead(DensityHead):
             without a weight the network may predict white everywhere.
     """
 
-    knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
     direct: ClassVar[bool] = True
     bibtex = "kendall2017uncertainties, seitzer2022pitfalls"
 
@@ -105,11 +103,7 @@ class LaplaceImageHead(DensityHead):
     @torch.no_grad()
     def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
         """Fit the factor of the scales to the validation split."""
-        if len(raw) == 0:
-            raise ValueError(
-                "The scale of an image's numbers is fitted to the validation split, but this split is empty. Use data "
-                "with a validation split."
-            )
+        require_validation(raw, "The scale of an image's numbers is")
         parts = zip(target, map(self._parts, raw), strict=True)
         distances = (((value - location).abs() / scale) for value, (location, scale) in parts)
         if self.cover is None:

@@ -1,8 +1,5 @@
 """The matrix Fisher head, which turns nine raw parameters into one density over viewpoints."""
 
-from collections.abc import Mapping
-from typing import ClassVar
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -31,7 +28,6 @@ class MatrixFisherHead(DensityHead):
         ConfigError: the target is not azimuth, elevation and tilt, in this order.
     """
 
-    knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
     bibtex = "mohlin2020probabilistic"
 
     def __init__(self, target: Target) -> None:

@@ -1,7 +1,6 @@
 """The finite mixture head."""
 
-from collections.abc import Mapping
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
@@ -33,7 +32,6 @@ class MixtureHead(DensityHead):
         component: the head whose densities are mixed.
     """
 
-    knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
     bibtex = "bishop1994mixture"
 
     def __init__(

@@ -13,6 +13,7 @@ from torch.distributions import Categorical, Distribution
 from framework.density_head import DensityHead, Fitted
 from framework.distributions.density import Mixture
 from framework.distributions.normals import IndependentNormals
+from framework.heads.parameters import require_validation
 from framework.heads.unit import Unit
 from framework.target import Target
 from plugins.density_head.trees.forest import frequencies, leaves
@@ -150,10 +151,7 @@ class ExtraTreesHead(DensityHead, Fitted):
         """Fit the widths by maximum likelihood; do nothing for classes."""
         if self.classes:
             return
-        if len(raw) == 0:
-            raise ValueError(
-                "Widths are fitted to the validation split, but this split is empty. Use data with a validation split."
-            )
+        require_validation(raw, "Widths are")
         density = self(raw.double())
         assert isinstance(density, Mixture)
         means, target = map(self.unit.standardise, (density.components.mean, target.double()))

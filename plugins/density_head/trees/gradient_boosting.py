@@ -14,6 +14,7 @@ from torch.distributions import Categorical, Distribution
 from framework.density_head import DensityHead, Fitted
 from framework.distributions.normals import IndependentNormals
 from framework.errors import ConfigError
+from framework.heads.parameters import require_validation
 from framework.heads.unit import Unit
 from framework.target import Target
 from plugins.density_head.trees.heads_without_gradient import (
@@ -141,11 +142,7 @@ class XGBoostHead(DensityHead, Fitted):
         """Set the standard deviations to those of the residuals; do nothing for classes."""
         if self.classes:
             return
-        if len(raw) == 0:
-            raise ValueError(
-                "A standard deviation is fitted to the validation split, but this split is empty. Use data with a "
-                "validation split."
-            )
+        require_validation(raw, "A standard deviation is")
         self._measure_width(raw, target)
 
     def _measure_width(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:

@@ -1,8 +1,7 @@
 """A density head that adds a small uniform density to the density of another head."""
 
 import math
-from collections.abc import Mapping
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
@@ -32,7 +31,6 @@ class UniformFloorHead(DensityHead):
         component: the head whose density the floor is added to.
     """
 
-    knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
     bibtex = "prokudin2018deep"
 
     def __init__(

@@ -3,10 +3,9 @@
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.distributions import Distribution, constraints, register_kl
+from torch.distributions import constraints, register_kl
 
 from framework.distributions.circular import circular
-from framework.distributions.description import one_line
 from framework.distributions.protocol import (
     QuadraticBound,
     arc_length,
@@ -14,13 +13,13 @@ from framework.distributions.protocol import (
     estimate,
     exact_estimate,
     marginal,
-    median,
     pick,
     quadratic_bound,
     recentre,
     take,
     tempered_density,
 )
+from framework.distributions.symmetric import Symmetric
 from plugins.density_head.von_mises import functions, integrals
 
 LARGEST = {torch.float32: torch.finfo(torch.float32).max, torch.float64: 1e300}
@@ -30,7 +29,7 @@ At this κ the density is a point mass in all but its height.
 """
 
 
-class VonMises(Distribution):
+class VonMises(Symmetric):
     """Angles with independent von Mises densities given their parameters (thesis eq. 3.3).
 
     Args:
@@ -41,9 +40,7 @@ class VonMises(Distribution):
         ValueError: a negative concentration.
     """
 
-    arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
     has_rsample = False
-    __repr__ = one_line
 
     def __init__(
         self, mean: Float[Tensor, "*batch angle"], concentration: Float[Tensor, "*batch angle"]
@@ -63,16 +60,6 @@ class VonMises(Distribution):
     def support(self) -> constraints.Constraint:
         """Support of the density."""
         return circular
-
-    @property
-    def mean(self) -> Tensor:
-        """Mean direction of each angle, (*batch, angle), radians."""
-        return self.location
-
-    @property
-    def mode(self) -> Tensor:
-        """Angles of highest density, which are the mean directions."""
-        return self.location
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Return the log-density, nats, (*sample, *batch)."""
@@ -113,12 +100,6 @@ def _(density: VonMises, value: Tensor) -> QuadraticBound:
 def _(density: VonMises, index: tuple[Tensor, ...], place: Tensor) -> VonMises:
     location = density.location.double()[index] - place
     return VonMises(location, density.concentration.double()[index].expand_as(location))
-
-
-@median.register
-def _(density: VonMises, samples: int) -> Tensor:
-    # the density is symmetric around its mean and falls on both sides of it
-    return density.location
 
 
 @tempered_density.register

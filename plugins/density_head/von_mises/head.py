@@ -1,7 +1,6 @@
 """The von Mises head: one mean and one concentration per angle."""
 
-from collections.abc import Mapping
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Float
@@ -9,7 +8,7 @@ from pydantic import Field
 from torch import Tensor
 
 from framework.density_head import DensityHead
-from framework.heads.parameters import require_finite
+from framework.heads.parameters import require_finite, require_validation
 from framework.storage.weights import FROM_0, require_state
 from framework.target import Target
 from plugins.density_head.von_mises import functions
@@ -43,7 +42,6 @@ class VonMisesHead(DensityHead):
         floor: smallest κ.
     """
 
-    knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
     bibtex = "prokudin2018deep"
 
     concentration: Tensor
@@ -86,11 +84,7 @@ class VonMisesHead(DensityHead):
         """Fit a fixed concentration by maximum likelihood; do nothing if it is predicted."""
         if self.predicted:
             return
-        if len(raw) == 0:
-            raise ValueError(
-                "A fixed concentration is fitted to the validation split, but this split is empty. Use data with a "
-                "validation split."
-            )
+        require_validation(raw, "A fixed concentration is")
         sine, _ = half_angle(target.double(), self(raw).mean.double())
         deviation = 2 * sine.square()
         concentration = functions.concentration_of_moments((1 - deviation).mean(0), deviation.mean(0))

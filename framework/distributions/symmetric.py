@@ -1,0 +1,31 @@
+"""Base of densities that are symmetric about one point and fall on all sides of it."""
+
+from torch import Tensor
+from torch.distributions import Distribution
+
+from framework.distributions.description import one_line
+from framework.distributions.protocol import median
+
+
+class Symmetric(Distribution):
+    """Density whose mean, mode and median are its `location`, (*batch, *event)."""
+
+    arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
+    __repr__ = one_line
+
+    location: Tensor
+
+    @property
+    def mean(self) -> Tensor:
+        """Mean of each number; for angles the mean direction, radians."""
+        return self.location
+
+    @property
+    def mode(self) -> Tensor:
+        """Value of highest density."""
+        return self.location
+
+
+@median.register
+def _(density: Symmetric, samples: int) -> Tensor:
+    return density.location
