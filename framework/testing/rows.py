@@ -34,11 +34,25 @@ class Case:
 
 
 @dataclass(frozen=True)
-class HeadRow:
-    """Parameters with which a density head is checked.
+class Row:
+    """Base of the rows; these are the attributes of all rows.
 
     Attributes:
         name: Description that distinguishes the row from the plugin's other rows.
+        limits: Property → largest error that passes, where it differs from the default.
+        leave_out: Property that is not checked → reason.
+    """
+
+    name: str
+    limits: Mapping[str, float] = field(default_factory=dict, kw_only=True)
+    leave_out: Mapping[str, str] = field(default_factory=dict, kw_only=True)
+
+
+@dataclass(frozen=True)
+class HeadRow(Row):
+    """Parameters with which a density head is checked.
+
+    Attributes:
         target: Target that the head predicts.
         config: Parameters of the plugin.
         cases: Function from the head, in evaluation mode and float64, to reference cases; None where no reference is
@@ -46,36 +60,27 @@ class HeadRow:
         scale: Standard deviation of the random raw parameters at which densities are integrated on a grid: those of
             three numbers, and those that draw random numbers in log_prob. The densities must be broad enough for the
             grid. All other densities are also integrated at scales from 1e-2 to 1e3.
-        limits: Property → largest error that passes, where it differs from the default.
-        leave_out: Property that is not checked → reason.
     """
 
-    name: str
     target: Target
     config: Mapping[str, Any] = field(default_factory=dict)
     cases: Callable[[DensityHead], Iterable[Case]] | None = None
     scale: float = 1.0
-    limits: Mapping[str, float] = field(default_factory=dict)
-    leave_out: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
-class EncoderRow:
+class EncoderRow(Row):
     """Parameters with which an encoder of vectors, or of images of up to 3 channels, is checked; see also CloudRow.
 
     Attributes:
-        name: Description that distinguishes the row from the plugin's other rows.
         input_shape: Shape of the input of one sample.
-        config, limits, leave_out: See HeadRow.
+        config: Parameters of the plugin.
         columns: Names of the entries of the input's last dimension, as in `Data.columns`.
         inputs: Function from a number of samples to inputs, for an encoder that does not accept random numbers.
     """
 
-    name: str
     input_shape: tuple[int, ...]
     config: Mapping[str, Any] = field(default_factory=dict)
-    limits: Mapping[str, float] = field(default_factory=dict)
-    leave_out: Mapping[str, str] = field(default_factory=dict)
     columns: tuple[str, ...] = ()
     inputs: Callable[[int], Tensor] | None = None
 
@@ -90,80 +95,64 @@ class CloudRow(EncoderRow):
 
 
 @dataclass(frozen=True)
-class MetricRow:
+class MetricRow(Row):
     """Parameters with which a metric is checked.
 
     Attributes:
-        name: Description that distinguishes the row from the plugin's other rows.
         target: Target of the predictions. A metric that reads images gets those of `framework.testing.balls`.
         fields: Further batch fields that the metric reads: name → function from a number of samples to a tensor with
             that first dimension.
         size: Height and width, pixels, of the predicted images, for a metric that reads images.
-        config, limits, leave_out: See HeadRow.
+        config: Parameters of the plugin.
     """
 
-    name: str
     target: Target
     config: Mapping[str, Any] = field(default_factory=dict)
     fields: Mapping[str, Callable[[int], Tensor]] = field(default_factory=dict)
     size: tuple[int, int] = (24, 32)
-    limits: Mapping[str, float] = field(default_factory=dict)
-    leave_out: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
-class WrapperRow:
+class WrapperRow(Row):
     """Parameters with which an uncertainty wrapper is checked.
 
     Attributes:
-        name: Description that distinguishes the row from the plugin's other rows.
         target: Target of the wrapped model.
         identity: Parameters with which the wrapper must equal the wrapped model to the last bit, for example
             {"members": 1}; None where there are none.
-        config, limits, leave_out: See HeadRow.
+        config: Parameters of the plugin.
     """
 
-    name: str
     target: Target
     config: Mapping[str, Any] = field(default_factory=dict)
     identity: Mapping[str, Any] | None = None
-    limits: Mapping[str, float] = field(default_factory=dict)
-    leave_out: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
-class ObjectiveRow:
+class ObjectiveRow(Row):
     """Parameters with which an objective is checked; inputs are vectors of `framework.testing.wrappers.LENGTH` numbers.
 
     Attributes:
-        name: Description that distinguishes the row from the plugin's other rows.
         target: Target of the predictor.
         fields: Further batch fields that the objective reads: name → function from a number of samples to a tensor with
             that first dimension.
-        config, limits, leave_out: See HeadRow.
+        config: Parameters of the plugin.
     """
 
-    name: str
     target: Target
     config: Mapping[str, Any] = field(default_factory=dict)
     fields: Mapping[str, Callable[[int], Tensor]] = field(default_factory=dict)
-    limits: Mapping[str, float] = field(default_factory=dict)
-    leave_out: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
-class RendererRow:
+class RendererRow(Row):
     """Parameters with which a renderer is checked.
 
     Attributes:
-        name: Description that distinguishes the row from the plugin's other rows.
-        config, limits, leave_out: See HeadRow.
+        config: Parameters of the plugin.
     """
 
-    name: str
     config: Mapping[str, Any] = field(default_factory=dict)
-    limits: Mapping[str, float] = field(default_factory=dict)
-    leave_out: Mapping[str, str] = field(default_factory=dict)
 
 
 Damage = Literal["missing", "empty", "cut", "garbage", "folder"]
@@ -186,12 +175,11 @@ NEEDS_ROWS: Mapping[str, str] = dict.fromkeys(
 
 
 @dataclass(frozen=True)
-class DataRow:
+class DataRow(Row):
     """Parameters with which a data set is checked. It should be small, because it is prepared a dozen times.
 
     Attributes:
-        name: Description that distinguishes the row from the plugin's other rows.
-        config, limits, leave_out: See HeadRow.
+        config: Parameters of the plugin.
         write: Function that writes the files of the data set to an empty folder, in the official layout where there is
             one, and returns the parameters that locate them, for example {"root": ...}. None for generated data.
         synthetic: Value that `Data.synthetic` must have; None accepts any.
@@ -204,7 +192,6 @@ class DataRow:
         changes: Parameters, each with a value that changes the samples and therefore the fingerprint.
     """
 
-    name: str
     config: Mapping[str, Any] = field(default_factory=dict)
     write: Callable[[Path], Mapping[str, Any]] | None = None
     synthetic: bool | None = None
@@ -212,5 +199,3 @@ class DataRow:
     fragile: Mapping[str, Collection[Damage]] = field(default_factory=dict)
     skip: Mapping[str, Any] = field(default_factory=dict)
     changes: Mapping[str, Any] = field(default_factory=dict)
-    limits: Mapping[str, float] = field(default_factory=dict)
-    leave_out: Mapping[str, str] = field(default_factory=dict)

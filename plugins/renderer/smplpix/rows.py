@@ -81,13 +81,15 @@ SLIM_RUN, SURFACE_RUN, UNET_RUN = (
 )
 ROWS = {
     "smplpix": (
-        RendererRow("slim", {"checkpoint": SLIM_RUN}, WHITE, POINTS_ARE_DRAWN),
-        RendererRow("over splats", {"checkpoint": SURFACE_RUN}, UNBOUNDED_WHITE, POINTS_ARE_DRAWN),
+        RendererRow("slim", {"checkpoint": SLIM_RUN}, limits=WHITE, leave_out=POINTS_ARE_DRAWN),
+        RendererRow(
+            "over splats", {"checkpoint": SURFACE_RUN}, limits=UNBOUNDED_WHITE, leave_out=POINTS_ARE_DRAWN
+        ),
         RendererRow(
             "unet of another size, bfloat16, whole frame",
             {"checkpoint": UNET_RUN, "precision": "bfloat16", "crop": "whole"},
-            WHITE,
-            POINTS_ARE_DRAWN,
+            limits=WHITE,
+            leave_out=POINTS_ARE_DRAWN,
         ),
     ),
 }
