@@ -1,4 +1,4 @@
-"""Runs the command line as a user does: in a folder of its own, with a stranger's package installed beside ours."""
+"""Fixtures that run the command line as a user does: in a separate folder, with a third-party package installed."""
 
 import json
 import os
@@ -26,7 +26,7 @@ from framework.storage.cache import folder as cache_folder
 Once = Callable[[str, Callable[[Path], None]], Path]
 STRANGER = Path(__file__).parent / "stranger"
 PATIENCE = 900.0
-"""Seconds after which a command hangs: on a machine with six neighbours some take five minutes."""
+"""Time after which a command counts as hanging, seconds; on a busy machine some commands take five minutes."""
 TINY = [
     "data=dial",
     "density_head=wrapped_cauchy",
@@ -40,7 +40,7 @@ TINY = [
     "trainer.log_every_steps=1",
     "threads=1",
 ]
-"""A run of 27 steps (9 an epoch) on the stranger's data, done in a second after its imports."""
+"""Settings of a run of 27 steps (9 in each epoch) on the third-party data, which takes one second after its imports."""
 
 
 def first_of_each(
@@ -103,7 +103,8 @@ class Done:
 
 @pytest.fixture(scope="session")
 def once(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> Once:
-    """Makes the folder of a name by a function that gets its path; of several workers only the first one does."""
+    """Function that fills the folder of a name by calling another function; of several test workers, only the first
+    calls it."""
     base = tmp_path_factory.getbasetemp()
     shared = base if worker_id == "master" else base.parent
 
@@ -121,7 +122,7 @@ def once(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> Once:
 
 @pytest.fixture(scope="session")
 def stranger_site(once: Once) -> Path:
-    """The stranger's package, built and installed by pip into a folder of its own."""
+    """Return the folder into which pip has installed the third-party package."""
 
     def install(site: Path) -> None:
         arguments = ["install", "--quiet", "--no-deps", "--no-build-isolation", "--target", site, STRANGER]
@@ -169,7 +170,7 @@ def listed(*arguments: str, folder: Path, site: Path | None = None) -> Listed:
 
 
 class Forks:
-    """Runs commands in forks of one process that has imported what most of them need (`fork_server.py`)."""
+    """Server that runs commands in forks of one process that has already imported torch (`fork_server.py`)."""
 
     def __init__(self) -> None:
         self.start()
@@ -197,14 +198,14 @@ class Forks:
         return int(self.server.stdout.readline())
 
     def close(self) -> None:
-        """End the server and whatever runs in it."""
+        """End the server and all commands that run in it."""
         os.killpg(self.server.pid, signal.SIGKILL)
         self.server.communicate()
 
 
 @pytest.fixture(scope="session")
 def forks() -> Iterator[Forks]:
-    """A server of forks for all tests of this process."""
+    """Yield one fork server for all tests of this process."""
     forks = Forks()
     yield forks
     forks.close()
@@ -265,7 +266,7 @@ def command(forks: Forks, site: Path, base: Path) -> Framework:
 
 @pytest.fixture
 def framework(forks: Forks, stranger_site: Path, tmp_path: Path) -> Framework:
-    """The command line, in a folder of this test's own."""
+    """Return a function that runs the command line in a folder of this test."""
     return command(forks, stranger_site, tmp_path)
 
 

@@ -50,7 +50,7 @@ SECONDS = 10.0
 
 
 def case(name: str, action: Callable[[], object]) -> None:
-    """Do it in a fork, and print how that ended: "done", a sentence, or what else was raised."""
+    """Run a function in a fork, and print its outcome: "done", an error message, or another exception."""
     reading, writing = os.pipe()
     child = os.fork()
     if child == 0:
@@ -78,7 +78,7 @@ def case(name: str, action: Callable[[], object]) -> None:
 
 @dataclass
 class Model:
-    """A small model around one plugin, and where the plugin stands in the config."""
+    """Small model that contains one plugin, and the place of this plugin in the config."""
 
     name: str
     config: dict[str, Any]
@@ -104,8 +104,8 @@ class Model:
 
 
 def models(only: str = "") -> Iterator[Model]:
-    """One for each row of every installed plugin that a model is made of, and one for each kind of data; those of one
-    plugin, "encoder mlp", where it is named."""
+    """Yield a model for each row of every plugin that can be part of a model, and for each kind of data; or only for
+    the named plugin, such as "encoder mlp"."""
 
     def names(group: str) -> list[str]:
         return [name for name in installed(group) if only in ("", f"{group} {name}")]
@@ -177,7 +177,8 @@ def put(config: Any, place: tuple[Any, ...], value: Any) -> Any:
 
 
 def stored_parameters(folder: Path) -> None:
-    """Every number of every plugin's config, in the checkpoint of a small model."""
+    """Write checkpoints of small models in which one number of the config is too large, for every number of every
+    plugin."""
     file, seen = folder / "model.ckpt", set()
     for model in models():
         part = model.config
@@ -236,7 +237,7 @@ def image(mode: str, size: tuple[int, int], kind: str, **options: Any) -> bytes:
 
 
 def array(shape: tuple[int, ...], kind: str, content: bytes) -> bytes:
-    """An .npy file."""
+    """Return the bytes of an .npy file."""
     header = io.BytesIO()
     described = {"descr": kind, "fortran_order": False, "shape": shape}
     np.lib.format.write_array_header_1_0(header, described)
@@ -252,7 +253,7 @@ def archive(**arrays: bytes) -> bytes:
 
 
 def matlab(name: bytes, shape: tuple[int, int], content: bytes) -> bytes:
-    """A compressed variable of a MATLAB 5 file, of bytes."""
+    """Return a compressed variable of bytes in a MATLAB 5 file."""
 
     def element(kind: int, data: bytes) -> bytes:
         return struct.pack("<II", kind, len(data)) + data + b"\0" * (-len(data) % 8)
@@ -388,7 +389,7 @@ def bombs() -> dict[str, tuple[Callable[[], bytes], Callable[[Path], object]]]:
 
 
 def files(folder: Path) -> None:
-    """Each reader of users' files, and what a small one unfolds to."""
+    """Read small files that decompress to huge content, with each reader of users' files."""
     writer = os.fork()  # what writing them takes is no part of a case
     if writer == 0:
         try:

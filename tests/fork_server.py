@@ -21,7 +21,7 @@ import pytorch_lightning  # noqa: F401
 def run(
     arguments: list[str], environment: dict[str, str], folder: str, packages: list[str], output: str
 ) -> None:
-    """The command; this process ends with it."""
+    """Run the command, and end this process with its exit code."""
     signal.signal(signal.SIGHUP, signal.SIG_DFL)  # tests may run under nohup
     os.dup2(os.open(output, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), 1)
     os.dup2(1, 2)

@@ -61,7 +61,7 @@ class Case:
 
 
 def squares(values: np.ndarray) -> np.ndarray:
-    """An image (side, side, channels) of four squares."""
+    """Return an image of four squares, (side, side, channels)."""
     values = np.asarray(values)
     return values.reshape(2, 2, -1).repeat(SIDE // 2, 0).repeat(SIDE // 2, 1)
 
@@ -112,7 +112,7 @@ def grey(values: np.ndarray) -> np.ndarray:
 
 
 def frames() -> dict[str, Any]:
-    """Options for an image that is followed by a black one."""
+    """Return options with which Pillow saves a second, black image in the same file."""
     return {"save_all": True, "append_images": [Image.new("RGB", (SIDE, SIDE))]}
 
 
@@ -136,7 +136,7 @@ def tiff(values: np.ndarray, kind: type, tags: Mapping[int, int] | None = None) 
 
 
 def transparent(colour: int | tuple[int, ...]) -> np.ndarray:
-    """Greys over white, of which one level is transparent."""
+    """Return greys composed over white, with one transparent level."""
     return grey(np.where(colour == GREYS, 255, GREYS))
 
 
@@ -271,7 +271,7 @@ def image_data(sound: Path) -> Iterator[tuple[str, Data]]:
 
 
 def pixels(inputs: torch.Tensor) -> np.ndarray:
-    """(channels, height, width) as the bytes of an image."""
+    """Return an image (channels, height, width) as 8-bit numbers."""
     assert inputs.dtype == torch.uint8
     return inputs.movedim(0, -1).numpy()
 
@@ -322,9 +322,9 @@ STORED: dict[str, Reader] = {
     "texture of a subject": of_subject,
     "skin": lambda case, folder: skins.read(written(case, folder)),
 }
-"""Readers of pixels as they are stored, over white."""
+"""Readers of the stored pixels, composed over white."""
 TEXTURES: dict[str, Reader] = {"glTF": of_gltf, "OBJ": of_obj, "PLY": of_ply}
-"""Readers of what lies under transparent pixels."""
+"""Readers of the colours below transparent pixels."""
 
 
 def upright(data: Data) -> dict[str, Reader]:
@@ -390,7 +390,7 @@ def test_every_reader_finds_the_colours_or_refuses_with_a_sentence(
 
 
 REFUSED = re.compile(r"^(?!.*[<>]).*(Image 1\.|one\.|texture|row 0|an image of mode).*\. ?[A-Z]", re.DOTALL)
-"""A sentence that says of which file it speaks, and another with what to do."""
+"""Require that the message names the file and tells the user what to do."""
 
 
 @pytest.mark.parametrize(

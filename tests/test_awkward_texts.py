@@ -280,7 +280,7 @@ INDEX = ("", "Unnamed: 0", "index", "id", "row_number")
 @pytest.mark.parametrize("name", INDEX)
 @pytest.mark.parametrize("start", [0, 1, 100])
 def test_row_numbers_are_no_inputs_and_no_angles(tmp_path: Path, name: str, start: int) -> None:
-    """Also shuffled ones, as a table that was drawn from another has them."""
+    """Row numbers may also be shuffled, as in a table that was sampled from another one."""
     order = np.random.default_rng(0).permutation(30) if start == 100 else np.arange(30)
     file = tmp_path / "one.csv"
     lines = [f"{name},a,file,y"] + [
@@ -379,7 +379,7 @@ LONG = (
 
 @pytest.mark.parametrize("number", range(len(LONG)))
 def test_long_texts_take_linear_time(tmp_path: Path, number: int) -> None:
-    """A pattern of quadratic time would take minutes."""
+    """A regular expression with quadratic time would take minutes."""
     start = time.process_time()
     for name, read in (("one.xyz", vertex), ("one.obj", vertex), ("one.off", vertex), ("one.csv", cell)):
         (tmp_path / name).write_text(f"a;b\n{LONG[number]}", encoding="utf-8")

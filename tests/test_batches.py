@@ -72,7 +72,7 @@ class Sums(Data):
 
 
 class Single(Dataset[Batch]):
-    """The same samples, without batched fetching."""
+    """Data set with the same samples, without fetching whole batches at once."""
 
     def __init__(self, fields: Fields) -> None:
         self.fields = fields
@@ -134,7 +134,7 @@ def test_every_epoch_is_a_permutation_shared_among_the_ranks(
 def test_models_that_train_together_each_have_an_order(
     size: tuple[int, int, int], seed: int, epoch: int, first: int
 ) -> None:
-    """The first that of one that trains alone; also from the middle of an epoch on."""
+    """The first model has the order of a model that trains alone, also after a resumption within an epoch."""
     length, batch_size, orders = size
 
     def batches(**more: Any) -> list[list[int]]:
@@ -317,7 +317,7 @@ def test_where_cuda_is_in_use_its_generator_is_seeded_too(monkeypatch: pytest.Mo
 
 
 class Regression(pl.LightningModule):
-    """Dropout and batch norm, so that a wrong seed, order or statistic shows in the losses."""
+    """Network with dropout and batch norm, so that a wrong seed, order or statistic changes the losses."""
 
     def __init__(self, folder: Path, stop: tuple[str, int, int] | None) -> None:
         super().__init__()
@@ -357,7 +357,7 @@ class Regression(pl.LightningModule):
 
 
 def train(folder: Path, case: dict[str, Any], resume: Path | None) -> None:
-    """One training of 3 epochs of 10 batches, stopped where the case says unless it is resumed."""
+    """Train 3 epochs of 10 batches; unless it is a resumption, stop at the step of the case."""
     folder.mkdir(parents=True)
     stop = None if resume or "whole" in folder.name else tuple(case.get("stop", ())) or None
     checkpoints = pl.callbacks.ModelCheckpoint(
@@ -428,7 +428,7 @@ CASES: dict[str, dict[str, Any]] = {
 
 
 def main(folder: Path) -> None:
-    """Every case in forks of one process, so that Lightning is imported once."""
+    """Run every case in a fork of one process, so that Lightning is imported only once."""
     torch.set_num_threads(1)
     gc.freeze()  # so that collecting a fork's garbage copies none of these pages
     wholes: dict[str, Path] = {}

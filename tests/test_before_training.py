@@ -40,7 +40,7 @@ def targets(target: Target) -> Batch:
 
 
 def given(fields: Fields) -> Data:
-    """A data set that has these three times."""
+    """Return a data set that holds the same samples three times."""
     kind = type("Given", (Data,), {"splits": lambda self: Splits(fields, fields, fields)})
     kind.__abstractmethods__ = frozenset()  # type: ignore[attr-defined]
     data: Data = kind()
@@ -144,8 +144,8 @@ def test_a_label_of_the_test_split_costs_the_test_alone(framework: Framework) ->
 
 
 def test_a_picture_that_nobody_asked_for_costs_no_table(framework: Framework) -> None:
-    """A stranger's density of two angles that has not said what one of them alone is, with a metric that has no better
-    way and data that say nothing of what they left out."""
+    """Third-party parts with omissions: a density of two angles without marginals, a metric without a direction, and
+    data that do not report skipped samples."""
     done = framework(
         *SMALL,
         "density_head=silent",

@@ -1,4 +1,4 @@
-"""A benchmark that is told to stop stops what it runs, and waits until that has closed."""
+"""Stopped benchmarks, which stop their commands and wait until these have ended."""
 
 import signal
 import subprocess
@@ -60,7 +60,7 @@ def test_a_command_that_fails_is_an_error_and_handlers_are_as_before() -> None:
 
 
 def test_every_benchmark_that_runs_the_framework_does_it_so() -> None:
-    """A sweep begun by other means goes on by itself, or is killed in the middle of what it writes."""
+    """A sweep that is started in another way would continue alone, or be killed while it writes."""
     others = [
         path.name
         for folder in ("benchmarks", "reproduction", "tests/fuzz")
@@ -72,5 +72,5 @@ def test_every_benchmark_that_runs_the_framework_does_it_so() -> None:
 
 @pytest.mark.parametrize("package", ["benchmarks", "reproduction"])
 def test_an_installed_package_of_the_same_name_does_not_hide_it(package: str) -> None:
-    """A folder without `__init__.py` gives way to any package of its name, wherever that is on the path."""
+    """A folder without `__init__.py` is hidden by any package of the same name on the path."""
     assert Path(ROOT, package, "__init__.py").is_file()

@@ -21,9 +21,9 @@ MACHINE = re.compile(r"\d+ cores?\b[^\n]*; 20\d\d-\d\d-\d\d; Python 3\.\d+\.\d+"
 TIMED = re.compile(r"\bms\b|[Mm]illiseconds|\bseconds\b|times as (fast|long)|times \S+'s speed|× torch")
 SPREAD = re.compile(r"least to largest|\brounds\b|±|standard deviation")
 PEERS = {"SciPy": "scipy", "scikit-learn": "scikit-learn", "NumPy": "numpy", "onnxruntime": "onnxruntime"}
-"""Peers as texts name them, and their packages."""
+"""Other libraries that the pages compare with, by the name in the text, with their packages."""
 WITHOUT_MACHINE = {"claims.md"}
-"""Pages that measure nothing themselves: they quote others."""
+"""Pages that contain no measurements and quote other pages."""
 WITHOUT_SPREAD = {
     "ball_flights.md",
     "ball_stiffness.md",
@@ -40,7 +40,8 @@ WITHOUT_SPREAD = {
     "smplpix_work_precision.md",
     "sweep_start.md",
 }
-"""Pages from before `benchmarks.timing`; whoever measures one again takes it out of this list."""
+"""Pages that were measured before `benchmarks.timing` existed; remove a page from this list when it is measured
+again."""
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)

@@ -14,7 +14,7 @@ from framework.datasets.images import Crop, blur
 @pytest.mark.parametrize("deviation", [0.1, 0.5, 1.0, 2.3, 8.0, 40.0])
 @pytest.mark.parametrize("size", [(1, 1), (5, 9), (50, 50), (75, 40)])
 def test_blur_is_scipys(deviation: float, size: tuple[int, int]) -> None:
-    """Also where the kernel reaches over the whole image several times."""
+    """The kernel may be several times larger than the image."""
     pixels = np.random.default_rng(0).random((2, 3, *size))
     expected = gaussian_filter(pixels, (0, 0, deviation, deviation), mode="reflect", truncate=4)
     np.testing.assert_allclose(blur(torch.from_numpy(pixels), deviation), expected, atol=1e-13)

@@ -1,4 +1,5 @@
-"""mode=calibrate: a trained model in wrappers has the numbers of one trained with them; and what it refuses."""
+"""Tests of mode=calibrate: a model that is wrapped after training gives the results of one that was trained in its
+wrappers."""
 
 import json
 from collections.abc import Callable
@@ -87,7 +88,7 @@ def test_it_is_the_model_that_was_trained_with_the_wrappers(framework: Framework
 
 
 class Twice(Uncertainty):
-    """A wrapper that asks for two models, or learns a weight."""
+    """Wrapper that requires two models, or has a weight that must be trained."""
 
     bibtex = ""
 

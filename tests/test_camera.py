@@ -111,7 +111,7 @@ WRONG = {
 }
 WRONG["focal"] += tuple(torch.ones(shape) for shape in ((1,), (3,), (), (1, 2), (2, 1), (0,)))
 WRONG["principal"] = WRONG["focal"]
-"""Shapes that no camera is made of."""
+"""Shapes of arrays from which no camera can be built."""
 
 
 @pytest.mark.parametrize(

@@ -65,7 +65,7 @@ def test_what_is_not_known_is_none():
 
 def test_registered_parts_serve_a_mixture_of_them():
     class Square(Normal):
-        """Uniform on [0, 1], as its own distribution function says."""
+        """Uniform density on [0, 1] with its own distribution function."""
 
     @cdf.register
     def _(density: Square, value: torch.Tensor) -> torch.Tensor:

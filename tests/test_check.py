@@ -1,4 +1,4 @@
-"""mode=check: a sound plugin passes by name, an unsound one fails and is told where."""
+"""Tests of mode=check: a correct plugin passes, and a faulty one fails with the place of its fault."""
 
 import math
 from pathlib import Path
@@ -108,7 +108,8 @@ def test_a_plugin_without_rows_is_tried_with_every_target(monkeypatch: pytest.Mo
 
 
 def test_a_further_row_has_the_target_that_its_parts_ask_for() -> None:
-    """A floor under rotations, by name or with keys of its own, and under one angle: never a row that is refused."""
+    """A uniform floor under rotations or one angle, given by name or with settings, gets no row that its head
+    refuses."""
     for component, kind in (("matrix_fisher", 3), ("von_mises", 1), ("categorical", 3)):
         config = {"weight": 0.3, "component": {"name": component}}
         first, *_ = contracts.contract("density_head", "uniform_floor", config).rows

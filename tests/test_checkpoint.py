@@ -1,4 +1,4 @@
-"""A checkpoint is whole or absent, whatever happens while it is written or lies on the disk."""
+"""Tests of checkpoints: a checkpoint is complete or absent, even after an interruption or damage on the disk."""
 
 import errno
 import hashlib
@@ -301,7 +301,8 @@ KINDS += (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64)
 
 @pytest.mark.parametrize("wanted", KINDS, ids=str)
 def test_numbers_of_another_kind_do_not_fit(wanted: torch.dtype) -> None:
-    """Floating-point numbers of another width do; a complex number would lose half of itself, an integer its bits."""
+    """Another floating-point type is accepted; a complex number would lose its imaginary part, and an integer its
+    digits."""
     for found in KINDS:
         for any_shape in ((), ("a",)):
             said = describe_mismatch(
@@ -315,7 +316,7 @@ def test_numbers_of_another_kind_do_not_fit(wanted: torch.dtype) -> None:
 
 
 def signed(content: bytes, path: Path) -> Path:
-    """A file that a forger wrote, checksum and all."""
+    """Write a forged checkpoint with a right checksum."""
     path.write_bytes(content + MARK + hashlib.sha256(content).digest())
     return path
 
@@ -436,7 +437,7 @@ def test_whatever_is_plain_is_read_as_torch_reads_it(saved: Path) -> None:
 
 
 def call(name: str, *arguments: Any) -> bytes:
-    """A pickle of what a function makes of these."""
+    """Return a pickle that calls a function with these arguments."""
     module, word = name.rsplit(".", 1)
     return b"\x80\x02c%s\n%s\n" % (module.encode(), word.encode()) + pickle.dumps(arguments, 2)[2:-1] + b"R."
 

@@ -13,7 +13,7 @@ angles = st.floats(-1e6, 1e6, allow_nan=False)
 
 
 def brute_force_median(samples: list[float]) -> float:
-    """Least mean deviation of any sample from all, by the O(S²) double loop."""
+    """Return the smallest mean deviation of a sample from all samples, by a double loop."""
     return min(
         math.fsum(abs(math.remainder(a - b, 2 * math.pi)) for b in samples) / len(samples) for a in samples
     )
@@ -29,7 +29,7 @@ def test_median_is_the_sample_of_least_mean_deviation(samples: list[float]) -> N
 
 @pytest.mark.parametrize("spread", [1e-6, 0.5, 3.0])
 def test_no_angle_at_all_beats_the_median(spread: float) -> None:
-    """Eq. 3.23 asks for the best angle, 3.24 for the best sample: here they are the same."""
+    """Eq. 3.23 searches the best angle and eq. 3.24 the best sample; in this case they are equal."""
     samples = torch.randn(101, dtype=torch.float64, generator=torch.Generator().manual_seed(1)) * spread + 3
     found = angular_distance(circular_median(samples), samples).mean()
     everywhere = angular_distance(grid(20001, dtype=torch.float64)[:, None], samples).mean(1).min()

@@ -22,7 +22,7 @@ def categorical(logits):
 
 
 class Listed(Distribution):
-    """A density over classes whose log-probabilities (class, batch) are given."""
+    """Return a density over classes with these log-probabilities, (class, batch)."""
 
     arg_constraints = {}  # noqa: RUF012 - as torch has it
     has_enumerate_support = True

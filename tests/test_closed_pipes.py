@@ -1,4 +1,5 @@
-"""Every command goes on, and ends as usual without a word, where the reader of its output has ended (`| head -1`)."""
+"""head -1`).|Commands whose output is no longer read (`| head -1`), which continue and end without an error
+message.| head -1`)."""
 
 import io
 import os
@@ -21,7 +22,7 @@ OF_OUR_OWN = {
     "framework/tracking/store_process.py",
     "framework/tracking/watch.py",
 }
-"""Processes that the framework starts and speaks with by pipes: one whose pipe is closed is to end."""
+"""Processes that communicate with the framework by pipes, and that must end when their pipe is closed."""
 
 
 GENERATORS = {"plugins/density_head/von_mises/fit_coefficients.py"}
@@ -29,7 +30,7 @@ GENERATORS = {"plugins/density_head/von_mises/fit_coefficients.py"}
 
 
 def programs() -> set[str]:
-    """Files of the framework and of its plugins that are run by themselves."""
+    """Files of the framework and its plugins that can be run as scripts."""
     files = [
         file for room in ("framework", "plugins", "hydra_plugins") for file in (ROOT / room).rglob("*.py")
     ]

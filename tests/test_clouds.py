@@ -30,7 +30,7 @@ def cloud(count, columns=3, seed=0, dtype=torch.float64):
 
 
 def unit_ball(points):
-    """Eq. 6.2 of one cloud, in long double."""
+    """Return one cloud normalised by eq. 6.2, in long double."""
     points = points.astype(np.longdouble)
     local = points - points.sum(0) / len(points)
     largest = max(np.sqrt((point**2).sum()) for point in local)

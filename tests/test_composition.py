@@ -70,7 +70,7 @@ SMOKE_RUNS = {
     "moons": "moons/vanilla_128",
     "modelnet40": "modelnet40/bps_extra_trees",
 }
-"""An experiment on each data set that is generated in seconds."""
+"""Experiments, one for each data set that is generated in seconds."""
 NOT_RUN = {
     "coil20",
     "dales",
@@ -104,12 +104,12 @@ REFUSED = {
 
 
 HUGE = {"registration/large"}
-"""Checkpoints of 1.5 GB; it differs from registration/quick in numbers alone."""
+"""Experiments with checkpoints of 1.5 GB, which differ from registration/quick only in numbers."""
 
 
 SHORTENED = sorted({*EXPERIMENTS} - {*SMOKE_RUNS.values()} - HUGE)
 FAMILIES = {name.partition("/")[0]: name for name in [*reversed(SHORTENED), *SMOKE_RUNS.values()]}
-"""An experiment of each family: a smoke run where there is one, else the first."""
+"""Return one experiment of each family: the quick one if there is one, otherwise the first."""
 
 
 @pytest.mark.parametrize("name", sorted({*FAMILIES.values(), *HUGE}))
@@ -204,7 +204,7 @@ OTHER_HEADS = ("von_mises", "mixture", "gaussian", "categorical", "bernoulli_ima
     ],
 )
 def test_what_an_experiment_sets_of_its_head_can_be_taken_out_for_another(name: str, head: str) -> None:
-    """Each key that the other head does not know is named, with the words that leave it out, and those do."""
+    """The message names each key that the new head does not have, with the arguments that remove the key."""
     from framework.configuration.assembly import resolve_all
 
     words: list[str] = []

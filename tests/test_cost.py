@@ -1,4 +1,4 @@
-"""Costs against counts by hand, known allocations and scripted clocks."""
+"""Costs, compared with counts by hand, known allocations and scripted clocks."""
 
 import math
 from pathlib import Path

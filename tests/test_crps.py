@@ -45,7 +45,7 @@ def exact(density, value, samples=1000):
 
 
 def by_mpmath(mean, scale, value):
-    """∫ (F - 1[y ≤ x])² dx of one normal, 40 digits, by quadrature."""
+    """Return ∫ (F - 1[y ≤ x])² dx for a normal density, computed by quadrature with 40 digits."""
     with mpmath.workdps(40):
         mean, scale, value = (mpmath.mpf(number) for number in (mean, scale, value))
         ends = sorted({value, *(mean + step * scale for step in (-40, -10, -3, 0, 3, 10, 40))})

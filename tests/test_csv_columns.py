@@ -1,4 +1,4 @@
-"""A CSV file by columns: what is read, and what is refused by line and column."""
+"""Tests of the reader of CSV columns, and of its messages, which name line and column."""
 
 import math
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Damaged and harmful files: every reader of the project reads them or says a sentence, and soon."""
+"""Damaged and malicious files, which every reader reads or refuses with an error message, within limits of time."""
 
 import ast
 import os
@@ -52,7 +52,8 @@ def arrays_of(group: str) -> list[str]:
 
 
 STORE_NOTHING = {"arrays of density_head lorentzian", "arrays of encoder inception_resnet_v2"}
-"""Plugins that keep no arrays, and one whose 200 MB are read as every network's weights are."""
+"""Plugins that store no arrays, and one whose 200 MB of weights are read by the same code as those of other
+networks."""
 
 
 def test_every_reader_of_the_project_is_among_them() -> None:
@@ -291,7 +292,7 @@ def test_what_data_keep_with_a_model_is_checked(name: str) -> None:
 
 
 def test_no_more_of_a_file_is_read_than_it_has(tmp_path: Path) -> None:
-    """A chunk that announces 64 TB is no reason to allocate them, as Python's own files do."""
+    """A chunk that declares 64 TB is refused before that memory is allocated."""
     file = tmp_path / "one.x"
     file.write_bytes(b"abcdef")
     with reading.open_regular(file) as stream:

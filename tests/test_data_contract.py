@@ -1,4 +1,4 @@
-"""The contract of data sets: a sound one passes, and each fault is found by the property that is meant for it."""
+"""Contract tests of data sets: a correct data set passes, and each planted fault fails the test made for it."""
 
 import itertools
 import math
@@ -26,7 +26,7 @@ COUNT = itertools.count()
 
 
 def needle(number, seed=0):
-    """A file's text: the tip of a needle, and its angle."""
+    """Return the text of a file with the tip of a needle, and its angle."""
     angle = np.random.default_rng([seed, number]).uniform(-3, 3)
     return f"{math.cos(angle):.6f} {math.sin(angle):.6f} {angle:.6f}\n"
 
@@ -37,14 +37,14 @@ def draw(root, seed):
 
 
 class Sorted(Fields):
-    """Fields whose batches forget what order was asked for."""
+    """Fields whose batches ignore the requested order."""
 
     def __getitems__(self, indices):
         return super().__getitems__(sorted(indices))
 
 
 class Needles(Data):
-    """Right, or with one fault."""
+    """Data set that is correct or has one fault."""
 
     bibtex = ""
 

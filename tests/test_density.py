@@ -1,4 +1,4 @@
-"""Mixture, marginals, medians and quadratures of densities that no method owns."""
+"""Tests of mixtures, marginals, medians and quadratures that belong to no single method."""
 
 import math
 from typing import ClassVar

@@ -1,4 +1,4 @@
-"""Everything a density may be asked (framework.distributions.protocol) × every structure × every installed head.
+"""Tests of every function of the density protocol, for every structure and every installed head.
 
 A structure is made of densities that are at hand one by one, so that each of its answers is compared with theirs, put
 together by a plain loop, or is an explicit refusal. What is sampled is found out by making it twice with other seeds.
@@ -67,7 +67,7 @@ WARM = torch.tensor(1.7, dtype=torch.float64)
 
 
 class Made:
-    """One head's densities over a batch of 4, each from raw numbers of its own: the same of the same seed."""
+    """Densities of one head over a batch of 4 with random parameters, which depend only on the seed."""
 
     def __init__(self, name: str, row: HeadRow, seed: int = 0, spread: float = 1.0) -> None:
         torch.manual_seed(0)
@@ -122,7 +122,7 @@ class Made:
 
 
 def there_and_back(density: Distribution) -> Distribution:
-    """The density itself, but for rounding, by way of another frame."""
+    """Return the density after an affine transform and its inverse, equal apart from rounding."""
     like = density.sample()
     location = torch.linspace(-3, 5, like.numel(), dtype=like.dtype).reshape(like.shape)
     scale = 0.1 + location.square()
@@ -175,7 +175,7 @@ def item_of(name: str, made: Made, answer) -> Tensor | None:
 
 
 def value_of(name: str, value: Tensor) -> Tensor:
-    """Values as the structure reads them: the same one for each component."""
+    """Return the values in the shape that the structure reads, with the same value for each component."""
     match name:
         case "stacked":
             return torch.stack([value] * 3, 1)
@@ -227,7 +227,7 @@ def everywhere(density: Distribution, value: Tensor, index: int | None = None) -
 
 
 def event(made: Made) -> range:
-    """Places of the target's numbers, each of which has a marginal; an image is asked as a whole."""
+    """Return the indices of the numbers of the target, each with a marginal; an image has no marginals."""
     return range(made.parts[0].event_shape[0] if made.target.kind in ("angle", "real") else 0)
 
 
@@ -236,7 +236,7 @@ def ids(rows) -> Iterator[str]:
 
 
 def shown_or_refused(part: Distribution, density: Distribution) -> None:
-    """Images of each item of the batch, of a density that draws some; else a sentence that says how to."""
+    """A density that provides images returns one for each item; any other density refuses with an instruction."""
     draws = protocol.images.dispatch(type(part)) is not protocol.images.dispatch(Distribution)
     try:
         found = protocol.images(density, {"mask", "color"})
@@ -248,7 +248,8 @@ def shown_or_refused(part: Distribution, density: Distribution) -> None:
 
 
 def pictured(kind: str, made: Made, density: Distribution) -> None:
-    """An image over every structure: the light of one density's mean, of several the mean of theirs."""
+    """Every structure over images returns the mean of its density, and for several densities the mean of their
+    means."""
     found = protocol.images(density, {"color"})["color"]
     parts = torch.stack([linear_from_srgb(part.mean) for part in made.parts], -1)
     wanted = parts[..., 0] if kind in ("itself", "with a set", "mixture of one") else None
@@ -293,7 +294,7 @@ def test_every_question_to_every_structure_of_every_head(name: str, row: HeadRow
 
 
 def densities(kind: str, made: Made, density: Distribution, value: Tensor) -> None:
-    """log_prob, estimate, marginal, tempered."""
+    """Compare log_prob, estimate, marginal and tempered_density with the parts."""
     found = protocol.estimate(density, value)
     close(found.log_mean, density.log_prob(value), 1e-12)
     wanted = log_mixed(kind, made, lambda part, at: part.log_prob(at))
@@ -389,7 +390,7 @@ def errors(kind: str, made: Made, found) -> None:
 
 
 def draws(kind: str, made: Made, density: Distribution) -> None:
-    """median, pick, peaks, value_set."""
+    """Compare median, pick, mode_candidates and value_set with the parts."""
     torch.manual_seed(3)
     found = protocol.median(density, 20)
     assert found.shape == density.batch_shape + density.event_shape
@@ -447,7 +448,7 @@ def draws(kind: str, made: Made, density: Distribution) -> None:
 
 
 def bounds(made: Made, density: Distribution, value: Tensor) -> None:
-    """slope: where the parts know theirs, the density's own, and what it promises of the density elsewhere."""
+    """Check that quadratic_bound exists if the parts have one, touches the density, and bounds it elsewhere."""
     found = protocol.quadratic_bound(density, value)
     if any(protocol.quadratic_bound(part, made.value) is None for part in made.parts):
         assert found is None
@@ -467,7 +468,7 @@ def bounds(made: Made, density: Distribution, value: Tensor) -> None:
 
 
 def features(drawn: Tensor, made: Made) -> Tensor:
-    """Bounded numbers that tell densities apart."""
+    """Return bounded numbers that differ for different densities."""
     if made.target.kind == "class":
         return torch.nn.functional.one_hot(drawn, len(made.target.names)).double()
     squashed = drawn.cos() if made.target.kind == "angle" else (drawn / 3).tanh()
@@ -475,7 +476,8 @@ def features(drawn: Tensor, made: Made) -> Tensor:
 
 
 def closed_forms(kind: str, made: Made, density: Distribution, value: Tensor) -> None:
-    """cdf, arc, normals, mahalanobis and moments of one number: as of the parts, or None as of them."""
+    """Compare cdf, arc_probability, normals, mahalanobis and moments of one number with the parts; None if the parts
+    return None."""
     if made.target.kind == "class":
         return
     if made.target.kind == "image":
@@ -524,7 +526,8 @@ def closed_forms(kind: str, made: Made, density: Distribution, value: Tensor) ->
 
 
 def each_number(kind: str, made: Made, density: Distribution, value: Tensor) -> None:
-    """each_cdf: of an image of the parts' by plain sums, of a few numbers that of each marginal; or None as of them."""
+    """Compare marginal_cdfs with sums over the parts, or with the cdf of each marginal; None if the parts return
+    None."""
     found = protocol.marginal_cdfs(density, value)
     if made.target.kind == "image":
         parts = torch.stack([protocol.marginal_cdfs(part, made.value) for part in made.parts], 1)
@@ -541,7 +544,7 @@ def each_number(kind: str, made: Made, density: Distribution, value: Tensor) -> 
 
 
 def moments(kind: str, made: Made, density: Distribution) -> None:
-    """mean and variance where the parts have them: by plain sums of the parts' first two moments."""
+    """Compare mean and variance with sums over the first two moments of the parts, if the parts have these moments."""
     try:
         means = torch.stack([part.mean for part in made.parts], 1)
         squares = torch.stack([part.variance for part in made.parts], 1) + means.square()
@@ -605,7 +608,7 @@ def agree(found: Tensor | None, wanted: Tensor | None) -> None:
 def never_silently_exact(
     density: Distribution, other: Distribution, value: Tensor, warm: bool = True
 ) -> None:
-    """Made twice with other seeds: where log-densities differ, neither says that nothing was drawn."""
+    """If two estimates with different seeds differ, neither may report that it used no random draws."""
     for one, two in ((density, other), *(warm_of(density, other) if warm else ())):
         differs = one.log_prob(value) != two.log_prob(value)
         for found in (protocol.estimate(one, value), protocol.estimate(two, value)):
@@ -623,7 +626,7 @@ def warm_of(density: Distribution, other: Distribution) -> list[tuple[Distributi
 
 
 class Untold(Cardioid):
-    """A stranger's density: only log_prob, sample and mode, and not a word on how log_prob comes about."""
+    """Third-party density with only log_prob, sample and mode, and without registered protocol functions."""
 
 
 protocol.estimate.register(Untold, protocol.estimate.dispatch(Distribution))
@@ -748,7 +751,7 @@ def test_one_of_several_products_is_picked_without_drawing_the_others(family: st
 @pytest.mark.parametrize("given", [{"probs": SHARE}, {"logits": LOC}], ids=["shares", "logits"])
 @pytest.mark.parametrize("kind", [distributions.Bernoulli, distributions.Geometric, distributions.Binomial])
 def test_what_was_asked_of_a_product_before_changes_no_marginal(kind: type, given: dict[str, Tensor]) -> None:
-    """torch computes shares from logits, or the reverse, when they are asked and then keeps both."""
+    """torch computes probabilities from logits, or the reverse, at first use, and then stores both."""
     fresh, asked = (Independent(kind(**given), 1) for _ in range(2))
     assert asked.base_dist.probs.shape == asked.base_dist.logits.shape
     value = torch.zeros(2, 2, 1, dtype=torch.float64)
@@ -761,7 +764,7 @@ def test_what_was_asked_of_a_product_before_changes_no_marginal(kind: type, give
 
 
 class Own(Laplace):
-    """Made of one number; what it answers is its base's."""
+    """Density of one number that passes every call to its base."""
 
     def __init__(self, wide: Tensor) -> None:
         super().__init__(wide, wide)
@@ -855,7 +858,7 @@ def test_what_draws_nothing_says_so() -> None:
 
 
 def test_a_moved_normal_density_is_the_normal_density_there() -> None:
-    """Every question, of one number and of several, against the density with the moved parameters."""
+    """Compare every function, for one and several numbers, with the density that has the transformed parameters."""
     torch.manual_seed(0)
     for numbers in (1, 3):
         mean, scale, location, unit = torch.randn(4, 5, numbers).double()

@@ -1,4 +1,4 @@
-"""Pages that list things list all of them, links lead somewhere, and every place says the same version."""
+"""Tests of the documentation: lists are complete, links lead to files, and all files state the same version."""
 
 import importlib.util
 import re
@@ -36,7 +36,7 @@ COMPONENTS = ("von_mises", "gaussian", "categorical", "laplace_image")
 
 @pytest.fixture(scope="module")
 def methods() -> ModuleType:
-    """The script that writes docs/methods.md."""
+    """Return the script that writes docs/methods.md as a module."""
     spec = importlib.util.spec_from_file_location("methods", ROOT / "docs/methods.py")
     assert spec and spec.loader
     module = importlib.util.module_from_spec(spec)

@@ -1,4 +1,4 @@
-"""mode=encode: parts are whole, each file is encoded once whatever stops or shares the work, nothing is mixed up."""
+"""Tests of mode=encode: parts are complete, and each file is encoded once, even with interruptions and several jobs."""
 
 import json
 import re
@@ -33,7 +33,7 @@ def root(tmp_path):
 
 
 def alone(root, name):
-    """The features of one file by itself."""
+    """Return the features of one file, encoded alone."""
     data = build("data", CONFIG["data"])
     clouds = data.read([root / name]).__getitems__([0])["input"]
     encoder = build("encoder", CONFIG["encoder"][0], input_shape=tuple(clouds.shape[1:]), input_columns=())

@@ -1,4 +1,4 @@
-"""Features that need be computed but once, and heads that are fitted to all of them at once."""
+"""Tests of features that are computed only once, and of heads that are fitted to all features together."""
 
 import math
 
@@ -24,7 +24,7 @@ CLASSES = Target("class", ("low", "high"))
 
 
 class Squares(Encoder):
-    """x → (x, x²); counts the samples it has seen."""
+    """Encoder x → (x, x²) that counts its samples."""
 
     bibtex = ""
     fixed = True
@@ -81,7 +81,7 @@ class Points(Data):
 
 
 class Shares(DensityHead, Fitted):
-    """The share of each class, whatever the features; keeps what it was fitted with."""
+    """Head that predicts the share of each class for any features, and stores the data of its fit."""
 
     bibtex = ""
     knobs = {}  # noqa: RUF012

@@ -1,4 +1,5 @@
-"""The contract of encoders of point clouds is held by a sound one, and each unsound one is caught by what it breaks."""
+"""Contract tests of encoders of point clouds: a correct encoder passes, and each faulty one fails the test made for
+its fault."""
 
 import pytest
 import torch
@@ -30,35 +31,35 @@ class Moments(Encoder):
 
 
 class Padded(Moments):
-    """Padding counts as points at 0."""
+    """Encoder that reads padding as points at 0."""
 
     def forward(self, inputs):
         return super().forward(inputs.nan_to_num(0))
 
 
 class First(Moments):
-    """The first point has a say of its own."""
+    """Encoder whose features depend on which point is first."""
 
     def forward(self, inputs):
         return super().forward(inputs) + inputs[:, 0, :1]
 
 
 class Leaking(Moments):
-    """NaN times 0 is NaN: padding spoils the gradient, though not the features."""
+    """Encoder in which padding makes the gradient NaN (NaN times 0), though not the features."""
 
     def forward(self, inputs):
         return super().forward(inputs) + inputs.square().where(~inputs.isnan(), 0).sum((1, 2))[:, None]
 
 
 class Silent(Moments):
-    """Points that are not finite are left out without a word."""
+    """Encoder that leaves out points that are not finite, without an error."""
 
     def forward(self, inputs):
         return super().forward(inputs.where(inputs.isfinite().all(-1, keepdim=True), torch.nan))
 
 
 class Vague(Moments):
-    """Its errors name nothing."""
+    """Encoder whose error messages do not name the input."""
 
     def forward(self, inputs):
         try:
@@ -68,7 +69,7 @@ class Vague(Moments):
 
 
 class Greedy(Moments):
-    """Takes whatever comes."""
+    """Encoder that accepts any input."""
 
     def __init__(self, input_shape):
         super().__init__((1, 3))
@@ -76,7 +77,7 @@ class Greedy(Moments):
 
 
 class Curt(Moments):
-    """Refuses without saying what came."""
+    """Encoder whose error messages do not state the input that it got."""
 
     def __init__(self, input_shape):
         if len(input_shape) != 2 or input_shape[1] < 3:

@@ -1,4 +1,4 @@
-"""The entropy of densities of one number, and of mixtures of several, against 50 digits and brute force."""
+"""Entropies of densities of one number and of mixtures, compared with a 50-digit reference and brute force."""
 
 import logging
 import math
@@ -41,7 +41,8 @@ def log_peak(kappa: mpmath.mpf) -> mpmath.mpf:
 
 
 def exact(density: Mixture) -> float:
-    """-∫ f log f in 50 digits, Gauss-Legendre between the centres and multiples of every scale about them."""
+    """Return -∫ f log f with 50 digits, by Gauss-Legendre quadrature between the centres and multiples of each
+    scale."""
     weights, means = density.log_weights[0].exp().tolist(), []
     circular = isinstance(density.components, VonMises)
     parts = density.components if circular else density.components.base_dist
@@ -122,7 +123,7 @@ def test_of_single_precision_is_right_to_its_rounding() -> None:
 
 @pytest.mark.parametrize("count", [1, 2, 7, 50])
 def test_far_apart_it_is_that_of_the_parts_and_their_weights(count: int) -> None:
-    """Σ w_k (H_k - log w_k) where no two overlap."""
+    """Return Σ w_k (H_k - log w_k), the entropy of components that do not overlap."""
     mean = torch.linspace(-3, 3, count, dtype=torch.float64).expand(7, count).unsqueeze(-1)
     kappa = torch.logspace(6, 30, 7, dtype=torch.float64)[:, None, None].expand(7, count, 1)
     log_weights = torch.linspace(-20, 0, count, dtype=torch.float64).log_softmax(-1).expand(7, count)

@@ -13,7 +13,7 @@ from framework.errors import CheckpointError, ConfigError, DataError, NonFiniteL
 
 
 class OfAPlugin(DataError):
-    """One that somebody else derived."""
+    """Error class that a third party has derived."""
 
 
 KINDS = [UserError, ConfigError, DataError, CheckpointError, NonFiniteLoss, OfAPlugin]

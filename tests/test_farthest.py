@@ -1,4 +1,4 @@
-"""Points far from each other against a loop that computes all distances anew."""
+"""Farthest-point sampling, compared with a loop that computes all distances again in each step."""
 
 import itertools
 import math

@@ -1,4 +1,4 @@
-"""File names as people have them: any bytes, in training, encoding, prediction, figures, tables and the store."""
+"""File names with any bytes, in training, encoding, prediction, figures, tables and the store."""
 
 import csv
 import os

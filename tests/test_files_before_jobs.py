@@ -1,4 +1,4 @@
-"""A sweep looks at the user's files before its jobs start."""
+"""Tests of sweeps, which check the user's files before their jobs start."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""A config folder that is added on the command line runs no code, writes nowhere and names no store."""
+"""Config folders that are added on the command line, which can run no code, write no files and name no store."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""The deployable form gives the predictor's numbers, whatever it is made of; what is fully connected needs no torch."""
+"""Frozen models give the numbers of their predictors; fully connected networks run without torch."""
 
 import math
 

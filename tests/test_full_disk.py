@@ -1,4 +1,4 @@
-"""Places that take nothing: a sentence, exit 1, and every checkpoint that is there is whole."""
+"""Full disks and folders without permission: one error message, exit code 1, and complete checkpoints."""
 
 import json
 from pathlib import Path

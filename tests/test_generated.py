@@ -1,4 +1,4 @@
-"""Generated data in the cache (framework.storage.generated): whole or absent, once, marked."""
+"""Generated data in the cache (framework.storage.generated), which are complete or absent, and generated only once."""
 
 import json
 import threading

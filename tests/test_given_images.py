@@ -1,4 +1,4 @@
-"""Images in memory become what the same images become as files; what is none is refused."""
+"""Images in memory, which give the same inputs as the same images in files."""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,4 @@
-"""The mode of a mixture: a top of the density, against brute force."""
+"""Modes of mixtures, compared with the highest density by brute force."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Runs whose targets are images: the same pipeline as any, with objectives, rivals, members, and pictures after it."""
+"""Runs whose targets are images, with objectives, discriminators, ensembles and figures."""
 
 import base64
 import json
@@ -79,7 +79,7 @@ def trained(framework: Framework, *more: str, folder: str) -> Done:
 def test_a_killed_run_goes_on_bit_by_bit(
     framework: Framework, tmp_path: Path, objectives: tuple[str, ...], at: int
 ) -> None:
-    """Losses of the predictor and of its rivals, and the weights that are left."""
+    """Return the losses of the predictor and its discriminators, and the final weights."""
     whole = trained(framework, *objectives, folder="whole")
     signals = (f"+data.signal_at={at}", f"+data.signal_marker={tmp_path / 'marker'}")
     killed = framework(*SQUARES, *objectives, *signals, folder="killed")

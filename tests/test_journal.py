@@ -1,4 +1,4 @@
-"""The journal: what is written can be read, whatever happened in between."""
+"""Tests of the journal: every written number can be read, even after interruptions."""
 
 import errno
 import json

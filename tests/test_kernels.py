@@ -1,4 +1,4 @@
-"""Compiled code on disk is that of the sources as they are."""
+"""Cached compiled code, which must belong to the present source files."""
 
 import os
 import re

@@ -1,4 +1,4 @@
-"""Whichever process of a run or a sweep is killed, no other is left, and the run is closed."""
+"""Killed processes of runs and sweeps: all other processes end, and the run is closed."""
 
 import ast
 import json
@@ -90,7 +90,7 @@ class Lives:
 
 
 def until(condition: Callable[[], bool], seconds: float = 60.0) -> None:
-    """Wait until something is so."""
+    """Wait until a condition holds."""
     start = time.monotonic()
     while not condition():
         assert time.monotonic() - start < seconds, "it never happened"

@@ -103,7 +103,7 @@ CIRCLES = {
     frozenset({"framework.testing.calibration", "framework.testing.wrappers"}),
     frozenset(f"framework.testing.{name}" for name in ("gradients", "heads", "precision", "units")),
 }
-"""Modules that still import each other. A circle that is opened is taken out here; none may be added."""
+"""Groups of modules that import each other. Remove a group when its circle is gone, and add none."""
 
 
 def modules_of(folder: Path) -> dict[str, Path]:

@@ -1,4 +1,4 @@
-"""Light of stored numbers, against kornia's."""
+"""Conversion between sRGB and linear RGB, compared with kornia."""
 
 import kornia
 import pytest

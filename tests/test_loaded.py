@@ -1,4 +1,4 @@
-"""A trained model after its run: it takes what its user has, of each kind of data, when the training data are gone."""
+"""Loaded models, which read the user's files of each kind of data without the training data."""
 
 import base64
 import copy

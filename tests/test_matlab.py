@@ -1,4 +1,4 @@
-"""MATLAB 5 files (framework.datasets.matlab): whole ones are read, damaged ones named; none ends the process."""
+"""Tests of the reader of MATLAB 5 files: undamaged files are read, and damaged ones are refused by name."""
 
 import io
 import os

@@ -1,4 +1,4 @@
-"""A hundred and fifty mistyped commands: each ends with one sentence that says what to do, and is no run."""
+"""A hundred and fifty mistaken commands: each ends with one message that tells what to do, and leaves no run."""
 
 import os
 import re

@@ -1,4 +1,4 @@
-"""Densities under mixed precision: what they say does not depend on it."""
+"""Densities under mixed precision, whose numbers must not change."""
 
 from collections.abc import Callable, Iterator
 

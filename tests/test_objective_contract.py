@@ -1,4 +1,4 @@
-"""The contract of objectives: what each of its checks catches."""
+"""Contract tests of objectives, each with the faulty objectives that it finds."""
 
 import pytest
 import torch

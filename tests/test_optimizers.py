@@ -1,4 +1,4 @@
-"""Optimisers: each that a config may name, those of rivals, and what one step computes."""
+"""Optimisers: all that a config can name, those of discriminators, and the result of one step."""
 
 import copy
 import math

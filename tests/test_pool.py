@@ -1,4 +1,4 @@
-"""A sweep goes on, keeps right records and can be resumed, whatever happens to its jobs or to itself."""
+"""Tests of sweeps: they continue, keep right records and can be resumed, even if jobs or the sweep itself fail."""
 
 import json
 import os

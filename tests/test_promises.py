@@ -33,7 +33,7 @@ CHAINS = {
     "ensemble": "[ensemble,conformal]",
     "platt": "[platt,conformal]",
 }
-"""Each wrapper, with the one that promises sets around it."""
+"""Wrappers, each inside the wrapper for conformal prediction sets."""
 ELSEWHERE = {"refined"}
 """Wrappers of one data set's models alone: least squares of Z-spectra."""
 ONLY = {"platt": ("class",)}
@@ -44,7 +44,7 @@ OFTEN = {
     "ensemble": ("class",),
     "platt": ("class",),
 }
-"""The kinds that each wrapper is always asked; the others are slow tests."""
+"""Kinds of targets that are always tested for each wrapper; the other kinds are slow tests."""
 PROMISED = 0.8
 
 

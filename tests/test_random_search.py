@@ -1,4 +1,4 @@
-"""A random search draws what it should, can be repeated and extended, and leaves its best trial as an experiment."""
+"""Tests of the random search: its samples, repetitions and extensions, and the experiment of its best trial."""
 
 import csv
 import json
@@ -402,7 +402,7 @@ def test_a_metric_of_the_results_ranks_its_own_way(
 def completed(
     home: Path, overrides: list[str], data: str = "d", milliseconds: float = 1.0, seed: int = 0
 ) -> None:
-    """Leave in `home` what a job leaves."""
+    """Write the files of a finished job into `home`."""
     results = {
         "method": "m",
         "data": data,

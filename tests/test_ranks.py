@@ -1,4 +1,4 @@
-"""Several ranks train as one process does: the same noise, the same statistics, the same numbers, one record."""
+"""Training with several ranks, which gives the noise, statistics and numbers of one process, and one record."""
 
 import json
 import math

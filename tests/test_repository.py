@@ -1,4 +1,4 @@
-"""Commit and state of a repository: as git says them, without running anything that the repository names."""
+"""Commit and state of a repository, compared with git, without running any program that the repository names."""
 
 import json
 import os

@@ -220,7 +220,7 @@ def test_hand_made_and_damaged_pickles_are_refused(name):
 
 
 def test_nesting_does_not_multiply():
-    """Check thirty lists that each hold the one before twice, of which a copy would have a billion items."""
+    """Check thirty lists, each of which holds the previous one twice; a copy would have a billion items."""
     content = BytesIO()
     pickler = pickle.Pickler(content, protocol=2)
     item = []

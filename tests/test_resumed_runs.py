@@ -1,4 +1,4 @@
-"""Runs that end badly or start from a checkpoint: what is left of them, what is refused, and what is done once."""
+"""Runs that fail or start from a checkpoint: their remaining files, refusals, and work that is done only once."""
 
 import signal
 from collections.abc import Callable, Iterator

@@ -1,4 +1,4 @@
-"""Runs that end well, badly or not at all: nothing is lost, and the next run goes on from where it was."""
+"""Runs that finish, fail or are killed: no number is lost, and the next run continues at the same place."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""Configs are checked against constructor signatures, and every fault becomes a sentence."""
+"""Checks of configs against the signatures of constructors, with one message for every fault."""
 
 import importlib
 import math

@@ -1,4 +1,5 @@
-"""Served models: whatever a request holds, the answer is a prediction or one sentence, in bounded time and memory."""
+"""Served models, which respond to every request with a prediction or one error message, within limits of time and
+memory."""
 
 import asyncio
 import base64

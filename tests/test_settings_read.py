@@ -1,4 +1,4 @@
-"""Each mode reads exactly the keys of a config that it declares; a command that sets any other key is refused."""
+"""Keys of a config that each mode reads, which are exactly the keys that it declares."""
 
 import re
 import warnings

@@ -1,4 +1,4 @@
-"""Paths that a stored config names are used where the user says them again, or not at all."""
+"""Paths in a stored config, which are used only if the user names them again."""
 
 import json
 import os

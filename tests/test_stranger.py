@@ -1,4 +1,4 @@
-"""A third-party package runs by name, and a broken one disturbs nobody."""
+"""Third-party packages, which run by name, and broken packages, which do not disturb other commands."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Tracking: whatever happens to the store or to the process, each number is stored once and nobody waits."""
+"""Tests of tracking: each number is stored once, without delay of the run, even if the store or a process fails."""
 
 import json
 import logging
@@ -920,7 +920,7 @@ def died(tmp_path_factory: pytest.TempPathFactory, empty_store: Path) -> Path:
 
 @pytest.fixture
 def killed(died: Path, tmp_path: Path) -> Path:
-    """A copy of it."""
+    """Return a copy of the run folder whose process was killed."""
     shutil.copytree(died.parents[1], tmp_path / "outputs")
     folder = tmp_path / "outputs" / "some experiment" / "run"
     sidecar = folder / "run.json"

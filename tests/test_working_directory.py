@@ -1,4 +1,4 @@
-"""Commands in an unpacked archive import nothing of it."""
+"""Commands in an unpacked archive, which import no file of the archive."""
 
 import os
 import subprocess

@@ -1,4 +1,4 @@
-"""Files that are made to do harm: they try to take all memory, to hang, to read other files or to run something."""
+"""Malicious files, which try to take all memory, to hang, to read other files or to run code."""
 
 import hashlib
 import io
@@ -25,7 +25,7 @@ HUGE = 10**9
 
 @cache
 def zeros(header: bytes = b"") -> bytes:
-    """So many zeros behind a header, as zlib packs them."""
+    """Return a header and many zeros, compressed by zlib."""
     packer, block = zlib.compressobj(1), bytes(2**20)
     return (
         packer.compress(header) + b"".join(packer.compress(block) for _ in range(BOMB >> 20)) + packer.flush()
@@ -54,7 +54,7 @@ def zip_of(parts: dict[str, bytes], **how: Any) -> bytes:
 
 
 def deflated_part(name: str, packed: bytes, size: int, declared: int | None = None) -> bytes:
-    """A zip archive of one part, compressed already, that declares a size."""
+    """Return a zip archive of one part that is already compressed, with a chosen declared size."""
     raw = packed[2:-4]  # zlib's without its header and checksum
     fields = (20, 0, 8, 0, 0, 0, len(raw), size if declared is None else declared, len(name), 0)
     local = b"PK\x03\x04" + struct.pack("<5H3I2H", *fields) + name.encode() + raw
@@ -63,7 +63,7 @@ def deflated_part(name: str, packed: bytes, size: int, declared: int | None = No
 
 
 def npz(name: str) -> Iterator[bytes]:
-    """Archives whose array of this name is not what it seems."""
+    """Return archives in which the array of this name declares a wrong type or size."""
     array = npy_header((4, 3), data=bytes(96))
     packed, size = zeros(npy_header((BOMB // 24, 3))), BOMB + 128
     yield deflated_part(f"{name}.npy", packed, size)
@@ -169,7 +169,7 @@ def mat_array(name: str, kind: int, sides: tuple[int, ...], *data: bytes) -> byt
 
 
 def mat(name: str) -> Iterator[bytes]:
-    """MATLAB 5 files whose variable of this name is not what it seems."""
+    """Return MATLAB 5 files in which the variable of this name declares a wrong type or size."""
     header = b"MATLAB 5.0 MAT-file".ljust(124) + b"\x00\x01IM"
     fields = mat_element(5, struct.pack("<i", 4)) + mat_element(1, b"a\0\0\0")
     most = 2**31 - 1
@@ -194,7 +194,7 @@ def mat(name: str) -> Iterator[bytes]:
 
 
 def hdf5() -> Iterator[bytes]:
-    """Label files of IDIAP whose fields lie elsewhere, or are larger than memory."""
+    """Return label files of IDIAP whose fields refer to other files, or are larger than the memory."""
 
     def written(write: Callable[[h5py.Group], object]) -> bytes:
         with tempfile.TemporaryDirectory() as folder:
@@ -301,7 +301,7 @@ JSONS = [
 SAME_TUPLE_TWICE = b"\x80\x02}K\x01\x85q\x00" + b"".join(
     b"h%ch%c\x86q%c" % (number, number, number + 1) for number in range(40)
 )
-"""... and this tuple again, forty deep, for a key."""
+"""Return a pickle whose key is a tuple of tuples, forty levels deep, in which each level repeats the next."""
 JOURNALS = [
     b'{"n":1,"values":{"a":{}},"time":0,"step":0,"epoch":0}\n', b'{"n":1,"values":[1],"time":0}\n',
     b'{"n":-5,"values":{}}\n',
@@ -373,7 +373,7 @@ SAFETENSORS = [
 
 
 def niftis(whole: bytes) -> Iterator[bytes]:
-    """Images of NIfTI-1 that are not of the size they say, lie elsewhere, or are scaled to nothing."""
+    """Return NIfTI-1 images with a wrong declared size, a wrong data offset, or a scale of 0."""
     most = 2**15 - 1
     for place, packed in (
         (40, struct.pack("<8h", 4, most, most, most, most, 1, 1, 1)),

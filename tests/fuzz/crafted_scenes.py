@@ -1,4 +1,4 @@
-"""Scenes that are made to do harm: sizes that are not there, circular references, references to other files."""
+"""Malicious scenes: wrong sizes, circular references, and references to other files."""
 
 import copy
 import json

@@ -22,11 +22,11 @@ from framework.errors import UserError
 
 SEED = 13
 MEMORY = 2**30
-"""Bytes that reading may take beyond what the process has."""
+"""Limit of the memory for reading one file, in addition to the memory of the process, bytes."""
 SECONDS = 2.0
 """Limit of the processor time for reading one file, seconds."""
 BLOCKED = 20.0
-"""Seconds without any progress until a process counts as blocked."""
+"""Time without progress after which a process counts as blocked, seconds."""
 LONGEST_MESSAGE = 1500
 OUT_OF_MEMORY = re.compile(
     r"not enough memory|unable to allocate|can't allocate|bad_alloc|out of memory", re.IGNORECASE
@@ -34,7 +34,7 @@ OUT_OF_MEMORY = re.compile(
 """Messages of libraries that failed to allocate memory; an error made from such a message shows that no limit was
 checked."""
 CANARY = (16, 64, 256, 1024, 4096, 16384) * 8
-"""Sizes of arrays that nothing else than an access out of bounds changes."""
+"""Sizes of guard arrays, which only an access out of bounds can change."""
 EXTREME = (
     0,
     1,
@@ -128,7 +128,7 @@ class Tally:
 
 
 def damaged(reader: Reader, number: int) -> bytes:
-    """File `number` of a reader: the same every time; the crafted ones come first."""
+    """Return file `number` of a reader, the same at every call; the crafted files come first."""
     if number < len(reader.crafted):
         return reader.crafted[number]
     random = np.random.default_rng([SEED, zlib.crc32(reader.name.encode()), number])
@@ -139,7 +139,7 @@ def damaged(reader: Reader, number: int) -> bytes:
 
 
 def spoilt(content: bytes, random: np.random.Generator) -> bytes:
-    """Bytes with one to three faults."""
+    """Return the bytes with one to three random faults."""
     for _ in range(int(random.choice([1, 1, 2, 3]))):
         content = FAULTS[int(random.integers(len(FAULTS)))](content, random)
     return content
@@ -164,7 +164,7 @@ def _cut(content: bytes, random: np.random.Generator) -> bytes:
 
 
 def _run(content: bytes, random: np.random.Generator) -> bytes:
-    """A run of bytes put in."""
+    """Insert random bytes."""
     length = int(2 ** random.uniform(0, 12))
     kinds = (
         b"\0" * length,
@@ -179,7 +179,7 @@ def _run(content: bytes, random: np.random.Generator) -> bytes:
 
 
 def _field(content: bytes, random: np.random.Generator) -> bytes:
-    """A field of one to eight bytes, a length perhaps, with another number."""
+    """Replace a field of one to eight bytes, which may be a length, by another number."""
     width = int(random.choice([1, 2, 4, 8]))
     if len(content) < width:
         return content
@@ -192,7 +192,7 @@ def _field(content: bytes, random: np.random.Generator) -> bytes:
 
 
 def _block(content: bytes, random: np.random.Generator) -> bytes:
-    """Two blocks swapped, one repeated, or one taken out."""
+    """Swap two blocks, repeat one block, or remove one block."""
     if len(content) < 4:
         return content
     a, b, c, d = np.sort(random.integers(0, len(content) + 1, 4)).tolist()
@@ -203,7 +203,7 @@ def _block(content: bytes, random: np.random.Generator) -> bytes:
 
 
 def _word(content: bytes, random: np.random.Generator) -> bytes:
-    """A number in letters with another one, near the beginning more often: counts stand there."""
+    """Replace a number in a text by another one, more often near the beginning, where counts stand."""
     within = len(content) if random.random() < 0.5 else min(len(content), 200)
     found = list(re.finditer(rb"-?\d+(\.\d+)?", content[:within]))
     if not found:
@@ -246,7 +246,7 @@ def fuzz(reader: Reader, count: int, folder: Path, first: int = 0) -> Tally:
 
 
 def _waited(child: int, shared: mmap.mmap) -> int:
-    """Status of the child; one that makes no progress is killed."""
+    """Return the exit status of the child process, which is killed if it makes no progress."""
     before, since = -1, time.monotonic()
     while True:
         done, status = os.waitpid(child, os.WNOHANG)
@@ -356,7 +356,7 @@ def scratch():
 
 
 def replay(reader: Reader, number: int) -> None:
-    """Read one damaged file here, for whoever mends the fault."""
+    """Read one damaged file in this process, to find the cause of a fault."""
     with scratch() as folder:
         (folder / reader.file).write_bytes(damaged(reader, number))
         sys.stdout.write(f"{reader.read(folder / reader.file)!r}\n"[:2000])

@@ -1,4 +1,4 @@
-"""Whole files of every format that is read, and damage inside what a format checks first."""
+"""Undamaged files of every format, and damage inside checksums and compression."""
 
 import gzip
 import hashlib
@@ -39,7 +39,7 @@ RANDOM = np.random.default_rng(0)
 
 
 def in_zip(content: bytes, random: np.random.Generator) -> bytes:
-    """One part of a zip archive, its checksum made right."""
+    """Damage one part of a zip archive, and make its checksum right."""
     packed = io.BytesIO()
     with zipfile.ZipFile(io.BytesIO(content)) as archive, zipfile.ZipFile(packed, "w") as made:
         chosen = int(random.integers(len(archive.infolist())))
@@ -77,7 +77,7 @@ def in_gzip(content: bytes, random: np.random.Generator) -> bytes:
 
 
 def in_mat(content: bytes, random: np.random.Generator) -> bytes:
-    """One compressed variable of a MATLAB 5 file, compressed again."""
+    """Damage one compressed variable of a MATLAB 5 file, and compress it again."""
     variables, place = [], 128
     while place < len(content):
         kind, size = struct.unpack_from("<II", content, place)
@@ -95,7 +95,7 @@ def in_mat(content: bytes, random: np.random.Generator) -> bytes:
 
 
 def signed(inner: Damage) -> Damage:
-    """A checkpoint whose content is damaged and whose checksum is right."""
+    """Damage the content of a checkpoint, and make its checksum right."""
 
     def damage(content: bytes, random: np.random.Generator) -> bytes:
         made = inner(content[:-TRAILER], random)
@@ -105,7 +105,7 @@ def signed(inner: Damage) -> Damage:
 
 
 def in_values(content: bytes, random: np.random.Generator) -> bytes:
-    """A checkpoint written anew with a value less, or another one."""
+    """Write a checkpoint again, with one value removed or replaced."""
     values = torch.load(io.BytesIO(content[:-TRAILER]), weights_only=True)
     odd = (None, -1, 10**12, 0.5, "x" * 5000, [], {}, [[]], {"name": "mlp"}, torch.zeros(2, 3), True, [10**9])
     for _ in range(int(random.integers(1, 3))):

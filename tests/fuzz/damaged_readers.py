@@ -85,7 +85,7 @@ def weight(file: Path) -> object:
 
 
 def stored(file: Path) -> object:
-    """Everything that is done with a stored config before data is read."""
+    """Read a stored config with all checks that a run makes before it reads data."""
     (file.parent / "overrides.yaml").write_text("- seed=1\n", encoding="utf-8")
     values, changed = modes._read_stored_run(file.parent, {}, [f"resume={file.parent}"])
     return Config.of(values, file.parent, changed).parts
@@ -170,7 +170,7 @@ def subjects() -> Iterator[Reader]:
 
 
 def with_buffer(file: Path, document: str) -> object:
-    """A scene whose numbers lie beside it."""
+    """Read a scene whose numbers are in a second file."""
     scene = file.with_suffix(".gltf")
     scene.write_text(document, encoding="utf-8")
     return scene_files.read(scene)
@@ -234,14 +234,14 @@ def lists(file: Path) -> object:
 
 
 def beside(file: Path, sound: Mapping[str, bytes]) -> None:
-    """Write what belongs to a damaged file, by name, where it is not there yet."""
+    """Write the undamaged files that belong to a damaged file, by name, if they are missing."""
     for name, content in sound.items():
         if name != file.name and not file.with_name(name).exists():
             file.with_name(name).write_bytes(content)
 
 
 def materials(file: Path) -> object:
-    """An OBJ file with what it names, one of which is damaged."""
+    """Read an OBJ file and the files that it names, one of which is damaged."""
     beside(file, {"one.obj": scenes.OBJ, "one.mtl": scenes.MTL, "one.png": image("PNG")})
     return scene_files.read(file.with_suffix(".obj"))
 
@@ -311,7 +311,7 @@ def labels() -> Iterator[Reader]:
 
 
 def spectra() -> Iterator[Reader]:
-    """Z-spectra and what lies beside them."""
+    """Yield readers of Z-spectra, and of their offsets and masks."""
     found = whole.z_spectra()
     mats = [whole.mat(packed, **found) for packed in (False, True)]
     packed = [npz(packed=packed, **found) for packed in (False, True)]
@@ -340,7 +340,7 @@ def spectra() -> Iterator[Reader]:
 
 
 def nifti(file: Path) -> object:
-    """A volume with its offsets and its mask, one of which is damaged."""
+    """Read a volume with its offsets and its mask, one of which is damaged."""
     found = whole.z_spectra()
     sound = {
         "slice.nii": whole.nifti(found["spectra"]),

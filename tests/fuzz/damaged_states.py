@@ -40,11 +40,11 @@ CLASSES = Target("class", ("a", "b"))
 HEADS = {"class": "categorical", "real": "gaussian", "angle": "von_mises"}
 SMALL = {"name": "mlp", "widths": [4], "dropout": 0.1}
 HEAVY = {"inception_resnet_v2"}
-"""Networks of 200 MB: their weights are read as every other network's are."""
+"""Plugins with networks of 200 MB, whose weights are read by the same code as those of other networks."""
 OURS: set[str] = set()
 """Paths that the rows' configs name."""
 TOLD = "fuzz"
-"""Key of a checkpoint under which stands what was done to it, and what the whole model answers."""
+"""Key of a checkpoint that holds the kind of damage and the predictions of the undamaged model."""
 
 
 # ---- models of every row ------------------------------------------------------------------------------------------
@@ -94,7 +94,7 @@ class Subject:
 
 
 def answer(predictor: Predictor, target: Target, inputs: Tensor) -> Tensor:
-    """Log-densities of drawn targets."""
+    """Return the log-densities of random targets."""
     torch.manual_seed(SEED)
     with torch.no_grad():
         return predictor(inputs).log_prob(values(target, (len(inputs),)))
@@ -207,7 +207,7 @@ def structured(array: Tensor, random: np.random.Generator) -> Any:
 
 
 def retyped(array: Tensor, random: np.random.Generator) -> Tensor:
-    """The same numbers of another type."""
+    """Return the same numbers as another type."""
     return array.to(TYPES[int(random.integers(len(TYPES)))])
 
 
@@ -229,7 +229,7 @@ def reshaped(array: Tensor, random: np.random.Generator) -> Tensor:
 
 
 def revalued(array: Tensor, random: np.random.Generator) -> Tensor:
-    """Numbers at the limits, cycles, another order."""
+    """Replace numbers by extreme numbers, by cycles of indices, or by another order."""
     if array.dtype == torch.uint8 and array.dim() == 1:  # bytes of a format
         return torch.tensor(list(spoilt(array.numpy().tobytes(), random)), dtype=torch.uint8)
     found = array.clone(memory_format=torch.contiguous_format)
@@ -417,7 +417,7 @@ DATA: Mapping[str, Mapping[str, Any]] = {
     "tabular": {"columns": ["x", "y"], "largest": [2.0, 3.0], "mean": [0.1, 0.2], "deviation": [0.5, 0.6]},
     "human_scans": {"height": 16, "width": 12},
 }
-"""Data sets that keep something of their own with a model."""
+"""Data sets that store a state with a model."""
 ODD = (
     None,
     -1,
@@ -440,7 +440,7 @@ ODD += ("x" * 5000, "\x1b[2J", [], {}, [[]], [1.0], [1.0, 2.0, 3.0], (1.0, float
 
 
 def of_data(name: str) -> bytes:
-    """A model of two numbers that was trained on such data."""
+    """Return the checkpoint of a model of two numbers that was trained on such data."""
     subject = Subject(
         parts([resolve("encoder", SMALL)], "categorical"), CLASSES, torch.zeros(4, 2), ("x", "y")
     )
@@ -451,7 +451,7 @@ def of_data(name: str) -> bytes:
 
 
 def in_data(content: bytes, random: np.random.Generator) -> bytes:
-    """A checkpoint with one value of its data's state missing, or another one."""
+    """Remove or replace one value of the stored state of the data in a checkpoint."""
     values_of = whole(content)
     place: Any = values_of["framework"]["data_state"]
     while True:

@@ -9,7 +9,7 @@ from framework.testing.rows import Case, HeadRow, WrapperRow
 
 
 def cases(head):
-    """SciPy's wrapped Cauchy, about 0."""
+    """Return SciPy's wrapped Cauchy density with mean 0."""
     value = np.linspace(-3, 3, 13, dtype=np.float32).astype(np.float64)
     for spread in (-30.0, -1.0, 0.0, 4.0):
         length = head.largest / (1 + np.exp(-spread))

@@ -1,4 +1,4 @@
-"""A data set of every kind of target, with the mistakes that one makes first; and metrics as a stranger writes them."""
+"""Data set for every kind of target with typical mistakes of beginners, and metrics of a third party."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -23,7 +23,7 @@ NO_SAMPLE = torch.Size()
 
 
 class Trial(Data):
-    """Two numbers near a circle (synthetic), and what is to be said of them."""
+    """Two numbers near a circle (synthetic), with a target of the chosen kind."""
 
     def __init__(
         self,
@@ -83,7 +83,7 @@ class Trial(Data):
 
 
 class Silent(Distribution):
-    """Uniform over several angles; of one of them alone it says nothing."""
+    """Uniform density over several angles, which provides no marginal of a single angle."""
 
     arg_constraints: ClassVar = {}
     support = circular
@@ -107,7 +107,7 @@ class Silent(Distribution):
 
 
 class SilentHead(DensityHead):
-    """Uniform whatever the network says."""
+    """Density head that always returns the uniform density."""
 
     def __init__(self, target: Target) -> None:
         super().__init__()
@@ -125,7 +125,7 @@ class SilentHead(DensityHead):
 
 
 class MeanEntropy(Metric):
-    """It has no better way, and says none."""
+    """Metric that does not declare whether lower or higher values are better."""
 
     columns: ClassVar = {"mean_entropy": "mean entropy"}
     count: Tensor
@@ -145,7 +145,7 @@ class MeanEntropy(Metric):
 
 
 class Listed(MeanEntropy):
-    """Computes several numbers under one name."""
+    """Metric that returns several numbers under one name."""
 
     def compute(self) -> dict[str, Tensor]:
         return {"mean_entropy": (self.total / self.count).expand(3)}
