@@ -20,7 +20,10 @@ if TYPE_CHECKING:
     from framework.metric import Metric
 
 Resolved = dict[str, Any]
-"""Resolved configs of all plugins of a run by group, as plain values; a group of several plugins has a list."""
+"""Checked configs of all plugins of a run, as plain values with every parameter, by group.
+
+The value of a group from which several plugins may be chosen is a list of configs.
+"""
 
 
 def resolve_all(config: Mapping[str, Any]) -> Resolved:
@@ -117,7 +120,8 @@ def build_predictor(
 ) -> Predictor:
     """Return the untrained predictor, whose initial weights are a function of `seed` and the config.
 
-    The leading encoders with fixed features are placed outside the wrappers of `uncertainty`.
+    The first encoders of the config, up to the first one that is trained, have fixed features. They are shared by all
+    models and are placed outside the uncertainty wrappers. `columns` are the names of the input columns.
     """
     # the model is built on the CPU; the generators of other devices stay unchanged
     torch.default_generator.manual_seed(seed)
@@ -175,7 +179,7 @@ def build_metrics(resolved: Resolved, target: Target) -> "list[Metric]":
 
 
 def citations(resolved: Resolved) -> dict[str, str]:
-    """Return the BibTeX of every plugin used, including parts of parts, by the key 'group name'.
+    """Return the BibTeX of every plugin used, including plugins inside plugins, by 'group name', such as 'data moons'.
 
     Metrics and objectives of a stored model that are not installed are left out, since the model predicts without them.
     """

@@ -47,7 +47,10 @@ class PluginConfigs(SearchPathPlugin):
 
 
 class PluginFolder(FileConfigSource):
-    """Config folder of a plugin that refuses a config which two plugins ship; Hydra would silently use one of them."""
+    """Config folder of a plugin; loading a config that several plugins ship raises an error.
+
+    Hydra itself would silently use one of these configs.
+    """
 
     @staticmethod
     def scheme() -> str:
@@ -85,8 +88,8 @@ def in_quotes(text: str) -> str:
 def plain(config: DictConfig) -> dict[str, Any]:
     """Return the composed config as plain values with interpolations resolved.
 
-    Leftover parts of replaced choices are dropped. For example, an experiment that sets keys of `encoder.a` and is run
-    with `encoder=b` leaves a part `encoder.a` without a name.
+    Entries of a group that have no `name` are dropped. Such an entry remains, for example, if an experiment sets keys
+    of `encoder.a`, and the command replaces this encoder by `encoder=b`.
 
     Raises:
         ConfigError: A required value is missing, or an experiment's keys are not at the top level.
@@ -117,7 +120,8 @@ def plain(config: DictConfig) -> dict[str, Any]:
 def _missing(values: Any, before: str = "") -> Iterator[tuple[str, str]]:
     """Yield the dotted key of each missing required value, and the part of the message that describes the value.
 
-    A config marks such a value as `<a file of ...>`, with a description, or as `???`, without one.
+    A config marks such a value by a description, `<a file of ...>`, or by `???`. `before` is the dotted key of
+    `values`.
     """
     if isinstance(values, str) and re.fullmatch(r"\?\?\?|<.*>", values):
         yield before, f": give {values[1:-1]}" if values != "???" else ""
@@ -195,7 +199,7 @@ def _describe_unreadable(override: str) -> str:
 
 
 def _describe_damage(error: BaseException) -> str | None:
-    """Return the message for an error that a file causes which is no config at all; None for any other error."""
+    """Return the message for an error caused by a file that is no valid config; None for any other error."""
     cause: BaseException | None = error
     while cause is not None and not isinstance(cause, yaml.YAMLError):
         cause = cause.__cause__
@@ -272,7 +276,7 @@ def _describe_unknown_key(cause: OmegaConfBaseException) -> str:
 
 
 def _dotted_keys(values: Any, before: str = "") -> list[str]:
-    """Return the dotted keys of all entries of nested mappings, without Hydra's own keys."""
+    """Return the dotted keys, each with the prefix `before`, of all entries of nested mappings, without Hydra's own."""
     keys = []
     for key, value in values.items() if isinstance(values, Mapping) else ():
         if before or key != "hydra":

@@ -29,7 +29,8 @@ class Config:
     """Config of a command, as a mode receives it.
 
     Attributes:
-        values: Composed config as plain values, which the run folder stores; a resumed run compares it with its own.
+        values: Composed config as plain values. The run folder stores them, and a run is resumed only if they agree
+            with the stored ones.
         settings: Checked settings of the core.
         folder: Folder of the run.
         overrides: Overrides on the command line.

@@ -18,7 +18,7 @@ from framework.storage.old_versions import complete_description
 from framework.target import Kind, Target
 
 MOST_REMARKS, LONGEST_REMARK = 8, 500
-"""Largest number of remarks of a stored model that are read, and largest number of characters of a remark."""
+"""Largest number of remarks (`Description.remarks`) that are read from a checkpoint, and of characters of a remark."""
 INHERITED = ("seed", "batch_size", "samples", "experiment_name")
 """Settings that a later test of the model takes over, so that its numbers equal those of the model's own run."""
 
@@ -33,13 +33,14 @@ class Description:
         input_shape: Shape of one input, as in `Data`.
         columns: Names of the input columns, as in `Data`.
         synthetic: Whether the model was trained on generated data.
-        method: Name of the model in tables; may be "" (`framework.storage.old_versions`).
-        settings: Settings of the model's run that are in `INHERITED`; may be empty (`framework.storage.old_versions`).
+        method: Name of the model in tables; "" for a checkpoint of version 0.1, which stores no name.
+        settings: Values of the settings `INHERITED` in the run that trained the model; see
+            `framework.storage.old_versions` for checkpoints that store none.
         data_state: `Data.state_dict` of the training data.
         path: Path of the checkpoint from which the description was read.
         dropped: Paths in the stored config that the user has not repeated, by dotted keys; in `config` these keys have
             their defaults.
-        remarks: Remarks of the wrappers from their calibration (`Uncertainty.remark`).
+        remarks: Sentences for the user that the uncertainty wrappers return after calibration (`Uncertainty.remark`).
     """
 
     config: Resolved

@@ -51,7 +51,7 @@ def require_harmless(arguments: Sequence[str], groups: Collection[str]) -> None:
 
 
 def _group(file: Path, folder: Path) -> str:
-    """Return the name of the first folder below `folder` on the path of a config; empty for one in `folder` itself."""
+    """Return the name of the topmost folder below `folder` that contains a file; "" for a file in `folder` itself."""
     return (*file.relative_to(folder).parts[:-1], "")[0]
 
 
@@ -93,7 +93,7 @@ def _require_harmless(file: Path, folder: Path, groups: Collection[str]) -> None
 
 
 def _is_own(group: str, package: str) -> bool:
-    """Return whether a choice belongs to, or changes, a part of the config that only the user may set."""
+    """Return whether a choice `group@package` concerns a part of the config that only the user may set (`OWN`)."""
     if CHOSEN.fullmatch(group):
         return bool(package)
     return any(word in f"{group}@{package}" for word in OWN)

@@ -86,13 +86,13 @@ class User:
         self.frames = WeakTensorKeyDictionary()  # frames of the inputs of the calls in progress
 
     def convert_inputs(self, model: nn.Module, arguments: tuple[Any]) -> Tensor:
-        """Return the model's inputs for the user's data, and store the frame in which the density is returned."""
+        """Return the model's inputs for the user's data, and store their `Data.frame` for `convert_density`."""
         batch = read_batch(model, self.data, *arguments)
         self.frames[batch["input"]] = self.data.frame(batch)
         return batch["input"]
 
     def convert_density(self, model: nn.Module, inputs: tuple[Tensor], density: Distribution) -> Distribution:
-        """Return the density in the frame of its inputs, with the names of the target."""
+        """Return the density converted to the user's unit (`Data.frame`), with the names of the target."""
         frame: Frame | None = self.frames.pop(inputs[0])
         user_density = (
             density if frame is None else AffineDensity(density, *(part.to(inputs[0]) for part in frame))
@@ -230,7 +230,8 @@ def rebuild(description: Description, state: Mapping[str, torch.Tensor]) -> Pred
 def bound_first_prediction(predictor: Predictor, path: str) -> None:
     """Limit the memory of the first prediction of a stored model (`budget.predicting`).
 
-    A prediction raises an error before it takes far more memory than its weights and inputs explain.
+    A prediction that would take far more memory than the sizes of its weights and inputs justify raises an error before
+    the memory is allocated.
     """
     # a frozen model calls the fixed encoders and the predictor behind them separately
     split = isinstance(predictor, FrozenFrontEnd)
@@ -241,7 +242,9 @@ def bound_first_prediction(predictor: Predictor, path: str) -> None:
 
 
 class FirstPrediction:
-    """Hooks of `bound_first_prediction`; they limit a prediction only if its batch is larger than all before.
+    """Hooks of `bound_first_prediction`, which limit the memory of predictions.
+
+    A prediction is limited only if its batch has more samples than every earlier batch.
 
     Args:
         path: Path of the checkpoint.

@@ -48,7 +48,7 @@ MODES: Mapping[str, Mode] = {
     "plugins": Mode(),
     "sync": Mode(),
 }
-"""Modes by name."""
+"""Keys that each mode reads, by the name of the mode."""
 
 UNUSED_BY_TRAINING = {
     "limit_test_batches": "the test always covers its whole split",
@@ -115,7 +115,7 @@ _CONDITIONS = (
         for key in ("preset", "debug")
     ),
 )
-"""Conditions that depend on the composed config only; `runs.job.refuse_idle` serves those known later."""
+"""Conditions that the composed config decides; code that decides a condition later calls `runs.job.refuse_idle`."""
 
 
 def require_read(mode: str, overrides: Sequence[str]) -> None:

@@ -35,7 +35,7 @@ UNUSED = ("metric", "objective", "outliers", "renderer")
 
 @dataclass
 class _Part:
-    """Config of one plugin inside a larger config; its values can be changed.
+    """Config of one plugin inside a larger config; a change of `values` changes the larger config.
 
     Attributes:
         key: Dotted key of the plugin in the whole config.
@@ -83,7 +83,8 @@ def remove_paths(
 
     Returns:
         A copy of the config with the user's values, in which all other paths are replaced by the defaults; and the
-        removed paths by dotted keys. Parameters that only training needs (`Encoder.initial`) are not among the latter.
+        removed paths by dotted keys. Paths of parameters that only training needs (`Encoder.initial`) are removed but
+        not listed.
 
     Raises:
         ConfigError: The config has no part for a key of `user_values`, or the key is no path of the model.
@@ -151,15 +152,15 @@ def flatten(nested: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def require_paths(dropped: Mapping[str, Any], groups: Collection[str], source: str) -> None:
-    """Refuse to continue without the paths of some groups.
+    """Refuse to continue if a path of a plugin of `groups` was removed from the stored config.
 
     Args:
         dropped: Removed paths, by dotted keys.
-        groups: Groups whose paths are needed.
+        groups: Groups of plugins that are needed.
         source: Path of the checkpoint, for the message.
 
     Raises:
-        ConfigError: Paths of these groups were removed; the message says which, and what to write.
+        ConfigError: Such a path was removed; the message names the paths, and says what to write.
     """
     needed = {key: value for key, value in dropped.items() if key.partition(".")[0] in groups}
     if needed:
@@ -202,7 +203,7 @@ def require_repeated(stored: Mapping[str, Any], repeated: Mapping[str, Any], fol
 
 
 def shell_arguments(paths: Mapping[str, Any]) -> list[str]:
-    """Return the command-line arguments that set these paths, quoted for a shell."""
+    """Return the command-line arguments that set `paths`, which has paths by dotted keys, quoted for a shell."""
     return [shlex.quote(f"{shorten(key)}={_shell_value(value)}") for key, value in paths.items()]
 
 
@@ -241,7 +242,7 @@ def parse_paths(options: Sequence[str]) -> dict[str, str]:
 
 
 def _parts(config: dict[str, Any], unused: Collection[str]) -> Iterator[_Part]:
-    """Yield every plugin in a config, including plugins that are parts of others."""
+    """Yield every plugin in a config, including plugins inside plugins; those of the groups `unused` get no class."""
     for group in (*GROUPS, "outliers"):
         chosen = config.get(group)
         named: list[tuple[str, Any]] = []
@@ -303,7 +304,7 @@ def _is_marked_path(annotation: Any) -> bool:
 
 
 def _path_mark(annotation: Any) -> bool | None:
-    """Return True if an annotation marks a text as a path, False if as no path, and None if the text is not marked."""
+    """Return True if an annotation says that a text is a path, False if it says that it is none, and None otherwise."""
     marks = [item.path for item in getattr(annotation, "__metadata__", ()) if isinstance(item, Mark)]
     if isinstance(annotation, type) and issubclass(annotation, PurePath):
         marks.append(True)

@@ -15,7 +15,10 @@ MODEL = ("encoder", "density_head", "uncertainty")
 """Groups of the plugins with which a model predicts."""
 
 Entry = Any
-"""Type of an entry point: that of importlib.metadata, or that of its backport, which importing MLflow installs."""
+"""Type of an entry point.
+
+It is the class of importlib.metadata or, after MLflow was imported, the class of the package importlib_metadata.
+"""
 
 
 @cache
@@ -46,7 +49,7 @@ def unusable_names(group: str) -> dict[str, str]:
 
 
 def _entries(group: str) -> dict[str, list[Entry]]:
-    """Return the entry points of a group by name, sorted; those of the same name and object are listed once."""
+    """Return the entry points of a group by name, sorted; if two have the same name and object, one of them."""
     entries_by_name: dict[str, list[Entry]] = {}
     for entry in sorted(entry_points(group=f"framework.{group}"), key=lambda entry: entry.name):
         same_name = entries_by_name.setdefault(entry.name, [])
@@ -125,7 +128,7 @@ def _describe_missing_module(entry: Entry, module: str) -> str:
 
 
 def _remedy(entry: Entry, module: str) -> str:
-    """Return how to install a missing module: by an extra of the plugin's package, if an extra requires the module."""
+    """Return how to install a missing module: with the plugin package's extra that requires it, or by its name."""
     package = module.partition(".")[0].lower()
     for requirement in (entry.dist.requires if entry.dist else None) or ():
         required = re.match(r"[\w.-]+", requirement)
@@ -141,7 +144,7 @@ def _remedy(entry: Entry, module: str) -> str:
 
 
 def group_of(annotation: object) -> str | None:
-    """Return the attribute `group` of the abstract base of a plugin class; None for other objects."""
+    """Return the name of the registry if `annotation` is a plugin class or the abstract base of one; None otherwise."""
     if not isinstance(annotation, type):
         return None
     group = getattr(annotation, "group", None)

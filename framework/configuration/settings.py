@@ -74,17 +74,17 @@ class OptimizerSettings(_Strict):
     name: Literal["adam", "adamw", "sgd", "nadam", "radam"] = "adamw"
     learning_rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1e-3
     momentum: Annotated[float, Field(ge=0, lt=1)] | None = None
-    """Momentum of sgd; None means 0. The other optimisers have fixed kinds of momentum and refuse this setting."""
+    """Momentum of `sgd`; None means 0. The other optimisers have fixed kinds of momentum and refuse this setting."""
     weight_decay: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
     schedule: Literal["constant", "cosine", "step", "plateau"] = "constant"
     warmup_steps: NotNegative = 0
     """Number of steps in which the learning rate rises linearly, at most a quarter of the training's steps."""
     factor: Annotated[float, Field(gt=0, lt=1)] = 0.1
-    """Factor by which the schedules step and plateau multiply the learning rate to reduce it."""
+    """Factor by which the schedules `step` and `plateau` multiply the learning rate to reduce it."""
     milestones: list[Count] = []
-    """Epochs after which the schedule step reduces the learning rate."""
+    """Epochs after which the schedule `step` reduces the learning rate."""
     patience: Count = 5
-    """Number of epochs without a better validation loss after which the schedule plateau reduces the learning rate."""
+    """Number of epochs without a lower validation loss after which the schedule `plateau` reduces the learning rate."""
 
     @model_validator(mode="after")
     def _fits(self) -> "OptimizerSettings":
@@ -184,7 +184,7 @@ class Settings(_Strict):
     checkpoint: str | None = None
     resume: str | None = "auto"
     stored: dict[str, Any] = {}
-    """Values for keys of a stored config, by group, such as `data.root=...` in a command with `checkpoint=`."""
+    """Values by group that replace those of a checkpoint's config, such as `data.root=...` beside `checkpoint=`."""
     experiment_name: str | None = None
     optimizer: OptimizerSettings = OptimizerSettings()
     logger: LoggerSettings = LoggerSettings()
@@ -195,10 +195,11 @@ class Settings(_Strict):
 def store_experiment(config: Mapping[str, Any], trained_on: str = "") -> str:
     """Return the name of the experiment to which a run belongs in the tracking store.
 
-    The name is `logger.experiment`, if it is set. Otherwise it is "data" for `experiment=data/method`, the name of the
-    data set for a run without an experiment, or the data set on which a stored model was trained (`trained_on`). For a
-    run without data it is "Default", which MLflow creates itself. All methods on the same data share one experiment, so
-    that the runs of a sweep over methods appear under their parent and can be compared.
+    The name is `logger.experiment`, if it is set. Otherwise it is the part of `experiment=` before the slash, such as
+    "moons" for `experiment=moons/scvae`; without an experiment, it is the name of the data set; without a data set, it
+    is `trained_on`, the data set on which the stored model was trained. If there is none of these, it is "Default", the
+    experiment that MLflow creates itself. All methods on the same data share one experiment, so that the runs of a
+    sweep over methods appear under their parent and can be compared.
     """
     logger = config.get("logger") or {}
     name = config.get("experiment_name")

@@ -76,7 +76,11 @@ def signature(cls: type) -> dict[str, tuple[Any, Any]]:
 
 
 def _keys(cls: type, instance: Any = None) -> Iterator[tuple[str, str, Any, Any]]:
-    """Yield parameter, key, annotation and default of every key; the defaults are read from `instance`, if given."""
+    """Yield parameter, key, annotation and default of every key of `cls`.
+
+    A parameter that is a dataclass has one key for each of its fields. If `instance` is given, the defaults are the
+    values of its attributes.
+    """
     for name, (annotation, default) in _keywords(cls).items():
         default = getattr(instance, name, default)
         if _is_value(annotation):
