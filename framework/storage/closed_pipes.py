@@ -12,8 +12,8 @@ from typing import Any, final
 class DroppingWriter(io.FileIO):
     """Writer to a pipe or socket that drops the output once no process reads it any more.
 
-    At that moment its file descriptor is redirected to the null device. Child processes, which inherit the descriptor,
-    then lose their output as well but do not fail.
+    When the last reader has ended, the file descriptor of this writer is redirected to the null device. Child processes
+    inherit the descriptor, so their output is dropped too, and they do not fail.
     """
 
     def write(self, data: Any, /) -> int | None:

@@ -11,8 +11,9 @@ from framework.storage.files import describe_unwritable
 def run_command(main: Callable[[list[str]], object]) -> None:
     """Call `main` with the arguments of this process.
 
-    The process exits with 0, 1 (refused or failed) or 130 (interrupted); argparse exits with 2. If the reader of the
-    output ends, as in `... | head -1`, the rest of the output is dropped and the command continues.
+    The process exits with 0 (success), 1 (the command was refused or failed) or 130 (interrupted); argparse exits with
+    2 if the arguments are wrong. If the reader of the output ends, as in `... | head -1`, the rest of the output is
+    dropped and the command continues.
     """
     survive_closed_pipes()
     try:

@@ -126,7 +126,7 @@ def read_plain(path: Path, most: int) -> bytes:
 
 
 def _fault(status: os.stat_result) -> str:
-    """Return the name of the kind of a forbidden entry, such as "a link"; "" for a folder or a plain file."""
+    """Return the kind of a folder's entry that is forbidden, such as "a link"; "" for a folder or a plain file."""
     if stat.S_ISLNK(status.st_mode):
         return "a link"
     if stat.S_ISDIR(status.st_mode):

@@ -44,17 +44,17 @@ def describe_unwritable(error: BaseException) -> str | None:
 
 
 def _is_missing_parent(error: OSError) -> bool:
-    """Return whether a folder could not be created below its parent, for which /proc reports "no such file"."""
+    """Return whether creating a folder failed with "no such file", as it does in /proc, which allows no new folders."""
     frames = [frame.f_code.co_name for frame, _ in walk_tb(error.__traceback__)]
     return error.errno == errno.ENOENT and frames[-1:] == ["mkdir"]
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yield a temporary path beside `path`; if the block ends without an error, that file is synced and renamed to it.
+    """Yield a temporary path beside `path`, and rename the file there to `path` if the block ends without an error.
 
-    A crash, SIGKILL or power cut leaves either the old file or the new one; an error leaves the old one. The folder of
-    `path` is created if it is missing.
+    The file is synced to the disk before it is renamed. So a crash, SIGKILL or power cut leaves either the complete old
+    file or the complete new one, and an error leaves the old one. The folder of `path` is created if it is missing.
 
     Raises:
         OSError: The disk is full, or there is no permission to write.
@@ -79,7 +79,7 @@ def write_whole(path: Path, content: bytes) -> None:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Delete temporary files of `replacing` in `folder` whose processes on this machine have ended."""
+    """Delete temporary files in `folder` that `replacing` left because its process, on this machine, was killed."""
     for partial in folder.glob(f".*.{socket.gethostname()}.*.partial"):
         try:
             os.kill(int(partial.suffixes[-2][1:]), 0)
@@ -99,7 +99,7 @@ def sync(path: Path) -> None:
 
 
 def lock_within(descriptor: int, seconds: float) -> None:
-    """Take the POSIX record lock of a file, which this process holds until it closes any descriptor of the file.
+    """Acquire the POSIX record lock of a file, which this process holds until it closes any descriptor of the file.
 
     Raises:
         BlockingIOError, PermissionError: Another process still holds the lock after `seconds`.

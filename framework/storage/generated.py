@@ -22,7 +22,8 @@ def ensure_generated(root: Path, mark: Mapping[str, Any], write: Callable[[Path]
 
     Args:
         root: Folder of the generated data.
-        mark: Values that determine the content, as JSON values; they are stored in `synthetic.json` in the folder.
+        mark: Settings that determine the generated data, as JSON values; the file `synthetic.json` in the folder stores
+            them, and they distinguish generated from recorded data.
         write: Function that writes the data into an empty folder, which is renamed to `root` when it is complete.
 
     Raises:
@@ -61,7 +62,7 @@ def read_mark(root: Path) -> dict[str, Any] | None:
 
 
 def draw_all(count: int, draw: Callable[[int], None], name: str) -> None:
-    """Call `draw` with 0 … count - 1, in several threads; `name` is the name of the files in the progress report."""
+    """Call `draw` with 0 … count - 1 in several threads; the progress report calls the drawn files `name`."""
     with ThreadPoolExecutor(PAINTERS) as painters:
         try:
             for _ in track_progress(painters.map(draw, range(count)), f"drawing {name}", count, "files"):

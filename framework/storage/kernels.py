@@ -17,7 +17,8 @@ def kernel_cache(name: str, sources: Iterable[Path]) -> str | None:
 
     The name of the folder contains a hash of all the sources, because numba notices changes in a function's own file
     but not in the files of the functions that it calls. The folder lies below NUMBA_CACHE_DIR if that is set, else in
-    the framework's cache. If the folder cannot be written, the result is None, and every process compiles.
+    the framework's cache. If the folder cannot be written, the function returns None, and every process compiles the
+    functions itself.
     """
     digest = sha256(b"".join(source.read_bytes() for source in sorted(sources))).hexdigest()[:16]
     try:

@@ -7,28 +7,29 @@ that reading a file of a few megabytes takes less than 1 GB and 5 s, whether it 
 # models that a checkpoint describes
 
 BUILDING_TIMES, BUILDING_BYTES = 8, 2**27
-"""Memory for building a stored model: this multiple of the size of its weights, plus this number of bytes.
+"""Limit on the memory for building a stored model: BUILDING_TIMES × the bytes of its weights, plus BUILDING_BYTES.
 
-Members that are stacked are allocated twice, and orthogonal initial weights three times. Bases of point sets and tables
-of constants take memory although they have no weights.
+The weights of ensemble members that are computed together are allocated twice, and orthogonal initial weights three
+times. Basis point sets and tables of constants take memory although they are no weights.
 """
 CALLS_PER_WEIGHT, BUILDING_CALLS = 200, 10_000
-"""Operations of torch for building a stored model: this number for each tensor of its weights, plus this number.
+"""Limit on torch's operations for building a stored model: CALLS_PER_WEIGHT for each tensor, plus BUILDING_CALLS.
 
-A layer takes about ten operations; the second number of operations takes less than a second.
+A layer takes about ten operations; BUILDING_CALLS operations take less than a second.
 """
 PREDICTING_TIMES, PREDICTING_BYTES, PREDICTING_ROW = 8, 2**27, 2**26
-"""Memory for the first prediction of a stored model.
+"""Limit on the memory for the first prediction of a stored model.
 
 The limit is PREDICTING_TIMES × the bytes of weights and inputs, plus PREDICTING_BYTES, plus PREDICTING_ROW bytes for
 each sample (for an occupancy grid of side 256, for example).
 """
 SMALL_RESULT = 2**17
-"""Size, in bytes, up to which the result of an operation is not counted."""
+"""Largest result of an operation of torch, in bytes, that is not counted towards the memory limits."""
 MOST_INPUT = 2**24
 """Largest number of elements of one input or target in a checkpoint: a colour image of 2,364 × 2,364 pixels.
 
-An image file of any size is scaled to the size that the checkpoint states, so the checkpoint determines the memory.
+An image file of any size is scaled to the input size that the checkpoint states, so the checkpoint determines how much
+memory an input takes.
 """
 MOST_SIDES = 8
 """Largest number of dimensions of one input."""
@@ -42,12 +43,12 @@ MOST_DRAWN = 2**26
 # compressed files
 
 UNFOLDED_BYTES, UNFOLDED_TIMES = 2**27, 20
-"""A compressed file may decompress to this number of bytes or this multiple of its size, whichever is larger."""
+"""A compressed file may decompress to UNFOLDED_BYTES or UNFOLDED_TIMES × its own size, whichever is larger."""
 
 # images
 
 MOST_PIXELS, LONGEST_SIDE = 2**25 + 2**24, 2**16
-"""Largest number of pixels of a stored image (8,688 × 5,792, from a camera of 50 megapixels), and of its longer side.
+"""Largest number of pixels of an image file (8,688 × 5,792, a 50-megapixel camera), and of pixels along a side.
 
 Pillow uses 4 bytes for each decoded pixel. An image with an alpha channel, or one that is padded to a square, takes
 this memory twice.
@@ -64,9 +65,9 @@ AT_ONCE = 2**25
 MOST_ANNOUNCED = 2**31
 """Largest number of vertices or faces in the header of a file; a larger number means that the file is damaged."""
 MOST_COLUMNS = 1000
-"""Largest number of values of a vertex."""
+"""Largest number of values (coordinates, colours and others) that a file may store for each vertex."""
 MOST_NUMBERS = 2**24
-"""Number of values to which a compressed archive of points or of a body may decompress, even if the file is small.
+"""Number of values to which a compressed archive of a point cloud or body model may decompress, however small it is.
 
 A file with more bytes than this may contain as many values as it has bytes. Each value takes 8 bytes in memory.
 """
@@ -74,7 +75,7 @@ A file with more bytes than this may contain as many values as it has bytes. Eac
 # volumes
 
 MOST_OF_SPECTRA, MOST_VOXELS = 2**24, 2**22
-"""Number of values and number of voxels that a volume of spectra may contain, even if its file is small.
+"""Number of values and number of voxels that a volume of spectra may contain, however small its file is.
 
 A larger file may contain as many values as it has bytes, and a quarter as many voxels. Without the limit, 128 kB of
 compressed zeros would decompress to 134 million values.
@@ -83,7 +84,7 @@ compressed zeros would decompress to 134 million values.
 # scenes
 
 MOST_PARTS, MOST_MATERIALS = 10_000, 10_000
-"""Largest number of parts of a scene (each has one material and takes a millisecond), and of materials."""
+"""Largest number of parts of a scene, each with one material and a millisecond of work, and of materials."""
 MOST_TEXELS, FEW_TEXELS, TEXELS_PER_BYTE = 2**25, 2**24, 16
 """Largest number of texels in all textures of a scene, which fits two textures of 4096 × 4096.
 
@@ -96,14 +97,14 @@ SCENE_BYTES = 2**25
 A larger file may expand by the same factor as a compressed file (`UNFOLDED_TIMES`).
 """
 MOST_JOINT_SETS = 4
-"""Largest number of sets of four joints that move a vertex."""
+"""Largest number of sets of joints per vertex in a glTF file; a set names four joints that move the vertex."""
 MOST_SAMPLES = 2**25
-"""Largest number of samples of an image: 2560 × 1440 pixels of 9 samples. With colour and depth they take 1 GB."""
+"""Largest number of samples of a drawn image: 2560 × 1440 pixels of 9 samples, with colour and depth 1 GB."""
 
 # other files
 
 MOST_ARRAYS, DEEPEST_ARRAYS = 300_000, 32
-"""Largest number of arrays in a MATLAB file, cells and struct fields included, and largest depth of nesting."""
+"""Largest number of arrays in a MATLAB file, including cells and struct fields, and largest depth of nesting."""
 MOST_TABLE_COLUMNS = 100_000
 """Largest number of columns of a CSV table."""
 MOST_FRAMES = 1_000_000

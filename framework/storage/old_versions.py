@@ -13,7 +13,8 @@ PREDICTION_SETTINGS = {"seed": 0, "samples": 1000}
 def complete_description(stored: Mapping[str, Any]) -> dict[str, Any]:
     """Return the stored description of a model with the entries that version 0.1 did not write.
 
-    Without a state of the data (`data_state`), a data set that needs one reads its training data again.
+    The added entries are empty or False. If the added entry is `data_state`, a data set that needs this state to read
+    raw input computes it again from its training data.
     """
     absent = {
         "columns": (),
@@ -32,7 +33,7 @@ def can_resume_from_best(checkpoint: Mapping[str, Any]) -> bool:
 
 
 def has_checkpoint_files(client: Any, run_id: str) -> bool:
-    """Return whether a run in MLflow keeps its checkpoints as files, as in version 0.1, and not as a model.
+    """Return whether a run in MLflow has its checkpoints as files, as version 0.1 stored them, instead of as a model.
 
     Args:
         client: MLflow client of the store.

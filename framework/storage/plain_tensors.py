@@ -35,7 +35,7 @@ NUMBERS = {
     "uint32": "",
     "uint64": "",
 }
-"""Data types that a tensor may have, with the prefix of their storage class; the last three have no such class."""
+"""Data types that a tensor may have, with the prefix of their storage class; "" if there is no such class."""
 CALLED = frozenset(
     {
         "collections OrderedDict",
@@ -62,11 +62,11 @@ NAMED = frozenset(
 """
 TYPES = frozenset(getattr(torch, name) for name in NUMBERS)
 MOST_EXPANDED = 1000
-"""Number of elements up to which a tensor may have more elements than its storage, as an expanded tensor has."""
+"""Largest number of elements of a tensor that has more elements than its storage, as an expanded tensor has."""
 MOST_SHARED = 1000
 """Largest ratio of the bytes of all tensors to the bytes of the file; above 1, because tensors may share storage."""
 PICKLES_BEFORE_ZIP = 5
-"""Number of pickles in a file of torch before 1.6: mark, version, system, values, and names of the storages."""
+"""Number of pickles in a file of torch before 1.6: magic number, version, system, values, and names of the storages."""
 LENGTH_OF_MARK = 20
 
 

@@ -15,7 +15,7 @@ from framework.storage.reading import RESTORE, read_bytes, translate_errors
 from framework.storage.text import decode
 
 LARGEST_JSON, LARGEST_YAML = 2**24, 2**17
-"""Largest size of a file, in bytes."""
+"""Largest size of a JSON file and of a YAML file, in bytes."""
 DEEPEST, MOST_ITEMS = 64, 100_000
 
 
@@ -97,11 +97,11 @@ class _Item:
     """Description of a value on the stack of a pickle; the value itself is not built.
 
     Attributes:
-        size: Size of the text or of the contents.
+        size: Size of the text, or of everything that the value contains.
         values: Number of values that a tuple contains, including nested values.
         name: Name of a global as "module name"; "" for any other value.
         text: Text of a short string, or of the last string of a tuple.
-        mark: Whether the value is a mark.
+        mark: Whether the item is a mark, which a pickle pushes before a list of values, and not a value.
     """
 
     size: int = 1
@@ -115,7 +115,10 @@ PUTS = frozenset(("PUT", "BINPUT", "LONG_BINPUT", "MEMOIZE"))
 GETS = frozenset(("GET", "BINGET", "LONG_BINGET"))
 TUPLES = frozenset(("TUPLE", "TUPLE1", "TUPLE2", "TUPLE3"))
 ADDS = {"APPEND": 1, "SETITEM": 2, "BUILD": 1, "APPENDS": 0, "SETITEMS": 0, "ADDITEMS": 0}
-"""Instructions that add values to the object below them, with the number of values; 0 means all above the mark."""
+"""Instructions that add values from the top of the stack to the object below these, with the number of values.
+
+0 means all values above the last mark, which another instruction has pushed before the values.
+"""
 OTHERS = {"STACK_GLOBAL", "INST", "OBJ", "NEWOBJ_EX", "EXT1", "EXT2", "EXT4", "PERSID", "DUP"}
 OTHERS |= {"NEXT_BUFFER", "READONLY_BUFFER"}
 """Instructions that `torch.save` never writes and torch does not read."""
@@ -132,7 +135,7 @@ RENAMED = {"__builtin__": "builtins"}
 ENCODE = "_codecs encode"
 """Function that a pickle of protocol 2 calls to build bytes."""
 TIMES_ITSELF = 4
-"""Largest ratio of the size of all objects built by calls to the size of the pickle."""
+"""Largest ratio of the total size of the objects that calls in a pickle build to the size of the pickle."""
 HIGHEST = 2**62
 MOST_INSTRUCTIONS = 1_000_000
 """Largest number of instructions in a pickle; a tensor takes 30 of them, a number 1 or 2."""

@@ -12,7 +12,7 @@ from framework.storage.first_rank import first_rank
 
 Item = TypeVar("Item")
 QUIET_TIME, REPORT_INTERVAL = 2.0, 30.0
-"""Seconds before work reports its progress for the first time, and seconds between two lines in a log file."""
+"""Seconds from the start of the work to its first progress report, and seconds between two lines in a log file."""
 WIDE = 160
 """Number of characters in a line of a log file."""
 

@@ -23,13 +23,13 @@ WIDE = (
     (codecs.BOM_UTF16_BE, "UTF-16"),
 )
 LONGEST = 64
-"""Largest number of characters in a word for `suggest_number`, whose patterns take more than linear time."""
+"""Largest number of characters of a word that `suggest_number` examines, because its patterns take superlinear time."""
 LOOKED_AT = 64
-"""Number of leading bytes in which UTF-16 without a byte-order mark is detected: every second byte is 0."""
+"""Number of leading bytes that are searched for UTF-16 without a byte-order mark, in which every second byte is 0."""
 MINUS = str.maketrans(
     dict.fromkeys("\N{MINUS SIGN}\N{EN DASH}\N{SMALL HYPHEN-MINUS}\N{FULLWIDTH HYPHEN-MINUS}", "-")
 )
-"""Characters that stand for a minus before digits. A word with one inside, such as the range 1–5, is no number."""
+"""Characters that mean a minus at the beginning of a number. A word such as 1–5, a range, is no number."""
 NOT_FINITE = re.compile(r"[+-]?1\.#([A-Za-z]+)\d*")
 """Pattern of NaN and infinity as Microsoft's C library writes them: 1.#INF, -1.#IND, 1.#QNAN, sometimes truncated."""
 FORTRAN = re.compile(r"([+-]?(?:\d+\.\d*|\.\d+))[dD]([+-]?\d+)|([+-]?\d+)[dD]([+-]\d+)")
@@ -185,7 +185,7 @@ OTHERS: tuple[tuple[str, str, str], ...] = (
     (rf"([+-]?{FIGURES})\s*[x×*·]\s*10\s*\^?\s*([+-]?\d+)", "as a product with a power of ten", r"\1e\2"),
     (rf"[<>≤≥~≈]\s*([+-]?{FIGURES})", "as a bound", r"\1"),
 )
-"""Patterns of numbers that no setting reads, each with a description of the form and the replacement in plain form."""
+"""Patterns of numbers that no setting reads, each with a name of the form and a template for the plain number."""
 UNIT = re.compile(
     r"([+-]?)([A-Z]{3}(?=[ \xa0])|[^\w\s.,()+\-'\"<>≤≥~≈=#]{1,3})?\s*([+-]?[\d.,].*?)\s*"
     r"([^\W\d_]{1,8}(?:/[^\W\d_]{1,4})?[²³]?|[^\w\s.,()+\-'\"#*]{1,3})?"
@@ -194,7 +194,10 @@ UNIT = re.compile(
 
 
 def suggest_number(word: str) -> Suggestion | None:
-    """Return how to write a word with a decimal comma, thousands separators, a unit, … as a plain number, or None."""
+    """Return how to write a word, if it is a number in an unusual form, as a plain number; None for any other word.
+
+    Examples of unusual forms are a decimal comma, separators between thousands, and a unit.
+    """
     word = trim(word).translate(MINUS)
     if len(word) > LONGEST or not any(letter.isdigit() for letter in word):
         return None
@@ -209,7 +212,7 @@ def suggest_number(word: str) -> Suggestion | None:
 
 
 def _separated(sign: str, figures: str) -> Suggestion | None:
-    """Return how to write a number that has a decimal comma or digits in groups, or None."""
+    """Return how to write a number with a decimal comma or digits in groups; None if the number has neither."""
     decimal = {"decimal": "comma"}
     if re.fullmatch(r"\d*,\d+(?:[eE][+-]?\d+)?|\d+,", figures):
         number = sign + figures.replace(",", ".")
@@ -250,7 +253,7 @@ def _with_unit(word: str) -> Suggestion | None:
 
 
 def line_of_word(text: str, number: int) -> int:
-    """Return the number of the line, from 1, in which the word with the index `number` (from 0) stands."""
+    """Return the number (from 1) of the line that contains the word with the index `number` (from 0)."""
     line = 1
     for line, words in enumerate(re.split(r"\r\n|\r|\n", text), 1):
         number -= len(words_of(words))
@@ -264,8 +267,8 @@ def require_numbers_in(words: Sequence[str], text: str, first: int = 0) -> list[
 
     Args:
         words: Consecutive words of the text.
-        text: Whole text, in which an error message counts the lines.
-        first: Index of words[0] among all words of the text.
+        text: Whole text; an error message gives the number of a line in it.
+        first: Index of `words[0]` among all words of `text`.
 
     Raises:
         ValueError: A word is no number; the message names its line.

@@ -17,7 +17,7 @@ def wait_passively() -> None:
 
 
 class Pool:
-    """Pool of threads that are started on first use, and again in a forked child process, which inherits no threads."""
+    """Pool of threads, which start at the first use and, in a forked child process, at the first use there."""
 
     def __init__(self) -> None:
         self.threads: ThreadPoolExecutor | None = None
@@ -25,11 +25,11 @@ class Pool:
         os.register_at_fork(after_in_child=self.forget)
 
     def forget(self) -> None:
-        """Drop the threads, which do not exist in a child process."""
+        """Forget the threads of the parent in a forked child process, which does not inherit them."""
         self.threads = None
 
     def run(self, work: Callable[[int], object], threads: int) -> None:
-        """Call work(0) … work(threads - 1) concurrently, work(0) in this thread; `work` must not use the pool."""
+        """Call work(0) … work(threads - 1) concurrently, work(0) in the calling thread; `work` may not use the pool."""
         if threads <= 1:
             work(0)
             return

@@ -22,7 +22,7 @@ from framework.storage.reading import most_decompressed, open_regular
 _log = logging.getLogger(__name__)
 
 LISTED = 5
-"""Largest number of names of weights that a message lists; the message states the number of the others."""
+"""Largest number of names of weights that a message lists; of further names, it states only the number."""
 NUMBERS = (torch.float64, torch.float32, torch.float16, torch.bfloat16, torch.int64, torch.int32)
 """Data types that weights may have; complex numbers would lose their imaginary parts silently."""
 
