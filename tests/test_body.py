@@ -252,9 +252,13 @@ def test_weights_that_are_rounded_are_made_to_sum_to_1():
 @pytest.mark.parametrize(
     "shape, pose, message",
     [
-        (torch.zeros(2, 4), torch.zeros(2, 6, 3), "expected .batch, at most 3"),
-        (torch.zeros(2, 3), torch.zeros(3, 6, 3), "expected .batch, at most 3"),
-        (torch.zeros(2, 3), torch.zeros(2, 5, 3), "expected .batch, at most 3"),
+        (
+            torch.zeros(2, 4),
+            torch.zeros(2, 6, 3),
+            r"shape parameters \(2, 4\), expected \(batch, at most 3\)",
+        ),
+        (torch.zeros(2, 3), torch.zeros(3, 6, 3), r"pose \(3, 6, 3\), expected \(batch, 6, 3\)"),
+        (torch.zeros(2, 3), torch.zeros(2, 5, 3), r"pose \(2, 5, 3\), expected \(batch, 6, 3\)"),
         (
             torch.zeros(2, 3),
             torch.tensor([0.0, math.nan])[:, None, None].expand(2, 6, 3),

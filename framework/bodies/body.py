@@ -137,13 +137,14 @@ def _depths(parents: Sequence[int]) -> list[int]:
 
 
 def with_joints(body: Body, names: Sequence[str]) -> Body:
-    """Return a copy of the body that has only these joints.
+    """Return a copy of the body that has only the joints `names`.
 
-    Each other joint moves rigidly with its nearest remaining ancestor. Poses of the remaining joints give the same
-    vertices with less computation. A body with pose shapes is refused, because pose shapes refer to all joints.
+    The vertices of a removed joint follow its nearest remaining ancestor rigidly. A pose in which only the remaining
+    joints rotate gives the same vertices as before, with less computation. A body with pose shapes is refused, because
+    pose shapes refer to all joints.
 
     Raises:
-        ConfigError: no joint has such a name, the root is not among them, or the body has pose shapes.
+        ConfigError: a name is not the name of a joint, the root is not among the names, or the body has pose shapes.
     """
     for name in names:
         if name not in body.names:
@@ -182,9 +183,11 @@ def _kept_above(parents: Sequence[int], joint: int, kept_joints: dict[int, int])
 class BodyModel(nn.Module):
     """Differentiable model that returns the vertices of bodies from shape coefficients and joint rotations, in batches.
 
-    X = W(T + B_S(β) + B_P(θ), J(β), θ) (eq. 7.1, 7.2; Loper et al. 2015). The rotation of a joint is relative to its
-    parent; in the rest pose its axes are the world axes. With a pose of zeros the result is template plus shapes,
-    equal to the last bit if there are no pose shapes.
+    The vertices are X = W(T + B_S(β) + B_P(θ), J(β), θ) (eq. 7.1, 7.2; Loper et al. 2015). β are the shape
+    coefficients, θ the joint rotations (the pose), T the template, B_S the displacements by `shapes`, B_P those by
+    `pose_shapes`, J the joints in the rest pose, and W is linear blend skinning. The rotation of a joint is relative to
+    its parent; in the rest pose its axes are the world axes. For a pose of zeros the vertices are the template plus the
+    displacements by shape, to the last bit if the body has no pose shapes.
 
     Args:
         body: arrays of the model; they become buffers, so that `.to` changes their type and device.
@@ -237,7 +240,7 @@ class BodyModel(nn.Module):
         """Return the posed vertices, metres, of the model's dtype.
 
         Args:
-            shape: coefficients β; if there are fewer than the model has, they are the first ones.
+            shape: coefficients β. They may be fewer than the model has; the remaining coefficients are then 0.
             pose: θ, axis times angle of each joint, radians; angles above 2π are allowed.
             translation: translation of the whole body, metres.
             offsets: displacements of one person's vertices from the model's in the rest pose, metres: clothes, hair.
@@ -266,7 +269,10 @@ class BodyModel(nn.Module):
     def skinning(
         self, shape: Float[Tensor, "batch shape"], pose: Float[Tensor, "batch joint 3"]
     ) -> Float[Tensor, "batch vertex 3 3"]:
-        """Return Σ_j w_j R_j of each vertex, the linear part of its skinning transform (W of eq. 7.1)."""
+        """Return Σ_j w_j R_j of each vertex, the linear part of its skinning transform (W of eq. 7.1).
+
+        w_j is the vertex's skinning weight of joint j, and R_j the rotation of joint j relative to the world.
+        """
         self._check(shape, pose, None)
         blended = self._blended(shape, rotation_minus_identity(pose.double()))[:, :9]
         return blended.mT.unflatten(2, (3, 3)) + torch.eye(3).to(blended)
@@ -286,11 +292,15 @@ class BodyModel(nn.Module):
         return (joints + moved + transforms[..., 9:]).to(self.template.dtype)
 
     def _blended(self, shape: Tensor, turns: Tensor) -> Float[Tensor, "batch 12 vertex"]:
-        """Return Σ_j w_j (R_j - 1, t_j) of each vertex."""
+        """Return Σ_j w_j (R_j - 1, t_j) of each vertex, with skinning weights w_j and (R_j - 1, t_j) of `_transforms`."""
         return self._transforms(shape, turns).to(self.weights.dtype).transpose(1, 2) @ self.weights
 
     def _transforms(self, shape: Tensor, turns: Tensor) -> Float[Tensor, "batch joint 12"]:
-        """Return (R - 1, t) of each joint, float64, such that x becomes R x + t: all rotations up to the root."""
+        """Return (R - 1, t) of each joint, float64: the transform x → R x + t from the rest pose to the pose.
+
+        It includes the rotations of the joint and of all its ancestors. `turns` are the rotations relative to the
+        parents, less the identity.
+        """
         joints = self.rest_joints(shape).double()
         rotations = list(turns.unbind(1))
         shifts = list(joints.unbind(1))
@@ -321,10 +331,15 @@ class BodyModel(nn.Module):
         batch, most, joints = len(shape), len(self.shapes), len(self.parents)
         fits = shape.dim() == 2 and shape.shape[1] <= most and pose.shape == (batch, joints, 3)
         if not fits or (translation is not None and translation.shape != (batch, 3)):
-            moved = "" if translation is None else f" and translation {tuple(translation.shape)}"
+            moved = (
+                ""
+                if translation is None
+                else f"; translation {tuple(translation.shape)}, expected (batch, 3)"
+            )
             raise ValueError(
-                f"shape {tuple(shape.shape)}, pose {tuple(pose.shape)}{moved}; expected (batch, at most {most}), "
-                f"(batch, {joints}, 3) and (batch, 3)."
+                f"The body parameters have wrong shapes: shape parameters {tuple(shape.shape)}, expected (batch, at "
+                f"most {most}); pose {tuple(pose.shape)}, expected (batch, {joints}, 3){moved}. Give all of them the "
+                "same batch."
             )
         for name, values in (("shape", shape), ("pose", pose), ("translation", translation)):
             # angles whose squares are infinite in float64 are also refused

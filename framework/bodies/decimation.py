@@ -15,11 +15,14 @@ from framework.errors import DataError
 EVEN = 1e-3
 """Weight of an edge's squared length beside the squared distances from planes: it keeps triangles even."""
 TURN = 0.2
-"""Smallest cosine between a triangle's normals before and after a collapse."""
+"""Smallest allowed cosine of the angle between a triangle's normals before and after a collapse."""
 
 
 class Decimated(NamedTuple):
-    """Remaining vertices, and their triangles and texture triangles, with the numbers of the input."""
+    """Result of a decimation: the remaining vertices, and the triangles of vertices and of texture coordinates.
+
+    All numbers are indices into the arrays of the mesh before decimation.
+    """
 
     kept: Int[np.ndarray, "left"]  # this name is a key of cached files
     faces: Int[np.ndarray, "triangles 3"]
@@ -32,7 +35,7 @@ def decimate(
     uv_faces: Int[np.ndarray, "faces 3"],
     count: int,
 ) -> Decimated:
-    """Collapse edges until `count` vertices are left; ties go to the lower vertex number.
+    """Collapse edges until `count` vertices are left; of edges with equal error, the lowest vertex number goes first.
 
     Seams of the texture stay seams: a vertex on a seam moves along it or not at all.
 
@@ -57,7 +60,10 @@ def decimate(
 
 
 class _Collapses:
-    """State of the mesh during decimation, in lists and tuples, because each step reads only a few numbers."""
+    """State of the mesh during decimation.
+
+    It consists of lists and tuples, which are faster than arrays here, because each step reads only a few numbers.
+    """
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray, uv_faces: np.ndarray) -> None:
         self.points = [tuple(point) for point in vertices.astype(np.float64).tolist()]
@@ -103,7 +109,10 @@ class _Collapses:
         return {corner for face in self.around[v] for corner in self.corners[face] or ()} - {v}
 
     def _places_after(self, v: int, u: int) -> dict[int, int] | None:
-        """Return the texture coordinate of u that replaces each of those of v; None if a seam would break."""
+        """Return which texture coordinates of vertex u replace those of vertex v if v collapses onto u.
+
+        The keys are the texture coordinates of v. None means that the collapse would break a seam of the texture.
+        """
         place_after: dict[int, int] = {}
         for face in self.around[v] & self.around[u]:
             corners, places = self.corners[face] or [], self.places[face]
@@ -114,7 +123,10 @@ class _Collapses:
         return place_after if needed <= set(place_after) else None
 
     def _keeps_shape(self, v: int, u: int) -> bool:
-        """Return whether the mesh stays a manifold (v and u share exactly two neighbours) and no triangle flips."""
+        """Return whether vertex v may collapse onto vertex u.
+
+        It may if the mesh stays a manifold (v and u share exactly two neighbours) and no triangle flips (TURN).
+        """
         if len(self.around[v] & self.around[u]) != 2 or len(self._neighbours(v) & self._neighbours(u)) != 2:
             return False
         for face in self.around[v] - self.around[u]:
@@ -155,9 +167,10 @@ def _normal(a: tuple[float, ...], b: tuple[float, ...], c: tuple[float, ...]) ->
 
 
 def _quadrics(vertices: np.ndarray, faces: np.ndarray) -> Float[np.ndarray, "vertices 10"]:
-    """Return the quadric of each vertex: the upper triangle of a symmetric 4 × 4 matrix.
+    """Return the quadric of each vertex: the upper triangle of a symmetric 4 × 4 matrix, row by row.
 
-    The matrix is the sum over the vertex's triangles of area n nᵀ, n the plane (Garland, eq. 2).
+    The matrix is Σ a n nᵀ over the triangles around the vertex. a is the area of a triangle, and n its plane: the unit
+    normal and the offset (Garland, eq. 2).
     """
     a, b, c = (vertices[faces[:, corner]] for corner in range(3))
     cross = np.cross(b - a, c - a)

@@ -42,7 +42,7 @@ class Traits:
         anchors: anchors of each interpolated trait, ascending.
         traits: trait to which each column of `products` belongs; the columns of a trait without anchors have equal
             shares.
-        products: which columns are the factors of a blend shape's weight.
+        products: (blend shape, column), true if the column is a factor of the blend shape's weight.
         projection: matrix from blend shapes to shape coefficients.
         largest_error: largest distance of vertices of random bodies from the package's own result, metres.
     """
@@ -90,7 +90,11 @@ class Traits:
 def interpolation(
     values: Float[Tensor, "person"], anchors: Float[Tensor, "anchor"]
 ) -> Float[Tensor, "person anchor"]:
-    """Return weights of linear interpolation between ascending anchors: at most two are not 0, their sum is 1."""
+    """Return for each value the weights of the anchors with which their weighted mean is the value.
+
+    This is linear interpolation: only the two anchors around the value have weights above 0, and their sum is 1. Values
+    outside of the anchors are clamped. The anchors ascend.
+    """
     values = values.clamp(anchors[0], anchors[-1])
     right = torch.searchsorted(anchors, values.contiguous()).clamp(1, len(anchors) - 1)
     share = (values - anchors[right - 1]) / (anchors[right] - anchors[right - 1])

@@ -29,12 +29,16 @@ BONES = {
     "knee": ("{side}leg", "{side}lowleg"),
     "ankle": ("{side}foot",),
 }
-"""Names of each role of framework.bodies.poses.Skeleton, in lower case, without a prefix that ends with a colon.
+"""Names that BVH files use for the joint of each role of framework.bodies.poses.Skeleton.
 
-If a file has several names of one role, the first name of the tuple counts.
+The names are in lower case, and without a prefix that ends with a colon. `{side}` stands for the side of the body. If a
+file has joints with several names of one role, the first of these names in the tuple counts.
 """
 ENDS = {"arm": "elbow", "elbow": "wrist", "hip": "knee", "knee": "ankle"}
-"""Joint at the end of each bone whose direction is taken; the other joints rotate as in the file."""
+"""Bones whose directions are taken from the file: from the joint that is the key to the joint that is the value.
+
+All other joints rotate as in the file.
+"""
 CHANNELS = {f"{axis}{kind}" for axis in "XYZ" for kind in ("position", "rotation")}
 SLOWEST = 1_000
 """Exclusive upper limit of the duration of a frame, seconds."""

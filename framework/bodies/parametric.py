@@ -152,11 +152,11 @@ class ParametricBody:
         )
 
     def __call__(self, numbers: Float[Tensor, "number"]) -> Float[Tensor, "vertex 3"]:
-        """Return the vertices, metres, float32."""
+        """Return the vertices for the parameters `numbers` (in the order of `names`), metres, float32."""
         return self.vertices(numbers, slice(None))
 
     def vertices(self, numbers: Float[Tensor, "number"], chosen: slice | Tensor) -> Float[Tensor, "vertex 3"]:
-        """Return only the chosen vertices, metres, float32."""
+        """Return the vertices `chosen` (indices or a slice) for the parameters `numbers`, metres, float32."""
         numbers = numbers.double()
         rest = self._rest(numbers, chosen)
         blended = self._transforms(numbers).to(rest.dtype).T @ self.weights[:, chosen]
@@ -166,10 +166,10 @@ class ParametricBody:
     def derivatives(
         self, numbers: Float[Tensor, "number"], chosen: Int[Tensor, "chosen"]
     ) -> Float[Tensor, "chosen 3 number"]:
-        """Return the derivatives of the positions of some vertices by every parameter, float32.
+        """Return the derivatives of the positions of the vertices `chosen` by every parameter, float32.
 
-        The derivatives of the joints' transforms are central differences in float64, all at once. Skinning is linear in
-        them.
+        The derivatives of the joints' transforms are central differences in float64, computed in one batch. Skinning is
+        linear in the transforms, so it maps their derivatives to those of the vertices.
         """
         numbers = numbers.double()
         steps = STEP * torch.eye(len(numbers), dtype=torch.float64, device=numbers.device)
@@ -185,12 +185,15 @@ class ParametricBody:
         return derivatives
 
     def _rest(self, numbers: Tensor, chosen: slice | Tensor) -> Float[Tensor, "3 chosen"]:
-        """Return the chosen vertices of the shape in the mean pose."""
+        """Return the vertices `chosen` in the mean pose, for the shape coefficients in `numbers`."""
         shape = numbers[6 + len(self.slots) :].to(self.template.dtype)
         return (self.template + (shape @ self.shapes).unflatten(0, (3, -1)))[:, chosen]
 
     def _transforms(self, numbers: Float[Tensor, "*batch number"]) -> Float[Tensor, "*batch joint 12"]:
-        """Return (R, t) of each joint, such that x becomes R x + t: the product of the rotations up to the root."""
+        """Return (R, t) of each joint: the transform x → R x + t from the mean pose to the pose of `numbers`.
+
+        It includes the rotations of the joint and of all its ancestors.
+        """
         count = len(self.slots)
         joints = self.joints + torch.einsum("...s,sjk->...jk", numbers[..., 6 + count :], self.joint_shapes)
         about = torch.cat([numbers[..., None, :3], self.axes * numbers[..., 6 : 6 + count, None]], -2)
@@ -216,7 +219,7 @@ class ParametricBody:
 
 
 def _in_mean_pose(body: Body, traits: Traits | None, where: poses.Skeleton) -> tuple[Body, tuple[str, ...]]:
-    """Return the body with the mean pose as its rest pose and a few shape coefficients, and the names of these."""
+    """Return the body with the mean pose as its rest pose and a few shape coefficients, and the coefficients' names."""
     usual = [limits[0] for limits in (*poses.CENTRAL.values(), *2 * (*poses.SIDED.values(),))]
     pose = torch.from_numpy(poses.rotations(body, where, np.array([usual], float))).to(torch.float64)
     if traits is None:
@@ -256,7 +259,10 @@ def _in_mean_pose(body: Body, traits: Traits | None, where: poses.Skeleton) -> t
 def _free_movements(
     body: Body, place: dict[str, int]
 ) -> tuple[list[tuple[int, np.ndarray, str]], dict[str, poses.Range]]:
-    """Return joint, axis and name of every free movement, and the limits of all movements."""
+    """Return joint, axis and name of every free movement, and the limits of all movements.
+
+    `place` maps a role, such as "left arm", to the number of a joint.
+    """
     axes = dict(zip("xyz", np.eye(3), strict=True))
     moves = [(place[turn.role], turn.sign * axes[turn.axis], turn.movement) for turn in CENTRAL]
     for side, mirror in (("left", 1.0), ("right", -1.0)):
@@ -292,7 +298,10 @@ def _parents_first(parents: tuple[int, ...]) -> list[int]:
 
 
 def paint(body: Body) -> Float[np.ndarray, "vertex 4"]:
-    """Return smooth linear RGB colours that distinguish all parts and sides of the body, and 1 for the silhouette."""
+    """Return four channels of vertex colours: linear RGB, and a constant 1 that gives the silhouette.
+
+    The colours are smooth and differ between all parts of the body, left and right, front and back.
+    """
     random = np.random.default_rng(3)
     parts = random.uniform(0.25, 0.75, (len(body.parents), 3))
     colors = body.weights @ parts

@@ -50,7 +50,10 @@ class People:
 
 
 def load_body(file: str | None) -> tuple[Body, Traits | None]:
-    """Return the body in a file and None; without a file, the default body with its posable joints, and its traits."""
+    """Return the body in a file, which has no traits (None), or the default body and its traits if `file` is None.
+
+    The default body keeps only the joints that poses rotate.
+    """
     if file is not None:
         return body_files.read(Path(file).expanduser()), None
     body, traits = load_default_body()

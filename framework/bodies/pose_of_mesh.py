@@ -23,7 +23,7 @@ ENOUGH = 1e-6
 MOST = 2_500
 """Largest number of vertices that are used; evenly spread vertices of a finer mesh suffice."""
 STEP = 1e-5
-"""Step of the differences: radians, metres, standard deviations of shape."""
+"""Step of the central differences that give derivatives: radians, metres, standard deviations of shape."""
 TOGETHER = 24
 """Number of parameters by which the model is differentiated at once."""
 
@@ -63,7 +63,10 @@ class _Problem(NamedTuple):
         return float(self.residuals(numbers).square().sum() + (self.prior * numbers.square()).sum())
 
     def derivatives(self, numbers: Float[Tensor, "number"]) -> Float[Tensor, "coordinate number"]:
-        """Return central differences, one row of a batch for each parameter: some ten digits in float64."""
+        """Return the derivatives of all vertex coordinates by all parameters.
+
+        They are central differences, of TOGETHER parameters in one batch, and have some ten correct digits in float64.
+        """
         columns = []
         for steps in (STEP * torch.eye(len(numbers)).to(numbers)).split(TOGETHER):
             after, before = (self.model(*self.parts(numbers + sign * steps)) for sign in (1, -1))
@@ -134,9 +137,9 @@ def _minimise(problem: _Problem, numbers: Float[Tensor, "number"]) -> Float[Tens
 def estimate_rotations(model: BodyModel, vertices: Float[Tensor, "vertex 3"]) -> Float[Tensor, "joint 3"]:
     """Return the rotation of each joint relative to its parent's: axis times angle, radians.
 
-    It is the rotation that best maps the template's vertices that follow the joint to their positions in the mesh
-    (Kabsch 1976). The root's is that of all vertices. Joints with too few vertices to determine a rotation follow their
-    parents.
+    A joint's rotation is the one that best maps the template's vertices, weighted by how much they follow the joint, to
+    their positions in the mesh (Kabsch 1976). For the root all vertices have equal weights. A joint with too few
+    vertices to determine a rotation has the rotation 0 relative to its parent.
     """
     template = model.template.unflatten(0, (3, -1)).T
     upright = torch.eye(3).to(vertices)

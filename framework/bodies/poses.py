@@ -73,7 +73,10 @@ MOVEMENTS = (*CENTRAL, *(f"{side} {name}" for side in ("left", "right") for name
 
 @dataclass(frozen=True)
 class Skeleton:
-    """Joints that each movement rotates; several joints share the rotation equally."""
+    """Indices of the joints that each movement rotates; several joints share the rotation equally.
+
+    Pairs are (left, right).
+    """
 
     root: int
     spine: tuple[int, ...]
@@ -103,7 +106,7 @@ NAMED = {
     "knee": ("lowerleg01.L", "lowerleg01.R"),
     "ankle": ("foot.L", "foot.R"),
 }
-"""Names of the default body's joints."""
+"""Names of the default body's joints, for each field of `Skeleton`."""
 JOINTS = tuple(name for names in NAMED.values() for name in names)
 ORDERED = Skeleton(
     root=0,
@@ -119,7 +122,10 @@ ORDERED = Skeleton(
     knee=(4, 5),
     ankle=(7, 8),
 )
-"""The first 22 joints of the SMPL family, whose files have no names (Loper et al. 2015; Pavlakos et al. 2019)."""
+"""Indices of the joints of the SMPL family, whose files have no names (Loper et al. 2015; Pavlakos et al. 2019).
+
+Only the first 22 joints are used.
+"""
 
 
 def skeleton(body: Body) -> Skeleton:
@@ -193,7 +199,10 @@ def rotations(
     joint_rotations = [Rotation.identity(count)] * len(body.parents)
 
     def turn(places: Sequence[int], *about: tuple[Sequence[float] | np.ndarray, np.ndarray]) -> None:
-        """Add rotations about fixed axes, the last one first, to some joints, which share each rotation equally."""
+        """Rotate the joints `places`, which share each rotation equally.
+
+        `about` are pairs (axis, angles in radians), with axes that do not rotate along. The last pair is applied first.
+        """
         for place in places:
             for axis, radians in reversed(about):
                 joint_rotations[place] = _about(axis, radians / len(places)) * joint_rotations[place]

@@ -1,7 +1,8 @@
 """Meshes of one body with fewer vertices (a subset) or more vertices (with midpoints of edges).
 
-The vertices of all of them are rows of one finely split surface, so that values of that surface (colours, positions)
-hold for each mesh.
+A sheet is the body's mesh after every edge was split in the middle, once or several times; each such pass over all
+edges is a stage. The vertices of every mesh are a subset of the sheet's vertices, so values at the sheet's vertices
+(colours, positions) give the values of each mesh.
 """
 
 import hashlib
@@ -35,11 +36,12 @@ class Corners(NamedTuple):
 
 
 class Split(NamedTuple):
-    """A mesh after edges were split.
+    """A mesh after edges were split in the middle.
 
     Attributes:
-        corners: its triangles.
-        pairs, uv_pairs: the two old vertices, and the two old texture coordinates, around each new one.
+        corners: the triangles after the split.
+        pairs: the two ends of the split edge of each new vertex.
+        uv_pairs: the two ends of the split texture edge of each new texture coordinate.
     """
 
     corners: Corners
@@ -49,12 +51,13 @@ class Split(NamedTuple):
 
 @dataclass(frozen=True)
 class Sheet:
-    """The body's surface after all edges were split in the middle, once for each stage.
+    """The body's mesh after all edges were split in the middle, once for each stage.
 
     Attributes:
-        corners: triangles of the body, and those after each stage.
-        pairs, uv_pairs: for each stage the ends of the split edges, whose midpoints follow the earlier vertices
-            (texture coordinates).
+        corners: triangles of the body, and then the triangles after each stage.
+        pairs: for each stage, the two ends of each split edge. The midpoints of these edges, in this order, are
+            appended to the vertices.
+        uv_pairs: the same for edges between texture coordinates.
     """
 
     corners: tuple[Corners, ...]
@@ -67,23 +70,26 @@ class Sheet:
         return self.corners[-1].faces
 
     def interpolate(self, values: np.ndarray, stages: int | None = None) -> np.ndarray:
-        """Return values of the body's vertices interpolated to those of the sheet (after the first `stages`)."""
+        """Return values at the body's vertices, interpolated to the sheet's vertices after the first `stages` stages.
+
+        None means all stages.
+        """
         return _interpolate(values, self.pairs[:stages])
 
     def interpolate_uv(self, uv: Float[np.ndarray, "place 2"]) -> Float[np.ndarray, "places 2"]:
-        """Return the body's texture coordinates interpolated to those of the sheet."""
+        """Return the sheet's texture coordinates, interpolated from the body's texture coordinates `uv`."""
         return _interpolate(uv, self.uv_pairs)
 
 
 @dataclass(frozen=True)
 class Topology:
-    """A mesh whose vertices are rows of a sheet.
+    """A mesh whose vertices are a subset of a sheet's vertices.
 
     Attributes:
-        rows: rows of the sheet's vertices.
-        faces: rows of `rows`, corners counter-clockwise seen from outside.
-        uv_rows: rows of the sheet's texture coordinates.
-        uv_faces: rows of `uv_rows`.
+        rows: index in the sheet of each vertex of the mesh.
+        faces: triangles as indices into `rows`, corners counter-clockwise seen from outside.
+        uv_rows: index in the sheet of each texture coordinate of the mesh.
+        uv_faces: triangles as indices into `uv_rows`.
     """
 
     rows: Int[np.ndarray, "vertices"]
@@ -93,9 +99,9 @@ class Topology:
 
 
 def sheet(body: Body, stages: int = 2) -> Sheet:
-    """Return the body's surface with edges split in `stages` stages.
+    """Return the body's mesh after all edges were split in the middle, `stages` times one after the other.
 
-    For a body without texture coordinates, the numbers of its vertices take their role.
+    A body without texture coordinates is treated as if each vertex had one texture coordinate.
     """
     corners = [Corners(body.faces, body.faces if body.uv_faces is None else body.uv_faces)]
     places = len(body.template) if body.uv is None else len(body.uv)
@@ -110,9 +116,11 @@ def sheet(body: Body, stages: int = 2) -> Sheet:
 
 
 def topology(body: Body, surface: Sheet, name: Name) -> Topology:
-    """Return the topology with this name.
+    """Return the topology with this name: the body decimated, unchanged, or with its longest edges split.
 
-    A body with too few vertices stays unchanged, or has each edge split once at most.
+    The name stands for a number of vertices (COUNTS). For "7k", a body that has fewer vertices stays unchanged. For
+    "27k" edges are split once at most and for "110k" twice at most, so a small body can have fewer vertices than the
+    name says.
     """
     vertices, places = len(body.template), len(body.template if body.uv is None else body.uv)
     wanted = COUNTS.get(name, vertices)
@@ -137,10 +145,10 @@ def topology(body: Body, surface: Sheet, name: Name) -> Topology:
 def recognise_topology(
     body: Body, vertices: int, faces: Int[np.ndarray, "faces 3"], source: str
 ) -> tuple[Sheet, Topology]:
-    """Return the sheet and the topology of the body that a mesh has.
+    """Return the topology of the body that has as many vertices and the same triangles as a mesh, and its sheet.
 
     Raises:
-        DataError: no mesh of the body has this number of vertices, or the one that has it has other triangles.
+        DataError: no topology of the body has this number of vertices, or the triangles differ.
     """
     for name in ("14k", "7k", "27k", "110k"):
         # decimation takes seconds, so it is done only if the number of vertices matches
@@ -154,8 +162,9 @@ def recognise_topology(
         if np.array_equal(ours, theirs):
             return surface, mesh
         raise DataError(
-            f"{source}: the mesh has the {vertices} vertices of {body.source}, but other triangles, so that the "
-            "vertices are in another order. Use a mesh that is registered to that body, or set the body of this mesh."
+            f"{source}: the mesh has as many vertices as {body.source} ({vertices}) but different triangles, so its "
+            "vertices are probably in a different order. Use a mesh that is registered to that body, or give the "
+            "file of this mesh's body as --body."
         )
     raise DataError(
         f"{source}: no mesh of {body.source} has {vertices} vertices; it has {len(body.template)}, and "
@@ -165,11 +174,11 @@ def recognise_topology(
 
 
 def body_in_topology(body: Body, surface: Sheet, mesh: Topology) -> Body:
-    """Return a body with the vertices of a mesh, without texture coordinates.
+    """Return a body model whose vertices are those of the topology `mesh`; it has no texture coordinates.
 
-    Each vertex has the template, shapes and skinning weights of its point on the body's surface; at a midpoint they are
-    the means of the edge's ends. Vertices of a decimated mesh are the body's own. On a bent surface, the skinned
-    midpoint is not quite the middle of its edge.
+    `surface` is the sheet of the topology. Vertices that the body has too keep their template, shapes and skinning
+    weights. At the midpoint of an edge these are the means over both ends. Where the surface is bent by the pose, the
+    skinned midpoint is therefore not exactly the middle of the posed edge.
     """
     parts = {
         part: surface.interpolate(getattr(body, part))[mesh.rows]
@@ -187,10 +196,11 @@ def split(
     *,
     numbered_as_all: bool = False,
 ) -> Split:
-    """Split edges, all or those chosen (in the order of `edges`), in the middle.
+    """Split edges in the middle: all edges, or those where `chosen` is true.
 
-    Midpoints are numbered from `vertices` and `places` on, the numbers of existing vertices and texture coordinates.
-    With `numbered_as_all`, edges that are not split also take a number, which stays unused.
+    `chosen` is in the order of the function `edges`. The numbers of new vertices start at `vertices`, the number of
+    existing ones; those of new texture coordinates start at `places`. With `numbered_as_all`, edges that are not split
+    also take a number, which stays unused.
     """
     pairs, sides = edges(corners.faces)
     uv_pairs, uv_sides = edges(corners.uv_faces)
@@ -208,9 +218,10 @@ def split(
 
 
 def edges(faces: Int[np.ndarray, "faces 3"]) -> tuple[Int[np.ndarray, "edge 2"], Int[np.ndarray, "faces 3"]]:
-    """Return all edges, lower end first, in ascending order, and the numbers of each triangle's sides.
+    """Return all edges, and for each triangle the indices of its three sides in the list of edges.
 
-    The first side of a triangle leads from its first to its second corner.
+    An edge is the pair of its ends, the lower vertex number first; edges are in ascending order. The first side of a
+    triangle leads from its first to its second corner.
     """
     sides = np.sort(np.stack([faces, np.roll(faces, -1, 1)], -1), -1).reshape(-1, 2)
     keys = sides[:, 0] * (faces.max(initial=0) + 1) + sides[:, 1]
@@ -219,7 +230,10 @@ def edges(faces: Int[np.ndarray, "faces 3"]) -> tuple[Int[np.ndarray, "edge 2"],
 
 
 def _triangles(faces: np.ndarray, middle: np.ndarray, marked: np.ndarray) -> Int[np.ndarray, "triangles 3"]:
-    """Return the triangles after their marked sides are split at the vertices `middle`."""
+    """Return the triangles after the sides where `marked` is true are split.
+
+    `middle` holds the number of the midpoint of each side; both arrays are (triangle, side).
+    """
     count = marked.sum(1)
     # corners are rotated so that a single marked side is the first, and of two marked sides neither is the last
     shift = np.where(count == 1, marked.argmax(1), np.where(count == 2, (~marked).argmax(1) + 1, 0)) % 3
@@ -247,7 +261,10 @@ def _interpolate(values: np.ndarray, stages: tuple[np.ndarray, ...]) -> np.ndarr
 
 
 def _compact(rows: np.ndarray, faces: np.ndarray, uv_faces: np.ndarray) -> Topology:
-    """Return the topology whose triangles refer to `rows`, with only those texture coordinates that are used."""
+    """Return a topology from triangles in the numbers of the sheet; `rows` are the vertices of the topology.
+
+    It has only those texture coordinates that its triangles use.
+    """
     place = np.zeros(max(faces.max(initial=0), rows.max(initial=0)) + 1, np.int64)
     place[rows] = np.arange(len(rows))
     uv_rows, uv_numbers = np.unique(uv_faces, return_inverse=True)
@@ -255,7 +272,7 @@ def _compact(rows: np.ndarray, faces: np.ndarray, uv_faces: np.ndarray) -> Topol
 
 
 def _read_decimated(body: Body, corners: Corners, count: int) -> Decimated:
-    """Return a decimated body from the cache, because decimation takes some seconds."""
+    """Return the body decimated to `count` vertices, from the cache, because decimation takes some seconds."""
     digest = hashlib.sha256(np.ascontiguousarray(body.template).tobytes())
     for part in corners:
         digest.update(np.ascontiguousarray(part).tobytes())

@@ -20,11 +20,11 @@ A vertex that follows two bones half and half has cos(φ / 2), where φ is the a
 
 
 class Unposed(NamedTuple):
-    """A subject's differences from the model.
+    """Differences of a subject's vertices from the body model, in the rest pose.
 
     Attributes:
         offsets: displacements in the rest pose, metres.
-        folded: vertices whose blended matrix has a singular value below SMALLEST.
+        folded: true for each vertex whose blended matrix (`unpose`) has a singular value below SMALLEST.
     """
 
     offsets: Float[Tensor, "batch vertex 3"]
@@ -45,10 +45,10 @@ def unpose(
     pose: skinning is affine, and B_P(θ) is in both. Only r is multiplied by A⁻¹, so that the effect of errors of A does
     not grow with the distance from the origin.
 
-    Where A = U diag(σ) Vᵀ has a σ below SMALLEST, the mesh hardly determines the component along that v: many positions
-    in the rest pose are mapped to the same point. 1/σ is replaced by σ/SMALLEST², which falls to 0, so that the vertex
-    moves to the model's own position along v; posing in the same pose shows no difference. The result is continuous and
-    bounded.
+    Let A = U diag(σ) Vᵀ. If a singular value σ is below SMALLEST, the mesh hardly determines the offset along the
+    corresponding column v of V, because many positions in the rest pose are mapped to nearly the same point. For such a
+    σ, 1/σ is replaced by σ/SMALLEST², which goes to 0 with σ. Along v the vertex then approaches the model's own
+    position, which makes almost no difference in this pose. The offsets are continuous and bounded.
 
     Raises:
         ValueError: other shapes, or numbers that are not finite.
