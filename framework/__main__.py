@@ -1,4 +1,4 @@
-"""`python -m framework`."""
+"""Entry module of the command `python -m framework`, which starts the command line."""
 
 import os
 import sys

@@ -21,9 +21,9 @@ Every batch has "input", "index" (int64, the number of the sample in its split) 
 README describes.
 
 "symmetry", int64, is optional. A data set sets it if it knows the symmetry of an object, for example of a generated
-one. The figures of densities read it. The value n means that the object looks the same after 1/n of a turn about its
-vertical axis, so that n values of the first angle are equally right. 1 means no symmetry, and so does a missing field.
-0 means that the object looks the same after every turn, so that it has no direction.
+one. The figures of densities read it. The value n means that the object looks the same after a rotation by 360°/n about
+its vertical axis, so that n values of the first angle are equally right. 1 means no symmetry, and so does a missing
+field. 0 means that the object looks the same after every rotation, so that it has no direction.
 
 "color", "mask" and "depth" are optional too. They hold the true image in the layout of
 `framework.renderer.Renderer.channels`, and metrics of images read them.
@@ -95,7 +95,7 @@ class Data(ABC):
     title: str = ""
     """Name of the data in figures and tables.
 
-    If it is empty, they use the name of the only group, or else the plugin's name.
+    If it is empty, figures and tables show the name of the group if there is only one, and else the plugin's name.
     """
     directions: tuple[str, ...] = ()
     """Words for 0°, 90°, 180° and 270° of the first angle, if that angle is the direction from which an object is seen.
@@ -198,12 +198,14 @@ class Data(ABC):
     def state_dict(self) -> Mapping[str, Any]:
         """Return what `inputs` and `read` need beside the config, as plain values and tensors.
 
-        It travels with the model.
+        The checkpoint of a model that is trained on these data stores it.
         """
         return {}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Take over the state of a model's training data; a later `prepare` makes inputs as that model reads them.
+        """Set the state of the data on which a model was trained, as `state_dict` returned it.
+
+        Afterwards `inputs`, `read` and `prepare` give inputs in the form that this model reads.
 
         Raises:
             DataError: the state belongs to another kind of data.

@@ -30,13 +30,13 @@ class Encoder(nn.Module, ABC):
     bibtex: ClassVar[str]
     """Citation of the method: BibTeX entries, or their keys in the `references.bib` of the package; "" for none."""
     vectorises: bool = False
-    """True if `torch.vmap` over the parameters of several such encoders gives their features in one pass, and faster.
+    """True if `torch.vmap` over the parameters of several such encoders is faster than one pass for each encoder.
 
-    The features agree to rounding. This holds for layers of matrix products without buffers. The constructor may set
-    it.
+    The features of both ways must agree to rounding. This holds for layers of matrix products without buffers. The
+    constructor may set the attribute.
     """
     fixed: bool = False
-    """True if features are a function of the input alone: no part of them is learned or drawn.
+    """True if features are a function of the input alone: they have no trained parameters and no randomness.
 
     The framework then computes them once per sample and not once per epoch, if neither the data nor an objective varies
     the inputs.

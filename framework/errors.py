@@ -25,7 +25,7 @@ class UserError(Exception):
 
 
 def escape_unprintable(text: str, allowed: str = "\n\t") -> str:
-    """Return a text whose unprintable characters, except those in `allowed`, are escaped: none controls a terminal."""
+    """Return `text` with unprintable characters escaped, except those in `allowed`, so that it controls no terminal."""
     return "".join(
         letter if letter.isprintable() or letter in allowed else repr(letter)[1:-1]
         for letter in escape_undecodable(text)
@@ -112,7 +112,11 @@ def nearest_name(word: str, known: Iterable[str], likeness: float = LEAST_SIMILA
 
 
 def list_names(word: str, known: Iterable[str]) -> str:
-    """Return all names as a text; of many names, those most similar to `word` and the number of the others."""
+    """Return the names in `known` as a text.
+
+    If there are more than LISTED_WHOLE, the text holds only the LISTED names most similar to `word`, and the number of
+    the remaining names.
+    """
     names = list(known)
     if len(names) <= LISTED_WHOLE:
         return ", ".join(names)

@@ -33,8 +33,8 @@ class Metric(torchmetrics.Metric, ABC):
     splits: ClassVar[tuple[Split, ...]] = ("test",)
     """Splits whose predictions `update` receives.
 
-    With "outliers" it also receives the predictions on the test split of the config's `outliers`; `prediction.split`
-    tells which of the two it is. No predictions are made on outliers if no metric reads them.
+    If "outliers" is among them, `update` also receives the predictions on the test split of the config's `outliers`;
+    `prediction.split` is then "outliers". No predictions are made on outliers if no metric reads them.
     """
     reads: ClassVar[frozenset[str]] = frozenset()
     """Channels of `Prediction.image` that `update` requests; the true images are `Prediction.true_image`.
@@ -63,11 +63,12 @@ class Metric(torchmetrics.Metric, ABC):
 
 
 class Mean(Metric):
-    """Base class of metrics that are a mean over samples, of one number or several, with its standard error.
+    """Base class of metrics that compute one or more numbers for each sample, and return their mean over all samples.
 
-    A subclass calls `start` in its constructor, `add_samples` in `update` and `mean_and_error` in `compute`. The states
-    are the sums of the numbers and of their squares. They suit numbers that are not negative, where no large mean hides
-    a small spread (for scores in [0, 2] float64 resolves a spread of 1e-8).
+    A subclass calls `start` in its constructor, `add_samples` in `update`, and `mean_and_error` in `compute`, which
+    also returns the standard error of the mean. The states are the sums of the numbers and of their squares. The
+    standard deviation is computed from the difference of these sums, and loses digits if it is far smaller than the
+    mean. For scores in [0, 2], float64 resolves a standard deviation of 1e-8.
     """
 
     count: Tensor
@@ -75,7 +76,7 @@ class Mean(Metric):
     squares: Tensor
 
     def start(self, *shape: int) -> None:
-        """Declare the states for numbers of this shape in each sample."""
+        """Declare the states of the sums; `shape` is the shape of the numbers of one sample, () for a single number."""
         self.add_state("count", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
         for name in ("total", "squares"):
             self.add_state(name, torch.zeros(shape, dtype=torch.float64), dist_reduce_fx="sum")

@@ -21,7 +21,7 @@ class Predictor(nn.Module, ABC):
     """Base class of everything that returns a density for inputs and can be trained: models and wrappers of models."""
 
     description: object = None
-    """Description of a loaded model from its checkpoint; the model prints as its text."""
+    """Description of a loaded model, read from its checkpoint; `repr` of the model returns its text."""
 
     def __repr__(self) -> str:
         return nn.Module.__repr__(self) if self.description is None else str(self.description)
@@ -231,11 +231,12 @@ class FrozenFrontEnd(Predictor):
 
 @contextmanager
 def one_pass(predictor: Predictor) -> Iterator[None]:
-    """Compute shared results once for each tensor of inputs inside the block.
+    """Compute shared results only once for each tensor of inputs inside the block.
 
-    They are reused however often loss and densities are requested. The shared results are fixed features, the raw
-    parameters of direct heads, and the results that other modules keep in `shared_result`. The encoders of a direct
-    head give images, which an objective compares as the loss does.
+    Loss and densities of the same inputs then reuse them. The shared results are fixed features (`Encoder.fixed`), the
+    raw parameters of direct heads (`DensityHead.direct`), and the results that other modules keep in an attribute
+    `shared_result`. Raw parameters of direct heads are shared, because they are images that are expensive to compute,
+    and an objective reads the same images as the loss.
     """
     candidates = (getattr(module, "shared_result", None) for module in predictor.modules())
     caches = [cache for cache in candidates if isinstance(cache, SharedResult)]
@@ -255,20 +256,25 @@ def fitted_models(predictor: Predictor) -> list[Model]:
 
 
 def learns(predictor: Predictor) -> bool:
-    """Return true if a predictor is trained by gradient: it has such parameters and no head that is fitted at once."""
+    """Return true if a predictor is trained by gradient.
+
+    It then has parameters that require a gradient, and no head that is fitted at once (`Fitted`).
+    """
     return not fitted_models(predictor) and any(
         parameter.requires_grad for parameter in predictor.parameters()
     )
 
 
 def independent_penalty(values: Float[Tensor, "batch *member"]) -> Float[Tensor, "batch"]:
-    """Return a penalty per sample, (batch,), from those of the members, such that each member trains as if alone.
+    """Return one penalty per sample, (batch,), with which each member of an ensemble trains as it would train alone.
 
     The value is the mean over members, so it is comparable with the penalty of a single model. The gradient is that of
-    the sum, so the gradient of each member is neither divided by the number of members nor changed by the others.
+    the sum over members, so the gradient of a member is neither divided by the number of members nor changed by other
+    members.
 
     Args:
-        values: (batch,), returned as they are, or (batch, member).
+        values: penalties of each sample and member, (batch, member). Those of a single model, (batch,), are returned
+            as they are.
     """
     if values.dim() == 1:
         return values
@@ -277,9 +283,9 @@ def independent_penalty(values: Float[Tensor, "batch *member"]) -> Float[Tensor,
 
 
 def own_sample_penalty(values: Float[Tensor, "batch"], members: int) -> Float[Tensor, "batch"]:
-    """Return penalties of samples, each seen by one member only; gradients are multiplied by the number of members.
+    """Return `values` unchanged, but with gradients multiplied by `members`, the number of members of an ensemble.
 
-    Their mean is the mean of `values`. In each member the gradient of that mean is the gradient of the mean over the
-    member's own samples.
+    It is for batches in which each sample is seen by one member only. The gradient of the mean over the whole batch is
+    then, for each member, the gradient of the mean over the samples that this member sees.
     """
     return members * values - (members - 1) * values.detach()

@@ -13,7 +13,7 @@ from framework.data import Batch
 from framework.model import Predictor
 
 Share = Annotated[float, Field(ge=0, lt=1)]
-"""A share in [0, 1)."""
+"""Config value that is a share: a number in [0, 1)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,7 +24,7 @@ class AdversaryOptimizer:
     equals two optimisers whose losses are both computed before either of them steps. Gradients are clipped separately.
 
     Attributes:
-        learning_rate: factor on its steps.
+        learning_rate: factor on the optimiser's steps.
         schedule: change of the learning rate: none, or half a cosine to 0.
         betas: decay rates of the moments.
     """
@@ -59,6 +59,6 @@ class Objective(nn.Module, ABC):
     def forward(self, predictor: Predictor, batch: Batch) -> Float[Tensor, ""]:
         """Return the weighted penalty on this batch, a scalar in nats, differentiable in the predictor's parameters.
 
-        If the predictor gives images, the loss and the densities of the batch's own inputs are shared and cost nothing
-        more.
+        If the predictor's densities are images, the images for the inputs of `batch` were computed for the loss already
+        and are reused (`framework.model.one_pass`).
         """

@@ -115,8 +115,8 @@ class Prediction:
     def deviation(self, draws: int = 999) -> Tensor:
         """Return the standard deviation of each real, (batch, number).
 
-        If the density does not know its standard deviation, it is estimated from `draws` samples. The standard error of
-        the estimate is 1 / √(2 draws) of it for a normal density, 2 % by default.
+        If a density has no formula for its standard deviation, it is estimated from `draws` samples. For a normal
+        density the relative standard error of this estimate is 1 / √(2 draws), which is 2 % by default.
         """
         try:
             return self.density.stddev

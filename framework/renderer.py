@@ -24,7 +24,7 @@ class Texture:
         images: linear in [0, 1], rows from top to bottom; their sizes may differ, their numbers of channels may not.
         uv: positions in an image, u to the right and v upwards: (0, 0) is its lower left corner, (1, 1) its upper
             right.
-        faces: three rows of `uv` per triangle of the scene.
+        faces: for each triangle of the scene, the rows of `uv` that hold the positions of its three corners.
         shown: index of the image on each face, -1 for none; None puts the first image on all faces.
         wrap: rule for positions beyond the image.
         smooth: True interpolates between the centres of texels; False takes the texel that holds the position.
@@ -68,7 +68,8 @@ class Report:
         left_out: number of the other faces by the first reason that held: "outside" (the box around the face holds no
             pixel centre of the image), "behind" (the near plane), "back" (seen from behind), "flat" (no area, or not
             finite), "hidden" (behind faces that were drawn before). A reason that held for no face is absent.
-        visited: number of pixels in the box around the drawn faces; the renderer did not visit the others again.
+        visited: number of pixels in the rectangle for which channels were computed. It holds all drawn faces; the
+            pixels outside of it keep the background.
         reused: names of results that were kept from the last image because they had not changed, such as "places" of
             vertices on the screen.
         channels: names of the channels that were drawn.

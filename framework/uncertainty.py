@@ -38,7 +38,7 @@ class Uncertainty(Predictor):
     remark: str = ""
     """A sentence for the user about the result of `calibrate`; "" if there is nothing to report.
 
-    `calibrate` sets it, runs print it, and it travels with the model.
+    `calibrate` sets it, runs print it, and checkpoints store it.
     """
 
     @abstractmethod
@@ -100,16 +100,19 @@ def outermost(predictor: Predictor) -> SeveralModels | None:
 
 
 def rows_per_model(predictor: Predictor, rows: int) -> int:
-    """Return the number of rows of a batch that each model sees."""
+    """Return how many of the `rows` samples of a batch each model sees.
+
+    These are all of them, unless a wrapper gives each of its models an own part (`SeveralModels.own_batches`).
+    """
     several = outermost(predictor)
     return rows // several.model_count if several is not None and several.own_batches else rows
 
 
 @contextmanager
 def own_batches(predictor: Predictor, own: bool = True) -> Iterator[None]:
-    """Set `SeveralModels.own_batches` of the outermost wrapper inside the block.
+    """Set `SeveralModels.own_batches` of the outermost wrapper of several models to `own` inside the block.
 
-    True gives each of several models its part of a batch; False gives the whole batch to all of them.
+    With True each model sees its own part of a batch; with False each model sees the whole batch.
     """
     several = outermost(predictor)
     if several is None:
