@@ -30,8 +30,8 @@ def titled_figure(size: tuple[float, float], title: str, synthetic: bool) -> Fig
 def save_figure(figure: Figure, path: Path, pictures: bool | str) -> Path:
     """Write the figure to `path` with the suffix of its format, and return the path.
 
-    The format is the one that the setting `pictures` names, or else PNG. The same figure gives the same bytes. Text in
-    a PDF stays text (TrueType), text in an SVG becomes outlines.
+    The format is the one that the setting `pictures` names ("pdf", "svg" …), or PNG if `pictures` is true or false. The
+    same figure gives the same bytes. Text in a PDF stays text (TrueType), text in an SVG becomes outlines.
     """
     kind = pictures if isinstance(pictures, str) else "png"
     path = path.with_name(f"{path.name}.{kind}")

@@ -21,9 +21,9 @@ def free_flight(
 ) -> Float[Tensor, "flight 9"]:
     """Return the state after `time` seconds without a table: one step of the classical Runge-Kutta method (order 4).
 
-    For 16 ms at 6 m/s its error is below 1e-8 m (tests/test_flight_physics.py). Spin decays independently of the
-    motion, so only the velocity has stages. The stages of the position are the velocity's, and those of the spin are
-    powers of the decay.
+    For 16 ms at 6 m/s its error is below 1e-8 m (tests/test_flight_physics.py). The acceleration is evaluated four
+    times per step, as the method requires. The spin decays independently of the motion, so its values at these four
+    evaluations are polynomials of the decay.
     """
     h = time.unsqueeze(-1)
     place, velocity, spin = state[:, :3], state[:, 3:6], state[:, 6:]
@@ -31,7 +31,10 @@ def free_flight(
     lift, decay = constants.lift * spin, constants.spin_decay * h
 
     def faster(velocity: Tensor, left: Tensor | float) -> Tensor:
-        """Return physics.acceleration for vectors; `left` is the share of the spin that is left."""
+        """Return the acceleration as `physics.acceleration` does, but from (flight, 3) tensors.
+
+        `left` is the share of the initial spin that has not decayed yet.
+        """
         drag = constants.drag * (velocity.square().sum(-1, keepdim=True) + 1e-24).sqrt()
         return torch.linalg.cross(left * lift, velocity) - drag * velocity - gravity
 

@@ -58,7 +58,10 @@ class PosedBodyDensity(Independent):
 
 
 def scene_of(body_model: ParametricBody, parameters: Float[Tensor, "parameter"], camera: Camera) -> Scene:
-    """Return the scene of a body and a camera; its colours are red, green, blue and a constant 1 for the silhouette."""
+    """Return the scene of a body with these parameters, seen by a camera.
+
+    Its vertex colours have four channels: red, green, blue, and a constant 1 that gives the silhouette.
+    """
     return Scene(body_model(parameters), body_model.faces, body_model.colors, camera)
 
 

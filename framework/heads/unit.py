@@ -41,7 +41,11 @@ class Unit(NamedTuple):
     def to_target_unit(
         self, mean: Tensor, scale: Tensor, coefficients: Tensor | None = None
     ) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Return the parameters of a Gaussian in the target's own unit; x → l + s x maps φ_ij to s_i φ_ij / s_j."""
+        """Return mean, scale and regression coefficients of a Gaussian, converted to the target's own unit.
+
+        The map is x → l + s x with l = `location` and s = `scale` of this unit. It maps the mean m to l + s m, the
+        scale σ to s σ, and the coefficient φ_ij of number i on number j to s_i φ_ij / s_j.
+        """
         if self.location is None or self.scale is None:
             return mean, scale, coefficients
         location, unit = self.location.to(mean.device), self.scale.to(mean.device)
