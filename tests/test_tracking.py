@@ -65,8 +65,7 @@ with importing_mlflow():
 def empty_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An SQLite store, which takes MLflow seconds to make."""
     folder = tmp_path_factory.mktemp("store") / "outputs" / "run"
-    tracker = build(folder, experiment="made with the store")
-    tracker.open()
+    tracker = open_tracker(folder, experiment="made with the store")
     tracker.close("FINISHED")
     return folder.parent / "mlflow.db"
 
@@ -91,6 +90,12 @@ def build(folder: Path, run_id: str | None = None, **changes: object) -> MlflowT
     destination = Destination(run_id=run_id, **{key: changes.pop(key, value) for key, value in named.items()})  # type: ignore[arg-type]
     options: dict[str, Any] = {"opening_patience": 30.0, "open_store": mlflow_store.MlflowStore, **changes}
     return MlflowTracker(folder, destination, **options)
+
+
+def open_tracker(folder: Path, run_id: str | None = None, **changes: object) -> MlflowTracker:
+    tracker = build(folder, run_id, **changes)
+    tracker.open()
+    return tracker
 
 
 def client(folder: Path) -> MlflowClient:
@@ -227,8 +232,7 @@ def test_a_run_from_open_to_close(folder: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("end", ["FAILED", "KILLED"])
 def test_other_ends(folder: Path, end: str) -> None:
-    tracker = build(folder)
-    tracker.open()
+    tracker = open_tracker(folder)
     log(tracker, [1])
     tracker.close(end)
     tracker.close("FINISHED")  # too late
@@ -237,8 +241,7 @@ def test_other_ends(folder: Path, end: str) -> None:
 
 
 def test_a_short_run_leaves_sending_to_whoever_syncs(folder: Path) -> None:
-    tracker = build(folder, wait=1e6)
-    tracker.open()
+    tracker = open_tracker(folder, wait=1e6)
     log(tracker, range(5))
     tracker.close("FINISHED")
     info = read_run_info(folder)
@@ -251,8 +254,7 @@ def test_a_short_run_leaves_sending_to_whoever_syncs(folder: Path) -> None:
 
 
 def test_a_run_that_lasts_sends_from_then_on(folder: Path) -> None:
-    tracker = build(folder, wait=0.2)
-    tracker.open()
+    tracker = open_tracker(folder, wait=0.2)
     assert tracker.run_id is None
     log(tracker, [0])
 
@@ -267,8 +269,7 @@ def test_a_run_that_lasts_sends_from_then_on(folder: Path) -> None:
 
 
 def test_long_parameters_are_shortened_visibly_and_kept_whole(folder: Path) -> None:
-    tracker = build(folder)
-    tracker.open()
+    tracker = open_tracker(folder)
     fits, long, longer = "x" * 250, "y" * 251, "z" * 10_000
     tracker.log_params({"fits": fits, "long": long})
     tracker.log_params({"longer": longer})
@@ -283,8 +284,7 @@ def test_long_parameters_are_shortened_visibly_and_kept_whole(folder: Path) -> N
 def test_long_parameters_on_a_full_disk_stop_nobody(
     folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    tracker = build(folder)
-    tracker.open()
+    tracker = open_tracker(folder)
 
     def full(path: Path, content: bytes) -> None:
         raise OSError(28, "No space left on device")
@@ -300,8 +300,7 @@ def test_long_parameters_on_a_full_disk_stop_nobody(
 def test_long_parameters_beside_damaged_ones_stop_nobody(
     folder: Path, content: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    tracker = build(folder)
-    tracker.open()
+    tracker = open_tracker(folder)
     (folder / "params.json").write_text(content)
     tracker.log_params({"long": "y" * 251})
     tracker.close("FINISHED")
@@ -311,16 +310,14 @@ def test_long_parameters_beside_damaged_ones_stop_nobody(
 
 def test_many_parameters(folder: Path) -> None:
     params = {f"group.key{i}": i for i in range(350)}  # the store takes 100 at once
-    tracker = build(folder)
-    tracker.open()
+    tracker = open_tracker(folder)
     tracker.log_params(params)
     tracker.close("FINISHED")
     assert client(folder).get_run(identity(folder)).data.params == {key: str(i) for key, i in params.items()}
 
 
 def test_names_the_store_does_not_take(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
-    tracker = build(folder)
-    tracker.open()
+    tracker = open_tracker(folder)
     for step in range(3):
         tracker.log_metrics({"deviation [°]": 1.0, "/a//../b": 2.0, "": 3.0, "n" * 300: 4.0}, step, 0)
     tracker.log_params({"x=y": 1})
@@ -342,8 +339,7 @@ def test_an_entry_the_store_refuses_holds_up_nothing(
     folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setenv("MLFLOW_TRUNCATE_LONG_VALUES", "false")
-    tracker = build(folder)
-    tracker.open()
+    tracker = open_tracker(folder)
     tracker.set_tags({"good": "1", "bad": "x" * 10_000})
     log(tracker, [1, 2])
     tracker.set_tags({"bad": "x" * 10_000})
@@ -355,8 +351,7 @@ def test_an_entry_the_store_refuses_holds_up_nothing(
 
 
 def test_a_file_that_is_gone_holds_up_nothing(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
-    tracker = build(folder)
-    tracker.open()
+    tracker = open_tracker(folder)
     tracker.log_artifact(folder / "missing.png")
     log(tracker, [1])
     tracker.close("FINISHED")
@@ -368,8 +363,7 @@ def test_a_file_that_is_gone_holds_up_nothing(folder: Path, caplog: pytest.LogCa
 def test_a_strangers_journal_gives_away_nothing_but_the_run_folder(
     path: str, folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    tracker = build(folder, wait=1e6)
-    tracker.open()
+    tracker = open_tracker(folder, wait=1e6)
     log(tracker, range(3))
     (folder.parent / "secret.txt").write_text("secret")
     (folder / "a").mkdir()
@@ -490,8 +484,7 @@ def test_no_file_of_a_run_holds_the_password_of_its_store(
     uri = f"http://me:pa/ssw0rd@{address}"
     if by_setting:
         monkeypatch.setenv("MLFLOW_TRACKING_URI", uri)
-    tracker = build(folder, uri=None if by_setting else uri, patience=0.0, opening_patience=0.0)
-    tracker.open()
+    tracker = open_tracker(folder, uri=None if by_setting else uri, patience=0.0, opening_patience=0.0)
     log(tracker, [1, 2])
     tracker.close("FINISHED")
     assert json.loads((folder / "run.json").read_text())["uri"] == f"http://{address}"
@@ -504,8 +497,7 @@ def test_the_default_store_names_no_other_folder_to_load_from(
     table: str, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It may have come with somebody's folder; one that the user names says where its runs are."""
-    tracker = build(folder)
-    tracker.open()
+    tracker = open_tracker(folder)
     log(tracker, [1])
     tracker.close("FINISHED")
     elsewhere = tmp_path / "elsewhere"
@@ -628,8 +620,7 @@ def test_batches_keep_order_and_bounds() -> None:
 
 @pytest.mark.usefixtures("short_locks")
 def test_a_store_locked_for_longer_than_mlflow_waits(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
-    tracker = build(folder)
-    tracker.open()
+    tracker = open_tracker(folder)
     log(tracker, range(100))
     with locked(folder):
         # One thread holds the lock and logs: it would never come to release it if logging waited.
@@ -660,8 +651,7 @@ def test_a_store_locked_at_the_start(folder: Path, caplog: pytest.LogCaptureFixt
 
 @pytest.mark.usefixtures("short_locks")
 def test_a_store_locked_until_after_the_end(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
-    tracker = build(folder, patience=0.3)
-    tracker.open()
+    tracker = open_tracker(folder, patience=0.3)
     with locked(folder):
         log(tracker, range(10))
         tracker.close("FAILED")
@@ -685,8 +675,7 @@ def test_a_full_disk_under_the_store(folder: Path, caplog: pytest.LogCaptureFixt
         connection.execute(f"PRAGMA max_page_count = {pages + 20}")
 
     sqlalchemy.event.listen(sqlalchemy.Engine, "connect", nearly_full)
-    tracker = build(folder)
-    tracker.open()
+    tracker = open_tracker(folder)
     for step in range(500):
         tracker.log_metrics({f"metric {i}": float(step) for i in range(10)}, step, 0)
     until(lambda: "database or disk is full" in caplog.text)
@@ -699,8 +688,7 @@ def test_a_full_disk_under_the_store(folder: Path, caplog: pytest.LogCaptureFixt
 def test_a_place_for_files_that_is_away_holds_up_no_number(
     folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    tracker = build(folder)
-    tracker.open()
+    tracker = open_tracker(folder)
     names = ["a.txt", "b.txt", "c.txt"]
     for name in names:
         (folder / name).write_text(name)
@@ -733,8 +721,7 @@ def test_a_place_for_files_that_is_away_holds_up_no_number(
 def test_a_run_deleted_in_the_store_goes_on_and_is_whole_when_restored(
     folder: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    tracker = build(folder)
-    tracker.open()
+    tracker = open_tracker(folder)
     log(tracker, [1])
     until(lambda: history(folder))
     client(folder).delete_run(identity(folder))
@@ -748,8 +735,7 @@ def test_a_run_deleted_in_the_store_goes_on_and_is_whole_when_restored(
 def test_a_deleted_experiment_is_said(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
     experiment = client(folder).create_experiment("some/experiment")
     client(folder).delete_experiment(experiment)
-    tracker = build(folder, patience=0.0)
-    tracker.open()
+    tracker = open_tracker(folder, patience=0.0)
     log(tracker, [1])
     tracker.close("FINISHED")
     assert (
@@ -770,8 +756,7 @@ def test_a_server_away_from_start_to_end_and_then_back(
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     uri = f"http://user:secret@127.0.0.1:{port}"
-    tracker = build(folder, uri=uri, patience=0.0)
-    tracker.open()
+    tracker = open_tracker(folder, uri=uri, patience=0.0)
     tracker.log_params({"seed": 3})
     log(tracker, range(30))
     (folder / "note.txt").write_text("a note")
@@ -818,8 +803,7 @@ def test_a_store_that_does_not_answer_does_not_hold_up_the_start(
         return opened(info)
 
     monkeypatch.setattr(mlflow_store, "_open_client", hangs)
-    tracker = build(folder, opening_patience=0.01)
-    tracker.open()
+    tracker = open_tracker(folder, opening_patience=0.01)
     assert "the store has not responded yet" in caplog.text
     log(tracker, range(5))
     answer.set()
@@ -838,8 +822,7 @@ def sending_process(tracker: MlflowTracker) -> subprocess.Popen[bytes]:
 
 
 def test_what_sends_dies_and_another_goes_on(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
-    tracker = build(folder, open_store=None, opening_patience=0.0)
-    tracker.open()
+    tracker = open_tracker(folder, open_store=None, opening_patience=0.0)
     assert tracker.run_id is None, "nobody waits for the store"
     first = sending_process(tracker)
     tracker.log_metrics({"a name [°]": 1.0}, 0, 0)
@@ -860,8 +843,7 @@ def test_what_sends_and_hangs_is_ended_with_the_run(
     folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(store_process, "_COMMAND", ("sleep", "100"))
-    tracker = build(folder, open_store=None, opening_patience=0.01, patience=0.1)
-    tracker.open()
+    tracker = open_tracker(folder, open_store=None, opening_patience=0.01, patience=0.1)
     assert "the store has not responded yet" in caplog.text
     log(tracker, range(5))
     process = sending_process(tracker)
@@ -964,8 +946,7 @@ def test_a_killed_run_whose_store_is_away_is_closed_later(
 
 @pytest.mark.parametrize("checkpoint", [0, 99, 120, 149, 155, 159])
 def test_a_killed_run_is_resumed_and_each_step_is_stored_once(killed: Path, checkpoint: int) -> None:
-    tracker = build(killed, run_id=identity(killed))
-    tracker.open()
+    tracker = open_tracker(killed, run_id=identity(killed))
     assert status(killed) == "RUNNING"
     tracker.drop_after(checkpoint)
     log(tracker, range(checkpoint + 1, 200))
@@ -979,13 +960,11 @@ def test_a_killed_run_is_resumed_and_each_step_is_stored_once(killed: Path, chec
 
 def test_a_run_resumed_before_it_is_opened_and_resumed_again(killed: Path) -> None:
     Journal(killed / "journal.jsonl").drop_after(50)
-    first = build(killed, run_id=identity(killed))
-    first.open()
+    first = open_tracker(killed, run_id=identity(killed))
     log(first, range(51, 101))
     first.leave_open()
     assert status(killed) == "RUNNING"
-    second = build(killed, run_id=identity(killed))
-    second.open()
+    second = open_tracker(killed, run_id=identity(killed))
     second.drop_after(80)
     log(second, range(81, 180))
     second.close("FINISHED")
@@ -993,26 +972,22 @@ def test_a_run_resumed_before_it_is_opened_and_resumed_again(killed: Path) -> No
 
 
 def test_repeating_a_step_without_a_resumption_keeps_both_numbers(folder: Path) -> None:
-    tracker = build(folder)
-    tracker.open()
+    tracker = open_tracker(folder)
     tracker.log_metrics({"test/loss": 1.0}, 5, 0)
     tracker.close("FINISHED")
-    again = build(folder, run_id=tracker.run_id)
-    again.open()
+    again = open_tracker(folder, run_id=tracker.run_id)
     again.log_metrics({"test/loss": 2.0}, 5, 0)
     again.close("FINISHED")
     assert history(folder, "test/loss") == [(5, 1.0), (5, 2.0)]
 
 
 def test_what_a_power_cut_took_from_the_journal_is_not_missed(folder: Path) -> None:
-    tracker = build(folder)
-    tracker.open()
+    tracker = open_tracker(folder)
     log(tracker, range(50))
     tracker.leave_open()
     path = tracker.journal.path
     path.write_bytes(b"".join(path.read_bytes().splitlines(keepends=True)[:20]))
-    again = build(folder, run_id=tracker.run_id)
-    again.open()
+    again = open_tracker(folder, run_id=tracker.run_id)
     again.drop_after(10)
     log(again, range(11, 60))
     again.close("FINISHED")
@@ -1020,12 +995,10 @@ def test_what_a_power_cut_took_from_the_journal_is_not_missed(folder: Path) -> N
 
 
 def test_changed_parameters_of_a_resumed_run_become_tags(folder: Path) -> None:
-    tracker = build(folder)
-    tracker.open()
+    tracker = open_tracker(folder)
     tracker.log_params({"epochs": 3, "seed": 0})
     tracker.leave_open()
-    again = build(folder, run_id=tracker.run_id)
-    again.open()
+    again = open_tracker(folder, run_id=tracker.run_id)
     again.log_params({"epochs": 5, "seed": 0})
     again.close("FINISHED")
     run = client(folder).get_run(identity(folder))
@@ -1045,8 +1018,7 @@ def test_a_creation_that_was_cut_short_is_found_again(folder: Path, monkeypatch:
         raise ConnectionError("the answer was lost")
 
     monkeypatch.setattr(mlflow_store.MlflowStore, "_create_run", cut_short)
-    tracker = build(folder)
-    tracker.open()
+    tracker = open_tracker(folder)
     log(tracker, [1])
     tracker.close("FINISHED")
     assert calls == 1
@@ -1059,14 +1031,12 @@ def test_a_creation_that_was_cut_short_is_found_again(folder: Path, monkeypatch:
 def test_a_store_that_lost_the_run_gets_it_anew(
     folder: Path, empty_store: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    tracker = build(folder)
-    tracker.open()
+    tracker = open_tracker(folder)
     log(tracker, range(5))
     tracker.leave_open()
     moved = f"sqlite:///{folder.parents[1] / 'other.db'}"
     shutil.copy(empty_store, folder.parents[1] / "other.db")
-    again = build(folder, uri=moved, run_id=tracker.run_id)
-    again.open()
+    again = open_tracker(folder, uri=moved, run_id=tracker.run_id)
     log(again, range(5, 8))
     again.close("FINISHED")
     assert again.run_id != tracker.run_id
@@ -1079,8 +1049,7 @@ def test_a_store_deleted_while_the_run_goes_on_is_made_again_with_everything(
     folder: Path, empty_store: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(mlflow_store, "SqlAlchemyStore", copies(empty_store))
-    tracker = build(folder)
-    tracker.open()
+    tracker = open_tracker(folder)
     tracker.log_params({"seed": 0})
     log(tracker, range(10))
     until(lambda: len(history(folder)) == 10)
@@ -1096,12 +1065,10 @@ def test_a_store_deleted_while_the_run_goes_on_is_made_again_with_everything(
 
 
 def test_a_new_run_in_a_used_folder_sets_the_old_one_aside(folder: Path) -> None:
-    first = build(folder)
-    first.open()
+    first = open_tracker(folder)
     log(first, range(3))
     first.close("FAILED")
-    second = build(folder)
-    second.open()
+    second = open_tracker(folder)
     log(second, range(5))
     second.close("FINISHED")
     assert second.run_id != first.run_id
@@ -1109,8 +1076,7 @@ def test_a_new_run_in_a_used_folder_sets_the_old_one_aside(folder: Path) -> None
     assert len(list(Journal(folder / "journal.1.jsonl").lines())) == 3
     old = json.loads((folder / "run.1.json").read_text())
     assert (old["run_id"], old["status"]) == (first.run_id, "FAILED")
-    third = build(folder)
-    third.open()
+    third = open_tracker(folder)
     third.close("FINISHED")
     assert (folder / "journal.2.jsonl").exists()
     assert third.run_id not in (first.run_id, second.run_id)
@@ -1125,14 +1091,12 @@ def test_a_run_that_never_reached_its_store_goes_on_as_one(
             raise ConnectionError("away")
 
         patched.setattr(mlflow_store, "_open_client", away)
-        tracker = build(folder, patience=0.0)
-        tracker.open()
+        tracker = open_tracker(folder, patience=0.0)
         log(tracker, range(10))
         tracker.leave_open()
     assert tracker.run_id is None
     for resumed, expected in ((None, range(20)), (False, range(5))):
-        again = build(folder, resumed=resumed)
-        again.open()
+        again = open_tracker(folder, resumed=resumed)
         if resumed is None:
             again.drop_after(4)
         log(again, range(5, 20) if resumed is None else range(5))
@@ -1231,8 +1195,7 @@ for act in (
     else:
         sys.exit("it was allowed")
 """
-    tracker = build(folder)
-    tracker.open()
+    tracker = open_tracker(folder)
     subprocess.run([sys.executable, "-c", program, folder], check=True, timeout=120)
     log(tracker, [1])
     tracker.close("FINISHED")
@@ -1347,8 +1310,7 @@ def test_run_json_of_a_later_version_can_be_read(tmp_path: Path) -> None:
 def test_run_json_that_cannot_be_written_stops_nobody(
     folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    tracker = build(folder)
-    tracker.open()
+    tracker = open_tracker(folder)
 
     def full(path: Path, content: bytes) -> None:
         raise OSError(28, "No space left on device")
@@ -1368,8 +1330,7 @@ def test_the_folder_of_a_run_or_a_copy_of_its_checkpoints(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("FRAMEWORK_CACHE", str(tmp_path / "cache"))
-    tracker = build(folder)
-    tracker.open()
+    tracker = open_tracker(folder)
     (folder / "model.ckpt").write_text("weights")
     tracker.log_artifact(folder / "model.ckpt", "checkpoints")
     tracker.close("FINISHED")
@@ -1428,8 +1389,7 @@ def test_a_runs_model_is_one_of_mlflow_that_answers_raw_rows(
     monkeypatch.setenv("FRAMEWORK_CACHE", str(tmp_path / "cache"))
     monkeypatch.chdir(tmp_path)  # MLflow makes a store where it loads a model
     checkpoint, rows = trained
-    tracker = build(folder, run_name="mine, seed=3")
-    tracker.open()
+    tracker = open_tracker(folder, run_name="mine, seed=3")
     facts = {"root": "table.csv", "sha256": "ab" * 32, "train": "28", "synthetic": "false"}
     tracker.log_dataset("tabular", "training", facts)
     (folder / "model.ckpt").write_bytes(checkpoint.read_bytes())
@@ -1468,8 +1428,7 @@ def test_a_runs_model_is_one_of_mlflow_that_answers_raw_rows(
 
 
 def test_a_run_without_checkpoints_is_said(folder: Path) -> None:
-    tracker = build(folder)
-    tracker.open()
+    tracker = open_tracker(folder)
     tracker.close("FINISHED")
     shutil.rmtree(folder)
     with pytest.raises(CheckpointError, match="has no checkpoints"):

@@ -1,7 +1,7 @@
 """Densities with a changed batch_shape: several densities side by side, or one reshaped batch."""
 
 from collections.abc import Collection, Sequence
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -143,24 +143,20 @@ class Reshaped(Distribution):
         return self.density.entropy().reshape(self.batch_shape)
 
 
-@protocol.marginal.register
-def _(density: Stacked, index: int) -> Stacked:
-    return Stacked([protocol.marginal(inner, index) for inner in density.densities])
+def _register_density(function: Any) -> None:
+    """Register a function (density, argument) → density, which is applied to each inner density."""
+
+    @function.register
+    def _(density: Stacked, argument: Any) -> Distribution:
+        return Stacked([function(inner, argument) for inner in density.densities])
+
+    @function.register
+    def _(density: Reshaped, argument: Any) -> Distribution:
+        return Reshaped(function(density.density, argument), density.batch_shape)
 
 
-@protocol.marginal.register
-def _(density: Reshaped, index: int) -> Reshaped:
-    return Reshaped(protocol.marginal(density.density, index), density.batch_shape)
-
-
-@protocol.tempered_density.register
-def _(density: Stacked, temperature: Tensor) -> Distribution:
-    return Stacked([protocol.tempered_density(inner, temperature) for inner in density.densities])
-
-
-@protocol.tempered_density.register
-def _(density: Reshaped, temperature: Tensor) -> Distribution:
-    return Reshaped(protocol.tempered_density(density.density, temperature), density.batch_shape)
+_register_density(protocol.marginal)
+_register_density(protocol.tempered_density)
 
 
 @protocol.median.register
@@ -186,15 +182,21 @@ def _(density: Reshaped, value: Tensor) -> protocol.Estimate:
     return protocol.estimate(density.density, flat).map_fields(lambda field: field.reshape(shape))
 
 
-@protocol.cdf.register
-def _(density: Stacked, value: Tensor) -> Tensor | None:
-    return _stack([protocol.cdf(inner, part) for inner, part in density.pair_with_values(value)])
+def _register_number(function: Any) -> None:
+    """Register a function (density, value) → (*sample, *batch) or None, which is applied to each inner density."""
+
+    @function.register
+    def _(density: Stacked, value: Tensor) -> Tensor | None:
+        return _stack([function(inner, part) for inner, part in density.pair_with_values(value)])
+
+    @function.register
+    def _(density: Reshaped, value: Tensor) -> Tensor | None:
+        flat, shape = density.inner(value)
+        return _reshape(function(density.density, flat), shape)
 
 
-@protocol.cdf.register
-def _(density: Reshaped, value: Tensor) -> Tensor | None:
-    flat, shape = density.inner(value)
-    return _reshape(protocol.cdf(density.density, flat), shape)
+_register_number(protocol.cdf)
+_register_number(protocol.mahalanobis)
 
 
 @protocol.marginal_cdfs.register
@@ -222,17 +224,6 @@ def _(density: Reshaped, start: Tensor, end: Tensor) -> Tensor | None:
     start, end = torch.broadcast_tensors(start, end)
     flat, shape = density.inner(start)
     return _reshape(protocol.arc_probability(density.density, flat, density.inner(end)[0]), shape)
-
-
-@protocol.mahalanobis.register
-def _(density: Stacked, value: Tensor) -> Tensor | None:
-    return _stack([protocol.mahalanobis(inner, part) for inner, part in density.pair_with_values(value)])
-
-
-@protocol.mahalanobis.register
-def _(density: Reshaped, value: Tensor) -> Tensor | None:
-    flat, shape = density.inner(value)
-    return _reshape(protocol.mahalanobis(density.density, flat), shape)
 
 
 @protocol.normals.register

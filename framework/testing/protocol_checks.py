@@ -93,12 +93,7 @@ def check_powers(density: Distribution, worst: Worst) -> None:
         density = density.components
     value = draws_and_mode(density)
     log_prob = density.log_prob(value).double()
-    for temperature in TEMPERATURES:
-        try:
-            power = protocol.tempered_density(density, torch.tensor(temperature, dtype=torch.float64))
-        except UserError:
-            worst.count(False, "the density has no powers")
-            return
+    for temperature, power in powers_of(density, worst):
         label = f"T = {temperature:g}"
         worst.same(f"batch_shape, {label}", tuple(power.batch_shape), tuple(density.batch_shape))
         worst.same(f"event_shape, {label}", tuple(power.event_shape), tuple(density.event_shape))
@@ -113,16 +108,22 @@ def check_powers(density: Distribution, worst: Worst) -> None:
         worst.record(above.abs() / 0.05, f"the mode differs from that of the density, {label}")
 
 
-def apply_to_powers(
-    density: Distribution, worst: Worst, check: Callable[[Distribution, Worst], None]
-) -> None:
-    """Apply a check to the density tempered with each of TEMPERATURES."""
+def powers_of(density: Distribution, worst: Worst) -> Iterator[tuple[float, Distribution]]:
+    """Yield each of TEMPERATURES with the density tempered by it, as far as the density has powers."""
     for temperature in TEMPERATURES:
         try:
             power = protocol.tempered_density(density, torch.tensor(temperature, dtype=torch.float64))
         except UserError:
             worst.count(False, "the density has no powers")
             return
+        yield temperature, power
+
+
+def apply_to_powers(
+    density: Distribution, worst: Worst, check: Callable[[Distribution, Worst], None]
+) -> None:
+    """Apply a check to the density tempered with each of TEMPERATURES."""
+    for _, power in powers_of(density, worst):
         check(power, worst)
 
 

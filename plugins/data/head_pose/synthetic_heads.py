@@ -180,28 +180,14 @@ def render(
     centers = np.array([center for center, _, _, _ in parts])
     frames = np.array([frame for _, frame, _, _ in parts])
     # along an axis of the camera, the ellipsoid |F (p - c)| = 1 extends as far as the length of that row of F⁻¹
-    half_extents = np.linalg.norm(np.linalg.inv(frames), axis=2)
+    extents = np.linalg.norm(np.linalg.inv(frames), axis=2)
     colors = np.array([color for _, _, color, _ in parts])
     kinds = np.array([kind for _, _, _, kind in parts])
     opening = np.array([0.0, -math.sin(person.face_tilt), math.cos(person.face_tilt), person.face_reach])
     look = np.array([person.glasses, person.beard, *person.hair])
     image = np.zeros((pixels, pixels, 4))
     lamp = light / np.linalg.norm(light)
-    _cast(
-        centers,
-        frames,
-        half_extents,
-        colors,
-        kinds,
-        head,
-        opening,
-        look,
-        lamp,
-        strength,
-        scale,
-        *middle,
-        image,
-    )
+    _cast(centers, frames, extents, colors, kinds, head, opening, look, lamp, strength, scale, *middle, image)
     return image
 
 
@@ -256,20 +242,7 @@ def _ellipsoids(person: Person, head: Array, torso: Array) -> list[tuple[Array, 
 @compiled
 @no_type_check
 def _cast(
-    centers,
-    frames,
-    half_extents,
-    colors,
-    kinds,
-    head,
-    opening,
-    look,
-    lamp,
-    strength,
-    scale,
-    column0,
-    row0,
-    image,
+    centers, frames, extents, colors, kinds, head, opening, look, lamp, strength, scale, column0, row0, image
 ):
     """Fill `image` with the nearest surface along each ray, with Lambert shading."""
     size = image.shape[0]
@@ -286,7 +259,7 @@ def _cast(
         nearest, chosen = -np.inf, -1
         for part in range(centers.shape[0]):
             right, up = x - centers[part, 0], y - centers[part, 1]
-            if abs(right) > half_extents[part, 0] or abs(up) > half_extents[part, 1]:
+            if abs(right) > extents[part, 0] or abs(up) > extents[part, 1]:
                 continue
             # |F (p - c)| = 1 with p = (x, y, z) is a quadratic equation in z - c_z; its larger root is nearer
             a = b = c = 0.0

@@ -4,6 +4,7 @@ import copy
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from functools import cached_property
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
@@ -201,29 +202,21 @@ def _(density: LatentDensity, value: Tensor) -> Estimate:
     return result.map_fields(lambda field: field.reshape(shape))
 
 
-@marginal.register
-def _(density: LatentDensity, index: int) -> Distribution:
-    return marginal(density.mixture, index)
+def _register_mixture(function: Any) -> None:
+    """Register a function of a density as that of the mixture of the drawn components."""
+
+    @function.register
+    def _(density: LatentDensity, *arguments: Any) -> Any:
+        return function(density.mixture, *arguments)
+
+
+for _function in (marginal, median, mode_candidates, peak_widths):
+    _register_mixture(_function)
 
 
 @uniform.register
 def _(density: LatentDensity) -> Distribution:
     return uniform(density._example)
-
-
-@median.register
-def _(density: LatentDensity, samples: int) -> Tensor:
-    return median(density.mixture, samples)
-
-
-@mode_candidates.register
-def _(density: LatentDensity) -> Tensor:
-    return mode_candidates(density.mixture)
-
-
-@peak_widths.register
-def _(density: LatentDensity) -> Tensor:
-    return peak_widths(density.mixture)
 
 
 @tempered_density.register

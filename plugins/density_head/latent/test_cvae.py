@@ -63,7 +63,7 @@ def test_each_network_may_have_a_backbone_of_its_own():
     same.load_state_dict(model.head.state_dict())
     torch.manual_seed(0)
     torch.testing.assert_close(same.double().loss(raw, target), loss, rtol=0, atol=0)
-    with pytest.raises(ConfigError, match="which only the head of a model has"):
+    with pytest.raises(ConfigError, match="but only the head of a model has networks"):
         component = {"name": "cvae", **SMALL, "backbones": "each"}
         build(
             "density_head", resolve("density_head", {"name": "mixture", "component": component}), target=ONE

@@ -91,19 +91,6 @@ def test_a_nan_prediction_gives_nan():
     assert np.isnan(compute_metric(ONE, ([[np.nan], [0.0]], [[0.0], [0.0]]))["maad_deg"])
 
 
-def test_merged_states_equal_the_state_of_all_samples():
-    generator = np.random.default_rng(1)
-    point, target = generator.uniform(-4, 4, (2, 40, 3))
-    first, second, whole = (MeanAngularDeviation(THREE) for _ in range(3))
-    first.update(prediction(point[:7], target[:7]))
-    second.update(prediction(point[7:], target[7:]))
-    whole.update(prediction(point, target))
-    first.merge_state(second)
-    expected = whole.compute()
-    for name, value in first.compute().items():
-        torch.testing.assert_close(value, expected[name], rtol=1e-12, atol=1e-12)
-
-
 @pytest.mark.parametrize("count", [1, 2, 7, 100])
 @pytest.mark.parametrize("angles", [1, 3])
 def test_the_median_agrees_with_numpy(count, angles):

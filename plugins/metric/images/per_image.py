@@ -10,15 +10,13 @@ from torch import Tensor
 from torchmetrics.utilities import dim_zero_cat
 
 from framework.errors import DataError
+from framework.figures.chosen_images import choose_images
 from framework.geometry.srgb import bytes_from_linear
 from framework.metric import HasFigure, Metric
 from framework.prediction import Prediction
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-KEPT = 8
-"""Number of random images that are kept besides the worst and the best; the one closest to the median is shown."""
 
 
 class PerImage(Metric, HasFigure):
@@ -140,22 +138,6 @@ class PerImage(Metric, HasFigure):
                 value, index = facts[row].tolist()
                 shown[f"{name}: image {index:.0f}\n{heading}: {value:.3g}"] = pairs[row].numpy()
         return sheet(self._channel, shown, title, summary, synthetic=synthetic)
-
-
-def choose_images(facts: Float[Tensor, "image 2"]) -> list[int]:
-    """Return the rows of the images that the figure may show, in ascending order.
-
-    These are the images with the lowest and the highest score, and KEPT random images. The choice does not depend on
-    the order of the images. Images without a score (NaN) are left out.
-
-    Args:
-        facts: score and data set index of each image.
-    """
-    rows = facts.tolist()
-    known = sorted((row for row, (score, _) in enumerate(rows) if score == score), key=rows.__getitem__)
-    # Knuth's multiplicative hash
-    random = sorted(known, key=lambda row: int(rows[row][1]) * 2654435761 % 2**32)
-    return sorted({*known[:1], *known[-1:], *random[:KEPT]})
 
 
 def check_images(channel: str, predicted: Tensor, true: Tensor, by: str) -> None:

@@ -15,13 +15,13 @@ from torchmetrics.functional.image import structural_similarity_index_measure
 
 from framework.configuration.schema import build, resolve
 from framework.errors import ConfigError, DataError, UserError
+from framework.figures.chosen_images import KEPT, choose_images
 from framework.geometry.srgb import bytes_from_linear, srgb_from_linear
 from framework.prediction import Prediction
 from framework.target import Target
 from framework.testing.balls import Ball, ball
 from framework.testing.metrics import simplest_density
 from plugins.metric.images import functional
-from plugins.metric.images.per_image import KEPT, choose_images
 
 PLACE = Target("real", ("across", "down"))
 NAMES = ("psnr", "ssim", "ms_ssim", "silhouette_iou", "depth_error")

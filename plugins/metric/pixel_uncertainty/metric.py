@@ -11,6 +11,7 @@ from torchmetrics.utilities import dim_zero_cat
 
 from framework.distributions.checks import refuse_nan
 from framework.errors import DataError
+from framework.figures.chosen_images import choose_images
 from framework.metric import HasFigure, Metric
 from framework.prediction import Prediction
 from framework.target import Target
@@ -21,8 +22,6 @@ if TYPE_CHECKING:
 
 LEVELS = 19
 """Number of nominal masses 0.05, 0.10, ..., 0.95."""
-KEPT = 8
-"""Number of random images kept besides the least and most certain; the one closest to the median is shown."""
 
 
 class PixelUncertainty(Metric, HasFigure):
@@ -169,19 +168,3 @@ def with_error(name: str, values: Float[Tensor, "image"]) -> dict[str, Tensor]:
     known = values[~values.isnan()]
     error = known.std() / math.sqrt(len(known)) if len(known) > 1 else known.new_tensor(math.nan)
     return {name: known.mean(), f"{name}_sem": error}
-
-
-def choose_images(facts: Float[Tensor, "image 2"]) -> list[int]:
-    """Return the rows of the images that the figure may show, in ascending order.
-
-    These are the images with the smallest and the largest scale, and KEPT random images. The choice does not depend on
-    the order of the images. Images without a scale (NaN) are left out.
-
-    Args:
-        facts: scale and data set index of each image.
-    """
-    rows = facts.tolist()
-    known = sorted((row for row, (scale, _) in enumerate(rows) if scale == scale), key=rows.__getitem__)
-    # Knuth's multiplicative hash
-    random = sorted(known, key=lambda row: int(rows[row][1]) * 2654435761 % 2**32)
-    return sorted({*known[:1], *known[-1:], *random[:KEPT]})

@@ -102,17 +102,6 @@ def test_a_nan_prediction_gives_nan():
     assert actual["acc_pi_6"] == pytest.approx(2 / 3)
 
 
-def test_merged_states_equal_the_state_of_all_samples():
-    generator = np.random.default_rng(4)
-    point, target = generator.uniform(-1, 1, (2, 31, 3))
-    first, second, whole = (Viewpoint(TARGET) for _ in range(3))
-    first.update(prediction(point[:12], target[:12]))
-    second.update(prediction(point[12:], target[12:]))
-    whole.update(prediction(point, target))
-    first.merge_state(second)
-    assert first.compute() == whole.compute()
-
-
 def test_two_processes_give_the_results_of_all_samples():
     generator = np.random.default_rng(5)
     point, target = generator.uniform(-1, 1, (2, 31, 3))
