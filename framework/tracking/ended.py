@@ -85,7 +85,9 @@ def mark_dead(folder: Path, status: Status = "KILLED", uri: str | None = None, *
 
 
 def close_and_send(folder: Path, uri: str | None = None) -> None:
-    """Close a run as `mark_dead` does; if only its folder records the end (`watch`), send the status to the store.
+    """Close a run as `mark_dead` does, or send the lines that the store lacks if the run is already closed.
+
+    A run that the watcher (`watch`) has closed is closed in its folder only, so its store lacks the status.
 
     Raises:
         DataError: The process is alive, or the folder contains links.

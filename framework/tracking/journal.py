@@ -40,8 +40,8 @@ class Line:
 class Journal:
     """Append-only file of JSON lines that survives a crash of its process.
 
-    Every line has a number `n`, which grows by one and is never used twice, not even after `drop_after`. It is
-    therefore enough to remember up to which number the lines are stored elsewhere. Lines of metrics contain `time`,
+    Every line has a number `n`, which grows by one and is never used twice, not even after `drop_after`. So one
+    number suffices to say which lines are stored elsewhere: all up to this number. Lines of metrics contain `time`,
     `step`, `epoch` and `values`; a value that is not finite is the string "nan", "inf" or "-inf". Other lines contain
     the arguments of `append`.
 
@@ -97,10 +97,10 @@ class Journal:
             self._write_line(_encode({"n": self.last, "time": round(time.time(), 3), **record}))
 
     def read(self, after: int = 0) -> list[dict[str, Any]]:
-        """Return the next lines with a number greater than `after`, about a mebibyte at most; empty at the end.
+        """Return the next lines whose number is greater than `after`, about a mebibyte at most; [] if there are none.
 
-        An incomplete last line is left out, and damaged lines are skipped with a warning. If `after` is the last number
-        that the previous call returned, only new lines are read from the file.
+        An incomplete last line is left out, and damaged lines are skipped with a warning. If `after` is the number of
+        the last line that the previous call returned, the call reads only the part of the file after this line.
         """
         with self._lock:
             position, offset = self._place
@@ -378,7 +378,7 @@ def _whole_lines(file: BinaryIO) -> bytes:
 
 
 def _number(line: bytes) -> int:
-    """Return the number of a line without parsing the rest; for a line without a number, 2**62."""
+    """Return the number `n` of a line without parsing the rest of the line; 2**62 for a line without a number."""
     digits = line[5 : line.find(b",", 5)] if line.startswith(b'{"n":') else b""
     return int(digits) if digits.isdigit() and len(digits) < 19 else 1 << 62
 

@@ -54,8 +54,8 @@ class MlflowStore(Store):
 
     Args:
         folder: Folder of the run.
-        info: Description of the run. The run is searched by its id first, then by its key. If the status is RUNNING,
-            the status in MLflow is set too.
+        info: Content of `run.json`. The run is searched in the store by its id first, then by its key. If the status
+            in `info` is RUNNING, the status of an existing run in MLflow is set to RUNNING too.
 
     Raises:
         Exception: MLflow, SQLAlchemy and the network raise errors of many classes when the store is locked, full or
@@ -100,7 +100,7 @@ class MlflowStore(Store):
             require_own_files(self._info.uri, (location or "",))
 
     def send(self, batch: Sequence[Record]) -> None:
-        """Store a batch; a store ignores a metric that it has already, with the same key, time, step and value."""
+        """Store a batch; MLflow ignores a metric if it has one with the same key, time, step and value already."""
         if "status" in batch[0]:
             status, end = batch[0]["status"], round(batch[0]["time"] * 1000)
             if status == "RUNNING":
@@ -152,7 +152,7 @@ class MlflowStore(Store):
             _log.warning("%s was removed before it could be sent to the store.", shorten(file))
 
     def _send_model(self, file: Path) -> None:
-        """Store the checkpoint as a model that MLflow can serve, in place of a model that was sent before."""
+        """Store a checkpoint as the run's model, which MLflow can serve; it replaces a model that was sent before."""
         models = self._client.search_logged_models(
             [self._experiment_id], f"source_run_id = '{self._run_id}'", max_results=1
         )
@@ -208,7 +208,7 @@ class MlflowStore(Store):
                 yield Metric(key, float(value), round(record["time"] * 1000), step)
 
     def _params_and_tags(self, batch: Sequence[Record]) -> tuple[list[Param], list[RunTag], list[str]]:
-        """Return the parameters, the tags, and the keys of removed tags in a batch."""
+        """Return the parameters and the tags to set that a batch contains, and the keys of the tags to remove."""
         params: dict[str, str] = {}
         tags: dict[str, str | None] = {}
         for record in batch:
@@ -338,7 +338,7 @@ def run_folder(run_id: str, uri: str | None = None) -> Path:
 
 
 def _contains_run(folder: Path, run_id: str) -> bool:
-    """Return whether a folder contains the run with this id; another run may have replaced it."""
+    """Return whether a folder still contains the run `run_id`, and not another run that has replaced it."""
     try:
         info = read_run_info(folder)
     except DataError:
@@ -347,7 +347,7 @@ def _contains_run(folder: Path, run_id: str) -> bool:
 
 
 def _open_client(info: RunInfo) -> tuple[MlflowClient, str]:
-    """Return a client of the run's store and the id of the run's experiment; both are created if missing."""
+    """Return a client of the run's store and the id of the run's experiment; create them if they are missing."""
     path = sqlite_path(info.uri)
     if path is None:
         client = MlflowClient(tracking_uri=info.uri)
@@ -392,9 +392,10 @@ def _experiment(client: MlflowClient, info: RunInfo) -> str:
 
 
 def _chart_tags(experiment_id: str) -> dict[str, str]:
-    """Return tags of an experiment: a view that shows both losses in one chart, and a description that links to it.
+    """Return tags of an experiment that give it a chart with both the training loss and the validation loss.
 
-    By default, MLflow draws each metric in a separate chart. A view is the object that MLflow's button `Share` creates.
+    By default, MLflow draws each metric in a separate chart. One tag is a view, as MLflow's button `Share` creates it;
+    the other is a description of the experiment with a link to this view.
     """
     losses = ["train/loss", "validation/loss"]
     chart = {"uuid": "losses", "metricSectionId": "losses", "type": "LINE", "metricKey": losses[0]}

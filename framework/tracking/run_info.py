@@ -22,12 +22,12 @@ _log = logging.getLogger(__name__)
 
 SIDECAR = "run.json"
 MODEL = "model:"
-"""Folder name that marks a checkpoint which the store keeps as the run's model, not as a file."""
+"""Name to give as `folder` of a checkpoint that the store shall keep as the run's model, not as a file."""
 
 
 @dataclass(frozen=True)
 class Destination:
-    """Store of a run, and the names under which the store keeps the run.
+    """Store to which a run is sent, and the experiment, name and parent that the run has there.
 
     Attributes:
         uri: MLflow tracking URI that the user names; None means the default of `stores.address`.
@@ -59,18 +59,18 @@ class RunInfo:
     artifacts: str | None
     """Folder for the files of a new experiment; None lets the store decide."""
     key: str
-    """Id that the framework creates, which finds a run in the store even if its creation was interrupted."""
+    """Id that the framework creates for the run; it finds the run in the store even if `run_id` was never received."""
     started: float
     """Start of the run, in seconds since 1970."""
     status: str
     """Status of the run: RUNNING, FINISHED, FAILED or KILLED."""
     experiment_id: str | None = None
     sent: int = 0
-    """Number of the journal line up to which all lines are in the store."""
+    """Number of the last journal line such that the store has this line and all lines before it."""
     replay_after: int | None = None
     """Step from which the run was last resumed; the run repeats the steps after it."""
     replay_until: dict[str, int] = field(default_factory=dict)
-    """Last step of each metric in the store when the run was resumed; up to it, the metric is not sent again."""
+    """Last step of each metric that the store had when the run was resumed; repeated steps up to it are not sent."""
     owed: tuple[tuple[str, str], ...] = ()
     """Files (path, folder in the store) that must still be sent to the store."""
     named: bool = False
@@ -101,7 +101,7 @@ class RunInfo:
         )
 
     def at_store(self, store: Address, folder: Path) -> "RunInfo":
-        """Return the record with the address of its store replaced by the user's own address."""
+        """Return the record with the address of its store replaced by `store`, the address that the user gave."""
         return replace(self, uri=store.uri, named=store.named, artifacts=artifact_folder(store.uri, folder))
 
 
@@ -120,7 +120,7 @@ def read_run_info(folder: Path) -> RunInfo | None:
 
 
 class Sidecar:
-    """Record of a run in memory, and in the file `run.json`."""
+    """Record of a run (`RunInfo`), kept in memory and in the file `run.json` with the same content."""
 
     def __init__(self, folder: Path, info: RunInfo) -> None:
         self.info = info

@@ -26,16 +26,19 @@ Record = dict[str, Any]
 
 
 class Store(ABC):
-    """Contract of one run in a store; after any exception of a method, the sender tries again later."""
+    """Contract of the connection to one run in a store.
+
+    A method may raise any exception if the store fails; the sender then tries again later.
+    """
 
     identity: Mapping[str, Any]
-    """Fields of `RunInfo` with their values after the store was opened."""
+    """Names and new values of the fields of `RunInfo` that change when the store is opened, such as `run_id`."""
     replay: Mapping[str, Any]
-    """Fields `replay_after` and `replay_until` of `RunInfo` with their values after the batches sent so far."""
+    """Names and values of the fields `replay_after` and `replay_until` of `RunInfo` after the batches sent so far."""
 
     @abstractmethod
     def send(self, batch: Sequence[Record]) -> None:
-        """Store one batch from `batches`; a batch that is sent twice is stored once."""
+        """Store one batch that `batches` yielded; a batch that is sent twice must be stored only once."""
 
     @abstractmethod
     def send_file(self, path: str, place: str) -> None:
@@ -76,7 +79,8 @@ def batches(records: Sequence[Record]) -> Iterator[list[Record]]:
 def send_new(journal: Journal, sidecar: Sidecar, store: Store, stop: Callable[[], bool]) -> int:
     """Send the journal lines that the store lacks until `stop()` returns True, and return the number of lines sent.
 
-    Lines that are logged during this call wait for the next one. Otherwise each line of a training would be sent alone.
+    Lines that are written to the journal during this call are left for the next call. Otherwise each line of a training
+    would be sent in a call of its own.
     """
     count, last_line = 0, journal.last
     while sidecar.info.sent < last_line and (records := journal.read(sidecar.info.sent)):
@@ -101,14 +105,14 @@ def send_owed(
     stop: Callable[[], bool],
     refused: Callable[[DataError], None] | None = None,
 ) -> None:
-    """Send the waiting files in order.
+    """Send the files that must still be sent (`RunInfo.owed`), in order.
 
     Args:
         sidecar: Record of the run, which lists the files.
         store: Run in the store.
         stop: Function that returns whether to stop before the next file.
-        refused: Function that is called with the error if a file may not be sent, which is then left out; None raises
-            the error.
+        refused: Function that is called with the error if a file may not be sent; the next file is then sent. None: the
+            error is raised.
     """
     while sidecar.info.owed and not stop():
         try:
@@ -159,7 +163,7 @@ class Sender(threading.Thread):
         self._refusal_logged = False
 
     def notice(self) -> None:
-        """Count one more waiting line, and start sending if there are many."""
+        """Count one more line that waits to be sent, and start sending if many lines wait."""
         self._waiting_lines += 1
         if self._waiting_lines >= _LINES:
             self._wake.set()
@@ -177,7 +181,7 @@ class Sender(threading.Thread):
             )
 
     def finish(self, patience: float) -> bool:
-        """Send the rest and stop; return whether everything was sent within `patience` seconds."""
+        """Send the remaining lines and files, stop, and return whether all were sent within `patience` seconds."""
         self._finishing.set()
         self._wake.set()
         self.join(patience)

@@ -19,7 +19,7 @@ _SET_PARENT_DEATH, _GET_PARENT_DEATH = 1, 2  # constants of prctl.h
 
 
 def handled_signals() -> tuple[signal.Signals, ...]:
-    """Return the signals to handle: all of `SIGNALS`, without SIGHUP if it is ignored, as under nohup."""
+    """Return the signals to handle: SIGINT, SIGTERM and, unless the process ignores it (as under nohup), SIGHUP."""
     return tuple(
         number for number in SIGNALS if number != CLOSED or signal.getsignal(number) is not signal.SIG_IGN
     )
@@ -36,8 +36,8 @@ class Stopped(SystemExit):
 class Stopper:
     """Handler that raises `Stopped` for SIGINT, SIGTERM and SIGHUP.
 
-    The exception is raised immediately or, while `wait` is set, when the code calls `stop`. A second signal raises it
-    immediately in any case.
+    The first signal raises the exception immediately or, if the attribute `wait` is True, only when the code calls
+    `stop`. A second signal raises the exception immediately in any case.
     """
 
     def __init__(self) -> None:
@@ -72,7 +72,7 @@ class Stopper:
 
 
 def end_with_parent(number: int = signal.SIGTERM) -> Callable[[], None]:
-    """Return a function for a new child process to call first; the child then gets a signal when this process dies.
+    """Return a function that a new child process must call first, so that it gets a signal when this process dies.
 
     This works on Linux only; elsewhere the child continues to run. Start the child in the main thread, because the
     signal is sent when the starting thread ends.

@@ -32,7 +32,10 @@ class StoreAway(Exception):
 
 @final
 class StoreProcess:
-    """Function object (`sender.OpenStore`) that opens runs in MLflow in a process that the first call starts."""
+    """Function object of type `sender.OpenStore` that opens runs in MLflow from a separate process.
+
+    The first call starts the process.
+    """
 
     def __init__(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None

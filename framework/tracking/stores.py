@@ -19,11 +19,11 @@ SETTING = "MLFLOW_TRACKING_URI"
 """MLflow's environment variable for the address of a store, which may include a password."""
 _SQLITE = "sqlite:///"
 _BESIDE = ("", "-wal", "-shm", "-journal")
-"""Suffixes of the files that SQLite opens together with a database."""
+"""Suffixes, added to the path of an SQLite database, of all files that SQLite opens for it."""
 _MEANING = r"[%?\x00-\x1f\x7f]"
 """Pattern of characters in a path that have a special meaning in an address of SQLAlchemy."""
 _ESCAPED = r"[%?#'\"\\\x00-\x1f\x7f]"
-"""Pattern of characters in a path that have a special meaning to MLflow, which decodes paths and quotes them in SQL."""
+"""Pattern of characters in a path that MLflow would change, because it decodes the path and writes it into SQL."""
 _SECRET = r"([?&][^=&\s]*(?:pass|pwd|token|secret)[^=&\s]*=)[^&\s]*"
 
 
@@ -49,7 +49,7 @@ def address(named: str | None, folder: Path) -> Address:
         folder: Folder of the run.
 
     Raises:
-        ConfigError: MLflow cannot keep runs at the address, or cannot use a folder of such a name.
+        ConfigError: MLflow cannot keep runs at the address, or the address contains a folder whose name is not UTF-8.
     """
     user_uri = named or os.environ.get(SETTING)
     uri = store_uri(user_uri) if user_uri else default_uri(folder)
@@ -63,7 +63,7 @@ def address(named: str | None, folder: Path) -> Address:
 
 
 def confirm_address(recorded: str, named: str | None, folder: Path, source: Path) -> Address:
-    """Return the address at which the user names the store that a file records for the run in `folder`.
+    """Return the user's address of the store whose address `recorded` a file contains for the run in `folder`.
 
     Args:
         recorded: Address in the file.
@@ -72,7 +72,7 @@ def confirm_address(recorded: str, named: str | None, folder: Path, source: Path
         source: Path of the file, for the message.
 
     Raises:
-        ConfigError: The user does not name the recorded store.
+        ConfigError: The user's address (without one, the default address) is that of another store.
     """
     candidates = [Address(store_uri(uri), True) for uri in (named, os.environ.get(SETTING)) if uri]
     candidates += [Address(default_uri(place), False) for place in (folder, Path.cwd() / "outputs" / "run")]
@@ -136,7 +136,7 @@ def artifact_folder(uri: str, folder: Path) -> str | None:
 
 
 def require_own_files(uri: str, locations: tuple[str, ...] = ()) -> None:
-    """Refuse a store that the user did not name if it leads out of its own folder.
+    """Refuse a store that the user did not name if it would read or write files outside its own folder.
 
     Args:
         uri: Address of an SQLite store.

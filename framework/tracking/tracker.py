@@ -36,9 +36,9 @@ class Tracker(ABC):
     """Contract of the object that records one run.
 
     Only one process records a run; the other processes of a distributed training record nothing. `open` is called first
-    and `close` last. Between them, no method raises an error or waits because of a store: when the call returns, the
-    entry is in the journal (metrics take at most a tenth of a millisecond), and it reaches the store later. Steps are
-    optimiser steps; names have the form "validation/loss".
+    and `close` last. Between these calls, no method raises an error or waits because of a store: when the call returns,
+    the entry is in the journal (metrics take at most a tenth of a millisecond), and it reaches the store later. Steps
+    are optimiser steps; names have the form "validation/loss".
     """
 
     journal: Journal
@@ -57,7 +57,7 @@ class Tracker(ABC):
 
     @abstractmethod
     def set_tags(self, tags: Mapping[str, str | None]) -> None:
-        """Record texts that describe the run; the last value of a tag counts, and None removes the tag."""
+        """Record texts that describe the run, by name; a new text replaces the earlier one, and None removes it."""
 
     @abstractmethod
     def log_metrics(self, values: Mapping[str, float], step: int, epoch: int) -> None:
@@ -69,9 +69,10 @@ class Tracker(ABC):
 
     @abstractmethod
     def log_artifact(self, path: Path, folder: str = "") -> None:
-        """Record a file or a directory under `folder` in the store; it must not be moved, because it is read later.
+        """Record a file or directory, to be stored under `folder`; it is read later and must stay where it is.
 
-        A checkpoint under `MODEL` (`run_info`) becomes the model of the run, which the store can serve.
+        With `folder=run_info.MODEL`, the file is a checkpoint and becomes the model of the run, which the store can
+        serve.
         """
 
     @abstractmethod
@@ -84,7 +85,7 @@ class Tracker(ABC):
 
     @abstractmethod
     def leave_open(self) -> None:
-        """Release the run like `close`, but do not end it, because another tracker will open it again."""
+        """Release the run like `close`, but set no final status, because another tracker will continue the run."""
 
     @property
     @abstractmethod
@@ -94,7 +95,7 @@ class Tracker(ABC):
     @property
     @abstractmethod
     def url(self) -> str:
-        """Return the command or the address that shows the run."""
+        """Return where the user sees the run: the address of a page, a command to type, or the journal's path."""
 
 
 @final
@@ -121,13 +122,13 @@ class NoTracker(Tracker):
         """Do nothing, because the config is in the run folder."""
 
     def set_tags(self, tags: Mapping[str, str | None]) -> None:
-        """Do nothing, because tags are only used to search in a store."""
+        """Do nothing, because tags only serve to find runs in a store."""
 
     def log_metrics(self, values: Mapping[str, float], step: int, epoch: int) -> None:
         self.journal.write(values, step, epoch)
 
     def log_dataset(self, name: str, context: str, facts: Mapping[str, str]) -> None:
-        """Do nothing, because data sets are only recorded to search in a store."""
+        """Do nothing, because recorded data sets only serve to find runs in a store."""
 
     def log_artifact(self, path: Path, folder: str = "") -> None:
         """Do nothing, because the file stays in the run folder."""
@@ -289,7 +290,7 @@ class MlflowTracker(Tracker):
         self._notice()
 
     def _notice(self) -> None:
-        """Tell the sender that one more line waits; start the sender if the waiting time is over."""
+        """Notify the sender that one more line waits; start the sender if the time `wait` after opening is over."""
         if self._sender is None and self._sidecar is not None and not self._closed:
             if time.monotonic() >= self._sends_from:
                 self._start_sending(self._sidecar)
@@ -310,7 +311,10 @@ class MlflowTracker(Tracker):
 
 
 def _begin_run(folder: Path, journal: Journal, new_info: RunInfo, resumed: bool | None) -> Sidecar:
-    """Open a run folder for writing, continue the run in it or rename the files of that run, and return its record."""
+    """Open a run folder for writing, and return the record of the run that continues or begins there.
+
+    If the run in the folder is not continued, its files are renamed.
+    """
     earlier = read_run_info(folder)
     journal.open(after=earlier.sent if earlier else 0)
     if earlier is not None and _continues(earlier, new_info, resumed):

@@ -1,7 +1,7 @@
 """Small process that closes a run after the run's own process was killed.
 
 The arguments of this program are the run folder, the id of the run's process, and the id of the parent process with
-which the run must end (for a job, the process of its sweep) or 0. The program ends with the run.
+which the run must end (for a job, the process of its sweep), or 0 if there is none. The program ends with the run.
 """
 
 import os
@@ -25,8 +25,8 @@ def start_watcher(folder: Path) -> Iterator[None]:
     """Start a process that watches this process, whose run is in `folder`, during the block.
 
     If this process dies, the watcher records the status KILLED in the folder; a later `sync` sends the status to the
-    store. If this process must end with its parent and the parent dies, this process has `ENDING` seconds to close the
-    run. Then the watcher kills it together with all processes of its group.
+    store. If this process must end with its parent (`signals.end_with_parent`), it has `ENDING` seconds after the death
+    of the parent to close the run. After that, the watcher kills it together with all processes of its group.
     """
     parent = os.getppid() if ends_with_parent() else 0
     watcher = subprocess.Popen(
@@ -61,7 +61,7 @@ def watch(folder: Path, run: int, parent: int) -> None:
 
 
 def _parent_of(process: int) -> int | None:
-    """Return the id of the parent of a process, or None if the system does not provide it."""
+    """Return the id of a process's parent; None if the system does not provide it."""
     try:
         state = Path(f"/proc/{process}/stat").read_text(encoding="utf-8", errors="replace")
     except OSError:
@@ -70,7 +70,7 @@ def _parent_of(process: int) -> int | None:
 
 
 def _kill(run: int) -> None:
-    """Kill the process of a run, and its process group if it leads one.
+    """Kill the process `run` and, if it leads a process group, all processes of this group.
 
     The watcher is a child of that process, so no other process can have the same id.
     """
