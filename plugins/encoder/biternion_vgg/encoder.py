@@ -22,8 +22,8 @@ class BiternionVGG(Encoder):
     order computes ReLU on a quarter of them. Convolutions have no bias, since the batch norm after them would subtract
     the bias.
 
-    Images are read in [0, 1] and not normalised further. Nothing is padded, so that the first batch norm removes any
-    scale and offset of the images.
+    Images are read in [0, 1] and not normalised further. Because the convolutions pad no zeros, the first batch norm
+    removes any scale and offset of the images.
 
     Args:
         input_shape: (channels, height, width), 1 or 3 channels; at least 32 × 32 pixels for six convolutions.
@@ -88,7 +88,7 @@ class BiternionVGG(Encoder):
 
 
 def _smallest(convolutions: int) -> int:
-    """Return the side, pixels, of the smallest image that leaves one pixel, by inverting the layers one by one."""
+    """Return the side, in pixels, of the smallest image of which the convolutions and poolings leave one pixel."""
     side = 1
     for index in reversed(range(convolutions)):
         side = (side * 2 if index in range(1, convolutions - 1, 2) else side) + 2

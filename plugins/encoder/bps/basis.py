@@ -40,7 +40,8 @@ def basis(strategy: Strategy, count: int, radius: float, seed: int) -> Float[Ten
         seed: seed of "ball_uniform".
 
     Raises:
-        ConfigError: `count` is no cube and the strategy is "grid"; or no scale of the lattice gives `count` points.
+        ConfigError: `count` is not the cube of an integer and the strategy is "grid"; or no scale of the lattice gives
+            `count` points.
     """
     if strategy == "ball_uniform":
         return torch.from_numpy(_ball_uniform(count, seed) * radius)
@@ -54,7 +55,7 @@ def side(count: int) -> int:
     """Return the number of points along each edge of a cubic grid of `count` points.
 
     Raises:
-        ConfigError: `count` is no cube; the message names the nearest cubes.
+        ConfigError: `count` is not the cube of an integer; the message names the nearest cubes.
     """
     below = round(count ** (1 / 3))
     while below**3 > count:
@@ -68,7 +69,11 @@ def side(count: int) -> int:
 
 
 def _ball_uniform(count: int, seed: int) -> np.ndarray:
-    """Return random directions at radii u^(1/3), because the volume of a ball grows with the cube of its radius."""
+    """Return `count` points drawn uniformly from the unit ball, (count, 3).
+
+    Each point is a random direction times u^(1/3), where u is drawn uniformly from [0, 1): the volume of a ball grows
+    with the cube of its radius.
+    """
     # NumPy guarantees that its legacy generator always gives the same bits. Directions and radii have separate
     # generators, so that a larger set begins with the points of a smaller one.
     direction = np.random.RandomState(seed).normal(size=(count, 3))
@@ -82,7 +87,7 @@ def _grid(side: int) -> np.ndarray:
 
 
 def _cubic(reach: int) -> np.ndarray:
-    """Return a cubic lattice with distance 1 between neighbours, from -reach to reach along each axis."""
+    """Return a cubic lattice with distance 1 between neighbours, from -`reach` to `reach` along each axis."""
     axis = np.arange(-reach, reach + 1.0)
     return np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
 
@@ -90,8 +95,9 @@ def _cubic(reach: int) -> np.ndarray:
 def _hexagonal(reach: int) -> np.ndarray:
     """Return hexagonal close packing with distance 1 between neighbours (Conway & Sloane 1999, §1.3 of ch. 5).
 
-    Rows along x at distance √3/2 make a layer. Layers have distance √(2/3). Every second layer is shifted so that its
-    points lie above the gaps of the layer below.
+    A layer consists of rows along x, which are √3/2 from each other. The distance between layers is √(2/3). Every
+    second layer is shifted so that its points lie above the gaps of the layer below. The lattice contains at least all
+    points within `reach` of the origin.
     """
     wide, deep, high = reach, math.ceil(reach / math.sqrt(3 / 4)), math.ceil(reach / math.sqrt(2 / 3))
     axes = [np.arange(-end - 1, end + 2.0) for end in (wide, deep, high)]
@@ -111,7 +117,8 @@ def _in_ball(lattice: Callable[[int], np.ndarray], cell: float, count: int) -> n
         count: number of points in the ball.
 
     Raises:
-        ConfigError: for every position of the origin, the last point inside is as far from it as the next one outside.
+        ConfigError: for every tried position of the ball's centre, the points number `count` and `count` + 1 by
+            distance are equally far from the centre, up to rounding.
     """
     radius = (3 * count * cell / (4 * math.pi)) ** (
         1 / 3

@@ -16,7 +16,9 @@ from plugins.encoder.bps.encoding import Basis, channels, columns_of, encode, pr
 
 
 class BPS(Encoder):
-    """Features of the point of a cloud that is nearest to each point of a fixed basis (thesis eq. 6.1-6.5).
+    """Encoder that finds the cloud point nearest to each point of a fixed basis, and returns features of these points.
+
+    The features are defined in thesis eq. 6.1-6.5.
 
     With the basis "grid", features are (channels, side, side, side), where x changes slowest. With the other bases,
     features are (channels × points,), one channel after the other. The basis is stored in the checkpoint.
@@ -27,15 +29,16 @@ class BPS(Encoder):
         basis: choice of basis points (`plugins.encoder.bps.basis`).
         points: number of basis points, k; side³ for a "grid".
         radius: radius of the ball of basis points, or half the edge of a "grid", in units of the normalised cloud.
-        features: features of each basis point, in order: "distance" (1 number, eq. 6.4), "delta" (3, eq. 6.5), and of
-            the nearest point "color" (3: red, green, blue), "normal" (3), or the name of a column (1).
+        features: names of the features of each basis point, in order: "distance" (1 number, eq. 6.4), "delta" (3
+            numbers, eq. 6.5), and attributes of the nearest point: "color" (3 numbers: red, green, blue), "normal" (3
+            numbers), or the name of a column (1 number).
         normalise: as in `framework.geometry.clouds.normalise_clouds`.
         basis_seed: seed of "ball_uniform"; the run's seed has no influence.
         rotation_invariant: encode each cloud along its own axes (`plugins.encoder.bps.frame`).
 
     Raises:
         ConfigError: the input is no cloud; a feature is named twice or needs a column that the clouds do not have; or
-            the basis is "grid" and `points` is no cube.
+            the basis is "grid" and `points` is not the cube of an integer.
     """
 
     fixed = True

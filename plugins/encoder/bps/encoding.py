@@ -210,7 +210,14 @@ def _gather_rows(numbers: Float[Tensor, "batch points columns"], index: Int[Tens
 def _rotate_into_frames(
     local: Float[Tensor, "batch points columns"], axes: Tensor, columns: Sequence[str], read: set[int]
 ) -> Float[Tensor, "batch points columns"]:
-    """Return the clouds with coordinates, and normals if `read` holds one, along each cloud's own axes."""
+    """Return clouds whose coordinates and normals are expressed in each cloud's own frame.
+
+    Args:
+        local: clouds, whose coordinates are normalised.
+        axes: axes of each cloud as columns, as `frame` returns them.
+        columns: names of the clouds' columns.
+        read: indices of the attributes that are read; normals are rotated only if one of their columns is among them.
+    """
     parts = list(local.unbind(-1))
     vectors = [[0, 1, 2]]
     if read & {columns.index(name) for name in NORMAL if name in columns}:
@@ -225,7 +232,7 @@ def _rotate_into_frames(
 
 
 def _first_occurrences(index: Int[Tensor, "k"]) -> Int[Tensor, "different"]:
-    """Return the first position of each distinct value of an index, ordered by value."""
+    """Return the position in `index` at which each distinct value occurs first; the values are in ascending order."""
     order = index.argsort(stable=True)
     ordered = index[order]
     first = torch.ones_like(ordered, dtype=torch.bool)

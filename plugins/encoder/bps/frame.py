@@ -35,10 +35,10 @@ def frame(coordinates: Float[Tensor, "batch points 3"], reach: float = 1.0) -> F
     its direction is the one that makes the frame right-handed. A mirror plane makes this skewness 0, so that the frame
     of a cloud with mirror planes is determined up to the cloud's own symmetries.
 
-    `symmetric_frame` chooses the frame if two moments are equal to rounding, as for a cube, or if fewer than two axes
-    are skewed, as for a cloud that the reflection x → -x does not change. If two moments are nearly equal, as for
-    points drawn on a cylinder, a small change of the cloud can rotate its axes by a large angle. The frame is
-    differentiable in the clouds to any order, except where eigenvalues are equal.
+    `symmetric_frame` chooses the frame if two second moments are equal up to rounding, as for a cube, or if fewer than
+    two axes have a third moment that is clearly not 0, as for a cloud that the reflection x → -x does not change. If
+    two second moments are nearly equal, as for points drawn on a cylinder, a small change of the cloud can rotate its
+    axes by a large angle. The frame is differentiable in the clouds to any order, except where eigenvalues are equal.
 
     Args:
         coordinates: coordinates relative to the origin; rows of NaN are padding.
@@ -76,7 +76,9 @@ def frame(coordinates: Float[Tensor, "batch points 3"], reach: float = 1.0) -> F
 
 
 class Axes(torch.autograd.Function):
-    """Eigenvalues and eigenvectors that are known already, with their derivatives in the matrix.
+    """Differentiable function that returns the eigenvalues and eigenvectors that it is given.
+
+    They belong to the matrix of second moments, `second`, and are differentiable with respect to this matrix.
 
     The backward pass uses only the outputs of the forward pass, so that it can itself be differentiated. The
     derivatives of torch.linalg.eigh are not finite where two eigenvalues are equal.
@@ -95,7 +97,7 @@ class Axes(torch.autograd.Function):
     def backward(  # type: ignore[override]
         ctx: Any, values_gradient: Tensor, axes_gradient: Tensor
     ) -> tuple[Tensor, None, None]:
-        """Return the gradient in the matrix, and None for the eigenvalues and eigenvectors."""
+        """Return the gradient with respect to the matrix, and None for the eigenvalues and eigenvectors."""
         values, axes = ctx.saved_tensors
         # first-order perturbation: d value_j = axis_jᵀ d(second) axis_j, and
         # d axis_j = Σ_i axis_i (axis_iᵀ d(second) axis_j) / (value_j - value_i)

@@ -17,11 +17,14 @@ EQUAL = 1e-6
 TIE = 1e-6
 """Relative difference below which lengths count as equal, and absolute difference below which values of log L do."""
 GENERIC = (1.3, 0.9, 0.5)
-"""The vector a, in inverse units of the root mean square of a coordinate; the components differ, and none is 0."""
+"""The constant vector a of the values L(F a) that are compared; its components differ, and none is 0.
+
+Its unit is the inverse of the root mean square of a coordinate.
+"""
 PAIRS_IN_MEMORY = 2**22
 """Largest number of pairs of a candidate and a point that are in memory at once."""
 FLIPS = ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))
-"""Directions of three axes that leave a frame right-handed."""
+"""Signs by which the three axes of a right-handed frame can be multiplied so that the frame stays right-handed."""
 
 
 @torch.no_grad()
@@ -55,10 +58,11 @@ def symmetric_frame(
 
 
 def _frames_through_points(points: Float[Tensor, "points 3"]) -> Float[Tensor, "frame 3 3"]:
-    """Return frames through points of the cloud, (frame, 3, 3).
+    """Return candidate frames whose axes point to points of the cloud, (frame, 3, 3).
 
-    The first axis points to one of the points farthest from the origin. The second axis points towards one of the
-    points farthest from the first axis.
+    The first axis points to one of the points farthest from the origin; if several points are equally far, only those
+    with the largest Laplace transform in their direction are used. For each first axis there is one frame for each
+    candidate of the second axis, as `_frames_about` describes.
     """
     first = points[_farthest(points.norm(dim=1))]
     first = first / first.norm(dim=1, keepdim=True)
@@ -69,10 +73,12 @@ def _frames_through_points(points: Float[Tensor, "points 3"]) -> Float[Tensor, "
 def _frames_about(
     points: Float[Tensor, "points 3"], axis: Float[Tensor, "3"], last: bool = False
 ) -> Float[Tensor, "frame 3 3"]:
-    """Return frames with `axis` as their first column, or as their last.
+    """Return right-handed frames that contain `axis`: one frame for each candidate of the axis that follows it.
 
-    The next axis points towards one of the points that are farthest from `axis`. If several points are equally far, it
-    points towards one of those farthest from the origin along `axis`, in either direction.
+    `axis` is the first column and the second column follows it; if `last` is true, `axis` is the last column and the
+    first column follows it. Candidates are the directions, perpendicular to `axis`, towards the points farthest from
+    the line along `axis`. If several points are equally far from this line, only those farthest from the origin along
+    the line, on either side, give candidates.
     """
     along = points @ axis
     across = points - along[:, None] * axis
@@ -86,16 +92,17 @@ def _frames_about(
 
 
 def _farthest(length: Float[Tensor, "points"]) -> Tensor:
-    """Return the indices of the largest lengths."""
+    """Return the indices of the lengths that are equal to the largest one up to TIE."""
     return (length >= (1 - TIE) * length.max()).nonzero()[:, 0]
 
 
 def _log_transform(
     points: Float[Tensor, "points 3"], arguments: Float[Tensor, "argument 3"]
 ) -> Float[Tensor, "argument"]:
-    """Return log L at each argument s, (argument,), for points in units of the root mean square of a coordinate.
+    """Return the logarithm of the Laplace transform L of the points at each row of `arguments`.
 
-    The result exceeds log L by the constant log(number of points), which changes no comparison.
+    The points are first divided by the root mean square of a coordinate. The returned numbers exceed log L by the
+    constant log(number of points), which changes no comparison.
     """
     unit = points / points.square().mean().sqrt().clamp(min=torch.finfo(points.dtype).tiny)
     parts = arguments.split(max(1, PAIRS_IN_MEMORY // max(1, len(unit))))

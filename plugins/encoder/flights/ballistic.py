@@ -21,8 +21,8 @@ LARGEST = 1e4
 class BallisticEncoder(Encoder):
     """Predicted flight of the ball by its differential equation, as features.
 
-    Features: x, y and z at each future frame, m; the logarithms of their standard deviations; and the observed frames
-    (frame by frame as `PARTS`).
+    Features: x, y and z at each future frame, m; the logarithms of their standard deviations; and the observed frames,
+    each with the numbers of `framework.flights.frames.PARTS`: time, x, y, z, and whether the ball was seen.
 
     The constants are those of the config, or those that a run of `density_head=ballistic` has fitted. Nothing is
     learnt.
@@ -35,7 +35,7 @@ class BallisticEncoder(Encoder):
         constants: constants of the ball and the table.
 
     Raises:
-        ConfigError: the inputs are not flattened frames of `PARTS`.
+        ConfigError: the inputs are not flattened frames with the numbers of `PARTS`.
     """
 
     bibtex = "mulling2011biomimetic"

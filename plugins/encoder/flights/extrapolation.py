@@ -21,7 +21,9 @@ SPANS = (1.0, 0.7, 0.5, 0.35)
 The longest span that a parabola fits is used, so that a bounce is left out.
 """
 SPEED, GROWTH = (0.4, 0.4, 3.0), (0.5, 0.5, 6.0)
-"""Growth of a coordinate's unit with time, m/s, and with the square of time, m/s², for x, y and z.
+"""Growth of the unit of x, y and z with time, m/s, and with the square of time, m/s².
+
+The unit of a coordinate is the length in which a density head expresses its distance from the parabola.
 
 The values of z are larger, because a bounce reverses the velocity along z, and the last frames may hold a bounce.
 """
@@ -44,7 +46,7 @@ class ExtrapolationEncoder(Encoder):
         noise: standard deviation of a coordinate, m.
 
     Raises:
-        ConfigError: the inputs are not flattened frames of `PARTS`.
+        ConfigError: the inputs are not flattened frames with the numbers of `framework.flights.frames.PARTS`.
     """
 
     bibtex = "holland1977robust"
@@ -86,10 +88,14 @@ class ExtrapolationEncoder(Encoder):
 
 
 def count_frames(input_shape: tuple[int, ...], by: str) -> int:
-    """Return the number of frames of a sample.
+    """Return the number of observed frames in a sample.
+
+    Args:
+        input_shape: shape of a sample, (frames × numbers of `PARTS`,).
+        by: name of the encoder, for messages.
 
     Raises:
-        ConfigError: the shape is not that of flattened frames of `PARTS`.
+        ConfigError: the shape is not that of flattened frames with the numbers of `PARTS`.
     """
     length = math.prod(input_shape)
     if len(input_shape) != 1 or length % len(PARTS) or not length:

@@ -22,7 +22,7 @@ PRIOR_DEVIATIONS = (10.0, 10.0, 4.0)
 @compiled
 @no_type_check
 def factorise(matrix):
-    """Compute Cholesky's lower triangle of a positive definite 3 × 3 matrix in place."""
+    """Replace the lower triangle of a positive definite 3 × 3 matrix by its Cholesky factor."""
     for row in range(3):
         for column in range(row + 1):
             total = matrix[row, column]
@@ -34,7 +34,7 @@ def factorise(matrix):
 @compiled
 @no_type_check
 def solve(triangle, right):
-    """Solve L Lᵀ X = right (3, columns) in place."""
+    """Solve L Lᵀ X = `right` for X, (3, columns), where L is the lower triangle `triangle`; X overwrites `right`."""
     for column in range(right.shape[1]):
         for row in range(3):
             for inner in range(row):
@@ -57,7 +57,8 @@ def fit_parabolas(times, positions, visible, spans, noise, long, short, covarian
         visible: (flight, frame), whether the ball was seen.
         spans: numbers of last frames that are fitted, the largest first.
         noise: standard deviation of a coordinate, m.
-        long: filled with the coefficients of 1, t and t²/2 (flight, 3, axis) of the longest span that fits.
+        long: filled with the coefficients of 1, t and t²/2, (flight, 3, axis), of the parabola through the longest
+            span that a parabola fits.
         short: filled with the coefficients of the last (shortest) span, in the same form.
         covariance: filled with the covariance of an axis's coefficients of `long`, (flight, 3, 3).
         span: filled with the index of the span of `long`, (flight,).
@@ -126,8 +127,8 @@ def fill_features(times, positions, visible, gravity, spans, noise, speed, growt
         gravity: m/s².
         spans: see `fit_parabolas`.
         noise: see `fit_parabolas`.
-        speed: growth of the unit with time, (3,), m/s.
-        growth: growth of the unit with the square of time, (3,), m/s².
+        speed: growth of the unit of x, y and z with time, (3,), m/s, as `extrapolation.SPEED`.
+        growth: growth of the unit with the square of time, (3,), m/s², as `extrapolation.GROWTH`.
         moments: times at which the ball is predicted, (future,), s.
         features: filled with the features, (flight, length of the features).
     """

@@ -72,5 +72,5 @@ def occupancy(clouds: Float[Tensor, "batch points columns"], side: int) -> Float
 def decode(
     occupied: Float[Tensor, "batch cells"], side: int, normalised: NormalisedClouds
 ) -> Float[Tensor, "batch points 3"]:
-    """Return the centres of the occupied cells, as `chosen_centres` returns them."""
+    """Return the centres of the occupied cells in the clouds' own units, padded with rows of NaN (`chosen_centres`)."""
     return chosen_centres(occupied > 0, occupied, side, normalised, "occupied")

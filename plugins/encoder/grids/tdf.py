@@ -102,5 +102,13 @@ def truncated_distance(
 def decode(
     field: Float[Tensor, "batch cells"], side: int, normalised: NormalisedClouds
 ) -> Float[Tensor, "batch points 3"]:
-    """Return the centres of the cells less than the truncation from a point, as `chosen_centres` returns them."""
+    """Return the centres of the cells whose distance in `field` is below the truncation, that is, below 1.
+
+    The centres are in the clouds' own units, padded with rows of NaN (`chosen_centres`).
+
+    Args:
+        field: truncated distances, as `truncated_distance` returns them.
+        side: number of cells along each edge.
+        normalised: the encoded clouds, whose centre and scale convert the centres to the clouds' units.
+    """
     return chosen_centres(field < 1, field, side, normalised, "near a point")

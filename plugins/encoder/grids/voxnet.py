@@ -113,7 +113,10 @@ class VoxNet(Encoder):
 def _voxnet(
     planes: int, side: int, channels: list[int], dropout: list[float], padding: int
 ) -> tuple[list[nn.Module], int]:
-    """Return the layers up to the pooling, and the side of their output in cells, below 1 if the grid is too small."""
+    """Return the layers of "voxnet" up to the pooling, and the side of their output in cells.
+
+    The side is below 1 if the grid is too small. The input has `planes` channels and `side` cells along each edge.
+    """
     first, *later_channels = channels
     layers: list[nn.Module] = [
         nn.Conv3d(planes, first, kernel_size=5, stride=2),
@@ -130,7 +133,10 @@ def _voxnet(
 def _conv3d(
     planes: int, side: int, channels: list[int], dropout: list[float], padding: int
 ) -> tuple[list[nn.Module], int]:
-    """Return the layers before the fully connected ones, and the side of their output, as `_voxnet` does."""
+    """Return the layers of "conv3d" before the fully connected ones, and the side of their output in cells.
+
+    The side is below 1 if the grid is too small. The input has `planes` channels and `side` cells along each edge.
+    """
     layers: list[nn.Module] = []
     for index, width in enumerate(channels):
         layers += [

@@ -11,7 +11,9 @@ class ConvNorm(nn.Module):
     """A convolution without bias, batch norm and ReLU.
 
     Args:
-        kernel: height and width of the kernel; one number for both.
+        inputs, outputs: numbers of channels.
+        kernel: (height, width) of the kernel, or one number if both are equal.
+        stride: step of the kernel, pixels.
         padding: "same" keeps height and width; "valid" pads nothing.
     """
 

@@ -24,9 +24,10 @@ ACTIVATION = {"tanh": nn.Tanh, "elu": nn.ELU}
 class DeepSets(Encoder):
     """Equivariant layers on each point's difference from the maximum over its cloud, then a maximum over the cloud.
 
-    The equivariant layer is x ↦ σ(β + (x - 1 max x) Γ), as in the paper's network for clouds. The features do not
-    depend on the order of the points or on padding. Adding the same vector to all points does not change the features
-    either.
+    The equivariant layer is x ↦ σ(β + (x - 1 max x) Γ), as in the paper's network for clouds. The rows of x are the
+    points of a cloud, max x is the row of the columns' maxima, 1 is a column of ones, and β and Γ are the layer's bias
+    and weight. The features do not depend on the order of the points or on padding. Adding the same vector to all
+    points does not change the features either.
 
     Args:
         input_shape: (points, columns).
@@ -122,5 +123,5 @@ class DeepSets(Encoder):
 def below_largest(
     values: Float[Tensor, "point channels"], counts: Int[Tensor, "batch"]
 ) -> Float[Tensor, "point channels"]:
-    """Return x - 1 max x, where the maximum is over the points x of each cloud."""
+    """Return the values of each point minus the maximum of each channel over the points of its cloud."""
     return values - repeat_for_points(largest(values, counts), counts)

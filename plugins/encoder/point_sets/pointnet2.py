@@ -43,7 +43,7 @@ PUBLISHED = {
         (Scale(1, 32, (64, 64, 128)), Scale(2, 64, (128, 128, 256)), Scale(4, 128, (128, 128, 256))),
     ),
 }
-"""Published scales of each level, by grouping."""
+"""Scales of each level in the paper, by the names of the `grouping` of `PointNet2`."""
 WHOLE, LAST = (256, 512, 1024), (512, 256)
 """Widths of the layers that the last centroids pass, and of the layers after the maximum over them."""
 REACH = 5
@@ -193,7 +193,8 @@ def describe_balls(
     """Return the maximum of each output channel of a network over the points of each ball.
 
     Args:
-        network: layers of `layers`, which read a point's position relative to the centroid and the point's features.
+        network: layers built by `plugins.encoder.point_sets.layers.layers`. They read a point's position relative to
+            the centroid, and the point's features.
         positions: positions of all points.
         values: features of all points.
         centres: positions of the centroids.

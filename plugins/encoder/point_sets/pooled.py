@@ -1,7 +1,7 @@
-"""Maxima over each cloud of the outputs of `layers`, where possible without computing the outputs of every point.
+"""Maxima of a network's outputs over the points of each cloud, where possible without the outputs of every point.
 
-A training step of PointNet then takes a quarter of the time and a third of the memory
-(benchmarks/clouds/set_steps.md).
+The network is one that `layers.layers` builds. A training step of PointNet takes a quarter of the time and a third of
+the memory that it takes if the outputs of every point are computed (benchmarks/clouds/set_steps.md).
 """
 
 from typing import cast
@@ -28,12 +28,12 @@ def largest_after(
     ReLU is monotone, and so is batch norm in each channel. The maximum over a cloud is therefore attained by the point
     with the largest number before batch norm (the smallest number if the factor of batch norm is negative). In
     evaluation, batch norm is folded into the last linear layer. In training, the moments over all points follow from
-    the mean m and the covariance C of the linear layer's inputs: the mean is W m, the variances are the diagonal of
-    W C Wᵀ. Only the points that attain a maximum therefore pass the linear layer with a gradient. If several points
-    attain a maximum, one of them has the gradient.
+    the mean m and the covariance C of the inputs of the last linear layer, whose weight is W: the mean is W m, the
+    variances are the diagonal of W C Wᵀ. Only the points that attain a maximum therefore pass the linear layer with a
+    gradient. If several points attain a maximum, one of them has the gradient.
 
     Args:
-        network: layers of `layers`.
+        network: repetitions of linear layer, batch norm and ReLU, built by `plugins.encoder.point_sets.layers.layers`.
         values: concatenated points.
         counts: number of points of each cloud.
     """
@@ -62,11 +62,11 @@ def fold_norm(
 
 
 def _shortcut_pays(final: nn.Linear, norm: nn.Module, values: Tensor, counts: Tensor) -> bool:
-    """Return whether the shortcut applies and needs less computation.
+    """Return whether the shortcut of `largest_after` in training can be used and needs less computation.
 
-    The shortcut applies with a gradient, on a CPU, in the layer's own precision. As a share of a pass of all points
-    through the layer, the covariance of the inputs costs columns / channels, and the points that attain a maximum cost
-    clouds / points.
+    It can be used if a gradient is computed, on a CPU, in the layer's own precision. Its costs are shares of the cost
+    of a pass of all points through the linear layer: columns / channels for the covariance of the inputs, and clouds /
+    points for the points that attain a maximum.
     """
     return (
         torch.is_grad_enabled()

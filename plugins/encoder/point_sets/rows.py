@@ -6,7 +6,10 @@ COLOURED = ("x", "y", "z", "red", "green", "blue")
 
 
 def rows(first: CloudRow, second: CloudRow) -> tuple[CloudRow, ...]:
-    """Return the two cases, and two more for the second's network: with attributes, and with only the first points."""
+    """Return `first`, `second`, and two more cases with the settings of `second`.
+
+    One of them also reads attributes; the other reads only the first points of a cloud.
+    """
     small = second.config
     return (
         first,

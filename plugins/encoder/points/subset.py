@@ -20,10 +20,11 @@ def choose_points(
     choice: Choice,
     seed: int,
 ) -> Int[Tensor, "batch count"]:
-    """Return the indices of the chosen points of each cloud; a cloud with fewer points repeats them in the same order.
+    """Return the indices of the chosen points of each cloud.
 
-    "random" chooses without replacement; the choice depends only on the seed and the cloud's size. "farthest" is
-    `framework.geometry.farthest`.
+    If a cloud has fewer than `count` points, its points are repeated in the same order. "random" chooses without
+    replacement; the choice depends only on the seed and the cloud's size. "farthest" chooses points that are as far as
+    possible from the points chosen before (`framework.geometry.farthest`).
 
     Args:
         clouds: (batch, points, columns), padded with NaN.

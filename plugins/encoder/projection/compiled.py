@@ -23,10 +23,10 @@ compiled = compiler(kernel_cache("projection", [Path(__file__)]))
 @compiled
 @no_type_check
 def project(cloud, focal, middle, nearest, farthest, depth, index, image):
-    """Fill `depth`, and either `index` or `image`; the other array is None.
+    """Fill `depth`, and either `index` or `image`; the array that is not filled is None.
 
-    The function decides as `encoder.visible_points_in_torch` does, in float64. A NaN fails every comparison, so that
-    points with NaN are left out.
+    The visible points are those that `encoder.visible_points_in_torch` finds; pixels are computed in float64. Points
+    with NaN are left out, because a NaN fails every comparison.
 
     Args:
         cloud: see the module.
@@ -91,7 +91,10 @@ def halve(depth, index, coarse_depth, coarse_index):
 @compiled
 @no_type_check
 def paint(cloud, index, level, nearest, farthest, image):
-    """Fill the four channels of `image` from an index whose pixels cover 2^level × 2^level pixels of `image`."""
+    """Fill the four channels of `image` with the colours and depths of the points that `index` names.
+
+    Each entry of `index` fills a square of 2^level × 2^level pixels of `image`.
+    """
     span = farthest - nearest
     image[:] = 1.0
     for row in range(image.shape[1]):

@@ -44,7 +44,10 @@ def weights(radius: int) -> np.ndarray:
 
 
 def closing_radius(radius: int) -> int:
-    """Return the radius, pixels, of the morphological closing, which closes gaps up to twice this radius."""
+    """Return the radius, pixels, of the morphological closing for splats of radius `radius`.
+
+    The closing fills gaps that are up to twice as wide as the returned radius.
+    """
     return (3 * radius + 2) // 5
 
 

@@ -55,7 +55,13 @@ class Picture:
 
 @dataclass(frozen=True, kw_only=True)
 class MeshSettings:
-    """Mesh whose vertices are the input; the settings have the same names and meanings as in `human_scans`."""
+    """Settings of the mesh whose vertices are the input; they have the names and meanings of those of `human_scans`.
+
+    Attributes:
+        topology: name of the mesh topology.
+        root: folder of the data set; None if the meshes have the topology of the body model.
+        body: file of the body model; None for the default body.
+    """
 
     topology: Name = "7k"
     root: FilePath | None = None
@@ -150,7 +156,11 @@ class Rasterised(Encoder):
         return features
 
     def _scene(self, cloud: Float[Tensor, "points columns"], row: int) -> Scene:
-        """Return the scene of a cloud; the fourth colour channel is 1 and renders as each pixel's covered share."""
+        """Return the scene that shows the mesh whose vertices are the points of a cloud.
+
+        Colours have a fourth channel, which is 1 everywhere on the mesh, so that its render is the share of each pixel
+        that the mesh covers.
+        """
         vertices, colors = cloud[:, :3].float(), cloud[:, 3:6].float()
         if self.people is None:
             paint = torch.cat([linear_from_srgb(colors), colors.new_ones(len(colors), 1)], 1)
@@ -162,7 +172,10 @@ class Rasterised(Encoder):
 
 
 def load_faces(mesh: MeshSettings) -> Tensor:
-    """Return the triangles, (faces, 3): of the body model's topology, or of a registration if `mesh.root` is set.
+    """Return the triangles of the mesh as vertex indices, (faces, 3).
+
+    If `mesh.root` is set, they are read from the registration of the first training subject in this folder; otherwise
+    they are those of the body model in the topology.
 
     Raises:
         DataError: the body, or the meshes in the folder, are not available.

@@ -135,7 +135,16 @@ class Canvas:
     def _in_boxes(
         self, images: Tensor, boxes: tuple[Box | None, ...], evaluate: Step, empty: Tensor
     ) -> tuple[Tensor, CropReport]:
-        """Return outputs and report, computed one box at a time, so that no image depends on the rest of the batch."""
+        """Return the outputs of the network and the report of the cropped evaluation.
+
+        The boxes are computed one at a time, so that the output of an image does not depend on the rest of the batch.
+
+        Args:
+            images: images as differences from the empty ground.
+            boxes: box of each image that is computed, or None for an empty image.
+            evaluate: function that returns the outputs for a part of an image.
+            empty: outputs for an empty square of `shuffle`² pixels, which are repeated outside the boxes.
+        """
         count, _, height, width = images.shape
         side = empty.shape[-1]
         outputs = empty.new_empty(count, empty.shape[1], height, width)
@@ -154,7 +163,12 @@ class Canvas:
         return outputs, CropReport(boxes, computed, left_out)
 
     def _color(self, raw: Tensor, images: Tensor) -> Tensor:
-        """Return colours and raw scales from the network's output and the images, which are differences from 1."""
+        """Return the colours, followed by the other outputs of the network, which stay raw.
+
+        Args:
+            raw: output of the last convolution.
+            images: images as differences from the empty ground, whose value is 1.
+        """
         if self.residual:
             # Colours may lie a little beyond [0, 1]. They are not clamped: a clamped colour that should become darker
             # than its input would have no gradient.
@@ -180,7 +194,7 @@ def fast_bfloat16(device: torch.device) -> bool:
 
 
 def subject_box(image: Float[Tensor, "channels height width"], stride: int, margin: int) -> Box | None:
-    """Return the box around the pixels that are not 0 in every channel, or None if there are none.
+    """Return the box around the pixels in which at least one channel is not 0, or None if there are no such pixels.
 
     The box is widened by `margin` pixels within the image, then to multiples of `stride`.
     """
@@ -198,10 +212,18 @@ def subject_box(image: Float[Tensor, "channels height width"], stride: int, marg
 def build_head(
     channels: int, size: int, colors: int, scales: int, pixels: int = 1, *, residual: bool = False
 ) -> nn.Conv2d:
-    """Return the last convolution, from maps to the colours and scales of `pixels` pixels at each position.
+    """Return the last convolution of a U-Net, from maps to raw colours and logarithms of scales.
 
     Before training, its output for an empty image is 0 for colours and EMPTY_LOG_SCALE for scales. With `residual`,
     this is its output for every image before training.
+
+    Args:
+        channels: number of channels of the maps.
+        size: side of the kernel, pixels.
+        colors: number of colours of a pixel.
+        scales: number of scales of a pixel.
+        pixels: number of pixels whose colours and scales are outputs at each position of the maps.
+        residual: whether the outputs are added to the input's colours.
     """
     convolution = nn.Conv2d(channels, (colors + scales) * pixels, size)
     assert convolution.bias is not None

@@ -19,14 +19,18 @@ Normalisation = Literal["batch", "renorm", "group"]
 Step = Callable[[Tensor], Tensor]
 EPSILON = 1e-5
 SLOWEST = 0.02
-"""Smallest share of a batch in the running moments; until it is reached, they are the mean over all batches so far."""
+"""Smallest weight of the newest batch in the running moments.
+
+The weight of batch number n is 1/n as long as this is larger, so that the running moments of the first batches are
+means over all batches so far.
+"""
 LARGEST_RATIO, LARGEST_SHIFT = 3.0, 5.0
 """Bounds on the factor and on the shift with which batch renormalisation corrects a batch (Ioffe 2017, §4)."""
 GROUPS = 8
 
 
 class Layer(nn.Module):
-    """A convolution, normalisation and ReLU of differences from the empty ground.
+    """A convolution, normalisation and ReLU, applied to maps that are differences from the empty ground.
 
     Args:
         size: side of the kernel, pixels; 3 keeps the size of the image, 2 halves it.
@@ -54,7 +58,10 @@ class Layer(nn.Module):
             self.register_buffer("batches", torch.zeros((), dtype=torch.long))
 
     def forward(self, maps: Float[Tensor, "batch channels height width"]) -> Tensor:
-        """Return the maps after the layer in training; with "group" normalisation, evaluation is the same."""
+        """Return the output maps of the layer in training; with "group", evaluation computes the same.
+
+        With "batch" and "renorm", evaluation uses the function that `fold` returns.
+        """
         return self._normalise(convolve(maps, self.weight, None, self.stride))
 
     def fold(self, dtype: torch.dtype) -> Step:
@@ -150,7 +157,7 @@ class FromGround(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Return the gradients in the maps, the gain and the offset, and None for the other arguments."""
+        """Return the gradients with respect to maps, gain and offset, and None for the other arguments."""
         rectified, standard, gain, mean, inverse, shift = ctx.saved_tensors
         count = gradient.numel() // gradient.shape[1]
         of_ground = -_sum(gradient, gain.dtype) * (shift > 0)
@@ -173,7 +180,11 @@ def _per_channel(values: Tensor, maps: Tensor) -> Tensor:
 
 
 def _sum(maps: Tensor, dtype: torch.dtype) -> Float[Tensor, " channels"]:
-    """Return the sum of each channel; the summed rows are contiguous if channels are last."""
+    """Return the sum of each channel over all pixels of all images.
+
+    The maps are summed as rows with one number for each channel. If the maps are stored with channels last, these rows
+    are contiguous in memory, and nothing is copied.
+    """
     return maps.permute(0, 2, 3, 1).reshape(-1, maps.shape[1]).sum(0, dtype=dtype)
 
 
