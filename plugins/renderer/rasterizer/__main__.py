@@ -113,7 +113,7 @@ def parse_color(text: str) -> tuple[int, int, int] | None:
 
 
 def parse_channel(text: str) -> str:
-    """Return the name of a channel, after checking that the renderer draws this channel."""
+    """Check that the renderer can draw the channel named `text`, and return the name."""
     known = sorted(Rasterizer.channels)
     if text not in known:
         near = did_you_mean(text, known)
@@ -261,7 +261,7 @@ def check_arguments(options: argparse.Namespace, out: Path) -> None:
     """Check the arguments, before any file is read.
 
     Raises:
-        ConfigError: the arguments contradict each other or `out`.
+        ConfigError: two arguments contradict each other, or an argument does not fit the type of the file `out`.
     """
     suffix = out.suffix.lower()
     if suffix not in pictures.SUFFIXES:
@@ -297,7 +297,13 @@ def check_arguments(options: argparse.Namespace, out: Path) -> None:
 
 
 def make_camera(options: argparse.Namespace, sphere: turntable.BoundingSphere, up: Axis) -> Camera:
-    """Return the camera that a file or the arguments describe."""
+    """Return the camera from the file `options.camera`; without a file, the camera that the other arguments describe.
+
+    Args:
+        options: arguments of the command.
+        sphere: sphere around the subject, which the camera looks at.
+        up: the scene's vertical axis.
+    """
     if options.camera is not None:
         return turntable.read_camera(options.camera)
     chosen = {name: getattr(options, name) for name in DEFAULT_VIEW}
@@ -308,7 +314,11 @@ def make_camera(options: argparse.Namespace, sphere: turntable.BoundingSphere, u
 
 
 def check_size(camera: Camera, options: argparse.Namespace, out: Path) -> None:
-    """Check that the image is not too large, and that its file format supports its size."""
+    """Check that the image is not too large, and that the format of the file `out` supports its size.
+
+    Raises:
+        ConfigError: the image has too many samples, or is a video whose width or height is odd.
+    """
     samples = camera.height * camera.width * options.supersampling**2
     if samples > MOST_SAMPLES:
         raise ConfigError(

@@ -15,13 +15,14 @@ from plugins.renderer.rasterizer.raster import SUBPIXELS, compiled
 from plugins.renderer.rasterizer.shading import fill_color, weights_in_space
 
 MOST_FACES = 1000
-"""Largest number of faces that are followed between two neighbouring pixels."""
+"""Largest number of faces that `find_edge` follows between two neighbouring pixels."""
 
 
 def find_adjacent_faces(faces):
-    """Return the neighbouring face at each edge of each face, (faces, 3); edge i runs from corner i to the next corner.
+    """Return the index of the neighbouring face at each edge of each face, (faces, 3).
 
-    The entry is -1 if an edge has no neighbouring face, or more than one.
+    Edge i of a face runs from corner i to the next corner. The entry is -1 if an edge has no neighbouring face, or more
+    than one.
     """
     start, end = faces.astype(np.int64), np.roll(faces, -1, 1).astype(np.int64)
     key = (np.minimum(start, end) * (faces.max(initial=0) + 1) + np.maximum(start, end)).ravel()
@@ -90,9 +91,15 @@ def boundary(
 @compiled
 @no_type_check
 def are_separate(depth, other_depth, footprint):
-    """Return whether neighbouring pixels may show separate surfaces: whether their depths differ by a pixel's width.
+    """Return whether two neighbouring pixels may show separate surfaces.
 
-    The width is measured at the distance of the farther surface; `footprint` is this width per metre of distance.
+    They may if their depths differ by more than the width of a pixel at the farther of the two depths, or if one of
+    them shows the background.
+
+    Args:
+        depth: depth at one pixel, metres; infinite for background.
+        other_depth: depth at the other pixel.
+        footprint: width of a pixel, in metres per metre of depth.
     """
     return (
         abs(depth - other_depth) > footprint * max(depth, other_depth)
@@ -104,14 +111,22 @@ def are_separate(depth, other_depth, footprint):
 @compiled
 @no_type_check
 def find_edge(screen, faces, adjacent, index, goal, pixels):
-    """Follow the nearer surface face by face, from its pixel towards the other pixel, to the edge where it ends.
+    """Find the edge between two neighbouring pixels at which the nearer surface ends.
 
-    The surface ends at an edge without a neighbouring face, or with a neighbouring face that faces away. The other
-    pixel shows the face `goal`.
+    The surface is followed face by face, from the pixel that shows it to the other pixel. It ends at an edge without a
+    neighbouring face, or with a neighbouring face that faces away.
+
+    Args:
+        screen: see `raster`.
+        faces: (faces, 3), indices of vertices.
+        adjacent: result of `find_adjacent_faces`.
+        index: face at the pixel that shows the nearer surface.
+        goal: face at the other pixel.
+        pixels: row and column of the pixel that shows the nearer surface, row and column of the other pixel.
 
     Returns:
-        Index of the last face, or -1 if there is no such edge; number of the edge in this face; position of the edge
-        between the two pixels, 0 to 1.
+        Index of the last face of the surface, or -1 if the surface does not end between the pixels; number of the edge
+        in this face; position of the edge between the two pixels, 0 to 1.
     """
     row, column, other_row, other_column = pixels
     facing = signed_area(screen, faces, index)
@@ -131,7 +146,17 @@ def find_edge(screen, faces, adjacent, index, goal, pixels):
 @compiled
 @no_type_check
 def add_edge_gradient(pixels, end, surfaces, image, grad_points, grad_lens, edge_colors):
-    """Add the contribution of a pair of neighbouring pixels; `end` is the edge between them from `find_edge`."""
+    """Add the contribution of a pair of neighbouring pixels to `grad_points` and `grad_lens`.
+
+    Args:
+        pixels: row and column of the pixel that shows the nearer surface, row and column of the other pixel.
+        end: edge between the two pixels, as `find_edge` returns it.
+        surfaces: camera points, screen, faces, colours, texture and lens.
+        image: visible faces, depths, `single_sample` and `grad_image` of `boundary`.
+        grad_points: gradient of the loss with respect to the vertices in camera coordinates.
+        grad_lens: gradient of the loss with respect to the lens.
+        edge_colors: working array, (1, 2, channels).
+    """
     row, column, other_row, other_column = pixels
     index, corner, share = end
     camera_points, screen, faces, colors, texture, lens = surfaces
@@ -202,7 +227,11 @@ def signed_area(screen, faces, index):
 @compiled
 @no_type_check
 def find_exit(screen, faces, index, facing, row, column, other_row, other_column):
-    """Return the edge (-1: none) through which the line between two pixels leaves a face, and its position, 0 to 1."""
+    """Return the edge through which the line from a pixel to another pixel leaves a face, and where on the line.
+
+    The edge is -1 if the line does not cross an edge outwards. The second number is the position of the crossing on the
+    line: 0 at the first pixel, 1 at the other pixel. `facing` is the `signed_area` of a face of the same surface.
+    """
     share, exit_corner = np.inf, -1
     for corner in range(3):
         a, b = faces[index, corner], faces[index, (corner + 1) % 3]
@@ -216,7 +245,10 @@ def find_exit(screen, faces, index, facing, row, column, other_row, other_column
 @compiled
 @no_type_check
 def side(screen, a, b, row, column):
-    """Return twice the signed area of the triangle of an edge and a pixel; its sign is the pixel's side of the edge."""
+    """Return twice the signed area of the triangle of the vertices `a` and `b` and a pixel.
+
+    The sign says on which side of the edge from `a` to `b` the pixel lies.
+    """
     x, y = column * SUBPIXELS, row * SUBPIXELS
     return (screen[a, 0] - x) * (screen[b, 1] - y) - (screen[b, 0] - x) * (screen[a, 1] - y)
 

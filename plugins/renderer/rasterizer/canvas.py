@@ -42,7 +42,7 @@ def bits(array: np.ndarray) -> np.ndarray:
 
 
 class Corners:
-    """Three indices per face in the form that kernels read.
+    """Three indices per face, of vertices or of texture coordinates, in the form that compiled functions read.
 
     Attributes:
         array: (faces, 3) int32; meaningless if an index does not fit int32, which `largest` shows.
@@ -73,7 +73,10 @@ class MeshCache:
         self._meshes: list[Corners] = []
 
     def find(self, indices: np.ndarray) -> Corners:
-        """Return the `Corners` of indices, (faces, 3), of vertices or of texture coordinates."""
+        """Return the `Corners` of `indices`, (faces, 3), from the cache if it holds them.
+
+        The indices are those of vertices or of texture coordinates.
+        """
         for mesh in self._meshes:
             if mesh.equals(indices):
                 if mesh is not self._meshes[0]:
@@ -160,7 +163,7 @@ class Canvas:
         self._shown_mesh, self.box = None, (0, height, 0, width)  # safe if drawing fails before `record_mesh`
 
     def empty_tiles(self) -> Tiles:
-        """Return the tiles (see `raster.rasterise`) in the state of an image that shows only background."""
+        """Return the arrays `farthest`, `empty` and `changed` of `raster.rasterise` for an image of only background."""
         farthest, empty, changed = self.tiles
         farthest.fill(np.inf)
         changed.fill(0)

@@ -288,7 +288,14 @@ def to_corners(name: str, face_indices: Tensor, count: int, of: str, mesh_cache:
 
 
 def describe_out_of_range(name: str, face_indices: Tensor, count: int, of: str) -> str:
-    """Return the message about indices out of range; `of` names what they refer to."""
+    """Return the message about `face_indices` that are negative or not below `count`.
+
+    Args:
+        name: name of the indices.
+        face_indices: the indices.
+        count: number of elements that the indices refer to.
+        of: name of these elements, such as "vertices".
+    """
     return (
         f"{name} refer to the {of} {int(face_indices.min())} to {int(face_indices.max())}, expected 0 to {count - 1}, "
         "since the scene has "
@@ -305,7 +312,9 @@ def texture_tensors(texture: Texture) -> dict[str, Tensor]:
 
 
 def check_texture(texture: Texture, count: int, channels: int | None) -> Texture:
-    """Return a texture on any device in number types that kernels read, after all checks but that of `texture.faces`.
+    """Check a texture on any device, and return it in number types that compiled functions read.
+
+    The indices `texture.faces` are not checked here.
 
     Args:
         texture: the texture.

@@ -10,14 +10,15 @@ from plugins.renderer.rasterizer.raster import FARTHEST, compiled, on_screen
 @compiled
 @no_type_check
 def clip(camera_points, faces, focal, principal, near):
-    """Return the visible parts of all faces that the near plane cuts.
+    """Return the visible parts of all faces that the near plane cuts, as triangles.
 
-    A face with one corner in front of the plane leaves one triangle; a face with two such corners leaves two. A new
-    corner on an edge is computed from the edge's vertices in the order of their indices, so that neighbouring faces get
-    the same corner.
+    The visible part of a face with one corner in front of the plane is one triangle; that of a face with two such
+    corners is divided into two triangles. A new corner on an edge is computed from the edge's vertices in the order of
+    their indices, so that neighbouring faces get the same corner.
 
     Returns:
-        (corners, 5) rows of `screen`; (parts, 3) triangles as indices of these rows; (parts) index of each part's face.
+        Corners of the triangles, (corners, 5), as rows of `screen` (see `raster`); triangles as indices of these rows,
+        (triangles, 3); index of the face that each triangle is a part of, (triangles,).
     """
     count = 0
     for index in range(faces.shape[0]):
@@ -60,7 +61,7 @@ def clip(camera_points, faces, focal, principal, near):
 @compiled
 @no_type_check
 def is_in_front(camera_points, vertex, near):
-    """Return whether a vertex is in front of the near plane."""
+    """Return whether a vertex is on the visible side of the near plane: whether its depth is at least `near`."""
     return camera_points[vertex, 2] >= near
 
 

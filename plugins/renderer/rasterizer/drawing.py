@@ -105,7 +105,14 @@ class RenderedImage:
 
 
 def draw(scene: SceneArrays, settings: DrawingSettings, pool: list[Canvas], learning: bool) -> RenderedImage:
-    """Draw the channels of an image; `learning` also prepares the data that the gradient needs."""
+    """Draw the channels of an image.
+
+    Args:
+        scene: inputs of the image.
+        settings: settings of the image.
+        pool: canvases that are not in use.
+        learning: whether to prepare also the data that the gradient needs.
+    """
     lease = CanvasLease(pool)
     canvas, (height, width), faces = lease.canvas, settings.size, settings.faces.array
     numbers = allocate_channels(scene, settings)
@@ -158,7 +165,11 @@ def is_out_of_view(scene: SceneArrays, settings: DrawingSettings) -> bool:
 
 
 def place_vertices(scene: SceneArrays, settings: DrawingSettings, canvas: Canvas) -> bool:
-    """Project the vertices onto the canvas; return whether the canvas already held the same projection."""
+    """Project the vertices onto the canvas, unless it already holds the same projection.
+
+    Returns:
+        Whether the canvas already held the projection.
+    """
     if "unchanged" not in settings.savings:
         canvas.forget()
     pose = np.concatenate([scene.rotation.ravel(), scene.translation, scene.lens, [settings.near]])
@@ -195,9 +206,11 @@ def rasterise_faces(
     mask_only: np.ndarray | None,
     counts: np.ndarray,
 ) -> Box:
-    """Draw all faces on the canvas, or only into a mask, and add to `counts` as `raster.rasterise` does.
+    """Draw all faces and return the box of the pixels that may show a face.
 
-    The visible parts of faces that the near plane cuts are also drawn.
+    The visible parts of faces that the near plane cuts are also drawn. The faces are drawn on the canvas, or, if
+    `mask_only` is given, only into this mask. The number of faces with each outcome is added to `counts`, as in
+    `raster.rasterise`.
     """
     faces, box = settings.faces.array, (settings.size[0], 0, settings.size[1], 0)
     tiles = None
@@ -236,7 +249,7 @@ def rasterise_faces(
 def fill_channels(
     scene: SceneArrays, settings: DrawingSettings, canvas: Canvas, numbers: dict[str, np.ndarray], box: Box
 ) -> None:
-    """Fill the channels, except soft colours, from the visible faces."""
+    """Fill the channels in `numbers` from the visible faces; colours are not filled if the gradient is "soft"."""
     top, bottom, left, right = box
     part = (slice(top, bottom), slice(left, right))
     if "face" in numbers:

@@ -21,9 +21,10 @@ from plugins.renderer.rasterizer.textures import (
 )
 
 FLATTEST = 1e-12
-"""Smallest Σ m relative to its terms.
+"""Smallest |Σ m| as a share of the sum of the absolute values of its terms.
 
-A face with a smaller value is seen edge-on, and its gradient with respect to positions is meaningless.
+A face with a smaller share is seen edge-on, and its gradient with respect to positions is meaningless. Σ m is defined
+in the module's docstring.
 """
 
 
@@ -37,7 +38,7 @@ def cross(a0, a1, a2, b0, b1, b2):
 @compiled
 @no_type_check
 def add_scaled(to, vertex, scale, x, y, z):
-    """Add the vector (x, y, z), multiplied by `scale`, to the row of a vertex."""
+    """Add the vector (x, y, z), multiplied by `scale`, to row `vertex` of the array `to`."""
     to[vertex, 0] += scale * x
     to[vertex, 1] += scale * y
     to[vertex, 2] += scale * z
@@ -147,10 +148,10 @@ def interior(
 @compiled
 @no_type_check
 def ray_beside(camera_points, faces, index, sums, slot, w0, w1, w2, inverse):
-    """Return the ray (x, y) to the point of a face at barycentric weights, and 1 / Σ m for this ray.
+    """Return x and y of the ray (x, y, 1) to the point of a face with weights w0, w1, w2, and 1 / Σ m for this ray.
 
-    `sums` and `slot` are as in `start_sums`. `inverse` is 1 / Σ m at a pixel beside the face; it is 0 if the face is
-    seen edge-on, and then all results are 0.
+    `sums` and `slot` are as in `start_sums`. `inverse` is 1 / Σ m for the ray through the pixel beside the face. It is
+    0 if the face is seen edge-on; all three returned numbers are then 0.
     """
     a, b, c = faces[index, 0], faces[index, 1], faces[index, 2]
     x = w0 * camera_points[a, 0] + w1 * camera_points[b, 0] + w2 * camera_points[c, 0]
@@ -174,10 +175,12 @@ def ray_beside(camera_points, faces, index, sums, slot, w0, w1, w2, inverse):
 @compiled
 @no_type_check
 def start_sums(camera_points, faces, index, sums, slot):
-    """Initialise the row of sums of a face.
+    """Initialise row `slot` of `sums`, in which the terms of all pixels of the face `index` are added up.
 
-    Columns 0 to 8 hold B×C, C×A, A×B. Columns 9 to 17 hold Σ d r over the pixels, for the gradients d with respect to
-    m_0, m_1 and m_2. Column 18 holds Σ (gradient with respect to depth) / Σ m, and column 19 holds A·(B×C).
+    Columns 0 to 8 hold B×C, C×A, A×B, where A, B, C are the corners of the face. Columns 9 to 17 are for Σ d r over the
+    pixels, where d is the gradient of the loss with respect to m_0, m_1 or m_2, and r is the pixel's ray. Column 18 is
+    for the sum over the pixels of (gradient with respect to depth) / Σ m. Column 19 holds A·(B×C). Columns 9 to 18
+    begin at 0.
     """
     a, b, c = faces[index, 0], faces[index, 1], faces[index, 2]
     ax, ay, az = camera_points[a, 0], camera_points[a, 1], camera_points[a, 2]
@@ -194,7 +197,11 @@ def start_sums(camera_points, faces, index, sums, slot):
 @compiled
 @no_type_check
 def add_face_gradient(camera_points, faces, index, sums, slot, lens, grad_points, grad_lens):
-    """Add the sums of a face to the gradients of its corners and the lens (∂m_0/∂B = C×r, ∂m_0/∂C = r×B etc.)."""
+    """Add the gradient of a face, computed from its row of `sums`, to `grad_points` and `grad_lens`.
+
+    The derivatives are ∂m_0/∂B = C×r, ∂m_0/∂C = r×B, and likewise for m_1 and m_2. `sums` and `slot` are as in
+    `start_sums`.
+    """
     a, b, c = faces[index, 0], faces[index, 1], faces[index, 2]
     ax, ay, az = camera_points[a, 0], camera_points[a, 1], camera_points[a, 2]
     bx, by, bz = camera_points[b, 0], camera_points[b, 1], camera_points[b, 2]
@@ -230,7 +237,9 @@ def add_face_gradient(camera_points, faces, index, sums, slot, lens, grad_points
 @compiled
 @no_type_check
 def add_texture_gradient(faces, colors, texture, face_weights, pixel, grad_colors, grad_texels, grad_uv):
-    """Add the gradients of one pixel with respect to colours, texels and uv; return the gradients in its three weights.
+    """Add the gradients of one pixel to `grad_colors`, `grad_texels` and `grad_uv`, and return those of its weights.
+
+    The returned numbers are the gradients of the loss with respect to the pixel's three barycentric weights.
 
     `face_weights` holds the index of the face and its barycentric weights. `pixel` holds the gradient of the loss with
     respect to the image, (height, width, channels), and the row and column of the pixel.

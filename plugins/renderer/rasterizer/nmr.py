@@ -41,7 +41,10 @@ def add_edge_gradients(
     grad_points: np.ndarray,
     grad_lens: np.ndarray,
 ) -> None:
-    """Add the gradient from all pixels on all edges, along rows and along columns, to `grad_points` and `grad_lens`."""
+    """Add the gradient that comes from moving edges to `grad_points` and `grad_lens`.
+
+    All pairs of a pixel and an edge contribute, along the rows and along the columns of the image.
+    """
     for axis in (0, 1):
         if axis == 1:
             face = np.ascontiguousarray(face.T)
@@ -56,11 +59,13 @@ def add_edge_gradients(
 @compiled
 @no_type_check
 def collect_gradient_pixels(face, color, grad_image):
-    """Return the pixels with a gradient g that is not 0, line by line.
+    """Return the pixels at which the gradient of the loss with respect to the colour is not 0, line by line.
+
+    These are the stored pixels. I is the colour of a pixel, and g is the gradient with respect to it.
 
     Returns:
         before: (lines, length + 1), number of stored pixels before each pixel.
-        pixel_positions, owner, value: position, face and I · g of each stored pixel.
+        pixel_positions, owner, value: for each stored pixel its position, the face that it shows, and I · g.
         slopes: (channels, stored pixels), g.
     """
     lines, length = face.shape
@@ -96,7 +101,11 @@ def collect_gradient_pixels(face, color, grad_image):
 def sum_line_gradients(
     axis, screen, faces, face, color, before, pixel_positions, owner, value, slopes, grad_position
 ):
-    """Add the gradient with respect to each vertex's position along the lines, per pixel, to `grad_position`."""
+    """Add the gradient of the loss with respect to each vertex's position along the lines to `grad_position`.
+
+    Its unit is loss per pixel of motion. `axis` is 0 if the lines are rows, and 1 if they are columns. The other
+    arguments are those of `add_edge_gradients`, and the results of `collect_gradient_pixels`.
+    """
     lines, length = face.shape
     least = LEAST_DISTANCE * length / 2
     shown = np.zeros(faces.shape[0], np.bool_)
@@ -177,9 +186,23 @@ def sum_line_gradients(
 def sum_gains(
     first, last, number, painted, crossing, share, least, pixel_positions, owner, value, slopes, gains
 ):
-    """Return the decrease of the loss per pixel of motion, for each end of an edge, summed over stored pixels.
+    """Return the decrease of the loss per pixel of motion of the start and of the end of an edge.
 
-    The sum runs over the stored pixels from `first` to `last` - 1 that show the face `number` (-1: any face).
+    The decrease is summed over the stored pixels from `first` to `last` - 1 that show the face `number` (-1: any face).
+
+    Args:
+        first: index of the first stored pixel.
+        last: index after the last stored pixel.
+        number: face that the pixels must show, or -1.
+        painted: colour that the pixels change to.
+        crossing: position at which the edge crosses the line.
+        share: motion of the crossing for a motion of 1 of the edge's start; for the edge's end it is 1 - `share`.
+        least: distance that is added to every distance, pixels.
+        pixel_positions: see `collect_gradient_pixels`.
+        owner: see `collect_gradient_pixels`.
+        value: see `collect_gradient_pixels`.
+        slopes: see `collect_gradient_pixels`.
+        gains: working array.
     """
     count = last - first
     gains = gains[:count]
@@ -209,7 +232,11 @@ def sum_gains(
 @compiled
 @no_type_check
 def add_to_camera(camera_points, axis, grad_position, lens, grad_points, grad_lens):
-    """Convert gradients with respect to positions along a screen axis; add them to `grad_points` and `grad_lens`."""
+    """Convert `grad_position` into gradients with respect to camera points and lens, and add them to the arrays.
+
+    `grad_position` is the gradient with respect to the vertices' positions along the screen axis `axis`, per pixel. The
+    arrays are `grad_points` and `grad_lens`.
+    """
     for vertex in range(grad_position.shape[0]):
         if grad_position[vertex] != 0:
             add_screen_gradient(

@@ -33,9 +33,10 @@ MOST_AROUND = 32
 
 @dataclass(frozen=True)
 class Stage:
-    """A scene prepared for drawing in colour, with coverage as the last colour channel.
+    """A scene prepared for drawing in colour.
 
     Attributes:
+        scene: the scene; its last colour channel is 1 everywhere, and renders as the covered share of each pixel.
         normals: unit normals of the vertices that are shaded by a light at the camera, 0 for the other vertices; None
             if no vertex is shaded.
     """
@@ -44,7 +45,7 @@ class Stage:
     normals: Float[Tensor, "vertices 3"] | None
 
     def lit_scene(self, camera: Camera) -> Scene:
-        """Return the scene with this camera, and with colours lit from the camera (Lambert's law, both sides)."""
+        """Return the scene as `camera` sees it, with a light at the camera that shades both sides by Lambert's law."""
         scene = replace(self.scene, camera=camera)
         if self.normals is None or scene.colors is None:
             return scene
@@ -191,7 +192,7 @@ INTEGER_IMAGES: dict[str, Callable[[Tensor], NDArray]] = {
     "normal": normal_image,
     "uv": uv_image,
 }
-"""Functions that encode a channel as integers of an image file; colour is encoded by `color_image`."""
+"""Functions that encode a channel as the integers of an image file, by channel; `color_image` encodes colours."""
 SUFFIXES = (".png", ".gif", ".mp4", ".npy")
 
 

@@ -40,7 +40,7 @@ REASONS = {BEHIND: "behind", FLAT: "flat", BACK: "back", OUTSIDE: "outside", HID
 
 # Without fastmath: products must be rounded before they are subtracted, see `_draw_far`.
 KERNELS = "boundary", "canvas", "clipping", "interior", "nmr", "raster", "shading", "soft", "textures"
-"""Files whose compiled functions call each other."""
+"""Names of the files whose compiled functions call each other."""
 KEPT_IN = kernel_cache("rasterizer", (Path(__file__).with_name(f"{name}.py") for name in KERNELS))
 compiled = compiler(KEPT_IN)
 
@@ -48,7 +48,10 @@ compiled = compiler(KEPT_IN)
 @compiled
 @no_type_check
 def largest_index(indices):
-    """Return the largest index; the integers are unsigned views, so that a negative index becomes a very large one."""
+    """Return the largest of the unsigned integers `indices`.
+
+    The caller reads signed indices as unsigned integers with the same bits, so that a negative index is very large.
+    """
     largest = indices.dtype.type(0)
     for index in indices:
         largest = max(largest, index)
@@ -122,7 +125,10 @@ def project(vertices, rotation, translation, focal, principal, near, camera_poin
 @compiled
 @no_type_check
 def on_screen(x, y, z, focal, principal, near, row_of_screen):
-    """Fill a row of `screen` from camera coordinates."""
+    """Fill a row of `screen` (see the module) from the camera coordinates x, y, z of a vertex.
+
+    The row is 0 if the vertex cannot be drawn: if it is nearer than `near`, too far away, or not finite.
+    """
     inverse = 1.0 / z
     column = (focal[0] * x * inverse + principal[0]) * SUBPIXELS
     row = (focal[1] * y * inverse + principal[1]) * SUBPIXELS
@@ -137,9 +143,11 @@ def on_screen(x, y, z, focal, principal, near, row_of_screen):
 @compiled
 @no_type_check
 def owns_edge(along_column, along_row):
-    """Return whether pixel centres exactly on an edge belong to the triangle (top-left rule).
+    """Return whether a pixel centre that lies exactly on an edge belongs to the edge's triangle (top-left rule).
 
-    The arguments are the derivatives of the edge function along columns and rows.
+    Args:
+        along_column: derivative of the edge function with respect to the column.
+        along_row: derivative of the edge function with respect to the row.
     """
     return along_column > 0 or (along_column == 0 and along_row > 0)
 
@@ -156,10 +164,10 @@ def comes_before(x, y, other_x, other_y):
 def rasterise(
     screen, faces, first, numbers, cull, height, width, depth, face, mask, farthest, empty, changed, counts
 ):
-    """Draw faces into `depth` and `face`, or only into `mask`, and return the box of the pixels.
+    """Draw faces into `depth` and `face`, or only into `mask`, and return the box of pixels that may show a face.
 
     Each pixel shows the nearest face; among equal float32 depths, it shows the face with the lowest number. The arrays
-    may already show other faces.
+    may already show faces of an earlier call.
 
     Args:
         screen: corners, see the module.
@@ -291,7 +299,13 @@ def rasterise(
 @compiled
 @no_type_check
 def is_hidden(farthest, pixels, nearest):
-    """Return whether the tiles show that every pixel of a box has a depth below `nearest`."""
+    """Return whether every pixel of a box certainly has a depth below `nearest`, by the bounds in `farthest`.
+
+    Args:
+        farthest: upper bound of the depths in each tile of `TILE` × `TILE` pixels.
+        pixels: first row, last row, first column, last column of the box.
+        nearest: smallest depth of the face that would be drawn, metres.
+    """
     first_row, last_row, first_column, last_column = pixels
     for row in range(first_row // TILE, last_row // TILE + 1):
         for column in range(first_column // TILE, last_column // TILE + 1):
@@ -303,10 +317,10 @@ def is_hidden(farthest, pixels, nearest):
 @compiled
 @no_type_check
 def update_tiles(farthest, empty, changed, pixels, written, depth):
-    """Record that `written` pixels of a box were written, and update the largest depths of its tiles.
+    """Record that `written` pixels of the box `pixels` were written, and update `farthest` for the tiles of the box.
 
-    The largest depth of a tile is computed when all its pixels show a face for the first time, and again whenever as
-    many pixels were written as the tile has.
+    The largest depth of a tile is computed when all pixels of the tile show a face for the first time. It is computed
+    again whenever as many pixels have been written since then as the tile has. The arrays are those of `rasterise`.
     """
     first_row, last_row, first_column, last_column = pixels
     for row in range(first_row // TILE, last_row // TILE + 1):
@@ -327,9 +341,10 @@ def update_tiles(farthest, empty, changed, pixels, written, depth):
 @compiled
 @no_type_check
 def front_to_back(screen, faces, cull, height, width, depth, face, farthest, empty, changed, counts):
-    """Draw like `rasterise`, but in runs of `RUN` faces from near to far, and return the box.
+    """Draw faces like `rasterise`, from near to far, and return the box of pixels that may show a face.
 
-    All faces of a run that is completely hidden are counted as hidden.
+    `RUN` consecutive faces form a run. The runs are sorted by their nearest depth. If the box around a run is
+    completely hidden, the run is not drawn, and all its faces are counted as hidden.
     """
     runs = (faces.shape[0] + RUN - 1) // RUN
     last_x, last_y = (width - 1) * SUBPIXELS, (height - 1) * SUBPIXELS
@@ -405,7 +420,11 @@ def _draw_far(corners, pixels, number, depth, face, mask):
 @compiled
 @no_type_check
 def edges(ax, ay, bx, by, cx, cy, row, column):
-    """Return the edge functions x1 y2 - x2 y1 of a triangle, relative to a pixel; the i-th is opposite corner i."""
+    """Return the three edge functions of the triangle (ax, ay), (bx, by), (cx, cy) at a pixel.
+
+    The i-th one is that of the edge opposite corner i. It is x1 y2 - x2 y1 for an edge from (x1, y1) to (x2, y2), in
+    coordinates relative to the pixel.
+    """
     x, y = column * SUBPIXELS, row * SUBPIXELS
     ax, ay, bx, by, cx, cy = ax - x, ay - y, bx - x, by - y, cx - x, cy - y
     return bx * cy - cx * by, cx * ay - ax * cy, ax * by - bx * ay
@@ -414,7 +433,10 @@ def edges(ax, ay, bx, by, cx, cy, row, column):
 @compiled
 @no_type_check
 def to_edge(ax, ay, bx, by, x, y):
-    """Return the squared distance from a point to an edge, and the position of the nearest point on it, 0 to 1."""
+    """Return the squared distance from (x, y) to the edge from a to b, and the nearest point's position on the edge.
+
+    The position is 0 at a and 1 at b.
+    """
     ux, uy, vx, vy = bx - ax, by - ay, x - ax, y - ay
     length = ux * ux + uy * uy
     part = min(max((ux * vx + uy * vy) / length, 0.0), 1.0) if length > 0 else 0.0

@@ -121,7 +121,12 @@ def split_by_pixel_count(counts: Tensor) -> Iterator[Tensor]:
 
 
 def box_pixels(low: Tensor, sides: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return box index, column and row of every pixel of every box."""
+    """Return three tensors with one entry for each pixel of each box: index of the box, column and row of the pixel.
+
+    Args:
+        low: smallest column and row of each box, (boxes, 2).
+        sides: number of columns and of rows of each box, (boxes, 2).
+    """
     counts = sides.prod(1)
     part = torch.arange(len(counts), device=counts.device).repeat_interleave(counts)
     offset = torch.arange(len(part), device=counts.device) - (counts.cumsum(0) - counts)[part]
@@ -162,7 +167,9 @@ def compute_weights(camera_points: Tensor, corners: Tensor, lens: Tensor, pixels
 
 
 def triple_products(normals: Tensor, lens: Tensor, pixels: Tensor, absolute: bool = False) -> Tensor:
-    """Return r·n (pixels, 3) for rays r through `pixels` (pixels, 2) and three normals n each, (pixels, 3, 3).
+    """Return the products r·n, (pixels, 3), of the ray r through each pixel and each of the pixel's three normals n.
+
+    The pixels are given as `pixels`, (pixels, 2), column and row. Their normals are `normals`, (pixels, 3, 3).
 
     If `absolute` is true, return the sums of the absolute values of the terms.
     """
@@ -174,7 +181,17 @@ def triple_products(normals: Tensor, lens: Tensor, pixels: Tensor, absolute: boo
 def find_nearest_on_border(
     camera_points: Tensor, corners: Tensor, lens: Tensor, pixels: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return the nearest points on the borders of faces to pixels, (pixels, 2), and their weights, (pixels, 3)."""
+    """Return the point on the border of a face that is nearest, on the screen, to each pixel.
+
+    Args:
+        camera_points: (vertices, 3), vertices in camera coordinates.
+        corners: (pixels, 3), vertex indices of the face of each pixel.
+        lens: fx, fy, cx, cy, pixels.
+        pixels: (pixels, 2), column and row.
+
+    Returns:
+        Column and row of the nearest points, (pixels, 2), and their barycentric weights in space, (pixels, 3).
+    """
     corner = camera_points[corners]
     start = lens[:2] * corner[..., :2] / corner[..., 2:] + lens[2:]
     along = start.roll(-1, 1) - start

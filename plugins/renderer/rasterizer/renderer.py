@@ -81,7 +81,10 @@ class Rasterizer(Renderer):
     def batch(
         self, scenes: Sequence[Scene], channels: Collection[str] = ("color",)
     ) -> list[dict[str, Tensor]]:
-        """Draw several scenes in parallel on as many threads as torch uses; `report` describes the last scene."""
+        """Draw several scenes in parallel on as many threads as torch uses.
+
+        The attribute `report` then describes the last scene.
+        """
         learning = torch.is_grad_enabled()
         results: list[tuple[dict[str, Tensor], Report | None]] = [({}, None)] * len(scenes)
 
@@ -156,9 +159,10 @@ class Rasterizer(Renderer):
 
 
 def group_by_samples(channels: Collection[str], supersampling: int) -> list[tuple[tuple[str, ...], int]]:
-    """Return groups of channels that are drawn together, with the samples per pixel along each axis of each group.
+    """Return groups of channels that are drawn together, each with its number of samples per pixel along each axis.
 
-    Colours form the last group.
+    If there are several samples per pixel, "color" forms a group of its own, which is the last one; the other channels
+    take one sample.
     """
     names = tuple(dict.fromkeys(channels))
     rest = tuple(name for name in names if name != "color")

@@ -17,10 +17,14 @@ Entry = dict[str, Any]
 
 
 def describe(content: Entry, parts: Sequence[NDArray | bytes]) -> tuple[Entry, bytes]:
-    """Return the complete description of a glTF file, and its binary part.
+    """Return the complete JSON description of a glTF file, and its binary part.
 
-    The binary part holds `parts` in their order. An array becomes an accessor with a buffer view; bytes become only a
-    buffer view.
+    The binary part holds `parts` in their order. An accessor and a buffer view are added to the description for each
+    array, and only a buffer view for bytes.
+
+    Args:
+        content: description without accessors, buffer views and buffer.
+        parts: arrays and bytes of the binary part.
     """
     content = {"asset": {"version": "2.0"}, "accessors": [], "bufferViews": [], **copy.deepcopy(content)}
     binary = b""

@@ -38,9 +38,10 @@ class SoftImage:
         positions: (vertices, 2) float64, column and row, pixels.
         bounds: (faces, 4) int64, first row, last row + 1, first column, last column + 1 of the pixels near a face.
         nearest: index of the nearest vertex in view, the unit of depths; -1 if nothing is in view.
-        scales: 1 / σ in 1/pixel², γ, and the distance beyond its border at which a face is still visible, pixels.
-        most, total, clear: (height, width) float64: the largest z_j or ε, Σ D exp((z - most) / γ) with the background's
-            part, and Π (1 - D).
+        scales: 1 / σ in 1/pixel², γ, and the result of `blur_margin`, pixels.
+        most: (height, width) float64, the largest z_j, or ε if it is larger.
+        total: (height, width) float64, Σ_j D_j exp((z_j - most) / γ) plus the background's term exp((ε - most) / γ).
+        clear: (height, width) float64, Π_j (1 - D_j).
         mean: (height, width, channels) float64, A_S.
         color: (height, width, channels) float64, A_O A_S.
     """
@@ -57,7 +58,7 @@ class SoftImage:
 
 
 def blur_margin(sigma: float, size: tuple[int, int]) -> float:
-    """Return the distance beyond its border at which a face is still visible, pixels."""
+    """Return the largest distance from a face, in pixels, at which a pixel outside of the face still shows it."""
     return math.sqrt(REACH * sigma) * min(size) / 2
 
 
@@ -114,7 +115,11 @@ def add_gradients(
 @compiled
 @no_type_check
 def prepare(camera_points, screen, faces, lens, cull, height, width, margin, positions, bounds, counts):
-    """Fill `positions` and `bounds`, count the faces by outcome, and return the nearest vertex in view, or -1."""
+    """Fill `positions` and `bounds` of `SoftImage`, and return the index of the nearest vertex in view, or -1.
+
+    The number of faces with each outcome is added to `counts`, as in `raster.rasterise`. -1 means that no face is in
+    view. `margin` is the result of `blur_margin`.
+    """
     for vertex in range(camera_points.shape[0]):
         if screen[vertex, 2] != 0:
             for axis in range(2):
@@ -197,10 +202,20 @@ def triangle_heights(ax, ay, bx, by, cx, cy):
 @compiled
 @no_type_check
 def distance_to_border(corners, heights, w0, w1, w2, x, y):
-    """Return the squared distance to the border of a triangle, the side (1 inside, -1 outside), and the nearest edge.
+    """Return the squared distance from (x, y) to a triangle's border, the side of the point, and the nearest edge.
 
-    The number of an edge is that of the opposite corner. Inside, the distance is measured to the lines of all edges;
-    outside, to the edges that face the point.
+    The side is 1 for a point inside of the triangle and -1 for one outside. The number of an edge is that of the
+    opposite corner. For a point inside, the distance is measured to the lines of all edges; for a point outside, to the
+    edges that have the point on their outer side.
+
+    Args:
+        corners: column and row of the three corners, as `face_corners` returns them.
+        heights: heights of the triangle, as `triangle_heights` returns them.
+        w0: barycentric weight of the first corner at the point.
+        w1: weight of the second corner.
+        w2: weight of the third corner.
+        x: column of the point.
+        y: row of the point.
     """
     ax, ay, bx, by, cx, cy = corners
     least, edge = np.inf, 0
@@ -225,10 +240,18 @@ def distance_to_border(corners, heights, w0, w1, w2, x, y):
 @compiled
 @no_type_check
 def weigh_pixel(corners, heights, low, sharpness, x, y):
-    """Return barycentric weights, side, nearest edge and exp(-d²/σ) of a pixel, where d is the distance to the edge.
+    """Return the three barycentric weights, the side, the nearest edge and exp(-d²/σ) of the pixel (x, y).
 
-    The side is 1 inside of the triangle, -1 outside, and 0 if the pixel is too far away. A pixel with a weight below
-    its limit in `low` is too far away.
+    d is the distance from the pixel to the triangle's border. The side is 1 inside of the triangle, -1 outside, and 0
+    if the pixel is too far away to show the face.
+
+    Args:
+        corners: column and row of the three corners, as `face_corners` returns them.
+        heights: heights of the triangle, as `triangle_heights` returns them.
+        low: limit of each weight; a pixel with a weight below its limit is too far away.
+        sharpness: 1 / σ in 1/pixel².
+        x: column of the pixel.
+        y: row of the pixel.
     """
     w0, w1, w2 = screen_weights(*corners, x, y)
     if w0 < low[0] or w1 < low[1] or w2 < low[2]:
@@ -266,7 +289,10 @@ def forward(
     mean,
     color,
 ):
-    """Fill the arrays of `SoftImage` face by face; the sums of w_j are rescaled whenever a nearer face follows."""
+    """Fill the arrays `most`, `total`, `clear`, `mean` and `color` of `SoftImage`, face by face.
+
+    The sums `total` and `mean` are relative to exp(most / γ); they are rescaled whenever a face increases `most`.
+    """
     channels = colors.shape[1]
     height, width = most.shape
     unit = camera_points[nearest, 2]
@@ -319,7 +345,16 @@ def forward(
 @compiled
 @no_type_check
 def backward(scene, blend_data, grad_image, sums):
-    """Add the gradients of the loss to `sums`, face by face; the terms of each face and pixel are recomputed."""
+    """Add the gradients of the loss to the arrays in `sums`, face by face.
+
+    The terms of each face and pixel are computed again, because `forward` does not store them.
+
+    Args:
+        scene: camera points, faces, colours and lens.
+        blend_data: arrays and scales of `SoftImage`.
+        grad_image: gradient of the loss with respect to the image, (height, width, channels).
+        sums: gradients with respect to camera points, colours and lens.
+    """
     camera_points, faces, colors, lens = scene
     positions, bounds, nearest, sharpness, gamma, margin, most, total, clear, mean = blend_data
     grad_points, grad_colors, grad_lens = sums

@@ -64,9 +64,10 @@ def wrap_index(index, count, wrap):
 @compiled
 @no_type_check
 def find_texels(texture, image, u, v):
-    """Return the indices of the four texels around (u, v), and the position between them to the right and down, 0 to 1.
+    """Return the indices of the four texels around (u, v), and the position of (u, v) between them.
 
-    The texels are ordered from the top left, row by row. If the texture is not smooth, all four are the same texel.
+    The texels are ordered from the top left, row by row. The position consists of the distances to the right and down
+    from the first texel, each 0 to 1. If the texture is not smooth, all four are the same texel.
     """
     start, height, width = texture.images[image, 0], texture.images[image, 1], texture.images[image, 2]
     x, y = u * width - 0.5, (1 - v) * height - 0.5

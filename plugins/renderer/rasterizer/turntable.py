@@ -23,7 +23,7 @@ from plugins.renderer.rasterizer.parts import Axis
 MARGIN = 1.03
 """Factor on the smallest distance from which the whole sphere around the subject is visible."""
 NEAR = 1e-3
-"""Distance of the near plane in metres; or, if smaller, this share of the distance to the subject."""
+"""Distance of the near plane, metres; for a subject nearer than 1 m, this share of the distance to the subject."""
 LONGEST_SIDE = 2**14
 ROTATION_ERROR = 1e-4
 """Largest allowed difference between R Rᵀ and the identity; files hold rounded numbers."""
@@ -31,7 +31,10 @@ UPRIGHT = {
     "y": torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]], dtype=torch.float64),
     "z": torch.eye(3, dtype=torch.float64),
 }
-"""Rotations of a scene's axes after which z points upwards and the scene's front (z or -y) looks towards -y."""
+"""Rotation of a scene's axes, by the axis that points upwards, after which z points upwards.
+
+The scene's front, which looks towards z if y points upwards and towards -y if z does, then looks towards -y.
+"""
 IMAGE = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64).diag()
 """Rotation from a viewer's axes (x right, y up, z backwards) to a camera's axes."""
 KEYS = ("K", "R", "t", "size")

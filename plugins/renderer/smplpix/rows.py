@@ -36,7 +36,16 @@ def write_checkpoint(
     names: tuple[str, ...] = COLUMNS[3:],
     uncertainty: Sequence[dict[str, Any]] = (),
 ) -> str:
-    """Write a checkpoint like that of a run on people, but with random weights, and return its path."""
+    """Write the checkpoint of a network with random weights, as a run on `human_scans` writes it; return its path.
+
+    Args:
+        file: path of the checkpoint.
+        encoders: settings of the encoders.
+        size: (height, width) of the image, pixels.
+        points: number of points of the input.
+        names: names of the target's channels.
+        uncertainty: settings of the uncertainty wrappers.
+    """
     state, target = {"height": size[0], "width": size[1]}, Target("image", names, size=size)
     config: Resolved = {
         "data": resolve("data", {"name": "human_scans", **state}),
