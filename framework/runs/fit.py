@@ -28,10 +28,11 @@ from framework.uncertainty import outermost
 
 
 def fit(session: Session, run: Run) -> tuple[float, int | None]:
-    """Fit the predictor, and return the validation loss (nats) and epoch (from 0) of the weights that it has then.
+    """Fit the predictor, and return the validation loss (nats) and the epoch (from 0) of its fitted weights.
 
-    The epoch is None if the head was fitted in one step, or if nothing learns (a renderer, for example). Ranks other
-    than the first return when training has ended.
+    The epoch is None if no part of the predictor is trained by gradient: its head is fitted in one step, or it has
+    nothing to learn (a renderer, for example). Ranks other than the first return after training without loading these
+    weights.
     """
     if not learns(session.predictor):
         return _fit_at_once(session, run), None
@@ -93,7 +94,10 @@ def _fit_by_gradient(session: Session, run: Run) -> tuple[float, int]:
 
 
 def _resume_checkpoint(session: Session, run: Run) -> Path | None:
-    """Return the checkpoint from which training continues, or None; every rank calls this before rank 0 writes one."""
+    """Return the checkpoint from which training continues, or None if it begins anew.
+
+    All ranks must call this function before rank 0 writes a checkpoint, so that all find the same one.
+    """
     resume = find_resumable(run.checkpoints) if run.resumed else None
     if run.resumed and first_rank():
         step = 0 if resume is None else int(read(resume)["global_step"])
@@ -113,7 +117,7 @@ def remove_resume_files(run: Run) -> None:
 
 
 def _give_up(run: Run, error: BaseException) -> None:
-    """Close the run of a process that cannot continue; the process will end without returning to the caller."""
+    """Record the error and close the run; the caller ends the process afterwards, because it cannot continue."""
     stopped = isinstance(error, Stopped)
     sentence = f"stopped by {error.signal}" if isinstance(error, Stopped) else str(error)
     sys.stderr.write(f"{sentence}; continue with: python -m framework {resume_arguments(run)}\n")
@@ -122,14 +126,18 @@ def _give_up(run: Run, error: BaseException) -> None:
 
 
 def _leave_process_group() -> None:
-    """Leave the process group, so that the rest, which only rank 0 does, does not wait for other ranks."""
+    """Leave the process group of the ranks, so that rank 0, which works on alone, waits for no other rank."""
     if dist.is_available() and dist.is_initialized():
         dist.barrier()
         dist.destroy_process_group()
 
 
 def _cache_features(session: Session) -> Data:
-    """Return the data with precomputed features if the features do not change from step to step, else the data."""
+    """Return the session's data with precomputed features as inputs; the data unchanged if that is not possible.
+
+    It is possible if the first encoders have fixed features, the data are not augmented, and the features fit into
+    memory.
+    """
     predictor, data = session.predictor, session.data
     if not isinstance(predictor, FrozenFrontEnd) or data.varies or not fits(data, predictor.features):
         return data

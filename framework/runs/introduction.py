@@ -19,7 +19,7 @@ BUSY = 1.0
 
 
 def introduce(data: Data, console: Console) -> None:
-    """Print what prepared data contain."""
+    """Print the inputs, the target, the numbers of samples and the remarks of prepared data."""
     _print_lines(lines(data), console)
 
 
@@ -109,7 +109,7 @@ def describe_target(target: Target) -> str:
 
 
 def _samples(data: Data) -> list[str]:
-    """Return a line with the number of samples of each split, and the data set's remarks on the user's files."""
+    """Return a line with the number of samples of each split, and the lines of `Data.remarks`."""
     sizes = [
         f"{name} {len(part)}"
         for name, part in zip(Splits._fields, data.splits(), strict=True)

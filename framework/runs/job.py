@@ -14,7 +14,7 @@ from framework.storage.plain_values import read_json
 PARENT = "FRAMEWORK_SWEEP_PARENT"
 """Environment variable with the id of the sweep's run in the tracking store, which becomes the parent of the job."""
 SYNCED_WITHIN = 60.0
-"""Duration in seconds of a job up to which the sweep sends the job's journal to the tracking store afterwards."""
+"""Seconds; a job that ends sooner sends nothing to the tracking store, and its sweep sends the job's journal."""
 RECORD = "job.json"
 VALUE = "value.json"
 _COMMAND = "multirun.yaml"
@@ -62,7 +62,10 @@ def natural_order_key(folder: Path) -> list[tuple[int, str]]:
 
 
 def find_job_folders(folder: Path) -> list[Path]:
-    """Return the folders of a sweep's jobs at any depth, sorted by `natural_order_key`, without inner sweeps' jobs."""
+    """Return the folders of a sweep's jobs at any depth, sorted by `natural_order_key`.
+
+    Jobs of another sweep, whose folder lies in this one, are left out.
+    """
     job_folders = []
     for name, below, files in os.walk(folder):
         path = Path(name)
@@ -76,13 +79,16 @@ def find_job_folders(folder: Path) -> list[Path]:
 
 
 def write_value(folder: Path, value: float) -> None:
-    """Write the number that an optimising sweeper reads; do nothing if the run in `folder` is not a job of a sweep."""
+    """Write the number that a sweeper minimises; do nothing if the run in `folder` is not a job of a sweep."""
     if (folder / RECORD).is_file():
         write_whole(folder / VALUE, json.dumps(value).encode())
 
 
 def refuse_idle(folder: Path, sentence: str) -> None:
-    """Refuse a setting that has no effect; in a job of a sweep, print a note, because other jobs may read the setting.
+    """Refuse a setting that has no effect; in a job of a sweep, print `sentence` instead.
+
+    Other jobs of the sweep may read the setting.
+
 
     Args:
         folder: Folder of the run.

@@ -21,7 +21,7 @@ from typing import NamedTuple
 SECONDS = 3.0
 """Time limit, in seconds, for all git commands about one repository."""
 SMALL, PACKED, INDEX = 2**12, 2**26, 2**28
-"""Largest size in bytes of a file with one name or commit, of the file of packed references, and of an index."""
+"""Largest sizes in bytes: of a file with one reference or commit, of the file of packed references, of an index."""
 LINKS = 5
 """Largest number of symbolic references that are followed in a chain, as in git."""
 KEYS = frozenset(
@@ -31,9 +31,12 @@ KEYS = frozenset(
         *("core.trustctime", "sparse.expectfilesoutsideofpatterns"),
     )
 )
-"""Settings that affect how git compares files, without programs or files as values; `WORDS` are the allowed values."""
+"""Settings that affect how git compares files and that name no program or file; `WORDS` are their allowed values."""
 SPARSE = re.compile(rb"sdir[\0-\x10]")
-"""Mark of a sparse index, in which a folder stands for its files; to expand it, git changes the times of objects."""
+"""Pattern of the entry that marks a sparse index, in which a folder stands for its files.
+
+Such an index is not read, because git would expand it and change the times of objects in the repository.
+"""
 TRUE = ("", "1", "on", "true", "yes")
 WORDS = frozenset((*TRUE, "0", "crlf", "default", "false", "input", "lf", "minimal", "native", "no", "off"))
 
@@ -82,7 +85,7 @@ def git_commit(folder: Path) -> dict[str, str]:
 
 
 def _repository(folder: Path) -> Repository | None:
-    """Return the nearest enclosing repository, or None; like git, skip a folder `.git` that is no repository."""
+    """Return the nearest repository that contains a folder, or None; like git, skip a `.git` that is no repository."""
     ceilings = {
         os.path.realpath(ceiling)
         for ceiling in os.environ.get("GIT_CEILING_DIRECTORIES", "").split(":")
@@ -242,7 +245,7 @@ class _Git:
         self.write({}, "")
 
     def write(self, settings: Mapping[str, str], commit: str) -> None:
-        """Write `HEAD` and the configuration of the temporary repository, with these settings only."""
+        """Write `HEAD` (with `commit`) and the configuration (only `settings`) of the temporary repository."""
         sha256 = len(commit) == 64
         lines = ["[core]\nbare = false", f"repositoryformatversion = {int(sha256)}"]
         lines += ["[extensions]\nobjectformat = sha256"] * sha256
@@ -263,7 +266,10 @@ class _Git:
         return self.settings("--file", str(copy), "--no-includes", "--list") if _copy(file, copy) else []
 
     def settings(self, *arguments: str, user: bool = False) -> list[tuple[str, str]]:
-        """Return keys (in lower case) and values that `git config` prints; with `user`, those of user and system."""
+        """Return the keys (in lower case) and values that `git config` prints.
+
+        If `user` is True, git also reads the settings of the user and of the system.
+        """
         output = self.ask("config", "--null", *arguments, user=user).decode(errors="surrogateescape")
         pairs = (item.partition("\n") for item in output.split("\0") if item)
         return [(key.lower(), value) for key, _, value in pairs]
@@ -322,7 +328,7 @@ class _Git:
 
 
 def _quote_path(path: Path) -> str:
-    """Return a path in quotes, because git reads a list of paths in which a colon separates the paths."""
+    """Return a path in quotes, so that git, which reads a list separated by colons, keeps a colon in the path."""
     escaped = str(path).replace("\\", "\\\\").replace('"', '\\"')
     return f'"{escaped}"'
 

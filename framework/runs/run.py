@@ -1,4 +1,4 @@
-"""Run with its folder, tracking and signals, which is always closed with the status FINISHED, FAILED or KILLED."""
+"""Run with its folder, tracking and signals; it is always closed with the status FINISHED, FAILED or KILLED."""
 
 import itertools
 import os
@@ -30,7 +30,7 @@ from framework.tracking.tracker import MlflowTracker, NoTracker, Tracker
 from framework.tracking.watch import start_watcher
 
 TRACEBACK = "traceback.txt"
-"""File with the traceback of a run that failed or was stopped; it is removed when the resumed run finishes."""
+"""File with the traceback of a run that failed or was stopped; it is removed when the run is resumed and finishes."""
 LEFT_BY_RUNS = (
     "config.yaml",
     "overrides.yaml",
@@ -46,12 +46,12 @@ LEFT_BY_RUNS = (
 )
 """Files and folders that modes write into a run folder; the tracker writes the journal in addition."""
 HOW = ("threads", "workers", "logger.uri")
-"""Keys that do not affect the result of a run, so that their values may differ in the resumed run."""
+"""Keys that do not affect the result of a run, so that a resumed run may have other values of them."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """Run in progress, as a mode sees it.
+    """Objects of a run in progress, which a mode receives.
 
     Attributes:
         config: Config of the command.
@@ -88,7 +88,7 @@ def stored_config(folder: Path) -> dict[str, Any] | None:
 
 
 def may_resume(config: Config) -> bool:
-    """Return whether the folder contains an unfinished run with this config, and `resume` allows continuing it."""
+    """Return whether the run in `config.folder` is unfinished, has this config, and `resume` allows continuing it."""
     earlier = read_run_info(config.folder)
     return (
         earlier is not None
@@ -100,7 +100,7 @@ def may_resume(config: Config) -> bool:
 
 @contextmanager
 def open_run(config: Config) -> Iterator[Run]:
-    """Open the run for the block, and close it with the right status at the end.
+    """Open the run of a command for the `with` block, and close it as FINISHED, FAILED or KILLED, as the block ends.
 
     The run in the folder is continued if `may_resume` returns True; otherwise the files of that run are moved to a
     subfolder. A rank other than the first writes nothing and gets a silent tracker.
@@ -194,7 +194,7 @@ def _tracker(config: Config, run_id: str | None, resumed: bool) -> Tracker:
 
 
 def _method(config: Config) -> str | None:
-    """Return the name of the density head, as the method of a training without an experiment; None for other modes."""
+    """Return the name of the density head, which names a training without an experiment; None in other modes."""
     head = config.values.get("density_head") if config.mode == "train" else None
     return str(head.get("name")) if isinstance(head, Mapping) else None
 
@@ -202,7 +202,7 @@ def _method(config: Config) -> str | None:
 def run_name(settings: Settings, method: str, overrides: Sequence[str]) -> str:
     """Return a name that distinguishes a run from similar ones.
 
-    The name consists of the method, the changes on the command line, and the seed. The part before the first comma is
+    The name consists of the method, the overrides on the command line, and the seed. The part before the first comma is
     also the name of the run's model in the store.
 
     Args:

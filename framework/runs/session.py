@@ -67,21 +67,22 @@ from framework.training.checkpoint import WholeCheckpoints, find_resumable
 from framework.uncertainty import remarks
 
 FEW = 8
-"""Number of validation samples on which wrappers are tried before training; some wrappers need more than one."""
+"""Number of validation samples with which uncertainty wrappers are tried before training; some need more than one."""
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # constants of malloc.h
 
 
 @dataclass
 class Session:
-    """Objects with which a mode works.
+    """Data, model, metrics and other objects with which a mode works, built from the config of its command.
 
     Attributes:
-        config: Config of the command; for a stored model, settings that affect its numbers come from the model's run.
+        config: Config of the command; for a stored model, with the settings of the model's run that affect its results
+            (`inherit_settings`).
         parts: Resolved configs of all plugins, with every parameter.
         method: Name of the model in tables.
         target: Target that is predicted.
         data: Data set; it is prepared, unless only the user's own files are read.
-        predictor: Predictor, untrained or as loaded.
+        predictor: Predictor; untrained in a session for training, and trained in a session for a stored model.
         device: Device on which the predictor is evaluated.
         console: Console for the user; it prints nothing in ranks other than the first.
         objectives: Objectives of the training loss.
@@ -114,11 +115,11 @@ class Session:
 
     @property
     def title(self) -> str:
-        """Return the name of data and model in figures and tables."""
+        """Return the names of the data and the model, as figures and tables show them."""
         return f"{self.data_title} · {self.method}"
 
     def batches(self, data: Data | None = None) -> Batches:
-        """Return the training batches of the session's data or, if given, of `data`."""
+        """Return the batches, in the size for training, of the session's data or, if given, of `data`."""
         chosen = self.settings
         return Batches(
             data or self.data, batch_size=chosen.batch_size, workers=chosen.workers, seed=chosen.seed
@@ -171,7 +172,7 @@ def set_up_process(settings: Settings) -> Console:
 
 
 def for_training(config: Config) -> Session:
-    """Build all parts from the config, prepare the data, and return the session after `rehearse`.
+    """Build all plugins from the config, prepare the data, call `rehearse`, and return the session.
 
     Raises:
         ConfigError: A part is missing or does not fit another.
@@ -253,7 +254,7 @@ class Start:
         path: Path of the checkpoint.
         state: Weights in the checkpoint, by name.
         predictor: Predictor with these weights; None if the checkpoint does not describe a model.
-        about: Target, input shape and input columns for which `predictor` was built.
+        about: Target, input shape and input columns for which `predictor` was built; None without a predictor.
     """
 
     path: Path
@@ -334,14 +335,14 @@ def add_test_parts(session: Session) -> Session:
 
 @torch.no_grad()
 def rehearse(session: Session) -> None:
-    """Try the steps after training on a few samples, so that their errors appear before training.
+    """Try the steps that follow training with a few samples, so that errors in these steps appear before training.
 
     The function checks a few targets, lets the untrained model predict two samples, updates every metric with these
     predictions, and calibrates a copy of the model. If the model cannot predict before it is fitted, the function only
     checks that the true images exist.
 
     Raises:
-        UserError: The data, a metric or a wrapper raises the error.
+        UserError: The data, a metric or an uncertainty wrapper fails with these samples.
     """
     fitted, reads = (
         bool(fitted_models(session.predictor)),
@@ -395,10 +396,10 @@ def _silence() -> Iterator[None]:
 
 
 def for_trained(config: Config, *, prepare: bool = True) -> Session:
-    """Return the session of the trained model that `checkpoint` names.
+    """Return the session of the trained model that the setting `checkpoint` names.
 
-    Data, outliers and metrics are those of the command line, or else those of the model. Without `prepare`, the data
-    set can only read the user's own files, and it generates and loads no data.
+    Data, outliers and metrics are those that the command line chooses; groups that it does not choose are those of the
+    model. If `prepare` is False, the data set generates and loads no data, and can only read the user's own files.
 
     Raises:
         ConfigError: The command names no checkpoint.
@@ -480,12 +481,13 @@ def _read_files(
         read: Method `read` of the data set.
         data: Data set.
         description: Description of the model.
-        config: Config of the command; None for a resumed run, whose settings are not checked again.
+        config: Config of the command; None for a resumed run, which may contain a choice without effect.
         files: Files of the user.
 
     Raises:
         CheckpointError: The first sample has another shape than the inputs of the model.
-        ConfigError: The choice has no effect, because the model's own data set reads the first files in the same way.
+        ConfigError: The choice of the data set has no effect: the model's own data set reads the first files as the
+            same samples.
     """
     samples = read(files)
     first_shape, model_shape = tuple(fetch(samples, range(1))["input"].shape[1:]), description.input_shape
@@ -543,7 +545,7 @@ def inherit_settings(config: Config, description: Description) -> Config:
 
 
 def require_fit(data: Data, description: Description) -> None:
-    """Refuse data with other inputs or targets than the model's.
+    """Refuse prepared data whose inputs or targets are not those of the model.
 
     Raises:
         CheckpointError: The inputs have another shape, or the targets differ.
@@ -560,7 +562,7 @@ def require_fit(data: Data, description: Description) -> None:
 
 
 def require_target(target: Target | None, description: Description) -> None:
-    """Refuse data whose targets differ from the model's and are known before the data are read or generated.
+    """Refuse data whose target `target`, known before the data are read, differs from the model's; None is accepted.
 
     Raises:
         CheckpointError: The targets differ.
@@ -590,8 +592,8 @@ def calibrate(session: Session) -> None:
 def keep_memory() -> None:
     """Make glibc keep freed memory for this process, because every training step frees and requests the same megabytes.
 
-    Otherwise each step causes thousands of page faults, which take a quarter of the training time of a small network.
-    Without glibc, the function does nothing.
+    If glibc returned the memory to the system, each step would cause thousands of page faults, which take a quarter of
+    the training time of a small network. On a system without glibc, the function does nothing.
     """
     if platform.libc_ver()[0] == "glibc":
         library = ctypes.CDLL(None)

@@ -16,9 +16,9 @@ UNREADABLE = "unreadable.txt"
 
 
 def list_files(path: Path) -> tuple[list[Path], list[Path]]:
-    """Return the files in a folder, or the file `path` itself, and the folders in it, which are not searched.
+    """Return the files and the subfolders of the folder `path`, or the file `path` and no subfolders.
 
-    Hidden files and folders are left out of both lists.
+    Subfolders are not searched for files. Hidden files and folders are left out of both lists.
 
     Raises:
         DataError: The path does not exist, or the folder contains no file.
@@ -57,8 +57,8 @@ def select_files(
     """Return the files to read, and the files left out because they are damaged; print which files are not read.
 
     Three kinds of files are ignored: hidden files, files that are read together with another file (`Data.companions`),
-    and files with a suffix that the data set does not list, if it can read no file with this suffix (a README, a
-    table). A remaining file that cannot be read stays in the list and causes an error later, unless `config` contains
+    and files (such as a README) with a suffix that the data set does not list, if no file with this suffix can be read.
+    A remaining file that cannot be read stays in the list and causes an error later, unless `config` contains
     `unreadable=skip` or `skip_unreadable`.
 
     Raises:
