@@ -14,15 +14,15 @@ from typing import Any
 PLACES = {
     "start": None,
     "before the first step": ("framework.training.module", "Training", "configure_optimizers", 1),
-    "collective": ("framework.training.module", None, "share", 5),
+    "collective": ("framework.training.module", None, "rank_share", 5),
     "between epochs": ("framework.training.module", "StopAtBatch", "on_train_epoch_end", 1),
     "in a checkpoint": ("torch", None, "save", 5),
     "testing": ("framework.modes.train", None, "report_test", 1),
     "fitted": ("framework.runs.fit", None, "mean_loss", 1),
     "logged": ("framework.modes.train", None, "calibrate", 1),
-    "tested": ("framework.modes.train", None, "keep_model_alone", 1),
+    "tested": ("framework.modes.train", None, "remove_resume_files", 1),
 }
-"""Module, class, function, and how often it is called until the rank ends, before it does anything."""
+"""Module, class and function at whose call the rank ends, and the number of that call, by moment."""
 
 
 def end(how: str) -> None:
@@ -34,7 +34,7 @@ def end(how: str) -> None:
 
 
 def plant() -> None:
-    """Have this process end where KILL says, if it is the rank."""
+    """Let this process end at the moment that KILL names, if this process is that rank."""
     rank, moment, how = os.environ["KILL"].split("|")
     if os.environ.get("LOCAL_RANK", "0") != rank:
         return
