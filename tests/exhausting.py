@@ -1,4 +1,5 @@
-"""Small files that ask for much memory or time, each read in a process of its own: `python -m tests.exhausting <what>`.
+"""Small files that would need much memory or time, each read in a separate process: `python -m tests.exhausting
+<what>`.
 
 Prints a line of JSON for each: what it was, how it ended, processor seconds and peak megabytes.
 """
@@ -264,7 +265,7 @@ def matlab(name: bytes, shape: tuple[int, int], content: bytes) -> bytes:
 
 
 def scene(count: int, mode: int = 4, nodes: int = 1, sets: int = 0) -> bytes:
-    """A glTF file whose accessors have no data, so that all their numbers are 0."""
+    """Return a glTF file whose accessors have no data, so that all their numbers are 0."""
     accessors = [{"componentType": 5121, "count": count, "type": kind} for kind in ("VEC3", "SCALAR", "VEC4")]
     attributes = {"POSITION": 0} | {
         f"{name}_{one}": 2 for one in range(sets) for name in ("JOINTS", "WEIGHTS")
@@ -282,7 +283,7 @@ def scene(count: int, mode: int = 4, nodes: int = 1, sets: int = 0) -> bytes:
 
 
 def textured(sides: list[tuple[int, int]]) -> bytes:
-    """A glTF file with images of these sides."""
+    """Return a glTF file with images of this size."""
     pictures = [image("RGB", side, "PNG") for side in sides]
     corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4").tobytes()
     binary, views = corners, [{"buffer": 0, "byteOffset": 0, "byteLength": 36}]
@@ -314,7 +315,7 @@ def textured(sides: list[tuple[int, int]]) -> bytes:
 
 
 def bombs() -> dict[str, tuple[Callable[[], bytes], Callable[[Path], object]]]:
-    """Files, each with what writes and what reads it."""
+    """Yield files, each with the functions that write and read it."""
     from framework.bodies import body_files, motion
     from plugins.data.cest.volumes import read_volume
     from plugins.renderer.rasterizer import scene_files

@@ -82,7 +82,7 @@ def chunk(kind: bytes, data: bytes) -> bytes:
 
 
 def png(values: np.ndarray, bits: int, kind: int, *chunks: bytes, interlaced: bool = False) -> bytes:
-    """A PNG file (ISO/IEC 15948) of any depth, which Pillow does not write."""
+    """Return a PNG file (ISO/IEC 15948) with a bit depth that Pillow does not write."""
     pixels = squares(values)
     passes = [(0, 0, 1, 1)]
     if interlaced:  # section 8.2, Adam7: first row and column, and the steps
@@ -328,7 +328,7 @@ TEXTURES: dict[str, Reader] = {"glTF": of_gltf, "OBJ": of_obj, "PLY": of_ply}
 
 
 def upright(data: Data) -> dict[str, Reader]:
-    """The ways into a data set of photographs, turned as viewers turn them."""
+    """Readers of a data set of photographs, which rotate images as their EXIF orientation requires."""
 
     def of_request(case: Case, folder: Path) -> np.ndarray:
         sent = {"base64": [base64.b64encode(case.content).decode()], "name": [f"image{case.suffix}"]}

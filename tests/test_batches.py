@@ -1,4 +1,4 @@
-"""The order of batches and the noise of steps: the same whatever the workers, ranks and interruptions.
+"""Order of batches and noise of steps, which are the same for any number of workers, ranks and interruptions.
 
 Run as a script, this file trains: the tests that need a process to be killed start it so.
 """
@@ -36,7 +36,7 @@ SAMPLES = 165  # ten batches of 16, and a rest
 
 
 class Sums(Data):
-    """Rows of numbers and their sums."""
+    """Data set of rows of numbers, with their sums as targets."""
 
     bibtex = ""
 

@@ -91,7 +91,7 @@ OWN_CACHE = {
     "framework/bodies/topologies.py",
     "plugins/data/labelled_clouds/reading.py",
 }
-"""They guard what the project keeps in its own cache, where `read_npz` reads it, which is among the readers."""
+"""Modules that guard files in the project's own cache; `read_npz`, which is tested here, reads these files."""
 OWN_FILES = {
     "framework/configuration/composition.py": "the package's config.yaml",
     "framework/datasets/images.py": "within a guard",
@@ -127,7 +127,7 @@ print(*(file[len(here) + 1:] for file in found if file.startswith(here)))
 
 
 def test_a_strip_is_scaled_before_it_is_padded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its middle is the picture of the strip, what is above and below its border; as where memory does not matter."""
+    """The middle of the figure shows the strip; the rest shows its border, as for images that need little memory."""
     random = np.random.default_rng(0)
     smooth = np.kron(random.integers(0, 256, (1, 25, 3)), np.ones((12, 40, 1))).astype(np.uint8)  # 1000 x 12
     for pixels in (smooth, smooth.transpose(1, 0, 2)):

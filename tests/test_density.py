@@ -20,7 +20,7 @@ def normals(*shape: int) -> Independent:
 
 
 class Cardioid(Distribution):
-    """(1 + 2ρ cos φ) / 2π: a density on the circle with a closed-form entropy series, for reference."""
+    """Cardioid density (1 + 2ρ cos φ) / 2π, a reference on the circle with a closed-form series for the entropy."""
 
     arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
     support = circular

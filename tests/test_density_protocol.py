@@ -135,7 +135,7 @@ def restricted(name: str, row: HeadRow) -> bool:
 
 
 def with_set(target: Target) -> type:
-    """The type of density that the conformal wrapper predicts."""
+    """Return the type of density that the conformal wrapper predicts."""
     wrapper = build(
         "uncertainty", resolve("uncertainty", "conformal"), model=lambda: Plain(target), target=target
     )
@@ -143,7 +143,7 @@ def with_set(target: Target) -> type:
 
 
 def floored(density: Distribution, target: Target) -> Distribution:
-    """(1 - γ) p + γ u with γ = 0.1, by the head of that name."""
+    """Return (1 - γ) p + γ u with γ = 0.1, made by the head `uniform_floor`."""
     component = "categorical" if target.kind == "class" else "von_mises"
     config = {"name": "uniform_floor", "component": {"name": component}, "weight": 0.1}
     head = build("density_head", resolve("density_head", config), target=target)
@@ -187,7 +187,7 @@ def value_of(name: str, value: Tensor) -> Tensor:
 
 
 def log_mixed(name: str, made: Made, log_prob) -> Tensor | None:
-    """log-density of a structure at `made.value` by plain sums of its parts' densities."""
+    """Return the log-density of a structure at `made.value`, by sums over the densities of its parts."""
     simple = item_of(name, made, log_prob)
     if simple is not None:
         return simple
@@ -365,7 +365,7 @@ def sampled(made: Made) -> bool:
 
 
 def errors(kind: str, made: Made, found) -> None:
-    """Monte Carlo errors by the delta method, item by item; samples add up."""
+    """Compare Monte Carlo errors with the delta method for each item; the numbers of samples add up."""
     parts = [protocol.estimate(part, made.value) for part in made.parts]
     error = torch.stack([part.standard_error for part in parts], -1)
     count = torch.stack([part.samples for part in parts], -1)

@@ -41,7 +41,7 @@ class Squares(Encoder):
 
 
 class Points(Data):
-    """Two numbers, and whether their sum is positive."""
+    """Data set of two numbers, and a class that tells whether their sum is positive."""
 
     bibtex = ""
     target = CLASSES

@@ -15,7 +15,7 @@ ROW = CloudRow("mean and spread", (12, 4))
 
 
 class Moments(Encoder):
-    """Mean and mean square of each column, over the points that are no padding."""
+    """Encoder that returns the mean and mean square of each column over the points without padding."""
 
     bibtex = ""
 

@@ -26,14 +26,14 @@ VIEWPOINT = Target("angle", ("azimuth", "elevation", "tilt"))
 def mixture_of(
     logits: list[float], means: list[float], spreads: list[float], kind: type = VonMises
 ) -> Mixture:
-    """One item of von Mises densities with these κ, or of normal ones with these σ."""
+    """Return one item of von Mises densities with these κ, or of normal densities with these σ."""
     mean, spread = (torch.tensor(column, dtype=torch.float64)[None, :, None] for column in (means, spreads))
     parts = VonMises(mean, spread) if kind is VonMises else Independent(Normal(mean, spread), 1)
     return Mixture(torch.tensor([logits], dtype=torch.float64), parts)
 
 
 def log_peak(kappa: mpmath.mpf) -> mpmath.mpf:
-    """κ - log(2π I0(κ))."""
+    """Return the largest log-density of a von Mises density, κ - log(2π I0(κ))."""
     if kappa < 1e6:
         return kappa - mpmath.log(2 * mpmath.pi * mpmath.besseli(0, kappa))
     series = 1 + 1 / (8 * kappa) + 9 / (128 * kappa**2) + 225 / (3072 * kappa**3) + 11025 / (98304 * kappa**4)
@@ -75,7 +75,7 @@ def exact(density: Mixture) -> float:
 
 
 def drawn(seed: int, kind: type, count: int) -> tuple[list[float], list[float], list[float]]:
-    """Weights down to 0, components far apart, within a few scales of each other, and at one place."""
+    """Return mixtures with weights down to 0 and components far apart, close to each other, and at the same place."""
     chance = random.Random(seed)
     low, high = (-3, 30) if kind is VonMises else (-30, 30)
     spreads = [10 ** chance.uniform(low, high) for _ in range(count)]
@@ -145,7 +145,7 @@ def test_its_gradient_is_that_of_differences() -> None:
 
 
 class Strange(Distribution):
-    """A density of which only the torch's questions are answered: two normals, the second not at the mode."""
+    """Third-party density around another density, which provides only torch's own methods and no protocol functions."""
 
     arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
 
@@ -164,7 +164,8 @@ class Strange(Distribution):
 
 
 def test_of_a_stranger_it_is_right_or_drawn_and_said(caplog: pytest.LogCaptureFixture) -> None:
-    """Asked by log_prob and mode alone: smooth ones to 1e-9; one that hides a peak far from its mode by draws."""
+    """The entropy needs only log_prob and mode: to 1e-9 for smooth densities, and by draws if a peak is far from the
+    mode."""
     smooth = [
         mixture_of([0.0, 0.5], [0.4, 1.5], [20.0, 7.0]),
         mixture_of([0.0, 0.5], [0.4, 1.5], [1.0, 3.0], Normal),
@@ -201,7 +202,7 @@ def test_nothing_and_not_a_number() -> None:
 
 
 def test_of_several_angles_only_overlap_is_left_to_chance() -> None:
-    """Far apart to the last digits, however narrow; overlapping to the draws' error."""
+    """Separate components are exact to the last digits, overlapping ones to the error of the draws."""
     torch.manual_seed(1)
     mean = torch.tensor([[[0.0, 1.0, 2.0], [2.0, -1.0, 0.0]]], dtype=torch.float64)
     for kappa in (1e6, 1e14, 1e30):
@@ -218,7 +219,7 @@ def test_of_several_angles_only_overlap_is_left_to_chance() -> None:
 
 
 def test_the_nodes_are_kronrod_s() -> None:
-    """Exact for polynomials of degree 22, and Gauss's of 13 (Piessens et al. 1983)."""
+    """The Kronrod rule is exact for polynomials of degree 22, and Gauss's rule for degree 13 (Piessens et al. 1983)."""
     for degree in range(24):
         wanted = 2 / (degree + 1) if degree % 2 == 0 else 0.0
         assert (FINE @ NODES**degree).item() == pytest.approx(wanted, abs=1e-15)
@@ -227,7 +228,7 @@ def test_the_nodes_are_kronrod_s() -> None:
 
 
 def test_on_a_part_of_the_circle_with_a_logarithm_at_its_ends() -> None:
-    """Elevations of uniform rotations, density cos(e)/2: log 2 - E log cos e = 1."""
+    """Elevations of uniform rotations have the density cos(e)/2 and the entropy log 2 - E log cos e = 1."""
     head = build("density_head", resolve("density_head", "matrix_fisher"), target=VIEWPOINT)
     joint = head(torch.zeros(2, 9, dtype=torch.float64))
     elevation = marginal(joint, 1)
@@ -240,7 +241,7 @@ def test_on_a_part_of_the_circle_with_a_logarithm_at_its_ends() -> None:
 def test_of_more_peaks_than_can_be_compared_draws_tell_it(
     kind: type, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """No array of all pairs, which of 25,000 components would take 5 GB."""
+    """The entropy needs no array of all pairs of components, which would take 5 GB for 25,000 components."""
     count = 25_000
     spread = 4.0 if kind is VonMises else 0.5
     whole = mixture_of([0.0] * count, [-1.0, 1.5] * (count // 2), [spread] * count, kind)

@@ -76,7 +76,7 @@ def instead_of_another(error: UserError) -> None:
 
 
 class Failing(Dataset):
-    """Fails at every item, in another way each."""
+    """Data set that fails at every item, each time with another error."""
 
     def __init__(self, cases: list[tuple[type[UserError], str, str]]) -> None:
         self.cases = cases

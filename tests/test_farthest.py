@@ -13,11 +13,11 @@ from framework.geometry.clouds import pad
 from framework.geometry.farthest import farthest
 
 WILD = st.lists(st.tuples(*[st.sampled_from([-1.0, 0.0, 1.0])] * 3), min_size=1, max_size=20)
-"""Clouds of equal points and equal distances."""
+"""Return clouds with equal points and equal distances."""
 
 
 def by_hand(cloud, count):
-    """Farthest-point sampling, all distances anew at each step, no point twice before all were chosen."""
+    """Return the farthest-point sampling, with all distances computed again in each step."""
     start = np.linalg.norm(cloud - cloud.mean(0), axis=1)
     chosen = [int(start.argmax())]
     while len(chosen) < min(count, len(cloud)):

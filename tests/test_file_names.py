@@ -69,7 +69,7 @@ def test_what_is_made_of_a_name_takes_any(name: bytes, tmp_path: Path) -> None:
 
 @pytest.fixture
 def clouds(tmp_path: Path) -> Path:
-    """Two classes of clouds, one of them in a folder whose name is not UTF-8."""
+    """Write two classes of clouds, one of them in a folder whose name is not UTF-8."""
     draws = np.random.default_rng(0)
     for number, name in enumerate(NAMES):
         for kind in (b"box", b"stra\xdfe"):

@@ -14,7 +14,7 @@ HELD = {"files": ("one.png", "two.PNG"), "folders": ("sub", "more"), "hidden": (
 
 
 def made(folder: Path, *kinds: str) -> Path:
-    """A folder that holds these kinds of things; its folders hold files."""
+    """Make a folder with entries of these kinds; its subfolders contain files."""
     folder.mkdir()
     for name in (name for kind in kinds for name in HELD[kind]):
         if name in ("sub", "more", ".git"):

@@ -22,7 +22,7 @@ for command in sys.argv[1:]:
 
 
 def written(figure: Path) -> str:
-    """The words of an SVG picture; they stand beside their outlines."""
+    """Return the texts of an SVG figure, which are stored beside their outlines."""
     return " ".join(re.findall("<!-- (.*?) -->", figure.read_text(encoding="utf-8"), re.S))
 
 

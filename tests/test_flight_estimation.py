@@ -1,4 +1,4 @@
-"""States from frames against SciPy's robust least squares, with and without outliers."""
+"""Estimates of states from frames, compared with SciPy's robust least squares, with and without outliers."""
 
 import numpy as np
 import torch

@@ -1,4 +1,5 @@
-"""A ball's physics against closed forms, and many flights at once against SciPy's solvers one by one."""
+"""Physics of a ball, compared with closed forms, and many flights at once, compared with SciPy's solvers for each
+flight."""
 
 import math
 
@@ -32,7 +33,7 @@ def test_a_fall_with_drag_has_its_closed_form() -> None:
 
 
 def test_spin_turns_a_flight_about_its_axis() -> None:
-    """ω × v: topspin of a ball that flies along y presses it down, and no spin does work."""
+    """The Magnus force ω × v presses a ball with topspin down, and does no work."""
     constants = Constants(drag=0.0)
     down = acceleration((0.0, 5.0, 0.0), (-100.0, 0.0, 0.0), constants)
     assert down == pytest.approx((0, 0, -9.802 - 0.0033 * 500))

@@ -35,7 +35,7 @@ def head(name, target, **config):
 
 
 def trained(encoders, made, shape, dtype=torch.float32) -> Model:
-    """As after training: moments of batch norm that are not 0 and 1, a scale and shift that are not 1 and 0."""
+    """Return a model as after a training, with random parameters and moments of batch norm."""
     torch.manual_seed(0)
     model = Model(encoders, made, shape).to(dtype).train()
     with torch.no_grad():
@@ -105,7 +105,7 @@ def test_affine_logits_are_found_by_asking():
 
 
 class Blocks(Encoder):
-    """Layers in another order, and features beside what they were computed from."""
+    """Encoder with layers in another order, in which later layers also read the inputs of earlier layers."""
 
     bibtex = ""
 
@@ -130,7 +130,7 @@ def test_layers_in_another_order_and_side_by_side():
 
 
 class Twice(Encoder):
-    """Reads a layer's numbers both before and after a ReLU."""
+    """Encoder that returns the output of a layer both before and after a ReLU."""
 
     bibtex = ""
 
@@ -145,7 +145,7 @@ class Twice(Encoder):
 
 
 class Squared(Encoder):
-    """Something else than layers."""
+    """Network with an operation that is not a layer."""
 
     bibtex = ""
 
@@ -198,7 +198,7 @@ def test_images_of_bytes_go_through_torch():
 
 
 class Lengths(Encoder):
-    """Fixed features of sets: the mean distance of their points from points at given places."""
+    """Encoder without parameters for point sets: mean distances of the points from fixed positions."""
 
     bibtex = ""
     fixed = True

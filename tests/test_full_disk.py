@@ -22,7 +22,8 @@ def one_sentence(done: Done) -> str:
 
 @pytest.mark.parametrize(("size", "at"), [(4_000, "checkpoint"), (12_000, "last.ckpt"), (20_000, "")])
 def test_a_disk_that_is_full_ends_a_run_with_a_sentence(size: int, at: str, framework: Framework) -> None:
-    """No file longer than `size` bytes can be written, so the run fails in training, after it, or when it draws."""
+    """No file longer than `size` bytes can be written, so the run fails during training, after it, or when it draws
+    figures."""
     done = framework(*TINY, f"+data.longest_file={size}", "logger=none", *STEPS)
     said = one_sentence(done)
     assert at in said, said

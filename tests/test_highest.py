@@ -22,7 +22,7 @@ KINDS = ("angles", "reals", "torch's normals", "correlated reals")
 
 
 def mixture(kind: str, numbers: int, components: int, seed: int, dtype: torch.dtype) -> Mixture:
-    """Components from far apart to one on another, from broad to narrow, of unequal weights."""
+    """Return mixtures whose components are far apart to equal, broad to narrow, and of unequal weights."""
     generator = torch.Generator().manual_seed(seed)
 
     def drawn(*shape: int) -> Tensor:
@@ -45,7 +45,7 @@ def mixture(kind: str, numbers: int, components: int, seed: int, dtype: torch.dt
 
 
 def everywhere(density: Distribution, kind: str) -> Tensor:
-    """The greatest log-density on a grid and about the components, (items,)."""
+    """Return the largest log-density on a grid and near the components, (items,)."""
     ends, points = (math.pi, 3001) if kind == "angles" else (12.0, 6001)
     numbers = density.event_shape[0]
     axis = torch.linspace(-ends, ends, points if numbers == 1 else 101, dtype=torch.float64)
@@ -103,7 +103,7 @@ def test_hardly_any_density_is_higher_elsewhere(kind: str, numbers: int) -> None
 
 
 def nested(structure: str, seed: int) -> Distribution:
-    """Densities with several humps inside another mixture, (ITEMS,)."""
+    """Return mixtures of densities that have several peaks themselves, (ITEMS,)."""
     generator = torch.Generator().manual_seed(seed)
     center = math.pi * torch.randn(3, ITEMS, 5, 1, dtype=torch.float64, generator=generator)
     width = (0.4 * torch.randn(3, ITEMS, 5, 1, dtype=torch.float64, generator=generator) - 0.5).exp()
@@ -129,7 +129,8 @@ def nested(structure: str, seed: int) -> Distribution:
 
 @pytest.mark.parametrize("structure", ["three mixtures", "three tempered", "moved", "mixtures of mixtures"])
 def test_humps_of_nested_mixtures_are_highest_together(structure: str) -> None:
-    """The second hump of each may be the highest of all: each one's own mode alone does not lead there."""
+    """The second peak of a component can be the highest of the mixture, so the modes of the components do not
+    suffice."""
     missed = before = 0
     for seed in range(5):
         density = nested(structure, seed)
@@ -143,7 +144,7 @@ def test_humps_of_nested_mixtures_are_highest_together(structure: str) -> None:
 
 
 def test_two_overlapping_components_have_their_mode_between_them() -> None:
-    """0.9 deviations on either side of 0 one hump at 0, 2 deviations two; across the seam of the circle too."""
+    """Components at ±0.9 standard deviations have one peak at 0, and at ±2 two peaks; also across ±π on the circle."""
     apart = torch.tensor([[[-0.9], [0.9]], [[-2.0], [2.0]]], dtype=torch.float64)
     density = Mixture(torch.zeros(2, 2), Gaussian(apart, torch.ones_like(apart)))
     assert density.mode[0].abs() < 1e-5
@@ -157,7 +158,7 @@ def test_two_overlapping_components_have_their_mode_between_them() -> None:
 
 
 def test_crossing_ridges_are_highest_where_they_cross() -> None:
-    """One narrow in the first number, one in the second: neither's mode is near the top."""
+    """One component is narrow in the first number and one in the second, so that the peak is near neither mode."""
     center = torch.tensor([[[0.0, 1.0], [1.0, 0.0]]], dtype=torch.float64)
     scale = torch.tensor([[[0.01, 2.0], [2.0, 0.01]]], dtype=torch.float64)
     mode = Mixture(torch.zeros(1, 2), Gaussian(center, scale)).mode

@@ -44,7 +44,7 @@ SQUARES = (
     "pictures=false",
     "samples=1",
 )
-"""9 steps, 3 an epoch."""
+"""Settings of a run of 9 steps, 3 in each epoch."""
 RIVALS = (
     "objective=[random_features,patch_gan]",
     "objective.random_features.width=4",
@@ -56,7 +56,7 @@ RIVALS = (
 
 
 def journal(done: Done) -> dict[int, dict[str, Any]]:
-    """Everything logged in training, by step."""
+    """Return all values that were logged in training, by step."""
     found: dict[int, dict[str, Any]] = {}
     for line in (done.folder / "journal.jsonl").read_text(encoding="utf-8").splitlines():
         record = json.loads(line)
@@ -100,7 +100,7 @@ def test_a_killed_run_goes_on_bit_by_bit(
 
 
 def people(folder: Path) -> tuple[str, ...]:
-    """A run on photographs of a dressed doll, small."""
+    """Return the arguments of a small run on photographs of a dressed doll."""
     file = write_body_file(folder)["body"]
     drawing = ("views=3", "height=32", "width=24", "texture_side=0", "topologies=[7k]")
     counts = ("train=2", "validation=1", "test=1")
@@ -174,7 +174,7 @@ def test_images_are_predicted_loaded_frozen_served_and_trained_further(
 
 
 def test_what_learns_nothing_is_tested_as_it_is(framework: Framework, tmp_path: Path) -> None:
-    """A rasteriser has nothing to train; its one scale is fitted."""
+    """A rasteriser has no trained parameters; only the scale of its density is fitted."""
     run = [item for item in people(tmp_path) if not item.startswith(("experiment", "encoder", "trainer"))]
     done = framework("experiment=smplpix/rasterised", *run, folder="drawn")
     assert done.code == 0, done.out

@@ -1,4 +1,4 @@
-"""The image code that data plugins share (framework.datasets.images), against independent references."""
+"""Image code that data plugins share (framework.datasets.images), compared with independent references."""
 
 import io
 import math
@@ -19,7 +19,8 @@ from framework.errors import DataError
 
 
 def ramp(width: int, height: int) -> Image.Image:
-    """Red grows by 2 a column, green by 3 a row: what a filter without bias keeps exactly."""
+    """Return an image in which red grows by 2 per column and green by 3 per row; a filter without bias keeps it
+    exactly."""
     x, y = np.meshgrid(np.arange(width), np.arange(height))
     return Image.fromarray(np.stack([2 * x, 3 * y, 0 * x], axis=2).astype(np.uint8))
 
@@ -32,7 +33,7 @@ def ramp(width: int, height: int) -> Image.Image:
 def test_square_lies_where_it_should_to_a_part_of_a_pixel(
     box: tuple[float, float, float, float], margin: float, side: int
 ) -> None:
-    """A crop of a ramp is the ramp at the crop's sample centres; pixel i covers [i, i + 1]."""
+    """The crop of a linear ramp equals the ramp at the sample centres of the crop; pixel i covers [i, i + 1]."""
     left, top, right, bottom = box
     half = (0.5 + margin) * max(right - left, bottom - top)
     pixels = cut_square(ramp(100, 80), box, margin, side)

@@ -47,7 +47,7 @@ def column(*numbers: float, dtype: torch.dtype = torch.float64) -> Tensor:
 
 
 def quantiles(law: Callable[[float], float], mass: float, low: float, high: float) -> tuple[float, float]:
-    """Both ends by SciPy's root finder from a distribution function."""
+    """Return both ends of an interval, from a distribution function and SciPy's root finder."""
     tails = ((1 - mass) / 2, (1 + mass) / 2)
     found = [
         optimize.brentq(lambda x, tail=tail: law(x) - tail, low, high, xtol=1e-300, rtol=1e-14)
@@ -57,7 +57,7 @@ def quantiles(law: Callable[[float], float], mass: float, low: float, high: floa
 
 
 def reals(dtype: torch.dtype) -> Iterator[tuple[str, Distribution, Ends]]:
-    """Densities of one real with their exact ends, of parameters as the number type holds them."""
+    """Yield densities of one real number with the exact ends of their intervals."""
     for place in PLACES:
         for width in WIDTHS:
             loc, scale = column(place, dtype=dtype), column(width, dtype=dtype)
@@ -91,7 +91,7 @@ def reals(dtype: torch.dtype) -> Iterator[tuple[str, Distribution, Ends]]:
 
 
 def mixed(logits: Tensor, loc: Tensor, scale: Tensor, exact: Any, base: Any) -> tuple[Distribution, Ends]:
-    """A mixture with its exact ends."""
+    """Return a mixture with the exact ends of its intervals."""
     weights = logits[0].double().softmax(-1).numpy()
     laws = [exact(at, by) for at, by in zip(loc.flatten().tolist(), scale.flatten().tolist(), strict=True)]
 
@@ -191,7 +191,7 @@ def test_of_angles_are_scipys_arcs(dtype: torch.dtype, mass: float) -> None:
 
 @pytest.mark.parametrize("mass", MASSES)
 def test_of_other_angles_follow_from_the_series(mass: float) -> None:
-    """A density that knows no arc, and powers of one, have their Fourier series."""
+    """A density without arc_probability, and powers of one, use their Fourier series."""
     rho = column(-0.4, 0.0, 0.9)
 
     cardioid = Cardioid(rho)
@@ -209,7 +209,7 @@ def test_of_other_angles_follow_from_the_series(mass: float) -> None:
 
 
 class Sampled(Distribution):
-    """A normal density, or an angle's, that knows nothing but its draws and their density."""
+    """Density of a real number or an angle that provides only samples and log_prob."""
 
     arg_constraints = {}  # noqa: RUF012
 
@@ -236,7 +236,8 @@ class Sampled(Distribution):
 
 @pytest.mark.parametrize("turns", [False, True])
 def test_ends_from_draws_say_their_error(turns: bool) -> None:
-    """The errors that are told are those that the ends have: over 150 items, of one angle too narrow for a grid too."""
+    """The reported errors equal the actual errors of the ends over 150 items, also for an angle too narrow for a
+    grid."""
     torch.manual_seed(0)
     loc, scale = torch.full((150, 1), 2.0, dtype=torch.float64), 1e-7 if turns else 3.0
     found = central_interval(Sampled(loc, scale, turns), 0.9)
@@ -263,7 +264,7 @@ def test_of_what_is_not_a_number_is_none() -> None:
 
 
 def test_a_part_of_the_circle_has_ends_like_a_line() -> None:
-    """An elevation, say: uniform on the sphere its density is cos(x)/2."""
+    """Density cos(x)/2 of the elevation of a uniform direction on the sphere."""
 
     class Elevation(Sampled):
         @property

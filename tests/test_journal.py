@@ -246,7 +246,7 @@ def test_set_aside_begins_anew(path: Path) -> None:
 
 
 class Disk:
-    """Stands for os.write: takes so many bytes, then is full."""
+    """Replacement of os.write that accepts a number of bytes and then reports a full disk."""
 
     def __init__(self, room: int, write: Callable[[int, bytes], int]) -> None:
         self.room, self.write = room, write

@@ -31,7 +31,7 @@ def test_code_is_kept_anew_where_any_of_its_files_changed(tmp_path: Path) -> Non
     [(raster.KERNELS, raster), (compiled.PARTS, compiled), (projecting.KERNELS, projecting)],
 )
 def test_every_file_that_compiles_is_among_the_sources(names: tuple[str, ...], home: object) -> None:
-    """Numba itself sees a change in the file of a function alone, and not in what the function calls."""
+    """Numba notices changes only in the file of a function, and not in functions that this function calls."""
     folder = Path(str(vars(home)["__file__"])).parent
     compiling = re.compile(r"^@(compiled|reordered|inlined)", re.MULTILINE)
     found = {file.stem for file in folder.glob("*.py") if compiling.search(file.read_text(encoding="utf-8"))}
@@ -44,7 +44,7 @@ ALONE = re.compile(r"kernel_cache\([^,]+, \[Path\(__file__\)\]\)")
 
 
 def test_kernels_that_call_other_files_are_kept_by_their_sources() -> None:
-    """A file whose code is kept by itself alone takes no compiled function from another."""
+    """A file whose code is cached separately uses no compiled function of another file."""
     alone = [file for file in FILES if ALONE.search(file.read_text(encoding="utf-8"))]
     assert len(alone) > 5
     for file in alone:
@@ -58,7 +58,7 @@ def test_kernels_that_call_other_files_are_kept_by_their_sources() -> None:
 
 
 def test_numba_itself_keeps_no_code() -> None:
-    """It refuses to import a module whose code it can keep neither beside it nor in the home."""
+    """Numba refuses to import a module whose code it can cache neither beside the module nor in the home folder."""
     own = [file for file in FILES if re.search(r"cache=True|cuda\.jit", file.read_text(encoding="utf-8"))]
     assert own == []
 

@@ -20,7 +20,7 @@ pytestmark = pytest.mark.skipif(
     sys.platform != "linux", reason="elsewhere nothing tells a process that its parent has died"
 )
 LOADED = 25.0
-"""Seconds for what takes at most 10 on a machine that does nothing else (tests/fuzz/kills.md)."""
+"""Limit of the time until all processes end, seconds; on an idle machine 10 suffice (tests/fuzz/kills.md)."""
 RUN = """
 import json, os, signal, sys, threading, time
 from pathlib import Path
@@ -56,7 +56,7 @@ FOREST = (
 
 
 class Lives:
-    """A run that is ended in the middle, and goes on as often as it is called.
+    """Run that is killed in the middle, and that continues with each call.
 
     Args:
         words: of the command.
@@ -99,7 +99,7 @@ def until(condition: Callable[[], bool], seconds: float = 60.0) -> None:
 
 @pytest.mark.slow
 def test_a_run_that_is_fitted_at_once_logs_every_number_once(tmp_path: Path) -> None:
-    """Wherever it was killed: fitted, validated, tested."""
+    """The run may be killed during training, validation or test."""
     for name in ("whole", "killed"):
         (tmp_path / name).mkdir()
     whole, killed = (Lives(FOREST, tmp_path / name) for name in ("whole", "killed"))
@@ -122,7 +122,7 @@ def test_a_run_that_is_fitted_at_once_logs_every_number_once(tmp_path: Path) -> 
     "how", ["is killed", "is killed, and closed by two", "is the job of a sweep that is killed", "closes"]
 )
 def test_a_run_is_closed_whatever_becomes_of_its_process(how: str, tmp_path: Path) -> None:
-    """A process beside it closes it; of a dead sweep the job is killed if it does not end by itself."""
+    """A separate process closes the run; a job of a dead sweep is killed if it does not end by itself."""
     run = [sys.executable, "-c", RUN, str(tmp_path), how]
     words = [sys.executable, "-c", PARENT, RUN, str(tmp_path), how] if "sweep" in how else run
     command = Command(words, tmp_path)
@@ -139,7 +139,7 @@ def test_a_run_is_closed_whatever_becomes_of_its_process(how: str, tmp_path: Pat
 
 
 def test_a_killed_script_leaves_nothing_of_its_sweep(tmp_path: Path) -> None:
-    """Not even a job that does not end when it is told to."""
+    """Even a job that ignores the request to end leaves no process."""
     app = App(tmp_path, fork=True)
     words = ["-m", "hydra/launcher=pool", "what=hold,stubborn", "hydra.launcher.jobs=2"]
     script = (

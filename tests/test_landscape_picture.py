@@ -1,4 +1,4 @@
-"""The landscape of a classifier of two inputs."""
+"""Figure of the predicted probabilities of a classifier of two inputs."""
 
 import math
 

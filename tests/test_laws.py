@@ -1,4 +1,4 @@
-"""The design's laws, read from the source: what the import linter (pyproject.toml) does not see."""
+"""Rules of the design that the import linter (pyproject.toml) does not check, read from the source."""
 
 import ast
 import re
@@ -16,7 +16,7 @@ PLUGINS = sorted(path for path in (ROOT / "plugins").rglob("*.py") if path.paren
 
 
 MATHEMATICS = {"points", "projection", "temperature", "mixture", "categorical", "bernoulli"}
-"""Entry points that bear the name of something mathematical which no method owns."""
+"""Entry points whose names are mathematical terms, which the framework may use."""
 
 
 def faults(paths: list[Path], find: Callable[[Path], Iterable[object]]) -> dict[str, list[object]]:

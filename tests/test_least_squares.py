@@ -1,4 +1,4 @@
-"""Bounded least squares of many problems at once, against SciPy's of one after the other."""
+"""Bounded least squares for many problems at once, compared with SciPy for each problem."""
 
 import math
 
@@ -17,7 +17,7 @@ INFINITE = torch.tensor(math.inf, dtype=torch.float64)
 
 
 class Decays:
-    """a exp(-b t) + c, measured with noise."""
+    """Model a exp(-b t) + c, measured with noise."""
 
     def __init__(self, measured):
         self.measured = measured
@@ -229,7 +229,7 @@ def test_narrow_valleys_are_followed_to_their_end(name, start):
     boxed=st.booleans(),
 )
 def test_linear_problems_of_any_condition(seed, size, more, decades, boxed):
-    """Their least cost is one number whatever the way: SciPy's bounded variables, or a QR decomposition."""
+    """The smallest cost equals that of SciPy's bounded solver, or of a QR decomposition."""
     generator = np.random.default_rng(seed)
     rows = size + more
     left, _ = np.linalg.qr(generator.normal(size=(rows, size)))

@@ -23,7 +23,8 @@ ROOT = Path(__file__).parent.parent
 @pytest.mark.slow  # each case is a process, and there are 300
 @pytest.mark.parametrize(("what", "least"), [("parameters", 250), ("fields", 15), ("files", 25)])
 def test_nothing_small_takes_much(what: str, least: int) -> None:
-    """Every number in every plugin's config, all else that a checkpoint says of its model, and every reader's bombs."""
+    """Test every number of every plugin's config, other descriptions in a checkpoint, and compressed files of every
+    reader."""
     quiet = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
     done = subprocess.run(
         [sys.executable, "-m", "tests.exhausting", what],

@@ -60,7 +60,7 @@ QUICK = (
     "logger=none",
     "threads=1",
 )
-"""A small training, whatever the data."""
+"""Return the settings of a small training for any data."""
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -129,7 +129,8 @@ def test_a_model_takes_files_when_its_training_data_are_gone(
 
 
 def follows_the_scan(model: Predictor, frozen: Frozen, file: Path, lines: list[str]) -> None:
-    """Answers are in metres where the scan lies: one twice as large, and elsewhere, has its mesh there."""
+    """Predictions are in metres at the place of the scan: a scan of twice the size at another place has its mesh
+    there."""
     scan = torch.from_numpy(read(file).vertices)
     away = torch.tensor([3.0, -2.0, 5.0])
     here, there = model(scan[None]), model(2 * scan + away)

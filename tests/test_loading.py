@@ -19,7 +19,7 @@ from framework.target import Target
 from framework.training.checkpoint import WholeCheckpoints
 
 OF_ONE_TARGET = {"ballistic", "fit_pose", "lorentzian"}
-"""Made for one data set's; their own tests say that a checkpoint holds them."""
+"""Heads for the targets of a single data set, whose own tests check their checkpoints."""
 WITHOUT_GRADIENT = [
     name
     for name in installed("density_head")
@@ -47,7 +47,7 @@ def test_a_checkpoint_holds_what_was_fitted(name: str, target: Target, tmp_path:
 
 
 class Built(UserError):
-    """Ends the loading where the model would be built."""
+    """Exception that ends the loading before the model is built."""
 
 
 def test_a_loaded_model_does_not_ask_for_what_its_training_started_from(

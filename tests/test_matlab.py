@@ -65,7 +65,7 @@ def test_other_versions_and_complex_numbers_are_refused(tmp_path: Path) -> None:
 
 
 def same(found: Any, wanted: Any) -> None:
-    """Ours and SciPy's, squeezed: the same to the last bit, structs as dicts and no text as ''."""
+    """Compare our variables with SciPy's to the last bit, with structs as dicts and empty texts as ''."""
     if isinstance(wanted, mat_struct):
         assert list(found) == wanted._fieldnames
         for name in found:
@@ -126,7 +126,7 @@ def test_what_is_no_label_is_none_and_what_is_not_asked_for_may_be_anything() ->
 
 
 def bomb(size: int) -> bytes:
-    """A variable of so many zeros, in a thousandth of their bytes."""
+    """Return a compressed variable of many zeros, with a thousandth of their size."""
     stream = io.BytesIO()
     scipy.io.savemat(stream, {"labels": np.zeros(size, np.uint8)}, do_compression=True)
     return stream.getvalue()

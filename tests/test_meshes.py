@@ -1,4 +1,4 @@
-"""Mesh and cloud files, whole and broken, and points drawn from surfaces."""
+"""Tests of mesh and cloud files, undamaged and damaged, and of points sampled from surfaces."""
 
 import io
 import os
@@ -231,7 +231,7 @@ C3 A0."""
 
 
 def written(letter):
-    """Its bytes in UTF-8, and in Latin-1 where that has it."""
+    """Return the bytes of a text in UTF-8, and in Latin-1 if Latin-1 has its characters."""
     return {letter.encode(), letter.encode("latin-1", "ignore") or letter.encode()}
 
 
@@ -425,7 +425,7 @@ def test_every_real_file_loads_or_gives_a_sentence():
 
 
 def soup(random, count, spread=1.0):
-    """Triangles of very different areas, every third without any."""
+    """Return triangles of very different areas, every third with area 0."""
     vertices = random.normal(size=(count, 3, 3)) * np.exp(spread * random.normal(size=(count, 1, 1)))
     vertices[::3] = vertices[::3].astype(
         np.float32
@@ -436,7 +436,7 @@ def soup(random, count, spread=1.0):
 
 
 def heron(mesh):
-    """Areas from the sides' lengths, in higher precision: nothing that the code uses."""
+    """Return the areas from the lengths of the sides in higher precision, independently of the tested code."""
     corners = mesh.vertices[mesh.faces].astype(np.longdouble)
     a, b, c = (np.sqrt(((corners[:, i] - corners[:, i - 1]) ** 2).sum(1)) for i in range(3))
     s = (a + b + c) / 2

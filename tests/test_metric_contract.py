@@ -19,7 +19,7 @@ IMAGES = Target("image", ("red", "green", "blue"), size=(8, 8))
 
 
 class Contrast(Metric):
-    """Mean entropy on outliers less that on the test split; right, or with one fault."""
+    """Metric of the mean entropy on outliers minus that on the test split, correct or with one fault."""
 
     splits = ("test", "outliers")
     columns = {"contrast": "contrast"}  # noqa: RUF012 - a metric as people write it

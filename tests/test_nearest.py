@@ -1,4 +1,4 @@
-"""Exact nearest neighbours against brute force in float64, on clouds of every kind; and the Chamfer distance."""
+"""Exact nearest neighbours and Chamfer distances, compared with brute force in float64."""
 
 import math
 import os
@@ -54,7 +54,7 @@ def lattice(count, _):
 
 
 def clusters(count, generator):
-    """Ten, each a hundred times smaller than the one before and around another place of it."""
+    """Return points of ten nested clusters, each a hundred times smaller than the previous one."""
     scale = 100.0 ** -generator.integers(0, 10, count)
     return 0.5 + scale[:, None] * generator.normal(size=(count, 3))
 
@@ -77,7 +77,7 @@ KINDS = {
 
 
 def brute(cloud, queries):
-    """Least distances in float64 of exactly the coordinates that came."""
+    """Return the smallest distances in float64, computed from the unrounded coordinates."""
     cloud, queries = cloud.double().numpy(), queries.double().numpy()
     scale = max(np.abs(cloud).max(), np.abs(queries).max()) or 1.0
     found = [
@@ -320,7 +320,7 @@ def test_no_cloud_is_no_answer():
 
 @DTYPES
 def test_chamfer_is_the_formula(dtype):
-    """Eq. 6.6 by NumPy, with and without padding; derivatives by finite differences."""
+    """Compare with eq. 6.6 in NumPy, with and without padding, and with finite differences."""
     generator = np.random.default_rng(6)
     a, b = torus(400, generator), ball(300, generator)
     square = ((a[:, None] - b) ** 2).sum(-1)
@@ -349,7 +349,7 @@ LONG = np.longdouble
 
 
 def by_loops(a, b):
-    """Eq. 6.6 in extended precision, and its derivative in both clouds."""
+    """Return eq. 6.6 in extended precision, and its derivatives with respect to both clouds."""
     a, b = a.astype(LONG), b.astype(LONG)
     slopes = [np.zeros_like(a), np.zeros_like(b)]
     total = LONG(0)

@@ -15,7 +15,7 @@ ROW = ObjectiveRow("reals", Target("real", ("x", "y")))
 
 
 class Spread(Objective):
-    """Sound: the mean entropy-like size of the places, of each member."""
+    """Correct objective: a penalty of the means of each member."""
 
     def __init__(self, weight):
         super().__init__()
@@ -44,14 +44,14 @@ class Spread(Objective):
 
 
 class Averaging(Spread):
-    """Divides each member's gradient by their number."""
+    """Objective that divides the gradient of each member by the number of members."""
 
     def penalty(self, predictor, batch):
         return self.places(predictor, batch).mean(1).sum()
 
 
 class Learning(Spread):
-    """Moves the running moments."""
+    """Objective that changes the running moments of batch norm."""
 
     def penalty(self, predictor, batch):
         predictor.training_densities(batch["input"].to(next(predictor.parameters()).dtype))
@@ -59,7 +59,7 @@ class Learning(Spread):
 
 
 class Switching(Spread):
-    """Leaves the predictor in evaluation."""
+    """Objective that leaves the predictor in evaluation mode."""
 
     def penalty(self, predictor, batch):
         predictor.eval()
@@ -67,7 +67,7 @@ class Switching(Spread):
 
 
 class Backward(Spread):
-    """Leaves gradients in the parameters."""
+    """Objective that leaves gradients in the parameters."""
 
     def penalty(self, predictor, batch):
         found = super().penalty(predictor, batch)
@@ -76,21 +76,21 @@ class Backward(Spread):
 
 
 class Squared(Spread):
-    """Not linear in its weight."""
+    """Objective that is not linear in its weight."""
 
     def forward(self, predictor, batch):
         return self.weight * super().forward(predictor, batch)
 
 
 class Detached(Spread):
-    """No gradient."""
+    """Objective without a gradient."""
 
     def forward(self, predictor, batch):
         return super().forward(predictor, batch).detach()
 
 
 class Halved(Spread):
-    """Half the gradient of its value."""
+    """Objective with half the gradient of its value."""
 
     def penalty(self, predictor, batch):
         found = super().penalty(predictor, batch)
@@ -98,14 +98,14 @@ class Halved(Spread):
 
 
 class Empty(Spread):
-    """The mean of no samples."""
+    """Objective that computes a mean, which is NaN for an empty batch."""
 
     def forward(self, predictor, batch):
         return self.weight * self.places(predictor, batch).sum(1).mean()
 
 
 class Unseeded(Spread):
-    """Noise that no seed fixes."""
+    """Objective with noise that does not depend on the seed."""
 
     generator = torch.Generator().manual_seed(0)
 
@@ -114,28 +114,28 @@ class Unseeded(Spread):
 
 
 class Ordered(Spread):
-    """Reads the batch from its front."""
+    """Objective that reads only the first half of the batch."""
 
     def penalty(self, predictor, batch):
         return super().penalty(predictor, {**batch, "input": batch["input"][: len(batch["input"]) // 2]})
 
 
 class Narrow(Spread):
-    """float32 whatever comes."""
+    """Objective that always computes in float32."""
 
     def forward(self, predictor, batch):
         return super().forward(predictor, batch).float()
 
 
 class Overflowing(Spread):
-    """e to the power of what it penalises."""
+    """Objective that returns the exponential of its penalty."""
 
     def penalty(self, predictor, batch):
         return super().penalty(predictor, batch).exp()
 
 
 class Marking(Spread):
-    """Leaves inputs that need a gradient."""
+    """Objective that leaves the inputs with requires_grad."""
 
     def penalty(self, predictor, batch):
         batch["input"].requires_grad_()

@@ -54,7 +54,7 @@ def test_settings_reach_the_optimiser(
 
 @pytest.mark.parametrize("patience", [1, 2, 5])
 def test_plateau_reduces_when_torchs_does(patience: int) -> None:
-    """Whose patience is one less: it reduces at the first epoch beyond it."""
+    """torch's scheduler needs a patience of one less, since it reduces in the first epoch after its patience."""
     settings = OptimizerSettings(schedule="plateau", factor=0.5, patience=patience, learning_rate=0.25)
     ours, theirs = (torch.optim.SGD([nn.Parameter(torch.zeros(2))], lr=0.25) for _ in range(2))
     rates = torch.optim.lr_scheduler.LambdaLR(ours, [make_schedule(settings, 100, 4)])
@@ -116,7 +116,8 @@ class Against(Objective):
 def test_a_rival_steps_as_by_an_optimiser_of_its_own(
     monkeypatch: pytest.MonkeyPatch, clip: float | None, schedule: Literal["constant", "cosine"]
 ) -> None:
-    """Bit by bit as two optimisers of torch that are stepped one after the other, each clipped by itself."""
+    """The steps are bit-equal to those of two optimisers of torch, stepped one after the other and clipped
+    separately."""
     torch.manual_seed(0)
     data = build("data", resolve("data", {"name": "moons"}))
     predictor, objective = Plain(Target("real", ("x",))).eval(), Against(schedule)
@@ -151,7 +152,7 @@ def test_a_rival_steps_as_by_an_optimiser_of_its_own(
 
 
 class Picture(Encoder):
-    """One number for each pixel, and how often it was asked."""
+    """Encoder that returns one number for each pixel, and counts its calls."""
 
     bibtex = ""
 

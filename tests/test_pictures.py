@@ -32,7 +32,7 @@ ANGLES = -math.pi + 2 * math.pi / 720 * np.arange(720)
 
 
 def bumps(*parts: tuple[float, float, float]) -> np.ndarray:
-    """Log-density on the grid of a mixture of (weight, mean, concentration)."""
+    """Return the log-density of a mixture of (weight, mean, concentration) on the grid."""
     logs = [math.log(weight) + vonmises.logpdf(ANGLES, sharp, loc=mean) for weight, mean, sharp in parts]
     return logsumexp(logs, axis=0)
 
@@ -43,7 +43,7 @@ def words(figure: Figure) -> str:
 
 
 def drawn(figure: Figure, folder: Path) -> None:
-    """Rendering raises what only rendering finds: missing glyphs, a layout that does not fit."""
+    """Render a figure, since missing glyphs and layouts that do not fit raise errors only then."""
     figure.savefig(folder / "figure.png", dpi=60)
     assert (folder / "figure.png").stat().st_size > 2000
 
@@ -128,7 +128,7 @@ def circles(densities: list[np.ndarray], **changed) -> Figure:
 
 
 def band(figure: Figure, panel: int = 0) -> np.ndarray:
-    """Corners of the density's band."""
+    """Return the corners of the band that shows the density."""
     (polygon,) = [patch for patch in figure.axes[panel].patches if isinstance(patch, Polygon)]
     return polygon.get_xy()
 
@@ -215,7 +215,7 @@ def test_a_scale_holds_its_peak_and_is_not_much_larger(peak: float) -> None:
 def test_no_density_falls_between_the_angles_where_it_is_drawn(
     parts: list[tuple[float, float, float]],
 ) -> None:
-    """The mass is 1 in all, and within 3° of each needle its weight."""
+    """The total mass is 1, and the mass within 3° of each narrow peak is the weight of that peak."""
     weight, mean, sharp = torch.tensor(parts, dtype=torch.float64)[None].unbind(-1)  # of a batch of one
     density = Mixture(weight.log(), VonMises(mean[..., None], sharp[..., None]))
     torch.manual_seed(0)

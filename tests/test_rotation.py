@@ -1,4 +1,4 @@
-"""Viewpoint rotations and geodesic distances against SciPy."""
+"""Viewpoint rotations and geodesic distances, compared with SciPy."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Z-spectra as sums of Lorentzian lines: derivatives against autograd, fits against SciPy's."""
+"""Z-spectra as sums of Lorentzian lines: derivatives compared with autograd, and fits compared with SciPy."""
 
 import mpmath
 import numpy as np

@@ -1,4 +1,4 @@
-"""Tables against NumPy, Rich's own rendering and the csv module."""
+"""Tables, compared with NumPy, Rich's own rendering and the csv module."""
 
 import csv as reader
 import io

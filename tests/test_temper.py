@@ -343,7 +343,7 @@ def test_draws_of_a_power_are_those_of_its_density(kind, dtype, temperature, mon
 
 
 class Narrow(Cardioid):
-    """(1 + cos)^10000000, up to a factor."""
+    """Density proportional to (1 + cos)^10000000."""
 
     def log_prob(self, value):
         return 1e7 * super().log_prob(value)

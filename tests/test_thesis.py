@@ -1,4 +1,4 @@
-"""The thesis's own networks and settings: parameter counts of Tables 6.1 and 6.2, and preset=thesis."""
+"""Networks and settings of the thesis: numbers of parameters in Tables 6.1 and 6.2, and preset=thesis."""
 
 import json
 from typing import Any

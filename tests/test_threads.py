@@ -1,4 +1,4 @@
-"""Work that is shared out to threads is done once, and ends where some of it fails."""
+"""Work in several threads, each part of which is done once, and which ends if a part fails."""
 
 import os
 import threading

@@ -1,4 +1,4 @@
-"""Error against run time along a knob: metrics, and errors of log-likelihoods, against closed forms and brute force."""
+"""Error against run time for the values of a knob, compared with closed forms and brute force."""
 
 import math
 from collections.abc import Iterator, Sequence

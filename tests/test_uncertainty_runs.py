@@ -1,4 +1,5 @@
-"""Uncertainty from the command line: ensembles trained in one pass or joined from a sweep, and metrics of outliers."""
+"""Uncertainty from the command line: ensembles that are trained together or combined from a sweep, and metrics of
+outliers."""
 
 import json
 from dataclasses import replace

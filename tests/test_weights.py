@@ -27,7 +27,7 @@ def state():
 
 
 def safetensors(tensors, **changed):
-    """The bytes of a .safetensors file, written from its specification."""
+    """Return the bytes of a .safetensors file, written from the specification of the format."""
     kinds = {torch.float32: "F32", torch.float16: "F16", torch.bfloat16: "BF16", torch.int64: "I64"}
     header, body = {"__metadata__": {"format": "pt"}}, b""
     for name, tensor in tensors.items():

@@ -19,7 +19,8 @@ from PIL import Image
 from framework.storage.checkpoints import MARK
 
 BOMB = 2**27 + 2**20
-"""Bytes to which a compressed file of a thousandth of them decompresses; more than `most_decompressed` allows."""
+"""Decompressed size of the compressed files, bytes; a thousand times their own size, and more than
+`most_decompressed`."""
 HUGE = 10**9
 
 
@@ -118,7 +119,7 @@ CSV = [
 
 
 def plain_png(width: int, height: int, rows: int | None = None) -> bytes:
-    """A black PNG; `rows`: so many of it are there."""
+    """Return a black PNG that contains only the first `rows` rows."""
     row = 1 + -(-width // 8)
     packer = zlib.compressobj(1)
     block = bytes(row * max(1, 2**20 // row))
@@ -301,7 +302,7 @@ JSONS = [
 SAME_TUPLE_TWICE = b"\x80\x02}K\x01\x85q\x00" + b"".join(
     b"h%ch%c\x86q%c" % (number, number, number + 1) for number in range(40)
 )
-"""Return a pickle whose key is a tuple of tuples, forty levels deep, in which each level repeats the next."""
+"""Pickled tuple of tuples, forty levels deep, in which each level repeats the next."""
 JOURNALS = [
     b'{"n":1,"values":{"a":{}},"time":0,"step":0,"epoch":0}\n', b'{"n":1,"values":[1],"time":0}\n',
     b'{"n":-5,"values":{}}\n',
@@ -340,7 +341,7 @@ def checkpoints(whole: bytes, signed: Callable[[bytes], bytes]) -> Iterator[byte
 
 
 def sha(content: bytes) -> bytes:
-    """A file with a checkpoint's checksum."""
+    """Return the content with the checksum of a checkpoint."""
     return content + MARK + hashlib.sha256(content).digest()
 
 

@@ -13,7 +13,7 @@ from tests.fuzz.damage import EXTREME, spoilt
 
 
 def in_glb(content: bytes, random: np.random.Generator) -> bytes:
-    """A value of the description, or bytes of the binary part, the lengths made right."""
+    """Damage a value of the description or bytes of the binary part, and make the lengths right."""
     size = int.from_bytes(content[12:16], "little")
     text, binary = content[20 : 20 + size], content[28 + size :]
     if random.random() < 0.3:
@@ -22,7 +22,7 @@ def in_glb(content: bytes, random: np.random.Generator) -> bytes:
 
 
 def in_gltf(content: bytes, random: np.random.Generator) -> bytes:
-    """A value of the description replaced by another one, by an extreme one, or taken out."""
+    """Replace a value of the description by another or an extreme value, or remove it."""
     whole = json.loads(content)
     places = [*_places(whole)]
     holder, key = places[int(random.integers(len(places)))]

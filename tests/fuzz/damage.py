@@ -295,7 +295,8 @@ def _child(reader: Reader, first: int, count: int, folder: Path, shared: mmap.mm
 
 
 def outcome_of(reader: Reader, file: Path) -> tuple[int, str]:
-    """0: read; 1: refused with a sentence that names the file; 2: anything else; 3: other numbers; and what."""
+    """Return the outcome of reading a file, and its message. 0: read; 1: refused with a message that names the file;
+    2: any other error; 3: other numbers."""
     try:
         reader.read(file)
     except UserError as error:
@@ -349,7 +350,7 @@ def _limit() -> None:
 
 @contextlib.contextmanager
 def scratch():
-    """A folder in memory where there is one."""
+    """Yield a temporary folder, in memory if possible."""
     shm = Path("/dev/shm")
     with tempfile.TemporaryDirectory(dir=shm if shm.is_dir() else None) as folder:
         yield Path(folder)

@@ -52,7 +52,8 @@ def in_zip(content: bytes, random: np.random.Generator) -> bytes:
 
 
 def in_png(content: bytes, random: np.random.Generator) -> bytes:
-    """One chunk of a PNG, its length and checksum made right; the pixels unfolded before where it is theirs."""
+    """Damage one chunk of a PNG, and make its length and checksum right; pixels are damaged in their decompressed
+    form."""
     chunks, place = [], 8
     while place < len(content):
         (length,) = struct.unpack_from(">I", content, place)
@@ -205,7 +206,7 @@ def xyz() -> bytes:
 
 
 def bvh() -> bytes:
-    """Two joints, three frames."""
+    """BVH file of two joints and three frames."""
     turns = "CHANNELS 3 Zrotation Yrotation Xrotation"
     head = [
         "HIERARCHY", "ROOT Hips", "{", "OFFSET 0 0 0", "CHANNELS 6 Xposition Yposition Zposition " + turns[11:],

@@ -1,4 +1,4 @@
-"""Every reader of files that the project has, with whole files for it, damage inside checksums, and crafted ones."""
+"""All readers of files, each with undamaged files, damage inside checksums, and malicious files."""
 
 import gzip
 import json
@@ -177,7 +177,7 @@ def with_buffer(file: Path, document: str) -> object:
 
 
 def people() -> Iterator[Reader]:
-    """Motions, and the layout of photographed people."""
+    """Yield readers of motions, and of the files of photographed people."""
     colors = np.arange(3 * len(VERTICES), dtype=np.uint8).reshape(-1, 3)
     parts = (torch.from_numpy(part) for part in (VERTICES.astype(np.float32), colors, FACES.astype(np.int64)))
     mesh = written(
@@ -227,7 +227,7 @@ def pairs(file: Path) -> object:
 
 
 def lists(file: Path) -> object:
-    """Splits, one of whose lists is damaged."""
+    """Read the splits of people, one of whose lists is damaged."""
     for number, split in enumerate(("validation", "test")):
         file.with_name(f"{split}.txt").write_text(f"other_{number}\n")
     return scan_layout.read_splits(file.parent)

@@ -34,7 +34,7 @@ from tests.fuzz.damage import Reader, Silent, spoilt
 from tests.fuzz.damaged_files import saved, signed, written
 
 LARGEST = 200_000
-"""Bytes of a checkpoint that is read thousands of times; of each plugin the rows up to this size are."""
+"""Largest size of the checkpoints that are damaged, bytes, since each is read thousands of times."""
 SEED = 17
 CLASSES = Target("class", ("a", "b"))
 HEADS = {"class": "categorical", "real": "gaussian", "angle": "von_mises"}
@@ -42,7 +42,7 @@ SMALL = {"name": "mlp", "widths": [4], "dropout": 0.1}
 HEAVY = {"inception_resnet_v2"}
 """Plugins with networks of 200 MB, whose weights are read by the same code as those of other networks."""
 OURS: set[str] = set()
-"""Paths that the rows' configs name."""
+"""Paths in the configs of the rows."""
 TOLD = "fuzz"
 """Key of a checkpoint that holds the kind of damage and the predictions of the undamaged model."""
 
@@ -137,7 +137,7 @@ MAKERS: Mapping[str, Callable[[str, Any], Subject]] = {
 
 @cache
 def stored(group: str, name: str) -> tuple[bytes, ...]:
-    """Whole checkpoints of a plugin's rows that store arrays and are not too large."""
+    """Return undamaged checkpoints for the rows of a plugin that store arrays and are not too large."""
     found = [] if name in HEAVY else [MAKERS[group](name, row) for row in contract(group, name).rows]
     made = [subject.checkpoint() for subject in found]
     return tuple(content for content in made if len(content) <= LARGEST and whole(content)["state_dict"])
@@ -152,7 +152,7 @@ def whole(content: bytes) -> dict[str, Any]:
 
 
 class Forged:
-    """A tensor whose place in its storage is somebody's word.
+    """Forged tensor with any offset, size and stride in its storage.
 
     Args:
         like: whose storage it is.
@@ -282,7 +282,7 @@ KINDS: tuple[Callable[[Tensor, np.random.Generator], Any], ...] = (
 def in_arrays(content: bytes, random: np.random.Generator) -> bytes:
     """A checkpoint, or a file of weights, with one array damaged; its checksum is right.
 
-    What was done is told: "any" answer may be right, the "same", or it has to be "refused".
+    The checkpoint records the required outcome: "any" prediction, the "same" prediction, or "refused".
     """
     trailed = content[-TRAILER:].startswith(checkpoints.MARK)
     values_of = whole(content)
@@ -386,7 +386,7 @@ def compare(told: Mapping[str, Any], found: Tensor | None) -> None:
 
 
 def said_again(content: Mapping[str, Any]) -> dict[str, Any]:
-    """Paths of the rows' own models, which whoever loads one says again."""
+    """Return the paths in the config of a row's model, which the user must name again to load the model."""
     with contextlib.suppress(Exception):  # of a damaged config
         return {key: path for key, path in paths_of(content["framework"]["config"]).items() if path in OURS}
     return {}

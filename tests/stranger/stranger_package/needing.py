@@ -1,4 +1,4 @@
-"""A metric that needs a module which is not everywhere."""
+"""Metric that needs a module which may not be installed."""
 
 import only_where_it_was_trained  # noqa: F401
 

@@ -28,7 +28,7 @@ class Hits(NamedTuple):
 
 
 def rays(camera: Camera) -> Tensor:
-    """(rows, columns, 3) float64, through pixel centres, as long along the optical axis as 1."""
+    """Return the rays through the pixel centres, (rows, columns, 3) float64, with length 1 along the optical axis."""
     focal, principal = (torch.as_tensor(part).double() for part in (camera.focal, camera.principal))
     row, column = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
     ahead = (torch.stack([column, row], -1) - principal) / focal
@@ -116,7 +116,7 @@ def cast(corners: Tensor, ray: Tensor, near: float) -> Hits:
 
 
 def normals(corners: Tensor) -> Tensor:
-    """(rays, 3), of length 1, of corners in world coordinates."""
+    """Return the unit normals of faces, (rays, 3), from their corners in world coordinates."""
     across = cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return across / across.norm(dim=-1, keepdim=True)
 
@@ -130,7 +130,7 @@ def texel(place: Tensor, count: int, wrap: str) -> Tensor:
 
 
 def papered(texture: Texture, image: Tensor, uv: Tensor) -> Tensor:
-    """(places, channels), what an image shows at (places, 2)."""
+    """Return the colours of an image at positions (places, 2), as (places, channels)."""
     height, width, _ = image.shape
     column, row = uv[:, 0] * width, (1 - uv[:, 1]) * height
     if not texture.smooth:
