@@ -12,12 +12,12 @@ from framework.distributions.description import one_line
 
 
 class AffineDensity(Distribution):
-    """The density of X = location + scale · Y, number by number.
+    """Density of X = location + scale · Y, for a vector Y of n numbers; each number has its own location and scale.
 
     Args:
-        density: density of Y, over n real numbers.
-        location: (*batch, n).
-        scale: (*batch, n), above 0.
+        density: density of Y, event_shape (n,).
+        location: numbers that are added, (*batch, n).
+        scale: factors, (*batch, n), above 0.
     """
 
     arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
@@ -42,15 +42,15 @@ class AffineDensity(Distribution):
 
     @property
     def log_volume(self) -> Tensor:
-        """Log-determinant of the map, log |det|, (*batch,), nats, which the change of variables subtracts."""
+        """Logarithm of the transform's determinant, Σ log scale, (*batch,), nats, which log_prob subtracts."""
         return self.scale.log().sum(-1)
 
     def inner(self, value: Tensor) -> Tensor:
-        """Return the value of Y for a value of X."""
+        """Return the value of Y that belongs to the value `value` of X: (value - location) / scale."""
         return (value - self.location) / self.scale
 
     def outer(self, value: Tensor) -> Tensor:
-        """Return the value of X for a value of Y."""
+        """Return the value of X that belongs to the value `value` of Y: location + scale · value."""
         return self.location + self.scale * value
 
     def log_prob(self, value: Tensor) -> Tensor:
@@ -166,11 +166,11 @@ def _(density: AffineDensity) -> Tensor:
 
 
 class AffineSet(protocol.ValueSet):
-    """The set of Y, transformed by X = location + scale · Y.
+    """Prediction set for X = location + scale · Y: the prediction set for Y, transformed in the same way.
 
     Args:
-        inner: the set of Y.
-        density: the density of X.
+        inner: prediction set for Y.
+        density: density of X, which holds the location and the scale.
     """
 
     def __init__(self, inner: protocol.ValueSet, density: AffineDensity) -> None:

@@ -1,4 +1,4 @@
-"""Densities with a changed batch_shape: several densities side by side, or one reshaped batch."""
+"""Densities with a changed batch_shape: `Stacked` makes one batch of several densities, `Reshaped` reshapes a batch."""
 
 from collections.abc import Collection, Sequence
 from typing import Any, ClassVar
@@ -12,10 +12,12 @@ from framework.distributions.description import one_line
 
 
 class Stacked(Distribution):
-    """K densities of one batch_shape side by side, with batch_shape (*batch, K), as a Mixture reads them.
+    """One density with batch_shape (*batch, K), made of K densities with batch_shape (*batch,).
+
+    A `Mixture` reads its components in this form.
 
     Args:
-        densities: at least one; all have the same batch_shape, event_shape and support.
+        densities: the K densities, at least one; all have the same batch_shape, event_shape and support.
     """
 
     arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
@@ -39,20 +41,24 @@ class Stacked(Distribution):
         return self.densities[0].support
 
     def enumerate_support(self, expand: bool = True) -> Tensor:
-        """Return every class, (class, *batch, K), or (class, *1) without `expand`."""
+        """Return every class, (class, *batch, K); without `expand`, all dimensions after the first have length 1."""
         labels = self.densities[0].enumerate_support(expand).unsqueeze(-1)
         return labels.expand(*labels.shape[:-1], len(self.densities)) if expand else labels
 
     @property
     def _axis(self) -> int:
-        """The dimension of a value tensor that counts the K densities."""
+        """Dimension of a value tensor (*sample, *batch, K, *event) that counts the K densities, as a negative index."""
         return -1 - len(self.event_shape)
 
     def log_prob(self, value: Tensor) -> Tensor:
         return torch.stack([density.log_prob(part) for density, part in self.pair_with_values(value)], -1)
 
     def pair_with_values(self, value: Tensor) -> list[tuple[Distribution, Tensor]]:
-        """Return a pair for each density: the density, and its part of the values (*sample, *batch, K or 1, *event)."""
+        """Return a pair for each of the K densities: the density, and the values at which it is evaluated.
+
+        Args:
+            value: values (*sample, *batch, K, *event). If there is 1 in place of K, all densities get the same values.
+        """
         wide = value.expand(*value.shape[: self._axis], len(self.densities), *self.event_shape)
         return list(zip(self.densities, wide.unbind(self._axis), strict=True))
 
@@ -77,11 +83,11 @@ class Stacked(Distribution):
 
 
 class Reshaped(Distribution):
-    """One density whose batch is read in another shape with the same number of items, in the same order.
+    """A density whose batch_shape is replaced by another one with as many items; the order of the items stays.
 
     Args:
-        density: a density with any batch_shape.
-        batch_shape: the new shape, with as many items.
+        density: the wrapped density, with any batch_shape.
+        batch_shape: the new batch_shape.
     """
 
     arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
@@ -104,7 +110,7 @@ class Reshaped(Distribution):
         return self.density.support
 
     def enumerate_support(self, expand: bool = True) -> Tensor:
-        """Return every class, (class, *batch), or (class, *1) without `expand`."""
+        """Return every class, (class, *batch); without `expand`, all dimensions after the first have length 1."""
         labels = self.density.enumerate_support(expand=False).reshape(-1, *(1,) * len(self.batch_shape))
         return labels.expand(-1, *self.batch_shape) if expand else labels
 
@@ -113,7 +119,7 @@ class Reshaped(Distribution):
         return self.density.log_prob(flat).reshape(shape)
 
     def inner(self, value: Tensor) -> tuple[Tensor, torch.Size]:
-        """Return the values in the batch_shape of the inner density, and the shape of the result.
+        """Return `value` in the batch_shape of the wrapped density, and the shape (*sample, *batch) of its log_prob.
 
         Args:
             value: values (*sample, *batch, *event) in the new batch_shape.
@@ -304,7 +310,12 @@ def _(density: Reshaped) -> Tensor:
 
 
 def _stack_padded(candidates: list[Tensor], axis: int) -> Tensor:
-    """Return the stacked tensors (peak, …) of several densities; a density with fewer peaks repeats its first peak."""
+    """Return the stacked tensors (peak, …) of several densities; a density with fewer peaks repeats its first peak.
+
+    Args:
+        candidates: the tensor of each density.
+        axis: dimension along which they are stacked.
+    """
     largest_count = max(len(tensor) for tensor in candidates)
     padded = [
         torch.cat([tensor, tensor[:1].expand(largest_count - len(tensor), *tensor.shape[1:])])

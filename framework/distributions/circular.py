@@ -12,9 +12,9 @@ class Circular(constraints.Constraint):
     """Support of a density over angles: real numbers in the last dimension, read as radians modulo 2π.
 
     Args:
-        ranges: (lowest, highest) of each angle within [-π, π], radians, for a density that is spread over a chart of
-            another space (rotations, for example) and integrates to 1 over these ranges; None if each angle covers the
-            whole circle.
+        ranges: None if each angle covers the whole circle. Otherwise the angles are coordinates of another space (Euler
+            angles of rotations, for example), and `ranges` holds (lowest, highest) of each angle, radians, within [-π,
+            π]. The density then integrates to 1 over these ranges.
     """
 
     event_dim = 1
@@ -45,18 +45,25 @@ def angular_distance(first: Tensor, second: Tensor) -> Tensor:
 
 
 def circular_mean(angle: Tensor, dim: int = -1) -> Tensor:
-    """Return the direction of the mean of the unit vectors, in [-π, π]; the mean of 359° and 1° is 0°."""
+    """Return the direction of the mean of the unit vectors at `angle`, in [-π, π]; the mean of 359° and 1° is 0°.
+
+    Args:
+        angle: angles, radians.
+        dim: dimension over which the mean is taken.
+    """
     return torch.atan2(angle.sin().mean(dim), angle.cos().mean(dim))
 
 
 def circular_median(samples: Float[Tensor, "samples *batch"]) -> Float[Tensor, "*batch"]:
-    """Return the sample with the least mean angular deviation from all samples (eq. 3.24), exactly, in O(S log S).
+    """Return the sample with the least mean angular deviation from all S samples (thesis eq. 3.24), exactly.
 
-    F(θ) = Σ_k Δ(θ, φ_k) is piecewise linear with convex kinks at samples and concave kinks at their antipodes, so
-    its minimum over the whole circle lies at a sample: this sample is the exact circular median. In the sorted samples,
-    the samples within half a turn ahead of φ_j are consecutive and start at j. Prefix sums over two turns give the
-    sum of their distances, and the sum of the distances to all other samples. Ties go to the smallest angle in
-    [-π, π). The result is NaN if not all samples are finite.
+    The sum of angular distances Δ from an angle θ to the samples φ_k, F(θ) = Σ_k Δ(θ, φ_k), is piecewise linear. Its
+    kinks are convex at the samples and concave at the angles opposite to them. So its minimum over the whole circle
+    lies at a sample, and this sample is the exact circular median.
+
+    The samples are sorted, in O(S log S). The samples within half a turn ahead of φ_j are then consecutive and start at
+    j. Differences of prefix sums over two turns give the sum of their distances from φ_j, and the sum for all other
+    samples. Of several minima, the smallest angle in [-π, π) is returned. If a sample is not finite, the result is NaN.
     """
     count = samples.shape[0]
     if count == 0:
@@ -81,5 +88,8 @@ def circular_median(samples: Float[Tensor, "samples *batch"]) -> Float[Tensor, "
 
 
 def grid(points: int, *, dtype: torch.dtype = torch.float32, device: torch.device | None = None) -> Tensor:
-    """Return equally spaced angles in [-π, π); on them the trapezium rule is spectrally exact for smooth densities."""
+    """Return `points` equally spaced angles in [-π, π).
+
+    On these angles, the trapezium rule is spectrally exact for smooth densities.
+    """
     return -math.pi + 2 * math.pi / points * torch.arange(points, dtype=dtype, device=device)

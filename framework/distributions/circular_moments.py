@@ -11,31 +11,33 @@ from framework.distributions.circular import Circular
 from framework.distributions.density import circular_grid
 
 POINTS = (720, 2880)
-"""Number of angles on the grid, and on the finer grid that is used when the first does not resolve some density."""
+"""Number of angles on the coarse grid, and on the fine grid for densities that the coarse grid does not resolve."""
 MASS_GAP = 1e-4
-"""Largest difference between 1 and the mass on a grid that resolves the density."""
+"""Largest difference between 1 and the integral of a density by the grid, if the grid resolves this density."""
 COARSE_ENOUGH = {torch.float64: 1e-8}
-"""Largest moment at the coarse grid's end for which the fine grid is not needed, by the density's number type."""
+"""Largest |m_n| in the highest orders n of the coarse grid, if it resolves the density; by number type."""
 ROUNDED = 4e-6
-"""Value of COARSE_ENOUGH for number types with fewer digits.
+"""Value of COARSE_ENOUGH for number types with fewer digits than float64.
 
-In float32, rounding alone leaves 2e-6 there, which no finer grid improves.
+In float32, rounding alone gives the moments of the highest orders a size of 2e-6, which no finer grid reduces.
 """
 LAST_MOMENTS = 1e-4
-"""Largest moment at the fine grid's end for which the higher moments are taken as 0.
+"""Largest |m_n| in the highest orders n of the fine grid, if it resolves the density.
 
-A von Mises density with concentration 3,500 (σ = 1°) does not need the fine grid, and one with 100,000 (σ = 0.18°) is
-still resolved on the fine grid.
+Moments of still higher orders are taken as 0. A von Mises density with concentration 3,500 (σ = 1°) does not need the
+fine grid, and one with 100,000 (σ = 0.18°) is still resolved on the fine grid.
 """
 
 
 class CircularMoments:
-    """Moments m_n = E exp(i n X), n = 0 ... N/2, of densities of one angle X (Mardia & Jupp 2000, §3.4.1).
+    """Moments m_n = E exp(i n X), n = 0 ... N/2, of densities of one angle X, from grids of N angles.
+
+    Source: Mardia & Jupp 2000, §3.4.1.
 
     Args:
-        moments: the moments; m_0 is 1.
-        resolved: true where the grid resolved the density. Elsewhere the moments are meaningless, and draws must be
-            used instead. A density that is NaN counts as resolved.
+        moments: the moments m_n in the order of n; m_0 is 1.
+        resolved: true where the grid resolved the density. Where it is false, the moments are meaningless, and draws
+            must be used instead. A density that is NaN counts as resolved.
     """
 
     def __init__(self, moments: Complex[Tensor, "harmonic *batch"], resolved: Bool[Tensor, "*batch"]) -> None:
@@ -46,15 +48,18 @@ class CircularMoments:
 
     @property
     def direction(self) -> Float[Tensor, "*batch"]:
-        """Direction of the mean, radians in [-π, π]; 0 where the mean resultant is below 1e-6 and has no direction."""
+        """Mean direction, radians in [-π, π]; 0 where |m_1| is below 1e-6, since no direction is defined there."""
         first = self.moments[1]
         return torch.where(first.abs() < 1e-6, 0.0, first.angle())
 
     def arc_probability(self, start: Tensor, end: Tensor) -> Tensor:
         """Return the probability of the arc from `start` counter-clockwise to `end`, (*sample, *batch).
 
-        The Fourier series of the density is integrated term by term, so the result is as exact as the moments. Both
-        angles are (*sample, *batch), radians.
+        The Fourier series of the density is integrated term by term, so the probability is as exact as the moments.
+
+        Args:
+            start: first end of the arc, (*sample, *batch), radians.
+            end: second end of the arc, (*sample, *batch), radians.
         """
         length = torch.remainder(end - start, 2 * math.pi)
         return self._series(length, start).clamp(0, 1)
@@ -70,22 +75,25 @@ class CircularMoments:
         return length / (2 * math.pi) + parts.sum(0) / math.pi
 
     def distance(self, value: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-        """Return E d(X, y), with d the angular distance, radians: d(θ) = π/2 - 4/π Σ cos(nθ)/n² over odd n."""
+        """Return the mean angular distance E d(X - y) between X and y = `value`, radians.
+
+        The distance d is computed by its Fourier series, d(θ) = π/2 - 4/π Σ cos(nθ)/n² over odd n.
+        """
         turned = self.moments[1:] * torch.polar(torch.ones_like(self.order), -self.order * value)
         return math.pi / 2 - 4 / math.pi * (turned.real / self.order.square())[::2].sum(0)
 
     @property
     def spread(self) -> Float[Tensor, "*batch"]:
-        """Mean angular distance E d(X, X'), radians, of X and an independent copy X', by the series of `distance`."""
+        """Mean angular distance E d(X - X'), radians, of X and an independent copy X', by the series of `distance`."""
         squares = self.moments[1:].abs().square()
         return math.pi / 2 - 4 / math.pi * (squares / self.order.square())[::2].sum(0)
 
     def density(self, finer: int, *, slope: bool = False) -> Float[Tensor, "points *batch"]:
-        """Return the density on equally spaced angles from -π, interpolated by the Fourier series.
+        """Return the density on equally spaced angles from -π, interpolated by its Fourier series.
 
         Args:
-            finer: number of angles as a multiple of the number of angles on the grid of the moments.
-            slope: if true, return the derivative of the density per radian instead.
+            finer: number of these angles, as a multiple of the number N of angles on the grid of the moments.
+            slope: if true, return the derivative of the density, per radian, instead of the density.
         """
         count = 2 * (len(self.moments) - 1) * finer
         sign = 1 - 2 * (torch.arange(len(self.moments), device=self.moments.device) % 2)
@@ -101,10 +109,11 @@ class CircularMoments:
 
 @torch.no_grad()
 def circular_moments(density: Distribution) -> CircularMoments:
-    """Return the moments by the trapezium rule on a grid, which is spectrally exact for smooth densities.
+    """Return the trigonometric moments of a density of one angle, by the trapezium rule on a grid.
 
-    A density that the coarse grid does not resolve is evaluated on the finer grid. Densities that the coarse grid
-    resolves keep their coarse moments, so that these do not depend on the other densities of the batch.
+    The rule is spectrally exact for smooth densities. Items of the batch that the coarse grid does not resolve are
+    evaluated on the fine grid. The other items keep their moments from the coarse grid, so that these do not depend on
+    the rest of the batch.
 
     Raises:
         ValueError: the density is not over one angle.

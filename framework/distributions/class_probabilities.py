@@ -11,22 +11,23 @@ from framework.distributions.protocol import estimate
 from framework.errors import DataError, UserError
 
 LARGEST_DEFECT = 0.01
-"""Largest deviation of the sum of probabilities from 1; float32 rounds logits of 1e4 to 1e-3."""
+"""Largest accepted difference between 1 and a sum of class probabilities; float32 rounds logits of 1e4 by 1e-3."""
 
 
 def class_probabilities(density: Distribution) -> Float64[Tensor, "batch class"]:
     """Return p(y = k) of each sample, in [0, 1]; each row sums to 1 in float64.
 
-    The function computes exp of log_prob at each class, in float64, divided by their sum. A float32 log_prob leaves
-    sums of 1 ± 1e-7 (± 1e-3 where logits reach 1e4), and a mixture's largest probability may exceed 1 by as much. Where
-    log_prob is estimated from draws (`estimate`), class by class, the deviation of the sum from 1 is random.
+    The probabilities are exp of log_prob at each class, in float64, divided by their sum. Before this division, the
+    sums differ from 1: by 1e-7 for a float32 log_prob, by 1e-3 if its logits reach 1e4, and by a random number if
+    log_prob of each class is estimated from draws (`estimate`). The largest probability of a mixture may exceed 1 by as
+    much.
 
     Args:
         density: density over classes, with batch_shape (batch,); class k is the k-th of `enumerate_support`.
 
     Raises:
-        UserError: the density does not list its values, a probability is NaN, a sum is 0, or a sum differs from 1 by
-            1 % or more although nothing is drawn.
+        UserError: the density does not list its values, a probability is NaN, a sum is 0, or a sum differs from 1 by 1
+            % or more although log_prob does not use draws.
     """
     if not density.has_enumerate_support or tuple(density.event_shape):
         raise UserError(
@@ -49,7 +50,7 @@ def class_probabilities(density: Distribution) -> Float64[Tensor, "batch class"]
 
 
 def require_labels(target: Real[Tensor, "batch"], classes: int) -> Real[Tensor, "batch"]:
-    """Return `target` unchanged if every label names one of the classes.
+    """Return `target` unchanged if every label is a class index from 0 to `classes` - 1.
 
     Raises:
         DataError: a label is below 0, above `classes` - 1, or NaN; the message says which.

@@ -23,7 +23,7 @@ for _kind in (
 
 @protocol.estimate.register
 def _(density: Independent, value: Tensor) -> protocol.Estimate:
-    """Return the estimate of a product of independent factors; the squared errors of their logarithms add up."""
+    """Return the estimate for a product of independent densities; the squared errors of their log-densities add up."""
     factors = protocol.estimate(density.base_dist, value)
     count = density.reinterpreted_batch_ndims
     if count:
@@ -36,15 +36,15 @@ def _(density: Independent, value: Tensor) -> protocol.Estimate:
 
 
 _ON_THE_LINE = (Normal, torchs.Laplace, torchs.Cauchy, torchs.Gumbel, torchs.StudentT)
-"""Densities over all real numbers whose distribution function is known.
+"""Classes of densities over all real numbers whose distribution function torch or SciPy computes.
 
-The distribution function of torch's other densities is wrong outside of their support.
+torch's densities over a part of the real line are missing: their `cdf` is wrong outside of this part.
 """
 
 
 @protocol.marginal.register
 def _(density: Independent, index: int) -> Distribution:
-    """Return the factor itself as the marginal of a product."""
+    """Return the marginal of a product of independent densities, which is the density of number `index`."""
     if density.event_shape == (1,) and index == 0:
         return density
     if density.reinterpreted_batch_ndims == 0:
@@ -56,10 +56,10 @@ def _(density: Independent, index: int) -> Distribution:
 
 
 def _change_parameters(density: Distribution, change: Callable[[Tensor], Tensor]) -> Distribution | None:
-    """Return a torch density of one number with `change` applied to each parameter, or None if this is not known.
+    """Return a torch density with `change` applied to each of its parameters; None if they are not known.
 
-    It is known if every parameter of the constructor is a tensor with one number for each item of the batch. It is not
-    known for a mixture or a transformed density, which have other parts.
+    They are known if event_shape is () and every argument of the constructor is a tensor with one number for each item
+    of the batch. They are not known for a mixture or a transformed density, whose arguments are other densities.
     """
     kind: Any = next(base for base in type(density).__mro__ if getattr(torchs, base.__name__, None) is base)
     names = {*inspect.signature(kind.__init__).parameters} - {"self", "validate_args"}
@@ -77,7 +77,10 @@ def _change_parameters(density: Distribution, change: Callable[[Tensor], Tensor]
 
 
 def _distribution_function(base: Distribution, value: Tensor) -> Tensor:
-    """Return P(X ≤ value) of a density of `_ON_THE_LINE`, float64; of Student's t by SciPy, because torch has none."""
+    """Return P(X ≤ value), float64, of a density whose class is in `_ON_THE_LINE`.
+
+    Student's t is computed by SciPy, because torch has no distribution function for it.
+    """
     if not isinstance(base, torchs.StudentT):
         return base.cdf(value)
     # imported here, since importing SciPy is slow and most commands do not need it
@@ -217,8 +220,8 @@ def _(density: MultivariateNormal, value: Tensor) -> Tensor:
 
 
 def normal_quantile(probability: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-    """Return z with Φ(z) = probability.
+    """Return z with Φ(z) = probability, where Φ is the distribution function of the standard normal density.
 
-    Where float64 cannot tell the probability from 0 or 1, z is ±8.2 and not infinite.
+    Probabilities that are 0 or 1, or closer to these than 2⁻⁵⁴ or 2⁻⁵³, give about -8.3 or 8.2, and not ±∞.
     """
     return torch.special.ndtri(probability.clamp(2.0**-54, 1 - 2.0**-53))

@@ -1,4 +1,4 @@
-"""The mixture that every wrapper and mixture head returns, and a grid and the entropy of the density of one angle."""
+"""`Mixture`, the density that every ensemble and mixture head returns, and a grid for densities of one angle."""
 
 import math
 from collections.abc import Collection, Sequence
@@ -28,23 +28,23 @@ __all__ = [
 
 circular_entropy = entropy_of_one
 CHUNK = 2**20
-"""Largest number of component densities evaluated at once without gradient, when one density is read at many points."""
+"""Largest number of component densities that are evaluated at once, if no gradient is needed."""
 LARGEST = 2**26
-"""Largest number of elements of their values at once; an image has a hundred thousand."""
+"""Largest number of elements of the values at which they are evaluated at once; one image has a hundred thousand."""
 
 CROSSED = 16
-"""Largest number of components for which the mode search compares every pair."""
+"""Largest number of components with which the search for the mode also starts between every pair (`crossings`)."""
 
 
 class Mixture(Distribution):
-    """The density Σ_k w_k p_k, which every wrapper and mixture head returns; parameters are never averaged.
+    """The density Σ_k w_k p_k with weights w_k and components p_k, which every ensemble and mixture head returns.
+
+    The densities are averaged, never their parameters. A mixture of one component equals this component to the last
+    bit: the log-weight of one component is exactly 0, and log-sum-exp of one term is that term.
 
     Args:
         log_weights: (*batch, K), nats. They are normalised here, so logits are accepted. -inf is a weight of zero.
         components: one density with batch_shape (*batch, K).
-
-    A mixture of one component equals this component to the last bit: the log-weight of one component is exactly 0, and
-    log-sum-exp of one term is that term.
     """
 
     arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
@@ -67,7 +67,7 @@ class Mixture(Distribution):
         return self.components.support
 
     def enumerate_support(self, expand: bool = True) -> Tensor:
-        """Return every class, (class, *batch), or (class, *1) without `expand`."""
+        """Return every class, (class, *batch); without `expand`, all dimensions after the first have length 1."""
         return self.components.enumerate_support(expand)[..., 0]
 
     def log_prob(self, value: Tensor) -> Tensor:
@@ -78,9 +78,10 @@ class Mixture(Distribution):
         return torch.logsumexp(self.log_weights + self.components.log_prob(spread), -1)
 
     def split_values(self, value: Tensor) -> Sequence[Tensor]:
-        """Return the values (*sample, *batch, *event), split along the first dimension if they would fill the memory.
+        """Return `value` (*sample, *batch, *event) in pieces along the first dimension that fit into memory.
 
-        A grid of angles on many samples with many components is an example.
+        For example, a grid of angles with many samples and many components must be split. While gradients are recorded,
+        nothing is split, and the only piece is `value`.
         """
         extra = value.dim() - len(self.batch_shape) - len(self.event_shape)
         if extra > 0 and value.shape[0] > self.rows and not torch.is_grad_enabled():
@@ -89,7 +90,7 @@ class Mixture(Distribution):
 
     @property
     def rows(self) -> int:
-        """Number of values (*batch, *event) that are computed at once without gradient."""
+        """Largest length of the first dimension of values that are evaluated at once, if no gradient is needed."""
         components = max(1, self.log_weights.numel())
         return max(1, min(CHUNK // components, LARGEST // (components * max(1, self.event_shape.numel()))))
 
@@ -110,7 +111,7 @@ class Mixture(Distribution):
 
     @property
     def mode(self) -> Tensor:
-        """The likeliest class; the mode of a single component; otherwise a maximum of the density (`highest`)."""
+        """Mode: for classes the most likely one, for one component its mode, otherwise a maximum found by `highest`."""
         event = len(self.event_shape)
         if self.log_weights.shape[-1] == 1:
             return self.components.mode.squeeze(-1 - event)
@@ -127,27 +128,27 @@ class Mixture(Distribution):
 
     @property
     def mean(self) -> Tensor:
-        """The mean of real numbers, (*batch, *event); angles and classes have none."""
+        """Mean of real numbers, (*batch, *event); for angles and classes, a NotImplementedError is raised."""
         first, offset, shares = self._moments()
         return first + (shares * offset).sum(self._axis)
 
     @property
     def variance(self) -> Tensor:
-        """The variance of each real number, by the law of total variance."""
+        """Variance of each real number, (*batch, *event), by the law of total variance."""
         _, offset, shares = self._moments()
         deviation = offset - (shares * offset).sum(self._axis, keepdim=True)
         return (shares * (self.components.variance + deviation.square())).sum(self._axis)
 
     @property
     def _axis(self) -> int:
-        """The dimension of a value tensor that counts the components."""
+        """Dimension of a value tensor (*sample, *batch, K, *event) that counts the K components (negative)."""
         return -1 - len(self.event_shape)
 
     def _moments(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return the mean of the first component, the offsets of all component means from this mean, and the weights.
 
         Raises:
-            NotImplementedError: there is no mean; torch's own densities raise the same error.
+            NotImplementedError: angles and classes have no mean; torch's own densities raise the same error.
         """
         if self.has_enumerate_support or isinstance(self.support, Circular):
             raise NotImplementedError(
@@ -160,11 +161,11 @@ class Mixture(Distribution):
         return first, means - first.unsqueeze(self._axis), weights
 
     def entropy(self) -> Tensor:
-        """Return the entropy, nats; exact for classes, by quadrature for one number.
+        """Return the entropy, nats: exact for classes, by quadrature for one number, from draws for several numbers.
 
-        For several numbers the entropy is Σ_k w_k (H_k - E_k log f/p_k), with H_k each component's own entropy, and E_k
-        a mean over about 1000 samples in all, equally many from each component. So only the overlap of components is
-        estimated from random draws.
+        For several numbers, the entropy of the mixture f = Σ_k w_k p_k is Σ_k w_k (H_k - E_k log f/p_k). Here H_k is
+        the entropy of component k, and E_k is a mean over draws from component k. All components get the same number of
+        draws, in all about 1000. So only the overlap of components is estimated from random draws.
         """
         count = self.log_weights.shape[-1]
         if count == 1:
@@ -187,7 +188,11 @@ class Mixture(Distribution):
         return (self.log_weights.exp() * cross_entropies).sum(-1)
 
     def _surprise(self, draws: int) -> Tensor:
-        """Return log p_k - log f at `draws` draws of each component, (draw, *batch, component)."""
+        """Return log p_k - log f at draws from component k, with p_k the density of the component and f the mixture.
+
+        Args:
+            draws: number of draws from each component; the result is (draw, *batch, component).
+        """
         samples = self.components.sample(torch.Size((draws,)))
         values = samples.movedim(-1 - len(self.event_shape), 1).flatten(0, 1)
         mixed = self.log_prob(values).unflatten(0, (draws, self.log_weights.shape[-1])).movedim(1, -1)
@@ -195,13 +200,14 @@ class Mixture(Distribution):
 
 
 def estimate_of_sum(parts: protocol.Estimate, log_terms: Tensor, log_sum: Tensor) -> protocol.Estimate:
-    """Return the estimate of log Σ_k t_k, summed along the last dimension, from estimates of the terms.
+    """Return the estimate of log Σ_k t_k from the estimates of the terms t_k, which the last dimension counts.
 
-    The terms must be drawn independently of one another. By the delta method, the squared relative error of the sum is
-    Σ_k (t_k / Σ_j t_j)² s_k². The numbers of samples add up.
+    The terms must be estimated from independent draws. By the delta method, the squared standard error of the log-sum
+    is Σ_k (t_k / Σ_j t_j)² s_k², where s_k is the standard error of log t_k. The numbers of samples add up.
 
     Args:
-        parts: estimates of log t_k or of these plus constants, with errors and numbers of samples, (*items, K).
+        parts: estimates of log t_k, (*items, K). Only their errors, numbers of samples and `unresolved` are used, so
+            the estimates may be those of log t_k plus constants.
         log_terms: log t_k, (*items, K).
         log_sum: log Σ_k t_k, (*items,).
     """
@@ -217,7 +223,7 @@ def estimate_of_sum(parts: protocol.Estimate, log_terms: Tensor, log_sum: Tensor
 
 @protocol.estimate.register
 def _(density: Mixture, value: Tensor) -> protocol.Estimate:
-    """Return the estimate of a mixture of independent components; for one component its estimate, to the last bit."""
+    """Return the estimate of a mixture whose components draw independently; of a single component, its own estimate."""
     several = density.split_values(value)
     if len(several) > 1:
         return concatenate_estimates([protocol.estimate(density, part) for part in several])
@@ -230,7 +236,7 @@ def _(density: Mixture, value: Tensor) -> protocol.Estimate:
 
 
 def concatenate_estimates(parts: Sequence[protocol.Estimate]) -> protocol.Estimate:
-    """Return the estimates of several batches as one, concatenated along the first dimension."""
+    """Return one estimate whose fields are the fields of `parts`, concatenated along the first dimension."""
     return protocol.Estimate(*map(torch.cat, zip(*parts, strict=True)))
 
 
@@ -241,10 +247,10 @@ def _(density: Mixture, index: int) -> Distribution:
 
 @protocol.median.register
 def _(density: Mixture, samples: int) -> Tensor:
-    """Return the median of a single component; otherwise the median of draws, as by default.
+    """Return the median of a single component; for several components, the median of draws (the default of `median`).
 
-    For images the mean is returned, as `Frozen` does: the median of few draws is a noisy image, and the median from the
-    distribution function takes a second of processor time.
+    For several components over images the mean is returned, as `framework.deployment.frozen.Frozen` does: the median of
+    few draws is a noisy image, and the median from the distribution function takes a second of processor time.
     """
     if density.log_weights.shape[-1] == 1:
         return protocol.median(density.components, samples).squeeze(-1 - len(density.event_shape))
@@ -278,7 +284,13 @@ def _(density: Mixture, start: Tensor, end: Tensor) -> Tensor | None:
 
 
 def _weighted_mean(density: Mixture, parts: Tensor | None, numbers: int = 0) -> Tensor | None:
-    """Return the weighted mean of the components' `parts`, (*sample, *batch, *number, K)."""
+    """Return the mean of probabilities over the components, weighted by the mixture's weights; None if there are none.
+
+    Args:
+        density: the mixture.
+        parts: probabilities from each component, (*sample, *batch, *number, K), or None if they are not known.
+        numbers: number of dimensions in *number.
+    """
     if parts is None:
         return None
     weights = density.log_weights.double().softmax(-1)  # float32 weights sum to 1 only to 1e-7
@@ -322,7 +334,10 @@ def _(density: Mixture, index: Tensor) -> Distribution:
 
 @protocol.pick.register
 def _(density: Reshaped, index: Tensor) -> Distribution:
-    """Return the picked items of the inner density, whose batch is flattened; no draw is discarded."""
+    """Return the density at `index`; items that are not chosen are not drawn from if this can be avoided.
+
+    It can be avoided if the batch of the wrapped density has one dimension and this density is no mixture.
+    """
     inner = density.density
     # a picked mixture draws from all its items for each pick; here these would be the items of the whole batch
     if len(inner.batch_shape) != 1 or isinstance(inner, Mixture):
@@ -346,10 +361,10 @@ def _(density: Mixture) -> Tensor:
 
 @protocol.images.register
 def _(density: Mixture, channels: Collection[str]) -> dict[str, Tensor]:
-    """Return the images of a single component; for several components over images, their mean.
+    """Return the images of a single component; for several components over images, the weighted mean of their images.
 
-    Several components over other targets have no image: components whose images show their own point predictions do
-    not show the point prediction of the mixture.
+    Several components over other targets have no image: the image of each component shows its own point prediction,
+    which is not the point prediction of the mixture.
     """
     if density.log_weights.shape[-1] == 1:
         axis = len(density.batch_shape)
@@ -380,8 +395,8 @@ def _(density: Mixture, index: tuple[Tensor, ...], origin: Tensor) -> Distributi
 def circular_grid(density: Distribution, points: int = 360) -> tuple[Tensor, Tensor]:
     """Return angles (points,) in [-π, π) and the log-density there (points, *batch) of a density of one angle.
 
-    A density narrower than the grid (concentration above points²/40) may fall between two points; use more points
-    for such a density.
+    The peak of a density that is narrower than the grid (concentration above points²/40) may lie between two angles and
+    be missed; use more points for such a density.
     """
     if tuple(density.event_shape) != (1,):
         raise ValueError(

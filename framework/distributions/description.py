@@ -5,13 +5,13 @@ from torch import Tensor
 from torch.distributions import Categorical, Distribution
 
 LONGEST = 200
-"""Largest number of characters of a line."""
+"""Largest number of characters of the line."""
 WHOLE = 6
-"""Largest number of a parameter's elements that are printed in full; of longer parameters the range is printed."""
+"""Largest number of elements up to which a parameter is printed in full; of a longer one, the range is printed."""
 
 
 def one_line(self: Distribution) -> str:
-    """Return the kind of a density, its shapes, its names where it has some, and its parameters.
+    """Return a density as one line: its class, its shapes, the names of its target (if it has them) and its parameters.
 
     The function draws and integrates nothing. Densities use it as their `__repr__`.
     """
@@ -26,19 +26,31 @@ def one_line(self: Distribution) -> str:
 
 
 class CategoricalDensity(Categorical):
-    """A categorical density that prints as the other densities do."""
+    """torch's categorical density, printed as one line (`one_line`) like the project's own densities."""
 
     __repr__ = one_line
 
 
 def _parameters(density: Distribution, inner: bool = True) -> list[str]:
-    """Return the parameters of a density as text, and those of a density inside it if `inner` is true."""
+    """Return the parameters of a density as texts `name=value`.
+
+    Args:
+        density: the density.
+        inner: if true, a density among the attributes is printed with its parameters; otherwise only its class is
+            printed.
+    """
     texts = ((key, _parameter(key, value, inner)) for key, value in vars(density).items())
     return [f"{key}={text}" for key, text in texts if text]
 
 
 def _parameter(key: str, value: object, inner: bool) -> str:
-    """Return a parameter as a few characters; '' for an attribute that is no parameter."""
+    """Return an attribute of a density as a short text; '' if it is not printed because it is no parameter.
+
+    Args:
+        key: name of the attribute.
+        value: its value.
+        inner: as of `_parameters`.
+    """
     if key.startswith("_"):
         return ""
     if isinstance(value, Distribution):

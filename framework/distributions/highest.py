@@ -8,19 +8,19 @@ from framework.distributions.circular import Circular, wrap
 from framework.distributions.protocol import QuadraticBound, quadratic_bound
 
 STARTS = 3
-"""Number of starting points that are used: those where the density is highest."""
+"""Number of starting points from which the search begins: those at which the density is highest."""
 STEPS = 16
-"""Largest number of steps."""
+"""Largest number of steps from one starting point."""
 LONGEST = 16.0
-"""Longest step, as a multiple of the step to the maximum of the bound."""
+"""Longest step, as a multiple of the step to the maximum of the quadratic lower bound (`quadratic_bound`)."""
 
 
 def highest(density: Distribution, starts: Tensor) -> Tensor:
     """Return a point (*batch, *event) where the density is at least as high as at all starting points.
 
     If the `quadratic_bound` of the density is known, the point is a local maximum, up to the rounding of log_prob and
-    unless more than STEPS steps are needed. It is not the global maximum if no ascent from the starting points leads
-    there. If the `quadratic_bound` is not known, the point is the best starting point.
+    unless more than STEPS steps are needed. It is not the global maximum if no ascent from the starting points leads to
+    that. If the `quadratic_bound` is not known, the point is the starting point with the highest density.
 
     Args:
         density: the density.
@@ -33,13 +33,18 @@ def highest(density: Distribution, starts: Tensor) -> Tensor:
 
 
 def crossings(components: Distribution, modes: Tensor) -> Tensor:
-    """Return maxima of products of two of K components, (pair, *batch, *event); none if their bounds are not known.
+    """Return starting points between every two of K components, for the search for a mixture's mode.
 
-    Two components that are narrow in different numbers may be highest together far from the mode of each.
+    Two components that are narrow in different numbers may together be highest at a point far from both of their modes.
+    The starting point for such a pair is the maximum of the product of two quadratic bounds: of the first component and
+    of the second, both at the mode of the first.
 
     Args:
         components: a density with batch_shape (*batch, K).
         modes: modes of the components, (K, *batch, *event).
+
+    Returns:
+        Points (pair, *batch, *event); no pair if the `quadratic_bound` of the components is not known.
     """
     # (K, *batch, K, *event): the second component at the first's mode
     both = quadratic_bound(components, modes.unsqueeze(-2))
@@ -51,7 +56,15 @@ def crossings(components: Distribution, modes: Tensor) -> Tensor:
 
 
 def _step_to_top(pull: Tensor, stiffness: Tensor, angles: bool) -> Tensor:
-    """Return the step from where a bound touches the density to the bound's maximum; 0 where it is not finite."""
+    """Return the step from the point where a `QuadraticBound` touches the density to the maximum of the bound.
+
+    The step is 0 where it is not finite.
+
+    Args:
+        pull: field of the bound.
+        stiffness: field of the bound.
+        angles: true if the numbers are angles.
+    """
     return (torch.atan2(pull, stiffness) if angles else pull / stiffness).nan_to_num(0.0, 0.0, 0.0)
 
 
@@ -62,11 +75,17 @@ def _over_event(density: Distribution, index: Tensor) -> Tensor:
 
 @torch.no_grad()
 def _climb(density: Distribution, point: Tensor, height: Tensor) -> tuple[Tensor, Tensor]:
-    """Return local maxima (start, *batch, *event), one for each starting point, and their log-densities.
+    """Return a local maximum for each starting point, (start, *batch, *event), and the log-densities there.
 
-    A step leads to the maximum of the bound, where the density is never lower. The step is lengthened by what the last
-    step showed (the secant method). For one number this is Newton's method near the maximum, without a second
-    derivative.
+    Each step leads towards the maximum of the quadratic bound, where the density is at least as high. The step is
+    lengthened by a factor that follows from the gradients before and after the previous step (the secant method). For
+    one number this is Newton's method near the maximum, without a second derivative. If the bound is not known, the
+    starting points are returned.
+
+    Args:
+        density: the density.
+        point: starting points, (start, *batch, *event).
+        height: log-densities at the starting points, (start, *batch).
     """
     bound = quadratic_bound(density, point)
     if bound is None:

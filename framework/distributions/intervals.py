@@ -1,4 +1,4 @@
-"""Central intervals of densities of reals or angles: quantiles of a known distribution function, otherwise of draws."""
+"""Central intervals of densities of real numbers or angles, from the distribution function or else from draws."""
 
 import math
 from collections.abc import Callable
@@ -27,33 +27,33 @@ from framework.distributions.protocol import (
 from framework.errors import UserError
 
 DRAWS = 9999
-"""Number of draws of a density whose distribution function is unknown; the mass between two draws is right to 0.003."""
-ROUNDS = 200
-"""Largest number of times that a bracket is narrowed.
+"""Number of draws of a density whose distribution function is not known.
 
-The search ends earlier, at the last digits of the bracket's distance from the density's middle.
+The probability of an interval between two draws then has a standard error of 0.003, if it is 0.9.
 """
+ROUNDS = 200
+"""Largest number of steps in which a bracket is narrowed; the search normally ends earlier, at a width of EXACT."""
 EXACT = 1e-12
-"""Width of a bracket at the end of the search, relative to that distance."""
+"""Width of a bracket at which the search ends, as a multiple of its distance from the middle of the density."""
 AROUND = 24
-"""Number of angles at which the search for the middle of a density of one angle starts, besides those near peaks."""
+"""Number of equally spaced angles at which the search for the median of an angle starts, besides those near peaks."""
 RUNGS, NARROWER = 16, 8.0
-"""Number of arcs that are tried first in the search for the arc of a given mass, and the ratio of their widths."""
+"""Number of arcs that are tried first in the search for an arc of given probability, and the ratio of their widths."""
 _FURTHEST = 1100
-"""Number of doublings of a bracket that leads from the smallest to the largest floating-point number."""
+"""Largest number of times that a bracket is doubled; 1024 doublings lead from 1 to the largest float64 number."""
 _FEW = 5.0
-"""Number of draws that must lie beyond an end so that the error of this end is known."""
+"""Smallest expected number of draws beyond an end of an interval for which the error of this end is computed."""
 
 
 class Interval(NamedTuple):
-    """The central interval of each number's density, (*batch, number) each, float64.
+    """Central interval of each number of a density; every field has the shape (*batch, number) and is float64.
 
     Attributes:
-        low, high: the ends of the interval; half of the remaining mass lies outside of each end. Angles are in radians:
-            `low` is in [-π, π), and the arc runs counter-clockwise to `high`, at most one turn further. The circular
-            median splits the arc into two parts with half of its mass each.
-        low_error, high_error: standard errors of the ends in their unit; 0 where the ends were computed without draws,
-            infinite where the draws do not reach far enough.
+        low, high: the ends of the interval. Half of the remaining probability lies beyond each end. Angles are in
+            radians: `low` is in [-π, π), and the interval is the arc from `low` counter-clockwise to `high`, at most
+            one turn further. The circular median splits this arc into two parts of equal probability.
+        low_error, high_error: standard errors of the ends, in their unit; 0 where the ends were computed without draws,
+            infinite where fewer than 5 draws are expected beyond an end.
     """
 
     low: Tensor
@@ -69,10 +69,10 @@ class Interval(NamedTuple):
 
 @torch.no_grad()
 def central_interval(density: Distribution, mass: float, draws: int = DRAWS) -> Interval:
-    """Return the central interval with the given mass for each number of a density of reals or angles.
+    """Return the central interval with probability `mass` for each number of a density of real numbers or angles.
 
     Ends are computed from `normals`, `cdf` or `arc_probability`, or from the Fourier series of an angle's density
-    (`circular_moments`), where these are known; otherwise they are order statistics of `draws` draws.
+    (`circular_moments`), where one of these is known. Otherwise they are order statistics of `draws` draws.
 
     Args:
         density: a density with event_shape (number,).
@@ -106,7 +106,7 @@ def _select(chosen: Tensor, first: Interval, second: Interval) -> Interval:
 
 
 def _exact_interval(low: Tensor, high: Tensor) -> Interval:
-    """Return the interval with the computed ends (*batch,), and errors of 0."""
+    """Return the interval with the ends `low` and `high`, (*batch,), and with standard errors of 0."""
     none = torch.zeros_like(low).unsqueeze(-1)
     return Interval(low.unsqueeze(-1), high.unsqueeze(-1), none, none)
 
@@ -117,7 +117,7 @@ def _tails(mass: float) -> Tensor:
 
 
 def _interval_of_real(density: Distribution, mass: float) -> Interval | None:
-    """Return the interval of one real number whose distribution function is known; None if it is not."""
+    """Return the interval with probability `mass` of one real number; None if its distribution function is unknown."""
     below = _tails(mass)
     known = normals(density)
     if known is not None:
@@ -136,7 +136,11 @@ def _cdf_of(density: Distribution, value: Float[Tensor, "place *batch"]) -> Tens
 
 
 def _normal_quantiles(known: Normals, below: Float[Tensor, "place"]) -> Float[Tensor, "place *batch"]:
-    """Return quantiles of mixtures of normals; they lie between the quantiles of the components."""
+    """Return the quantiles of mixtures of normals at the probabilities `below`.
+
+    A quantile of a mixture lies between the smallest and the largest quantile of its components, where the search
+    starts.
+    """
     z = normal_quantile(below).reshape(-1, *(1,) * known.mean.dim())
     quantiles = known.mean + z * known.scale  # (place, *batch, component)
     if known.mean.shape[-1] == 1:
@@ -161,9 +165,12 @@ def _quantiles_by_search(
     below: Float[Tensor, "place"],
     samples: Float[Tensor, "draw *batch"],
 ) -> Float[Tensor, "place *batch"]:
-    """Return quantiles of any density of one real number, from a bracket that grows until it contains them.
+    """Return the quantiles of any density of one real number at the probabilities `below`.
 
-    The bracket starts from a few draws.
+    Args:
+        mass_below: distribution function of the density.
+        below: probabilities.
+        samples: a few draws. The first bracket is around their median, and it grows until it contains the quantile.
     """
     center = samples.median(0).values
     samples = samples.sort(0).values
@@ -189,16 +196,16 @@ def find_crossing(
 ) -> Tensor:
     """Return the argument at which a function that never falls reaches `level`; NaN where the function is NaN.
 
-    The search uses inverse quadratic interpolation where it is safe and bisection elsewhere (Chandrupatla 1997), item
-    by item.
+    Each item has its own search. It uses inverse quadratic interpolation where this is safe, and bisection elsewhere
+    (Chandrupatla 1997).
 
     Args:
         rising: the function, which never falls.
-        level: the value to reach.
-        low: lower end of a bracket.
+        level: the value that the function reaches.
+        low: lower end of a bracket of the argument.
         high: upper end of the bracket.
-        center: reference point; the search ends where the bracket is as narrow as EXACT times the distance from it,
-            or where two neighbouring numbers are left.
+        center: reference point. The search ends where the bracket is as narrow as EXACT times its distance from this
+            point, or where its ends are neighbouring floating-point numbers.
     """
     level, low, high = torch.broadcast_tensors(level, low, high)
     a, b = high, low
@@ -235,7 +242,10 @@ def find_crossing(
 
 
 def _interval_of_angle(density: Distribution, mass: float) -> Interval | None:
-    """Return the interval of one angle; NaN where neither the probability of arcs nor the Fourier series is known."""
+    """Return the interval with probability `mass` of one angle; None if the batch is empty.
+
+    The ends are NaN for items for which neither `arc_probability` nor the Fourier series (`circular_moments`) is known.
+    """
     flat = Reshaped(density, (density.batch_shape.numel(),))
     if not len(flat.batch_shape) or flat.batch_shape.numel() == 0:
         return None
@@ -263,7 +273,13 @@ def _interval_of_angle(density: Distribution, mass: float) -> Interval | None:
 def _width_of_mass(
     mass_within: Callable[[Tensor], Tensor], mass: float, center: Float[Tensor, "item"]
 ) -> Float[Tensor, "item"]:
-    """Return the width, radians up to π, of the arc next to `center` whose probability is `mass`."""
+    """Return the width, radians up to π, of the arc on one side of `center` whose probability is `mass`.
+
+    Args:
+        mass_within: function from the width of this arc to its probability.
+        mass: probability.
+        center: end of the arc, for each item.
+    """
     power = torch.arange(RUNGS, dtype=torch.float64, device=center.device).unsqueeze(-1)
     rungs = (math.pi * NARROWER**-power).expand(RUNGS, len(center))
     enough = (mass_within(rungs) >= mass).sum(0).clamp(min=1)  # falling
@@ -274,9 +290,12 @@ def _width_of_mass(
 
 
 def _arc_function(flat: Distribution) -> Callable[[Tensor, Tensor], Tensor]:
-    """Return a function of two angles, (*sample, item) each: the mass of the arc counter-clockwise between them.
+    """Return a function of two angles, (*sample, item) each: the probability of the arc from the first to the second.
 
-    The mass is NaN for items for which it is not known.
+    The arc runs counter-clockwise. The probability is NaN for items for which it is not known.
+
+    Args:
+        flat: density of one angle, with one batch dimension.
     """
     probe = torch.zeros((*flat.batch_shape, 1), dtype=torch.float64, device=flat.sample().device)
     if arc_probability(flat, probe, probe + 1) is not None:
@@ -298,11 +317,16 @@ def _arc_function(flat: Distribution) -> Callable[[Tensor, Tensor], Tensor]:
 
 
 def _circular_center(law: Callable[[Tensor, Tensor], Tensor], flat: Distribution) -> Float[Tensor, "item"]:
-    """Return the angle of least expected deviation (thesis eq. 3.23), in [-π, π).
+    """Return the circular median: the angle in [-π, π) with the least expected deviation (thesis eq. 3.23).
 
-    The deviation falls where less than half of the mass lies on the half turn behind an angle, and rises where more
-    than half lies there. So its minima are where this mass reaches one half. Among several minima the lowest one,
-    judged at the nodes, is taken.
+    If the angle increases, the expected deviation falls where less than half of the probability lies on the half circle
+    behind it (clockwise), and rises where more than half lies there. So the minima are where this probability reaches
+    one half. Of several minima, the one with the lowest deviation at the neighbouring `_nodes` is taken. If there is no
+    minimum (uniform density), the mode is returned.
+
+    Args:
+        law: function that `_arc_function` returns for `flat`.
+        flat: density of one angle, with one batch dimension.
     """
     nodes = _nodes(flat)
     behind = law(nodes - math.pi, nodes) - 0.5  # half the slope of the deviation
@@ -324,7 +348,7 @@ def _circular_center(law: Callable[[Tensor, Tensor], Tensor], flat: Distribution
 
 
 def _nodes(flat: Distribution) -> Float[Tensor, "node item"]:
-    """Return ascending angles in [-π, π): around the whole circle, and near each peak at steps of its width."""
+    """Return ascending angles in [-π, π): around the whole circle, and near each peak at multiples of its width."""
     places = wrap(mode_candidates(flat).squeeze(-1).double())
     width = peak_widths(flat).double().nan_to_num(nan=1.0, posinf=1.0)
     near = torch.tensor([-3, -1, 0, 1, 3], dtype=torch.float64, device=places.device)
@@ -335,9 +359,10 @@ def _nodes(flat: Distribution) -> Float[Tensor, "node item"]:
 
 
 def _interval_of_draws(density: Distribution, mass: float, draws: int) -> Interval:
-    """Return an interval of order statistics: of n draws, the i-th is the quantile i / (n + 1).
+    """Return the interval with probability `mass`, whose ends are order statistics of `draws` draws.
 
-    Angles are ordered about their circular median.
+    Of n draws in ascending order, the i-th is taken as the quantile i / (n + 1). Angles that cover the whole circle are
+    ordered by their signed distance from their circular median.
     """
     samples = density.sample(torch.Size((draws,))).double()
     angles = isinstance(density.support, Circular)

@@ -1,4 +1,4 @@
-"""Random noise that depends on its purpose alone: (seed, step) in training, (seed, batch, quantity) in evaluation."""
+"""Seeds of random noise, set from (seed, step) in training and from (seed, batch, quantity) in evaluation."""
 
 import hashlib
 import random
@@ -14,7 +14,7 @@ from framework.storage.names import as_bytes
 
 @dataclass(frozen=True)
 class Draw:
-    """The noise of one evaluated batch; the draws for a quantity do not depend on which others are computed.
+    """Random noise for one batch in evaluation: the draws for one quantity do not depend on which others are computed.
 
     Attributes:
         seed: seed of the run.
@@ -26,7 +26,7 @@ class Draw:
 
     @contextmanager
     def __call__(self, quantity: str) -> Iterator[None]:
-        """Seed the noise for this quantity within the context; afterwards torch's generators continue as before."""
+        """Seed the random generators for `quantity` in a `with` block; torch's generators are restored at its end."""
         devices = [torch.cuda.current_device()] if torch.cuda.is_initialized() else []
         with torch.random.fork_rng(devices):
             seed_step(self.seed, self.number, quantity)
@@ -34,11 +34,17 @@ class Draw:
 
 
 def seed_step(seed: int, step: int, stage: str, rank: int = 0) -> None:
-    """Make all following noise depend on (seed, step, stage, rank) alone.
+    """Seed all random generators, so that the following noise depends on (seed, step, stage, rank) alone.
 
-    The function seeds torch's CPU and CUDA generators, NumPy's legacy generator and Python's; it takes 7 µs in all, of
-    which Python's takes 3. `step` numbers the batches of a stage, not the optimiser's steps: otherwise batches whose
-    gradients are accumulated would share their noise.
+    These are torch's CPU and CUDA generators, NumPy's legacy generator and Python's. Seeding them takes 7 µs in all, of
+    which Python's takes 3 µs.
+
+    Args:
+        seed: seed of the run.
+        step: number of the batch, not of the optimiser's step: batches whose gradients are accumulated would share
+            their noise otherwise.
+        stage: name of what the noise is used for, such as "train" or "validation".
+        rank: number of the process.
     """
     value = stable_hash(seed, stage, step, rank)
     # torch.manual_seed is not used: where CUDA is not in use it formats the stack for a later report, 100 µs.
@@ -50,6 +56,6 @@ def seed_step(seed: int, step: int, stage: str, rank: int = 0) -> None:
 
 
 def stable_hash(*parts: int | str) -> int:
-    """Return a 64-bit hash of all parts that is the same on every machine."""
+    """Return a 64-bit hash of `parts` in their order, which is the same on every machine."""
     digest = hashlib.blake2b(as_bytes("|".join(map(str, parts))), digest_size=8).digest()
     return int.from_bytes(digest, "little")

@@ -10,10 +10,11 @@ from framework.distributions.protocol import marginal, median, tempered_density
 
 
 class IndependentNormals(Independent):
-    """Normal densities of several independent numbers.
+    """The normal density of several independent numbers.
 
     Args:
-        mean, scale: (*batch, number).
+        mean: (*batch, number).
+        scale: standard deviations, (*batch, number).
     """
 
     def __init__(self, mean: Tensor, scale: Tensor) -> None:
@@ -45,7 +46,7 @@ def _(density: IndependentNormals, temperature: Tensor) -> IndependentNormals:
 
 
 class JointNormal(MultivariateNormal):
-    """The normal density with covariance R Rᵀ.
+    """The normal density of several correlated numbers, with covariance R Rᵀ.
 
     Args:
         mean: (*batch, number).

@@ -15,27 +15,34 @@ from framework.distributions.circular import Circular, wrap
 from framework.distributions.protocol import mode_candidates, peak_widths, recentre
 
 AT_ONCE = 2**17
-"""Number of components that are evaluated together, and of pairs of peaks that are compared together."""
+"""Largest number of component densities evaluated at once, and of pairs of peaks that are compared at once."""
 WIDTH = 2.0
-"""Width of a first panel in v.
+"""Width of a panel before it is halved, in the variable v of `Panels`.
 
-The innermost panel ends 3.6 scales from its peak, and each further panel ends e² times as far out.
+The innermost panel ends 3.6 scales from its peak, and the end of each further panel is e² times as far from the peak.
 """
 REACH = 1e4
-"""Distance from the last peak to the end of a density's range on the real line, in multiples of its largest scale."""
+"""Distance from the outermost peak at which integration over the real line ends, in multiples of the widest peak."""
 ROUNDS, MOST = 40, 4096
-"""Largest number of times that a panel is halved, and of panels of one item that are halved at once.
+"""Largest number of times that a panel is halved, and of panels of one density that are halved at once.
 
-Where more are needed, the mass differs from 1 and shows it.
+If a density needs more, the integral of the density differs from 1, which `entropy_of_one` detects.
 """
 TOLERANCE = {torch.float64: 1e-9, torch.float32: 1e-6}
-"""Largest difference of the two rules on a panel, by the density's number type; the finer rule errs far less."""
+"""Largest difference between Kronrod's and Gauss's rule on a panel that is not halved, by the density's number type.
+
+The error of Kronrod's rule, which gives the entropy, is far smaller than this difference.
+"""
 MASS_GAP = 100
-"""Largest difference between 1 and the mass on all panels, in multiples of that tolerance."""
+"""Largest accepted difference between 1 and the integral of a density over its panels, in multiples of TOLERANCE."""
 LARGEST = 4096
-"""Largest number of peaks of one density; all pairs are compared, and each peak is evaluated at the nodes of all."""
+"""Largest number of peaks of one density with which its entropy is computed by quadrature.
+
+The cost grows with the square of this number: all pairs of peaks are compared, and the component at each peak is
+evaluated at the nodes of all peaks.
+"""
 DRAWS = 1024
-"""Number of draws of each density that quadrature does not resolve."""
+"""Number of draws for the entropy of a density that quadrature does not resolve."""
 _log = logging.getLogger(__name__)
 
 _HALF = (
@@ -54,9 +61,10 @@ COARSE[1::2] = torch.from_numpy(np.polynomial.legendre.leggauss(7)[1])
 
 
 class Panels(NamedTuple):
-    """Panels, which are parts of the ranges of densities: x = place + scale · sinh(v), low ≤ v ≤ high.
+    """Panels: intervals over which densities are integrated, x = place + scale · sinh(v) with low ≤ v ≤ high.
 
-    Each column has the shape (panel,); `item` is the index of the density.
+    All fields have the shape (panel,). `item` is the index of the density, `place` is the position of a peak, and
+    `scale` is the width of this peak.
     """
 
     item: Tensor
@@ -66,7 +74,7 @@ class Panels(NamedTuple):
     high: Tensor
 
     def of(self, chosen: Tensor) -> "Panels":
-        """Return the chosen panels."""
+        """Return the panels that are given by `chosen`, a mask or indices."""
         return Panels(*(column[chosen] for column in self))
 
     def halves(self) -> "Panels":
@@ -77,7 +85,10 @@ class Panels(NamedTuple):
 
 
 def has_range(density: Distribution) -> bool:
-    """Return true for a density of one number on a circle, a part of a circle, or the whole real line."""
+    """Return true for a density of one number on a circle, a part of a circle, or the whole real line.
+
+    `entropy_of_one` computes the entropy of such a density.
+    """
     support = density.support
     real = isinstance(support, constraints.independent) and support.base_constraint is constraints.real
     return tuple(density.event_shape) == (1,) and (real or isinstance(support, Circular))
@@ -86,12 +97,14 @@ def has_range(density: Distribution) -> bool:
 def entropy_of_one(density: Distribution) -> Float[Tensor, "*batch"]:
     """Return the entropy of a density of one number, nats, accurate to 1e-9 in float64 and to rounding in float32.
 
-    Panels begin at the `mode_candidates` of the density, and the first panels are as wide as the `peak_widths`. Panels
-    are halved until two rules agree. Their nodes are given relative to the peak, so that the rounding of the number
-    itself does not limit how narrow a peak may be. The mass checks the result: where it differs from 1 by more than
-    1e-7 (float32: 1e-4), some peak is missing from `mode_candidates`, or a tail is too long. Then the result is the
-    mean of -log_prob over DRAWS draws, with a warning in the log. It is this mean too if a density has more than
-    LARGEST peaks. NaN stays NaN. The result is differentiable like the density.
+    The density is integrated over panels, which begin at its `mode_candidates` and are as wide there as its
+    `peak_widths` suggest. A panel is halved until Kronrod's and Gauss's rule agree on it. The nodes are given relative
+    to the peak, so that the rounding of the number itself does not limit how narrow a peak may be.
+
+    If the integral of the density differs from 1 by more than 1e-7 (float32: 1e-4), some peak is missing from
+    `mode_candidates`, or a tail is too long. In this case, and if there are more than LARGEST peaks, the entropy is the
+    mean of -log_prob over DRAWS draws, and a warning is logged. If the density is NaN, its entropy is NaN. The entropy
+    has a gradient in the parameters of the density.
     """
     items = density.batch_shape.numel()
     if items == 0:
@@ -129,11 +142,11 @@ def entropy_of_one(density: Distribution) -> Float[Tensor, "*batch"]:
 
 
 def drawn_entropy(density: Distribution) -> Float[Tensor, "*batch"]:
-    """Return the mean of -log_prob over DRAWS draws, nats, with its gradient.
+    """Return the entropy of a density as the mean of -log_prob over DRAWS draws, nats, with an unbiased gradient.
 
-    The gradient of this mean alone has expectation 0, since the draws also move with the density. The gradient of -E
-    log p is -E (log p - b) ∇ log p, for any b (the score function's, Mohamed et al. 2020, §4). Here b is the mean; its
-    estimation takes one degree of freedom from DRAWS.
+    The gradient of this mean at fixed draws has expectation 0, because it ignores that the distribution of the draws
+    changes too. The gradient of -E log p is -E (log p - b) ∇ log p, for any constant b (score function, Mohamed et al.
+    2020, §4). Here b is the mean of log p over the draws; its estimation takes one degree of freedom from DRAWS.
     """
     log_prob = density.log_prob(density.sample(torch.Size((DRAWS,))))
     mean = log_prob.mean(0)
@@ -144,12 +157,15 @@ def drawn_entropy(density: Distribution) -> Float[Tensor, "*batch"]:
 
 
 def split(panels: Panels, step: int) -> list[Panels]:
-    """Return the panels in groups of at most `step`."""
+    """Return the panels in groups of at most `step` panels."""
     return [Panels(*part) for part in zip(*(column.split(step) for column in panels), strict=True)]
 
 
 def integrate(density: Distribution, panels: Panels) -> tuple[Tensor, Tensor]:
-    """Return ∫ p and -∫ p log p on each panel, (2, panel), and the larger difference of both rules, (panel,)."""
+    """Return ∫ p and -∫ p log p over each panel, (2, panel), and an error for each panel, (panel,).
+
+    The integrals are computed by Kronrod's rule. The error is the larger of the two differences to Gauss's rule.
+    """
     like = panels.place
     half = (panels.high - panels.low) / 2
     v = (panels.high + panels.low) / 2 + half * NODES.to(like).unsqueeze(-1)
@@ -165,7 +181,17 @@ def integrate(density: Distribution, panels: Panels) -> tuple[Tensor, Tensor]:
 def refine_panels(
     density: Distribution, panels: Panels, step: int, tolerance: float
 ) -> tuple[Panels, Tensor]:
-    """Return panels halved until both rules agree, and the sums on them."""
+    """Halve panels until Kronrod's and Gauss's rule agree on each of them.
+
+    Args:
+        density: the density of one number, with one batch dimension.
+        panels: the first panels.
+        step: largest number of panels that are evaluated at once.
+        tolerance: largest difference of the two rules.
+
+    Returns:
+        The panels, and the integrals of `integrate` over them, (2, panel).
+    """
     items = density.batch_shape.numel()
     finished: list[tuple[Panels, Tensor]] = []
     for number in range(ROUNDS + 1):
@@ -183,7 +209,7 @@ def refine_panels(
 
 
 def first_panels(density: Distribution, place: Float[Tensor, "peak item"]) -> Panels:
-    """Return panels on both sides of every peak, up to the middle between two peaks.
+    """Return the panels before they are halved: on both sides of every peak, up to the middle between two peaks.
 
     Args:
         density: the density of one number.
@@ -237,7 +263,16 @@ def known_scales(density: Distribution) -> Float[Tensor, "peak item"]:
 
 
 def _smallest_scale_at(some: Tensor, place: Tensor, scale: Tensor, closed: bool) -> Tensor:
-    """Return at each of the peaks `some` the least scale of all peaks that cover its position, (some, item)."""
+    """Return for each position in `some` the smallest scale of all peaks near it, (some, item).
+
+    A peak is near if it is at most 10 times its scale away.
+
+    Args:
+        some: positions, (some, item).
+        place: positions of all peaks, (peak, item).
+        scale: scales (widths) of all peaks, (peak, item).
+        closed: true if the number is an angle that covers the whole circle.
+    """
     distance = some.unsqueeze(1) - place  # (some, other, item)
     distance = (wrap(distance) if closed else distance).abs()
     return scale.expand_as(distance).where(distance <= 10 * scale, math.inf).amin(1)
@@ -246,9 +281,12 @@ def _smallest_scale_at(some: Tensor, place: Tensor, scale: Tensor, closed: bool)
 def first_in_cell(
     place: Float[Tensor, "peak item"], scale: Float[Tensor, "peak item"], width: float
 ) -> Bool[Tensor, "peak item"]:
-    """Return a mask of the ascending peaks that are the first in their cell.
+    """Return a mask of the peaks, in ascending order, that are the first peak in their cell of a grid.
 
-    A cell is at most `width` times as wide as the peak's scale, and at least half of that.
+    Args:
+        place: ascending positions of the peaks.
+        scale: scales (widths) of the peaks.
+        width: largest width of a cell, in multiples of the peak's scale; a cell is at least half as wide as this.
     """
     cell = width * scale.log2().floor().exp2()
     key = (place / cell).floor()
@@ -258,7 +296,10 @@ def first_in_cell(
 
 
 def _representatives(place: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the ascending peaks, with peaks within four scales of another peak replaced by that peak."""
+    """Return positions and scales of ascending peaks, with each peak replaced by the first peak in its cell.
+
+    A cell is at most four scales wide (`first_in_cell`).
+    """
     new = first_in_cell(place, scale, 4.0)
     number = torch.arange(len(place), device=place.device).unsqueeze(-1)
     chosen = torch.where(new, number, 0).cummax(0).values

@@ -11,13 +11,13 @@ from framework.distributions.protocol import pick, take
 
 
 class PickedMixture(Distribution):
-    """Samples of one chosen mixture per item, out of a batch (*batch, K) of mixtures; only `sample` is defined.
+    """Density of one chosen mixture for each item of a batch (*batch, K) of mixtures; only `sample` is defined.
 
     Args:
-        log_weights: (*batch, K, J), nats, normalised.
+        log_weights: log-weights of the J components of each mixture, (*batch, K, J), nats, normalised.
         components: components of the mixtures, with batch_shape (*batch, K, J).
-        index: (*sample, *batch), the chosen mixture among K.
-        rows: number of samples that are drawn at once.
+        index: index of the chosen mixture among K, (*sample, *batch).
+        rows: number of draws (of the whole batch) that are computed at once.
     """
 
     arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
@@ -39,7 +39,7 @@ class PickedMixture(Distribution):
         return samples.reshape(*lead, *batch, *self.event_shape)
 
     def _sample_once(self, index: Tensor) -> Tensor:
-        """Return one sample of each mixture at `index` (sample, *batch)."""
+        """Return one sample of each mixture that `index` (sample, *batch) chooses."""
         *_, mixtures, count = self.log_weights.shape
         which = torch.zeros_like(index)
         if count > 1 and index.numel() > 0:  # torch.multinomial refuses to draw nothing

@@ -7,13 +7,13 @@ on the type of the density, so that the author of a density registers what is kn
     @marginal.register
     def _(density: Mine, index: int) -> Mine: ...
 
-**No default claims to be exact.** A default that cannot know the result returns draws, an error of NaN or None ("not
-known in closed form; use draws"), or raises a `UserError` that says what to register. A subclass inherits the functions
-that are registered for its base. The structures call the function for each of their parts: `density.Mixture`,
-`batch_shapes.Stacked`, `batch_shapes.Reshaped`, `tempering.CircularPower`. Those of torch's densities are registered in
-`closed_forms`.
+**No default claims to be exact.** A default that cannot compute a quantity exactly returns draws, an error of NaN or
+None ("not known in closed form; use draws"), or it raises a `UserError` that says what to register. A subclass inherits
+the functions that are registered for its base. Densities that are made of other densities (`density.Mixture`,
+`batch_shapes.Stacked`, `batch_shapes.Reshaped`, `tempering.CircularPower`) call the function for each of these. The
+functions for torch's own densities are registered in `closed_forms`.
 
-Three further quantities are computed from these functions, with nothing to register: `class_probabilities`,
+Three further quantities are computed from these functions and need no registration: `class_probabilities`,
 `circular_moments` (which says where its grid resolved the density) and `density.circular_grid`.
 
 In shapes, `*batch` is the batch_shape, `*event` the event_shape, and `*sample` any dimensions before them.
@@ -55,9 +55,9 @@ def marginal(density: Distribution, index: int) -> Distribution:
 def median(density: Distribution, samples: int) -> Tensor:
     """Return the point of least expected absolute deviation, number by number (thesis eq. 3.23), (*batch, *event).
 
-    Default: for classes the mode, since a label is right or wrong and nothing lies between; otherwise the median of
-    `samples` draws (eq. 3.24), for angles on the circle. A density that knows the median in closed form registers it
-    and draws nothing. A mixture of several components over an image returns the mean instead.
+    Default: for classes the mode, since a label is either right or wrong; otherwise the median of `samples` draws
+    (thesis eq. 3.24), which for angles is the circular median. A density whose median is known in closed form registers
+    it and draws nothing. A mixture of several components over images returns its mean instead.
     """
     if density.has_enumerate_support:
         return density.mode
@@ -72,21 +72,26 @@ def pick(density: Distribution, index: Tensor) -> Distribution:
     """Return the density at `index` of the last batch dimension of a density with batch_shape (*batch, K).
 
     `index` has the shape (*sample, *batch). Only `sample` of the returned density is used. Default: all K densities are
-    sampled and all draws but one are discarded, which is right but slow; a density with parameters registers a function
-    that gathers them (`take`).
+    sampled, and all draws except those at `index` are discarded, which is right but slow. A density with parameters
+    registers a function that reads the parameters at `index` (`take`).
     """
     return _Picked(density, index)
 
 
 def take(parameter: Tensor, index: Tensor) -> Tensor:
-    """Return `parameter` (*batch, K, number) at `index` (*sample, *batch) of K: (*sample, *batch, number)."""
+    """Return the entries of `parameter` at `index` of its dimension K, (*sample, *batch, number).
+
+    Args:
+        parameter: (*batch, K, number).
+        index: from 0 to K - 1, (*sample, *batch).
+    """
     lead = index.shape[: index.dim() - parameter.dim() + 2]
     wide = parameter.expand((*lead, *parameter.shape))
     return wide.gather(-2, index[..., None, None].expand(*index.shape, 1, parameter.shape[-1])).squeeze(-2)
 
 
 class _Picked(Distribution):
-    """One chosen component for each item; all components are sampled, and the draws of the others are discarded."""
+    """The default result of `pick`, which samples all K densities and discards the draws that are not at `index`."""
 
     arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
 
@@ -108,22 +113,24 @@ class _Picked(Distribution):
 def recentre(density: Distribution, index: tuple[Tensor, ...], origin: Tensor) -> Distribution:
     """Return the density of X - origin, in float64, so that values near the origin keep their digits.
 
-    X has the density at `index` of the batch. Only `log_prob` of the returned density is used. Default: values are
-    rounded where the origin is added. A density with a location registers a function that subtracts the origin from the
-    location: then no rounding limits how narrow the density may be.
+    X is distributed by the item `index` of the density's batch. Only `log_prob` of the returned density is used.
+    Default: the origin is added to each value, and the sum is rounded to the density's number type. A density with a
+    location registers a function that subtracts the origin from the location: then no rounding limits how narrow the
+    density may be.
 
     Args:
         density: density of one number, event_shape (1,).
-        index: int64, one for each batch dimension; broadcast together they have the shape (*items).
+        index: indices of the items, int64, one tensor for each batch dimension; broadcast together they have the shape
+            (*items).
         origin: (*items, 1).
     """
     return _Recentred(density, index, origin)
 
 
 class _Recentred(Distribution):
-    """Recentred items of a batch, each used any number of times.
+    """The default result of `recentre`: items of a batch, each of which may be used any number of times.
 
-    The whole batch is evaluated as often as the most frequent item occurs.
+    For one log_prob, the whole batch is evaluated as often as the most frequent item occurs in `index`.
     """
 
     arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
@@ -158,11 +165,12 @@ class _Recentred(Distribution):
 
 @singledispatch
 def tempered_density(density: Distribution, temperature: Tensor) -> Distribution:
-    """Return the density proportional to p^(1/T), T > 0 a scalar; same shapes and number type, differentiable in T.
+    """Return the density proportional to p^(1/T) for a density p and a temperature T > 0, a scalar.
 
-    Call `tempering.temper` instead, which refuses an invalid T. Default (registered in `tempering`): classes are
-    enumerated, and the density of one angle over the whole turn is normalised on a grid that is refined until it
-    resolves the power.
+    It has the same shapes and number type as p, and is differentiable in T. Call `tempering.temper` instead, which
+    refuses an invalid T. Default (registered in `tempering`): the probabilities of classes are raised to the power and
+    divided by their sum; the power of the density of one angle over the whole circle is normalised on a grid, which is
+    refined until it resolves the power.
 
     Raises:
         UserError: any other density that has not registered its power, or a power too narrow for the finest grid.
@@ -177,7 +185,7 @@ class Estimate(NamedTuple):
         log_mean: the value of log_prob; its expectation is below the truth by about standard_error²/2 (Jensen).
         debiased: log_mean + standard_error²/2.
         standard_error: standard error of log_mean, from random draws inside the density; 0 where nothing is drawn, NaN
-            where it is not known, infinite where no draw had any weight.
+            where it is not known, infinite where all draws had weight 0.
         samples: number of draws, int64; 0 where nothing is drawn or the number is not known.
         unresolved: bool, true where a requested tolerance was not reached.
     """
@@ -196,7 +204,7 @@ class Estimate(NamedTuple):
 def estimate_with_error(
     log_mean: Tensor, standard_error: Tensor, samples: Tensor, unresolved: Tensor
 ) -> Estimate:
-    """Return an estimate whose `debiased` follows from its error; -∞ with an infinite error stays -∞."""
+    """Return an estimate with `debiased` computed from the error; where the error is infinite, it equals `log_mean`."""
     correction = torch.where(standard_error == math.inf, 0.0, standard_error.square() / 2)
     return Estimate(log_mean, log_mean + correction, standard_error, samples, unresolved)
 
@@ -205,8 +213,9 @@ def estimate_with_error(
 def estimate(density: Distribution, value: Tensor) -> Estimate:
     """Return the log-density at `value` (*sample, *batch, *event) with its Monte Carlo error, (*sample, *batch).
 
-    Default: log_prob with an error of NaN, "not known", since it is not known whether log_prob draws. A density whose
-    log_prob is computed without drawing registers `exact_estimate`; one that draws registers its own function.
+    Default: log_prob with an error of NaN, "not known", since it is not known whether log_prob uses random draws. If
+    log_prob of a density uses none, the density registers `exact_estimate`. If it uses some, the density registers its
+    own function.
     """
     result = exact_estimate(density, value)
     unknown = torch.full_like(result.log_mean, math.nan)
@@ -214,7 +223,7 @@ def estimate(density: Distribution, value: Tensor) -> Estimate:
 
 
 def exact_estimate(density: Distribution, value: Tensor) -> Estimate:
-    """Return the estimate of a density whose log_prob draws nothing: `estimate.register(Mine, exact_estimate)`."""
+    """Return the estimate of a density whose log_prob uses no draws: `estimate.register(Mine, exact_estimate)`."""
     log_prob = density.log_prob(value)
     samples = torch.zeros(log_prob.shape, dtype=torch.int64, device=log_prob.device)
     return Estimate(log_prob, log_prob, torch.zeros_like(log_prob), samples, samples > 0)
@@ -222,7 +231,7 @@ def exact_estimate(density: Distribution, value: Tensor) -> Estimate:
 
 @singledispatch
 def cdf(density: Distribution, value: Tensor) -> Tensor | None:
-    """Return P(X ≤ y) of a density of one real, float64 (*sample, *batch), at `value` (*sample, *batch, 1).
+    """Return P(X ≤ y) of a density of one real number, float64 (*sample, *batch), at `value` y (*sample, *batch, 1).
 
     Default: exact where `normals` knows the density as a mixture of normals, otherwise None, "not known".
     """
@@ -239,10 +248,10 @@ def cdf(density: Distribution, value: Tensor) -> Tensor | None:
 
 @singledispatch
 def marginal_cdfs(density: Distribution, value: Tensor) -> Tensor | None:
-    """Return P(X_i ≤ y_i) of each number i on its own; float64, in the shape of `value` (*sample, *batch, *event).
+    """Return P(X_i ≤ y_i) of each number i on its own; float64, in the shape of `value` y (*sample, *batch, *event).
 
-    Default: for a vector of reals `cdf` of each `marginal`, or None where a `cdf` is not known; for an image None. A
-    density over images registers its own function, since a hundred thousand marginals would be too many.
+    Default: for a vector of real numbers, the `cdf` of each `marginal`, or None if one of them is not known; for an
+    image, None. A density over images registers its own function, since a hundred thousand marginals would be too many.
     """
     if len(density.event_shape) != 1:
         return None
@@ -256,9 +265,9 @@ def marginal_cdfs(density: Distribution, value: Tensor) -> Tensor | None:
 def arc_probability(density: Distribution, start: Tensor, end: Tensor) -> Tensor | None:
     """Return the probability of the arc from `start` counter-clockwise to `end` for one angle; None if unknown.
 
-    Angles are (*sample, *batch, 1), radians; the result is float64 (*sample, *batch). The arc is shorter than the whole
-    circle, and empty between equal ends. Default: None; `circular_moments` then gives the probability where the density
-    is not too narrow.
+    Angles are (*sample, *batch, 1), radians; the probability is float64 (*sample, *batch). The arc is shorter than the
+    whole circle, and it is empty if `start` equals `end`. Default: None. Callers then use `circular_moments`, which
+    gives the probability unless the density is too narrow for its grid.
     """
     return None
 
@@ -269,7 +278,10 @@ def arc_length(start: Tensor, end: Tensor) -> Tensor:
 
 
 class Normals(NamedTuple):
-    """A mixture of normals over one real: log-weights, means and standard deviations, (*batch, component), float64."""
+    """A mixture of normals over one real number.
+
+    Its log-weights, means and standard deviations are (*batch, component), float64.
+    """
 
     log_weights: Tensor
     mean: Tensor
@@ -277,52 +289,57 @@ class Normals(NamedTuple):
 
 
 def one_normal(mean: Tensor, scale: Tensor) -> Normals:
-    """Return the result of `normals` for a single normal density; mean and scale have the shape (*batch, 1)."""
+    """Return a single normal density as `Normals`; mean and standard deviation have the shape (*batch, 1)."""
     mean = mean.double()
     return Normals(torch.zeros_like(mean), mean, scale.double())
 
 
 @singledispatch
 def normals(density: Distribution) -> Normals | None:
-    """Return the normals of which a density of one real, event_shape (1,), is a mixture.
+    """Return the mixture of normals that a density of one real number, event_shape (1,), is equal to.
 
-    Default: None, not known.
+    Default: None, it is not known to be a mixture of normals.
     """
     return None
 
 
 @singledispatch
 def mahalanobis(density: Distribution, value: Tensor) -> Tensor | None:
-    """Return (y - μ)ᵀ Σ⁻¹ (y - μ) of a normal density over any number of reals, float64 (*sample, *batch).
+    """Return (y - μ)ᵀ Σ⁻¹ (y - μ) at `value` y for a normal density with mean μ and covariance Σ.
 
-    Default: None, the density is not known to be normal.
+    The density may be over any number of real numbers. The squared distance is float64, (*sample, *batch). Default:
+    None, the density is not known to be normal.
     """
     return None
 
 
 @singledispatch
 def mode_candidates(density: Distribution) -> Tensor:
-    """Return candidates for the mode, (peak, *batch, *event): values where the density may be highest, unchecked.
+    """Return candidates for the mode, (peak, *batch, *event): values where the density may be highest.
 
-    Default: the mode alone. A density with several peaks registers a candidate for each.
+    It is not checked that the density is highest at one of them. Default: the mode alone. A density with several peaks
+    registers a candidate for each.
     """
     return density.mode.unsqueeze(0)
 
 
 @singledispatch
 def peak_widths(density: Distribution) -> Tensor:
-    """Return the width of each of the `mode_candidates` of a density of one number, (peak, *batch), in its unit.
+    """Return the width of the peak at each of the `mode_candidates` of a density of one number, (peak, *batch).
 
-    Default: the standard deviation of the normal density with the same height.
+    The unit is that of the number. Default: the standard deviation of a normal density that is as high at its mode.
     """
     candidates = mode_candidates(density)
     return (-density.log_prob(candidates).double()).exp() / math.sqrt(2 * math.pi)
 
 
 class QuadraticBound(NamedTuple):
-    """A lower bound of log p that touches it (see `quadratic_bound`): log_prob, its gradient `pull`, and `stiffness`.
+    """A lower bound of log p that touches log p at one value (see `quadratic_bound`).
 
-    log_prob is (*sample, *batch); `pull` and `stiffness` are (*sample, *batch, *event).
+    Attributes:
+        log_prob: log p at this value, (*sample, *batch).
+        pull: gradient of log p at this value, (*sample, *batch, *event).
+        stiffness: curvature of the bound, (*sample, *batch, *event).
     """
 
     log_prob: Tensor
@@ -332,12 +349,12 @@ class QuadraticBound(NamedTuple):
 
 @singledispatch
 def quadratic_bound(density: Distribution, value: Tensor) -> QuadraticBound | None:
-    """Return a lower bound of log p that touches it at `value` y (*sample, *batch, *event); by default None, not known.
+    """Return a lower bound of log p that touches log p at `value` y (*sample, *batch, *event).
 
-    With pull g and stiffness h, the bound for reals is log p(y + d) ≥ log p(y) + Σ (g d - h d²/2), h > 0, and for
-    angles log p(y + d) ≥ log p(y) + Σ (g sin d - h (1 - cos d)), for all d. A mixture has as g and h the means over its
-    components, weighted by each component's share of p(y) (Jensen), so a step to the bound's maximum never lowers p
-    (Dempster, Laird & Rubin 1977).
+    Let g be the `pull` and h the `stiffness` of the bound, h > 0. For real numbers, log p(y + d) ≥ log p(y) + Σ (g d -
+    h d²/2) for all d. For angles, log p(y + d) ≥ log p(y) + Σ (g sin d - h (1 - cos d)) for all d. In a mixture, g and
+    h are means over the components, weighted by each component's share of p(y) (Jensen). So a step to the maximum of
+    the bound never lowers p (Dempster, Laird & Rubin 1977). Default: None, no bound is known.
     """
     return None
 
@@ -346,10 +363,10 @@ def quadratic_bound(density: Distribution, value: Tensor) -> QuadraticBound | No
 def images(density: Distribution, channels: Collection[str]) -> dict[str, Tensor]:
     """Return images of the density's point prediction, with exactly the requested channels.
 
-    Each is (*batch, height, width) or (*batch, height, width, number), as `framework.renderer.Renderer.channels` says:
-    "color" is linear RGB. For torch's own densities over images, event_shape (height, width, number), "color" is the
-    mean, taken as linear RGB; a density over the numbers of files (a target of kind "image") registers its own
-    function. Default: the density has no images.
+    Each image is (*batch, height, width) or (*batch, height, width, number), as `framework.renderer.Renderer.channels`
+    says: "color" is linear RGB. For torch's own densities over images, event_shape (height, width, number), "color" is
+    the mean, taken as linear RGB. If a density is over pixel values as they are stored in files (a target of kind
+    "image"), it registers its own function. Default: the density has no images, and an error is raised.
 
     Raises:
         UserError: no images are registered for the density, or one of the channels is not among them.
@@ -362,7 +379,7 @@ def images(density: Distribution, channels: Collection[str]) -> dict[str, Tensor
 
 
 class ValueSet(ABC):
-    """A set of values for each item of the batch that is stated to contain the target.
+    """Prediction sets: for each item of a batch, a set of values that is stated to contain the target.
 
     Attributes:
         stated_probability: least share of targets that the sets are stated to contain; None if not stated.
@@ -372,34 +389,35 @@ class ValueSet(ABC):
 
     @abstractmethod
     def contains(self, value: Tensor) -> Tensor:
-        """Return true for each value (*sample, *batch, *event) in the set of its item, bool (*sample, *batch)."""
+        """Return a mask, bool (*sample, *batch): true if a value (*sample, *batch, *event) is in its item's set."""
 
     @abstractmethod
     def size(self) -> Tensor:
         """Return the size of each set, float64 (*batch).
 
-        The size is a number of labels, radians of one angle, the length for one real, or the volume for several.
+        The size is the number of labels for classes, the length in radians for one angle, the length for one real
+        number, or the volume for several real numbers.
         """
 
     @abstractmethod
     def empty(self) -> Tensor:
-        """Return true for each empty set, bool (*batch)."""
+        """Return a mask, bool (*batch): true if the set of the item is empty."""
 
     def parts(self) -> "list[list[int]] | list[list[tuple[float, float]]] | None":
-        """Return the parts of the set of each item of the flattened batch, ascending.
+        """Return the elements or intervals of which each set consists, ascending; one list for each item of the batch.
 
-        The parts are labels of classes, (low, high) of one real, or (low, high) of one angle in radians, from low in
-        [-π, π) counter-clockwise to high, at most one turn further. Default: None, the set cannot be listed.
-        Predictions print the listed parts.
+        The batch is flattened. For classes, the parts are labels. For one real number, they are intervals (low, high).
+        For one angle, they are arcs (low, high) in radians, from low in [-π, π) counter-clockwise to high, at most one
+        turn further. Default: None, the set cannot be listed. Predictions print the listed parts.
         """
         return None
 
 
 @singledispatch
 def value_set(density: Distribution) -> ValueSet | None:
-    """Return the prediction sets of the items of the density.
+    """Return the prediction sets of a density, one for each item of its batch; None if it has none.
 
-    Default: None, there are no sets. Structures return None too: a guarantee for a density does not hold for a mixture,
-    a power or a marginal of it. An affine transform (`affine.AffineDensity`) has the transformed sets.
+    Default: None. A mixture, a power or a marginal of a density with sets has no sets either, since a guarantee for the
+    density does not hold for them. An affine transform (`affine.AffineDensity`) has the transformed sets.
     """
     return None

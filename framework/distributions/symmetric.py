@@ -1,4 +1,4 @@
-"""Base of densities that are symmetric about one point and fall on all sides of it."""
+"""Base class of densities that are symmetric about one point and decrease on all sides of it."""
 
 from torch import Tensor
 from torch.distributions import Distribution
@@ -8,7 +8,7 @@ from framework.distributions.protocol import median
 
 
 class Symmetric(Distribution):
-    """Density whose mean, mode and median are its `location`, (*batch, *event)."""
+    """Base class of densities whose mean, mode and median are their `location`, (*batch, *event)."""
 
     arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
     __repr__ = one_line

@@ -27,29 +27,36 @@ from framework.distributions.protocol import (
 from framework.errors import UserError
 
 POINTS, MOST_POINTS = 1024, 2**15
-"""First and largest number of points of the grid that normalises the power of any density of one angle.
+"""First and largest number of points of the grid that normalises the power of a density of one angle.
 
 The number is doubled until the grid resolves the power.
 """
 RESOLVED = 1e-4
-"""Largest difference of log ∫ p^(1/T), nats, between two grids, one twice as fine, that resolve the density."""
+"""Largest difference of log ∫ p^(1/T), nats, between a grid that resolves the power and every second of its angles."""
 MASS_GAP = 0.01
-"""Largest |log ∫ p| on a grid that resolves p; beyond it, a peak lies between the grid's angles."""
+"""Largest |log ∫ p| on a grid that resolves p; if it is larger, a peak lies between the grid's angles."""
 HELD = 0.3
-"""Share of the mass at one angle above which a grid is too coarse for p itself, though not for its power."""
+"""Integral of p at a single angle of the grid above which MASS_GAP does not apply.
+
+The peak is then found, and the grid is too coarse for p itself, but not necessarily for its power.
+"""
 NARROWEST = 3.0
-"""Width of the innermost half of a stretched grid, in standard deviations of the power at its mode."""
+"""Stretch of a stretched grid, in standard deviations of the power at its mode.
+
+For a stretch s, half of the grid's angles lie within 2 atan(s) of the mode.
+"""
 QUANTILES = 2048
-"""Number of further angles at which the distribution function is computed for draws."""
+"""Number of angles, besides those of the grid, at which the distribution function is computed for random draws."""
 BROADER = 0.25
-"""Power of the density whose quantiles give these angles; it is below 1, so that tails and low peaks get angles too."""
+"""Exponent B: these angles are quantiles of p^(B/T). It is below 1, so that tails and low peaks get angles too."""
 _log = logging.getLogger(__name__)
 
 
 def temper(density: Distribution, temperature: Float[Tensor, ""]) -> Distribution:
-    """Return the density proportional to p^(1/T), of the same shapes and number type; differentiable in T.
+    """Return the density proportional to p^(1/T), with the shapes and the number type of p, and differentiable in T.
 
-    T = 1 gives the density itself, unless a gradient in T is wanted. For a mixture see `tempered_density`.
+    T = 1 gives p itself, unless a gradient in T is wanted. A mixture over real numbers or angles is not raised to the
+    power as a whole, but each of its components is.
 
     Args:
         density: p.
@@ -84,11 +91,11 @@ def _(density: Distribution, temperature: Tensor) -> Distribution:
 
 @tempered_density.register
 def _(density: Mixture, temperature: Tensor) -> Distribution:
-    """Return the tempered mixture; classes are tempered as a whole, other mixtures keep their weights.
+    """Return the tempered mixture: over classes it is tempered as a whole, otherwise component by component.
 
-    For these, the components are tempered: Σ w_k p_k raised to a power has no normaliser in closed form. The mixture of
-    tempered components is normalised as its components are, equals p at T = 1, and is exact for one component. It keeps
-    the modes that different components describe apart.
+    Tempering a component keeps its weight w_k. The power of a sum Σ w_k p_k over real numbers or angles has no
+    normaliser in closed form. The mixture of the tempered components is normalised because they are. It equals p at T =
+    1, and is exact for one component. Modes that different components describe remain separate.
     """
     if density.has_enumerate_support:
         return tempered_classes(density, temperature)
@@ -96,7 +103,10 @@ def _(density: Mixture, temperature: Tensor) -> Distribution:
 
 
 def tempered_classes(density: Distribution, temperature: Tensor) -> "RescaledClasses":
-    """Return p_k^(1/T) / Σ_j p_j^(1/T): logits divided by T (Guo et al. 2017, eq. 9), for any density over classes."""
+    """Return p_k^(1/T) / Σ_j p_j^(1/T) for a density over classes k with probabilities p_k: logits divided by T.
+
+    Source: Guo et al. 2017, eq. 9. The density may be of any type.
+    """
     log_prob = log_probabilities(density)
     # subtract the largest first, so that differences and not sizes are rounded; a probability of 0 stays 0
     heights = log_prob - log_prob.amax(-1, keepdim=True)
@@ -117,11 +127,11 @@ def divide_by_temperature(log_density: Tensor, temperature: Tensor) -> Tensor:
 
 
 class RescaledClasses(CategoricalDensity):
-    """Classes whose log-probabilities are `slope` times those of another density, plus constants, normalised.
+    """A density over classes whose log-probabilities are `slope` times those of another density, plus constants.
 
     Args:
-        logits: logits of the classes, (*batch, label).
-        density: the other density, which gives the Monte Carlo error.
+        logits: its log-probabilities, with the constants, (*batch, label); they are normalised.
+        density: the other density, whose Monte Carlo error gives the error of this density.
         slope: a scalar, 1/T for a temperature T.
     """
 
@@ -133,10 +143,12 @@ class RescaledClasses(CategoricalDensity):
 
 @estimate.register
 def _(density: RescaledClasses, value: Tensor) -> Estimate:
-    """Return the estimate with an upper bound of its error.
+    """Return the log-probability of the classes `value`, with an upper bound of its Monte Carlo error.
 
-    For log q_k = a log p_k - log Σ_j p_j^a + constants, errors e_j of log p_j cause the error a (e_k - Σ_j q_j e_j).
-    The errors may be correlated in any way, so the bound is a ((1 - q_k) s_k + Σ_{j≠k} q_j s_j).
+    Let p_k be the probabilities of the other density, s_k the standard errors of their logarithms, a the `slope` and
+    q_k the probabilities of this density, log q_k = a log p_k - log Σ_j p_j^a + constants. Errors e_j of log p_j cause
+    the error a (e_k - Σ_j q_j e_j) of log q_k. The errors may be correlated in any way, so the bound is a ((1 - q_k)
+    s_k + Σ_{j≠k} q_j s_j).
     """
     log_prob = density.log_prob(value)
     with torch.no_grad():
@@ -158,18 +170,20 @@ def _(density: RescaledClasses, value: Tensor) -> Estimate:
 
 
 class CircularPower(Distribution):
-    """The density p^(1/T) / Z for the density p of one angle, by the trapezium rule.
+    """The density p^(1/T) / Z for a density p of one angle; Z is computed by the trapezium rule on a grid.
 
     The grid starts at the mode, so that no peak is missed there. It is refined until it resolves the power and until p
-    has its mass on it. A power that is too narrow for MOST_POINTS equally spaced angles gets a grid that is denser
-    about the mode: angles mode + 2 atan(s tan(u/2)) of equally spaced u, on which the rule is spectrally exact too.
+    has its mass on it. A power that is too narrow for MOST_POINTS equally spaced angles gets a stretched grid, which is
+    denser about the mode: the angles mode + 2 atan(s tan(u/2)) for equally spaced u and a stretch s. The rule is
+    spectrally exact on these angles too.
 
-    Samples are drawn by the inverse of the distribution function. This function is known at the angles of the grid and
-    at QUANTILES quantiles of p^(BROADER/T) (at a distance of 0.005 standard deviations where a peak is highest, 0.4 at
-    six standard deviations from there), and the density is linear between these angles.
+    Samples are drawn by the inverse of the distribution function. This function is computed at the angles of the grid
+    and at QUANTILES quantiles of p^(BROADER/T), and the density is taken as linear between these angles. The distance
+    between them is 0.005 standard deviations at the highest point of a peak, and 0.4 at six standard deviations from
+    there.
 
     Args:
-        density: p, event_shape (1,), over the whole turn.
+        density: p, event_shape (1,), over the whole circle.
         temperature: T.
 
     Raises:
@@ -203,7 +217,7 @@ class CircularPower(Distribution):
             off = self._fill()
 
     def _fill(self) -> Float[Tensor, "*batch"]:
-        """Evaluate the power on the grid; return the uncertainty of log Z, nats: infinite where a peak is missed."""
+        """Evaluate the power on the grid; return the uncertainty of log Z, nats, infinite where a peak is missed."""
         self.angles, log_width = self._grid(self.points)
         log_prob = self.density.log_prob(self.angles)  # (points, *batch)
         self.top = log_prob[0]
@@ -228,15 +242,22 @@ class CircularPower(Distribution):
         return torch.where(missed, math.inf, off)
 
     def _grid(self, points: int) -> tuple[Tensor, Tensor]:
-        """Return the grid's angles, (points, *batch, 1), and the log of the arc that each represents, (points, *batch).
+        """Return the grid's angles, (points, *batch, 1), and the logarithm of the arc length of each, (points, *batch).
 
-        The first angle is the mode.
+        The arcs are the parts of the circle that the angles represent. The first angle is the mode.
         """
         u = grid(points, dtype=torch.float64, device=self.start.device) + math.pi
         return self._angles_at(u.reshape(points, *(1,) * self.start.dim()), 2 * math.pi / points)
 
     def _angles_at(self, u: Float[Tensor, "number *batch 1"], step: float) -> tuple[Tensor, Tensor]:
-        """Return the angles θ of the stretched grid at u, and log(dθ/du · step)."""
+        """Return the angles θ = mode + 2 atan(s tan(u/2)) of the stretched grid, and the logarithms of arc lengths.
+
+        The arc length of an angle is dθ/du · step; s is the stretch of the grid.
+
+        Args:
+            u: equally spaced numbers.
+            step: distance between neighbouring numbers in `u`.
+        """
         half_sine, half_cosine = (u / 2).sin(), (u / 2).cos()
         offset = 2 * torch.atan2(self.stretch * half_sine, half_cosine)
         arc = self.stretch / (half_cosine.square() + (self.stretch * half_sine).square())
@@ -244,7 +265,7 @@ class CircularPower(Distribution):
         return angle, (arc.log() + math.log(step)).squeeze(-1).expand(angle.shape[:-1])
 
     def _narrow(self) -> Float[Tensor, "*batch 1"]:
-        """Return the stretch that the grid needs at each mode: its spacing there over equal spacing, at most 1."""
+        """Return the stretch s that the grid needs, at most 1: its spacing at the mode, divided by equal spacing."""
         # width of the normal density with the same height; p^(1/T) is √T times as wide
         width = (-self.density.log_prob(self.start).detach().double()).exp() / math.sqrt(2 * math.pi)
         width = width * self.temperature.detach().double().sqrt()
@@ -268,7 +289,7 @@ class CircularPower(Distribution):
 
     @property
     def mass(self) -> Float[Tensor, "points *batch"]:
-        """Share of the mass at each angle of the grid."""
+        """Probability of the arc that each angle of the grid represents."""
         return (self.powers + self.log_width).softmax(0)
 
     @torch.no_grad()
@@ -293,7 +314,7 @@ class CircularPower(Distribution):
     @cached_property
     @torch.no_grad()
     def _between(self) -> tuple[Float[Tensor, "item node"], Float[Tensor, "item node"]]:
-        """Ascending angles relative to the mode, from 0 to 2π, and the height of the power at these angles."""
+        """Ascending angles relative to the mode, from 0 to 2π, and the power there, 1 at the mode."""
         batch = self.batch_shape.numel()
         u = (
             2
@@ -326,15 +347,17 @@ class CircularPower(Distribution):
         return offset, height
 
     def entropy(self) -> Tensor:
-        """Return log Z minus the mean of log p^(1/T), nats, by the trapezium rule."""
+        """Return log Z minus the expectation of log p^(1/T), nats, by the trapezium rule."""
         # p log p → 0 as p → 0; the clamp keeps 0 · (-inf) from being NaN
         return self.log_normaliser - (self.mass * self.powers.clamp(min=-1e4)).sum(0)
 
 
 def _cumulative_integral(position: Tensor, height: Float[Tensor, "item node"]) -> Float[Tensor, "item node"]:
-    """Return the integral from the first position to each position, by the trapezium rule.
+    """Return the integral of `height` from the first position to each position, by the trapezium rule.
 
-    The positions ascend; they are the same for all items, or there are own positions for each item.
+    Args:
+        position: ascending positions, (node,) if they are the same for all items, otherwise (item, node).
+        height: values of the integrand at the positions.
     """
     cells = position.diff(dim=-1) * (height[:, 1:] + height[:, :-1]) / 2
     return torch.nn.functional.pad(cells.cumsum(-1), (1, 0))
@@ -351,9 +374,9 @@ def _(density: CircularPower, value: Tensor) -> QuadraticBound | None:
 
 @estimate.register
 def _(density: CircularPower, value: Tensor) -> Estimate:
-    """Return the estimate with an upper bound of its error.
+    """Return the log-density of the power at `value`, with an upper bound of its Monte Carlo error.
 
-    The errors of p and of its normaliser may come from the same draws, so they are added.
+    The errors of log p at `value` and of the normaliser log Z may come from the same draws, so they are added.
     """
     inner_estimate = estimate(density.density, value)
     log_prob = density.power_of(inner_estimate.log_mean)

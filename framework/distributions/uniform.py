@@ -27,8 +27,8 @@ from framework.errors import UserError
 def uniform(density: Distribution) -> Distribution:
     """Return the distribution under which parts of the support of equal size are equally likely; same shapes.
 
-    Default: a distribution for classes, and for angles that each cover the whole circle. A density on a chart of
-    another space (rotations, for example) registers what is uniform there.
+    Default: known for classes, and for angles that each cover the whole circle. If the angles of a density are
+    coordinates of another space (rotations, for example), it registers the distribution that is uniform on that space.
 
     Raises:
         UserError: no distribution is uniform over the support, or the density has not registered one.
@@ -49,10 +49,12 @@ def uniform(density: Distribution) -> Distribution:
 
 
 class UniformAngles(Distribution):
-    """Angles that are all equally likely.
+    """Independent angles, each uniform over the whole circle.
 
     Args:
         like: any tensor with the samples' number type and device.
+        batch_shape: batch_shape of the distribution.
+        event_shape: event_shape of the distribution, (number of angles,).
     """
 
     arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]
