@@ -23,7 +23,7 @@ HEADS = [
 
 
 def answers(density: Distribution, value: Tensor) -> Iterator[tuple[str, Tensor]]:
-    """Log-densities and draws, with the same random numbers each time."""
+    """Return log-densities and draws, with the same random numbers in each call."""
     asked: dict[str, Callable[[], Tensor]] = {
         "log_prob": lambda: density.log_prob(value),
         "sample": lambda: density.sample(torch.Size((3,))),

@@ -37,7 +37,7 @@ def test_one_run_each_is_mcnemars_difference():
 
 @pytest.mark.parametrize("spread", [0.0, 0.03])
 def test_errors_are_those_of_new_clouds_and_new_seeds(spread):
-    """Standard errors agree with simulations, in which accuracy is a cloud's share plus a seed's plus chance."""
+    """Standard errors agree with simulations, in which the accuracy depends on the cloud, the seed and chance."""
     random = np.random.default_rng(1)
     values, variances, components = [], [], []
     for _ in range(400):

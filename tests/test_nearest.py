@@ -89,7 +89,7 @@ def brute(cloud, queries):
 
 
 def check(cloud, queries, found, i=0):
-    """Distances and neighbours of one cloud, and that the lowest index of equal points is given."""
+    """Check distances and neighbours of one cloud; of equal points, the lowest index is returned."""
     dtype = cloud.dtype
     wanted, scale = brute(cloud, queries)
     assert found[0].dtype == dtype and found[1].dtype == torch.int64
@@ -459,7 +459,7 @@ def test_points_whose_distances_round_to_the_same_root_are_told_apart_by_their_s
 
 
 def test_two_readings_of_the_chunks_normalise_as_the_formula():
-    """Eq. 6.2 in float64 NumPy, of a cloud a million times further away than it is large."""
+    """Compare with eq. 6.2 in float64 NumPy, for a cloud whose distance is a million times its size."""
     generator = np.random.default_rng(10)
     cloud = torus(3001, generator) + 1e6
     chunks = torch.tensor(cloud).split(100)
@@ -480,7 +480,8 @@ def test_two_readings_of_the_chunks_normalise_as_the_formula():
 @pytest.mark.parametrize("columns", [3, 5])
 @pytest.mark.parametrize("size", [1, 10, 100])
 def test_one_buffer_may_bring_all_chunks(size, columns, dtype):
-    """Filled anew for each, as a reader of large files does; queries and centre are of a buffer, too."""
+    """The buffer is filled again for each chunk, as by a reader of large files; queries and centre share a buffer,
+    too."""
     generator = np.random.default_rng(11)
     cloud = torch.tensor(generator.normal(size=(100, columns)), dtype=dtype) + 3
     queries, centre = torch.tensor(ball(20, generator), dtype=dtype), torch.tensor([1.0, 2, 3]).double()

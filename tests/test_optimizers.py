@@ -94,7 +94,7 @@ def test_step_reduces_after_the_epochs_that_it_names() -> None:
 
 
 class Against(Objective):
-    """Moves the predictor's weight down its own, and its own against it."""
+    """Objective whose own weight is trained against the weight of the predictor."""
 
     bibtex = ""
 
@@ -178,7 +178,7 @@ class Flat(Encoder):
 
 
 class Whole(DensityHead):
-    """Laplace's place is the image itself."""
+    """The location of the Laplace density is the image itself."""
 
     bibtex = ""
     knobs: ClassVar = {}
@@ -218,7 +218,7 @@ def test_a_direct_head_reads_what_the_encoder_gives_once_a_step() -> None:
 @pytest.mark.parametrize("wrapper", [None, "ensemble"])
 @pytest.mark.parametrize("direct", [True, False])
 def test_fixed_features_are_computed_once_a_step(direct: bool, wrapper: str | None) -> None:
-    """The features are computed once whatever model reads them."""
+    """Features are computed only once, also if several models read them."""
     reals = Target("real", ("x",))
 
     def inner() -> Predictor:
@@ -252,7 +252,7 @@ def test_fixed_features_are_computed_once_a_step(direct: bool, wrapper: str | No
 def test_gradients_are_clipped_in_every_precision(
     name: str, members: int, precision: Any, algorithm: str
 ) -> None:
-    """A step of SGD is as long as the clipped gradient; any other optimiser steps, and is fused where it may be."""
+    """A step of SGD has the length of the clipped gradient; each other optimiser makes a step, fused if possible."""
     config = {
         "data": "moons",
         "encoder": {"mlp": {"name": "mlp", "widths": [8]}},

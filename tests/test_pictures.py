@@ -172,7 +172,7 @@ WORDS = ("ahead", "port", "astern", "starboard")
 
 @pytest.mark.parametrize("directions", [(), WORDS])
 def test_words_stand_where_their_angles_are(directions: tuple[str, ...]) -> None:
-    """Words of the data's own, or degrees; never front and back of what has none."""
+    """Directions have the names that the data set gives, or degrees; no other names are shown."""
     figure = circles([bumps((1, 0, 5))], directions=directions)
     where = {text.get_text(): text.get_position() for text in figure.axes[0].texts}
     bottom, right, top, left = directions or ("0°", "90°", "180°", "270°")
@@ -184,7 +184,7 @@ def test_words_stand_where_their_angles_are(directions: tuple[str, ...]) -> None
 
 
 def test_thickness_is_the_density_whose_scale_each_panel_says() -> None:
-    """However sharp: none is cut, and the same height is the same density in panels of one scale."""
+    """No peak is cut off, however sharp; in panels of one scale, equal heights mean equal densities."""
     sharpness = (0, 4, 8, 400, 1e4)
     figure = circles([bumps((1, ANGLES[500], sharp)) for sharp in sharpness])
     for axes, sharp, outer in zip(figure.axes, sharpness, (1.5, 1.5, 1.5, 15, 60), strict=False):
@@ -536,7 +536,7 @@ def test_odd_comparisons_are_drawn(rows: list[dict], tmp_path: Path) -> None:
 def test_a_result_alone_stands_in_the_middle_of_its_panels(
     panels: int, times: tuple[float, ...], error: float, tmp_path: Path
 ) -> None:
-    """As of a sweep over seeds alone."""
+    """Return the rows of a sweep in which only the seed varies."""
     keys = [f"error {panel}" for panel in range(panels)]
     rows = [{"method": "a", "class": "car", "ms": time} | dict.fromkeys(keys, error) for time in times]
     figure = error_against_run_time(

@@ -46,7 +46,7 @@ def view(folder: Path, value: Any, key: str) -> Any:
 
 
 def scene(folder: Path, value: Any, key: str) -> Any:
-    """A triangle, of which one number is another."""
+    """Read a scene of one triangle in which one number is replaced."""
     places: dict[str, dict[str, Any]] = {
         "scale": {"scale": [1, value, 1]},
         "rotation": {"rotation": [0, 0, 0, value]},

@@ -1,4 +1,5 @@
-"""`mode=check` finds on the CPU what mixes devices on a GPU; heads that do are among tests.planted_questions."""
+"""Planted mixtures of devices, which `mode=check` finds without a GPU; tests.planted_questions contains heads with
+them."""
 
 from collections.abc import Iterator
 

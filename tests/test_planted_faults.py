@@ -1,4 +1,4 @@
-"""`mode=check` finds every planted fault, and nothing in the sound heads that they are planted in."""
+"""Planted faults in density heads, which `mode=check` finds; the heads without a fault pass."""
 
 import math
 
@@ -62,7 +62,7 @@ def test_a_right_head_of_somebody_else_is_not_refused(name: str, target: Target)
 
 @pytest.mark.parametrize("size", [3, 15])
 def test_a_normal_of_many_numbers_integrates_to_one(size: int) -> None:
-    """And one that is a fiftieth off does not."""
+    """A normal density integrates to one, and a density that is wrong by a fiftieth does not pass."""
     torch.manual_seed(0)
     root = torch.randn(6, size, size, dtype=torch.float64).tril(-1) + torch.eye(size)
 

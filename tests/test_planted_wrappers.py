@@ -1,4 +1,5 @@
-"""`mode=check` finds every wrong wrapper that is planted, by the property meant for it, and none in right ones."""
+"""Planted faults in uncertainty wrappers, each found by its own contract test of `mode=check`; correct wrappers
+pass."""
 
 import pytest
 
@@ -13,7 +14,7 @@ from tests.planted_wrappers import ALL_FAULTS, RIGHT, Fault
 
 
 class Only(dict[str, str]):
-    """Leaves out every property but one."""
+    """Mapping that contains every contract test except one, so that only this test runs."""
 
     def __init__(self, name: str) -> None:
         super().__init__()
@@ -34,7 +35,7 @@ def test_the_fault_is_found(fault: Fault) -> None:
 @pytest.mark.parametrize("name", RIGHT)
 @pytest.mark.parametrize("target", [CLASSES, HEIGHT], ids=lambda target: target.kind)
 def test_a_right_wrapper_passes(name: str, target: Target) -> None:
-    """benchmarks/framework/check.py asks all kinds of target, over many seeds."""
+    """Check few targets and one seed; benchmarks/framework/check.py checks all kinds of targets with many seeds."""
     build = RIGHT[name]
     require(*examine_wrapper(WrapperRow("", target), lambda target: build(lambda: Plain(target)), None))
 

@@ -1,4 +1,5 @@
-"""mode=predict on a user's folder of flights: a row each with intervals, and the bad file told."""
+"""Tests of mode=predict for a folder of flights: one row with intervals for each flight, and a message for the bad
+file."""
 
 import csv
 from pathlib import Path

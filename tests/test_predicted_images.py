@@ -1,4 +1,4 @@
-"""Images of predictions: only what some metric reads is drawn, all of it at once."""
+"""Images of predictions, of which only the channels that a metric reads are drawn, all of them in one call."""
 
 import pytest
 import torch
@@ -21,7 +21,7 @@ PLACE, SIZE = Target("real", ("across", "down")), (6, 8)
 
 
 class Reads(Metric):
-    """Mean of the predicted images of some channels less the true ones, read again at each update."""
+    """Metric of the mean difference between predicted and true images, which reads some channels in each update."""
 
     bibtex = ""
 
@@ -56,7 +56,7 @@ def batches(count: int) -> list[dict[str, Tensor]]:
 
 
 def asked(*metrics: Metric) -> list[list[frozenset[str]]]:
-    """Channels of every drawing, of two test batches and then one of outliers."""
+    """Return the channels of each drawing, for two test batches and then one batch of outliers."""
     predictor, (first, second, other) = Plain(PLACE), batches(3)
     predicted: list[Ball] = []
 

@@ -1,4 +1,4 @@
-"""mode=predict of volumes: maps where the data set draws them, and what is bad listed."""
+"""Tests of mode=predict for volumes: maps if the data set draws them, and a list of unusable voxels and files."""
 
 import csv
 from pathlib import Path
@@ -10,7 +10,7 @@ from tests.conftest import Framework
 
 
 def test_maps_are_written_and_what_is_bad_is_listed(tmp_path: Path, framework: Framework) -> None:
-    """Trained for a moment; a folder of two volumes, of which one has bad voxels, and a damaged file."""
+    """Train a model shortly, and make a folder of two volumes, one with unusable voxels, and a damaged file."""
     write_slice(tmp_path, side=32, noise=0.01, shift=0.05, data_seed=0)
     with np.load(tmp_path / "brain.npz") as stored:
         held = dict(stored)

@@ -1,4 +1,4 @@
-"""mode=predict with other data settings than the run had: they change what is read, or are refused."""
+"""Tests of mode=predict with other data settings than in the run, which change the reading or are refused."""
 
 from pathlib import Path
 

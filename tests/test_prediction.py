@@ -1,4 +1,4 @@
-"""Intervals and standard deviations of predictions, of densities that know theirs and of those that do not."""
+"""Intervals and standard deviations of predictions, for densities with and without closed forms."""
 
 import math
 
@@ -16,7 +16,7 @@ SCALE = torch.tensor([[1.0, 0.1], [3.0, 20.0]], dtype=torch.float64)
 
 
 class Unknown(Independent):
-    """A normal density that does not know its variance, as most mixtures over a latent variable."""
+    """Normal density without a variance, like most mixtures over a latent variable."""
 
     @property
     def variance(self) -> Tensor:

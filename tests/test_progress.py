@@ -9,7 +9,7 @@ from framework.storage.progress import QUIET_TIME, REPORT_INTERVAL, Work, track_
 
 
 class Clock:
-    """Seconds that pass when a test says so."""
+    """Clock that advances only when a test sets it."""
 
     def __init__(self) -> None:
         self.now = 100.0

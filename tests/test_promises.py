@@ -35,7 +35,7 @@ CHAINS = {
 }
 """Wrappers, each inside the wrapper for conformal prediction sets."""
 ELSEWHERE = {"refined"}
-"""Wrappers of one data set's models alone: least squares of Z-spectra."""
+"""Wrappers that only fit the models of one data set: least squares for Z-spectra."""
 ONLY = {"platt": ("class",)}
 OFTEN = {
     "conformal": ("degrees",),
@@ -50,7 +50,7 @@ PROMISED = 0.8
 
 @pytest.fixture(scope="module")
 def table(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two numbers, and a class, two reals and an angle that follow them."""
+    """Table of two input numbers, with a class, two real numbers and an angle that depend on them."""
     random = np.random.default_rng(0)
     a, b = random.normal(size=(2, 240))
     noisy = a + 0.3 * random.normal(size=240)

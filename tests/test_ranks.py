@@ -66,14 +66,14 @@ STEPS = (*TINY, *QUIET, *TWO, "trainer.checkpoint_every_steps=1")
 
 @pytest.fixture(scope="module")
 def whole_of_two(forks: Forks, stranger_site: Path, tmp_path_factory: pytest.TempPathFactory) -> Done:
-    """Two ranks without an interruption."""
+    """Train with two ranks without an interruption."""
     done = command(forks, stranger_site, tmp_path_factory.mktemp("two"))(*STEPS)
     assert done.code == 0, done.out
     return done
 
 
 def numbers(done: Done, prefix: str) -> dict[str, float]:
-    """The numbers of a run by name and step, from its journal."""
+    """Return the numbers of a run by name and step, from its journal."""
     found = {}
     for line in (done.folder / "journal.jsonl").read_text(encoding="utf-8").splitlines():
         record = json.loads(line)

@@ -1,4 +1,4 @@
-"""Pictures of the rasteriser against those of a renderer that casts rays in float64 and shares no code with it."""
+"""Images of the rasteriser, compared with those of an independent renderer that casts rays in float64."""
 
 import importlib.util
 import math
@@ -49,7 +49,7 @@ def papered(scene: Scene, wrap: str, smooth: bool) -> Scene:
 
 
 def crowd(camera: Camera, count: int, wrap: str = "repeat", smooth: bool = True) -> Scene:
-    """Bodies with and without textures that stand in, before and behind one another."""
+    """Return a scene of bodies with and without textures, which overlap and hide each other."""
     random = np.random.default_rng(count)
     subjects = []
     for number in range(count):
@@ -62,7 +62,7 @@ def crowd(camera: Camera, count: int, wrap: str = "repeat", smooth: bool = True)
 
 
 def soup(camera: Camera, count: int, length: float, width: float, away: tuple[float, float]) -> Scene:
-    """Loose triangles of this length and width anywhere before the camera, its frame being the world's."""
+    """Return a scene of random triangles of this length and width before the camera, in camera coordinates."""
     random = np.random.default_rng(count)
     middle = random.uniform([-1, -1, away[0]], [1, 1, away[1]], (count, 3))
     along, across = (random.normal(0, 1, (count, 3)) for _ in range(2))
@@ -198,7 +198,7 @@ def test_of_slivers_too_only_edges_differ(name: str, stranger: ModuleType) -> No
 
 
 class Faulty(Renderer):
-    """The rasteriser, with what it is given and what it draws passed through two functions."""
+    """Rasteriser whose inputs and outputs are changed by two functions."""
 
     bibtex = ""
     channels = frozenset(("color", "depth"))

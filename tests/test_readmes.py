@@ -1,5 +1,5 @@
-"""Every command of every README and of the page of claims composes, and its plugins accept it; a user's files are not
-looked at."""
+"""Commands in all READMEs and in the page of claims, which must compose with settings that their plugins accept;
+files are not read."""
 
 import re
 import shlex
@@ -51,7 +51,7 @@ ALL = [
 
 
 def jobs(command: str) -> list[str]:
-    """Arguments without the flag of a sweep, and the first value of each key that is swept over."""
+    """Return the arguments without the flag of a sweep, with only the first value of each swept key."""
     words = shlex.split(command.replace("checkpoint=last", "checkpoint=X"))  # there may be no run here
     arguments, swept = [word for word in words if word not in ("-m", "...", "…")], "-m" in words
     first = re.compile(r"^([^=]+=)([^\[{'\"(]*?),.*$")

@@ -1,4 +1,4 @@
-"""Densities seen with another batch_shape, against the same densities one by one."""
+"""Densities with another batch_shape, compared with the same densities one by one."""
 
 import math
 
@@ -66,7 +66,7 @@ def test_reshaped_is_the_density_in_another_order_of_places(kind):
 @KINDS
 @pytest.mark.parametrize("make", ["stacked", "reshaped"])
 def test_a_mixture_of_them_samples_what_it_says(kind, make):
-    """Frequencies of classes, means of numbers, of samples against those that log_prob and the parts give."""
+    """Compare frequencies and means of samples with the values from log_prob and the parts."""
     if make == "stacked":
         parts = [density(kind, 2), density(kind, 2)]
         components = Stacked(parts)

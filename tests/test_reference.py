@@ -1,4 +1,4 @@
-"""Errors of log-likelihoods against a reference, beside NumPy's."""
+"""Errors of log-likelihoods relative to a reference, compared with NumPy."""
 
 import math
 
@@ -10,7 +10,7 @@ from framework.evaluation.reference import BETTER, COLUMNS, Reference, errors, r
 
 
 def made_up(noise: np.ndarray, truth: np.ndarray):
-    """Log-likelihoods of seed r: truth plus row r of the noise."""
+    """Return an estimator whose log-likelihoods with seed r are the truth plus row r of the noise."""
     return lambda value, seed: torch.from_numpy(truth + noise[seed])
 
 

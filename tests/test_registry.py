@@ -87,7 +87,7 @@ def test_one_name_from_several_packages_is_refused_naming_all_and_breaks_only_it
 def test_what_is_left_of_a_package_disturbs_nobody(
     fake: list[EntryPoint], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its files and entry points without the METADATA that name it."""
+    """The rest of a package has files and entry points, but no METADATA with its name."""
     (tmp_path / "half-1.0.dist-info").mkdir()
     (tmp_path / "half-1.0.dist-info" / "entry_points.txt").write_text(
         "[framework.encoder]\nhalf = half:Encoder\n"

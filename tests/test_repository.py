@@ -85,7 +85,7 @@ STATES = {
 
 @pytest.fixture(autouse=True)
 def _alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """No repository above, and no configuration of whoever runs the tests."""
+    """Hide repositories above the folder, and the git configuration of the user who runs the tests."""
     for role in ("AUTHOR", "COMMITTER"):
         monkeypatch.setenv(f"GIT_{role}_NAME", "nobody")
         monkeypatch.setenv(f"GIT_{role}_EMAIL", "nobody@localhost")
@@ -183,7 +183,7 @@ RUNS = (
     *("trailer.x.command", "uploadpack.packObjectsHook", "browser.x.cmd", "difftool.x.cmd", "man.x.cmd"),
     *("remote.origin.uploadpack", "remote.origin.vcs", "submodule.part.update", "trace2.eventTarget"),
 )
-"""Settings whose value git runs, or opens."""
+"""Settings of git whose value is a program that git runs or a file that git opens."""
 HOOKS = (
     *("post-index-change", "post-checkout", "pre-commit", "fsmonitor-watchman", "reference-transaction"),
     *("pre-auto-gc", "sendemail-validate", "post-rewrite", "update", "query-watchman"),
@@ -202,7 +202,7 @@ PLACES = {
 
 @pytest.mark.parametrize("place", PLACES)
 def test_nothing_that_a_repository_names_is_run(place: str, tmp_path: Path) -> None:
-    """Every setting that runs something at once; git itself runs some of them."""
+    """Test all settings that name a program together; git itself runs some of these programs."""
     marker = tmp_path / "marker"
     program = tmp_path / "repository" / "program"
     lines = [
@@ -326,7 +326,7 @@ def test_a_family_of_repositories_may_be_listed(tmp_path: Path, monkeypatch: pyt
 def test_whoever_asks_git_asks_it_of_no_strangers_folder(
     framework: Framework, tmp_path: Path, stranger_site: Path
 ) -> None:
-    """MLflow and the libraries under it would do so of their own accord."""
+    """MLflow and its libraries would call git without a request."""
     asked, real = tmp_path / "asked", shutil.which("git")
     shell(tmp_path, "")
     programs = tmp_path / "programs"

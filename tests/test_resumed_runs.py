@@ -36,7 +36,7 @@ Composed = Callable[..., Config]
 
 @pytest.fixture
 def composed() -> Iterator[Composed]:
-    """The config of a command."""
+    """Return the config of a command."""
 
     def config(folder: Path, *overrides: str) -> Config:
         values = composition.plain(compose("config", ["experiment_name=test", *overrides]))

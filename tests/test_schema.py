@@ -55,7 +55,7 @@ class Toy(Encoder):
 
 @dataclass(frozen=True, kw_only=True)
 class Frame:
-    """A value: its fields are keys of the config."""
+    """Value whose fields are keys of the config."""
 
     side: Annotated[int, Field(ge=8)] = 48
     label: str
@@ -73,7 +73,7 @@ class Framed(Toy):
 
 
 class Demanding(Toy):
-    """Asks the framework for something nobody has."""
+    """Class with a framework parameter that does not exist."""
 
     def __init__(self, moon: str) -> None:
         super().__init__((1,))
@@ -91,7 +91,7 @@ class Choosy(Toy):
 
 
 class Named(Toy):
-    """Its parts have names of their own, which no config can give them."""
+    """Class whose parts have names that no config can set."""
 
     def __init__(
         self, input_shape: tuple[int, ...], *, experts: dict[str, list[Encoder]] | None = None
@@ -110,7 +110,7 @@ CLASSES: dict[str, type] = {
 
 @pytest.fixture(autouse=True)
 def toys(monkeypatch: pytest.MonkeyPatch) -> dict[str, type]:
-    """The classes that are there by name; a test may add its own."""
+    """Return the installed classes by name, to which a test can add further ones."""
     classes = dict(CLASSES)
 
     def load(group: str, name: str) -> type:
@@ -277,7 +277,7 @@ KINDS: dict[str, tuple[Any, Any, Any]] = {
     "bare dict": (Dict, {"q": [1]}, {"q": [1]}),  # noqa: UP006
     "anything": (Any, {"a": [1]}, {"a": [1]}),
 }
-"""Annotation, a value of it, and that as a config and a checkpoint hold it."""
+"""Annotations, each with a value and with the form of this value in a config and a checkpoint."""
 WRAPS: dict[str, tuple[Callable[[Any], Any], Callable[[Any], Any]]] = {
     "itself": (lambda kind: kind, lambda one: one),
     "optional": (lambda kind: Optional[kind], lambda one: one),  # noqa: UP045
@@ -293,7 +293,7 @@ WRAPS: dict[str, tuple[Callable[[Any], Any], Callable[[Any], Any]]] = {
 
 
 def alike(found: Any, wanted: Any) -> bool:
-    """Equal and of one type, where NaN is NaN."""
+    """Return whether two values are equal and have the same type; NaN equals NaN."""
     return type(found) is type(wanted) and (found == wanted or repr(found) == repr(wanted))
 
 
@@ -344,7 +344,7 @@ def test_what_is_lazy_or_frozen_arrives_whole(toys: dict[str, type], tmp_path: P
 
 
 def a_function() -> None:
-    """Nothing that a checkpoint keeps."""
+    """Value that no checkpoint can store."""
 
 
 @pytest.mark.parametrize(

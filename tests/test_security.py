@@ -1,4 +1,4 @@
-"""Each claim of SECURITY.md names a test that exists."""
+"""Claims of SECURITY.md, each of which names a test that exists."""
 
 import ast
 import re

@@ -122,7 +122,7 @@ def started(kind: str, forks: Forks, site: Path, base: Path) -> Server:
 def servers(
     forks: Forks, stranger_site: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[dict[str, Server]]:
-    """A server of rows and one of images, which start side by side."""
+    """Start a server for rows and one for images at the same time."""
     found: dict[str, Server] = {}
     try:
         for kind in (TABULAR, IMAGES):
@@ -145,14 +145,14 @@ def servers(
 
 
 def png(side: int = 8) -> bytes:
-    """An image of one colour."""
+    """Return an image of one colour."""
     content = BytesIO()
     Image.new("RGB", (side, side), (90, 120, 150)).save(content, "PNG")
     return content.getvalue()
 
 
 def bomb() -> bytes:
-    """A PNG of 0.6 GB of zeros in 0.6 MB, without decoding it."""
+    """Return a PNG whose 0.6 MB decompress to 0.6 GB of zeros."""
     side = 25_000
 
     def chunk(kind: bytes, data: bytes) -> bytes:
@@ -170,7 +170,7 @@ def text(content: bytes) -> str:
 
 
 def forms(rows: list[dict[str, Any]]) -> dict[str, tuple[str, str]]:
-    """The same rows in each form that MLflow reads: body and content type."""
+    """Return the body and content type of the same rows in each form that MLflow reads."""
     frame = pd.DataFrame(rows)
     split = {"columns": list(frame), "data": frame.to_numpy(object).tolist()}
     return {
@@ -183,7 +183,7 @@ def forms(rows: list[dict[str, Any]]) -> dict[str, tuple[str, str]]:
 
 
 def test_every_form_is_answered_as_in_a_notebook(servers: dict[str, Server]) -> None:
-    """Rows and files, in each form that MLflow reads, with content types of any spelling."""
+    """Rows and files are read in each form that MLflow accepts, with any spelling of the content type."""
     for kind, row in ((TABULAR, ROW), (IMAGES, {"base64": text(png()), "name": "my.png"})):
         wanted = load_model(str(servers[kind].model)).predict(pd.DataFrame([row, row]))
         for form, (body, content_type) in forms([row, row]).items():
@@ -196,7 +196,8 @@ def test_every_form_is_answered_as_in_a_notebook(servers: dict[str, Server]) -> 
 
 
 def test_made_up_samples_are_answered_before_the_server_listens(servers: dict[str, Server]) -> None:
-    """So the first request waits for no import and no compilation: each kind has a sample, and takes it."""
+    """Each kind of model predicts its own sample request, so that the first request needs no imports and no
+    compilation."""
     for server in servers.values():
         served = _load_pyfunc(str(server.model / "model.ckpt"))
         samples = list(served.sample_requests())
@@ -221,7 +222,7 @@ def test_made_up_samples_are_answered_before_the_server_listens(servers: dict[st
 
 
 def faults(row: dict[str, Any]) -> Iterator[tuple[str, bytes | str, str | None]]:
-    """Name, body and content type of requests that nothing can be predicted for."""
+    """Yield the name, body and content type of requests that have no prediction."""
     deep = "[" * 5000 + "]" * 5000
     good, wide = json.dumps(row), json.dumps([row] * 3)
     split = {"columns": list(row), "data": [list(row.values())]}
@@ -300,7 +301,7 @@ def faults(row: dict[str, Any]) -> Iterator[tuple[str, bytes | str, str | None]]
 
 
 def test_no_form_with_any_fault_gets_more_than_a_sentence(servers: dict[str, Server]) -> None:
-    """Status 400, 413 or 415 within 5 s, below 1 GB more than before, whatever the body and its content type."""
+    """Any faulty body gets the status 400, 413 or 415 within 5 s and with less than 1 GB of additional memory."""
     for kind, row in ((TABULAR, ROW), (IMAGES, {"base64": text(png()), "name": "my.png"})):
         server, count = servers[kind], 0
         before = server.peak()
@@ -317,7 +318,7 @@ def test_no_form_with_any_fault_gets_more_than_a_sentence(servers: dict[str, Ser
 
 
 def test_contents_of_files_are_bounded_and_named_by_row(servers: dict[str, Server]) -> None:
-    """The client's name of the file stands in the sentence, the server's does not; no file of the server is read."""
+    """The message contains the client's name of the file, not the server's; no file of the server is read."""
     server = servers[IMAGES]
     canary = server.model.parent / "canary.png"  # a file that could be predicted for
     canary.write_bytes(png())
@@ -359,7 +360,7 @@ def test_contents_of_files_are_bounded_and_named_by_row(servers: dict[str, Serve
 
 
 def test_the_bound_of_size_and_time_holds_before_a_body_is_there(servers: dict[str, Server]) -> None:
-    """Content-Length too large, false, or missing; bodies that never end, or come slowly."""
+    """Send a Content-Length that is too large, false or missing, and bodies that are endless or slow."""
     server = servers[TABULAR]
     head = "POST /invocations HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
     body = forms([ROW])["dataframe_split"][0]

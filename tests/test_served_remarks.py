@@ -1,4 +1,4 @@
-"""Answers of a server carry what a wrapper found when it was calibrated; densities of classes print their values."""
+"""Responses of a server, which contain the remarks of calibrated wrappers, and texts of densities over classes."""
 
 import asyncio
 import pickle

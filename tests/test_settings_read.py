@@ -43,7 +43,7 @@ from framework.training.schedules import Plateau, make_schedule
 GROUPED = {"optimizer": OptimizerSettings, "logger": LoggerSettings, "trainer": TrainerSettings}
 OPTIONS = composition.folder() / "mode"
 WITH_A_RUN = ("resume", "experiment_name")
-"""Settings that are read where a run is opened that was begun before, or that goes to a store."""
+"""Settings that are read only when a run is resumed or sent to a store."""
 
 
 def settings_of_the_schema() -> list[str]:
@@ -91,7 +91,7 @@ def test_the_key_of_a_group_elsewhere_is_where_it_goes() -> None:
 
 
 class Recorded(dict[str, Any]):
-    """A config that notes which of its keys are asked for by name; what copies all of it asks for none."""
+    """Config that records which of its keys are read by name; copying the whole config reads no key."""
 
     seen: set[str]
 
@@ -125,7 +125,7 @@ COMMANDS: dict[str, Sequence[str]] = {
     "plugins": (),
     "sync": ("mode.run={train}",),
 }
-"""One that works, of each mode; `{mode}` is the folder of the run before."""
+"""Working command for each mode; `{mode}` is the folder of an earlier run of that mode."""
 
 
 @pytest.fixture(scope="module")
@@ -199,7 +199,7 @@ def test_an_option_that_a_mode_has_not_is_refused(mode: str, composed: Callable[
 
 
 def rates(**changes: Any) -> tuple[float, ...]:
-    """The learning rate's factor in each step of a training that comes to a standstill."""
+    """Return the factor of the learning rate in each step of a training whose loss stops improving."""
     chosen = OptimizerSettings(**changes)
     factor = make_schedule(chosen, 120, 10)
     found = []

@@ -63,7 +63,7 @@ def test_of_equal_methods_at_most_one_table_in_twenty_has_a_bold_row(runs: int, 
 @pytest.mark.parametrize("better", ["higher", "lower"])
 @pytest.mark.parametrize("place", [0, 1, 2])
 def test_a_real_difference_of_three_standard_errors_is_found(better: str, place: int) -> None:
-    """Three standard errors of a difference, over the test samples of single runs."""
+    """A difference of three standard errors over the test samples of single runs is significant."""
     sign = 1 if better == "higher" else -1
     means = [
         Mean(sign * 3.0 * math.sqrt(2) if row == place else 0.0, 1.0, 199.0, "samples") for row in range(3)

@@ -111,7 +111,7 @@ def test_each_spectrum_is_fitted_as_scipy_fits_it_or_better(preset, brain):
 
 
 def exact_covariance(jacobian, variance, sides):
-    """(JᵀJ / s² + diag 12 / side²)⁻¹ with 60 digits."""
+    """Return (JᵀJ / s² + diag 12 / side²)⁻¹, computed with 60 digits."""
     with mpmath.workdps(60):
         rows = mpmath.matrix(jacobian.tolist())
         normal = rows.T * rows / variance

@@ -1,4 +1,4 @@
-"""The default store lies in the folder of the runs, whatever that folder is called."""
+"""Default store, which lies in the folder of the runs for any name of this folder."""
 
 import os
 import sqlite3

@@ -90,7 +90,7 @@ for line in sys.stdin.read().splitlines():
 
 
 def texts() -> list[tuple[str, str, str]]:
-    """Group, plugin and name of every parameter that takes a text of any kind."""
+    """Return the registry, plugin and name of every parameter that can hold a text."""
 
     def takes_text(annotation: Any) -> bool:
         if isinstance(annotation, type):
@@ -114,7 +114,7 @@ def texts() -> list[tuple[str, str, str]]:
 def test_no_use_of_a_stored_config_opens_what_it_names(
     whole: Done, tmp_path: Path, stranger_site: Path
 ) -> None:
-    """Every text of every installed plugin × every command that reads stored configs."""
+    """Test every text parameter of every plugin with every command that reads stored configs."""
     canary = tmp_path / "canary"
     canary.mkdir()
     asked = [f"{group} {name} {key} {canary}" for group, name, key in texts()]

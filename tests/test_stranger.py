@@ -20,7 +20,7 @@ def test_a_strangers_head_and_data_run_by_name(framework: Framework) -> None:
 
 @pytest.fixture
 def broken_site(tmp_path: Path) -> Path:
-    """A package that is installed and raises at import, with a config nobody asked for."""
+    """Install a package that raises an error at import, and whose config is not used."""
     site = tmp_path / "broken_site"
     package = site / "broken_package"
     (package / "conf" / "density_head").mkdir(parents=True)

@@ -1,4 +1,4 @@
-"""A run or sweep folder that somebody sent does nothing but what a sentence says: every attack against every command.
+"""Run and sweep folders from somebody else: every attack ends with an error message, for every command.
 
 What an attack must not reach lies in `home`; a listener on a second loopback address must hear nothing. `SECURITY.md`
 says what is trusted.
@@ -174,7 +174,7 @@ SURVIVED = {("results_of_two_names", name) for name in ("test", "predict", "trai
     for attack in ("journal_linked", "record_piped")
     for name in ("test", "predict", "train from it")
 }
-"""Commands that have no use for the file: they do what they are asked, and leave it alone."""
+"""Commands that do not read the file; they succeed and do not change it."""
 
 
 @pytest.fixture(scope="session")
@@ -217,7 +217,7 @@ def sent(whole: Done, tmp_path: Path, mlflow_database: Path, listener: socket.so
 
 
 def state(folder: Path) -> dict[str, tuple[int, int, bytes]]:
-    """Mode, time of the last change and content of everything below a folder."""
+    """Return the mode, modification time and content of all files below a folder."""
     found = {}
     for path in sorted(folder.rglob("*")):
         status = path.lstat()
@@ -271,7 +271,7 @@ PLUGIN_COMMANDS = {
     "plugins.data.human_scans.photograph_meshes": ["{run}", "{out}/root"],
     "plugins.renderer.rasterizer": ["{run}/results.json", "--out={out}/picture.png"],
 }
-"""Every command of a plugin, given a stranger's folder."""
+"""Test every command of a plugin with the folder of somebody else."""
 
 
 def test_these_are_all_commands_of_plugins() -> None:

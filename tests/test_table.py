@@ -114,7 +114,7 @@ def test_the_best_of_a_column_is_bold_where_better_is_known() -> None:
 def test_the_best_is_bold_where_it_differs_from_all_by_more_than_noise(
     suffix: str, way: Literal["higher", "lower"], distance: float
 ) -> None:
-    """A real difference of many standard errors is found, one of half of one is not, and none of unknown ones."""
+    """A difference of many standard errors is marked; half a standard error and unknown standard errors are not."""
     sign = 1 if way == "lower" else -1
     rows = [
         {"method": name, "n": 3, "error": sign * error, **({f"error{suffix}": 0.1} if suffix else {})}

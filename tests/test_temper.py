@@ -58,7 +58,8 @@ HEADS = [
 
 @pytest.mark.parametrize("name, target, config", HEADS)
 def test_every_heads_density_has_a_temperature(name, target, config):
-    """Temperature 1 is the density itself; others have its shapes and type, integrate to 1, and have derivatives."""
+    """Tempered densities: temperature 1 is the density itself; others keep shape and type, integrate to 1 and have
+    gradients."""
     for dtype in (torch.float32, torch.float64):
         density = density_of(name, target, dtype=dtype, **config)
         assert temper(density, hot(1.0)) is density
@@ -403,7 +404,7 @@ def test_of_classes_latent_densities_keep_their_likeliest(name, kelvin, more):
 @pytest.mark.parametrize("batch", [(3,), (0,), (2, 0), (2, 3)], ids=str)
 @pytest.mark.parametrize("joint", [False, True], ids=["independent", "joint"])
 def test_normals_stay_normals_whatever_is_asked_of_them(joint, batch):
-    """Their median is their mean, exactly, and no question fails on an empty batch: marginals and powers too."""
+    """The median equals the mean exactly, and no protocol function fails for an empty batch."""
     torch.manual_seed(0)
     mean = 1000 * torch.randn(*batch, 2).double()
     scale = torch.rand(*batch, 2).double() + 0.5

@@ -234,7 +234,7 @@ def test_refuses_numbers_that_are_no_weights(tmp_path, kind):
 
 
 class Calibrated(nn.Module):
-    """Something with a buffer that was fitted."""
+    """Module with a fitted buffer."""
 
     def __init__(self, values, bounds):
         super().__init__()
@@ -245,7 +245,7 @@ class Calibrated(nn.Module):
 @pytest.mark.parametrize("shape", [(), (3,)])
 @pytest.mark.parametrize("bounds", [ABOVE_0, FROM_0, FINITE, (-math.inf, math.inf), (-2.0, 0.5)])
 def test_a_stored_buffer_is_taken_within_its_bounds_only(bounds, shape):
-    """NaN never is, nor are numbers of another shape, for a single number not even one in a row, or of another type."""
+    """NaN, other shapes and other types are refused; a single number must not be a row of one."""
     whole = torch.full(shape, 0.25, dtype=torch.float64)
     holder = nn.Sequential(Calibrated(whole.tolist(), bounds))
     for value in (-math.inf, -1e300, -1.0, 0.0, 0.5, 1e300, math.inf, math.nan):

@@ -20,7 +20,7 @@ COMMANDS = sorted(
 
 @pytest.fixture(scope="module")
 def archive(tmp_path_factory: pytest.TempPathFactory, stranger_site: Path) -> Path:
-    """A folder with a module of each name that a run imports, but for those that `python -m` itself loads first."""
+    """Make a folder with a module for each name that a run imports, except those that `python -m` loads first."""
     base = tmp_path_factory.mktemp("working_directory")
     used = listed(*TINY, "trainer.max_epochs=1", folder=base, site=stranger_site)
     assert used.code == 0, used.out
