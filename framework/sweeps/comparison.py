@@ -32,16 +32,16 @@ _DIRECTIONS: Mapping[str, Literal["higher", "lower"]] = {"minimize": "lower", "m
 DESCRIPTION, LONGEST_DESCRIPTION = "mlflow.note.content", 7500
 """Tag that MLflow shows as a run's description, and the largest number of characters of a description."""
 RETURNED = "best validation loss (nats)"
-"""Name of the value that a training returns to its sweep."""
+"""Name, in tables, of the value that a training returns to its sweep."""
 _HEADER = ("method", "data", "columns", "better")
-"""Keys that the results of every job must contain for the table."""
+"""Keys that results.json of a job must contain so that the job appears in the table."""
 
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Trial:
-    """A job of a search; `value` is the value that the job returned, or None if there is none."""
+    """One job of a random search; `value` is the number that the job returned, or None if it returned none."""
 
     folder: Path
     overrides: list[str]
@@ -51,14 +51,14 @@ class Trial:
 
 @dataclass(frozen=True)
 class Ranking:
-    """The best trial of a search, None if no trial has a finite value, and a line that states its value."""
+    """Result of a search: the best trial, or None if no trial has a finite value, and a line that states its value."""
 
     best: Trial | None
     summary: str
 
 
 def begin(folder: Path, config: Mapping[str, Any]) -> str | None:
-    """Open the parent run of a sweep and return its id; None if there is no tracking store."""
+    """Open the parent run of a sweep's jobs in the tracking store, and return its id; None without a store."""
     logger = config.get("logger") or {}
     if logger.get("name") != "mlflow":
         return None
@@ -78,7 +78,7 @@ def summarise(folder: Path, overrides: Sequence[Sequence[str]], config: Mapping[
     Args:
         folder: Folder of the sweep.
         overrides: Overrides of each job of this command.
-        config: Config of the first job, as for `begin`; only the store that it names is contacted.
+        config: Composed config of the first job, as for `begin`; no store but the one that it names is contacted.
     """
     console = output()
     jobs = find_job_folders(folder)
@@ -127,9 +127,9 @@ def rank(
     metric: str | None = None,
     direction: str | None = None,
 ) -> Ranking:
-    """Print the trials of a search, write ranking.csv, and return the best trial.
+    """Print the trials of a search as a table, write them to ranking.csv, and return the best trial with its value.
 
-    The best trial comes first, and trials without a finite value come last.
+    The table begins with the best trial, and trials without a finite value are its last rows.
 
     Args:
         folder: Folder of the search.
@@ -189,7 +189,7 @@ def rank(
 
 
 def close_ranking(folder: Path, summary: str, config: Mapping[str, Any]) -> None:
-    """Log the result of a search to the parent run, with the description `summary`; `config` is as for `begin`."""
+    """Log ranking and best trial of a search to its parent run, described by `summary`; `config` is as for `begin`."""
     paths = (folder / name for name in ("ranking.csv", "best.yaml"))
     _close_parent(folder, [path for path in paths if path.is_file()], summary, config)
 
@@ -210,7 +210,7 @@ def _results(job: Path) -> dict[str, Any]:
 
 
 def _check_results(results: Mapping[str, Any], path: Path) -> dict[str, Any]:
-    """Check a job's results, since the file may come from an untrusted source; return them with texts safe to print.
+    """Check a job's results, which may come from an untrusted source; return them with texts that are safe to print.
 
     Raises:
         DataError: A value has a type that no test writes.
@@ -242,7 +242,7 @@ def _check_results(results: Mapping[str, Any], path: Path) -> dict[str, Any]:
 def _trial_row(
     trial: Trial, results: Mapping[str, Any], keys: Sequence[str], metric: str | None
 ) -> dict[str, Any]:
-    """Return the row of a trial; "value" is NaN if it has none, and "synthetic" is None if this is not known."""
+    """Return a trial's row of the table; "value" is NaN without a value, and "synthetic" is None without results."""
     value = trial.value if metric is None else results.get(metric)
     overridden = {key: text for key, _, text in (override.partition("=") for override in trial.overrides)}
     return {
@@ -283,7 +283,7 @@ def _status(folder: Path) -> str:
 
 
 def _row(job: Path) -> dict[str, Any] | None:
-    """Return the row of a completed job; None if the job did not complete or its results cannot be read."""
+    """Return a job's row of the table; None if the job did not complete or its results cannot be read."""
     record = read_record(job)
     results = _results(job) if record.get("status") == "completed" else {}
     if not results:
@@ -298,7 +298,7 @@ def _row(job: Path) -> dict[str, Any] | None:
 
 
 def _varied_keys(overrides: Sequence[Sequence[str]], *, absent: bool = False) -> list[str]:
-    """Return the keys whose values differ between jobs, in order; with `absent`, also keys that some jobs lack."""
+    """Return the keys with several values among the jobs, in order; with `absent`, also keys that some jobs lack."""
     values_of: dict[str, list[str]] = {}
     for job in overrides:
         for override in job:
@@ -312,13 +312,13 @@ def _varied_keys(overrides: Sequence[Sequence[str]], *, absent: bool = False) ->
 
 
 def _has_repetition(rows: Sequence[Mapping[str, Any]], keys: Sequence[str]) -> bool:
-    """Return whether two rows have the same method, data, seed and `keys`."""
+    """Return whether two rows agree in the method, the data, the seed and the values of `keys`."""
     combinations = [tuple(row.get(key) for key in ("method", "data", "seed", *keys)) for row in rows]
     return len(set(combinations)) < len(combinations)
 
 
 def _repeats_data(rows: Sequence[Mapping[str, Any]], key: str) -> bool:
-    """Return whether the column `key` has several values, but each value of the column `data` has its own."""
+    """Return whether the column `key` has several values, but only one for each value of the column `data`."""
     pairs = {(row["data"], row[key]) for row in rows}
     return len({value for _, value in pairs}) > 1 and len({data for data, _ in pairs}) == len(pairs)
 
@@ -326,7 +326,7 @@ def _repeats_data(rows: Sequence[Mapping[str, Any]], key: str) -> bool:
 def _draw_comparison(
     compared: Sequence[Mapping[str, Any]], rows: Sequence[Mapping[str, Any]], by: Sequence[str], folder: Path
 ) -> list[Path]:
-    """Draw the first column with a known direction against run time, and return the file; [] if a row lacks a number.
+    """Draw the first column with a known direction against run time; return the files, none if a row lacks a number.
 
     Args:
         compared: Means of the `rows`, one row for each combination of values of the keys `by`.

@@ -25,12 +25,12 @@ from framework.sweeps.processes import LARGEST
 from framework.tracking.signals import end_with_parent
 
 PATIENCE = 0.02
-"""Seconds between two checks whether a job has ended."""
+"""Seconds between two checks of whether a running job has ended."""
 
 
 @dataclass(frozen=True)
 class ForkJob:
-    """Job that a fork runs: its arguments, environment variables, and descriptors of its console and lock."""
+    """Job that a fork runs: arguments, environment variables, and descriptors of its output file and its lock."""
 
     arguments: list[str]
     environment: dict[str, str]
@@ -39,7 +39,11 @@ class ForkJob:
 
 
 def serve(channel: socket.socket) -> ForkJob | None:
-    """Fork a process for each requested job. Return the job in the fork, and None in the server after the last job."""
+    """Fork a process for each job that a packet requests.
+
+    The function returns in two kinds of process: in each fork, at once, with its job; and in the server, when the other
+    side has closed the socket, with None.
+    """
     running = set[int]()
     while True:
         if select.select([channel], [], [], PATIENCE if running else None)[0]:

@@ -51,9 +51,9 @@ class Job:
         arguments: Arguments of the job's command.
         folder: Folder of the job.
         key: Hash of the overrides, which identifies the job in the sweep.
-        config: Hash of the whole composed config, by which a completed job is recognised as up to date.
-        attempts: Number of times that this process has started the job.
-        waits: Whether a process of another sweep was found in the folder.
+        config: Hash of the whole composed config; a job that has completed with the same hash is not run again.
+        attempts: Number of times that this command has started the job.
+        waits: Whether the job waits, because a process of another sweep was found in its folder.
         unlocked: Whether the folder is on a file system without locks.
         record: Content of job.json.
     """
@@ -76,11 +76,11 @@ class Job:
 
     @property
     def identity(self) -> dict[str, Any]:
-        """Return the entries of the record that never change."""
+        """Return the entries of the record that identify the job and never change."""
         return {"key": self.key, "number": self.number, "overrides": self.overrides}
 
     def reread(self) -> bool:
-        """Read the record, which another sweep may have changed; return False if it now belongs to another job."""
+        """Read job.json again, which another sweep may have changed; return False if it now describes another job."""
         record = read_record(self.folder)
         if record.get("key") == self.key:
             self.record = record
@@ -96,7 +96,7 @@ class Job:
         write_whole(self.folder / RECORD, json.dumps(self.record, indent=1).encode())
 
     def value(self) -> float | None:
-        """Return the value that the job left for the sweeper to minimise (`leave_value`), or None."""
+        """Return the value that the job wrote for the sweeper (`runs.job.write_value`); None if it wrote none."""
         path = self.folder / VALUE
         with translate_errors(path, "a number", "Delete the file, and the job runs again."):
             return (
@@ -110,7 +110,10 @@ def short_hash(*parts: str) -> str:
 
 
 def find_records(folder: Path) -> dict[str, list[tuple[Path, dict[str, Any]]]]:
-    """Find folder and record of every job of earlier sweeps in `folder`, by key; a key may have several jobs."""
+    """Return the folder and the record of every job of earlier sweeps in `folder`, by `Job.key`.
+
+    Several jobs may have the same key.
+    """
     records_by_key: dict[str, list[tuple[Path, dict[str, Any]]]] = {}
     for path in find_job_folders(folder):
         record = read_record(path)
@@ -119,7 +122,7 @@ def find_records(folder: Path) -> dict[str, list[tuple[Path, dict[str, Any]]]]:
 
 
 def free_number(subfolder: Callable[[int], Path], number: int, used: set[Path]) -> int:
-    """Return the first number, from `number` on, whose folder belongs to no other job.
+    """Return the first job number, from `number` on, whose folder `subfolder(...)` is not in `used`.
 
     Raises:
         ConfigError: `hydra.sweep.subdir` gives two jobs the same folder.
@@ -235,7 +238,7 @@ def run(
 
 
 def _sync(folder: Path, store: str | None) -> None:
-    """Send the journal lines that a job has not sent; `comparison` closes and sends jobs that died."""
+    """Send the journal lines that a finished job has not sent; `comparison` closes and sends runs of killed jobs."""
     from framework.tracking.ended import sync  # imported late: Hydra imports this module at every start
 
     try:
@@ -281,7 +284,7 @@ def _environment(at_once: int, slot: int, devices: Sequence[str], parent: str | 
 
 
 def _earlier_seconds(record: Mapping[str, Any], config: str) -> float | None:
-    """Return the processor seconds of the earlier tries of a job; None if the end of one was not observed."""
+    """Return the processor seconds of a job's earlier tries with this config; None if the end of a try was missed."""
     if record.get("config") != config:
         return 0.0
     return None if record.get("ended") is None else record.get("processor_seconds")
@@ -309,7 +312,7 @@ def _start(job: Job, slot: int, lock: int, environment: Mapping[str, str], start
 
 
 def _end(active: _Running, code: int) -> None:
-    """Record the way in which a job ended."""
+    """Record how a job ended: its status, its error message and its processor time."""
     job = active.job
     active.process.kill()  # processes that a killed job left behind, such as data loaders and other ranks
     if active.process.seconds is None:
@@ -354,7 +357,7 @@ def _pass_on(number: int, before: int, running: Sequence[_Running]) -> None:
 
 @contextmanager
 def _signals() -> Iterator[list[int]]:
-    """Handle signals inside the `with` block, and yield the list of signal numbers, which grows as signals arrive."""
+    """Collect signals inside the `with` block; yield the list to which the number of each received signal is added."""
     received: list[int] = []
     numbers = handled_signals()
     before = [signal.signal(number, lambda number, frame: received.append(number)) for number in numbers]
@@ -368,8 +371,8 @@ def _signals() -> Iterator[list[int]]:
 def _lock(job: Job) -> int | None:
     """Lock the job's folder and return the lock's descriptor; None if a process of another sweep holds the lock.
 
-    On a file system without `flock` a POSIX record lock is used, which lasts as long as this process. On a file system
-    without both, a warning is logged.
+    On a file system without `flock`, a POSIX record lock is used, which ends with this process. On a file system
+    without either lock, a warning is logged.
     """
     path = job.folder / ".lock"
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)

@@ -18,17 +18,17 @@ from framework.tracking.signals import end_with_parent
 LARGEST = 2**17
 """Largest size, in bytes, of a packet that describes a job."""
 PATIENCE = 60.0
-"""Seconds that the start of a process may take, not counting imports."""
+"""Seconds that the start of the server process may take, not counting the imports of its modules."""
 _SERVER = "framework.sweeps.fork_server"
 _SET_CHILD_SUBREAPER = 36  # constant of prctl.h
 
 
 @runtime_checkable
 class Process(Protocol):
-    """Protocol of a job's process.
+    """Protocol of the process that runs a job.
 
     Attributes:
-        seconds: Processor time of all processes of the job; None before its end, and if the end was not observed.
+        seconds: Processor time of all processes of the job; None while it runs, or if its end was not observed.
     """
 
     seconds: float | None
@@ -41,7 +41,7 @@ class Process(Protocol):
     def poll(self) -> int | None:
         """Return the exit code, or None while the job runs.
 
-        A negative code is the signal that killed the job or, if its end was not observed, the signal sent to it.
+        A code -n means that signal n killed the job or, if the end of the job was not observed, was sent to it.
         """
         ...
 
@@ -63,7 +63,7 @@ a lock that is held until the last process of the job has ended.
 
 
 class SeparateProcess:
-    """Job in a separate process."""
+    """Job in a new Python process, as `Process` describes it; the constructor is a `Starter`."""
 
     def __init__(
         self, command: Sequence[str], environment: Mapping[str, str], console: int, lock: int
@@ -100,9 +100,9 @@ class SeparateProcess:
 class Forks:
     """Starter of jobs as forks of one server process (`fork_server`), which is started with the first job; Linux only.
 
-    A fork differs from a separate process only in that the modules are already imported. If the server dies, its
-    running jobs receive a signal to end. Jobs that the server had not started yet get separate processes. Later jobs
-    get another server, or separate processes if the first server had not forked any job.
+    A fork differs from a new process (`SeparateProcess`) only in that the modules are already imported. If the server
+    dies, its running jobs receive a signal to end, and jobs that it had not started yet get new processes. Jobs that
+    are started later get another server or, if the dead server had forked no job at all, new processes.
 
     Args:
         modules: Modules that the server imports.
@@ -290,12 +290,15 @@ class _Fork:
 
 
 def _adopt_orphans() -> None:
-    """Make this process the parent of a dead child's children (Linux), so that it observes their end."""
+    """Make this process the new parent of processes whose parent, a descendant of this one, dies (Linux only).
+
+    This process then observes their end.
+    """
     ctypes.CDLL(None).prctl(_SET_CHILD_SUBREAPER, 1)
 
 
 def _target_index(command: Sequence[str]) -> int:
-    """Return the index of the target in a Python command, which follows the interpreter's options."""
+    """Return the index of the target, `-m` or a file, in a Python command; the interpreter's options come before it."""
     return next(index for index, word in enumerate(command) if index and (word == "-m" or word[0] != "-"))
 
 

@@ -18,10 +18,12 @@ COMMAND: Sequence[str] = (sys.executable, "-P", "-m", "framework.sweeps.rehearsa
 
 
 def refuse_mistakes(jobs: Sequence[tuple[Sequence[str], Mapping[str, Any]]]) -> None:
-    """Check the configs of all training jobs, and the user's files that their data sets read (`Data.check_files`).
+    """Refuse a sweep if a training job has a wrong config, or its data set cannot read the user's files.
+
+    The files are checked by `Data.check_files`.
 
     Args:
-        jobs: Overrides and composed values of each job.
+        jobs: Overrides and composed config, as plain values, of each job.
 
     Raises:
         ConfigError: A job has a mistake; the message is the one that the first such job would print.
