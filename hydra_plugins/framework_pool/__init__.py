@@ -36,7 +36,7 @@ _COMPOSING = "framework.configuration.composition"
 
 
 class PoolLauncher(Launcher):
-    """Launcher that runs each job of a multirun as its own process, several at once; see `framework.sweeps.jobs`.
+    """Hydra launcher that runs each job of a sweep in its own process, several at once; see `framework.sweeps.jobs`.
 
     Args:
         jobs: number of jobs that run at once; None: half the number of cores.
@@ -61,7 +61,7 @@ class PoolLauncher(Launcher):
         self.parent: str | None = None
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
-        """Store the sweep's configuration, and raise an error if the sweep's folder is not enclosed."""
+        """Store the sweep's config; raise a DataError if the sweep's folder contains a link or a special file."""
         self.loader = hydra_context.config_loader
         self.config = config
         require_enclosed(Path(str(config.hydra.sweep.dir)))  # before Hydra writes multirun.yaml into it
@@ -166,7 +166,7 @@ class PoolLauncher(Launcher):
         return jobs
 
     def _shared_arguments(self) -> list[str]:
-        """Return the other arguments of the sweep's command from which a job composes its config."""
+        """Return the arguments that all jobs share: name and folders of the config, and overrides of Hydra's config."""
         hydra = self.config.hydra
         hydra_overrides: Any = OmegaConf.to_container(hydra.overrides.hydra, resolve=False)
         folders = [
@@ -181,7 +181,7 @@ class PoolLauncher(Launcher):
 
 
 def _remove_empty_sweep(folder: Path) -> None:
-    """Remove the folder of a sweep that never began, if it contains only the files of Hydra and of the lock."""
+    """Remove the folder of a sweep that never began, if it contains no files but Hydra's multirun.yaml and the lock."""
     files = list(folder.glob("*"))
     if {file.name for file in files} <= {"multirun.yaml", _LOCK}:
         for file in files:
@@ -213,7 +213,7 @@ def _without_hydra(config: DictConfig) -> DictConfig:
 
 
 def _plain_values(config: DictConfig, folder: Path) -> dict[str, Any]:
-    """Return a job's configuration as plain values; it equals that of the job itself except for its folder."""
+    """Return a job's config as plain values without Hydra's part; it is the job's own except for its folder."""
     with read_write(config), read_write(config.hydra), open_dict(config):
         config.hydra.runtime.output_dir = str(folder)
     before = HydraConfig.instance().cfg

@@ -24,15 +24,16 @@ log = logging.getLogger(__name__)
 
 
 class RandomSearch(Sweeper):
-    """Sweeper that draws trials at random, runs and ranks them all, and writes the best as an experiment.
+    """Hydra sweeper that draws jobs (trials) at random, runs and ranks them, and writes the best one as an experiment.
 
     A drawn value is a function of (seed, number of the trial, key) only, so more trials or another parameter do not
     change the values of existing trials. [Bergstra & Bengio, JMLR 13, 2012]
 
     Args:
-        trials: number of different trials; if the space has fewer points, all of them are run.
+        trials: number of different trials; if the search space has fewer points, every point is run once.
         seed: seed of the draws.
-        metric: a key of results.json; None: the value that a job returns, the best validation loss in nats.
+        metric: key of results.json by which trials are ranked; None: the value that a job returns, its best validation
+            loss in nats.
         direction: "minimize" or "maximize"; None: the direction that the metric declares.
         params: sweeps by key, in Hydra's grammar; a sweep of the same key on the command line takes precedence.
     """
@@ -52,7 +53,7 @@ class RandomSearch(Sweeper):
         self.params = dict(params or {})
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
-        """Store the configuration, and create the launcher that it chooses."""
+        """Store the config, and create the launcher that the config chooses."""
         self.hydra_context = hydra_context
         self.config = config
         self.launcher = Plugins.instance().instantiate_launcher(

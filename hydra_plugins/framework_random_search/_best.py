@@ -14,11 +14,14 @@ from rich.console import Console
 from framework.storage.files import write_whole
 
 OF_THE_RUN = ("logger", "mode", "debug", "threads", "workers", "resume")
-"""Keys that do not change the results of a trial; they stay on the command line."""
+"""Keys that do not change the results of a trial; they are no part of the experiment and stay on the command line."""
 
 
 def write_best(folder: Path, overrides: Sequence[str], loader: ConfigLoader, origin: str) -> None:
-    """Write best.yaml to `folder`, and a copy that Hydra finds as an experiment with `--config-dir=<folder>`."""
+    """Write the experiment of the best trial, which has `overrides`, to best.yaml in `folder`.
+
+    A copy is written to the subfolder `experiment`, where Hydra finds it with `--config-dir=<folder>`.
+    """
     name, content = build_experiment(overrides, loader, origin)
     path = folder / "best.yaml"
     write_whole(path, content.encode())
@@ -37,7 +40,10 @@ def write_best(folder: Path, overrides: Sequence[str], loader: ConfigLoader, ori
 
 
 AFTER = ("preset", "debug")
-"""Groups that config.yaml composes after the experiment; an experiment cannot override them, but can include them."""
+"""Groups that config.yaml composes after the experiment.
+
+An experiment cannot override the choice of such a group, but can include one of its configs.
+"""
 
 
 def build_experiment(overrides: Sequence[str], loader: ConfigLoader, origin: str) -> tuple[str, str]:

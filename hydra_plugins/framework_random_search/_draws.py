@@ -12,12 +12,12 @@ from framework.errors import ConfigError, did_you_mean
 
 WHOLE = re.compile(r"[+-]?\d+(_\d+)*")
 NARROWEST = 1e-12
-"""Smallest width of an interval, as a share of its larger end; a narrower interval has too few distinct numbers."""
+"""Smallest width of an interval, divided by its larger end; a narrower interval contains too few distinct floats."""
 
 
 @dataclass(frozen=True)
 class Choice:
-    """Choice among equally likely values, which are written as in an override."""
+    """Domain of a key that is a list of equally likely values, in the notation of overrides."""
 
     options: Sequence[object]
 
@@ -33,7 +33,10 @@ class Choice:
 
 @dataclass(frozen=True)
 class Interval:
-    """Interval start <= value < end; the value or its logarithm is uniform, and whole values are rounded down."""
+    """Domain of a key that is an interval, start <= value < end.
+
+    The value or, if `logarithmic` is True, its logarithm is uniform. If `whole` is True, the value is rounded down.
+    """
 
     start: float
     end: float
@@ -62,7 +65,7 @@ Domain = Choice | Interval
 
 
 def parse_space(overrides: Sequence[Override]) -> dict[str, Domain]:
-    """Return the domain of each override, by the override's key including its prefix.
+    """Return the domain of each override, by the override's key including its prefix, such as "+".
 
     A fixed override is a choice of one value. The last override of a key counts, as in Hydra's own sweeper.
 
@@ -86,8 +89,8 @@ def parse_space(overrides: Sequence[Override]) -> dict[str, Domain]:
 def draw(space: Mapping[str, Domain], trials: int, seed: int) -> tuple[list[list[str]], int]:
     """Return the overrides of different trials, and the number of draws that repeated an earlier trial.
 
-    There are `trials` trials, or one for each point of the space if it has fewer points. Then draws continue until all
-    points have occurred, so that the order begins with that of a shorter search.
+    There are `trials` trials or, if the space has fewer points, one for each point; the points are then drawn until all
+    have occurred. So the trials of a shorter search are the first trials of a longer one.
     """
     count = min(trials, math.prod(domain.size for domain in space.values()))
     drawn_trials: dict[tuple[str, ...], None] = {}
