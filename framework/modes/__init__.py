@@ -45,7 +45,7 @@ def run(values: dict[str, Any], folder: Path, overrides: Sequence[str]) -> float
 
 
 def _send_rest(folder: Path, store: str | None) -> bool:
-    """Send the journal lines that a finished run has not sent because it was killed; return whether there were any."""
+    """Send the journal lines that a run of status FINISHED could not send; return whether there were any."""
     from framework.tracking.ended import sync
     from framework.tracking.run_info import read_run_info
 
@@ -65,7 +65,8 @@ def _read_stored_run(
 ) -> tuple[dict[str, Any], list[str]]:
     """Return the config and overrides with which the run in `folder` was started.
 
-    Keys that do not affect the results (`HOW`) are taken from the present command, `command_values`, if it sets them.
+    Values of keys that do not affect the results (`HOW`) are taken from `command_values`, the config of the present
+    command, if the command sets them.
     """
     from framework.configuration.paths import flatten, paths_of, require_repeated
     from framework.runs.run import HOW

@@ -21,7 +21,7 @@ from framework.target import Target
 from framework.uncertainty import SeveralModels
 
 FEW = 2
-"""Number of samples with which wrappers are tried before they are fitted."""
+"""Number of samples with which uncertainty wrappers are tried before they are fitted."""
 
 
 class CalibrateOptions(Options):
@@ -59,7 +59,7 @@ def run(config: Config) -> None:
 
 
 def resolve_wrappers(wrappers: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return the checked wrappers of a config, innermost first.
+    """Return the checked configs of the uncertainty wrappers in `wrappers`, innermost first.
 
     Raises:
         ConfigError: There is no wrapper, or one of them trains several models.
@@ -83,7 +83,7 @@ def resolve_wrappers(wrappers: Mapping[str, Any]) -> list[dict[str, Any]]:
 def wrap_trained(
     predictor: Predictor, wrappers: Sequence[Mapping[str, Any]], target: Target, inputs: Tensor
 ) -> Predictor:
-    """Return a trained predictor inside wrappers, behind its fixed encoders, in evaluation mode.
+    """Return a trained predictor inside uncertainty wrappers, in evaluation mode; fixed encoders stay outside them.
 
     Args:
         predictor: Trained predictor.

@@ -72,7 +72,7 @@ def run(config: Config) -> None:
 
 
 def examine(plugin: Contract, console: Console) -> tuple[Table, list[dict[str, object]], list[str]]:
-    """Return the table of a plugin (worst case of each property), all findings, and the names of failed properties."""
+    """Return a plugin's table (worst case of each tested property), all test results, and the failed properties."""
     start = time.perf_counter()
     worst: dict[str, tuple[Row, Finding]] = {}
     lines: list[dict[str, object]] = []
@@ -103,7 +103,7 @@ def _chosen_plugins(values: Mapping[str, Any]) -> list[tuple[str, Mapping[str, A
 
 
 def _excess(finding: Finding) -> tuple[bool, float]:
-    """Return a sort key that increases with the ratio of error to limit; failed findings come last."""
+    """Return a sort key for test results: first whether the property failed, then the ratio of error to limit."""
     error = math.inf if math.isnan(finding.error) else finding.error
     return not finding.holds, error / finding.limit if finding.limit > 0 else error
 

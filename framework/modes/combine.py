@@ -69,8 +69,8 @@ def run(config: Config) -> None:
 def find_members(members: str | Sequence[str]) -> list[str | Path]:
     """Return the run folders, checkpoint files or MLflow run ids of the members.
 
-    If `members` is a folder, these are the runs directly in the folder that contain a trained model, sorted by name,
-    or, if there are none, the jobs with a trained model at any depth.
+    If `members` is a folder, the members are the runs directly in it that contain a trained model, sorted by name. If
+    it contains no such run, they are the jobs with a trained model at any depth.
 
     Raises:
         ConfigError: There are fewer than two members.
@@ -92,7 +92,7 @@ def find_members(members: str | Sequence[str]) -> list[str | Path]:
 
 
 def common_description(members: Sequence[Description]) -> Description:
-    """Return the description that all members share.
+    """Return the description of the first member, after checking that the others agree with it.
 
     Raises:
         CheckpointError: Two members differ in data, parts, target or inputs; the message names the difference.
@@ -128,7 +128,7 @@ def common_description(members: Sequence[Description]) -> Description:
 
 
 def wrapper_config(wrapper: str, count: int) -> dict[str, Any]:
-    """Return the config of a wrapper around `count` members.
+    """Return the resolved config of the uncertainty wrapper `wrapper` around `count` members.
 
     Raises:
         ConfigError: The wrapper cannot join separately trained members.
@@ -152,9 +152,9 @@ def build_joined(config: dict[str, Any], data: Data, members: Sequence[Predictor
 
 
 def _inner_predictor(joined: FrozenFrontEnd, member: Predictor, index: int) -> Predictor:
-    """Return the predictor of a member that follows its fixed encoders.
+    """Return the part of a member behind its fixed encoders, after checking that these equal those of the first member.
 
-    The encoders must be equal in all members. The encoders of the first member (`index` 0) are copied into `joined`.
+    The encoders of the first member (`index` 0) are copied into `joined`.
     """
     assert isinstance(member, FrozenFrontEnd)
     state = member.encoders.state_dict()

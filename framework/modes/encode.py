@@ -30,7 +30,7 @@ from framework.storage.progress import Work
 from framework.training.batches import Batches
 
 DESCRIPTION, NAMES = "encoding.json", "files.txt"
-"""Files in the folder of the parts: settings of the computation, and names of the encoded files, one per line."""
+"""Two files beside the features: settings of the computation, and names of the encoded files, one per line."""
 
 
 class EncodeOptions(Options):
@@ -44,13 +44,13 @@ class EncodeOptions(Options):
 
 @dataclass(frozen=True)
 class Collection:
-    """Files to encode, divided into parts, and the folder for the features.
+    """Files to encode, and the folder for their features. The features of `part` files are written to one file, a part.
 
     Attributes:
         root: Folder to which the names are relative.
         names: Names of the files, in order.
         part: Number of files in a part.
-        into: Folder of the parts.
+        into: Folder for the features.
     """
 
     root: Path
@@ -68,7 +68,7 @@ class Collection:
         return [self.root / name for name in self.names[number * self.part : (number + 1) * self.part]]
 
     def path(self, number: int) -> Path:
-        """Return the file for the features of a part."""
+        """Return the path of the file for the features of part `number`."""
         return self.into / f"part-{number:06}.npy"
 
     def missing(self) -> list[int]:
@@ -77,7 +77,7 @@ class Collection:
 
 
 def run(config: Config) -> None:
-    """Write this job's parts; parts that already exist are left unchanged."""
+    """Compute and write this job's parts of the features; parts that already exist are left unchanged."""
     options = config.options(EncodeOptions)
     console = set_up_process(config.settings)
     values = config.values
@@ -125,7 +125,7 @@ def run(config: Config) -> None:
 
 
 def parts_of_job(parts: int, which: str) -> range:
-    """Return the numbers of a job's parts: for job "2/4", every fourth part from the second on.
+    """Return the numbers, from 0, of a job's parts: for `which="2/4"`, every fourth part from the second on.
 
     Raises:
         ConfigError: The number of the job exceeds the number of jobs.

@@ -58,7 +58,7 @@ def _bibtex_value(bibtex: str, key: str) -> str:
 
 
 def _with_accent(command: re.Match[str]) -> str:
-    """Return the accented letter for which a LaTeX command stands."""
+    """Return the accented letter that a LaTeX command produces."""
     marks = {'"': "\u0308", "'": "\u0301", "`": "\u0300", "^": "\u0302", "~": "\u0303"}
     return unicodedata.normalize("NFC", command[2] + marks[command[1]])
 
@@ -115,7 +115,7 @@ def _docstring_and_bibtex(path: Path, attribute: str) -> tuple[str, str]:
 
 
 def _text(value: ast.expr, module: ast.Module) -> str:
-    """Return a text that is a literal, or a name of the same module for a literal; "" if the text is computed."""
+    """Return the text of an expression that is a literal, or a name of a literal in the module; "" for any other."""
     if isinstance(value, ast.Name):
         named = (item for item in module.body if isinstance(item, ast.Assign))
         constants = (

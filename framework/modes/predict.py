@@ -102,14 +102,14 @@ def predictions(
     images: Path,
     mass: float | None = None,
 ) -> tuple[list[dict[str, str]], list[tuple[Tensor, Tensor]]]:
-    """Return the rows of the table, and the tensors for maps.
+    """Return the rows of the CSV table, and the tensors from which the data set draws maps.
 
     A row has the name of a sample, the point prediction, the density's entropy in nats and the prediction set, or, if
     the model predicts no sets, the interval of probability `mass`. Standard errors are included if the ends of
-    intervals are estimated from random values. If the data set draws maps of files, the second list has for each batch
-    the point predictions and their standard deviations, each (batch, number).
+    intervals are estimated from random values. If the data set draws maps of `files`, the second list has for each
+    batch the point predictions and their standard deviations, each (batch, number); otherwise it is empty.
 
-    Predicted images are written to the folder `images`, and the row has the name of the file.
+    Predicted images are written to the folder `images`, and the row contains the name of the image file.
     """
     dataset = data.read(files) if files else data.splits().test
     loader = Batches(data, batch_size=BLOCK, workers=settings.workers, seed=settings.seed).of(dataset)
@@ -142,7 +142,10 @@ def predictions(
 def _intervals(
     target: Target, prediction: Prediction, mass: float | None
 ) -> Mapping[str, Sequence[Any] | Tensor]:
-    """Return the columns of the densities' prediction sets or, without sets, of the intervals of probability `mass`."""
+    """Return the columns of the prediction sets or, if the model has none, of the intervals of probability `mass`.
+
+    There are no columns without sets if `mass` is None.
+    """
     sets = value_set(prediction.density)
     if sets is None:
         return interval_columns(target, prediction.interval(mass)) if mass else {}
@@ -162,7 +165,7 @@ def _maps(
 
 
 def _names(data: Data, files: Sequence[Path], samples: int) -> list[str]:
-    """Return a name for each sample: its file, with the row if a file has several, or its number in the test split."""
+    """Return a name for each sample: its file, with the row if files have several; without files, "test <number>"."""
     if not files:
         return [f"test {number}" for number in range(samples)]
     if samples == len(files):
@@ -178,7 +181,8 @@ def _names(data: Data, files: Sequence[Path], samples: int) -> list[str]:
 def format_cell(value: str | float | Tensor, key: str) -> str:
     """Return the text of a table cell, with 15 significant digits for the ends of intervals and 10 for other numbers.
 
-    The last digits of an end matter even if the number is large in the user's unit.
+    The ends of an interval need more digits, because they may differ little compared with their size in the user's
+    unit.
     """
     if isinstance(value, str):
         return value

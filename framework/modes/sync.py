@@ -1,4 +1,4 @@
-"""mode=sync: send journal lines to the tracking store that a run could not send itself."""
+"""mode=sync: send to the tracking store the journal lines that a run could not send itself."""
 
 from pathlib import Path
 

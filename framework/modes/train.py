@@ -10,7 +10,7 @@ from framework.storage.first_rank import first_rank
 
 
 def run(config: Config) -> float:
-    """Train and test a model; return the validation loss of the kept weights, in nats, which a sweeper minimises."""
+    """Train and test a model; return the validation loss (nats) of the tested weights, which a sweeper minimises."""
     config.options(Options)
     session = for_training(config)
     with open_run(config) as run:

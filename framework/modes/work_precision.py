@@ -22,7 +22,7 @@ from framework.runs.run import Run, open_run
 from framework.runs.session import Session, for_trained
 
 ERROR, AXIS = "error_nats", "error of the mean log-likelihood (nats, RMS)"
-"""Default quantity for a knob of a density head, and the label of its axis."""
+"""Key of the error that is measured by default for a knob of a density head, and label of its axis."""
 
 
 class WorkPrecisionOptions(Options):
@@ -103,12 +103,12 @@ def _measure(run: Run, session: Session, options: WorkPrecisionOptions) -> None:
 
 
 def _refuse_unmeasured(config: Config, measured: bool, compared: bool) -> None:
-    """Raise an error for settings of quantities that are not measured.
+    """Raise an error if the command sets something for a quantity that is not measured.
 
     Args:
         config: Config of the command.
         measured: Whether metrics are measured.
-        compared: Whether the error against a reference is measured.
+        compared: Whether the error of the log-likelihood against a reference is measured.
 
     Raises:
         ConfigError: There is such a setting; the message names the first one.
@@ -127,12 +127,13 @@ def _refuse_unmeasured(config: Config, measured: bool, compared: bool) -> None:
 
 
 def _choose_keys(names: list[str] | None, metrics: list[Metric], *, own: bool) -> Better:
-    """Return the keys to measure, each with the direction in which it is better.
+    """Return the keys of the quantities to measure, each with its better direction, "higher" or "lower".
 
     Args:
-        names: Requested keys. None selects the error against a reference if `own` is True, and otherwise every metric.
+        names: Requested keys. None selects the error against a reference if `own` is True, and otherwise every key of
+            `metrics` with a known direction.
         metrics: Metrics of the session.
-        own: Whether the knob belongs to the density head of the model.
+        own: Whether the knob is one of the density head, and not of an uncertainty wrapper.
 
     Raises:
         ConfigError: No metric with a known direction has such a key.
