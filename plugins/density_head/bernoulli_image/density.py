@@ -25,8 +25,9 @@ from framework.geometry.srgb import linear_from_srgb
 class BernoulliImage(Distribution):
     """Independent numbers of an image, each 1 with its own probability and otherwise 0.
 
-    log p is y log σ(r) + (1 - y) log σ(-r). A value y between 0 and 1 is read as the share of the pixel that is 1;
-    log p is then the mean over the parts of the pixel. Values outside [0, 1] are clamped.
+    For the value y and the log-odds r of a number, log p = y log σ(r) + (1 - y) log σ(-r) with the logistic function σ.
+    A value y between 0 and 1 is read as the share of the pixel that is 1; log p is then the mean over the area of the
+    pixel. Values outside [0, 1] are clamped.
 
     Args:
         logits: r, (*batch, height, width, number), log-odds of 1.
@@ -46,12 +47,12 @@ class BernoulliImage(Distribution):
 
     @property
     def mean(self) -> Tensor:
-        """Probability of 1 of each number."""
+        """Probability of each number to be 1, (*batch, height, width, number)."""
         return self.logits.sigmoid()
 
     @property
     def mode(self) -> Tensor:
-        """Most likely image: 1 where that is at least as likely as 0."""
+        """Most likely image: each number is 1 if 1 is at least as likely as 0, and 0 otherwise."""
         return (self.logits >= 0).to(self.logits)
 
     @property
@@ -60,7 +61,7 @@ class BernoulliImage(Distribution):
         return self.logits.sigmoid() * (-self.logits).sigmoid()
 
     def each_log_prob(self, value: Tensor) -> Tensor:
-        """Return the log-probability of every number on its own, nats."""
+        """Return the log-probability of every single number, nats, shaped like `value`."""
         share = value.clamp(0, 1)
         return share * logsigmoid(self.logits) + (1 - share) * logsigmoid(-self.logits)
 
@@ -107,7 +108,11 @@ def _(density: BernoulliImage, temperature: Tensor) -> BernoulliImage:
 
 @images.register
 def _(density: BernoulliImage, channels: Collection[str]) -> dict[str, Tensor]:
-    """Return the channels "color", the probabilities in linear RGB, and "mask", true where 1 is at least as likely."""
+    """Return the requested channels of the images.
+
+    "color" holds the probabilities, read as sRGB and converted to linear RGB. "mask" is true where 1 is at least as
+    likely as 0.
+    """
     if (
         not channels
         or not set(channels) <= {"color", "mask"}

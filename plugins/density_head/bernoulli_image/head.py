@@ -59,7 +59,7 @@ class BernoulliImageHead(DensityHead):
 
     @torch.no_grad()
     def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
-        """Fit the factor of log-odds by maximum likelihood."""
+        """Fit the factor by which all log-odds are multiplied, by maximum likelihood."""
         # the log-likelihood is concave in the factor, so that its derivative has a single zero
         require_validation(raw, "The factor of the log-odds is")
         low, high = math.log(LEAST), math.log(MOST)
@@ -70,7 +70,10 @@ class BernoulliImageHead(DensityHead):
         self.factor.fill_(math.exp((low + high) / 2))
 
     def _slope(self, raws: Tensor, target: Tensor, factor: float) -> float:
-        """Return the derivative of the log-likelihood in the factor f, Σ r (y - σ(f r)), computed image by image."""
+        """Return the derivative of the log-likelihood by the factor f of the log-odds r: Σ r (y - σ(f r)).
+
+        y are the numbers in `target`, and σ is the logistic function. The sum is computed image by image.
+        """
         total = 0.0
         for raw, value in zip(raws, target, strict=True):
             logits = self._logits(raw).double()

@@ -15,7 +15,10 @@ WHITE = (-1e30, 0.0, 1e-7, 0.0625, 0.25, 0.5, 0.875, 0.9990234375, 1.0, 3.0)
 
 
 def bernoulli_cases(head: DensityHead) -> Iterator[Case]:
-    """Yield cases of log p = Σ log w for numbers of 0 and Σ log(1 - w) for numbers of 1, with the feature w clamped."""
+    """Yield cases with the reference log p: the sum of log w for numbers of 0, and of log(1 - w) for numbers of 1.
+
+    w is the clamped feature of the number.
+    """
     for white in WHITE:
         raw = torch.full((2, head.size), white, dtype=torch.float64)
         with mpmath.workdps(50):

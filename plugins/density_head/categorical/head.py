@@ -13,7 +13,7 @@ from framework.target import Target
 
 
 class CategoricalHead(DensityHead):
-    """Class probabilities by softmax; trains by cross-entropy."""
+    """Head of any number of classes: probabilities are the softmax of the logits; the loss is the cross-entropy."""
 
     bibtex = "bridle1990probabilistic"
 
@@ -28,7 +28,10 @@ class CategoricalHead(DensityHead):
 
 
 class BernoulliHead(DensityHead):
-    """Two classes by a logistic (thesis eq. 2.9-2.11); trains by binary cross-entropy."""
+    """Head of two classes: the logistic function of one logit is a probability; the loss is binary cross-entropy.
+
+    Source: thesis eq. 2.9-2.11.
+    """
 
     bibtex = "cox1958regression"
 
@@ -50,7 +53,10 @@ class BernoulliHead(DensityHead):
 
 
 def classes(logits: Float[Tensor, "*batch label"]) -> Categorical:
-    """Return the density of the classes by softmax of the logits, clamped so that their differences do not overflow."""
+    """Return the density of the classes, the softmax of `logits`.
+
+    The logits are clamped, so that differences of two of them do not overflow.
+    """
     most = torch.finfo(logits.dtype).max / 4
     # log_softmax subtracts the largest logit first; torch's Categorical does not, and loses digits of large logits.
     return CategoricalDensity(logits=logits.clamp(-most, most).log_softmax(-1), validate_args=False)

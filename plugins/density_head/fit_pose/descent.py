@@ -1,7 +1,8 @@
 """Fit of a body to an image by gradient descent through a differentiable renderer, from coarse to fine.
 
 The loss is the squared difference of two images, colours and silhouette, plus a weak prior on the pose. The images are
-drawn at a fraction of the size and blurred, so that edges that are far apart also have a gradient. The gradient is the
+drawn at a fraction of the size and blurred, so that edges that are far apart also have a gradient. A stage is a descent
+at one size and one blur (`Stage`); the stages follow each other with growing size and less blur. The gradient is the
 renderer's. Steps are quasi-Newton (BFGS with Powell's damping; Nocedal & Wright 2006, procedure 18.2). The Hessian
 approximation starts from the optical flow of the rendered image: the change of a pixel is its gradient along rows and
 columns times the motion of the surface there (Lucas & Kanade 1981). The body model gives the derivatives of that motion
@@ -28,13 +29,13 @@ from framework.renderer import Renderer
 
 
 class Stage(NamedTuple):
-    """Settings of one level of the image pyramid.
+    """Settings of one stage of the fit: a descent on images of reduced size that are blurred.
 
     Attributes:
-        part: the images of this level have 1/part of the height and the width of the whole image.
-        blur: standard deviation of the blur, in pixels of this level.
-        pull: weight of the prior, which is the sum of the squared parameters in units of their standard deviations. The
-            loss is summed over pixels of the whole image.
+        part: the images of the stage have 1/part of the height and the width of the original image.
+        blur: standard deviation of the blur, in pixels of the reduced image.
+        pull: weight of the prior, which is the sum of the squared parameters in units of their standard deviations. It
+            is added to the sum of squared differences, scaled to the number of pixels of the original image.
     """
 
     part: int
@@ -54,13 +55,16 @@ STAGES = (
 AGAIN_FROM = 2
 """Index of the stage at which a restart from another pose begins."""
 AFRESH = 6
-"""Number of steps after which the Hessian approximation is computed anew from the optical flow."""
+"""Number of successful steps after which the Hessian approximation is computed anew from the optical flow."""
 DAMPING, LEAST = 0.01, 1e-3
 """Damping of the Hessian approximation: this share of its diagonal plus this constant is added to the diagonal."""
 LONGEST = (0.2, 0.08)
-"""Longest step of a rotation (radians) and a translation (metres); for other parameters it is their spread."""
+"""Longest step of a rotation (radians) and of a translation (metres).
+
+For each other parameter, the longest step is its standard deviation among random people.
+"""
 SHORTER, TRIES = 0.4, 6
-"""Factor by which a step that raises the loss is shortened, and the largest number of trials."""
+"""Factor by which a step is shortened if it does not lower the loss, and largest number of lengths that are tried."""
 CONVERGED, IN_A_ROW = 5e-4, 3
 """Relative decrease of the loss below which a step is small, and number of consecutive small steps that end a stage."""
 
@@ -95,7 +99,10 @@ class Descent:
         )
 
     def __call__(self, picture: Float[Tensor, "height width 4"]) -> BodyFit:
-        """Return the best fit of all starts; the fit depends only on the image."""
+        """Return the fit with the smallest difference of images among the first descent and its restarts.
+
+        The restarts are random but always the same, so that the fit depends only on the image.
+        """
         began = time.process_time()
         random = torch.Generator().manual_seed(0)
         best = self._once(picture, torch.zeros_like(self.stiffness), STAGES, began)
@@ -156,7 +163,10 @@ class Descent:
     def _loss(
         self, numbers: Tensor, stage: Stage, camera: Camera, aim: Tensor
     ) -> tuple[float, Float[Tensor, "number"]]:
-        """Return the loss of a stage and its gradient."""
+        """Return the loss of a stage and its gradient by the parameters `numbers`.
+
+        `camera` and `aim` are the camera of the reduced image, and the given image after it was reduced and blurred.
+        """
         with torch.enable_grad():
             variable = numbers.detach().requires_grad_()
             rendered = self.renderer(scene_of(self.body_model, variable, camera))["color"]
@@ -170,9 +180,10 @@ class Descent:
         return torch.minimum(torch.maximum(numbers, least), most)
 
     def _curvature(self, numbers: Tensor, stage: Stage) -> Float[Tensor, "number number"]:
-        """Return the damped Gauss-Newton approximation of the Hessian of the loss.
+        """Return the damped Gauss-Newton approximation of the Hessian of a stage's loss.
 
-        It is twice the sum of outer products of the derivatives of the stage's blurred pixels.
+        It is twice the sum of outer products of the derivatives of the stage's pixels (`_flow`), plus the Hessian of
+        the prior and the damping.
         """
         slopes = self._flow(numbers, stage)
         hessian = 2 * stage.part**2 * (slopes.T @ slopes).double() + (2 * stage.pull * self.stiffness).diag()
@@ -180,7 +191,10 @@ class Descent:
 
     @torch.no_grad()
     def _flow(self, numbers: Tensor, stage: Stage) -> Float[Tensor, "pixel number"]:
-        """Return the derivatives of every colour of a stage's pixels by every parameter, from the optical flow."""
+        """Return the derivatives of the reduced and blurred image of a stage by every parameter, from the optical flow.
+
+        The first dimension has one row for each of the four channels of each pixel.
+        """
         camera, body_model = self.camera, self.body_model
         rendered = self.renderer(scene_of(body_model, numbers, camera), ("color", "face"))
         color, face = rendered["color"], rendered["face"].numpy()
@@ -204,7 +218,10 @@ class Descent:
         return blur(small.view(height, width, -1), stage.blur).reshape(-1, len(numbers))
 
     def _motion(self, numbers: Tensor, vertex: Tensor) -> Float[Tensor, "vertex 2 number"]:
-        """Return the derivatives of the pixel coordinates of some vertices by every parameter."""
+        """Return the derivatives of the pixel coordinates of some vertices by every parameter.
+
+        `vertex` holds the indices of the vertices.
+        """
         camera = self.camera
         rotation = camera.rotation
         camera_points = self.body_model.vertices(numbers, vertex) @ rotation.T + camera.translation
@@ -217,7 +234,13 @@ class Descent:
 def update_hessian(
     curvature: Float[Tensor, "number number"], step: Float[Tensor, "number"], change: Float[Tensor, "number"]
 ) -> Float[Tensor, "number number"]:
-    """Return the Hessian approximation after a step; `change` is that of the gradient. It stays positive definite."""
+    """Return the Hessian approximation after a step, which stays positive definite.
+
+    Args:
+        curvature: approximation before the step.
+        step: change of the parameters.
+        change: change of the gradient.
+    """
     expected = curvature @ step
     square = float(step @ expected)
     if not square > 0:
@@ -246,7 +269,7 @@ def reduce_camera(camera: Camera, part: int) -> Camera:
 def reduce_image(
     picture: Float[Tensor, "height width channels"], part: int
 ) -> Float[Tensor, "_height _width channels"]:
-    """Return the means of part × part pixels."""
+    """Return the image reduced in size: each of its pixels is the mean of part × part pixels of `picture`."""
     return avg_pool2d(picture.movedim(-1, 0), part).movedim(0, -1)
 
 
@@ -264,7 +287,10 @@ def blur(
 
 @cache
 def gaussian_matrix(length: int, deviation: float) -> Float[Tensor, "length length"]:
-    """Return the convolution of this many pixels as a matrix, which is faster than a convolution for few pixels."""
+    """Return the matrix that convolves a row of `length` pixels with a Gaussian.
+
+    For few pixels, multiplying with it is faster than a convolution.
+    """
     distance = torch.arange(length)[:, None] - torch.arange(length)
     weights = (
         (-0.5 * (distance / deviation).square()).exp().where(distance.abs() <= round(3 * deviation), 0.0)

@@ -25,7 +25,7 @@ FLOOR, WIDEST = 1e-5, 1e9
 SLACK = 1e-3
 """Largest excess of an image's values over [0, 1]."""
 NEEDED = frozenset(("vertices",))
-"""Parts of a scene in which the renderer must be differentiable."""
+"""Parts of a scene (`Renderer.differentiable`) by which the renderer must be differentiable."""
 
 
 class FitPoseHead(DensityHead, Fitted):

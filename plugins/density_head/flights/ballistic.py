@@ -174,17 +174,22 @@ class BallisticHead(DensityHead, Fitted):
         return torch.cat([observations.times, self._after(observations)], 1)
 
     def _carried(self, observations: ObservedFrames, estimate: Estimate) -> tuple[Tensor, Tensor]:
-        """Return the mean future positions (flight, number), and F (flight, number, 9) with the covariance F Fᵀ."""
+        """Return the mean of the future positions, (flight, number), and a factor F of their covariance F Fᵀ.
+
+        F has the shape (flight, number, 9) and comes from the linearised flight.
+        """
         places, slopes = simulate_with_jacobian(estimate.state, self._whole(observations), self.constants)
         mean = places[:, -self.future :].flatten(1)
         self._require_course(mean, estimate)
         return mean, slopes[:, -self.future :].flatten(1, 2) @ covariance_root(estimate.covariance)
 
     def _require_course(self, places: Tensor, estimate: Estimate) -> None:
-        """Require finite positions and covariances of all flights; implausible constants lead to infinite ones.
+        """Require that the positions and the covariance of every flight are finite.
+
+        They can be infinite if the constants are implausible.
 
         Raises:
-            NonFiniteParameters: the message names the first such row.
+            NonFiniteParameters: a flight is not finite; the message names the first such batch row.
         """
         finite = estimate.covariance.flatten(1).isfinite().all(-1) & places.flatten(1).isfinite().all(-1)
         if not finite.all():

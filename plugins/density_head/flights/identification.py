@@ -11,9 +11,9 @@ from framework.flights.physics import Constants
 from framework.flights.trajectories import simulate, simulate_with_jacobian
 
 FITTED = ("drag", "lift", "restitution", "friction", "surface")
-"""Names of the constants that are identify."""
+"""Names of the constants that `identify` fits."""
 LOW, HIGH = (0.0, -0.02, 0.3, 0.0, -0.3), (1.0, 0.02, 1.0, 1.0, 0.3)
-"""Bounds of the constants; those of the surface are metres from its value in the config."""
+"""Bounds of the constants in `FITTED`; those of the surface are metres above its value in the config."""
 SIZES = (0.05, 0.002, 0.05, 0.05, 0.01)
 """Typical step size of each constant."""
 ROUNDS = 40
@@ -36,7 +36,10 @@ def fitted_constants(constants: Constants) -> Float[Tensor, "constant"]:
 
 
 def constant_bounds(constants: Constants) -> tuple[Float[Tensor, "constant"], Float[Tensor, "constant"]]:
-    """Return the bounds of stored values of `FITTED`: the range of `identify`, extended to the values in the config."""
+    """Return lower and upper bounds that stored values of `FITTED` must satisfy.
+
+    They are the bounds of `identify`, extended to the values in `constants` (those of the config) if these lie outside.
+    """
     values = fitted_constants(constants)
     middle = torch.zeros_like(values)
     middle[-1] = values[-1]
@@ -121,7 +124,10 @@ def _step(
     damping: float,
     at_bound: Tensor,
 ) -> tuple[Float[Tensor, "flight 9"], Float[Tensor, "constant"]]:
-    """Return the steps of states and constants that solve the damped normal equations; constants at a bound stay."""
+    """Return the steps of states and constants that solve the damped normal equations.
+
+    Constants where `at_bound` is true do not move.
+    """
     own = own + damping * torch.diag_embed(own.diagonal(dim1=-2, dim2=-1))
     # the diagonal is 0 for a constant that no residual depends on
     whole = whole + torch.diag(damping * whole.diagonal() + 1e-9 + 1e12 * at_bound)

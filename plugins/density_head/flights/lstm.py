@@ -89,7 +89,14 @@ class LSTMHead(DensityHead):
     def _next(
         self, place: Tensor, move: Tensor, visible: Tensor, state: tuple[Tensor, Tensor] | None
     ) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor]]:
-        """Return the next displacement (batch, 3), its standard deviation, and the network's state."""
+        """Return the displacement to the next frame (batch, 3), its standard deviation, and the network's new state.
+
+        Args:
+            place: position at the current frame, (batch, 3).
+            move: displacement from the frame before.
+            visible: 1 if the current frame was observed, 0 if its position is predicted.
+            state: state of the network before this frame; None at the first frame.
+        """
         hidden, memory = self.cell(torch.cat([place, 10 * move, visible], -1), state)
         numbers = self.out(hidden)
         # a frame's displacement is about a tenth of a metre; the network predicts the change of the last displacement

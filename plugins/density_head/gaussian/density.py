@@ -15,13 +15,14 @@ from framework.distributions.symmetric import Symmetric
 class Gaussian(Symmetric):
     """A Gaussian with a full covariance, written as regressions of each number on the previous ones.
 
-    With d = y - μ, every e_i = d_i - Σ_{j<i} φ_ij d_j is an independent N(0, σ_i²): the modified Cholesky factors of
-    the inverse covariance (Pourahmadi 1999, eq. 2). Any φ and any σ > 0 give a covariance, the log-determinant is a sum
-    of logarithms, and neither a density nor a sample inverts a matrix.
+    For a value y with the deviation d = y - μ from the mean, the residuals e_i = d_i - Σ_{j<i} φ_ij d_j are independent
+    N(0, σ_i²). φ and σ are the modified Cholesky factors of the inverse covariance (Pourahmadi 1999, eq. 2). Any φ and
+    any σ > 0 give a covariance, the log-determinant is a sum of logarithms, and no matrix is inverted for a density or
+    a sample.
 
     Args:
-        mean: (*batch, number).
-        scale: (*batch, number), σ > 0; the standard deviations if there are no coefficients.
+        mean: μ, (*batch, number).
+        scale: σ > 0, (*batch, number); these are the standard deviations if there are no coefficients.
         coefficients: (*batch, number, number), φ strictly below the diagonal, 0 elsewhere; None if all are 0.
     """
 
@@ -73,10 +74,10 @@ class Gaussian(Symmetric):
         return self._representable(inverse)
 
     def _representable(self, numbers: Tensor) -> Tensor:
-        """Return the numbers unchanged.
+        """Return `numbers` unchanged if they are finite.
 
         Raises:
-            ValueError: the products of the coefficients exceed the range of the dtype.
+            ValueError: a number is not finite, because products of the coefficients exceed the range of the dtype.
         """
         assert self.coefficients is not None
         if not bool(numbers.isfinite().all()) and bool(self.coefficients.isfinite().all()):
@@ -110,7 +111,7 @@ class Gaussian(Symmetric):
 
 
 def _times(matrix: Tensor, vector: Tensor) -> Tensor:
-    """Return matrix times vector in the dtype of both; under mixed precision `@` would compute it in bfloat16."""
+    """Return matrix times vector in their dtype, also under mixed precision, where `@` would compute in bfloat16."""
     return (matrix * vector.unsqueeze(-2)).sum(-1)
 
 

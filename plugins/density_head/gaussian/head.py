@@ -86,7 +86,7 @@ class GaussianHead(DensityHead):
         return Gaussian(*self.unit.to_target_unit(mean, scale, coefficients))
 
     def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
-        """Return the negative log-likelihood of each sample, nats; with a fixed scale that for σ = 1."""
+        """Return the negative log-likelihood of each sample, nats; with `scale="fixed"` it is computed with σ = 1."""
         if self.predicted:
             return -self(raw).log_prob(target)
         # σ = 1 here also after calibration. There may be very many numbers, so that few passes over them are made.
@@ -97,7 +97,7 @@ class GaussianHead(DensityHead):
 
     @torch.no_grad()
     def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
-        """Fit a fixed covariance by maximum likelihood; do nothing if it is predicted."""
+        """Fit one covariance by maximum likelihood with `scale="fixed"`; do nothing with `scale="predicted"`."""
         if self.predicted:
             return
         require_validation(raw, "A fixed covariance is")
@@ -124,7 +124,9 @@ class GaussianHead(DensityHead):
 
 
 def scale_of_raw(raw: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-    """Return σ = exp(r) for r ≤ 0 and (1 + r/4)⁴ for r > 0; it is smooth, 1 at 0, and at most LARGEST_SCALE.
+    """Return the standard deviation for a raw parameter r: σ = exp(r) for r ≤ 0, and σ = (1 + r/4)⁴ for r > 0.
+
+    σ is a smooth function of r, 1 at r = 0, and at most LARGEST_SCALE.
 
     The Fisher information of log σ is constant, so that a logarithmic map trains best. The fourth power keeps σ from
     exploding at an outlier.
@@ -137,7 +139,7 @@ def scale_of_raw(raw: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
 def fit(
     residual: Float[Tensor, "sample number"],
 ) -> tuple[Float[Tensor, "number"], Float[Tensor, "number number"]]:
-    """Return the maximum-likelihood σ and φ of residuals of mean 0.
+    """Return the maximum-likelihood scales σ and coefficients φ of `Gaussian` for residuals of mean 0.
 
     They come from a least-squares regression of each number on the numbers before it.
     """

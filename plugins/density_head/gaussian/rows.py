@@ -16,7 +16,10 @@ OFFSETS = (0.0, 1e-6, 1.0, -3.0, 40.0, 1e6)
 
 
 def exact(residual: list[float], scale: list[Any]) -> Any:
-    """Return the log-density Σ -(d/σ)²/2 - log σ - log(2π)/2 (eq. 2.8), nats, as an mpmath number."""
+    """Return the log-density Σ -(d/σ)²/2 - log σ - log(2π)/2 (eq. 2.8), nats, as an mpmath number.
+
+    d are the numbers in `residual`, and σ those in `scale`.
+    """
     return sum(
         -((mpmath.mpf(d) / s) ** 2) / 2 - mpmath.log(s) - mpmath.log(2 * mpmath.pi) / 2
         for d, s in zip(residual, scale, strict=True)

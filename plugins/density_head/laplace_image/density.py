@@ -22,10 +22,10 @@ from framework.geometry.srgb import linear_from_srgb
 
 
 class LaplaceImage(Symmetric):
-    """Independent Laplace densities of the numbers of an image: log p is -|y - μ|/b - log 2b.
+    """Independent Laplace densities of the numbers of an image.
 
-    With one b for all numbers, the negative log-likelihood is the L1 distance between images, up to a factor and a
-    constant.
+    For a number with the value y, the location μ and the scale b, log p = -|y - μ|/b - log 2b. If b is the same for all
+    numbers, the negative log-likelihood is the L1 distance between images, up to a factor and a constant.
 
     Args:
         location: μ, (*batch, height, width, number), in sRGB as image files hold it.
@@ -52,7 +52,7 @@ class LaplaceImage(Symmetric):
         return 2 * self.scale.square()
 
     def each_log_prob(self, value: Tensor) -> Tensor:
-        """Return the log-density of every number on its own, nats."""
+        """Return the log-density of every single number, nats, shaped like `value`."""
         return -((value - self.location).abs() / self.scale + (2 * self.scale).log())
 
     def log_prob(self, value: Tensor) -> Tensor:

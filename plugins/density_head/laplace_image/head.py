@@ -102,7 +102,7 @@ class LaplaceImageHead(DensityHead):
 
     @torch.no_grad()
     def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
-        """Fit the factor of the scales to the validation split."""
+        """Fit the factor by which all scales are multiplied to the validation split."""
         require_validation(raw, "The scale of an image's numbers is")
         parts = zip(target, map(self._parts, raw), strict=True)
         distances = (((value - location).abs() / scale) for value, (location, scale) in parts)
@@ -123,7 +123,10 @@ class LaplaceImageHead(DensityHead):
         self.factor.copy_(torch.as_tensor(factor).clamp(SMALLEST_SCALE, LARGEST_SCALE))
 
     def _parts(self, raw: Float[Tensor, "*batch size"]) -> tuple[Tensor, Tensor]:
-        """Return locations (*batch, height, width, number) and scales, broadcastable, before calibration."""
+        """Return the locations, (*batch, height, width, number), and the scales before calibration.
+
+        The scales broadcast to the locations.
+        """
         image = require_finite(raw, self.size).unflatten(-1, self.shape).movedim(-3, -1)
         location = hardtanh(image[..., : self.numbers], -FURTHEST, FURTHEST)
         if not self.scales:
@@ -133,5 +136,5 @@ class LaplaceImageHead(DensityHead):
 
 
 def coloured(image: Float[Tensor, "*batch number"]) -> Bool[Tensor, "*batch 1"]:
-    """Return which pixels are not white after they are stored with 8 bits."""
+    """Return for each pixel whether it is not white: whether an 8-bit file stores a number below 1, (*batch, 1)."""
     return (image < WHITE).any(-1, keepdim=True)

@@ -15,7 +15,11 @@ OFFSETS = (0.0, 1e-6, 0.5, -1.0, 30.0)
 
 
 def laplace_cases(head: DensityHead) -> Iterator[Case]:
-    """Yield cases of log p = Σ -|d|/b - log 2b, with b = exp(r) clamped, or b = 1 if no scale is predicted."""
+    """Yield cases with the reference log p = Σ -|d|/b - log 2b.
+
+    d is the distance of the target from the location. b is exp(r), clamped, for a predicted log-scale r, and 1 if no
+    scale is predicted.
+    """
     numbers = 3 if head.size % 9 == 0 or head.size % 6 == 0 else 1
     pixels = 6 if numbers == 3 else 1
     predicted = head.size - numbers * pixels

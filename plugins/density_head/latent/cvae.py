@@ -33,11 +33,11 @@ class Gaussian:
     log_scale: Tensor
 
     def draw(self, count: int) -> Tensor:
-        """Return z of shape (count, *batch, latent), differentiable in the parameters."""
+        """Return `count` random samples z, (count, *batch, latent), differentiable in the Gaussian's parameters."""
         return self.at(torch.randn(count, *self.mean.shape, dtype=self.mean.dtype, device=self.mean.device))
 
     def at(self, noise: Tensor) -> Tensor:
-        """Return z for standard normal noise (*sample, *batch, latent), in the same shape."""
+        """Return z = mean + standard deviation · noise, for standard normal `noise` (*sample, *batch, latent)."""
         return self.mean + self.log_scale.exp() * noise
 
     def log_prob(self, z: Tensor) -> Tensor:
@@ -45,7 +45,10 @@ class Gaussian:
         return self.log_prob_at((z - self.mean) * torch.exp(-self.log_scale))
 
     def log_prob_at(self, noise: Tensor) -> Tensor:
-        """Return log_prob of `at(noise)`, (*sample, *batch), without the cancellation in z - mean for a large mean."""
+        """Return `log_prob(at(noise))`, (*sample, *batch), nats, computed from the noise.
+
+        The difference z - mean, which loses digits if the mean is large, is not computed.
+        """
         return -(noise.square() / 2 + self.log_scale + math.log(2 * math.pi) / 2).sum(-1)
 
 
@@ -84,12 +87,15 @@ class Networks(Latent):
         return self.prior.mean
 
     def numbers(self, noise: Tensor) -> Tensor:
-        """Return the component's raw parameters at the z of the noise, (*batch, sample, number)."""
+        """Return the component's raw parameters at z = prior mean + prior standard deviation · noise.
+
+        The shape is (*batch, sample, number) for standard normal `noise`.
+        """
         z = self.prior.at(noise.reshape(len(noise), *self.center.shape))
         return torch.cat([self.decode(part) for part in z.split(self.at_once(len(z)))]).movedim(0, -2)
 
     def log_weights(self, value: Tensor, items: Tensor, noise: Tensor) -> Tensor:
-        """Return the log of the importance weights, nats (eq. 3.19)."""
+        """Return the log of the importance weights of z that are drawn from q(z|x,φ), nats (eq. 3.19)."""
         return importance_log_weights(self.rows(items), value, noise)
 
     def sample(self, count: int) -> Tensor:
@@ -102,7 +108,7 @@ class Networks(Latent):
         return torch.cat(parts)
 
     def tempered(self, temperature: Tensor) -> "Networks":
-        """Return a copy with tempered components."""
+        """Return a copy whose components are tempered (`protocol.tempered_density`)."""
         return replace(
             self,
             component=lambda raw: tempered_density(self.component(raw), temperature),
@@ -227,7 +233,7 @@ class CVAEHead(DensityHead):
 
 
 def _layers_after_first(hidden: int, numbers: int) -> nn.Sequential:
-    """Return the layers of a network after its first linear layer."""
+    """Return the layers of a network after its first linear layer: `hidden` features in, `numbers` outputs."""
     return nn.Sequential(nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, numbers))
 
 

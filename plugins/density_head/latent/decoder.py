@@ -9,7 +9,9 @@ LARGEST_FEATURE = 1e6
 
 
 class LatentDecoder(nn.Module):
-    """Two hidden layers of (features, z), plus a path linear in the features and one linear in z.
+    """Network of two hidden layers that reads features and a latent vector z, with two additional linear paths.
+
+    One path adds a linear function of the features to the output, and the other a linear function of z.
 
     The decoder reads `size` raw parameters of an item: `hidden` features, then `numbers` values that are added to the
     output for every z, then `numbers × latent` values that modify the path linear in z. So the framework's linear layer

@@ -44,7 +44,8 @@ Several components together can describe a uniform density, and each still learn
 class Latent(ABC):
     """Base class of the networks of a latent-variable head, applied to one batch of inputs x.
 
-    It gives z as a function of a standard normal vector, the noise, and p(φ|x,z).
+    The networks give the latent vector z as a function of a standard normal vector, the noise, and for each z a
+    component p(φ|x,z), the density of the target φ. An item is one element of the flattened batch.
 
     Attributes:
         component: function from raw parameters (*batch, number) to p(φ|x,z).
@@ -59,18 +60,24 @@ class Latent(ABC):
     size: int
 
     def example(self) -> Distribution:
-        """Return the component for raw parameters of 0, (*batch); its support is known without running the decoder."""
+        """Return the components for raw parameters of 0, batch_shape (*batch).
+
+        They have the support of all components, and no decoder is run for them.
+        """
         return self.component(self.center.new_zeros(*self.center.shape[:-1], self.size))
 
     @abstractmethod
     def numbers(self, noise: Float[Tensor, "sample item latent"]) -> Float[Tensor, "*batch sample number"]:
-        """Return the component's raw parameters at the z of the noise; computed in chunks if no gradient is needed."""
+        """Return the component's raw parameters at the z that belong to `noise`.
+
+        They are computed in chunks if no gradient is needed.
+        """
 
     @abstractmethod
     def log_weights(
         self, value: Tensor, items: Int[Tensor, "row"], noise: Float[Tensor, "*draw row latent"]
     ) -> Float[Tensor, "*draw row"]:
-        """Return the log of weights, nats; the mean of the weights over the noise is p(φ|x).
+        """Return the log of weights, nats, whose expectation over the noise is the density p(φ|x) at `value`.
 
         Args:
             value: (row, *event).
@@ -84,7 +91,7 @@ class Latent(ABC):
 
     @abstractmethod
     def tempered(self, temperature: Tensor) -> "Latent":
-        """Return a copy with tempered components."""
+        """Return a copy whose components are tempered (`protocol.tempered_density`)."""
 
     @property
     def items(self) -> int:
@@ -96,7 +103,7 @@ class Latent(ABC):
         return torch.autocast(self.center.device.type, enabled=False)
 
     def points(self, effort: Effort, kept_count: int = 0) -> NormalPoints:
-        """Return the sequences of noise for all items."""
+        """Return the sequences of standard normal points for all items (`NormalPoints`)."""
         dtype, device = self.center.dtype, self.center.device
         dimensions = self.center.shape[-1]
         return NormalPoints(

@@ -1,4 +1,8 @@
-"""Estimates of log E w(z) over a standard normal z by quasi-random points, to a target standard error."""
+"""Estimates of log E w(z) over a standard normal z by quasi-random points, to a target standard error.
+
+w(z) is the weight of the point z. The points are divided into replicates: parts of equal size that are independent of
+each other, so that the spread of their means gives the standard error.
+"""
 
 import math
 from collections.abc import Callable
@@ -64,26 +68,29 @@ class Effort:
 
     @property
     def replicates(self) -> int:
-        """Number R of independent parts of the samples: 8, or the largest smaller number that divides a fixed S."""
+        """Number R of replicates, the independent parts of the samples.
+
+        It is TO_TOLERANCE with a tolerance. Without one, it is the largest number up to REPLICATES that divides S.
+        """
         if self.tolerance is not None:
             return TO_TOLERANCE
         return next(number for number in range(REPLICATES, 0, -1) if self.samples % number == 0)
 
     @property
     def first(self) -> int:
-        """Number of samples of each replicate in the first round."""
+        """Number of samples of each replicate in the first round; later rounds double the samples."""
         if self.tolerance is None:
             return self.samples // self.replicates
         return max(LEAST, 1 << (math.ceil(self.samples / TO_TOLERANCE) - 1).bit_length())
 
 
 class SampledMixture(Mixture):
-    """A mixture whose components are a sample of p(φ|x,z): one at each point z, with equal weights.
+    """A mixture with equal weights whose components are p(φ|x,z) at S random points z.
 
     Args:
         log_weights: (*batch, S), all equal.
         components: batch_shape (*batch, S); the components of one replicate are adjacent.
-        replicates: R, which divides S.
+        replicates: R, the number of independent parts of the points; it divides S.
     """
 
     def __init__(self, log_weights: Tensor, components: Distribution, replicates: int) -> None:
@@ -128,9 +135,10 @@ def estimate_from_sums(
     over replicates removes the same term, but is infinite if one replicate has all the weight; s² is at most 1, and
     the correction at most 1/2.
 
-    The shares have a known mean of 1. With shares, the estimate is the ratio of the mean weight to the mean share,
-    which has no error if the weights are proportional to the shares. The 1 in s² is then replaced by the relative mean
-    share of replicate r (ratio estimator, Cochran 1977, §6).
+    The shares of points (`stretch`) have the expectation 1. If they are given, the estimate is the ratio of the mean
+    weight to the mean share, which has no error if the weights are proportional to the shares. The 1 in s² is then
+    replaced by the mean share of replicate r divided by the mean share of all replicates (ratio estimator, Cochran
+    1977, §6).
 
     Args:
         log_sums: log of the sum of the weights of each replicate.
@@ -154,7 +162,7 @@ def estimate_from_sums(
 
 
 def estimated_error(result: Estimate) -> Float[Tensor, "*items"]:
-    """Return the root mean square error of log_mean, nats, from standard error and bias together."""
+    """Return the root mean square error of `log_mean`, nats: √(s² + (s²/2)²) for the standard error s and bias s²/2."""
     return torch.hypot(result.standard_error, result.standard_error.square() / 2)
 
 
@@ -220,7 +228,10 @@ def _log_sums(
     replicates: int,
     at_once: int,
 ) -> Float[Tensor, "*pair replicate rows"]:
-    """Return the log of the sum of `count` weights of each replicate, nats, computed chunk by chunk."""
+    """Return the log of the sum of `count` weights of each replicate, from the point `start` on, nats.
+
+    The sum is computed in chunks of at most `at_once` weights. If `log_weights` also returns shares, so does this.
+    """
     step = max(1, min(count, at_once // replicates))
     parts = []
     for some in rows.split(max(1, at_once // (replicates * step))):
@@ -236,7 +247,7 @@ def _log_sums(
 def rows_of(
     value: Tensor, batch_shape: torch.Size, event_shape: torch.Size
 ) -> tuple[Tensor, Tensor, torch.Size]:
-    """Return values (*sample, *batch, *event) as rows, with the item of each row and the shape of the result.
+    """Return values (*sample, *batch, *event) as rows, with the batch element of each row and the shape of log_prob.
 
     Returns:
         Values (rows, *event); the item of the flattened batch that each row belongs to, (rows,) int64; and the shape
@@ -298,11 +309,12 @@ class NormalPoints:
 def stretch(
     points: Float[Tensor, "*shape dimension"],
 ) -> tuple[Float[Tensor, "*shape dimension"], Float[Tensor, "*shape"]]:
-    """Return points with heavier tails, z = y exp(h y²/2) for normal y (Tukey's h), and the log of their shares.
+    """Return points with heavier tails, z = y exp(h y²/2) for the normal `points` y, and the log of their shares.
 
-    The share of a point is the standard normal density at z divided by the density from which z comes. Weights times
-    shares at these points have the same mean as weights at normal points, but regions far from 0 hold more points, so
-    that large weights there are not missed (defensive sampling, Hesterberg 1995).
+    The transform is Tukey's, with h = STRETCH. The share of a point is the standard normal density at z divided by the
+    density of the transformed points at z. Weights times shares at these points have the same mean as weights at normal
+    points, but regions far from 0 hold more points, so that large weights there are not missed (defensive sampling,
+    Hesterberg 1995).
     """
     h = STRETCH / points.shape[-1] ** 0.5
     square = points.square()

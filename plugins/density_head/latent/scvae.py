@@ -61,7 +61,7 @@ class Networks(Latent):
         return self.component(self._decoded(z)).sample().movedim(like.dim() - 1, 0)
 
     def tempered(self, temperature: Tensor) -> "Networks":
-        """Return a copy with tempered components."""
+        """Return a copy whose components are tempered (`protocol.tempered_density`)."""
         return replace(self, component=lambda raw: tempered_density(self.component(raw), temperature))
 
 

@@ -21,9 +21,10 @@ from framework.target import Target
 class LorentzianHead(DensityHead, Fitted):
     """A least-squares fit of Lorentzian lines to each spectrum (`framework.spectra.fit`).
 
-    The covariance of the parameters follows from the Jacobian. The head reads spectra of `data=cest` unchanged, without
-    an encoder, and needs no training and no calibration. The names of the target decide which preset is fitted. The
-    gradient of the density in the spectrum is set to 0.
+    The density is normal, and its covariance follows from the Jacobian of the fit. The head reads spectra of
+    `data=cest` unchanged, without an encoder, and needs no training and no calibration. The names of the target's
+    numbers decide which preset of parameters (framework.spectra.spectrum) is fitted. The gradient of the density in the
+    spectrum is set to 0.
 
     Attributes:
         steps: largest number of steps of a fit (a knob).
@@ -68,7 +69,7 @@ class LorentzianHead(DensityHead, Fitted):
 
 
 def parameters_of(names: tuple[str, ...], by: str) -> Parameters:
-    """Return the preset whose target has these names.
+    """Return the parameters of the preset (framework.spectra.spectrum) whose target has the names `names`.
 
     Raises:
         ConfigError: no preset has them.

@@ -55,9 +55,11 @@ def log_marginal(angle: Float[Tensor, "..."], frame: Frame, index: int) -> Float
 def _log_integral(
     angle: Tensor, left: Tensor, right: Tensor, falls: Tensor, index: int, count: int | None
 ) -> Tensor:
-    """Return the log of the integral over both other angles, without the factor 1/k(λ), with `count` nodes.
+    """Return the log of the density of one angle, without the factor 1/k(λ): the integral over the other two angles.
 
-    If `count` is None, the nodes are placed around the peaks.
+    `index` says which angle it is, as in `log_marginal`. The integral over the third angle is a Bessel function. The
+    integral over the second one is a quadrature with `count` fixed nodes or, if `count` is None, with nodes around the
+    peaks.
     """
     around = index == 1  # quadrature runs over the azimuth then, otherwise over the elevation
     log_density = _log_density(angle, left, right, falls, index)
@@ -74,7 +76,10 @@ def _log_integral(
 def _log_density(
     angle: Tensor, left: Tensor, right: Tensor, falls: Tensor, index: int
 ) -> Callable[[Tensor], Tensor]:
-    """Return the log-density as a function of a second angle, (*batch, point), integrated over the third angle."""
+    """Return a function from values of the second angle, (*batch, point), to the log-density of both angles.
+
+    The density is integrated over the third angle. `angle` holds values of the angle number `index`.
+    """
     _, i, _, k = torch.eye(4, dtype=falls.dtype, device=falls.device)
     product = quaternions.product
     # the viewpoint's quaternion is (1, k)·(cos, sin)(t/2) (1, i)·(cos, sin)(e/2 - π/4) (1, -k)·(cos, sin)(a/2)

@@ -17,11 +17,11 @@ from framework.distributions.uniform import uniform
 from plugins.density_head.matrix_fisher import angles, functions, quadrature, quaternions
 
 VOLUME = 8 * math.pi**2
-"""Volume of the chart, ∫ cos e da de dt."""
+"""Volume of all rotations in the coordinates azimuth a, elevation e and tilt t (CHART), ∫ cos e da de dt."""
 CHART = ((-math.pi, math.pi), (-math.pi / 2, math.pi / 2), (-math.pi, math.pi))
 """Ranges of azimuth, elevation and tilt, radians."""
 SUMMITS = 6
-"""Number of maxima of one angle's density on a grid, the highest ones, near which the mode is searched."""
+"""Number of maxima on a grid, the highest ones, near which the mode of one angle's density is searched."""
 
 
 class MatrixFisher(Distribution):
@@ -128,7 +128,10 @@ class Angle(Distribution):
 
     @property
     def mode(self) -> Float[Tensor, "*batch 1"]:
-        """The highest of the peaks near the angle of the joint mode and near the maxima on a grid, radians."""
+        """Angle of the highest density, radians, (*batch, 1).
+
+        It is the highest of the peaks near the SUMMITS maxima on a grid and near this angle of the joint mode.
+        """
         points = 90
         around = grid(points, dtype=torch.float64, device=self.joint.parameter.device)
         step = 2 * math.pi / points

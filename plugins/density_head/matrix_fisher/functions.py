@@ -110,13 +110,13 @@ def align(parameter: Float[Tensor, "*batch 3 3"]) -> Frame:
 
 @torch.no_grad()
 def log_height(falls: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-    """Return -log k(λ), the log-density at the mode, nats, float64."""
+    """Return -log k(λ), the log-density at the mode, nats, float64; `falls` are λ."""
     return -_quadrature(falls)[2].sum(-1).log()
 
 
 @torch.no_grad()
 def second_moments(falls: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-    """Return E qᵢ² = -∂log k/∂λᵢ for i = 1, 2, 3, each to full relative precision.
+    """Return E qᵢ² = -∂log k/∂λᵢ for i = 1, 2, 3, each to full relative precision; `falls` are λ.
 
     These moments give the diagonal of E UᵀRV, for example d₁ = 1 - 2(E q₂² + E q₃²).
     """
@@ -130,7 +130,7 @@ def second_moments(falls: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"
 
 @torch.no_grad()
 def fourth_moments(falls: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4 4"]:
-    """Return E qᵢ²qⱼ² for i, j = 0, ..., 3, each to nearly full relative precision."""
+    """Return E qᵢ²qⱼ² of the aligned quaternion q for i, j = 0, ..., 3, each to nearly full relative precision."""
     outer, inner, mass = _quadrature(falls)
     mass = mass / mass.sum(-1, keepdim=True)
     blocks = []
@@ -180,7 +180,12 @@ def sample(falls: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4"]:
 
 
 def _propose(fall: Tensor, width: Tensor) -> tuple[Tensor, Tensor]:
-    """Return one proposal per element, and whether the proposal is rejected."""
+    """Return one proposal of `sample` per element, and whether it is rejected.
+
+    Args:
+        fall: λ₀ = 0, λ₁, λ₂, λ₃ of each element.
+        width: b of each element.
+    """
     normal = torch.randn_like(fall) / (1 + 2 * fall / width).sqrt()
     turn = normal / torch.linalg.vector_norm(normal, dim=-1, keepdim=True)
     cost = (fall * turn.square()).sum(-1)
@@ -191,7 +196,14 @@ def _propose(fall: Tensor, width: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class _Circle(NamedTuple):
-    """The circle (r cos φ, r sin φ) at the nodes, by r² and the concentration of 2φ, which is von Mises around 0."""
+    """Two of the four components of the aligned quaternion, (r cos φ, r sin φ), at each node of the quadrature.
+
+    Given r, the angle 2φ has a von Mises density around 0.
+
+    Attributes:
+        square: r² at each node.
+        concentration: concentration of 2φ at each node.
+    """
 
     square: Tensor
     concentration: Tensor
@@ -200,13 +212,15 @@ class _Circle(NamedTuple):
 def _quadrature(falls: Tensor) -> tuple[_Circle, _Circle, Tensor]:
     """Return the circles of (q₀, q₁) and of (q₂, q₃) at the nodes, and terms (*batch, node) whose sum is k(λ).
 
-    w = q₂² + q₃² is uniform on [0, 1] and the two directions are uniform (cf. Lee 2018, eq. 12, with other pairs of
-    components). On each circle the density integrates to a Bessel function:
+    For a uniform quaternion, w = q₂² + q₃² is uniform on [0, 1], and the directions of (q₀, q₁) and of (q₂, q₃) are
+    uniform (cf. Lee 2018, eq. 12, with other pairs of components). On each circle the density integrates to a Bessel
+    function:
 
         k(λ) = ∫₀¹ exp(-λ₂w) I₀ₑ((λ₃-λ₂)w/2) I₀ₑ(λ₁(1-w)/2) dw,   I₀ₑ(x) = I₀(x) exp(-x).
 
-    With these pairs the integrand decays fastest. Its length scales 1/λ₃ ≪ 1/λ₂ are resolved by √w = t₀ sinh y, with
-    Gauss-Legendre quadrature in y on two panels; the integrand decays in the last panel.
+    With these pairs the integrand decays fastest. It changes over the lengths 1/λ₃ and 1/λ₂, which may differ by many
+    orders of magnitude. Both are resolved by the substitution √w = t₀ sinh y, with Gauss-Legendre quadrature in y on
+    two panels; the integrand decays in the last panel.
     """
     first, second, third = (falls.double()[..., index, None] for index in range(3))
     end = REACH / second.clamp(min=REACH)
@@ -260,7 +274,7 @@ def _sine_fourth(concentration: Tensor) -> Tensor:
 
 
 def _ratio(concentration: Tensor) -> tuple[Tensor, Tensor]:
-    """Return whether the concentration is small enough to compute 1 - A by subtraction, and A."""
+    """Return whether each concentration κ is small enough to compute 1 - A(κ) by subtraction, and A = I₁(κ)/I₀(κ)."""
     return concentration < LARGE, torch.special.i1e(concentration) / torch.special.i0e(concentration)
 
 
@@ -277,7 +291,8 @@ def _series(name: str, concentration: Tensor) -> Tensor:
 def _coefficients(terms: int = 20) -> dict[str, list[float]]:
     """Return the coefficients of the asymptotic series in 1/κ of E sin²φ and E sin⁴φ, by name.
 
-    They follow from the series of A, which solves A' = 1 - A² - A/κ (Mardia & Jupp 2000, A.14).
+    2φ has a von Mises density with the concentration κ around 0. The series follow from that of A = I₁(κ)/I₀(κ), which
+    solves A' = 1 - A² - A/κ (Mardia & Jupp 2000, A.14).
     """
     ratio = [Fraction(1)]
     for order in range(1, terms):
@@ -291,7 +306,10 @@ def _coefficients(terms: int = 20) -> dict[str, list[float]]:
 
 
 class _LogProb(Function):
-    """The log-density; its derivative in F is R - E R, and its derivative in the quaternion is that of -Σ λᵢqᵢ²."""
+    """Autograd function of the log-density.
+
+    The derivative by F is R - E R. The derivative by the quaternion is that of -Σ λᵢqᵢ².
+    """
 
     @staticmethod
     def forward(ctx: Any, turn: Tensor, parameter: Tensor) -> Tensor:
@@ -331,7 +349,10 @@ class _LogProb(Function):
 
 
 class _Mean(Function):
-    """The mean rotation E R; its derivative is the covariance of the elements of R, nearly diagonal after alignment."""
+    """Autograd function of the mean rotation E R.
+
+    Its derivative by F is the covariance of the elements of R, which is nearly diagonal for the aligned rotation UᵀRV.
+    """
 
     @staticmethod
     def forward(ctx: Any, parameter: Tensor) -> Tensor:
@@ -366,13 +387,16 @@ class _Mean(Function):
 
 
 def _shrinkage(falls: Tensor) -> Tensor:
-    """Return 1 - dᵢ = 2 Σ_{j≠i} E qⱼ², (*batch, 3)."""
+    """Return 1 - dᵢ = 2 Σ_{j≠i} E qⱼ², (*batch, 3), where diag(d) is the mean of the aligned rotation UᵀRV."""
     first, second, third = second_moments(falls).unbind(-1)
     return 2 * torch.stack([second + third, first + third, first + second], -1)
 
 
 def _quadratic_form(parameter: Tensor) -> Tensor:
-    """Return K with tr(FᵀR) = qᵀ K q (Mardia & Jupp 2000, §13.2.3), (*batch, 4, 4)."""
+    """Return the matrix K with tr(FᵀR) = qᵀ K q for the quaternion q of R, (*batch, 4, 4); `parameter` is F.
+
+    Source: Mardia & Jupp 2000, §13.2.3.
+    """
     (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in parameter.unbind(-2))
     rows = [
         torch.stack([a + e + i, h - f, c - g, d - b], -1),

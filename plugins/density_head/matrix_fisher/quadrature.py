@@ -86,7 +86,7 @@ def nodes(
 
 @cache
 def equal(count: int, low: float, high: float) -> tuple[Float[Tensor, "node"], Float[Tensor, "node"]]:
-    """Return nodes and weights of the trapezium rule over one period."""
+    """Return `count` nodes and the weights of the trapezium rule over the period from `low` to `high`."""
     step = (high - low) / count
     return low + step * torch.arange(count, dtype=torch.float64), torch.full(
         (count,), step, dtype=torch.float64
@@ -95,7 +95,7 @@ def equal(count: int, low: float, high: float) -> tuple[Float[Tensor, "node"], F
 
 @cache
 def gauss(count: int, low: float, high: float) -> tuple[Float[Tensor, "node"], Float[Tensor, "node"]]:
-    """Return nodes and weights of Gauss-Legendre quadrature."""
+    """Return `count` nodes and the weights of Gauss-Legendre quadrature over [low, high]."""
     at, weights = np.polynomial.legendre.leggauss(count)
     half = (high - low) / 2
     return torch.from_numpy(low + half * (at + 1)), torch.from_numpy(half * weights)
@@ -113,9 +113,10 @@ def maximum(
 def _refine(
     log_density: Callable[[Tensor], Tensor], centre: Tensor, reach: float, low: Tensor, high: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return the peaks in [low, high], and the distances from them at which the log-density has fallen by about 1.
+    """Return the peak in [low, high] near each start `centre`, and its width.
 
-    A peak is found by parabolas through three points, which come closer with each round.
+    The width is the distance from the peak at which the log-density has fallen by about 1. A peak is found by parabolas
+    through three points, which are `reach` apart at first and come closer with each round.
     """
     width, step = torch.full_like(centre, torch.inf), torch.full_like(centre, reach)
     for _ in range(ROUNDS):
@@ -133,9 +134,9 @@ def _refine(
 
 
 def _half(length: Tensor, width: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the offsets of nodes from a peak, in [0, length], and their weights.
+    """Return the distances of nodes on one side of a peak, in [0, length], and their weights.
 
-    They are those of Gauss-Legendre quadrature in y with offset = width · sinh y.
+    They are those of Gauss-Legendre quadrature in y, where the distance is width · sinh y.
     """
     ends = [
         torch.asinh(torch.minimum(length / width, torch.full_like(length, NEAR))),

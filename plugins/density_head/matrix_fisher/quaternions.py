@@ -88,7 +88,7 @@ def of_matrix(matrix: Float[Tensor, "... 3 3"]) -> Quaternions:
 
 
 def matrix_less_identity(turn: Quaternions) -> Float[Tensor, "... 3 3"]:
-    """Return R - I, without cancellation for small rotations."""
+    """Return R - I for the rotation R of a quaternion, without cancellation for small rotations."""
     w, x, y, z = turn.unbind(-1)
     rows = [
         torch.stack([-2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),

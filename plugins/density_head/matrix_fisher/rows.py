@@ -55,10 +55,10 @@ def exact(raw: np.ndarray, value: np.ndarray) -> float:
 
 
 def log_constant(first: float, second: float, third: float) -> float:
-    """Return log(c(F) exp(-tr S)) for the falls λ, by the integral of Lee 2018, eq. 12, with u = 1 - 2w.
+    """Return log(c(F) exp(-tr S)) for the falls λ₁, λ₂ and λ₃, by the integral of Lee 2018, eq. 12, with u = 1 - 2w.
 
-    It is computed by Gauss-Legendre quadrature on panels that shrink towards both ends, tenfold over two panels. It
-    pairs the components of the quaternion as (q₀, q₃) and (q₁, q₂), unlike functions.py.
+    It is computed by Gauss-Legendre quadrature on panels that become shorter towards both ends, by a factor of ten for
+    every two panels. The components of the quaternion are paired as (q₀, q₃) and (q₁, q₂), unlike in functions.py.
     """
     borders = np.concatenate([[0.0], np.logspace(-40, np.log10(0.5), 80)])
     nodes, weights = np.polynomial.legendre.leggauss(24)
@@ -94,7 +94,10 @@ def _rotation(azimuth: Any, elevation: Any, tilt: Any) -> Any:
 
 
 def cases(head: DensityHead) -> Iterator[Case]:
-    """Yield a case for every matrix at a few viewpoints, some outside the chart or many turns away."""
+    """Yield a case for every matrix of raw parameters, at a few viewpoints.
+
+    Some viewpoints have an elevation outside of ±π/2, or angles of many full rotations.
+    """
     for name, matrix in RAWS.items():
         raw = torch.tensor(matrix.ravel()).float().double().expand(len(VALUES), 9)
         value = torch.tensor(VALUES).float().double()

@@ -20,7 +20,7 @@ Several components together can describe a uniform density, and each still learn
 
 
 class MixtureHead(DensityHead):
-    """Finite mixture of any other head's densities, weights by softmax (thesis eq. 3.10-3.11).
+    """Finite mixture of densities of another head, with weights by softmax (thesis eq. 3.10-3.11).
 
     The head reads K logits, then the raw parameters of K components, then one further set of raw parameters that is
     added to each of the K. Through this set all components learn together what they have in common, and none falls

@@ -19,7 +19,10 @@ NESTED = {"components": 2, "component": {"name": "mixture", "components": 3}}
 
 
 def component(head: MixtureHead, number: np.ndarray, value: np.ndarray) -> float:
-    """Return one component's log-density, nats; the contract-test cases of its own head check it."""
+    """Return the log-density of a component with raw parameters `number` at `value`, nats.
+
+    It is computed by the component's head, which has contract-test cases of its own.
+    """
     return head.component(torch.from_numpy(number)).log_prob(torch.from_numpy(value)).item()
 
 

@@ -49,7 +49,7 @@ class ExtraTreesHead(DensityHead, Fitted):
         trees: number of trees that are used, counted from the first (a knob).
 
     Args:
-        trees: number of trees that are grow_forest.
+        trees: number of trees that are grown.
         features: share of the features tried at each split; None: their square root for classes, all for reals.
         leaf: smallest number of training samples of a leaf.
         depth: largest number of splits from root to leaf.
@@ -162,13 +162,14 @@ class ExtraTreesHead(DensityHead, Fitted):
         require_forest(arrays, self.classes, self.numbers)
 
     def _open(self, *_: Any) -> None:
-        """Read the number of features that the stored forest reads."""
+        """Set `size` to the number of features that the loaded forest reads."""
         self.size = int(self.read)
 
 
 def fit_width(residual: Float[Tensor, "sample tree number"]) -> Float[Tensor, "number"]:
     """Return widths σ that maximise Σ_i log (1/T) Σ_t Π_d N(residual_itd; 0, σ_d²), by expectation maximisation.
 
+    i is the sample, t one of T trees, and d the number of the target.
     A round computes r_it = N(residual_it; 0, σ²) / Σ_s N(residual_is; 0, σ²), then σ_d² = mean_i Σ_t r_it residual_itd²
     (Dempster, Laird & Rubin 1977). It never lowers the likelihood. The search starts from the largest useful width, at
     which all trees have similar weights.

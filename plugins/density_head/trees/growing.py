@@ -55,7 +55,7 @@ def grow_forest(
 
 
 def nodes(trees: Sequence[Any]) -> Arrays:
-    """Return the nodes of all trees, concatenated; leaves are numbered in the order of their nodes."""
+    """Return the nodes of all trees in the arrays of trees.forest; leaves are numbered in the order of their nodes."""
     count = np.array([tree.node_count for tree in trees])
     first = np.concatenate([[0], np.cumsum(count)[:-1]])
     feature = np.concatenate([np.where(tree.children_left < 0, -1, tree.feature) for tree in trees])
@@ -72,9 +72,10 @@ def nodes(trees: Sequence[Any]) -> Arrays:
 
 
 def votes(trees: Sequence[Any], labels: np.ndarray) -> Arrays:
-    """Return the arrays `start`, `label` and `count`: how many training samples of each class are in each leaf.
+    """Return the arrays `start`, `label` and `count` of `trees.forest.frequencies`.
 
-    `labels` are the classes that occur in the training samples.
+    They hold the number of training samples of each class in each leaf. `labels` are the classes that occur in the
+    training samples, in the order in which scikit-learn numbers them.
     """
     counts = []
     for tree in trees:

@@ -51,7 +51,7 @@ def require_fitted(raw: Float[Tensor, "*batch size"], size: int, by: str) -> Flo
 
 
 def single(features: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-    """Return the features on the CPU in float32, the type in which trees compare, clamped to its range."""
+    """Return the features on the CPU in float32, clamped to the range of float32; trees compare in this type."""
     most = torch.finfo(torch.float32).max
     return features.detach().clamp(-most, most).to("cpu", torch.float32).contiguous()
 
@@ -98,9 +98,9 @@ def _take_shapes(
     prefix: str,
     *_: Any,
 ) -> None:
-    """Replace the head's buffers by empty ones with the shapes of the state; torch copies the numbers later.
+    """Replace the head's buffers by empty ones that have the shapes of the stored tensors.
 
-    Dtypes and devices of the buffers stay.
+    Dtypes and devices of the buffers stay. Torch copies the stored numbers into them afterwards.
 
     Raises:
         CheckpointError: `require` refuses the state.

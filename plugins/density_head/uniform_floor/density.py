@@ -61,7 +61,7 @@ class Floored(Distribution):
         return self.density.mode
 
     def enumerate_support(self, expand: bool = True) -> Tensor:
-        """Return every class, as the density p does."""
+        """Return every class, as `enumerate_support` of the density p does."""
         return self.density.enumerate_support(expand)
 
     def log_prob(self, value: Tensor) -> Tensor:
@@ -69,7 +69,10 @@ class Floored(Distribution):
         return self.floored(value, self.density.log_prob(value))[0]
 
     def floored(self, value: Tensor, log_prob: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the log-density and the part of it that comes from p, log (1 - γ) p, for log p = `log_prob`; nats."""
+        """Return the log-density log((1 - γ) p + γ u) at `value`, and its first part, log((1 - γ) p), nats.
+
+        `log_prob` is log p.
+        """
         above = log_prob + math.log1p(-self.weight)
         below = self.floor.log_prob(value).double() + math.log(self.weight)
         return torch.logaddexp(above, below.to(above.dtype)), above
@@ -172,10 +175,10 @@ def _(density: Floored, index: Tensor) -> Floored:
 
 @tempered_density.register
 def _(density: Floored, temperature: Tensor) -> Distribution:
-    """Return the tempered density, as of any mixture.
+    """Return the tempered density.
 
-    For classes the whole density is tempered. For angles p is tempered; the floor stays, since its power is uniform
-    too.
+    For classes it is the power of the whole density, normalised. For angles the components are tempered, as in any
+    mixture: p is replaced by its power, and the floor stays as it is, since the power of a uniform density is uniform.
     """
     if density.has_enumerate_support:
         return tempered_classes(density, temperature)

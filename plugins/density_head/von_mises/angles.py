@@ -1,4 +1,7 @@
-"""Half of the difference of two angles, computed without rounding for any number of turns between them."""
+"""Sine and cosine of half the difference of two angles, without rounding of the difference.
+
+This holds for any number of full rotations between the two angles φ (`value`) and μ (`mean`).
+"""
 
 import math
 
@@ -13,7 +16,10 @@ _PI = tuple(
 
 
 def half_angle(value: Tensor, mean: Tensor) -> tuple[Tensor, Tensor]:
-    """Return sin and cos of (φ-μ)/2, computed without rounding of φ-μ; both may have the wrong sign together."""
+    """Return sin((φ-μ)/2) and cos((φ-μ)/2), computed without rounding of φ-μ.
+
+    Both are correct up to one common sign.
+    """
     if in_single(value, mean):
         return _half_angle_in_single(value, mean)
     sine, cosine, odd = _reduce(value, mean)
@@ -33,18 +39,18 @@ def half_products(value: Tensor, mean: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def in_single(value: Tensor, mean: Tensor) -> bool:
-    """Return whether float32 is enough: both arguments are float32, and no compiler is active."""
+    """Return whether to compute in float32 alone: if both arguments are float32, and no compiler is active."""
     return value.dtype == mean.dtype == torch.float32 and not torch.compiler.is_compiling()
 
 
 def _half_angle_in_single(value: Tensor, mean: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the result of `half_angle` for float32 arguments, computed in float32 only."""
+    """Return sin((φ-μ)/2) and cos((φ-μ)/2) as `half_angle` does, for float32 arguments and in float32 alone."""
     sine, cosine, small_sine, small_cosine = parts_in_single(value, mean)
     return sine * small_cosine + cosine * small_sine, cosine * small_cosine - sine * small_sine
 
 
 def parts_in_single(value: Tensor, mean: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return sin and cos of half the rounded difference φ-μ, then sin and cos of half its rounding error.
+    """Return sin(d/2), cos(d/2), sin(e/2) and cos(e/2) for the rounded difference d of φ-μ and its rounding error e.
 
     This takes fewer operations than `_reduce`, because float32's sine and cosine are also exact for large angles.
     """
@@ -62,13 +68,16 @@ def parts_in_single(value: Tensor, mean: Tensor) -> tuple[Tensor, Tensor, Tensor
 
 
 def _rounding_error(value: Tensor, mean: Tensor, high: Tensor) -> Tensor:
-    """Return the rounding error of high = φ-μ, so that high + error is the exact difference (Knuth's two-sum)."""
+    """Return the rounding error of `high`, the rounded difference φ-μ, by Knuth's two-sum.
+
+    `high` plus this error is the exact difference.
+    """
     back = value - high
     return (value - (high + back)) + (back - mean)
 
 
 def _reduce(value: Tensor, mean: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return sin(ρ/2), cos(ρ/2) and the parity of n, 0 or 1, where φ-μ = nπ + ρ with the smallest |ρ|."""
+    """Return sin(ρ/2), cos(ρ/2), and 1 where the integer n is odd or else 0, for φ-μ = nπ + ρ with the smallest |ρ|."""
     if value.dtype == torch.float32 and mean.dtype == torch.float32:
         high = value.double() - mean.double()
         low = None
@@ -86,7 +95,7 @@ def _reduce(value: Tensor, mean: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _sine_and_cosine(angle: Tensor) -> tuple[Tensor, Tensor]:
-    """Return sin and cos of an angle in [-π/4, π/4].
+    """Return sine and cosine of `angle`, which lies in [-π/4, π/4].
 
     Other angles occur only for numbers so large that neighbouring floats differ by a whole turn; the result then has no
     meaning.

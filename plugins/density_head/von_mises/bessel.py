@@ -1,4 +1,7 @@
-"""The Bessel functions I0 and I1 in the forms of the von Mises density, by the polynomials in coefficients.npz."""
+"""Functions of the concentration κ of a von Mises density, computed by the polynomials in coefficients.npz.
+
+They contain the Bessel functions I0 and I1 and their quotient A(κ) = I1(κ)/I0(κ).
+"""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -17,12 +20,18 @@ _TABLES = {
 
 
 def log_height(concentration: Tensor) -> Tensor:
-    """Return the log-density at the mean, κ - log(2π I0(κ)), nats; see `functions.log_peak` for its gradient."""
+    """Return the log-density at the mean, κ - log(2π I0(κ)), nats, for the concentration κ.
+
+    `functions.log_peak` is the same function with an accurate gradient.
+    """
     return torch.log(concentration + 2) / 2 - polynomial("log_peak", 2 / (concentration + 2))
 
 
 def height_and_deviation(concentration: Tensor) -> tuple[Tensor, Tensor]:
-    """Return log_peak and its derivative 1 - A = v (1/4 + v G'(v)/2), G the polynomial, in one pass."""
+    """Return the log-density at the mean, as `log_height`, and its derivative by κ, 1 - A(κ), in one pass.
+
+    With v = 2/(κ+2) and the polynomial G(v) of the function "log_peak", the derivative is v (1/4 + v G'(v)/2).
+    """
     v = 2 / (concentration + 2)
     rows, piece, y, by_v = _locate("log_peak", v)
     total = _coefficient(rows[-1], piece, y)
@@ -34,12 +43,12 @@ def height_and_deviation(concentration: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def deviation_of(concentration: Tensor) -> Tensor:
-    """Return 1 - A(κ)."""
+    """Return 1 - A(κ) = 1 - I1(κ)/I0(κ) for the concentration κ."""
     return height_and_deviation(concentration)[1]
 
 
 def polynomial(name: str, v: Tensor) -> Tensor:
-    """Return the smooth function `name` of v = 2/(κ+2), as defined by `smooth` in fit_coefficients.py."""
+    """Return the function with this name at v = 2/(κ+2); `smooth` in fit_coefficients.py defines the functions."""
     rows, piece, y, _ = _locate(name, v)
     total = _coefficient(rows[-1], piece, y)
     for row in range(len(rows) - 2, -1, -1):
@@ -48,9 +57,14 @@ def polynomial(name: str, v: Tensor) -> Tensor:
 
 
 def _locate(name: str, v: Tensor) -> tuple[Any, Any, Tensor, Any]:
-    """Return the rows of coefficients, the piece of [0, 1] that holds v, the position y ∈ [-1, 1] in it, and dy/dv.
+    """Return what is needed to evaluate the polynomial `name` at v.
 
-    Compiled code in float32 has few pieces and selects their coefficients by comparisons; otherwise a table is read.
+    The interval [0, 1] of v is divided into pieces, each with a polynomial of its own. Compiled code in float32 has few
+    pieces, and selects coefficients by comparisons of v with the borders; otherwise they are read from a table.
+
+    Returns:
+        The coefficients, one row for each power; the piece in which each v lies (for compiled code, whether v is beyond
+        each inner border); the position y ∈ [-1, 1] of v in its piece; and the derivative dy/dv.
     """
     if v.dtype == torch.float32 and torch.compiler.is_compiling():
         rows = CHAINS[name]
@@ -68,7 +82,10 @@ def _locate(name: str, v: Tensor) -> tuple[Any, Any, Tensor, Any]:
 
 
 def _select_piece(values: Sequence[float], beyond: tuple[Tensor, ...], like: Tensor) -> Tensor:
-    """Return for each element the value of its piece: `beyond` says for each inner border whether it is passed."""
+    """Return for each element the entry of `values` that belongs to the piece in which the element lies.
+
+    `beyond` has one tensor for each inner border: whether the element lies beyond this border.
+    """
     selected = torch.full_like(like, values[0])
     for passed, value in zip(beyond, values[1:], strict=True):
         selected = torch.where(passed, value, selected)
@@ -85,7 +102,10 @@ def _coefficient(row: Any, piece: Any, like: Tensor) -> Tensor:
 
 
 def _multiply_add(coefficient: Tensor, total: Tensor, y: Tensor) -> Tensor:
-    """Return coefficient + total y; the result replaces the coefficient in memory if no gradient needs it."""
+    """Return coefficient + total · y, one step of Horner's method.
+
+    If no gradient is needed, the sum overwrites `coefficient`.
+    """
     if torch.compiler.is_compiling() or (torch.is_grad_enabled() and total.requires_grad | y.requires_grad):
         return torch.addcmul(coefficient, total, y)
     return coefficient.addcmul_(total, y)

@@ -10,9 +10,10 @@ BLOCK = 2**16
 
 
 def in_blocks(function: Callable[..., tuple[Tensor, ...]], *arguments: Tensor) -> tuple[Tensor, ...]:
-    """Return the result of an elementwise function, computed block by block on the CPU.
+    """Return `function(*arguments)` for an elementwise function, computed block by block on the CPU.
 
-    Compiled code, other devices, few elements, and arguments of different shapes are computed without blocks.
+    It is computed at once, without blocks, in compiled code, on other devices, for at most BLOCK elements, and for
+    arguments of different shapes.
     """
     first = arguments[0]
     if (

@@ -30,7 +30,10 @@ QUADRATURES = (14, 40)
 
 
 def bessel(kappa: Real) -> tuple[Real, Real]:
-    """Return log(I0(κ) exp(-κ)) and 1 - I1(κ)/I0(κ), by asymptotic series (DLMF 10.40.1) where it has 60 digits."""
+    """Return log(I0(κ) exp(-κ)) and 1 - I1(κ)/I0(κ).
+
+    They are computed by the asymptotic series (DLMF 10.40.1) if κ is so large that the series has 60 digits.
+    """
     if kappa < 400:
         zero, first = mpmath.besseli(0, kappa), mpmath.besseli(1, kappa)
         return mpmath.log(zero) - kappa, 1 - first / zero
@@ -39,7 +42,7 @@ def bessel(kappa: Real) -> tuple[Real, Real]:
 
 
 def _hankel_series(order: int, kappa: Real) -> Real:
-    """Return √(2πκ) exp(-κ) I_order(κ)."""
+    """Return √(2πκ) exp(-κ) I_order(κ) for the modified Bessel function I_order, by its asymptotic series."""
     total = term = mpmath.mpf(1)
     for j in range(1, 400):
         term *= -mpmath.mpf(4 * order**2 - (2 * j - 1) ** 2) / (8 * j * kappa)
@@ -51,9 +54,14 @@ def _hankel_series(order: int, kappa: Real) -> Real:
 
 @cache
 def smooth(v: Real) -> tuple[Real, ...]:
-    """Return the three functions at v, in the order of NAMES, with A = I1/I0.
+    """Return the values of the functions that the polynomials approximate, in the order of NAMES.
 
-    They are log(2π I0(κ) exp(-κ)) + log(κ+2)/2;  A (κ+2)/κ;  A' (κ+2)²/2 with A' = 1 - A² - A/κ.
+    The argument v = 2/(κ+2) stands for the concentration κ = 2/v - 2, so that v in [0, 1] covers all κ from infinity to
+    0. With A = I1(κ)/I0(κ) and its derivative A' = 1 - A² - A/κ, the functions are
+
+    - "log_peak": log(2π I0(κ) exp(-κ)) + log(κ+2)/2,
+    - "ratio": A (κ+2)/κ,
+    - "ratio_slope": A' (κ+2)²/2.
     """
     if v == 0:
         return mpmath.log(2 * mpmath.pi) / 2, mpmath.mpf(1), mpmath.mpf(1) / 4
@@ -71,7 +79,13 @@ def smooth(v: Real) -> tuple[Real, ...]:
 
 
 def chebyshev_series(low: Real, high: Real, which: int) -> list[Real]:
-    """Return Chebyshev coefficients of function number `which` on [low, high] of v, from NODES interpolation nodes."""
+    """Return the coefficients of a Chebyshev series that interpolates a function of `smooth` on the interval of v.
+
+    Args:
+        low: lower end of the interval.
+        high: upper end of the interval.
+        which: index of the function in NAMES.
+    """
     angles = [mpmath.pi * (2 * i + 1) / (2 * NODES) for i in range(NODES)]
     values = [smooth((low + high) / 2 + (high - low) / 2 * mpmath.cos(angle))[which] for angle in angles]
     return [
@@ -83,10 +97,11 @@ def chebyshev_series(low: Real, high: Real, which: int) -> list[Real]:
 
 
 def degree(series: list[Real], pieces: Real, tolerance: Real) -> int:
-    """Return the smallest degree at which the remainder and its derivative in v are small enough.
+    """Return the smallest degree at which a Chebyshev series on a piece of the length 1 / `pieces` may be cut.
 
-    The remainder must be below the tolerance, and its derivative below four times the tolerance: 1 - A contains at most
-    half of the derivative, and is at least a quarter wherever it contains the derivative at all.
+    The terms that are cut must add up to less than the tolerance, and their derivatives by v to less than four times
+    the tolerance. The second bound limits the error of v/4 + v² G'(v)/2 = 1 - A(κ), which is computed from the
+    derivative of the polynomial G.
     """
     return next(
         d
@@ -112,7 +127,10 @@ def powers(series: list[Real]) -> list[Real]:
 
 
 def table(dtype: str, which: int) -> list[tuple[float, ...]]:
-    """Return coefficients, (power, piece), v ascending; all pieces have the largest degree that any piece needs."""
+    """Return the coefficients of function number `which` on equal pieces of v, (power, piece), in ascending order of v.
+
+    All pieces have the largest degree that any of them needs.
+    """
     count = PIECES[dtype]
     edges = [mpmath.mpf(i) / count for i in range(count + 1)]
     series = [chebyshev_series(low, high, which) for low, high in pairwise(edges)]
@@ -122,7 +140,10 @@ def table(dtype: str, which: int) -> list[tuple[float, ...]]:
 
 
 def chain(which: int) -> list[tuple[float, ...]]:
-    """Return coefficients, (power, piece), between BORDERS; all pieces have the largest degree that any piece needs."""
+    """Return the coefficients of function number `which` on the pieces between BORDERS, (power, piece).
+
+    All pieces have the largest degree that any of them needs.
+    """
     spans = list(pairwise(mpmath.mpf(border) for border in BORDERS))
     series = [chebyshev_series(low, high, which) for low, high in spans]
     highest = max(

@@ -42,11 +42,11 @@ def log_prob(value: Tensor, mean: Tensor, concentration: Tensor) -> Tensor:
 
 
 def log_prob_and_slopes(value: Tensor, mean: Tensor, concentration: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return log p, its derivative in the mean, κ sin(φ-μ), and in κ, 1 - A(κ) - 2 sin²((φ-μ)/2), in one pass.
+    """Return log p, nats, its derivative by the mean and its derivative by κ, in one pass.
 
-    The arguments have one dtype, and the results have no gradient. `log_prob` computes the same under gradient, but a
-    compiler turns `log_prob` and its gradient into two loops that repeat much of the computation, and this function
-    into one.
+    The derivatives are κ sin(φ-μ) and 1 - A(κ) - 2 sin²((φ-μ)/2). All arguments have the same dtype, and the results
+    have no gradient. Autograd on `log_prob` gives the same derivatives. But a compiler turns `log_prob` and its
+    gradient into two loops that repeat much of the computation, and this function into one loop.
     """
     return _value_and_slopes(value, mean, concentration)
 
@@ -57,12 +57,12 @@ def log_peak(concentration: Tensor) -> Tensor:
 
 
 def mean_resultant(concentration: Tensor) -> Tensor:
-    """Return A(κ) = I1(κ)/I0(κ) = E cos(φ-μ), to full relative precision at both ends."""
+    """Return A(κ) = I1(κ)/I0(κ) = E cos(φ-μ), to full relative precision for small and large κ."""
     return _Ratio.apply(concentration)
 
 
 def mean_deviation(concentration: Tensor) -> Tensor:
-    """Return 1 - A(κ) = E 2 sin²((φ-μ)/2), to full relative precision at both ends."""
+    """Return 1 - A(κ) = E 2 sin²((φ-μ)/2), to full relative precision for small and large κ."""
     return _OneMinusRatio.apply(concentration)
 
 
@@ -123,7 +123,7 @@ def sample(mean: Tensor, concentration: Tensor) -> Tensor:
 
 
 def _half_tangent(kappa: Tensor) -> Tensor:
-    """Return tan(θ/2) of one accepted proposal per element."""
+    """Return tan(θ/2) of one accepted proposal per element, where θ is the distance of the angle from the mean."""
     root = torch.hypot(torch.ones_like(kappa), 2 * kappa)
     tau = 1 + root
     span = tau + torch.sqrt(2 * tau)  # 2κ/ρ
@@ -141,7 +141,7 @@ def _half_tangent(kappa: Tensor) -> Tensor:
 
 
 def _propose(kappa: Tensor, scale: Tensor, floor: Tensor) -> tuple[Tensor, Tensor]:
-    """Return tan(θ/2) of one wrapped Cauchy proposal per element, and whether the proposal is rejected."""
+    """Return tan(θ/2) of one wrapped Cauchy proposal of `sample` per element, and whether it is rejected."""
     uniform, accept = torch.rand(2, kappa.numel(), dtype=kappa.dtype, device=kappa.device)
     tangent = scale * torch.tan(math.pi * (uniform - 0.5))
     square = tangent * tangent
@@ -166,20 +166,26 @@ def _value_and_slopes(value: Tensor, mean: Tensor, concentration: Tensor) -> tup
 
 
 def slope(value: Tensor, mean: Tensor, concentration: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return log p, -κ sin(φ-μ) and κ cos(φ-μ), without gradient."""
+    """Return log p, its derivative by φ, -κ sin(φ-μ), and the negative of its second derivative, κ cos(φ-μ).
+
+    φ is `value`. The results have no gradient.
+    """
     square, product = half_products(value, mean)
     log_prob = log_height(concentration) - concentration * (2 * square)
     return log_prob, -2 * concentration * product, concentration * (1 - 2 * square)
 
 
 def fall(value: Tensor, mean: Tensor, concentration: Tensor) -> Tensor:
-    """Return -2κ sin²((φ-μ)/2), which is κ(cos(φ-μ) - 1)."""
+    """Return log p at φ minus log p at the mean: -2κ sin²((φ-μ)/2) = κ(cos(φ-μ) - 1), nats."""
     sine, _ = half_angle(value, mean)
     return -2 * (concentration * sine) * sine
 
 
 class _LogProb(Function):
-    """The log-density; `forward` computes value and derivatives in one pass, and `backward` only multiplies."""
+    """Autograd function of the log-density.
+
+    `forward` computes the value and all derivatives in one pass, and `backward` only multiplies.
+    """
 
     @staticmethod
     def forward(
@@ -208,7 +214,7 @@ class _LogProb(Function):
 
 
 class _LogPeak(Function):
-    """The log-density at the mean; its derivative is 1 - A(κ)."""
+    """Autograd function of the log-density at the mean, whose derivative by κ is 1 - A(κ)."""
 
     @staticmethod
     def forward(ctx: Any, concentration: Tensor) -> Tensor:
@@ -222,7 +228,7 @@ class _LogPeak(Function):
 
 
 class _OneMinusRatio(Function):
-    """The function 1 - A(κ); its derivative is -A'(κ)."""
+    """Autograd function of 1 - A(κ), whose derivative is -A'(κ)."""
 
     @staticmethod
     def forward(ctx: Any, concentration: Tensor) -> Tensor:
@@ -236,7 +242,7 @@ class _OneMinusRatio(Function):
 
 
 class _Ratio(Function):
-    """The function A(κ); its derivative is A'(κ)."""
+    """Autograd function of A(κ), whose derivative is A'(κ)."""
 
     @staticmethod
     def forward(ctx: Any, concentration: Tensor) -> Tensor:

@@ -73,7 +73,7 @@ class VonMisesHead(DensityHead):
         return VonMises(mean, self.concentration.to(mean).expand_as(mean))
 
     def loss(self, raw: Float[Tensor, "*batch size"], target: Tensor) -> Float[Tensor, "*batch"]:
-        """Return the negative log-likelihood of each sample, nats; with a fixed concentration that for κ = 1."""
+        """Return the negative log-likelihood of each sample, nats; for `concentration="fixed"` that with κ = 1."""
         density = self(raw)
         if not self.predicted:  # the cosine loss does not change with calibration
             density = VonMises(density.mean, torch.ones_like(density.mean))
@@ -81,7 +81,7 @@ class VonMisesHead(DensityHead):
 
     @torch.no_grad()
     def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
-        """Fit a fixed concentration by maximum likelihood; do nothing if it is predicted."""
+        """Fit one κ per angle by maximum likelihood with `concentration="fixed"`; do nothing with "predicted"."""
         if self.predicted:
             return
         require_validation(raw, "A fixed concentration is")
@@ -97,7 +97,10 @@ class VonMisesHead(DensityHead):
 def polar(
     cosine: Float[Tensor, "*shape"], sine: Float[Tensor, "*shape"]
 ) -> tuple[Float[Tensor, "*shape"], Float[Tensor, "*shape"]]:
-    """Return angle, radians, and length of a pair (eq. 3.1), with finite gradients at any pair, also at zero."""
+    """Return the angle, radians, and the length of the vector (cosine, sine) (eq. 3.1).
+
+    Gradients are finite for every vector, also for the zero vector.
+    """
     shortest = 1e-18
     # A pair at zero is moved a little, because its angle has no gradient; length × cos(φ - angle) keeps its gradient.
     cosine = torch.where((cosine.abs() < shortest) & (sine.abs() < shortest), cosine + 2 * shortest, cosine)

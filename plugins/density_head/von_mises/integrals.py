@@ -100,17 +100,26 @@ def half_width(mass: Tensor, concentration: Tensor) -> Tensor:
 
 
 def interval(mass: Tensor, mean: Tensor, concentration: Tensor) -> tuple[Tensor, Tensor]:
-    """Return both ends, radians, of the shortest arc with the probability `mass`; the first end is not wrapped."""
+    """Return both ends, radians, of the shortest arc with the probability `mass`.
+
+    The ends are mean - w and mean + w for the half width w; they are not reduced modulo 2π.
+    """
     width = half_width(mass, concentration)
     return mean - width, mean + width
 
 
 def _one_side(sine: Tensor, cosine: Tensor, concentration: Tensor, within: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the mass on one side of the mean and its derivative in κ.
+    """Return the probability of an arc on one side of the mean, and its derivative by κ.
 
-    It is the probability between the mean and t where `within` is true, and from t to π elsewhere. t ∈ [0, π] is given
-    by sin(t/2) and cos(t/2). The density at the start b of the arc is factored out, so that the integrand over s is
-    exp(-2κ sin(s/2) sin(b+s/2)), which falls from 1 to exp(-CUT) at most.
+    Angles are distances from the mean, in [0, π]. The arc begins at b = 0 and ends at t where `within` is true;
+    elsewhere it begins at b = t and ends at π. The density at b is factored out. So the integrand at the angle b + s is
+    exp(-2κ sin(s/2) sin(b + s/2)), which falls from 1; the integral ends where it has fallen to exp(-CUT).
+
+    Args:
+        sine: sin(t/2).
+        cosine: cos(t/2).
+        concentration: κ.
+        within: whether the arc begins at the mean.
     """
     height, deviation = height_and_deviation(concentration)
     reach = CUT / (2 * concentration)
@@ -153,7 +162,7 @@ def _cdf_and_slopes(value: Tensor, mean: Tensor, concentration: Tensor) -> tuple
 
 
 class _Cdf(Function):
-    """The distribution function of float64 arguments of one shape."""
+    """Autograd function of the distribution function, for float64 arguments of one shape."""
 
     @staticmethod
     def forward(ctx: Any, value: Tensor, mean: Tensor, concentration: Tensor) -> Tensor:
@@ -169,7 +178,11 @@ class _Cdf(Function):
 
 
 def _log_quotient(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
-    """Return log((κ₂+2)/(κ₁+2)), and whether its magnitude is so small that integrals over κ need quadrature."""
+    """Return log((κ₂+2)/(κ₁+2)) for κ₁ in `first` and κ₂ in `second`, and whether its magnitude is at most 1.
+
+    If it is, integrals from κ₁ to κ₂ are computed by quadrature, because a difference of antiderivatives would lose
+    digits.
+    """
     quotient = torch.log((second + 2) / (first + 2))
     near = quotient.abs() <= 1
     exact = torch.log1p(torch.where(near, (second - first) / (first + 2), 0))
@@ -177,7 +190,10 @@ def _log_quotient(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class _Bregman(Function):
-    """The integral ∫_{κ₁}^{κ₂} (κ₂-x) A'(x) dx: the height of log I0 at κ₂ above its tangent at κ₁."""
+    """Autograd function of ∫_{κ₁}^{κ₂} (κ₂-x) A'(x) dx.
+
+    This is the Bregman divergence of log I0: its height at κ₂ above its tangent at κ₁.
+    """
 
     @staticmethod
     def forward(ctx: Any, first: Tensor, second: Tensor) -> Tensor:
@@ -203,7 +219,7 @@ class _Bregman(Function):
 
 
 class _RatioRise(Function):
-    """The difference A(κ₂) - A(κ₁)."""
+    """Autograd function of the difference A(κ₂) - A(κ₁)."""
 
     @staticmethod
     def forward(ctx: Any, first: Tensor, second: Tensor) -> Tensor:

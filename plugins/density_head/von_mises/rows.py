@@ -20,7 +20,10 @@ OFFSETS = (0.0, 1e-8, 1e-3, 1.0, 3.0, -math.pi, 2 * math.pi, 1e6)
 
 
 def exact(offset: float, concentration: float) -> Any:
-    """Return the log-density κ cos d - log(2π I0(κ)) (eq. 3.3), nats, computed with 50 digits."""
+    """Return the log-density κ cos d - log(2π I0(κ)) (eq. 3.3), nats, computed with 50 digits.
+
+    d is the distance `offset` from the mean, and κ the concentration.
+    """
     with mpmath.workdps(50):
         kappa = mpmath.mpf(concentration)
         return kappa * mpmath.cos(mpmath.mpf(offset)) - mpmath.log(2 * mpmath.pi * mpmath.besseli(0, kappa))
