@@ -217,10 +217,11 @@ class CEST(Data, Mapped):
         return write_maps(file, self.parameters.target, point, deviation, folder, synthetic=self.synthetic)
 
     def augment(self, batch: Batch) -> Batch:
-        """Return a batch with random noise and a random B0 shift of the lines; the residuals of the fit stay in place.
+        """Return a batch with random noise, and with fitted lines that are shifted along the offsets at random.
 
-        The standard deviation of the noise and the shift are the largest value times the cube of a uniform number, so
-        that most spectra stay nearly unchanged and some change strongly.
+        The shift is that of the B0 field. A spectrum is the sum of its fitted lines and of the residuals of the fit;
+        the residuals are not shifted. The shift and the standard deviation of the noise are their largest values times
+        the cube of a uniform random number, so that most spectra stay nearly unchanged and some change strongly.
         """
         spectra, target, lines = batch["input"], batch["target"], batch["lines"]
         if self.shift:

@@ -52,7 +52,13 @@ def maps_figure(methods: Mapping[str, Maps], title: str) -> Figure:
 
 
 def _scale(contrast: bool, row: int, values: np.ndarray) -> dict[str, object]:
-    """Return colour map and limits for `imshow`; row 0 holds predictions, row 1 standard deviations."""
+    """Return the colour map and the limits of a map for `imshow`.
+
+    Args:
+        contrast: Whether the map shows an amplitude; otherwise it shows the asymmetry, whose scale is centred on 0.
+        row: 0 for predictions, 1 for standard deviations.
+        values: Numbers of the map.
+    """
     low, high = np.nanquantile(values, (0.01, 0.99))
     if row:
         return {"cmap": "magma", "vmin": 0.0, "vmax": high}

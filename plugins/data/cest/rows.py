@@ -19,13 +19,13 @@ def slice_of(folder: Path, data_seed: int = 0) -> dict[str, np.ndarray]:
 
 
 def as_numpy(folder: Path) -> Mapping[str, str]:
-    """Write a slice as `.npz`."""
+    """Write a slice as `.npz`, and return the settings that name the file."""
     slice_of(folder)
     return {"root": str(folder / "brain.npz")}
 
 
 def as_matlab(folder: Path) -> Mapping[str, str]:
-    """Write a slice as `.mat`."""
+    """Write a slice as `.mat`, and return the settings that name the file."""
     arrays = slice_of(folder)
     (folder / "brain.npz").unlink()
     savemat(
@@ -36,7 +36,7 @@ def as_matlab(folder: Path) -> Mapping[str, str]:
 
 
 def files(folder: Path) -> Sequence[Path]:
-    """Write a part of one slice as a NumPy file and a part of another slice as a MATLAB file."""
+    """Write part of one slice to a NumPy file and part of another slice to a MATLAB file; return both paths."""
     first, second = (slice_of(folder, seed)["spectra"][8:16, 8:16] for seed in (1, 2))
     (folder / "brain.npz").unlink()
     np.savez(folder / "mine_1.npz", spectra=first, offsets=OFFSETS)

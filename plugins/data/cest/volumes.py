@@ -37,7 +37,8 @@ class Volume(NamedTuple):
         region: Region of each voxel, (voxel,), an index into `regions`.
         shape: Shape of the whole volume.
         regions: Names of the regions.
-        left_out: Indices of the voxels of the mask of which a number is not finite, (dropped, 3).
+        left_out: Indices of the voxels in the mask that are left out because one of their numbers is not finite,
+            (dropped, 3).
         affine: Transform from voxels to millimetres, for a NIfTI file; otherwise None.
         unread: Names of other arrays in the file.
     """

@@ -32,8 +32,8 @@ class COIL20(Data):
     training batches show the objects at random angles, interpolated by the objects' appearance manifolds: periodic
     cubic splines through the training views (Murase & Nayar 1995).
 
-    Results are also reported separately for the objects that look alike from two opposite sides: objects of which two
-    training views 180° apart are on average more similar than two neighbouring training views.
+    Results are also reported separately for the objects that look nearly the same from two opposite sides. For these
+    objects, two training views 180° apart are on average more similar than two neighbouring training views.
 
     Args:
         root: Folder that holds COIL20.mat or the processed images, or the path of COIL20.mat.

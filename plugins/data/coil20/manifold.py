@@ -11,10 +11,14 @@ FINE = 1440
 
 
 def spline_weights(views: int) -> Float[Tensor, "fine views"]:
-    """Return the weights of equally spaced views: the image at (i + 1/2)/FINE of a turn is row i times the views.
+    """Return the weights with which equally spaced views are summed to interpolated images.
 
-    The weights are those of a periodic cubic spline through the views (Murase & Nayar 1995, §2.2, where the spline lies
-    in an eigenspace). A spline is linear in its points, so a spline through the images themselves is the same curve.
+    Row i holds the weights of the views for the image at the angle 360° · (i + 1/2) / FINE. They are those of a
+    periodic cubic spline through the views (Murase & Nayar 1995, §2.2, where the spline lies in an eigenspace). A
+    spline is linear in its points, so a spline through the images themselves is the same curve.
+
+    Args:
+        views: number of views over the full circle.
     """
     points = np.eye(views)
     spline = CubicSpline(np.arange(views + 1) / views, np.vstack([points, points[:1]]), bc_type="periodic")
@@ -22,10 +26,10 @@ def spline_weights(views: int) -> Float[Tensor, "fine views"]:
 
 
 def look_alikes(views: Float[Tensor, "object view 1 side side"]) -> Bool[Tensor, "object"]:
-    """Return which objects look alike from opposite sides.
+    """Return which objects look nearly the same from two opposite sides.
 
-    The root mean square differences of two views 180° apart, averaged over the views, are then smaller than those of
-    two neighbouring views.
+    For such an object, the root mean square difference of two views 180° apart is smaller than that of two neighbouring
+    views; both are averaged over all views.
     """
     flat = views.flatten(2)
     half = (flat - flat.roll(flat.shape[1] // 2, 1)).square().mean(-1).sqrt().mean(-1)

@@ -11,7 +11,10 @@ from framework.testing.sample_files import images
 
 
 def turntable(symmetric: bool = False) -> np.ndarray:
-    """Return views (20, 72, 32, 32) of 20 blobs that go round once per turn of the table, or twice if symmetric."""
+    """Return views, (20, 72, 32, 32), of 20 blobs that move on a circle while the table rotates by 360°.
+
+    A blob moves round once, or twice if `symmetric`.
+    """
     angle = np.radians(5) * np.arange(72) * (2 if symmetric else 1)
     row, column = np.mgrid[:32, :32]
     views = []
@@ -30,7 +33,7 @@ def as_matlab(folder: Path, views: np.ndarray, **more: object) -> Path:
 
 
 def write(folder: Path) -> Mapping[str, str]:
-    """Write the views of a blob on a turntable."""
+    """Write the views of blobs on a turntable, and return the settings that name the folder."""
     return {"root": str(as_matlab(folder, turntable()))}
 
 

@@ -83,7 +83,11 @@ class Source:
         return cache.folder(self.archive.name) if self.root is None else None
 
     def fingerprint(self, synthetic: bool) -> dict[str, str]:
-        """Return root and version of the images, for `Data.fingerprint`."""
+        """Return root and version of the images, for `Data.fingerprint`.
+
+        Args:
+            synthetic: Whether the images are synthetic, in a user's folder or in the cache.
+        """
         return {
             "root": f"synthetic, seed {self.seed}" if self.root is None else self.root,
             "version": f"generator {self.archive.version}" if synthetic else self.archive.folder,

@@ -19,7 +19,10 @@ from plugins.data.head_pose.archive import TRAIN_AND_TEST
 LABELS = "or_label_full.mat"
 ANGLES = ("pan", "tilt", "roll")
 UNIT_CHECK_MINIMUM = 20
-"""Number of labels above which angles that all lie within ±2π are assumed to be radians."""
+"""Number of labels that a file must exceed for its unit to be checked.
+
+If all angles of such a file lie within ±2π, they are assumed to be radians.
+"""
 MOST_LABELS, MOST_VALUES = 2**20, 2**12
 """Largest number of labels of a split, and largest number of letters of a name."""
 HEADER = b"MATLAB 7.3 MAT-file, synthetic labels".ljust(116) + bytes(8) + b"\x00\x02IM"
@@ -73,7 +76,10 @@ def _read_struct(content: h5py.File, name: str) -> list[Label]:
 
 
 def _read_cells(content: Any, field: h5py.Dataset) -> list[np.ndarray]:
-    """Return the arrays that a field refers to; the field of a struct of one element holds its value itself."""
+    """Return the arrays that the references in a field point to, one for each element of the struct array.
+
+    If the struct array has only one element, the field holds the value instead of a reference.
+    """
     if field.dtype != h5py.ref_dtype:
         return [_values(content, field, MOST_VALUES)]
     return [
@@ -83,7 +89,11 @@ def _read_cells(content: Any, field: h5py.Dataset) -> list[np.ndarray]:
 
 
 def _values(content: h5py.File, dataset: Any, most: int) -> np.ndarray:
-    """Return all values of a small HDF5 dataset; a dataset that HDF5 would read from another file is refused."""
+    """Return all values of an HDF5 dataset of numbers or references.
+
+    Raises:
+        ValueError: The dataset holds something else or more than `most` values, or its values lie in another file.
+    """
     chunk = math.prod(dataset.chunks or ())
     plain = dataset.dtype.kind in "iuf" or dataset.dtype == h5py.ref_dtype
     if not plain or max(dataset.size, chunk) > most:

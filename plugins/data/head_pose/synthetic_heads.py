@@ -52,8 +52,9 @@ class Person:
     Attributes:
         skin, hair, cloth, hat_color: Colours (3,), 0…1.
         axes: Half width, half height and half depth of the skull.
-        face_tilt: Angle below the horizontal at which the middle of the opening in the hair lies, radians.
-        face_reach: Cosine of the angular radius of that opening; -1: no hair.
+        face_tilt: Angle below the horizontal at which the middle of the opening in the hair lies, radians; the face
+            shows through this opening.
+        face_reach: Cosine of the angular radius of the opening; -1 for a person without hair.
         long_hair, bun, hat: Whether the person has long hair, a bun or a hat.
         glasses, beard: Darkness of the glasses and of the beard, 0…1; 0: none.
         ears: Relative size of the ears; 0 if hair hides them.
@@ -192,7 +193,10 @@ def render(
 
 
 def _ellipsoids(person: Person, head: Array, torso: Array) -> list[tuple[Array, Array, Array, int]]:
-    """Return the parts as ellipsoids: centre (3,), matrix (3, 3) that maps to the unit ball, colour (3,) and kind.
+    """Return the parts of head, neck and shoulders as ellipsoids.
+
+    Each ellipsoid has a centre (3,), a matrix (3, 3) that maps it to the unit ball, a colour (3,) and a kind (`SKIN`,
+    `HAIR` or `CLOTH`).
 
     Args:
         person: The person.
@@ -244,7 +248,24 @@ def _ellipsoids(person: Person, head: Array, torso: Array) -> list[tuple[Array, 
 def _cast(
     centers, frames, extents, colors, kinds, head, opening, look, lamp, strength, scale, column0, row0, image
 ):
-    """Fill `image` with the nearest surface along each ray, with Lambert shading."""
+    """Fill `image` with the nearest surface along each ray, with Lambert shading.
+
+    Args:
+        centers: Centres of the ellipsoids, (parts, 3).
+        frames: Matrices that map the ellipsoids to the unit ball, (parts, 3, 3).
+        extents: Half widths of the ellipsoids along the axes of the camera, (parts, 3).
+        colors: Colours of the ellipsoids, (parts, 3).
+        kinds: Kinds of the ellipsoids, (parts,).
+        head: Rotation from the head's frame to the camera's.
+        opening: Direction of the opening in the hair (3 numbers), and the cosine of its angular radius.
+        look: Darkness of the glasses and of the beard, and the colour of the hair, (5,).
+        lamp: Unit vector towards the lamp.
+        strength: Share of the light that comes from the lamp, 0…1.
+        scale: Pixels per half height of a head.
+        column0: Column of the head's centre, pixels.
+        row0: Row of the head's centre, pixels.
+        image: Filled with colour times opacity, and opacity, (pixels, pixels, 4).
+    """
     size = image.shape[0]
     point = np.zeros(3)
     unit = np.zeros(3)
@@ -307,9 +328,10 @@ def _cast(
 @compiled
 @no_type_check
 def _paint_face(point, look, color):
-    """Change the colour of the skin at facial features.
+    """Change the colour of a point of the skin in place if it belongs to a facial feature.
 
-    `point` is in the head's frame. The features are projected onto the head from the front.
+    The features are projected onto the head from the front. `point` is in the head's frame. `look` holds the darkness
+    of the glasses and of the beard, and the colour of the hair. `color` is the colour of the point.
     """
     x, y = abs(point[0]), point[1]
     if point[2] < 0.15:

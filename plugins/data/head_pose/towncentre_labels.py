@@ -94,7 +94,11 @@ def read_label(file: Path) -> tuple[float, bool]:
 
 
 def _find_image(folder: Path, label: str, images: Sequence[str]) -> Path:
-    """Return the image whose name begins with the stem of the label file, without a digit directly after the stem."""
+    """Return the image whose name begins with the stem of the label file and does not go on with a digit.
+
+    Raises:
+        DataError: No image or more than one image has such a name.
+    """
     stem = label.removesuffix(".txt")
     names = [name for name in images if name.startswith(stem) and not name[len(stem) :][:1].isdigit()]
     if len(names) != 1:

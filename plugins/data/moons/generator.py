@@ -1,10 +1,10 @@
 """Two interleaved half circles with Gaussian noise: random points, their exact densities and their exact posterior.
 
 Class 0 is the upper half of a unit circle about (0, 0), class 1 the lower half of a unit circle about (1, ½). A point
-lies at a uniformly distributed angle of the arc of its class, plus normal noise. Points are in standard units: from
-each coordinate its mean is subtracted, and the result is divided by its standard deviation. Both are those of the
-distribution and not of a sample. In these units, reflection through the origin maps each arc and its density to those
-of the other class.
+lies at a uniformly distributed angle of the arc of its class, plus normal noise. Points are in standard units: the mean
+of each coordinate is subtracted, and the difference is divided by the coordinate's standard deviation. Mean and
+standard deviation are those of the distribution and not of a sample. In these units, reflection through the origin maps
+the arc and the density of each class to those of the other class.
 """
 
 import math
@@ -18,13 +18,14 @@ CENTRE = np.array([0.5, 0.25])
 NODES = 64
 """Number of nodes of the Gauss-Legendre rule on each piece of an arc."""
 DECAY = 40.0
-"""Nats by which the log of an integrand falls before its integral is cut off: e⁻⁴⁰ is below float64 resolution."""
+"""Decrease of an integrand's logarithm, in nats, at which its integral is cut off: e⁻⁴⁰ is below float64 resolution."""
 
 
 def scale(noise: float) -> np.ndarray:
-    """Return the standard deviation of either coordinate over both classes, in radii.
+    """Return the standard deviations of x and of y over both classes, (2,), in radii of the arcs.
 
-    E x² = ½ + ¼ + σ² about the centre; E y² = E (sin θ - ¼)² + σ² = ½ - 1/π + 1/16 + σ², as E sin θ = 2/π.
+    With coordinates relative to the centre of symmetry, a uniform angle θ and σ = `noise`, E x² = ½ + ¼ + σ² and
+    E y² = E (sin θ - ¼)² + σ² = ½ - 1/π + 1/16 + σ², because E sin θ = 2/π.
     """
     return np.sqrt([0.75 + noise**2, 0.5625 - 1 / math.pi + noise**2])
 
@@ -76,11 +77,12 @@ def posterior(points: Float[np.ndarray, "*batch 2"], noise: float) -> Float[np.n
 def _polar_terms(
     points: Float[np.ndarray, "*batch 2"], noise: float
 ) -> tuple[Float[np.ndarray, "*batch 2"], Float[np.ndarray, "*batch 2"]]:
-    """Return, for each class, the distance d from its circle's centre, radii, and log ∫ exp(-2 d sin²(t/2) / σ²) dt.
+    """Return, for each class, the distance d of a point x from the circle's centre, and the logarithm of an integral.
 
-    Here t is the angle at the circle's centre between x and a point of the arc. The integrand falls with |t|. The arc
-    is divided into two pieces on each of which |t| is monotonic. If the arc contains the direction of x, both pieces
-    start there, at |t| = 0. Otherwise each piece starts at an end of the arc and ends opposite to x, at |t| = π.
+    The integral is ∫ exp(-2 d sin²(t/2) / σ²) dt over the arc of the class, where t is the angle at the circle's centre
+    between x and a point of the arc, and σ is `noise`. Lengths are in radii of the arcs. The integrand falls with |t|.
+    The arc is divided into two pieces on each of which |t| is monotonic. If the arc contains the direction of x, both
+    pieces start there, at |t| = 0. Otherwise each piece starts at an end of the arc and ends opposite to x, at |t| = π.
     """
     centred = points * scale(noise)
     from_centres = np.stack([centred + CENTRE, CENTRE - centred], -2)

@@ -76,7 +76,7 @@ class PlanePoints(Data):
 
 
 def split_of(inputs: Float32[Tensor, "size 2"], label: Int[np.ndarray, "size"], **more: Tensor) -> Fields:
-    """Return a split of points with their labels and any further fields, all in one group."""
+    """Return a split that consists of points, their labels and further fields; all points are in group 0."""
     return Fields(
         input=inputs,
         target=torch.from_numpy(label),

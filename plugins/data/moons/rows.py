@@ -7,7 +7,7 @@ from framework.testing.rows import DataRow
 
 
 def files(folder: Path) -> Sequence[Path]:
-    """Write two files, with one point and with two points, whose columns are in different orders."""
+    """Write two files with one and two points, whose columns are in different orders, and return their paths."""
     first, second = folder / "first.csv", folder / "second.csv"
     first.write_text("x,y\n0.50000000,-1.25\n", encoding="utf-8")
     second.write_text("y,note,x\n2,hello,1\n4.75,,-3.5\n", encoding="utf-8")

@@ -26,7 +26,7 @@ from framework.renderer import Renderer, Scene
 from framework.target import Target
 
 VERSION = 1
-"""Version of the random draws; any change of them takes a new number."""
+"""Version of the random draws, part of the fingerprint; increase it if the draws change."""
 Count = Annotated[int, Field(ge=1, le=1_000_000)]
 
 
@@ -41,13 +41,15 @@ class Counts:
 
 @dataclass(frozen=True, kw_only=True)
 class Apart:  # this name is part of stored fingerprints
-    """Distance of people from the nominal pose: exact for rotation and translation, random for pose and shape.
+    """Settings of the difference between the drawn bodies and the body at its nominal position, pose and shape.
+
+    Every body is rotated by the same angle and moved by the same distance; its pose and shape are random.
 
     Attributes:
-        turned_deg: angle of the whole body's rotation, about an axis of random direction.
+        turned_deg: angle of the whole body's rotation, degrees, about an axis of random direction.
         moved: length of the translation, metres, in a random direction.
-        pose_spread: spread of the movements, in their usual standard deviations.
-        shape_spread: spread of the shape, in standard deviations of people.
+        pose_spread: standard deviation of each movement of a joint, as a multiple of its usual standard deviation.
+        shape_spread: standard deviation of each shape parameter, as a multiple of its standard deviation among people.
     """
 
     turned_deg: Annotated[float, Field(ge=0, le=180)] = 30.0
@@ -187,7 +189,7 @@ class PoseFromImage(Data):
 
 
 class Poses(Dataset[Batch]):
-    """Bodies of one split, drawn when they are fetched."""
+    """Images of the bodies of one split, which are rendered when they are fetched."""
 
     def __init__(
         self,

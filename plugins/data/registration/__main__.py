@@ -1,4 +1,7 @@
-"""`python -m plugins.data.registration <checkpoint> <scan> ...` registers meshes to scans: PLY files and figures."""
+"""`python -m plugins.data.registration <checkpoint> <scan> ...` registers a mesh to each scan.
+
+For each scan, the command writes a PLY file of the registered mesh and the scan's points, and a figure.
+"""
 
 import argparse
 import sys
@@ -21,7 +24,9 @@ from plugins.data.registration.result import figure, write_ply
 
 
 def main(arguments: list[str]) -> None:
-    """Write `<folder>/<scan>_registered.ply` and `.png` for each scan, in metres and in the coordinates of the scan.
+    """Write `<folder>/<scan>_registered.ply` and `<folder>/<scan>_registered.png` for each scan.
+
+    The meshes are in metres and in the coordinates of the scan.
 
     Raises:
         UserError: the checkpoint is of another data set, or a file cannot be read.

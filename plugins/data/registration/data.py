@@ -27,7 +27,7 @@ from plugins.data.registration.scanner import KINDS, Kinds, Scanner
 from plugins.data.registration.scans import Scans
 
 VERSION = 1
-"""Version of the random draws; any change of them takes a new number."""
+"""Version of the random draws, part of the fingerprint; increase it if the draws change."""
 Size = Annotated[int, Field(ge=1, le=10_000_000)]
 Points = Annotated[int, Field(ge=100, le=1_000_000)]
 Seed = Annotated[int, Field(ge=0, lt=2**31)]
@@ -46,8 +46,9 @@ class Sizes:
 class Registration(Bodies):
     """Synthetic scans of people of random shape and pose; the target is every vertex of the body (thesis §6.5.2).
 
-    A random adult is sampled (people), posed by linear blend skinning and scanned (scanner). Nothing is
-    stored: a sample is a function of (`data_seed`, split, number), computed when it is fetched.
+    A random adult is sampled (`framework.bodies.people`), posed by linear blend skinning, and scanned by a simulated
+    scanner (`plugins.data.registration.scanner`). Nothing is stored: a sample is a function of (`data_seed`, split,
+    number), computed when it is fetched.
 
     Args:
         sizes: numbers of bodies of the splits.
@@ -196,7 +197,11 @@ class Faust(Bodies):
         )
 
     def cloud(self, file: Path) -> Tensor:
-        """Return points of a scan, without replacement if there are enough; its name and the seed decide which."""
+        """Return at most `points` vertices of a scan, metres, float32.
+
+        If the scan has more vertices, they are drawn without replacement; the draw depends only on the name of the file
+        and on `data_seed`.
+        """
         vertices = read(file).vertices
         if len(vertices) > self.points:
             chosen = stream(self.data_seed, file.name).choice(len(vertices), self.points, replace=False)

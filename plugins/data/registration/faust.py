@@ -38,7 +38,7 @@ class Scan:
 
 
 class Pair(NamedTuple):
-    """Numbers of two test scans."""
+    """Numbers of two test scans, between which a challenge asks for the correspondence."""
 
     first: int
     second: int

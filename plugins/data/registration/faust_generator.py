@@ -19,7 +19,7 @@ from plugins.data.registration.faust import CHALLENGES, POSES, SUBJECTS, Pair
 from plugins.data.registration.scanner import KINDS, Kinds, Scanner, scan
 
 VERSION, SEED = 1, 0
-"""Version and seed of the random draws; any change of the draws takes a new version."""
+"""Version and seed of the random draws; increase the version if the draws change."""
 TEST_POSES = 3
 """Number of test scans of each person; FAUST has twenty."""
 SCANNER, SHARES = Scanner(points=20_000, noise=0.002), Kinds(partial=0.3, outliers=0.0)
@@ -81,7 +81,7 @@ def _write(folder: Path, people: People) -> None:
 
 
 def _pairs(same: bool) -> list[Pair]:
-    """Return pairs of two poses of one person, or of two poses of two successive people."""
+    """Return pairs of test scans in two poses: of one person if `same`, otherwise of two successive people."""
     scan_pairs = []
     for person in range(SUBJECTS):
         other = person if same else (person + 1) % SUBJECTS

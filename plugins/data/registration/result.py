@@ -29,7 +29,10 @@ def write_ply(
     faces: Int[np.ndarray, "face 3"],
     cloud: Float[np.ndarray, "points 3"],
 ) -> None:
-    """Write a binary PLY, metres: the mesh, skin-coloured, and the cloud's points, blue, as vertices without faces."""
+    """Write the mesh in skin colour and the points of the cloud in blue to one binary PLY file, metres.
+
+    The points are vertices that belong to no face.
+    """
     colours = np.repeat([_bytes(SKIN), _bytes(SCAN)], (len(vertices), len(cloud)), 0)
     points = np.concatenate([vertices, cloud])
     trimesh.Trimesh(points, faces, vertex_colors=colours, process=False).export(file, "ply")
@@ -40,7 +43,10 @@ def distances(
     faces: Int[np.ndarray, "face 3"],
     cloud: Float[np.ndarray, "points 3"],
 ) -> Float[np.ndarray, "points"]:
-    """Return the distance of each point of the cloud to the mesh: to the faces around the nearest vertices."""
+    """Return the distance of each point of the cloud to the mesh, metres.
+
+    Only the faces at the NEAR vertices nearest to a point are searched.
+    """
     around = trimesh.Trimesh(vertices, faces, process=False).vertex_faces  # padded with -1
     used = np.flatnonzero((around >= 0).any(1))
     _, nearest = KDTree(vertices[used]).query(cloud, k=min(NEAR, len(used)))
@@ -59,7 +65,11 @@ def figure(
     cloud: Float[np.ndarray, "points 3"],
     title: str,
 ) -> Figure:
-    """Return a figure of the panels with axes in metres, and of the scan's distances from the mesh, millimetres."""
+    """Return a figure of scan and mesh, seen from the front and from the left, with axes in metres.
+
+    The columns show the scan, the mesh, both, and the scan coloured by its distance from the mesh, millimetres. The
+    title is followed by the mean and the 95 % quantile of the distances.
+    """
     millimetres = 1e3 * distances(vertices, faces, cloud)
     far = np.quantile(millimetres, 0.95)
     summary = f"its points lie {millimetres.mean():.1f} mm off on average, 95 % within {far:.1f} mm"
@@ -117,7 +127,7 @@ def render_panels(
 
 
 def _frame(vertices: np.ndarray, cloud: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return middle and edge length of the cube that is drawn."""
+    """Return the middle and the edge length of the cube around mesh and cloud that the images show."""
     everything = np.concatenate([vertices, cloud])
     low, high = everything.min(0), everything.max(0)
     return (low + high) / 2, 1.06 * max(float((high - low).max()), 1e-9)
@@ -171,7 +181,7 @@ def _draw_mesh(vertices: np.ndarray, faces: np.ndarray, image: np.ndarray, depth
 
 
 def _pixels(points: np.ndarray, side: int) -> Int[np.ndarray, "points 2"]:
-    """Return row and column of points within ±0.5."""
+    """Return row and column of points (x right, y up, within ±0.5) in an image of `side` × `side` pixels."""
     column = np.floor((points[:, 0] + 0.5) * side)
     row = np.floor((0.5 - points[:, 1]) * side)
     return np.stack([row, column], 1).clip(0, side - 1).astype(np.int64)

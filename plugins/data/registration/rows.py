@@ -11,7 +11,7 @@ from framework.testing.sample_files import meshes, write_ply
 
 
 def people(folder: Path) -> Mapping[str, str]:
-    """Write two scans each of four of FAUST's ten people, and return the parameter that names their folder."""
+    """Write two scans of each of four people in FAUST's layout, and return the settings that name their folder."""
     faces = np.array([(0, 1, 2), (2, 1, 3)])
     for number in (0, 3, 70, 75, 80, 81, 90, 99):
         mesh, scan = person(number)

@@ -52,7 +52,11 @@ class Bodies(Data):
         return Fields(**normalise_scans(padded), index=torch.arange(len(files)))
 
     def user_batch(self, user_data: Any) -> Batch:
-        """Return the batch of scans in metres: files, or an array of one cloud or of a batch, padded with NaN."""
+        """Return the batch with a user's scans, normalised.
+
+        Args:
+            user_data: path or paths of files, or an array of one cloud or of several clouds, padded with NaN; metres.
+        """
         files = [user_data] if isinstance(user_data, str | Path) else user_data
         if isinstance(files, Sequence) and files and all(isinstance(file, str | Path) for file in files):
             return fetch(self.read([Path(file) for file in files]), range(len(files)))
@@ -84,7 +88,12 @@ def target_of(vertices: int) -> Target:
 def normalise_scans(
     batch: Float[Tensor, "batch points columns"], vertices: Float[Tensor, "batch vertex 3"] | None = None
 ) -> Batch:
-    """Return the fields "input", "centre" and "scale" of clouds in metres, and "target" of vertices in metres."""
+    """Return the fields "input", "centre" and "scale" of a batch of clouds; with `vertices`, also "target".
+
+    Args:
+        batch: clouds, metres, padded with NaN.
+        vertices: vertices of the registered meshes, metres.
+    """
     normalised_clouds = clouds.normalise_clouds(batch[..., :3], "robust")
     centre, scale = normalised_clouds.centre.float(), normalised_clouds.scale.float()
     fields = {"input": normalised_clouds.clouds, "centre": centre, "scale": scale}

@@ -48,10 +48,12 @@ class Kinds:
 
 
 def scan(mesh: Mesh, kind: Kind, scanner: Scanner, random: Generator) -> Float[np.ndarray, "points 3"]:
-    """Return points of one body, metres, uniform over the visible part of its surface.
+    """Return the points of one simulated scan of a body, metres.
 
-    "partial" removes the points behind a plane or within a ball, or all that face away from a camera at the body's
-    height (what an arm occludes is not removed). "outliers" adds a patch of floor and points anywhere around.
+    The points are uniform over the part of the surface that is not missing. In a scan of kind "partial", the points
+    behind a plane, or within a ball, or all points that face away from a camera at the body's height are missing
+    (points that an arm hides from the camera are not). A scan of kind "outliers" also has points of a patch of floor
+    and points anywhere around the body.
     """
     stranger = int(scanner.strangers * scanner.points * random.random()) if kind == "outliers" else 0
     surface_sample = sample(mesh, scanner.points - stranger, random)
@@ -68,7 +70,10 @@ def scan(mesh: Mesh, kind: Kind, scanner: Scanner, random: Generator) -> Float[n
 def strangers(
     vertices: Float[np.ndarray, "vertex 3"], count: int, random: Generator
 ) -> Float[np.ndarray, "points 3"]:
-    """Return a patch of the floor under the feet, and up to one point in fifty anywhere in a box around the body."""
+    """Return `count` points that do not belong to the body.
+
+    They lie on a patch of the floor under the feet; up to one point in fifty lies anywhere in a box around the body.
+    """
     low, high = vertices.min(0), vertices.max(0)
     anywhere = random.integers(count // 50 + 1)
     middle, reach = (low + high) / 2, 0.65 * (high - low).max()

@@ -20,9 +20,11 @@ class Scans(Dataset[Batch]):
     """Bodies that are posed and scanned when they are fetched.
 
     Args:
-        people: shape and pose of every body, for `model`.
+        model: body model.
+        people: shape and pose of every body, which `model` turns into vertices.
         kind: kind of every scan, as an index of KINDS.
-        seed: seed of the scans, which also depend on the sample's number.
+        scanner: settings of the simulated scanner.
+        seed: seed of the scans; a scan also depends on the number of its sample.
         precision: dtype of the targets.
     """
 

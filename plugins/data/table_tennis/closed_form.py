@@ -68,7 +68,15 @@ def _free_fall(z: Any, speed: Any, fall: Any) -> Motion:
 
 
 def _damped_oscillation(z: Any, speed: Any, fall: Any, rate: Any, damping: Any) -> Motion:
-    """Return the motion under z'' = -Ω² z - 2 ζ Ω z' - g, which oscillates about -g/Ω²."""
+    """Return the motion under z'' = -Ω² z - 2 ζ Ω z' - g, an oscillation about -g/Ω² that decays.
+
+    Args:
+        z: Height at time 0, m.
+        speed: Upward velocity z' at time 0, m/s.
+        fall: g, m/s².
+        rate: Ω, 1/s.
+        damping: ζ, at most 1.
+    """
     rest = -fall / rate**2
     first = z - rest
 
@@ -90,7 +98,10 @@ def _damped_oscillation(z: Any, speed: Any, fall: Any, rate: Any, damping: Any) 
 
 
 def _push(z: Any, speed: Any, rate: Any, damping: Any) -> Any:
-    """Return the upward push of the table per mass, before it is clipped at 0."""
+    """Return the upward push of the table per mass, -Ω² z - 2 ζ Ω z', before it is clipped at 0.
+
+    The arguments are those of `_damped_oscillation`.
+    """
     return -(rate**2) * z - 2 * damping * rate * speed
 
 
@@ -113,7 +124,10 @@ def _first_root(value: Callable[[Any], Any], scale: Any, longest: Any) -> Any | 
 
 
 def _end_of_loose(z: Any, speed: Any, fall: Any, rate: Any, damping: Any) -> Any:
-    """Return the time at which a ball that is inside the table and not pushed leaves the table or is pushed again."""
+    """Return when a ball that is inside the table and not pushed by it leaves the table or is pushed again.
+
+    The arguments are those of `_damped_oscillation`; the state is that at time 0.
+    """
     discriminant = speed**2 + 2 * fall * z
     leaves = (speed - mpmath.sqrt(discriminant)) / fall if discriminant >= 0 else None
     # along the parabola, Ω² z + 2 ζ Ω z' = 0 is a quadratic equation in t

@@ -148,7 +148,7 @@ class TableTennis(Data):
     def _read_flights(self, root: Path) -> tuple[list[Flight], int]:
         """Return the flights of all files, and the number of files that are left out.
 
-        Keep the names of the columns of the first file that are not read.
+        The names of the columns of the first file that are not read are stored in `_unread_columns`.
         """
         flights, left_out = [], 0
         unread: list[str] | None = None

@@ -16,9 +16,9 @@ COLUMNS = ("t", "x", "y", "z")
 TRUE_COLUMNS = ("true_x", "true_y", "true_z")
 SUFFIXES = (".csv", ".mat")
 TOLERANCE = 1e-4
-"""Largest difference of a position, metres, between two recordings of the same flight."""
+"""Largest difference of a coordinate, metres, up to which two recordings can be of the same flight."""
 COMPARED = 8
-"""Number of frames, from the first one, that two recordings of the same flight have in common."""
+"""Number of first frames that are compared to decide whether two recordings are of the same flight."""
 LARGEST_STEP = 1.0
 """Largest step between frames, seconds, that data.step allows."""
 TimesIn = Literal["seconds", "milliseconds", "microseconds"]
@@ -186,7 +186,13 @@ def _check(
 
 
 def _rate_remedy(usual: float, step: float, times_in: TimesIn) -> str:
-    """Return the remedy for frames that are `usual` seconds apart, if their times are in `times_in`."""
+    """Return the advice for a flight whose frames have another rate than `step`.
+
+    Args:
+        usual: Median time between two frames, s, if the times in the file are in `times_in`.
+        step: Configured seconds between two frames.
+        times_in: Configured unit of the times.
+    """
     for unit, seconds in SECONDS.items():
         if unit != times_in and 0.6 < usual / SECONDS[times_in] * seconds / step < 1.6:
             return f"Set data.times_in={unit}."

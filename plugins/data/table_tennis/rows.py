@@ -24,7 +24,7 @@ def write_csv(file: Path, rows: np.ndarray) -> Path:
 
 
 def write_csv_folder(folder: Path) -> Mapping[str, str]:
-    """Write eight flights as CSV, and a shorter recording of one of them."""
+    """Write eight flights as CSV and a shorter recording of one of them; return the settings that name the folder."""
     for number in range(8):
         write_csv(folder / f"{number}.csv", table(number))
     write_csv(folder / "again.csv", table(3)[:30])
@@ -32,7 +32,10 @@ def write_csv_folder(folder: Path) -> Mapping[str, str]:
 
 
 def write_matlab(folder: Path) -> Mapping[str, str]:
-    """Write one file in each of the laboratory's two layouts, with two flights in both files."""
+    """Write one file in each of the laboratory's two layouts, and return the settings that name their folder.
+
+    Two of the flights are in both files.
+    """
     cells, times, balls = (np.empty(count, object) for count in (6, 4, 4))
     for number in range(6):
         cells[number] = table(number, 36)

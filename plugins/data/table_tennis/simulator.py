@@ -21,9 +21,9 @@ from plugins.data.table_tennis.solvers import SolverGaveUp, flight
 
 VERSION = "1"
 LONGEST = 1.15
-"""Largest duration of a flight, seconds; it ends when the ball is past the robot or well below the table."""
+"""Largest duration of a flight, seconds; a flight ends earlier when the ball passes one of the limits below."""
 PAST, BELOW = 0.4, 0.25
-"""Limits at which a flight ends: y, m, and depth below the table, m."""
+"""Position y, m, and depth below the table, m, beyond which a flight ends."""
 MEAN = (0.6, -4.1, -0.62, -0.4, 6.0, 1.6, 0.0, 0.0, 0.0)
 SPREAD = (0.2, 0.08, 0.05, 0.4, 0.5, 0.25, 40.0, 40.0, 40.0)
 """Standard deviations of the normally distributed state at the start, with mean `MEAN`: m, m/s, rad/s.

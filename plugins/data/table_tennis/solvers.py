@@ -91,7 +91,10 @@ def flight(
 
 
 class _Walk:
-    """Integration of one flight over its phases, with its results and its counts of steps and evaluations."""
+    """Integration of one flight over its phases.
+
+    It holds the states, the times of the contacts, and the numbers of steps and evaluations so far.
+    """
 
     def __init__(
         self,
@@ -217,9 +220,16 @@ class _Walk:
         self, dense: Callable[..., NDArray[np.float64]], event: Callable[..., float], start: float, end: float,
         armed: bool,
     ) -> float | None:  # fmt: skip
-        """Return the time at which the event falls through 0 within a step, searched in eight intervals; None if never.
+        """Return the time at which the event falls through 0 within a step of the solver; None if it does not.
 
-        `armed` says whether the event was above 0 earlier in this phase.
+        Only a fall from above 0 counts. The step is divided into eight intervals, each of which is searched.
+
+        Args:
+            dense: function from time to state within the step.
+            event: function of the state, from `_event`.
+            start: start of the step, s.
+            end: end of the step, s.
+            armed: whether the event was above 0 earlier in this phase.
         """
         times = np.linspace(start, end, 9)
         values = [event(dense(time)) for time in times]

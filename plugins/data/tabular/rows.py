@@ -9,7 +9,7 @@ LABELS = ("cat", "dog", "emu")
 
 
 def write(folder: Path, rows: int = 40) -> Mapping[str, str]:
-    """Write a table with a number, its square, a group, and three columns for the target."""
+    """Write a table with a number, its square, a group and three targets; return the settings that name the table."""
     lines = ["number,square,group,class,real,angle"]
     for row in range(rows):
         lines.append(f"{row},{row * row},{'ab'[row % 2]},{LABELS[row % 3]},{row / 2 - 3},{20 * row - 360}")

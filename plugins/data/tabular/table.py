@@ -42,7 +42,7 @@ MANY_LABELS = 20
 
 
 class Question(NamedTuple):
-    """Settings that determine how a table is read; their names are those of the configuration."""
+    """Settings that determine how a table is read; their names and meanings are those of `Tabular`'s arguments."""
 
     target: tuple[str, ...]
     kind: Kind
@@ -307,7 +307,7 @@ def _choose_inputs(cells: Columns, question: Question) -> ColumnChoice:
 
 
 def _choose(cells: Columns, question: Question, columns: tuple[str, ...]) -> ColumnChoice:
-    """Return these columns as the choice, with all columns that are not read as left out."""
+    """Return the choice of `columns` as input, with the reasons why all columns that are not read are left out."""
     known = (*columns, *question.target, SPLIT, GROUP)
     unread = [name for name in cells.cells if name not in known]
     left_out = dict(cells.left_out) | dict.fromkeys(unread, "not among the columns to read")
@@ -315,9 +315,9 @@ def _choose(cells: Columns, question: Question, columns: tuple[str, ...]) -> Col
 
 
 def _targets(cells: Columns, question: Question, skip_remedy: str | None) -> tuple[np.ndarray, np.ndarray]:
-    """Return the unconverted targets, and a mask (row,) of the rows without a target.
+    """Return the targets as they are in the table, and a mask (row,) of the rows without a target.
 
-    The targets are numbers (row, name) or labels (row,).
+    Targets are labels (row,) if the kind is "class", and otherwise numbers (row, name) in the unit of the table.
 
     Args:
         cells: The table.
@@ -348,10 +348,10 @@ def _targets(cells: Columns, question: Question, skip_remedy: str | None) -> tup
 
 
 def _check_unit(cells: Columns, question: Question, values: np.ndarray, *, small_angles: bool) -> None:
-    """Refuse angles that look like the other unit.
+    """Refuse angles that seem to be in another unit than the configured one, degrees or radians.
 
     Raises:
-        DataError: The angles look like the other unit; the message names the setting to change.
+        DataError: The angles seem to be in the other unit; the message names the setting to change.
     """
     if question.kind not in ("degrees", "radians"):
         return
@@ -386,7 +386,7 @@ def _groups(file: Path, cells: Columns, rows: np.ndarray) -> tuple[tuple[str, ..
 
 
 def _splits(cells: Columns, rows: np.ndarray, question: Question) -> Int[np.ndarray, "row"]:
-    """Return the index into SPLITS of each row.
+    """Return the split of each row, as an index into SPLITS.
 
     The column `split` determines the split. Without that column the rows are divided at random.
     """
