@@ -6,7 +6,7 @@ line ends of all systems are read. Polygons are cut into fans of triangles (corr
 """
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -93,12 +93,14 @@ def line_numbers(
 
 def _lines(content: bytes, comment: bytes | None, names: Sequence[bytes]) -> list[bytes]:
     content = text.remove_byte_order_mark(content).replace(b"\r\n", b"\n").replace(b"\r", b"\n")
-    if comment is not None and comment in content:
-        cut = rb"(?:(?<![\d.])%b|%b(?!\w))[^\n]*" % (2 * (re.escape(comment),))
-        if names:  # a whole line with a name is found first, and stays
-            cut = rb"^([ \t]*(?:" + b"|".join(map(re.escape, names)) + rb")[ \t][^\n]*)|" + cut
-        content = re.sub(cut, rb"\1" if names else b"", content, flags=re.MULTILINE)
-    return content.split(b"\n")
+    lines = content.split(b"\n")
+    if comment is None or comment not in content:
+        return lines
+    cut = rb"(?:(?<![\d.])%b|%b(?!\w)).*" % (2 * (re.escape(comment),))
+    if names:  # a whole line with a name is found first, and stays
+        cut = rb"^([ \t]*(?:" + b"|".join(map(re.escape, names)) + rb")[ \t].*)|" + cut
+    remove, kept = re.compile(cut).sub, rb"\1" if names else b""
+    return [remove(kept, line) if comment in line else line for line in lines]
 
 
 def numbers(lines: Sequence[bytes], dtype: type = np.float64, place: Place | None = None) -> NDArray:
@@ -253,16 +255,35 @@ def join_continued_lines(content: bytes) -> bytes:
     return b"\n".join([*lines, b" ".join(begun)] if begun else lines)
 
 
+def statements(content: bytes, names: Sequence[bytes] = ()) -> Iterator[tuple[bytes, bytes]]:
+    """Yield the first word and the rest of each line of an OBJ or MTL file; `names` as of `text_lines`."""
+    for line in text_lines(content, names=names):
+        key, *rest = line.split(None, 1)
+        yield key, rest[0].rstrip() if rest else b""
+
+
+def from_zero(
+    numbers: Int[np.ndarray, "corners"], before: Sequence[int], counts: Int[np.ndarray, "polygons"]
+) -> Int[np.ndarray, "corners"]:
+    """Return row indices (from 0) for the numbers by which the faces of an OBJ file name rows.
+
+    Args:
+        numbers: from 1, or from -1 backwards; 0 becomes -1.
+        before: number of rows above each face in the file.
+        counts: number of corners of each face.
+    """
+    return np.where(numbers < 0, numbers + np.repeat(np.array(before, np.int64), counts), numbers - 1)
+
+
 def obj(content: bytes) -> Parsed:
     """Parse Wavefront OBJ: vertices (with colours after the coordinates, if all have them) and faces of all objects."""
     joined = join_continued_lines(content)
     points, faces, before = [], [], []
-    for line in text_lines(joined):
-        key, *rest = line.split(None, 1)
+    for key, rest in statements(joined):
         if key == b"v":
-            points += rest or [b""]
+            points.append(rest)
         elif key == b"f":
-            faces += rest or [b""]
+            faces.append(rest)
             before.append(len(points))
     values = rows(points, "vertex", place=line_numbers(joined, key=b"v"))
     if values.size and values.shape[1] not in (3, 4, 6, 7):
@@ -278,7 +299,7 @@ def obj(content: bytes) -> Parsed:
     corners = numbers([b" ".join(line) for line in words], np.int64, line_numbers(joined, key=b"f"))
     if (corners == 0).any():
         raise ValueError("a face names vertex 0; expected numbers from 1, or from -1 backwards")
-    corners = np.where(corners > 0, corners - 1, corners + np.repeat(np.array(before, np.int64), counts))
+    corners = from_zero(corners, before, counts)
     vertices, colours = values[:, :3].reshape(-1, 3), values[:, -3:]
     shape = fans(counts, corners)
     return Parsed(vertices, shape, COLOURS, colours) if values.shape[1] in (6, 7) else Parsed(vertices, shape)

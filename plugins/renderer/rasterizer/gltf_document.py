@@ -2,6 +2,7 @@
 
 The file may be damaged or malicious: all its numbers are checked against bounds, and the size of every array is limited
 by the size of the file.
+Why not trimesh: it bounds neither memory nor time; a crafted file of 2 kB asks for 11 GiB (5.2.0; see README.md).
 """
 
 import base64
@@ -146,14 +147,14 @@ class Document:
     def _elements(
         self, buffer_view: Any, described: dict[str, Any], count: int, width: int, kind: np.dtype
     ) -> NDArray:
-        content, stride = self.buffer_view(buffer_view)
-        description, size = whole_number(described.get("byteOffset", 0)), width * kind.itemsize
+        data, stride = self.buffer_view(buffer_view)
+        offset, size = whole_number(described.get("byteOffset", 0)), width * kind.itemsize
         stride = stride or size
-        if stride < size or (count and description + (count - 1) * stride + size > len(content)):
+        if stride < size or (count and offset + (count - 1) * stride + size > len(data)):
             raise ValueError(
-                f"{count} elements are declared, but there are only {len(content)} bytes; the file is cut short"
+                f"{count} elements are declared, but there are only {len(data)} bytes; the file is cut short"
             )
-        return np.ndarray((count, width), kind, content, description, (stride, kind.itemsize))
+        return np.ndarray((count, width), kind, data, offset, (stride, kind.itemsize))
 
     def check_size(self, needed: int) -> None:
         """Check that reading a part takes no more bytes than is plausible for a file of this size.
@@ -172,14 +173,13 @@ def open_document(file: Path) -> Document:
     content = read_bytes(file)
     size, binary = len(content), None
     if content[:4] == b"glTF":
-        description, binary = _split_chunks(content)
-        content = description
+        content, binary = _split_chunks(content)
     elif file.suffix.lower() == ".glb":
         raise ValueError("the file does not begin with the bytes glTF")
-    described = json.loads(content)
-    if not isinstance(described, dict):
-        raise ValueError(f"the description is a {type(described).__name__}, expected an object")
-    return Document(described, file.parent, binary, size)
+    description = json.loads(content)
+    if not isinstance(description, dict):
+        raise ValueError(f"the description is a {type(description).__name__}, expected an object")
+    return Document(description, file.parent, binary, size)
 
 
 def _split_chunks(content: bytes) -> tuple[bytes, bytes | None]:
@@ -188,8 +188,7 @@ def _split_chunks(content: bytes) -> tuple[bytes, bytes | None]:
     if version != 2 or length > len(content):
         raise ValueError(
             f"the header declares version {version} and {length} bytes, and the file has {len(content)} bytes; "
-            "version 2 and "
-            "the complete file are required"
+            "version 2 and the complete file are required"
         )
     chunks: dict[bytes, bytes] = {}
     offset = 12

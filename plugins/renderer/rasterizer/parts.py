@@ -18,6 +18,7 @@ from framework.geometry.camera import look_from
 from framework.geometry.srgb import linear_from_bytes
 from framework.renderer import Scene, Texture, Wrap, join_scenes
 from framework.storage.limits import FEW_TEXELS, MOST_TEXELS, TEXELS_PER_BYTE
+from framework.storage.reading import read_bytes, translate_errors
 
 Axis = Literal["y", "z"]
 GREY = 0.55
@@ -25,6 +26,8 @@ GREY = 0.55
 FARTHEST = 1e30
 """Largest coordinate for which float32 can hold the depth."""
 PLACEHOLDER_CAMERA = look_from(0.0, 0.0, 0.0, 1.0, 1.0, (1, 1))
+NO_COORDINATES = "a part with a texture has no texture coordinates, so the texture is left out."
+"""Note about a texture that cannot be placed."""
 EDGE = 1e-4
 """Largest distance of uv beyond a texture's edge that counts as rounding error and needs no wrap rule."""
 
@@ -158,6 +161,18 @@ class TextureDecoder:
     def find(self, key: object) -> Float[Tensor, "height width 3"] | None:
         """Return the texture that was decoded under this key; None if there is no such texture."""
         return self._decoded.get(key)
+
+    def read(self, file: Path) -> Float[Tensor, "height width 3"]:
+        """Decode an image file as `decode` does, if `file` was not read before.
+
+        Raises:
+            DataError: the file cannot be read, is not an image, or the image is too large.
+        """
+        if file not in self._decoded:
+            with translate_errors(file, "a texture"):
+                content = read_bytes(file)
+            self.decode(file, content, str(file))
+        return self._decoded[file]
 
     def decode(self, key: object, content: bytes, name: str) -> Float[Tensor, "height width 3"]:
         """Decode an image file to linear RGB, rows from top to bottom; transparency is ignored.

@@ -1,4 +1,7 @@
-"""Reader of scene files: surfaces, colours and textures."""
+"""Reader of scene files: surfaces, colours and textures.
+
+README.md says why trimesh does not read them ("Why not trimesh").
+"""
 
 import re
 from os import fsdecode
@@ -79,6 +82,5 @@ def _add_texture(file: Path, mesh: meshes.Mesh, part: Part, notes: list[str]) ->
     texture = find_beside(file.parent, name, "texture is", notes)
     if texture is None:
         return part
-    with translate_errors(texture, "a texture"):
-        image = TextureDecoder().decode(name, read_bytes(texture), str(texture))
+    image = TextureDecoder().read(texture)
     return Part(part.vertices, part.faces, part.colors, image, mesh.attribute(uv_names))
