@@ -39,9 +39,9 @@ BITS_PER_SAMPLE, PHOTOMETRIC = 258, 262
 MODES = {1: "L", 3: "RGB", 4: "RGBA"}
 """Pillow's names of decoded images, by number of channels."""
 STRIP = 256
-"""Number of pixel rows that are converted at a time."""
+"""Number of pixel rows of an image that are converted at a time."""
 IN_MEMORY = 2 * 2**30
-"""Size of a data set of crops, in bytes, up to which the crops are kept in memory."""
+"""Largest size, in bytes, of all decoded crops of a data set with which the crops are kept in memory."""
 
 Box = tuple[float, float, float, float]
 """Left, top, right and bottom in pixels, measured from the outer corner: (0, 0, width, height) is the whole image."""
@@ -54,7 +54,7 @@ class Crop:
     Attributes:
         file: path of the image.
         box: part of the image on which the square is centred; None: the whole image.
-        margin: border added on each side, as a share of the box's longer side.
+        margin: border that is added on each side of the square, divided by the box's longer side.
         side: side of the resulting square, pixels.
         channels: 3 for colour, 1 for grey.
         upright: apply the EXIF orientation, as photo viewers do.
@@ -144,7 +144,7 @@ def open_stream(stream: BinaryIO | BytesIO) -> Iterator[Image.Image]:
 class PixelLimit:
     """Limit on the number of decoded pixels that all threads together keep in memory.
 
-    One thread may exceed the limit while no other thread keeps any.
+    A thread may exceed the limit if no other thread keeps pixels, so that every image can be decoded.
 
     Args:
         most: largest number of pixels.
@@ -156,7 +156,7 @@ class PixelLimit:
 
     @contextmanager
     def reserve(self, pixels: int) -> Iterator[None]:
-        """Wait until this many pixels are within the limit, and count them inside the `with` block."""
+        """Wait until `pixels` more pixels do not exceed the limit; they count as kept inside the `with` block."""
         with self.changed:
             self.changed.wait_for(lambda: not self.reserved or self.reserved + pixels <= self.most)
             self.reserved += pixels
@@ -181,7 +181,7 @@ def decode(image: Image.Image, channels: int, *, upright: bool) -> Image.Image:
 
     Args:
         image: an opened image.
-        channels: 1 for grey, 3 for RGB, 4 for RGB with alpha. Without alpha, transparent pixels become white.
+        channels: 1 for grey, 3 for RGB, 4 for RGB with alpha. For 1 and 3, transparent pixels become white.
         upright: apply the EXIF orientation.
 
     Raises:
@@ -234,11 +234,11 @@ def has_alpha(image: Image.Image) -> bool:
 
 
 class _Encoding(NamedTuple):
-    """Meaning of the stored pixel values, which must be read before the pixels are loaded.
+    """Meaning of an image's stored pixel values; it must be read from the header before the pixels are loaded.
 
     Attributes:
-        black: value of black, if a value has more than eight bits.
-        white: value of white, if a value has more than eight bits.
+        black: value of black in an image with more than eight bits per value.
+        white: value of white in an image with more than eight bits per value.
         key: transparent colour, as a value of decoded pixels; None if no colour is transparent.
     """
 
@@ -275,7 +275,7 @@ def _read_encoding(image: Image.Image) -> _Encoding:
 
 
 def _eight_bit(strip: Image.Image, stored: _Encoding) -> Image.Image:
-    """Return a strip in one of the modes that Pillow converts to grey, RGB and RGBA."""
+    """Return a strip of an image with eight bits per channel, in a mode that Pillow converts to grey, RGB and RGBA."""
     if strip.mode.startswith("I"):
         numbers, most = np.asarray(strip).astype(np.int64), max(stored.black, stored.white)
         if numbers.size and not (numbers.min() >= 0 and numbers.max() <= most):
@@ -297,8 +297,9 @@ def _eight_bit(strip: Image.Image, stored: _Encoding) -> Image.Image:
 def cut_square(image: Image.Image, box: Box, margin: float, side: int) -> NDArray[np.uint8] | None:
     """Crop the square around a box and scale it; None if the box is empty.
 
-    The result has the shape (channels, side, side) and is low-pass filtered. The box is first clipped to the image.
-    Where the square reaches beyond the image, border pixels are repeated.
+    The returned array has the shape (channels, side, side). The box is first clipped to the image. The square is
+    centred at the clipped box; its side is the longer side of this box times 1 + 2 `margin`. Where the square extends
+    beyond the image, border pixels are repeated. The image is low-pass filtered when it is scaled down.
     """
     inner = clip_box(box, image.size)
     if inner is None:
@@ -325,7 +326,7 @@ def cut_square(image: Image.Image, box: Box, margin: float, side: int) -> NDArra
 
 
 def _pad(image: Image.Image, left: int, top: int, size: tuple[int, int]) -> Image.Image:
-    """Return an image of (width, height) `size` with this image at (left, top); its border pixels are repeated."""
+    """Return an image of (width, height) `size` with `image` at (left, top), whose border pixels are repeated."""
     width, height = size
     right, bottom = left + image.width, top + image.height
     result = Image.new(image.mode, size)
@@ -416,7 +417,7 @@ def load_splits(
     Args:
         crops: crops of each split, by the split's name.
         fields: further fields of each split, by the split's name.
-        faults: errors of samples whose labels could not be read.
+        faults: errors of further samples, which have no crop because their labels could not be read.
         skip_unreadable: leave out samples that cannot be read.
         generated_in: the cache folder of generated images; None: the images are the user's.
 
@@ -440,7 +441,7 @@ def load_splits(
 
 
 def angle_fields(angles: Sequence[Sequence[float]], names: Sequence[str]) -> dict[str, Tensor]:
-    """Return the fields "target" (radians in [-π, π), one column per name) and "group" (0) of the samples."""
+    """Return the fields "target" (radians in [-π, π), one column per name) and "group" (0 for every sample)."""
     wrapped = [[(angle + math.pi) % (2 * math.pi) - math.pi for angle in row] for row in angles]
     return {
         "target": torch.tensor(wrapped, dtype=torch.float32).reshape(len(angles), len(names)),
@@ -476,7 +477,7 @@ def fault_message(faults: Sequence[DataError], total: int, remedy: str) -> str:
 
 
 def list_lines(items: Sequence[object]) -> str:
-    """Return a text with at most ten of the items, each on its own line, and the number of the remaining ones."""
+    """Return a text with at most ten items, each on its own line, and the number of the items that are left out."""
     lines = [str(item) for item in items[:10]]
     if len(items) > 10:
         lines.append(f"and {len(items) - 10} more")
@@ -503,7 +504,7 @@ def vary(batch: Batch, signs: Sequence[float], jitter: float) -> Batch:
 def augment(
     images: Shaped[Tensor, "batch channels height width"], mirrored: Bool[Tensor, "batch"], jitter: float
 ) -> Float[Tensor, "batch channels height width"]:
-    """Vary images at random; return values in 0…1 on the images' device.
+    """Mirror, shift, scale and recolour images at random; return values in 0…1 on the images' device.
 
     Images for which `mirrored` is True are reflected left to right. Every image is shifted and scaled by up to `jitter`
     of its side (linear interpolation, border pixels repeated). Its brightness changes by up to `jitter`, and its
@@ -528,14 +529,17 @@ def augment(
 
 
 def _positions(length: int, scale: Tensor, shift: Tensor) -> Float[Tensor, "batch length"]:
-    """Return the source position of each of `length` pixels: scaled about the middle, shifted, clamped to the image."""
+    """Return for each of `length` pixels along an axis the position in the source image from which it is read.
+
+    Positions are scaled about the middle, shifted by `shift` pixels, and clamped to the image.
+    """
     middle = (length - 1) / 2
     offset = torch.arange(length, dtype=torch.float32) - middle
     return (middle + shift[:, None] + scale[:, None] * offset).clamp(0, length - 1)
 
 
 def _interpolate_rows(images: Tensor, rows: Float[Tensor, "batch height"]) -> Tensor:
-    """Return images, float32, whose rows are interpolated linearly at the fractional positions `rows`."""
+    """Return float32 images whose rows are interpolated linearly from `images` at the positions `rows`, in pixels."""
     batch, channels, height, width = images.shape
     lines = images.reshape(-1, width)
     plane = height * torch.arange(batch * channels, device=images.device).view(batch, channels, 1)
@@ -553,8 +557,8 @@ def blur(
 ) -> Shaped[Tensor, "*batch height width"]:
     """Convolve images with a Gaussian of standard deviation `deviation` pixels; 0 returns the images themselves.
 
-    The kernel ends at four deviations and sums to 1. Beyond the border the image is mirrored about its edge (d c b a |
-    a b c d | d c b a). The result has the images' type; integers are rounded.
+    The kernel is cut off at four times `deviation` and sums to 1. Beyond the border the image is mirrored about its
+    edge (d c b a | a b c d | d c b a). The result has the images' type; integers are rounded.
     """
     if deviation == 0:
         return images
