@@ -1,1 +1,1 @@
-"""Code that data sets of several families share: fields, images, tables, generated files."""
+"""Code that several data sets share: data in memory, images, tables, MATLAB files, folders of scans."""

@@ -33,18 +33,18 @@ MISSING = frozenset(
     | {".", "-", "--", "\N{EN DASH}", "\N{EM DASH}", "1.#ind", "-1.#ind", "1.#qnan", "-1.#qnan"}
     | {"#div/0!", "#value!", "#num!", "#ref!", "#name?", "#null!"}
 )  # fmt: skip
-"""Cells without a number or label, in small letters, as pandas, R and spreadsheets write them."""
+"""Words, in small letters, that pandas, R and spreadsheets write into a cell without a number or label."""
 BOOLEANS = {"true": 1.0, "false": 0.0}
-"""Numbers that the words TRUE and FALSE are read as."""
+"""Numbers as which the words TRUE and FALSE (in small letters) are read."""
 ENOUGH_ROWS = 20
-"""Number of rows above which a table is checked for row numbers and for radians."""
+"""Number of rows that a table must exceed to be searched for columns of row numbers and of radians."""
 INDEX = re.compile(
     r"unnamed: \d+(_level_\d+)?|index|level_\d+|row|rows?[ _.]?(number|name|id|index)s?|rownum|id|idx", re.I
 )
 """Names that pandas, R and databases give to a column that numbers the rows."""
 
 MOST_LOOKED_AT = 2000
-"""Number of cells of a column of words, evenly spaced, that are checked for numbers in another notation."""
+"""Largest number of cells, evenly spaced in a column of words, that are checked for numbers in another notation."""
 MOST_LISTED = 12
 """Largest number of columns that a sentence lists."""
 Separator = Literal["comma", "semicolon", "tab", "bar", "space", ",", ";", "\t", "|", " "]
@@ -63,9 +63,10 @@ class Writing:
     """Settings for the notation of a user's table.
 
     Attributes:
-        separator: the sign between cells; None takes the comma, semicolon, tab or bar that the first line contains.
+        separator: the sign between cells; None: the comma, semicolon, tab or bar that separates the names in the first
+            line.
         decimal: the decimal sign.
-        thousands: the sign between groups of three digits; None: no sign.
+        thousands: the sign between groups of three digits, as in 1,234,567; None: no sign.
         units: units that may stand beside the numbers of a column ("%", "$", "kg"). They are removed: 5% becomes 5.
     """
 
@@ -102,11 +103,11 @@ class Writing:
         return self.sign == "." and self.thousands is None and not self.units
 
     def standard(self, cell: str) -> str:
-        """Return the number in a cell as text that `float` reads; a cell that holds no number is not such text."""
+        """Return the number in a cell as a text that `float` reads; without a number, a text that `float` refuses."""
         return self._plain_notation(self.split_unit(cell)[0])
 
     def split_unit(self, cell: str) -> tuple[str, str]:
-        """Return a cell without its unit, and the unit, "" if the cell has none."""
+        """Return a cell without its unit, and the unit; the unit is "" if the cell has none."""
         cell = text.trim(cell).translate(text.MINUS)
         for unit in sorted(self.units or (), key=len, reverse=True):
             sign = cell[:1] if cell[:1] in ("+", "-") else ""
@@ -117,7 +118,7 @@ class Writing:
         return cell, ""
 
     def _plain_notation(self, cell: str) -> str:
-        """Return a number with a decimal point and without signs between groups of digits.
+        """Return the number in a cell, rewritten with a decimal point and without signs between groups of digits.
 
         A cell with digits that does not fit the notation gets a leading "_", so that it is not read as a number.
         """
@@ -163,7 +164,7 @@ class Columns:
         file: the file of the table.
         cells: cells by column name, without surrounding blanks.
         lines: for each row, the number of the line on which it ends.
-        writing: notation of the table; None: decimal points and no units, which no setting can change.
+        writing: notation of the table; None: the table has decimal points and no units, and no setting changes this.
         left_out: columns without a name that were left out, with the reason.
     """
 
@@ -181,8 +182,8 @@ class Columns:
     def notation_of(self, name: str) -> Writing:
         """Return the notation of one column.
 
-        In a table with decimal commas, a column may have decimal points. This is assumed if it contains no comma, and
-        points that do not group digits.
+        In a table with decimal commas, a column may have decimal points. This is assumed if the column contains no
+        comma, and contains points of which at least one cannot separate groups of three digits.
         """
         notation = self.notation
         if notation.sign != ",":
@@ -201,7 +202,7 @@ class ColumnChoice(NamedTuple):
     Attributes:
         names: names of the chosen columns.
         left_out: reason why each other column is left out, by name.
-        odd: remark about a chosen column that may not be meant as a number, by name.
+        odd: remark about each chosen column that may not be meant as a number, by name.
     """
 
     names: tuple[str, ...]
@@ -262,7 +263,7 @@ def _with_first(first: str, lines: io.TextIOWrapper) -> Iterator[str]:
 
 
 def _separator(first: str) -> str:
-    """Return the sign that separates the names of the first line; a comma if there is no such sign."""
+    """Return the sign that separates the names in the first line of a table; a comma if there is only one name."""
     outside = re.sub(r'"[^"]*"', "", first)
     counts = {sign: outside.count(sign) for sign in ",;\t|"}
     return "," if counts[","] or not any(counts.values()) else max(counts, key=counts.__getitem__)
@@ -390,7 +391,7 @@ def tables(
 
 
 def numeric_columns(columns: Columns, but: Collection[str], setting: str) -> ColumnChoice:
-    """Return the columns that hold numbers, or TRUE and FALSE, for a table whose columns the user did not name.
+    """Choose the columns that hold numbers, or TRUE and FALSE, in a table whose columns the user did not name.
 
     Args:
         columns: the table.
@@ -421,7 +422,7 @@ def numeric_columns(columns: Columns, but: Collection[str], setting: str) -> Col
 
 
 def _is_row_count(cells: Sequence[str]) -> bool:
-    """Return whether a column numbers the rows of a table that has more than ENOUGH_ROWS rows."""
+    """Return whether a column of more than ENOUGH_ROWS cells contains the row numbers, from 0 or from 1."""
     if len(cells) <= ENOUGH_ROWS or cells[0] not in ("0", "1"):
         return False
     start = int(cells[0])
@@ -473,7 +474,7 @@ def _why_no_numbers(columns: Columns, name: str, setting: str) -> str:
 
 
 def _other_reading(cell: str, writing: Writing) -> text.Suggestion | None:
-    """Return the number that a cell holds in another notation than the table's; None if it holds none."""
+    """Return how to read a cell that is a number in another notation than the table's; None for any other cell."""
     if not writing.plain and text.parse_number(cell) is not None:
         digits = cell.lstrip("+-")
         grouped = writing.sign == "," and re.fullmatch(GROUPED_BY_POINTS, digits)
@@ -484,7 +485,7 @@ def _other_reading(cell: str, writing: Writing) -> text.Suggestion | None:
 
 
 def remedy(mend: text.Suggestion, writing: Writing | None) -> str:
-    """Return advice for a number in another notation than the table's: settings that read it, or how to write it."""
+    """Return advice on a cell with a number in another notation: settings that read it, or how to write the number."""
     if writing is None or not mend.settings:
         return f"Write {mend.number}."
     ways = [
@@ -498,7 +499,7 @@ def remedy(mend: text.Suggestion, writing: Writing | None) -> str:
 
 
 def is_boolean(columns: Columns, name: str) -> bool:
-    """Return whether every cell of a column that is not missing is TRUE or FALSE, in large or small letters."""
+    """Return whether every filled cell of a column is TRUE or FALSE, in large or small letters."""
     cells, missing = columns.cells[name], columns.notation.missing
     first = next((cell for cell in cells if cell.lower() not in missing), "")
     return first.lower() in BOOLEANS and {cell.lower() for cell in cells} - missing <= BOOLEANS.keys()
@@ -562,7 +563,7 @@ def numbers(
 
 
 def _hint(cell: str, value: float | None, columns: Columns, missing: str | None) -> str:
-    """Return a further remedy for a cell without a finite number, with a leading space; "" if there is none."""
+    """Return a further remedy, with a leading space, for a cell without a finite number; "" if no other is known."""
     if value is not None:
         return f" Or {missing}." if math.isnan(value) and missing else ""
     mend = _other_reading(cell, columns.notation)
@@ -570,7 +571,7 @@ def _hint(cell: str, value: float | None, columns: Columns, missing: str | None)
 
 
 def _check_units(columns: Columns, name: str) -> None:
-    """Raise an error if some numbers of a column have another unit than the first number, or no unit."""
+    """Raise an error if not all numbers of a column have the same unit, or if only some of them have one."""
     notation = columns.notation
     if not notation.units:
         return
@@ -588,7 +589,7 @@ def _check_units(columns: Columns, name: str) -> None:
 
 
 def _all_finite(cells: Sequence[str], writing: Writing = PLAIN) -> Float[np.ndarray, "rows"] | None:
-    """Return the cells as `number` reads them, several times as fast; None if any cell is no finite number."""
+    """Return the same numbers as `number` for all cells, several times as fast; None if a cell is no finite number."""
     joined = "".join(cells)
     if "_" in joined:
         return None
@@ -623,7 +624,7 @@ def _check_header(file: Path, header: Sequence[str]) -> None:
 def _check_blanks(file: Path, header: Sequence[str], columns: Sequence[Sequence[str]]) -> None:
     """Raise an error if the cells of a table are separated by blanks.
 
-    Such a table is read as a single column, in which every cell holds equally many words.
+    Without another separator, such a table has a single column, in which every cell consists of equally many words.
     """
     words = len(header[0].split())
     if len(header) == 1 and words > 1 and all(len(cell.split()) == words for cell in columns[0]):

@@ -9,7 +9,9 @@ from framework.data import Batch
 
 
 class Fields(Dataset[dict[str, Tensor]]):
-    """Data set of named tensors with one common first dimension; `__getitems__` indexes each tensor once per batch.
+    """Data set of named tensors with one common first dimension, the sample.
+
+    `__getitems__` returns a batch by indexing each tensor once.
 
     Raises:
         ValueError: the tensors' lengths differ.
@@ -33,11 +35,11 @@ class Fields(Dataset[dict[str, Tensor]]):
 
 
 def fetch(dataset: Dataset[Batch], indices: Sequence[int]) -> Batch:
-    """Return the samples `indices` as a batch, as a loader does: with `__getitems__` if the dataset has that method."""
+    """Return the samples `indices` as a batch, read with `__getitems__` if the data set has it, or one by one."""
     at_once = getattr(dataset, "__getitems__", None)
     return as_batch(at_once(indices) if at_once else [dataset[index] for index in indices])
 
 
 def as_batch(items: Mapping[str, Tensor] | list[Batch]) -> Batch:
-    """Return samples as a batch: the result of `__getitems__` unchanged, or a list of single samples stacked."""
+    """Return `items` as a batch: a batch from `__getitems__` unchanged, or a list of single samples stacked."""
     return dict(items) if isinstance(items, Mapping) else default_collate(items)

@@ -30,7 +30,7 @@ CELL, STRUCT, CHAR, NUMERIC, OPAQUE = 1, 2, 4, range(6, 16), 17
 COMPLEX = 0x0800
 """Flag bit of an array of complex numbers."""
 NAME_WITHIN = 512
-"""Number of bytes at the beginning of a variable that hold its flags, at most 32 dimensions and its name."""
+"""Number of bytes at the beginning of a variable that suffice for its flags, at most 32 dimensions and its name."""
 
 
 def read_variables(file: Path, names: Sequence[str] | None = None, remedy: str = RESTORE) -> dict[str, Any]:
@@ -83,7 +83,7 @@ def parse_variables(content: bytes, names: Sequence[str] | None = None) -> dict[
 
 
 class _Head(NamedTuple):
-    """Header of an array, whose data begin at `position`."""
+    """Header of an array: class, whether its numbers are complex, dimensions, name, and position of its data."""
 
     kind: int
     complex: bool
@@ -201,7 +201,7 @@ class _Reader:
         return np.array([letters[row::rows] for row in range(rows)])
 
     def fields(self, content: bytes, position: int, limit: int) -> tuple[list[str], int]:
-        """Return the field names of a struct and the position of its values; stored names are padded to one length."""
+        """Return the field names of a struct, stored with padding to one length, and the position of its values."""
         lengths, position = self.numbers(content, position, limit)
         _, start, end = self.element(content, position, limit)
         length = int(lengths[0]) if len(lengths) == 1 else 0

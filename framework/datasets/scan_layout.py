@@ -42,12 +42,12 @@ NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 """Pattern of the names of subjects and views, which become file names."""
 PNG_END = b"IEND\xaeB`\x82"
 SLACK = 1e-4
-"""Largest difference of the entries of RRᵀ from those of the identity."""
+"""Largest difference between RRᵀ of a camera's rotation R and the identity, in any entry."""
 
 
 @dataclass(frozen=True)
 class View:
-    """One photograph of a subject: files and camera."""
+    """One photograph of a subject: the files of its image and mask, and its camera."""
 
     name: str
     image: Path
@@ -75,7 +75,7 @@ class Subject:
 
 @dataclass(frozen=True)
 class TexturePlaces:
-    """Texture coordinates of a topology's triangles in texture.png: u to the right, v upwards."""
+    """Texture coordinates in texture.png of the triangles of a topology; u points to the right, and v upwards."""
 
     faces: Int[np.ndarray, "faces 3"]
     uv: Float[np.ndarray, "places 2"]
@@ -83,20 +83,20 @@ class TexturePlaces:
 
 
 class SubjectFolder(ABC):
-    """Data set whose subjects lie in a folder of this layout."""
+    """Base of data sets whose subjects lie in a folder of the layout that this module describes."""
 
     @property
     @abstractmethod
     def place(self) -> Path:
-        """Return the folder, which need not exist.
+        """Return the path of the folder, which need not exist yet.
 
         Raises:
-            DataError: the folder is generated, and what it is generated from is not available.
+            DataError: the folder would be generated, but a file from which it is generated is not available.
         """
 
 
 class Photograph(NamedTuple):
-    """8-bit sRGB of the subject wherever the mask is above 0, and the share of each pixel that the subject covers."""
+    """8-bit sRGB pixels, valid where the mask is above 0, and the mask: the share of each pixel that is covered."""
 
     pixels: UInt8[np.ndarray, "height width 3"]
     mask: UInt8[np.ndarray, "height width"]
@@ -135,7 +135,7 @@ def read_splits(root: Path) -> dict[str, tuple[str, ...]]:
 
 
 def read_subject(root: Path, name: str, topology: str) -> Subject:
-    """Read one subject; of photographs and masks only size and end are checked.
+    """Read one subject; pixels are not read, but the size and the end of each photograph and mask are checked.
 
     Raises:
         DataError: a file is missing or damaged; the message names it.
@@ -183,7 +183,7 @@ def vertex_colors(mesh: meshes.Mesh) -> UInt8[np.ndarray, "vertices 3"]:
     """Return the 8-bit colours of a mesh.
 
     Raises:
-        DataError: the mesh has none.
+        DataError: the mesh has no colours.
     """
     if not set(COLOURS) <= set(mesh.columns):
         raise DataError(
@@ -266,7 +266,7 @@ def _checked_view(folder: Path, name: str, camera: Camera) -> View:
 
 
 def tail(file: Path) -> bytes:
-    """Return the last bytes of a PNG: the checksum of its pixels, and its end mark."""
+    """Return the last 20 bytes of a PNG file: the checksum of its pixels, and the mark of its end."""
     with open_regular(file) as stream:
         stream.seek(max(0, file.stat().st_size - 20))
         return stream.read()
