@@ -59,7 +59,10 @@ class Adversarial(Objective):
         return self.weight * losses.sum() / max(1, len(losses))  # without samples the penalty is 0
 
     def _direction(self, predictor: Predictor, inputs: Tensor, batch: Batch) -> Tensor:
-        """Return sign(∇ₓ[-log p(y | x)]), 0 where the loss is flat (eq. 2.20); parameters get no gradient from it."""
+        """Return sign(∇ₓ loss(x, y)) for the inputs x and the targets y of the batch (eq. 2.20).
+
+        It is 0 where the loss does not depend on x. No gradient flows to the predictor's parameters.
+        """
         leaf = inputs.detach().requires_grad_()
         with torch.enable_grad():
             # the gradient of the sum in one input is the gradient of this input's own loss

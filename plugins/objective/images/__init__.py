@@ -1,1 +1,1 @@
-"""Losses of predicted images other than the distance of their numbers: network features and discriminators."""
+"""Objectives for predicted images: squared error, distance of network features, and discriminators."""

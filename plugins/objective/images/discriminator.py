@@ -1,4 +1,4 @@
-"""Discriminators that judge overlapping patches of an image."""
+"""Discriminators that give a score to every patch of an image: near 1 for true images, near 0 for predicted ones."""
 
 from itertools import pairwise
 
@@ -29,7 +29,7 @@ class PatchDiscriminator(nn.Module):
         )
 
     def forward(self, images: Float[Tensor, "image 3 height width"]) -> list[Tensor]:
-        """Return the output of each layer; the last output is the judgement of each patch, near 1 for a true one."""
+        """Return the output of each layer; the last one is the score of each patch, trained to be 1 for true images."""
         outputs = []
         for number, layer in enumerate(self.layers):
             images = layer(images)

@@ -86,7 +86,10 @@ class PatchGAN(Objective):
         )
 
     def _mean(self, judged: list[Tensor], lead: tuple[int, ...]) -> Float[Tensor, "*lead"]:
-        """Return the mean over the patches of an image, then over the scales, of shape `lead`."""
+        """Return for each image the mean over its patches, and over the scales, of the numbers in `judged`.
+
+        `judged` has one tensor for each scale, (image, 1, height, width), and `lead` is the shape of the result.
+        """
         return torch.stack([outputs.mean((-3, -2, -1)) for outputs in judged]).mean(0).reshape(lead)
 
     def _matching(
@@ -96,7 +99,16 @@ class PatchGAN(Objective):
         lead: tuple[int, ...],
         of_true: tuple[int, ...],
     ) -> Float[Tensor, "*lead"]:
-        """Return the mean feature distance over all scales and all layers but the last (Wang et al. 2018, eq. 4)."""
+        """Return the mean L1 distance between the discriminators' features of predicted and of true images.
+
+        The mean is over all scales and all layers except the last (Wang et al. 2018, eq. 4).
+
+        Args:
+            false: outputs of the layers for predicted images, for each scale.
+            true: outputs of the layers for true images, for each scale.
+            lead: batch shape of the predicted images, (batch,) or (batch, member).
+            of_true: batch shape of the true images, which broadcasts to `lead`.
+        """
         distances = []
         for false_outputs, true_outputs in zip(false, true, strict=True):
             for ours, theirs in zip(false_outputs[:-1], true_outputs[:-1], strict=True):

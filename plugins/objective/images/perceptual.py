@@ -24,10 +24,12 @@ Cache = Annotated[int, Field(ge=0, le=2**20)]
 class FeatureDistance(Objective):
     """The mean L1 distance between features at several depths, with the largest weight for the deepest features.
 
-    It is Σ_l 2^(l - L) ‖φ_l(x) - φ_l(y)‖₁/n_l over the taps l = 1 … L (Wang et al. 2018, §3.4).
+    Taps are the layers of a network whose outputs are compared. The distance of a predicted image x and a true image y
+    is Σ_l 2^(l - L) ‖φ_l(x) - φ_l(y)‖₁/n_l over the taps l = 1 … L, where φ_l are the n_l features at tap l (Wang et
+    al. 2018, §3.4).
 
-    The features of true images are cached until the cache is full. They are found by a hash of the image's content, so
-    that the result is also right if an image changes between epochs.
+    The features of true images are cached until the cache is full. The key is a hash of the image's content, so that
+    the distance is correct even if the true image of a sample changes between epochs.
     """
 
     def __init__(self, weight: float, network: VGG, cache: int) -> None:

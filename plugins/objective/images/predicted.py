@@ -16,8 +16,8 @@ def predicted_images(
 ]:
     """Return the predicted images, which are the means of the densities, and the true images, both in sRGB.
 
-    The second dimension of the true images is 1 if all members read the same rows, and the number of members if each
-    member has its own rows.
+    For a predictor of several members, both have a second dimension for the member. In the true images its size is 1 if
+    all members read the same samples, and the number of members if each member reads its own samples.
 
     Raises:
         ConfigError: the target is not an image of red, green and blue.

@@ -16,7 +16,7 @@ KINKS = {"gradient": 0.05}
 
 
 def file_of(depth: Depth) -> str:
-    """Write random weights, named as torchvision names them, of the layers that are read, and return the file."""
+    """Write random weights with torchvision's names, of the layers that `read_vgg` reads; return the file's path."""
     generator, channels, state = torch.Generator().manual_seed(depth), 3, {}
     for block, _, index in layers_of(depth, TAPS[depth][-1]):
         width = WIDTHS[block]

@@ -67,12 +67,16 @@ class VGG(nn.Module):
 
     @property
     def least_side(self) -> int:
-        """Smallest side of an image, pixels, for which the last features exist."""
+        """Smallest side of an image, pixels, for which the features at the last tap exist."""
         return 2 ** self.taps[-1][0]
 
 
 def layers_of(depth: Depth, last: tuple[int, int]) -> list[tuple[int, int, int]]:
-    """Return (block, convolution in it, index in torchvision's `features`) of all convolutions up to the last tap."""
+    """Return all convolutions up to the last tap, in order, with their indices in torchvision's files.
+
+    Each is a triple: block, number of the convolution in the block, and index in torchvision's `features`. `last` is
+    the block and the number of the last tap.
+    """
     layers, index = [], 0
     for block, count in enumerate(CONVOLUTIONS[depth]):
         for place in range(count):

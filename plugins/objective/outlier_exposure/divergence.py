@@ -15,14 +15,20 @@ DRAWS = 16
 
 
 def from_uniform(density: Distribution) -> Float[Tensor, "*batch"]:
-    """Return KL(p ‖ u) = log K - H(p) over K classes, nats: the entropy of thesis eq. 2.21 up to a constant."""
+    """Return KL(p ‖ u) = log K - H(p) of a density p over K classes, nats; u is the uniform density.
+
+    This is the penalty of thesis eq. 2.21 plus a constant.
+    """
     log_prob = density.log_prob(density.enumerate_support())
     # p log p → 0 as p → 0; log p is clamped, because 0 × ∞ would be NaN where p rounds to 0
     return (log_prob.exp() * log_prob.clamp(min=-1e4)).sum(0) + math.log(len(log_prob))
 
 
 def to_uniform(density: Distribution) -> Float[Tensor, "*batch"]:
-    """Return KL(u ‖ p) = -Σ_k log p_k / K - log K over K classes, nats (Hendrycks et al. 2019, §4)."""
+    """Return KL(u ‖ p) = -Σ_k log p_k / K - log K of a density p over K classes, nats; u is the uniform density.
+
+    Source: Hendrycks et al. 2019, §4.
+    """
     log_prob = density.log_prob(density.enumerate_support())
     return -log_prob.mean(0) - math.log(len(log_prob))
 
@@ -30,11 +36,12 @@ def to_uniform(density: Distribution) -> Float[Tensor, "*batch"]:
 def to_ignorance(density: Distribution, scale: float) -> Float[Tensor, "*batch"]:
     """Return an unbiased estimate of KL(u ‖ p) = E_u[-log p] - H(u) of a continuous density, nats.
 
-    It is estimated from a few targets sampled from u, which is uniform for every angle and N(0, scale²) for every real.
-    If the density's support has ranges, the angles are those of a rotation, and u is uniform over rotations: sin e is
-    uniform for an elevation e in [-π/2, π/2]. The n targets are a Latin hypercube (McKay, Beckman & Conover 1979): each
-    n-th part of each number's probability holds exactly one. The estimate for one number therefore has an error of
-    O(n^-3/2) instead of O(n^-1/2). All members of a density with batch_shape (batch, member) get the same targets.
+    It is estimated from n = DRAWS targets sampled from u, which is uniform for every angle and N(0, scale²) for every
+    real number. If the density's support has ranges, the angles are those of a rotation, and u is uniform over
+    rotations: sin e is uniform for an elevation e in [-π/2, π/2]. The n targets are a Latin hypercube (McKay, Beckman &
+    Conover 1979): if the distribution of a number is divided into n parts of equal probability, each part holds one
+    target. The estimate for one number therefore has an error of O(n^-3/2) instead of O(n^-1/2). All members of a
+    density with batch_shape (batch, member) get the same targets.
     """
     support = density.support
     numbers = density.event_shape[0]
@@ -58,6 +65,9 @@ def to_ignorance(density: Distribution, scale: float) -> Float[Tensor, "*batch"]
 
 
 def latin_hypercube(shape: tuple[int, ...], device: torch.device) -> Float[Tensor, "draw *shape"]:
-    """Return DRAWS numbers in [0, 1) per element of `shape`, one in each DRAWS-th part, in random order; float64."""
+    """Return DRAWS random numbers in [0, 1) for each element of `shape`, float64, in random order.
+
+    [0, 1) is divided into DRAWS equal parts, and each part holds one of the numbers.
+    """
     order = torch.rand(DRAWS, *shape, dtype=torch.float64, device=device).argsort(0)
     return (order + torch.rand(DRAWS, *shape, dtype=torch.float64, device=device)) / DRAWS

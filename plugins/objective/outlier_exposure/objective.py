@@ -123,7 +123,10 @@ class OutlierExposure(Objective):
 def far_from(
     outliers: Float[Tensor, "outlier *input"], inputs: Tensor, clearance: float
 ) -> Bool[Tensor, "outlier"]:
-    """Return which outliers have at least the distance `clearance` from every input; uint8 is converted to 0…1."""
+    """Return for each outlier whether its Euclidean distance to every input is at least `clearance`.
+
+    Images of type uint8 are converted to 0…1 first.
+    """
     if len(inputs) == 0 or len(outliers) == 0:
         return torch.ones(len(outliers), dtype=torch.bool, device=outliers.device)
     outlier_rows, input_rows = (
@@ -134,7 +137,9 @@ def far_from(
 
 
 def uniform_range(low: float | None, high: float | None, *, other: bool) -> tuple[float, float]:
-    """Return (low, high), or a pair of NaN if `other`: if the outliers come from a data set.
+    """Return the range (low, high) of uniform random outliers, or (NaN, NaN) if the outliers come from a data set.
+
+    `other` says whether a data set of outliers is set.
 
     Raises:
         ConfigError: both sources of outliers are set, or none, or the range is empty.

@@ -1,4 +1,8 @@
-"""The density of one number on a line or circle: nodes that resolve it at any width, its level sets and their ends."""
+"""Level sets of the density of one number: their ends, their probabilities, and nodes that resolve peaks of any width.
+
+A level set holds all values whose log-density is at least a level. A hump is a region around a local maximum of the
+density. A cell is the interval between two neighbouring nodes.
+"""
 
 import math
 from dataclasses import dataclass
@@ -14,7 +18,7 @@ from framework.distributions.panels import first_in_cell, known_scales
 from framework.distributions.protocol import mode_candidates
 
 FOLD = 12
-"""Number of nodes per factor e of the distance from a peak; neighbouring nodes are 8 % of this distance apart."""
+"""Number of nodes per factor e of the distance from a peak: the distance grows by 8 % from node to node."""
 NEAREST, FARTHEST = 1e-11, 1e11
 """Smallest and largest distance of nodes from a peak, in the target's unit; the largest is π for angles."""
 TURN = 720
@@ -22,18 +26,18 @@ TURN = 720
 PEAKS, CANDIDATES = 8, 64
 """Number of peaks that get nodes of their own, and number of candidates among which they are chosen."""
 PARTED = 0.1
-"""Smallest depth, nats, of a valley that separates two humps."""
+"""Smallest depth, nats, of a valley that separates two humps; shallower ones count as part of one hump."""
 BISECTIONS = 52
-"""Number of halvings of a cell; the ends are then as exact as the dtype."""
+"""Number of halvings of the interval between two nodes; the ends of level sets are then as exact as the dtype."""
 
 
 @dataclass(frozen=True)
 class Ends:
-    """Parts of one number's range in which the density is above a level, by their ends.
+    """Intervals in which the log-density of one number is at least a level.
 
     Attributes:
-        length: total length of the parts of each item, (item,), float64.
-        intervals: (low, high) of the parts of each item, in ascending order.
+        length: total length of the intervals of each item, (item,), float64.
+        intervals: for each item, the ends (low, high) of its intervals, in ascending order.
     """
 
     length: Float[Tensor, "item"]
@@ -41,12 +45,14 @@ class Ends:
 
 
 class Line:
-    """The density of one number at nodes around its peaks, with distances of all orders of magnitude.
+    """The density p of one number, evaluated at nodes whose distances from its peaks have all orders of magnitude.
 
-    The nodes resolve a standard deviation of 1e-9 as well as one of 1e9. Between two nodes log p is linear.
+    The nodes resolve a standard deviation of 1e-9 as well as one of 1e9. Between two nodes, log p is taken to be
+    linear.
 
     Args:
-        density: event_shape (1,), of any batch_shape, whose items are numbered in order.
+        density: density of one real number or angle, event_shape (1,). It may have any batch_shape; the elements of the
+            flattened batch are the items.
     """
 
     def __init__(self, density: Distribution) -> None:
@@ -67,7 +73,7 @@ class Line:
         self._log_whole = self._log_less(torch.full_like(self.heights[0], math.inf))
 
     def at(self, places: Float[Tensor, "place item"]) -> Float[Tensor, "place item"]:
-        """Return log p, nats, float64."""
+        """Return log p at `places`, nats, float64."""
         return self.density.log_prob(places.to(self.dtype).unsqueeze(-1)).double()
 
     def score_of(self, level: Float[Tensor, "item"]) -> Float[Tensor, "item"]:
@@ -111,7 +117,10 @@ class Line:
         return high
 
     def ends(self, level: Float[Tensor, "item"]) -> Ends:
-        """Return the parts of each item with log p ≥ level; the length is NaN, without intervals, if log p is NaN."""
+        """Return the intervals of each item in which log p ≥ level.
+
+        If log p of an item is NaN, it has no intervals and the length NaN.
+        """
         inside = self.heights >= level
         start, stop = self.nodes, self.nodes.roll(-1, 0)
         following = inside.roll(-1, 0)
@@ -136,7 +145,15 @@ class Line:
     def _crossings(
         self, change: Bool[Tensor, "cell item"], start: Tensor, stop: Tensor, before: Tensor, level: Tensor
     ) -> list[tuple[list[float], list[bool]]]:
-        """Return the positions of each item where log p crosses the level, ascending, and whether it rises there."""
+        """Return for each item the positions at which log p crosses the level, ascending, and whether it rises there.
+
+        Args:
+            change: whether the level lies between the values of log p at the two ends of a cell.
+            start: lower end of each cell.
+            stop: upper end of each cell.
+            before: whether log p at the lower end is at least the level.
+            level: the level of each item.
+        """
         most = int(change.sum(0).amax()) if change.numel() else 0
         # the changed cells of each item first, in order
         order = change.to(torch.int8).sort(dim=0, descending=True, stable=True).indices[:most]
@@ -152,7 +169,14 @@ class Line:
     def _pair_ends(
         self, places: list[float], rising: list[bool], first: bool, last: bool
     ) -> list[tuple[float, float]]:
-        """Return the intervals of one item between its crossings; `first`, `last`: whether the end nodes are inside."""
+        """Return the intervals of one item in which log p is at least the level.
+
+        Args:
+            places: positions at which log p crosses the level, ascending.
+            rising: whether log p rises there.
+            first: whether log p is at least the level at the first node.
+            last: whether log p is at least the level at the last node.
+        """
         if not places:
             return [self.range] if first else []
         lows = [place for place, up in zip(places, rising, strict=True) if up]
@@ -193,7 +217,8 @@ class Line:
     def _peaks(self) -> Float[Tensor, "peak item"]:
         """Return the positions of the highest humps, at most PEAKS of each item.
 
-        A candidate belongs to a hump that was already chosen if no valley separates them.
+        They are chosen among the mode candidates, the highest first. A candidate that no valley (PARTED) separates from
+        a chosen one is on the same hump and is skipped.
         """
         places = self._candidates()  # (candidate, item), ascending; the last ones may repeat
         heights = self.at(places).nan_to_num(nan=-math.inf)
@@ -232,7 +257,10 @@ class Line:
     def _tops(
         self, places: Float[Tensor, "candidate item"], heights: Float[Tensor, "candidate item"]
     ) -> Bool[Tensor, "candidate item"]:
-        """Return which ascending candidates exceed both neighbours, or are separated by a valley from a higher one."""
+        """Return for each candidate whether it can be the highest of its hump.
+
+        It can if each neighbour is lower or is separated from it by a valley (PARTED). The candidates ascend.
+        """
         ahead = places.roll(-1, 0) - places
         ahead = wrap(ahead) if self.closed else ahead
         valley = self.at(places + ahead / 2)
@@ -260,8 +288,8 @@ class Line:
     def _log_less(self, level: Float[Tensor, "item"]) -> Float[Tensor, "item"]:
         """Return the log of the probability of all values whose log-density is below `level`, (item,).
 
-        The probability of a cell is ∫ exp(a + b x) dx over its part below the level, which is the cell's width times
-        (exp(c) - exp(low)) / (high - low) with c = min(level, high).
+        log p is linear in each cell and lies between `low` and `high`. So the probability of the part of the cell that
+        is below the level is the cell's width times (exp(c) - exp(low)) / (high - low) with c = min(level, high).
         """
         top = torch.minimum(level, self._high)
         rise, fall = top - self._low, self._high - self._low

@@ -20,7 +20,7 @@ Score = Literal["density", "mass"]
 FEW = 8
 """Number of values per item up to which computing their scores is faster than computing the level of the threshold."""
 DRAWS = 1000
-"""Number of samples of each density over several numbers; the ends of its sets cannot be computed."""
+"""Number of samples of each density over several numbers, from which scores and volumes of its sets are estimated."""
 WIDENED = (1.0, 2.0, 4.0, 8.0)
 """Factors by which a density over several reals is widened, so that samples cover its whole set.
 
@@ -90,7 +90,10 @@ class PredictionSet(Mixture, ValueSet):
 
     @torch.no_grad()
     def contains(self, value: Tensor) -> Bool[Tensor, "*shape"]:
-        """Return whether each value (*sample, *batch, *event) is in its item's set; no value is for a NaN density."""
+        """Return whether each value (*sample, *batch, *event) is in the set of its batch element.
+
+        No value is in the set of a density that is NaN.
+        """
         if self._holds_everything:
             return ~self.density.log_prob(value).isnan()
         several = value.numel() > FEW * self.batch_shape.numel()
@@ -100,11 +103,12 @@ class PredictionSet(Mixture, ValueSet):
 
     @torch.no_grad()
     def size(self) -> Float[Tensor, "*batch"]:
-        """Return the size of each set: the number of labels, the length of arcs (radians) or intervals, or the volume.
+        """Return the size of each set, float64.
 
-        The volume over several numbers is exact for a normal density, whose set is an ellipsoid, and otherwise an
-        estimate with a `size_error`. The result is float64, infinite if the set is unbounded, and NaN if the density
-        is NaN.
+        The size is the number of labels for classes, the total length of the arcs (radians) or intervals for one
+        number, and the volume for several numbers. The volume is exact for a normal density, whose set is an ellipsoid,
+        and otherwise an estimate with the standard error `size_error`. The size is infinite if the set is unbounded,
+        and NaN if the density is NaN.
         """
         if self._classes:
             return self.labels().sum(-1).double()
@@ -125,7 +129,7 @@ class PredictionSet(Mixture, ValueSet):
     @cached_property
     @torch.no_grad()
     def _volume(self) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
-        """Volume of a set of several numbers, and the standard error of the volume."""
+        """Volume of each set of several numbers, and its standard error, which is 0 for normal densities."""
         mode = self.density.mode
         if mahalanobis(self.density, mode) is not None:
             volume = self._ellipsoid(self.density.log_prob(mode).double())
@@ -187,7 +191,7 @@ class PredictionSet(Mixture, ValueSet):
         return log_draws[above - 1] + min(rank - above, 1.0) * (log_draws[above] - log_draws[above - 1])
 
     def empty(self) -> Bool[Tensor, "*batch"]:
-        """Return whether the set is empty."""
+        """Return for each set whether it is empty."""
         if self._classes:
             return ~self.labels().any(-1)
         if self._one_number:
@@ -195,7 +199,7 @@ class PredictionSet(Mixture, ValueSet):
         return ~(self.contains(self._draws).any(0) | self.contains(self.density.mode))
 
     def labels(self) -> Bool[Tensor, "*batch label"]:
-        """Return which classes are in the set.
+        """Return for each class whether it is in the set.
 
         Raises:
             UserError: the density is not over classes.
@@ -225,7 +229,7 @@ class PredictionSet(Mixture, ValueSet):
         return self._ends.intervals
 
     def parts(self) -> list[list[int]] | list[list[tuple[float, float]]] | None:
-        """Return the labels or the intervals of each set; None for sets of several numbers."""
+        """Return what each set contains: labels for classes, intervals for one number, None for several numbers."""
         if self._classes:
             labels = self.labels().reshape(-1, len(self._log_labels))
             return [row.nonzero().flatten().tolist() for row in labels]
@@ -245,7 +249,7 @@ class PredictionSet(Mixture, ValueSet):
 
     @property
     def _support_volume(self) -> float:
-        """Volume of the whole support."""
+        """Volume of the support of the density: the product of the ranges of its angles, or infinity for reals."""
         support = self.support
         if not isinstance(support, Circular):
             return math.inf
@@ -288,10 +292,14 @@ class PredictionSet(Mixture, ValueSet):
 
 
 def _label_scores(log_prob: Tensor, every: Float[Tensor, "label *batch"]) -> Tensor:
-    """Return the mass score -log(Σ_j p_j + (1 - u) p(y)), nats, where j ranges over the less probable labels.
+    """Return the mass score of labels y, nats: -log(Σ_j p_j + (1 - u) p(y)), with the sum over all j with p_j < p(y).
 
-    Romano, Sesia & Candès 2020 (eq. 5) sum over the more probable labels. That sum is 1 minus this one, and rounds to 1
-    where small differences matter.
+    u is the share u(x) of `PredictionSet`. Romano, Sesia & Candès 2020 (eq. 5) sum over the more probable labels
+    instead. Their sum is 1 minus this one, and rounds to 1 where small differences matter.
+
+    Args:
+        log_prob: log p(y) of the labels.
+        every: log-probabilities of all labels.
     """
     top = every.topk(min(2, len(every)), dim=0).values
     margin = top[0] - top[-1]
@@ -311,8 +319,8 @@ def _broadcast_labels(every: Tensor, values: Tensor) -> Tensor:
 def _share_scores(log_prob: Tensor, log_draws: Float[Tensor, "draw *batch"]) -> Tensor:
     """Return the mass score, nats: -log of the share of samples with a smaller log-density than `log_prob`.
 
-    The samples are in ascending order. Equal scores are rare, because the share is linear between two samples, and the
-    score is linear in log p below the first sample.
+    `log_draws` are the log-densities of the samples, ascending. The share is interpolated linearly between two samples,
+    and below the first sample the score is linear in log p, so that equal scores are rare.
     """
     edges = log_draws.movedim(0, -1).contiguous()
     lead = log_prob.shape[: log_prob.dim() - edges.dim() + 1]
@@ -336,5 +344,8 @@ def _(density: PredictionSet) -> PredictionSet:
 
 @marginal.register
 def _(density: PredictionSet, index: int) -> Distribution:
-    """Return the marginal without a set, since the coverage of all numbers together is not that of one number."""
+    """Return the marginal density of one number, without a prediction set.
+
+    The set has its coverage for all numbers together, which is not the coverage of one number.
+    """
     return density if tuple(density.event_shape) == (1,) and index == 0 else marginal(density.density, index)

@@ -21,9 +21,9 @@ from plugins.uncertainty.conformal.prediction_set import PredictionSet, Score
 SEED = 71
 """Seed of the random split into halves."""
 NEAR = 0.03
-"""Largest likely deviation of the coverage from the stated one for which the remark calls the samples enough.
+"""Largest deviation of the coverage from the stated one, in 90 % of cases, for which there are enough samples.
 
-Otherwise the remark names the number of samples with which the deviation is at most this in 90 % of cases.
+If the deviation may be larger, the remark names the number of samples with which it would not be.
 """
 NINETY = 1.645
 """Number of standard deviations to either side that hold the middle 90 % of a normal density."""
@@ -110,10 +110,11 @@ class Conformal(Uncertainty):
 
 
 def split_in_halves(batches: Sequence[Batch]) -> tuple[list[Batch], list[Batch]]:
-    """Return a random half of the samples, rounded up, and the rest, both in order and without empty batches.
+    """Return the batches with a random half of the samples, rounded up, and the batches with all other samples.
 
-    Taking every other sample would be biased: in many data sets neighbours alternate between classes, or belong
-    together. The split depends only on the number of samples.
+    Both keep the order of the samples and have no empty batches. The choice depends only on the number of samples. It
+    is random, because every other sample would be a biased choice: in many data sets neighbours alternate between
+    classes, or belong together.
     """
     sizes = [len(batch["target"]) for batch in batches]
     order = torch.randperm(sum(sizes), generator=torch.Generator().manual_seed(SEED))
@@ -129,10 +130,11 @@ def split_in_halves(batches: Sequence[Batch]) -> tuple[list[Batch], list[Batch]]
 
 
 def coverage_remark(count: int, miscoverage: float) -> str:
-    """Return a remark: how far the coverage of sets from `count` scores may deviate, and how many scores are enough.
+    """Return a sentence about how far the coverage may deviate from the stated one, and how many scores suffice.
 
-    The share that sets from n distinct scores cover is itself random, Beta(k, n + 1 - k) with k as in `threshold` (Vovk
-    2012, prop. 2a): on average over validation sets it is k / (n + 1).
+    The threshold is fitted to n = `count` scores of the validation split. The coverage of the sets with this threshold
+    is itself random: Beta(k, n + 1 - k) for distinct scores, with k as in `threshold` (Vovk 2012, prop. 2a). Its mean
+    over validation splits is k / (n + 1).
     """
     left_out = _left_out(count, miscoverage)
     if not left_out:

@@ -89,7 +89,7 @@ class Ensemble(Uncertainty, Joining, SeveralModels):
         return independent_penalty(losses)
 
     def _own_losses(self, inputs: Tensor, target: Tensor) -> Float[Tensor, "batch"]:
-        """Return the loss of each sample, where each member computes the loss of its own rows."""
+        """Return the loss of each sample; each member computes only the losses of its own part of the batch."""
         if self.together is None:
             parts = zip(
                 self._separate_members(), self._parts(inputs), target.chunk(self.model_count), strict=True
@@ -104,7 +104,10 @@ class Ensemble(Uncertainty, Joining, SeveralModels):
         )
 
     def _parts(self, inputs: Tensor) -> Sequence[Tensor]:
-        """Return the rows of each member; inside `one_pass`, repeated calls return the same tensors."""
+        """Return the part of `inputs` that each member sees.
+
+        Inside `one_pass`, later calls with the same inputs return the same tensors.
+        """
         return self.shared_result.get_or_compute(inputs, lambda batch: batch.chunk(self.model_count))
 
     def _own_raw(self, inputs: Tensor) -> Float[Tensor, "member batch size"]:
@@ -119,7 +122,7 @@ class Ensemble(Uncertainty, Joining, SeveralModels):
             self.together.clip_each(max_norm, list(self.heads) if len(self.heads) > 1 else [])
 
     def training_densities(self, inputs: Tensor) -> Distribution:
-        """Return the members' densities in training, batch_shape (batch, member), or (batch,) for one."""
+        """Return the densities of all trained members, batch_shape (batch, member), or (batch,) for a single member."""
         if self.together is not None:
             own = self.own_batches
             return self._densities(self._own_raw(inputs).movedim(0, 1) if own else self.together(inputs))

@@ -28,12 +28,13 @@ If the samples need more, they are computed in parts.
 
 
 class Layout(NamedTuple):
-    """Way in which the samples of a model are computed.
+    """Method by which the outputs of a network under several dropout masks are computed.
 
     Attributes:
-        vectorised: whether `torch.vmap` runs the network; layers before the first dropout are then computed only once.
-        widest: largest number of values, for one input, in any tensor that is repeated for every sample: the input of a
-            dropout layer or, without vmap, the network's input.
+        vectorised: True if `torch.vmap` runs the network; layers before the first dropout layer are then computed only
+            once for all masks. False if the network is run on one copy of each input for each mask.
+        widest: memory for one input and one mask: the largest number of values that enter a dropout layer or, without
+            vmap, the network.
     """
 
     vectorised: bool
@@ -97,7 +98,7 @@ class MCDropout(Uncertainty):
         return Stacked([self.model(inputs) for _ in range(self.samples)])
 
     def _raws(self, model: Model, inputs: Tensor) -> Float[Tensor, "batch sample size"]:
-        """Return the head's raw parameters under each mask."""
+        """Return the head's raw parameters for every input under each of its S dropout masks."""
         self.layout = self.layout or layout_of(model, inputs)
         at_once = max(1, AT_ONCE // (len(inputs) * self.layout.widest))
         counts = [min(at_once, self.samples - start) for start in range(0, self.samples, at_once)]
@@ -127,21 +128,24 @@ def _dropouts(model: nn.Module) -> Iterator[Any]:
 
 
 def _vectorised(model: Model, inputs: Tensor, count: int) -> Float[Tensor, "batch sample size"]:
-    """Return the raw parameters of `count` passes; torch.vmap computes layers before the first dropout once."""
+    """Return the raw parameters of `count` passes with different dropout masks, by `torch.vmap`.
+
+    Layers before the first dropout layer are computed only once.
+    """
     sampled = torch.vmap(lambda _: model.raw(inputs), randomness="different", out_dims=1)
     return sampled(torch.empty(count, device=inputs.device))
 
 
 def _repeated(model: Model, inputs: Tensor, count: int) -> Float[Tensor, "batch sample size"]:
-    """Return the raw parameters of `count` passes, computed in one pass over `count` copies of every input."""
+    """Return the raw parameters under `count` dropout masks, by one pass over `count` copies of every input."""
     return model.raw(inputs.repeat_interleave(count, 0)).unflatten(0, (len(inputs), count))
 
 
 def layout_of(model: Model, inputs: Tensor) -> Layout:
-    """Return how to compute samples of a model with active dropout layers; it is tried on two samples of one input.
+    """Return the method by which a model with active dropout layers is computed under several masks.
 
-    If torch.vmap cannot run the network, or warns that it is slow, the network is run on copies of the inputs. The
-    global random generators keep their state.
+    `torch.vmap` is tried on one input and two masks. If it cannot run the network, or warns that it is slow, the method
+    is to run the network on copies of the inputs. The global random generators keep their state.
     """
     devices = [inputs.device] if inputs.device.type == "cuda" else []
     with torch.random.fork_rng(devices), torch.no_grad(), warnings.catch_warnings(), _widths(model) as widths:
@@ -157,7 +161,7 @@ def layout_of(model: Model, inputs: Tensor) -> Layout:
 
 @contextmanager
 def _widths(model: Model) -> Iterator[list[int]]:
-    """Yield a list to which each dropout layer adds the number of values that enter it in a pass."""
+    """Yield a list to which, inside the block, each dropout layer appends the number of values that enter it."""
     widths: list[int] = [0]
     hooks = [
         layer.register_forward_pre_hook(lambda _, arguments: widths.append(arguments[0].numel()))

@@ -11,9 +11,10 @@ from torch.func import functional_call, vmap
 
 
 class SideBySide(nn.Module):
-    """T networks computed as one, by batched matrix products; the first dimension of each parameter is the member.
+    """Module that computes several networks of one architecture in one pass, by batched matrix products.
 
-    An optimiser that works element by element (SGD, Adam and similar ones) updates every member as it would alone.
+    The networks are the members of an ensemble; the first dimension of each stacked parameter is the member. An
+    optimiser that works element by element (SGD, Adam and similar ones) updates every member as it would alone.
 
     Args:
         networks: networks of one architecture, without buffers; their parameters are copied.
@@ -32,11 +33,14 @@ class SideBySide(nn.Module):
         self.__dict__["_template"] = copy.deepcopy(networks[0])
 
     def forward(self, inputs: Tensor, used: int | None = None) -> Float[Tensor, "batch member size"]:
-        """Return the outputs of the first `used` members (default: all); each member has its own dropout masks."""
+        """Return the outputs of the first `used` members for the same inputs; None means all members.
+
+        Each member has its own dropout masks.
+        """
         return self._computed(inputs, used, None).movedim(0, 1)
 
     def own(self, inputs: Float[Tensor, "member batch *input"]) -> Float[Tensor, "member batch size"]:
-        """Return the outputs of each member for its own inputs."""
+        """Return the outputs of all members, each for its own inputs."""
         return self._computed(inputs, None, 0)
 
     def _computed(

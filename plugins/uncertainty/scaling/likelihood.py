@@ -15,7 +15,7 @@ Term = Callable[[Tensor], Tensor]
 
 RESTARTS = 20
 NEAREST = 1e-9
-"""Smallest step towards a region without finite values, as a factor on the gradient."""
+"""Smallest step, as a factor on the gradient, of the search towards a region in which values are not finite."""
 
 
 class Minimum(NamedTuple):
@@ -24,7 +24,8 @@ class Minimum(NamedTuple):
     Attributes:
         point: position of the minimum within the bounds, float64.
         value: value at the minimum, never above the value at the start.
-        active: for each parameter -1 at a lower bound or 1 at an upper bound beyond which the sum still falls, else 0.
+        active: for each parameter, -1 if it is at its lower bound, 1 if it is at its upper bound, and 0 otherwise. A
+            bound counts only if the sum would fall further beyond it.
     """
 
     point: Float[Tensor, "n"]
@@ -40,7 +41,9 @@ def minimise(
     *,
     rounding: float = 2e-16,
 ) -> Minimum:
-    """Return a local minimum of Σ terms within lower ≤ point ≤ upper; one term's graph is in memory at a time.
+    """Return a local minimum of the sum of `terms` within lower ≤ point ≤ upper.
+
+    Only the autograd graph of one term is in memory at a time.
 
     Args:
         terms: the terms of the sum.

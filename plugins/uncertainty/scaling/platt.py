@@ -27,12 +27,12 @@ _log = logging.getLogger(__name__)
 
 
 class Platt(Uncertainty):
-    """Class log-probabilities l become a·l + b, normalised (thesis eq. 2.18-2.19).
+    """Class log-probabilities l are replaced by a·l + b, normalised (thesis eq. 2.18-2.19).
 
-    There is one slope a ≥ 0, and one bias for each class; the biases sum to 0. For two classes this is a slope and a
-    bias of the log-odds. In the thesis, the exponent holds the network's output probability. Here, as in Platt 1999 and
-    Guo et al. 2017, it holds the log-odds, so that a = 1, b = 0 changes nothing; these are the values before
-    `calibrate`. The wrapped model may return any density over classes, also a mixture.
+    The slope a ≥ 0 is common to all classes, and b holds one bias for each class; the biases sum to 0. For two classes
+    this is a slope and a bias of the log-odds. Eq. 2.18 of the thesis multiplies the network's output probability by a.
+    Here, as in Platt 1999 and Guo et al. 2017, it is the log-odds, so that a = 1 and b = 0 change nothing; these are
+    the values before `calibrate`. The wrapped model may return any density over classes, also a mixture.
 
     A slope below 0 would reverse the order of the classes. If the labels contradict the wrapped model, the slope stops
     at 0, and every prediction is then the share of each class. Slope and biases have upper bounds too. The log says if
@@ -133,9 +133,9 @@ def fit(
 def targets(label: Int[Tensor, "sample"], classes: int, *, smoothing: bool) -> Float[Tensor, "sample label"]:
     """Return the class probabilities to which the scaling is fitted, one row for each sample.
 
-    Without smoothing they are 1 for the label and 0 for other classes. With N_k samples of the label and K classes,
-    smoothed probabilities are (N_k+1)/(N_k+K) for the label, and 1/(N_k+K) for each other class (for two classes Platt
-    1999, §2.2).
+    Without smoothing they are 1 for the label of the sample and 0 for other classes. With smoothing they are
+    (N_k+1)/(N_k+K) for the label k, and 1/(N_k+K) for each other class (for two classes Platt 1999, §2.2). N_k is the
+    number of samples with the label k, and K the number of classes.
     """
     exact = torch.nn.functional.one_hot(label, classes).double()
     if not smoothing:

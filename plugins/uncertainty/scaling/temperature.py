@@ -27,7 +27,7 @@ _log = logging.getLogger(__name__)
 
 
 class Temperature(Uncertainty):
-    """Every density p becomes p^(1/T), normalised, with the T of highest validation likelihood.
+    """Every density p is replaced by p^(1/T), normalised, with the temperature T of highest validation likelihood.
 
     For classes this divides logits by T (thesis eq. 2.19 with β = 0). No mode changes. Before `calibrate` T is 1, and
     the densities are those of the wrapped model. The fitted T is never worse than 1 on the validation split. T stays
@@ -78,10 +78,11 @@ class Temperature(Uncertainty):
 
 
 def fit(predicted: Sequence[Distribution], batches: Sequence[Batch], lower: float, upper: float) -> float:
-    """Return the T in [lower, upper] with the smallest mean of -log p^(1/T)(y) + log Z (eq. 2.19), or 1.
+    """Return the temperature T in [lower, upper] with the smallest mean negative log-likelihood.
 
-    The result is 1 if no other T is better. Targets of probability 0 have probability 0 at any T: they are left out,
-    and their number is logged.
+    If no temperature is better than 1, the result is 1.
+    The negative log-likelihood of a target y is -log p(y)^(1/T) + log Z with the normalising constant Z of p^(1/T) (eq.
+    2.19). Targets of probability 0 have probability 0 at any T: they are left out, and their number is logged.
     """
     targets = [batch["target"] for batch in batches]
     with torch.no_grad():
@@ -131,7 +132,14 @@ def fit(predicted: Sequence[Distribution], batches: Sequence[Batch], lower: floa
 
 
 def _term(density: Distribution, target: Tensor, possible: Tensor, count: int) -> Term:
-    """Return a function of log T: the part of the mean negative log-likelihood that comes from this batch."""
+    """Return one batch's part of the mean negative log-likelihood, as a function of log T.
+
+    Args:
+        density: densities of the batch.
+        target: targets of the batch.
+        possible: False for targets of probability 0, which are left out.
+        count: number of targets of all batches that are not left out.
+    """
     # the mode replaces a target of probability 0, whose infinite log-likelihood would give a gradient of 0 · ∞
     mask = possible.reshape(*possible.shape, *(1,) * (target.dim() - possible.dim()))
     value = target if bool(possible.all()) else torch.where(mask, target, density.mode)
