@@ -7,6 +7,7 @@ import shlex
 import signal
 import subprocess
 import sys
+import time
 import warnings
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -41,6 +42,21 @@ TINY = [
     "threads=1",
 ]
 """Settings of a run of 27 steps (9 in each epoch) on the third-party data, which takes one second after its imports."""
+
+
+def imported_by(module: str) -> set[str]:
+    """Return the names of the modules that the import of a module loads."""
+    script = f"import sys, {module}; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    return set(done.stdout.split())
+
+
+def wait_for(condition: Callable[[], object], seconds: float = 120) -> None:
+    """Wait until the condition holds, and fail after so many seconds."""
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "it never happened"
+        time.sleep(0.01)
 
 
 def first_of_each(
@@ -272,7 +288,8 @@ def framework(forks: Forks, stranger_site: Path, tmp_path: Path) -> Framework:
 
 @pytest.fixture(scope="session")
 def whole(stranger_site: Path, once: Once) -> Done:
-    """The tiny run without interruption, in a process of its own, which interrupted ones must equal; change nothing."""
+    """Run the tiny settings without interruption. Interrupted runs must equal this run; tests must not change its
+    folder."""
 
     def train(base: Path) -> None:
         run = f"hydra.run.dir={base / 'run'}"

@@ -18,6 +18,7 @@ import pytest
 from framework.errors import ConfigError
 from framework.runs.job import write_value
 from framework.sweeps import jobs as sweep
+from tests.conftest import imported_by
 
 LINUX = pytest.mark.skipif(
     sys.platform != "linux", reason="elsewhere a fork is not safe once torch is imported"
@@ -153,7 +154,7 @@ hydra:
 
 
 class App:
-    """The app above in a folder, and its sweep's folder."""
+    """Small application in a folder of its own, with the folder of its sweep."""
 
     def __init__(self, folder: Path, fork: bool = False) -> None:
         self.folder = folder
@@ -189,7 +190,7 @@ class App:
         return process
 
     def __call__(self, *arguments: str) -> tuple[int, str]:
-        """Exit code and output of a multirun under the pool."""
+        """Run a sweep with the launcher `pool`, and return its exit code and output."""
         return self.start("-m", "hydra/launcher=pool", *arguments).wait(timeout=60), self.said()
 
     def said(self) -> str:
@@ -465,7 +466,7 @@ def test_forks_draw_random_numbers_of_their_own(tmp_path: Path) -> None:
 
 
 def test_what_jobs_are_forks_of_asks_for_no_device_and_starts_no_thread() -> None:
-    """A process that has asked cannot have forks that use one, and threads do not go into forks."""
+    """A process that has used CUDA cannot have forks that use CUDA, and threads do not continue in forks."""
     code = (
         "import importlib, threading, torch\n"
         "asked = []\n"
@@ -584,6 +585,4 @@ def test_the_launcher_costs_other_commands_nothing() -> None:
         "matplotlib",
         "framework.sweeps.comparison",
     }
-    script = "import sys, hydra_plugins.framework_pool; print(*sys.modules)"
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
-    assert not heavy & set(done.stdout.split())
+    assert not heavy & imported_by("hydra_plugins.framework_pool")

@@ -25,7 +25,7 @@ from framework.modes.combine import find_members
 from framework.runs.job import find_job_folders
 from framework.sweeps import comparison
 from hydra_plugins.framework_random_search import _best, _draws
-from tests.conftest import TINY, Framework
+from tests.conftest import TINY, Framework, imported_by
 
 SEARCH = ["-m", "hydra/sweeper=random_search"]
 SCVAE = {"/experiment@_global_": "pascal3d/scvae"}
@@ -340,7 +340,7 @@ def test_a_launcher_that_runs_jobs_in_this_process_will_do(tmp_path: Path) -> No
 
 
 def trials(folder: Path, *values: float | None, **more: list[float]) -> list[comparison.Trial]:
-    """Trials that returned `values` (None: that failed), and measured what `more` holds."""
+    """Return trials with the results `values` (None for a failed trial) and the further measurements `more`."""
     made_trials = []
     for number, value in enumerate(values):
         home = folder / str(number)
@@ -418,7 +418,7 @@ def completed(
 
 
 def table(folder: Path, *given: list[str]) -> list[dict[str, str]]:
-    """The lines of comparison.csv."""
+    """Return the lines of comparison.csv."""
     comparison.summarise(folder, given, {})
     with (folder / "comparison.csv").open(encoding="utf-8") as file:
         return list(csv.DictReader(file))
@@ -537,9 +537,7 @@ def test_the_sweeper_costs_other_commands_nothing() -> None:
         "rich",
         "framework.sweeps.comparison",
     }
-    script = "import sys, hydra_plugins.framework_random_search; print(*sys.modules)"
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
-    assert not heavy & set(done.stdout.split())
+    assert not heavy & imported_by("hydra_plugins.framework_random_search")
 
 
 def test_jobs_are_found_however_deep_they_lie_and_those_of_a_sweep_below_are_not(tmp_path: Path) -> None:

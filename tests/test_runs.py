@@ -10,8 +10,6 @@ import sqlite3
 import subprocess
 import sys
 import threading
-import time
-from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -24,7 +22,7 @@ from framework.configuration.composition import in_quotes
 from framework.configuration.settings import Settings, store_experiment
 from framework.runs.run import run_name
 from framework.training.checkpoint import WholeCheckpoints
-from tests.conftest import TINY, Done, Framework, listed
+from tests.conftest import TINY, Done, Framework, listed, wait_for
 
 QUIET = [*TINY, "logger=none"]
 
@@ -34,13 +32,13 @@ def status(done: Done) -> str:
 
 
 def store_of(done: Done) -> Path:
-    """The MLflow store a run went to."""
+    """Return the MLflow store of a run."""
     uri = json.loads((done.folder / "run.json").read_text(encoding="utf-8"))["uri"]
     return Path(uri.removeprefix("sqlite:///"))
 
 
 def stored_statuses(done: Done) -> list[str]:
-    """Status of every run in that store."""
+    """Return the status of every run in a store."""
     with closing(sqlite3.connect(store_of(done))) as store:
         return [status for (status,) in store.execute("select status from runs")]
 
@@ -124,7 +122,7 @@ def test_a_killed_run_goes_on_with_the_same_bits(
 
 
 STOPS = ["trainer.patience=1", "trainer.max_epochs=30", "optimizer.learning_rate=0.3"]
-"""A run whose validation loss soon is higher than before."""
+"""Settings of a run whose validation loss soon rises."""
 
 
 @pytest.mark.parametrize("every", [1, pytest.param(2, marks=pytest.mark.slow)])
@@ -152,7 +150,7 @@ def test_a_run_killed_after_it_stopped_early_trains_no_further(
 
 
 def test_a_killed_run_still_knows_how_long_it_has_waited(framework: Framework, tmp_path: Path) -> None:
-    """Killed in the epoch after the first validation that was no better, of which two end it."""
+    """The run is killed in the epoch after its first validation without improvement; the second one would end it."""
     patient = [*QUIET, *STOPS, "trainer.patience=2", "pictures=false"]
     whole = framework(*patient, folder="whole")
     assert whole.code == 0, whole.out
@@ -175,7 +173,8 @@ def test_a_killed_run_still_knows_how_long_it_has_waited(framework: Framework, t
 def test_a_rate_that_waits_for_the_validation_loss_goes_on_with_the_same_bits(
     framework: Framework, tmp_path: Path
 ) -> None:
-    """Killed in the epoch after a reduction, when the last checkpoint is the one of the epoch before it."""
+    """The run is killed in the epoch after a reduction of the rate, when the last checkpoint is from the epoch
+    before."""
     plateau = [
         "trainer.max_epochs=6",
         "optimizer.learning_rate=0.3",
@@ -250,7 +249,7 @@ def test_a_signal_saves_and_says_so(
 def test_a_run_is_resumed_where_it_stopped_whatever_its_folder_is_called(
     framework: Framework, whole: Done, tmp_path: Path, name: str
 ) -> None:
-    """Also where it was begun with resume=never."""
+    """The run continues even if it was started with resume=never."""
     stop = [
         "+data.signal_at=14",
         f"+data.signal_number={int(signal.SIGTERM)}",
@@ -324,7 +323,7 @@ def test_a_stored_config_cannot_run_code(framework: Framework, whole: Done, tmp_
 
 
 def test_test_and_predict_repeat_what_training_reported(framework: Framework) -> None:
-    """Also where everything is drawn: latent numbers, dropout in the test, medians, scores."""
+    """The results are equal even if latent variables, dropout, medians and scores are random."""
     drawn = [
         "density_head=scvae",
         "density_head.samples=4",
@@ -544,6 +543,7 @@ def test_a_run_killed_while_it_was_closed_is_sent_by_resume(framework: Framework
     assert "that run has finished" in again.out
 
 
+@pytest.mark.slow
 def test_a_sweep_that_was_killed_closes_its_parent_when_it_is_repeated(
     stranger_site: Path, tmp_path: Path
 ) -> None:
@@ -574,13 +574,6 @@ def test_a_sweep_that_was_killed_closes_its_parent_when_it_is_repeated(
     assert "| method | data |" in said
 
 
-def wait_for(condition: Callable[[], bool], seconds: float = 120) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "it never happened"
-        time.sleep(0.02)
-
-
 def test_a_strangers_run_is_not_resumed_into_the_store_that_it_names(framework: Framework) -> None:
     killed = framework(*QUIET, "+data.signal_at=2", "+data.signal_number=9", "+data.signal_marker=marker")
     config = yaml.safe_load((killed.folder / "config.yaml").read_text(encoding="utf-8"))
@@ -592,7 +585,7 @@ def test_a_strangers_run_is_not_resumed_into_the_store_that_it_names(framework: 
 
 
 def test_answers_that_are_not_finite_get_a_sentence(framework: Framework) -> None:
-    """Half precision gives such answers, because its largest number is 65,504."""
+    """Half precision gives parameters that are not finite, because its largest number is 65,504."""
     done = framework(
         *("experiment=moons/vanilla_128", "debug=fast", "logger=none", "pictures=false"),
         *("trainer.precision=16-true", "optimizer.learning_rate=1e3"),

@@ -50,7 +50,7 @@ from framework.tracking.stores import (
 )
 from framework.tracking.tracker import MlflowTracker, NoTracker
 from framework.training.checkpoint import WholeCheckpoints
-from tests.conftest import importing_mlflow
+from tests.conftest import importing_mlflow, wait_for
 
 with importing_mlflow():
     from mlflow import MlflowClient
@@ -63,7 +63,7 @@ with importing_mlflow():
 
 @pytest.fixture(scope="session")
 def empty_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An SQLite store, which takes MLflow seconds to make."""
+    """Return a new SQLite store; MLflow needs seconds to create it."""
     folder = tmp_path_factory.mktemp("store") / "outputs" / "run"
     tracker = open_tracker(folder, experiment="made with the store")
     tracker.close("FINISHED")
@@ -72,7 +72,7 @@ def empty_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def folder(tmp_path: Path, empty_store: Path) -> Path:
-    """A run folder to be, with a store beside it."""
+    """Return the path of a new run folder with a store beside it."""
     (tmp_path / "outputs").mkdir()
     shutil.copy(empty_store, tmp_path / "outputs" / "mlflow.db")
     return tmp_path / "outputs" / "some experiment" / "run"
@@ -85,7 +85,7 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def build(folder: Path, run_id: str | None = None, **changes: object) -> MlflowTracker:
-    """A tracker that sends from this process, where a test can meddle with MLflow."""
+    """Return a tracker that sends from this process, in which a test can replace functions of MLflow."""
     named = {"uri": None, "experiment": "some/experiment", "run_name": "some run", "parent": None}
     destination = Destination(run_id=run_id, **{key: changes.pop(key, value) for key, value in named.items()})  # type: ignore[arg-type]
     options: dict[str, Any] = {"opening_patience": 30.0, "open_store": mlflow_store.MlflowStore, **changes}
@@ -117,13 +117,6 @@ def status(folder: Path) -> str:
     return client(folder).get_run(identity(folder)).info.status
 
 
-def until(condition: Callable[[], object], seconds: float = 60.0) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "it never happened"
-        time.sleep(0.01)
-
-
 def ended(process: int) -> bool:
     try:
         return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
@@ -142,7 +135,7 @@ def log(tracker: MlflowTracker | NoTracker, steps: Sequence[int]) -> None:
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """The store of `folder` is held by somebody else, as by a backup."""
+    """Lock the store of `folder`, as a backup does."""
     connection = sqlite3.connect(folder.parents[1] / "mlflow.db", isolation_level=None)
     connection.execute("BEGIN EXCLUSIVE")
     try:
@@ -165,7 +158,7 @@ def short_locks() -> Iterator[None]:
 
 
 def copies(empty_store: Path) -> Callable[[str, str], mlflow_store.SqlAlchemyStore]:
-    """Stands for MLflow's making of a store: copies one, which takes no seconds."""
+    """Copy an existing store, instead of the slow creation by MLflow."""
     make = mlflow_store.SqlAlchemyStore
 
     def make_quickly(uri: str, artifacts: str) -> mlflow_store.SqlAlchemyStore:
@@ -262,7 +255,7 @@ def test_a_run_that_lasts_sends_from_then_on(folder: Path) -> None:
         tracker.set_tags({"still": "here"})
         return tracker.run_id is not None
 
-    until(sent_by_the_next_line)
+    wait_for(sent_by_the_next_line)
     tracker.close("FINISHED")
     assert history(folder) == losses([0])
     assert status(folder) == "FINISHED"
@@ -477,7 +470,7 @@ def test_other_addresses_pass(uri: str) -> None:
 def test_no_file_of_a_run_holds_the_password_of_its_store(
     by_setting: bool, folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Everything that a store gets stands in the journal first."""
+    """Every record of a store is written to the journal first."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{free.getsockname()[1]}"
@@ -496,7 +489,7 @@ def test_no_file_of_a_run_holds_the_password_of_its_store(
 def test_the_default_store_names_no_other_folder_to_load_from(
     table: str, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It may have come with somebody's folder; one that the user names says where its runs are."""
+    """A default store may come from somebody else; only a store that the user names decides where its files are."""
     tracker = open_tracker(folder)
     log(tracker, [1])
     tracker.close("FINISHED")
@@ -520,7 +513,7 @@ def test_the_default_store_names_no_other_folder_to_load_from(
 
 
 class ListStore(Store):
-    """A store that keeps what it gets; its first calls fail."""
+    """Store that records its calls, and whose first calls fail."""
 
     def __init__(self, failures: int = 0) -> None:
         self.failures = failures
@@ -625,7 +618,7 @@ def test_a_store_locked_for_longer_than_mlflow_waits(folder: Path, caplog: pytes
     with locked(folder):
         # One thread holds the lock and logs: it would never come to release it if logging waited.
         log(tracker, range(100, 200))
-        until(lambda: "database is locked" in caplog.text)
+        wait_for(lambda: "database is locked" in caplog.text)
         log(tracker, range(200, 300))
     log(tracker, range(300, 400))
     tracker.close("FINISHED")
@@ -644,7 +637,7 @@ def test_a_store_locked_at_the_start(folder: Path, caplog: pytest.LogCaptureFixt
         assert tracker.run_id is None
         assert "The run continues" in caplog.text
         log(tracker, range(10))
-    until(lambda: tracker.run_id is not None)
+    wait_for(lambda: tracker.run_id is not None)
     tracker.close("FINISHED")
     assert history(folder) == losses(range(10))
 
@@ -678,7 +671,7 @@ def test_a_full_disk_under_the_store(folder: Path, caplog: pytest.LogCaptureFixt
     tracker = open_tracker(folder)
     for step in range(500):
         tracker.log_metrics({f"metric {i}": float(step) for i in range(10)}, step, 0)
-    until(lambda: "database or disk is full" in caplog.text)
+    wait_for(lambda: "database or disk is full" in caplog.text)
     sqlalchemy.event.remove(sqlalchemy.Engine, "connect", nearly_full)
     mlflow_store.SqlAlchemyStore._engine_map[default_uri(folder)].dispose()
     tracker.close("FINISHED")
@@ -707,8 +700,8 @@ def test_a_place_for_files_that_is_away_holds_up_no_number(
     for step, name in enumerate(names):
         tracker.log_artifact(folder / name)
         log(tracker, [step])
-    until(lambda: len(history(folder)) == 3)
-    until(lambda: "Permission denied" in caplog.text)
+    wait_for(lambda: len(history(folder)) == 3)
+    wait_for(lambda: "Permission denied" in caplog.text)
     info = read_run_info(folder)
     assert info is not None
     assert [path for path, _ in info.owed] == names
@@ -723,10 +716,10 @@ def test_a_run_deleted_in_the_store_goes_on_and_is_whole_when_restored(
 ) -> None:
     tracker = open_tracker(folder)
     log(tracker, [1])
-    until(lambda: history(folder))
+    wait_for(lambda: history(folder))
     client(folder).delete_run(identity(folder))
     log(tracker, [2, 3])
-    until(lambda: "must be in the 'active' state" in caplog.text)
+    wait_for(lambda: "must be in the 'active' state" in caplog.text)
     client(folder).restore_run(identity(folder))
     tracker.close("FINISHED")
     assert history(folder) == losses([1, 2, 3])
@@ -826,12 +819,12 @@ def test_what_sends_dies_and_another_goes_on(folder: Path, caplog: pytest.LogCap
     assert tracker.run_id is None, "nobody waits for the store"
     first = sending_process(tracker)
     tracker.log_metrics({"a name [°]": 1.0}, 0, 0)
-    until(lambda: "MLflow does not accept the name 'a name [°]'" in caplog.text)
+    wait_for(lambda: "MLflow does not accept the name 'a name [°]'" in caplog.text)
     log(tracker, range(10))
     first.kill()
     log(tracker, range(10, 20))
-    until(lambda: "the process that sends to the store has ended" in caplog.text)
-    until(lambda: sending_process(tracker) is not first)
+    wait_for(lambda: "the process that sends to the store has ended" in caplog.text)
+    wait_for(lambda: sending_process(tracker) is not first)
     second = sending_process(tracker)
     tracker.close("FINISHED")
     assert history(folder) == losses(range(20))
@@ -888,7 +881,7 @@ time.sleep(60)
 
 @pytest.fixture(scope="session")
 def died(tmp_path_factory: pytest.TempPathFactory, empty_store: Path) -> Path:
-    """A run folder whose process was killed at the worst moment."""
+    """Return a run folder whose process was killed at the worst moment."""
     folder = tmp_path_factory.mktemp("died") / "outputs" / "some experiment" / "run"
     folder.mkdir(parents=True)
     shutil.copy(empty_store, folder.parents[1] / "mlflow.db")
@@ -896,7 +889,7 @@ def died(tmp_path_factory: pytest.TempPathFactory, empty_store: Path) -> Path:
         [sys.executable, "-c", DYING, folder], timeout=120, check=False, stdout=subprocess.PIPE
     )
     assert done.returncode == -9
-    until(lambda: ended(int(done.stdout)))  # the sending process does not outlive it
+    wait_for(lambda: ended(int(done.stdout)))  # the sending process does not outlive it
     return folder
 
 
@@ -1052,7 +1045,7 @@ def test_a_store_deleted_while_the_run_goes_on_is_made_again_with_everything(
     tracker = open_tracker(folder)
     tracker.log_params({"seed": 0})
     log(tracker, range(10))
-    until(lambda: len(history(folder)) == 10)
+    wait_for(lambda: len(history(folder)) == 10)
     before = tracker.run_id
     (folder.parents[1] / "mlflow.db").unlink()
     log(tracker, range(10, 20))
@@ -1104,6 +1097,7 @@ def test_a_run_that_never_reached_its_store_goes_on_as_one(
         assert history(folder) == losses(expected)
 
 
+@pytest.mark.slow
 def test_four_processes_begin_at_once_where_there_is_no_store(tmp_path: Path) -> None:
     program = """
 import os, sys

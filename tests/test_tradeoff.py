@@ -57,19 +57,14 @@ def metrics():
     return [build("metric", resolve("metric", "nll"), target=TARGET)]
 
 
+def tradeoff_of(whole, knob, values, repeats):
+    options = {"samples": 1, "seed": 0, "repeats": repeats, "timed_calls": 3}
+    return tradeoff(whole, batches(), metrics(), knob=knob, values=values, **options)
+
+
 def test_each_value_gives_the_metric_of_the_predictor_so_set():
     whole = predictor({"name": "ensemble", "members": 3})
-    curve = tradeoff(
-        whole,
-        batches(),
-        metrics(),
-        knob="members",
-        values=(1, 3),
-        samples=1,
-        seed=0,
-        repeats=2,
-        timed_calls=3,
-    )
+    curve = tradeoff_of(whole, "members", (1, 3), repeats=2)
     assert whole.members == 3  # as before
     assert [point.value for point in curve.points] == [1, 3]
     for point in curve.points:
@@ -84,17 +79,7 @@ def test_each_value_gives_the_metric_of_the_predictor_so_set():
 def test_repeats_differ_where_something_is_drawn():
     whole = predictor({"name": "mc_dropout", "samples": 4})
     state = torch.get_rng_state()
-    curve = tradeoff(
-        whole,
-        batches(),
-        metrics(),
-        knob="samples",
-        values=(1, 30),
-        samples=1,
-        seed=0,
-        repeats=6,
-        timed_calls=3,
-    )
+    curve = tradeoff_of(whole, "samples", (1, 30), repeats=6)
     assert torch.equal(torch.get_rng_state(), state)
     assert whole.samples == 4
     few, many = curve.points
@@ -118,7 +103,7 @@ def test_the_wrappers_knob_hides_a_heads_of_the_same_name():
 
 
 class Counting(Encoder):
-    """Two numbers in, two out; counts its calls."""
+    """Encoder of two numbers that counts its calls."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -290,7 +275,7 @@ def test_every_value_takes_its_turn() -> None:
 
 
 def known(errors: Sequence[float], noise: Sequence[float]) -> list[Mean]:
-    """Means of many samples."""
+    """Return means over many samples."""
     return [Mean(error, its, math.inf, "samples") for error, its in zip(errors, noise, strict=True)]
 
 
@@ -398,6 +383,7 @@ def test_the_file_holds_every_number_under_a_key_with_its_unit(
     assert [line["error_nats_pareto"] for line in found] == [str(one).lower() for one in best]
 
 
+@pytest.mark.slow
 def test_metrics_and_errors_against_a_reference_are_measured_together() -> None:
     angle = Target("angle", ("azimuth",))
     whole = predictor({"name": "mc_dropout"}, head="scvae", target=angle)

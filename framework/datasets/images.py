@@ -484,6 +484,16 @@ def list_lines(items: Sequence[object]) -> str:
     return "".join(f"\n  {line}" for line in lines)
 
 
+def refuse_listed(wrong: Sequence[object], problem: str, remedy: str) -> None:
+    """Raise an error that counts and lists the wrong items, if there are any.
+
+    Raises:
+        DataError: there are wrong items.
+    """
+    if wrong:
+        raise DataError(f"{len(wrong)} {problem}:{list_lines(wrong)}\n{remedy}")
+
+
 def vary(batch: Batch, signs: Sequence[float], jitter: float) -> Batch:
     """Augment the images of a training batch (see `augment`) and, if `signs` is not empty, mirror half of them.
 

@@ -9,7 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from framework.configuration.schema import build, resolve
 from framework.data import Batch, Data
+from framework.datasets.fields import Fields
 from framework.testing.finding import SEED, Worst
 
 FEW = 400
@@ -20,6 +22,20 @@ BYTES = 2**27
 """Limit on the memory of the checked samples of a split, bytes, where more than FEW are checked."""
 SECONDS = 1.5
 """Limit on the processor time to fetch the checked samples of a split, seconds, where more than FEW are checked."""
+
+
+def prepared(name: str, **config: Any) -> Any:
+    """Return the prepared data set of this name."""
+    data = build("data", resolve("data", {"name": name, **config}))
+    data.prepare()
+    return data
+
+
+def fields_of(data: Data, split: str) -> Mapping[str, Tensor]:
+    """Return the fields of a split that holds them all in memory."""
+    dataset = getattr(data.splits(), split)
+    assert isinstance(dataset, Fields)
+    return dataset.fields
 
 
 def spaced_indices(length: int, most: int) -> list[int]:

@@ -1,12 +1,22 @@
 """Small image and mesh files such as a user may have, for contract rows of data sets."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
 from framework.testing.finding import SEED
+
+
+def damaged_copies(content: bytes, count: int) -> Iterator[bytes]:
+    """Yield copies of the bytes of a file, in each of which up to three bytes are replaced at random."""
+    random = np.random.default_rng(0)
+    for _ in range(count):
+        damaged = np.frombuffer(content, np.uint8).copy()
+        positions = random.integers(0, len(content), 3)
+        damaged[positions] = random.integers(0, 256, 3)
+        yield damaged.tobytes()
 
 
 def noise_image(file: Path, number: int, size: tuple[int, int] = (20, 20)) -> Path:

@@ -200,11 +200,9 @@ def _refuse_wrong_labels(samples: Mapping[str, Sequence[Labelled]]) -> None:
         for sample in chosen
         if not all(map(math.isfinite, sample.angles))
     ]
-    if wrong:
-        raise DataError(
-            f"{len(wrong)} images have an angle that is not finite:{images.list_lines(wrong)}\n"
-            "Correct these labels, or remove the images."
-        )
+    images.refuse_listed(
+        wrong, "images have an angle that is not finite", "Correct these labels, or remove the images."
+    )
 
 
 def _digest(samples: Mapping[str, Sequence[Labelled]]) -> str:

@@ -1,6 +1,6 @@
 """Folders in the layouts of the three published data sets, written for the tests."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -8,11 +8,8 @@ import h5py
 import numpy as np
 import scipy.io
 from PIL import Image
-from torch import Tensor
 
-from framework.configuration import schema
-from framework.data import Data
-from framework.datasets.fields import Fields
+from framework.testing.data_samples import prepared
 
 PEOPLE = 40
 """Number of people in the folder of TownCentre heads, with two images each."""
@@ -23,16 +20,7 @@ Row = tuple[str, float, float, float]
 
 def prepare_data(name: str, root: Path | None, **config: Any) -> Any:
     """Return the prepared data set of this name, with a folder as its root."""
-    data = schema.build("data", schema.resolve("data", {"name": name, "root": root and str(root), **config}))
-    data.prepare()
-    return data
-
-
-def table(data: Data, split: str) -> Mapping[str, Tensor]:
-    """Return the fields of a split."""
-    dataset = getattr(data.splits(), split)
-    assert isinstance(dataset, Fields)
-    return dataset.fields
+    return prepared(name, root=root and str(root), **config)
 
 
 # ---- 20 images in train/ and 11 in test/; the red value of an image is eight times its number ---------------------

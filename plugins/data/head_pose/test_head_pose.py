@@ -15,6 +15,7 @@ from framework.configuration import schema
 from framework.data import Splits
 from framework.errors import ConfigError, DataError
 from framework.storage import generated
+from framework.testing.data_samples import fields_of
 from plugins.data.head_pose.archive import Archive, Source
 from plugins.data.head_pose.caviar import ARCHIVE as CAVIAR
 from plugins.data.head_pose.idiap import ARCHIVE as IDIAP
@@ -24,7 +25,6 @@ from plugins.data.head_pose.roots import (
     prepare_data,
     publish_caviar,
     publish_idiap,
-    table,
     write_caviar,
     write_idiap,
 )
@@ -107,13 +107,13 @@ def numbers_in(fields: Any) -> list[int]:
 def test_images_labels_and_splits(published: Published, root: Path) -> None:
     name = published.archive.name
     data = prepare_data(name, root)
-    assert numbers_in(table(data, "train")) == list(range(20))
+    assert numbers_in(fields_of(data, "train")) == list(range(20))
     np.random.seed(13)  # noqa: NPY002  (the thesis authors' code seeds the global generator)
     order = (20 + np.random.choice(11, 11, replace=False)).tolist()  # noqa: NPY002
-    assert numbers_in(table(data, "validation")) == order[:5]
-    assert numbers_in(table(data, "test")) == order[5:]
+    assert numbers_in(fields_of(data, "validation")) == order[:5]
+    assert numbers_in(fields_of(data, "test")) == order[5:]
     for split in SPLITS:
-        fields = table(data, split)
+        fields = fields_of(data, split)
         expected = torch.tensor([published.angles(number) for number in numbers_in(fields)])
         torch.testing.assert_close(fields["target"], expected)
         assert torch.all(abs(fields["target"]) < math.pi + 1e-6)
@@ -182,7 +182,7 @@ def test_config_out_of_range(name: str, key: str, value: Any) -> None:
 @in_two_folders
 def test_augment_changes_no_label(published: Published, root: Path) -> None:
     data = prepare_data(published.archive.name, root)
-    batch = dict(table(data, "train"))
+    batch = dict(fields_of(data, "train"))
     torch.manual_seed(0)
     varied = data.augment(batch)
     assert torch.equal(varied["target"], batch["target"])
@@ -226,7 +226,7 @@ def test_generation_is_the_same_to_the_byte_for_any_number_of_threads(
 def test_generated_sets_have_the_published_shares(name: str, sizes: list[int]) -> None:
     data = prepare_data(name, None, images=60)
     assert data.fingerprint()["root"] == "synthetic, seed 0"
-    assert [len(table(data, split)["input"]) for split in SPLITS] == sizes
+    assert [len(fields_of(data, split)["input"]) for split in SPLITS] == sizes
 
 
 @pytest.mark.parametrize("name", ["idiap", "caviar"])
@@ -249,7 +249,7 @@ def test_images_agree_with_their_labels(name: str, images: int, correlation: flo
     data = prepare_data(name, None, images=images, image_size=16)
 
     def columns(split: str, *, mirrored: bool) -> tuple[np.ndarray, np.ndarray]:
-        fields = table(data, split)
+        fields = fields_of(data, split)
         grey = fields["input"].flip(-1) if mirrored else fields["input"]
         grey = grey.float().mean(1).flatten(1)
         grey = (grey - grey.mean(1, keepdim=True)) / (grey.std(1, keepdim=True) + 1)

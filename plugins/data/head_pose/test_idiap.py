@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from framework.errors import DataError
+from framework.testing.data_samples import fields_of
 from plugins.data.head_pose.idiap import PEOPLE, random_pose
 from plugins.data.head_pose.idiap_labels import LABELS, Label, read_labels, write_labels
 from plugins.data.head_pose.roots import (
@@ -16,7 +17,6 @@ from plugins.data.head_pose.roots import (
     prepare_data,
     publish_idiap,
     save_idiap,
-    table,
     write_idiap,
 )
 
@@ -27,9 +27,9 @@ def root(tmp_path: Path) -> Path:
 
 
 def test_structs_may_lie_in_a_row(root: Path) -> None:
-    column = table(prepare_data("idiap", root), "train")
+    column = fields_of(prepare_data("idiap", root), "train")
     publish_idiap(root, column=False)
-    row = table(prepare_data("idiap", root), "train")
+    row = fields_of(prepare_data("idiap", root), "train")
     assert torch.equal(row["input"], column["input"])
     assert torch.equal(row["target"], column["target"])
 
@@ -38,7 +38,7 @@ def test_angles_are_chosen_and_ordered(root: Path) -> None:
     data = prepare_data("idiap", root, angles=["roll", "pan", "roll"])
     assert data.target.names == ("roll", "pan")
     expected = torch.tensor([[idiap_row(number)[3], idiap_row(number)[1]] for number in range(20)])
-    torch.testing.assert_close(table(data, "train")["target"], expected)
+    torch.testing.assert_close(fields_of(data, "train")["target"], expected)
 
 
 def test_struct_of_one_element(root: Path) -> None:
@@ -54,14 +54,14 @@ def test_labels_in_the_wrong_unit_are_refused(root: Path) -> None:
         ]
         for split, numbers in (("train", range(20)), ("test", range(20, 31)))
     }
-    radians = table(prepare_data("idiap", root), "train")["target"]
+    radians = fields_of(prepare_data("idiap", root), "train")["target"]
     with pytest.raises(DataError, match=r"looks like radians, but degrees .* Set data\.angles_in=radians"):
         prepare_data("idiap", root, angles_in="degrees")
     save_idiap(root / LABELS, **in_degrees)
     with pytest.raises(DataError, match=r"look like degrees, but radians .* Set data\.angles_in=degrees"):
         prepare_data("idiap", root)
     torch.testing.assert_close(
-        table(prepare_data("idiap", root, angles_in="degrees"), "train")["target"], radians
+        fields_of(prepare_data("idiap", root, angles_in="degrees"), "train")["target"], radians
     )
 
 
@@ -92,7 +92,7 @@ def test_angle_that_is_not_finite_is_never_skipped(root: Path, angle: float) -> 
     with pytest.raises(DataError, match=rf"1 images have an angle .*\n.*head_1\.png: 0\.5, {angle}, 0\.25"):
         prepare_data("idiap", root, skip_unreadable=True)
     # without tilt among the angles, that label is good
-    assert len(table(prepare_data("idiap", root, angles=["pan"]), "train")["input"]) == 2
+    assert len(fields_of(prepare_data("idiap", root, angles=["pan"]), "train")["input"]) == 2
 
 
 def test_labels_are_written_in_the_layout_of_matlab(tmp_path: Path) -> None:
@@ -121,4 +121,4 @@ def test_labels_of_the_generated_set_are_the_random_poses(
         random = np.random.default_rng([0, 0, number])
         random.integers(PEOPLE)
         poses.append(random_pose(random))
-    np.testing.assert_allclose(table(data, "train")["target"].rad2deg(), poses, atol=1e-4)
+    np.testing.assert_allclose(fields_of(data, "train")["target"].rad2deg(), poses, atol=1e-4)

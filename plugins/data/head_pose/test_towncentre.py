@@ -10,8 +10,9 @@ from PIL import Image
 
 from framework.data import Splits
 from framework.errors import DataError
+from framework.testing.data_samples import fields_of
 from plugins.data.head_pose import synthetic_heads
-from plugins.data.head_pose.roots import PEOPLE, pixels, prepare_data, table, write_towncentre
+from plugins.data.head_pose.roots import PEOPLE, pixels, prepare_data, write_towncentre
 from plugins.data.head_pose.towncentre import IMAGES_PER_PERSON, random_pose
 from plugins.data.head_pose.towncentre_labels import Head, find_heads, read_label, split_by_person
 
@@ -33,7 +34,7 @@ def test_people_are_split_as_the_authors_code_does(root: Path) -> None:
         "test": np.flatnonzero(uniform > 0.9).tolist(),
     }
     for split in SPLITS:
-        fields = table(data, split)
+        fields = fields_of(data, split)
         expected = {
             pixels(2 * person + second).tobytes(): 10.0 * person + 5 * second
             for person in people[split]
@@ -66,7 +67,7 @@ def test_heads_that_are_not_valid_are_left_out_and_counted(root: Path) -> None:
     data = prepare_data("towncentre", root)
     assert data.invalid == 1
     assert data.skipped == 0
-    assert sum(len(table(data, split)["input"]) for split in SPLITS) == 2 * PEOPLE - 1
+    assert sum(len(fields_of(data, split)["input"]) for split in SPLITS) == 2 * PEOPLE - 1
 
 
 def test_a_label_whose_stem_begins_another_stem_gets_its_own_image(root: Path) -> None:
@@ -132,7 +133,7 @@ def test_missing_damaged_and_doubtful_images_are_named_at_once_or_skipped(root: 
         assert part in message
     data = prepare_data("towncentre", root, skip_unreadable=True)
     assert data.skipped == 4
-    assert sum(len(table(data, split)["input"]) for split in SPLITS) == 2 * PEOPLE - 4
+    assert sum(len(fields_of(data, split)["input"]) for split in SPLITS) == 2 * PEOPLE - 4
 
 
 def test_pan_that_is_not_finite_is_refused(root: Path) -> None:
@@ -168,7 +169,7 @@ def test_empty_split(root: Path) -> None:
 
 def test_augment_mirrors_with_the_sign_of_pan(root: Path) -> None:
     data = prepare_data("towncentre", root, jitter=0.0)
-    batch = dict(table(data, "train"))
+    batch = dict(fields_of(data, "train"))
     torch.manual_seed(0)
     varied = data.augment(batch)
     flipped = (255 * varied["input"] - batch["input"].flip(-1)).abs().amax((1, 2, 3)) < 0.01
@@ -184,7 +185,7 @@ def test_labels_of_the_generated_set_are_the_random_poses(
 ) -> None:
     monkeypatch.setenv("FRAMEWORK_CACHE", str(tmp_path))
     data = prepare_data("towncentre", None, images=600)
-    counts = [len(table(data, split)["input"]) for split in SPLITS]
+    counts = [len(fields_of(data, split)["input"]) for split in SPLITS]
     assert sum(counts) == 600 - data.invalid
     assert 3 < data.invalid < 40
     assert counts[0] > 400
@@ -196,5 +197,5 @@ def test_labels_of_the_generated_set_are_the_random_poses(
         pan = random_pose(person_random.uniform(0, 360), random).pan
         if random.random() >= 0.03:
             pans.append((pan + 180) % 360 - 180)
-    read = torch.cat([table(data, split)["target"] for split in SPLITS]).rad2deg().flatten()
+    read = torch.cat([fields_of(data, split)["target"] for split in SPLITS]).rad2deg().flatten()
     np.testing.assert_allclose(np.sort(read.numpy()), np.sort(pans), atol=0.006)

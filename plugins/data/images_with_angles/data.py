@@ -34,7 +34,7 @@ class ImagesWithAngles(Data):
         mirror: Angles that change sign in a mirror image; if it names any, half of the training images are mirrored.
         jitter: Largest share by which training images are shifted, scaled and made brighter or darker.
         skip_unreadable: Whether images that cannot be read are left out and counted; otherwise they are an error.
-        writing: How the table is written.
+        writing: Notation of the table: separator, decimal sign and the like.
     """
 
     bibtex = "images_with_angles"

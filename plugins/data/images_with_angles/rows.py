@@ -9,7 +9,10 @@ from framework.testing.sample_files import images, noise_image
 
 
 def write(folder: Path, split: bool = False) -> Mapping[str, str]:
-    """Write forty images and a table of their angles, degrees."""
+    """Write forty images and a table of their angles, degrees; return the settings that name the folder.
+
+    If `split` is true, the table also names the split of each image.
+    """
     lines = ["file,pan,tilt" + ",split" * split]
     for number in range(40):
         file = noise_image(folder / f"{number:03d}.png", number)

@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from PIL import Image
 from framework.configuration import schema
 from framework.datasets.fields import Fields
 from framework.errors import ConfigError, DataError
+from framework.testing.data_samples import fields_of, prepared
 from plugins.data.images_with_angles.data import ImagesWithAngles
 from plugins.data.images_with_angles.table import SPLITS, split_of
 
@@ -35,16 +36,7 @@ def write_folder(root: Path, table: str | None = None, images: int = 40) -> Path
 
 
 def prepare_data(root: Path, **config: Any) -> ImagesWithAngles:
-    config = {"name": "images_with_angles", "root": str(root), "image_size": 8, **config}
-    data = schema.build("data", schema.resolve("data", config))
-    data.prepare()
-    return data
-
-
-def fields(data: ImagesWithAngles, split: str) -> Mapping[str, torch.Tensor]:
-    dataset = getattr(data.splits(), split)
-    assert isinstance(dataset, Fields)
-    return dataset.fields
+    return prepared("images_with_angles", **{"root": str(root), "image_size": 8, **config})
 
 
 def test_whole_folder(tmp_path: Path) -> None:
@@ -55,7 +47,7 @@ def test_whole_folder(tmp_path: Path) -> None:
     assert data.groups == (tmp_path.name,)
     all_numbers = []
     for split in SPLITS:
-        table = fields(data, split)
+        table = fields_of(data, split)
         numbers = table["input"][:, 0, 0, 0].tolist()
         assert torch.all(table["input"][:, 2] == 200)
         for number, target in zip(numbers, table["target"].tolist(), strict=True):
@@ -75,7 +67,7 @@ def test_columns_splits_and_grey(tmp_path: Path) -> None:
     assert data.input_shape == (1, 8, 8)
     for split, roll, yaw in (("train", 5, 10), ("test", 6, 170), ("validation", 7, 0)):
         expected = torch.tensor([[math.radians(roll), math.radians(yaw)]])
-        torch.testing.assert_close(fields(data, split)["target"], expected)
+        torch.testing.assert_close(fields_of(data, split)["target"], expected)
 
 
 def test_split_by_name_is_70_15_15_and_never_moves() -> None:
@@ -157,7 +149,7 @@ def test_table_written_by_a_spreadsheet(tmp_path: Path) -> None:
     write_folder(tmp_path)
     (tmp_path / "angles.csv").write_bytes(b"\xef\xbb\xbf" + text.encode())
     data = prepare_data(tmp_path)
-    assert sum(len(fields(data, split)["index"]) for split in SPLITS) == 40
+    assert sum(len(fields_of(data, split)["index"]) for split in SPLITS) == 40
 
 
 def radians_table(values: Sequence[float]) -> str:
@@ -171,7 +163,7 @@ def test_radians_are_noticed(tmp_path: Path) -> None:
         prepare_data(write_folder(tmp_path, radians_table(values)))
     for unit, factor in (("radians", 1.0), ("degrees", math.pi / 180)):
         data = prepare_data(tmp_path, angles_in=unit)
-        targets = torch.cat([fields(data, split)["target"] for split in SPLITS])
+        targets = torch.cat([fields_of(data, split)["target"] for split in SPLITS])
         expected = torch.tensor(values) * factor
         torch.testing.assert_close(targets.flatten().sort().values, expected.sort().values)
 
@@ -205,7 +197,7 @@ def test_read_gives_inputs_as_the_splits_hold_them(tmp_path: Path) -> None:
     names = [name for name in ("000.png", "001.png", "002.png", "003.png") if split_of(name) == "train"]
     read = data.read([tmp_path / name for name in names])
     assert isinstance(read, Fields)
-    assert torch.equal(read.fields["input"], fields(data, "train")["input"][: len(names)])
+    assert torch.equal(read.fields["input"], fields_of(data, "train")["input"][: len(names)])
 
 
 @pytest.mark.parametrize(

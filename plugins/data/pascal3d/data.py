@@ -299,11 +299,11 @@ def _refuse_wrong_labels(samples: Mapping[str, Sequence[Sample]]) -> None:
         for annotation, _ in chosen
         if not np.isfinite(annotation.angles or ()).all()
     ]
-    if wrong:
-        raise DataError(
-            f"{len(wrong)} objects have an angle that is not a finite number of degrees:{images.list_lines(wrong)}\n"
-            "Correct these annotations, or remove the images from their lists."
-        )
+    images.refuse_listed(
+        wrong,
+        "objects have an angle that is not a finite number of degrees",
+        "Correct these annotations, or remove the images from their lists.",
+    )
 
 
 def _digest(samples: Mapping[str, Sequence[Sample]]) -> str:

@@ -2,7 +2,7 @@
 
 import math
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,8 @@ from framework.datasets.fields import Fields
 from framework.datasets.images import Crop, Crops
 from framework.errors import ConfigError, DataError
 from framework.renderer import Renderer
+from framework.testing.data_samples import fields_of, prepared
+from framework.testing.sample_files import damaged_copies
 from plugins.data.pascal3d import layout
 from plugins.data.pascal3d.data import Pascal3D, validation_files
 from plugins.data.pascal3d.generator import generate_class
@@ -43,16 +45,7 @@ def root(shared_root: Path, tmp_path: Path) -> Path:
 
 
 def prepare_data(root: Path | None, **config: Any) -> Pascal3D:
-    config = {"name": "pascal3d", "root": root and str(root), **config}
-    data = schema.build("data", schema.resolve("data", config))
-    data.prepare()
-    return data
-
-
-def table(data: Pascal3D, split: str) -> Mapping[str, torch.Tensor]:
-    dataset = getattr(data.splits(), split)
-    assert isinstance(dataset, Fields)
-    return dataset.fields
+    return prepared("pascal3d", root=root and str(root), **config)
 
 
 # ---- single annotations, as MATLAB writes them -----------------------------------------------------------
@@ -222,13 +215,9 @@ def test_damaged_annotations_are_read_or_named(tmp_path: Path, compressed: bool)
     record = scipy.io.loadmat(file)["record"]
     scipy.io.savemat(file, {"record": record}, do_compression=compressed)
     whole = file.read_bytes()
-    random = np.random.default_rng(0)
     refused = 0
-    for _ in range(300):
-        damaged = np.frombuffer(whole, np.uint8).copy()
-        positions = random.integers(0, len(whole), 3)
-        damaged[positions] = random.integers(0, 256, 3)
-        file.write_bytes(damaged.tobytes())
+    for damaged in damaged_copies(whole, 300):
+        file.write_bytes(damaged)
         try:
             annotations = read_annotations(tmp_path, "car", "pascal", "image")
         except DataError as error:
@@ -287,7 +276,7 @@ def test_reading_a_generated_root_gives_the_drawn_objects(shared_root: Path, ren
     assert data.skipped == 0
 
     def labels(*splits: str) -> np.ndarray:
-        fields = [table(data, split) for split in splits]
+        fields = [fields_of(data, split) for split in splits]
         columns = [torch.cat([f["target"].rad2deg(), f["blur"][:, None]], dim=1) for f in fields]
         rows = torch.cat(columns).double().numpy()
         rows[:, 0] %= 360
@@ -300,7 +289,7 @@ def test_reading_a_generated_root_gives_the_drawn_objects(shared_root: Path, ren
 
 def test_fields_of_a_batch(shared_root: Path) -> None:
     data = prepare_data(shared_root, image_size=32)
-    fields = table(data, "train")
+    fields = fields_of(data, "train")
     count = len(data.splits().train)  # type: ignore[arg-type]
     assert data.input_shape == (3, 32, 32)
     assert data.groups == ("car",)
@@ -333,7 +322,7 @@ def test_crop_holds_the_object_and_its_margin(shared_root: Path) -> None:
         np.floor(x - half + 2 * half * (np.arange(64) + 0.5) / 64), 0, pixels.shape[1] - 1
     ).astype(int)
     nearest = pixels[rows][:, columns]
-    crop = table(data, "test")["input"][0].permute(1, 2, 0).numpy().astype(float)
+    crop = fields_of(data, "test")["input"][0].permute(1, 2, 0).numpy().astype(float)
     assert abs(crop - nearest).mean() < 12
     shifted = np.roll(nearest, 6, axis=1)
     assert abs(crop - nearest).mean() < 0.7 * abs(crop - shifted).mean()
@@ -357,10 +346,11 @@ def test_whole_images_are_held_out_independent_of_their_order(shared_root: Path)
 def test_occluded_objects_can_be_used_for_training_but_never_for_the_test(shared_root: Path) -> None:
     without, including = prepare_data(shared_root), prepare_data(shared_root, include_occluded=True)
     counts = [
-        len(table(d, "train")["index"]) + len(table(d, "validation")["index"]) for d in (without, including)
+        len(fields_of(d, "train")["index"]) + len(fields_of(d, "validation")["index"])
+        for d in (without, including)
     ]
     assert counts[1] > counts[0]
-    assert torch.equal(table(without, "test")["target"], table(including, "test")["target"])
+    assert torch.equal(fields_of(without, "test")["target"], fields_of(including, "test")["target"])
     added = without.excluded["truncated or occluded"] - including.excluded["truncated or occluded"]
     assert counts[1] - counts[0] == added
 
@@ -369,7 +359,7 @@ def test_real_data_have_no_symmetry_and_no_blur(root: Path) -> None:
     """Check that a root without synthetic.json counts as real, independent of its annotations."""
     (root / "synthetic.json").unlink()
     data = prepare_data(root)
-    assert "blur" not in table(data, "train")
+    assert "blur" not in fields_of(data, "train")
     assert data.fingerprint()["version"] == "PASCAL3D+ release 1.1"
 
 
@@ -377,14 +367,14 @@ def test_several_classes_are_groups(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setenv("FRAMEWORK_CACHE", str(tmp_path))
     data = prepare_data(None, category=["bottle", "diningtable", "bottle"], images=40, image_size=16)
     assert data.groups == ("bottle", "diningtable")
-    fields = table(data, "train")
+    fields = fields_of(data, "train")
     assert {(int(g), int(s)) for g, s in zip(fields["group"], fields["symmetry"], strict=True)} == {
         (0, 0),
         (1, 2),
     }
     alone = prepare_data(None, category="bottle", images=40, image_size=16)
     bottles = fields["group"] == 0
-    assert torch.equal(table(alone, "train")["target"], fields["target"][bottles])
+    assert torch.equal(fields_of(alone, "train")["target"], fields["target"][bottles])
 
 
 def test_grey_and_cmyk_images_are_read_as_colour(root: Path) -> None:
@@ -394,7 +384,7 @@ def test_grey_and_cmyk_images_are_read_as_colour(root: Path) -> None:
             converted = image.convert(mode)
         converted.save(file)
     data = prepare_data(root)
-    assert table(data, "train")["input"].shape[1] == 3
+    assert fields_of(data, "train")["input"].shape[1] == 3
     assert data.skipped == 0
 
 
@@ -402,10 +392,10 @@ def test_box_beyond_the_image_is_clipped(root: Path) -> None:
     def reach_out(record: dict[str, Any]) -> None:
         record["bbox"] = np.array([[-50.0, -20.0, 900.0, 700.0]])
 
-    before = len(table(prepare_data(root), "test")["index"])
+    before = len(fields_of(prepare_data(root), "test")["index"])
     change_objects(root, "car_val", reach_out)
     data = prepare_data(root)
-    assert len(table(data, "test")["index"]) == before
+    assert len(fields_of(data, "test")["index"]) == before
     assert data.skipped == 0
 
 
@@ -473,7 +463,7 @@ def test_all_unreadable_files_are_named_or_skipped(root: Path) -> None:
     data = prepare_data(root, skip_unreadable=True)
     assert data.skipped == 4
     for split in ("train", "validation", "test"):
-        fields = table(data, split)
+        fields = fields_of(data, split)
         assert torch.equal(fields["index"], torch.arange(len(fields["input"])))
         assert {len(field) for field in fields.values()} == {len(fields["input"])}
 
@@ -539,7 +529,7 @@ def test_large_data_are_read_when_used(shared_root: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr(images, "IN_MEMORY", 0)
     lazy = prepare_data(shared_root).splits().train
     assert isinstance(lazy, Crops)
-    eager = table(in_memory, "train")
+    eager = fields_of(in_memory, "train")
     assert len(lazy) == len(eager["input"])
     for index in (0, len(lazy) - 1):
         item = lazy[index]
@@ -591,7 +581,7 @@ def test_augment_mirrors_half_of_a_batch_with_its_labels(shared_root: Path) -> N
 
 def test_augment_can_be_switched_off(shared_root: Path) -> None:
     data = prepare_data(shared_root)
-    batch = {name: field[:8] for name, field in table(data, "train").items()}
+    batch = {name: field[:8] for name, field in fields_of(data, "train").items()}
     assert not torch.equal(data.augment(batch)["input"], data.augment(batch)["input"])
     off = prepare_data(shared_root, mirror=False, jitter=0.0)
     assert off.augment(batch) is batch

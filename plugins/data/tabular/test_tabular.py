@@ -6,7 +6,6 @@ import math
 import os
 import subprocess
 import sys
-from collections.abc import Mapping
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,7 @@ from hypothesis import strategies as st
 from framework.configuration.schema import build, resolve
 from framework.datasets.fields import Fields
 from framework.errors import ConfigError, DataError
+from framework.testing.data_samples import fields_of
 from plugins.data.tabular.data import Tabular
 from plugins.data.tabular.picture import HEIGHT, bars
 from plugins.data.tabular.table import fit_scaling, standardise
@@ -52,38 +52,32 @@ def prepare_data(file: Path, **config: Any) -> Tabular:
     return data
 
 
-def fields(data: Tabular, split: str) -> Mapping[str, torch.Tensor]:
-    dataset = getattr(data.splits(), split)
-    assert isinstance(dataset, Fields)
-    return dataset.fields
-
-
 def test_a_table_is_split_and_standardised_by_its_training_rows(tmp_path: Path) -> None:
     data = prepare_data(table(tmp_path), columns=None, target="class")
     assert data.input_shape == (5,)  # number, square, same, real and angle; words are not read
     assert data.target.kind == "class"
     assert data.target.names == ("cat", "dog", "emu")
     assert data.groups == ("mine",)
-    assert [len(fields(data, name)["index"]) for name in SPLITS] == [28, 6, 6]
-    rows = {name: fields(data, name)["line"].numpy() - 2 for name in SPLITS}
+    assert [len(fields_of(data, name)["index"]) for name in SPLITS] == [28, 6, 6]
+    rows = {name: fields_of(data, name)["line"].numpy() - 2 for name in SPLITS}
     assert sorted(np.concatenate(list(rows.values())).tolist()) == list(range(ROWS))
     columns = np.array([[row, row * row, 7, row / 2 - 3, 20 * row - 360] for row in range(ROWS)])
     trained = columns[rows["train"]]
     for name in SPLITS:
         expected = (columns[rows[name]] - trained.mean(0)) / np.where(trained.std(0) > 0, trained.std(0), 1)
-        np.testing.assert_allclose(fields(data, name)["input"], expected, atol=1e-6)
-        assert fields(data, name)["target"].tolist() == (rows[name] % 3).tolist()
-        assert fields(data, name)["group"].tolist() == [0] * len(rows[name])
+        np.testing.assert_allclose(fields_of(data, name)["input"], expected, atol=1e-6)
+        assert fields_of(data, name)["target"].tolist() == (rows[name] % 3).tolist()
+        assert fields_of(data, name)["group"].tolist() == [0] * len(rows[name])
     assert data.fingerprint()["constant"] == "same"
     assert data.fingerprint()["columns"] == "number, square, same, real, angle"
 
 
 def test_the_data_seed_determines_the_random_split(tmp_path: Path) -> None:
     file = table(tmp_path)
-    lines = [fields(prepare_data(file, data_seed=seed), "test")["line"].tolist() for seed in (0, 0, 1)]
+    lines = [fields_of(prepare_data(file, data_seed=seed), "test")["line"].tolist() for seed in (0, 0, 1)]
     assert lines[0] == lines[1] != lines[2]
     shares = prepare_data(file, validation=0.25, test=0.5)
-    assert [len(fields(shares, name)["index"]) for name in SPLITS] == [10, 10, 20]
+    assert [len(fields_of(shares, name)["index"]) for name in SPLITS] == [10, 10, 20]
     assert (
         prepare_data(file).fingerprint()["sha256"] != prepare_data(file, data_seed=1).fingerprint()["sha256"]
     )
@@ -93,18 +87,18 @@ def test_reals_keep_their_unit_and_degrees_become_radians(tmp_path: Path) -> Non
     file = table(tmp_path)
     reals = prepare_data(file, target="real", kind="real")
     assert (reals.target.kind, reals.target.names) == ("real", ("real",))
-    train = fields(reals, "train")
+    train = fields_of(reals, "train")
     np.testing.assert_array_equal(train["target"][:, 0], (train["line"] - 2) / 2 - 3)
     angle = prepare_data(file, target="angle", kind="degrees")
     assert (angle.target.kind, angle.target.names) == ("angle", ("angle",))
-    train = fields(angle, "train")
+    train = fields_of(angle, "train")
     degrees = 20 * (train["line"].double() - 2) - 360
     error = train["target"][:, 0].double() - torch.deg2rad(degrees)
     np.testing.assert_allclose(torch.remainder(error + 1, 2 * math.pi) - 1, 0, atol=1e-6)
     assert train["target"].abs().max() <= math.pi + 1e-6
     several = prepare_data(file, target=["real", "number"], kind="real")
     assert several.target.names == ("real", "number")
-    assert fields(several, "train")["target"].shape == (28, 2)
+    assert fields_of(several, "train")["target"].shape == (28, 2)
     assert several.input_shape == (3,)
 
 
@@ -112,8 +106,8 @@ def test_angles_of_many_turns_keep_their_digits(tmp_path: Path) -> None:
     text = "x,angle\n" + "\n".join(f"{row},{360 * 10**9 * (row - 20) + row}" for row in range(40))
     angle = prepare_data(table(tmp_path, text), target="angle", kind="degrees")
     for name in SPLITS:
-        expected = torch.deg2rad((fields(angle, name)["line"] - 2).double())
-        np.testing.assert_allclose(fields(angle, name)["target"][:, 0], expected, atol=1e-6)
+        expected = torch.deg2rad((fields_of(angle, name)["line"] - 2).double())
+        np.testing.assert_allclose(fields_of(angle, name)["target"][:, 0], expected, atol=1e-6)
 
 
 def test_splits_and_groups_come_from_columns_of_these_names(tmp_path: Path) -> None:
@@ -123,18 +117,18 @@ def test_splits_and_groups_come_from_columns_of_these_names(tmp_path: Path) -> N
     assert data.input_shape == (1,)
     assert data.groups == ("9", "10", "b")  # numbers by size
     for index, name in enumerate(SPLITS):
-        row = fields(data, name)["line"] - 2
+        row = fields_of(data, name)["line"] - 2
         assert (row % 3 == index).all()
         expected = [{"10": 1, "9": 0, "b": 2}[("10", "9", "b")[int(number) % 5 % 3]] for number in row]
-        assert fields(data, name)["group"].tolist() == expected
+        assert fields_of(data, name)["group"].tolist() == expected
 
 
 def test_labels_are_ordered_by_size_where_they_are_numbers(tmp_path: Path) -> None:
     text = "x,class\n" + "\n".join(f"{row},{(10, 2, -1)[row % 3]}" for row in range(60))
     data = prepare_data(table(tmp_path, text))
     assert data.target.names == ("-1", "2", "10")
-    row = fields(data, "test")["line"] - 2
-    assert fields(data, "test")["target"].tolist() == [(2, 1, 0)[int(number) % 3] for number in row]
+    row = fields_of(data, "test")["line"] - 2
+    assert fields_of(data, "test")["target"].tolist() == [(2, 1, 0)[int(number) % 3] for number in row]
 
 
 def with_cell(cell: str, line: int = 5, column: int = 0) -> str:
@@ -232,7 +226,7 @@ def test_angles_in_the_other_unit_are_refused(tmp_path: Path, kind: str) -> None
     with pytest.raises(DataError, match=rf"column 'angle': .* looks like {other}, .* Set data\.kind={other}"):
         prepare_data(file, target="angle", kind=kind)
     data = prepare_data(file, target="angle", kind=other)
-    angle, line = (fields(data, "train")[name] for name in ("target", "line"))
+    angle, line = (fields_of(data, "train")[name] for name in ("target", "line"))
     error = angle[:, 0].double() - torch.deg2rad(torch.from_numpy(degrees)[line - 2])
     np.testing.assert_allclose(torch.remainder(error + 1, 2 * math.pi) - 1, 0, atol=1e-3)
     if kind == "degrees":
@@ -283,7 +277,7 @@ def test_missing_skip_leaves_out_rows_without_a_number(tmp_path: Path, cell: str
     lines[10] = lines[10].replace(",a", ",").replace(",b", ",")
     data = prepare_data(table(tmp_path, "\n".join(lines)), missing="skip")
     assert data.skipped == 2
-    used_lines = torch.cat([fields(data, name)["line"] for name in SPLITS])
+    used_lines = torch.cat([fields_of(data, name)["line"] for name in SPLITS])
     assert sorted(used_lines.tolist()) == [line for line in range(2, ROWS + 2) if line not in (5, 11)]
     reals = prepare_data(
         table(tmp_path, with_cell(cell)), missing="skip", target="x", kind="real", columns=["y"]
@@ -299,7 +293,7 @@ def test_read_uses_the_training_rows_and_needs_no_prepare(tmp_path: Path) -> Non
     file = table(tmp_path)
     data = prepare_data(file, columns=["square", "number"])
     other = tmp_path / "other.csv"
-    test = fields(data, "test")
+    test = fields_of(data, "test")
     numbers = (test["line"] - 2).tolist()
     other.write_text("number,note,square\n" + "\n".join(f"{n},hello,{n * n}" for n in numbers))
     fresh = build_data(file, columns=["square", "number"])

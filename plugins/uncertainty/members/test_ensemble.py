@@ -77,11 +77,7 @@ def train(predictor, optimizer, inputs, target, steps=40):
 )
 @pytest.mark.parametrize(
     "kind",
-    [
-        {"head": "categorical"},
-        {"head": "von_mises", "target": ANGLE},
-        {"head": "scvae", "target": ANGLE},
-    ],
+    [{"head": "categorical"}, {"head": "von_mises", "target": ANGLE}, {"head": "scvae", "target": ANGLE}],
     ids=["categorical", "von_mises", "scvae"],
 )
 def test_each_member_becomes_what_it_becomes_alone(kind, make, dtype, tolerance):
