@@ -23,25 +23,26 @@ from framework.target import Target
 from framework.tracking.signals import SIGNALS
 
 Position = tuple[int, int]
-"""Pair (epoch, first batch within it), both counted from 0."""
+"""Pair (epoch, number of the epoch's next batch), both counted from 0."""
 
 
 @final
 class SeededBatches(Sampler[list[int]]):
-    """Sampler that yields the sample indices of each batch of an epoch; with several ranks, this rank's share of them.
+    """Sampler that yields the indices of the samples of each batch; with several ranks, those of this rank's slice.
 
-    The order depends on (seed, epoch) only, not on the ranks. Rank r of R takes the r-th of R equal slices of each
-    batch, so that all ranks have equally many batches and no sample occurs twice.
+    The order of the samples depends on (seed, epoch) only, not on the ranks. Rank r of R takes the r-th of R nearly
+    equal slices of each batch. So all ranks have equally many batches, and no sample occurs twice.
 
     Args:
         length: number of samples.
         batch_size: samples of a batch over all ranks.
         orders: number of independent orders; a batch concatenates one batch of each order.
-        position: function from the number of batches of an epoch to the starting position. It is called when the first
-            batch is requested, and not by `iter`, which a DataLoader calls earlier and, with workers, once too often.
+        position: function from the number of batches of an epoch to the position at which to start. It is called when
+            the first batch is requested, not when `iter` is called, because a DataLoader calls `iter` earlier and, with
+            workers, once too often.
         seed: seed of the order; None keeps the samples' own order.
-        drop_last: leave out the samples that do not fill a batch (different ones in each epoch). If there are fewer
-            samples than one batch, they still make one smaller batch.
+        drop_last: leave out the last samples of the order if they do not fill a batch (other samples in each epoch). A
+            data set with fewer samples than one batch still makes one smaller batch.
 
     Raises:
         ConfigError: the batch size is smaller than the number of ranks.
@@ -91,7 +92,7 @@ class SeededBatches(Sampler[list[int]]):
             yield [sample for order in orders for sample in self._part(order, number)]
 
     def _part(self, order: list[int], number: int) -> list[int]:
-        """Return this rank's share of batch `number` of an order."""
+        """Return the samples of this rank in batch `number` of the order `order`."""
         start = number * self.batch_size
         last = number == len(self) - 1
         batch = order[start:] if last and not self.drop_last else order[start : start + self.batch_size]
@@ -105,8 +106,8 @@ def epoch_order(length: int, seed: int | None, epoch: int, member: int = 0) -> l
         length: number of samples.
         seed: seed of the order; None keeps the samples' own order.
         epoch: counted from 0.
-        member: number of the model among several that train together; the first one has the order of a model that
-            trains alone.
+        member: number, from 0, of the model if several train together; model 0 has the order of a model that trains
+            alone.
     """
     if seed is None:
         return list(range(length))
@@ -116,16 +117,18 @@ def epoch_order(length: int, seed: int | None, epoch: int, member: int = 0) -> l
 
 @final
 class Batches(pl.LightningDataModule):
-    """Loaders of a data set's batches for every stage; a resumed training continues with the same next batch.
+    """Loaders of a data set's batches for training, validation, test and prediction.
+
+    A resumed training continues with the batch that would have been next.
 
     Call `attach` before `fit`, and give the Trainer `use_distributed_sampler=False`, because this class handles ranks.
-    Training drops the samples that do not fill a batch. The other stages see every sample once, in the data set's
-    order.
+    Training leaves out the samples that do not fill a batch. Validation, test and prediction use every sample once, in
+    the data set's order.
 
     Args:
         data: a prepared data set.
         batch_size: samples of a batch over all devices.
-        workers: number of loading processes of each stage; 0 loads in this process.
+        workers: number of loading processes of each loader; 0 loads in this process.
         seed: seed of the training order.
         files: files that `predict` reads.
         orders: number of models that train together, each with its own order; on a single device only.
@@ -150,11 +153,11 @@ class Batches(pl.LightningDataModule):
         self.orders = orders
 
     def attach(self, trainer: pl.Trainer) -> None:
-        """Set the trainer, which provides the starting position, the rank and the device of the batches."""
+        """Set the trainer, from which the loaders take the starting position, the rank and the device."""
         self.trainer = trainer
 
     def train_dataloader(self) -> DataLoader[Batch]:
-        """Return the training batches, starting at the trainer's position in the epoch."""
+        """Return the loader of the training batches, which starts at the trainer's position in the epoch."""
         orders = self.orders if self.trainer is None or self.trainer.world_size == 1 else 1
         split = self.data.splits().train
         return self._loader(split, position=self._position, seed=self.seed, drop_last=True, orders=orders)
@@ -206,7 +209,7 @@ class Batches(pl.LightningDataModule):
         )
 
     def _generator(self) -> torch.Generator:
-        """Return the generator of the workers' seeds.
+        """Return the random generator from which a DataLoader draws the seeds of its workers.
 
         Without one, a DataLoader would draw these seeds from the global generator at each start.
         """
@@ -239,7 +242,8 @@ class Batches(pl.LightningDataModule):
 def outlive_signals(worker: int) -> None:
     """Let a loading process continue after a signal that all processes of a run receive.
 
-    The main process saves its checkpoint and then ends the workers. A second SIGTERM ends a worker at once.
+    After the signal, the main process saves its checkpoint, and then ends the loading processes. A second SIGTERM ends
+    a loading process at once.
     """
     for number in SIGNALS:
         signal.signal(number, _end_at_second if number == signal.SIGTERM else signal.SIG_IGN)
@@ -275,7 +279,7 @@ def require_targets(batch: Batch, target: Target) -> Batch:
 
 
 def track_batches(loader: DataLoader[Batch], activity: str) -> Iterator[Batch]:
-    """Return the batches of a loader, and show the user how many samples are processed.
+    """Yield the batches of a loader, and show the user how many samples have been processed.
 
     Args:
         loader: the batches.

@@ -16,18 +16,20 @@ from framework.errors import ConfigError
 from framework.training.batches import Batches, track_batches
 
 LARGEST = 8 * 2**30
-"""Largest size of a split's features, in bytes, that is kept in memory.
+"""Largest size, in bytes, of the features of a split that are kept in memory.
 
-Larger features are computed in every epoch.
+Features of a larger size are not cached but computed in every epoch.
 """
 
 
 @final
 class CachedFeatures(Data):
-    """Another data set with features as inputs; the features of a split are computed when they are first read.
+    """Data set that wraps another one and has precomputed features as inputs.
+
+    The features of a split are computed when the split is first read.
 
     Args:
-        data: a prepared data set whose `augment` leaves batches as they are.
+        data: the original data set, prepared; its `augment` must leave batches unchanged.
         features: function from a batch of inputs to features.
         batch_size: number of samples encoded at once.
         workers: number of loading processes.
@@ -54,7 +56,7 @@ class CachedFeatures(Data):
         """Do nothing, because the original data set is already prepared."""
 
     def splits(self) -> Splits:
-        """Return the splits, with features as inputs."""
+        """Return the splits of the original data set, with features as inputs."""
         return self._splits
 
     def compute(self) -> int:
@@ -105,7 +107,7 @@ class _LazyFeatures(Dataset[Batch]):
 
     @cached_property
     def fields(self) -> Fields:
-        """All fields of the split."""
+        """All fields of the split, computed at the first access."""
         return self.compute(self.dataset)
 
     def __len__(self) -> int:

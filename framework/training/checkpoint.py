@@ -16,18 +16,18 @@ BEST = "best.ckpt"
 
 @final
 class WholeCheckpoints(CheckpointIO):
-    """Plugin of Lightning that writes checkpoints atomically: a file is always the complete old or new checkpoint."""
+    """Plugin of Lightning that writes checkpoints atomically: a file is always complete, the old or the new one."""
 
     def save_checkpoint(
         self, checkpoint: dict[str, Any], path: str | Path, storage_options: object = None
     ) -> None:
-        """Write a checkpoint."""
+        """Write a checkpoint to `path`; `storage_options` is ignored."""
         checkpoints.write(checkpoint, Path(path))
 
     def load_checkpoint(
         self, path: str | Path, map_location: object = None, weights_only: bool | None = None
     ) -> dict[str, Any]:
-        """Read a checkpoint onto the CPU, with plain values only; Lightning's other arguments are ignored."""
+        """Return the checkpoint at `path`, of plain values and tensors on the CPU; other arguments are ignored."""
         return checkpoints.read(Path(path))
 
     def remove_checkpoint(self, path: str | Path) -> None:

@@ -13,7 +13,7 @@ from framework.training.batches import Batches
 
 @torch.no_grad()
 def fit_at_once(predictor: Predictor, batches: Batches, seed: int) -> None:
-    """Fit every head of the kind `Fitted` to the features of the training split.
+    """Fit every density head of class `Fitted`, in one step, to the features of the training split.
 
     The members of an ensemble use different seeds.
 

@@ -33,13 +33,13 @@ OPTIMIZERS: dict[str, Callable[..., torch.optim.Optimizer]] = {
 }
 """Optimisers by their names in the config."""
 FUSED = ("adam", "adamw", "sgd")
-"""Optimisers whose fused form is used, which halves the time of a small network's step.
+"""Optimisers that are used in torch's fused form, which halves the time of a small network's step.
 
-The fused form makes one pass over the memory of each parameter instead of several.
+The fused form passes over the memory of each parameter once instead of several times.
 """
 
 ONE_VALUE = "Expected more than 1 value per channel"
-"""Beginning of torch's message about batch norm over a single value."""
+"""Beginning of torch's error message about batch norm in training over a single value per channel."""
 
 
 class Training(pl.LightningModule):
@@ -75,14 +75,14 @@ class Training(pl.LightningModule):
 
     @property
     def learner(self) -> Predictor:
-        """Predictor that reads the batches: with cached features, the one inside the `FrozenFrontEnd`."""
+        """Predictor that reads the batches; with cached features, it is the one inside the `FrozenFrontEnd`."""
         if self.cached:
             assert isinstance(self.predictor, FrozenFrontEnd)
             return self.predictor.predictor
         return self.predictor
 
     def training_step(self, batch: Batch, batch_index: int) -> Tensor:
-        """Return the loss of this rank's batch, weighted so that the mean over ranks is the loss of the whole batch.
+        """Return the loss of this rank's rows, weighted so that the mean over ranks is the loss of the whole batch.
 
         Raises:
             NonFiniteLoss: the loss is NaN or infinite.
@@ -108,7 +108,7 @@ class Training(pl.LightningModule):
         return loss
 
     def _losses(self, batch: Batch) -> Tensor:
-        """Return the predictor's loss per sample; errors of the network become messages for the user."""
+        """Return the predictor's loss per sample; errors of the network become messages that say what to change."""
         try:
             return self.learner.loss(batch["input"], batch["target"])
         except NonFiniteParameters as error:
@@ -127,7 +127,7 @@ class Training(pl.LightningModule):
             ) from error
 
     def _orders(self) -> int:
-        """Return the number of batches, one per model that is trained, that a batch concatenates (training.batches)."""
+        """Return the number of models that train together; each batch contains one batch per model (`Batches`)."""
         trainer: Any = self.trainer
         return trainer.datamodule.orders
 
@@ -183,7 +183,7 @@ class Training(pl.LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": rates, "interval": "step"}}
 
     def on_validation_end(self) -> None:
-        """Pass the validation loss to schedules that depend on it."""
+        """Pass the validation loss to the schedules that depend on it (`Plateau`)."""
         if self.trainer.state.fn == "fit" and not self.trainer.sanity_checking:
             loss = float(self.trainer.callback_metrics["validation/loss"])
             update_plateaus(self.lr_schedulers(), loss, self.current_epoch + 1)
@@ -198,7 +198,7 @@ class Training(pl.LightningModule):
         ]
 
     def _predictor_parameters(self) -> list[nn.Parameter]:
-        """Return the parameters that are trained with the predictor's optimiser settings."""
+        """Return all parameters except those of the adversaries; they are trained with the settings `optimizer`."""
         excluded = {
             id(parameter) for objective, _ in self._adversaries() for parameter in objective.parameters()
         }
@@ -210,7 +210,7 @@ class Training(pl.LightningModule):
         gradient_clip_val: float | None = None,
         gradient_clip_algorithm: str | None = None,
     ) -> None:
-        """Clip gradients as Lightning does, but separately for each adversary and each jointly trained model.
+        """Clip gradients as Lightning does, but each adversary, and each of several models, separately.
 
         Unlike Lightning, it also clips with fused optimisers in mixed precision.
         """
@@ -229,7 +229,7 @@ class Training(pl.LightningModule):
                 nn.utils.clip_grad_norm_(remaining, gradient_clip_val)
 
     def _planned_steps(self) -> tuple[int, int]:
-        """Return the planned number of optimiser steps of the whole training and of one epoch.
+        """Return the planned number of optimiser steps of the whole training, and that of one epoch.
 
         `trainer.estimated_stepping_batches` is not used, because it starts the loader: the workers of a resumed run
         would fetch from the first batch on, before the run's position is known.
@@ -243,7 +243,7 @@ class Training(pl.LightningModule):
         return max(1, min(steps, trainer.max_steps) if trainer.max_steps >= 0 else steps), epoch
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Add the description of the run to the checkpoint."""
+        """Add the description of the model (`configuration.description`) to the checkpoint."""
         checkpoint["framework"] = self.description
 
     def _non_finite_message(self, losses: Tensor, batch: Batch, value: float) -> str:
@@ -263,7 +263,8 @@ class Training(pl.LightningModule):
 class KeepCheckpoints(pl.Callback):
     """Callback that writes last.ckpt, previous.ckpt (the last.ckpt before it) and, with `keep="best"`, best.ckpt.
 
-    Training can resume from the first two. best.ckpt holds weights only; with Adam it has a third of their size.
+    Training can resume from last.ckpt and previous.ckpt. best.ckpt holds weights only; with Adam it has a third of the
+    size of the other two.
     last.ckpt is saved after every epoch with a validation, after the last epoch, and every `every_steps` steps.
     best.ckpt is saved whenever the validation loss reaches a new minimum. Every write is atomic
     (framework.storage.checkpoints).
@@ -303,7 +304,7 @@ class KeepCheckpoints(pl.Callback):
             self.save_last(trainer)
 
     def on_validation_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Record the loss of the weights to keep, and save best.ckpt if it is the lowest so far."""
+        """Record the loss of the weights to keep and, with `keep="best"`, save best.ckpt if it is the lowest so far."""
         if trainer.sanity_checking or trainer.state.fn != "fit":
             return
         loss = float(trainer.callback_metrics["validation/loss"])
@@ -327,11 +328,11 @@ class KeepCheckpoints(pl.Callback):
 
 
 class StopEarly(EarlyStopping):
-    """Callback that stops a training after `patience` validations without a new minimum, or a loss that is not finite.
+    """Callback that stops a training after `patience` validations without a lower loss, or if the loss is not finite.
 
-    The check runs at the end of a validation, because last.ckpt is written after it and must include the result.
-    When a run is resumed, Lightning restores this result, but not the trainer's flag to stop. Without `on_train_start`,
-    a run that was killed during its test would therefore continue to train.
+    The check runs at the end of a validation, because last.ckpt is written afterwards and must contain whether training
+    shall stop. When a run is resumed, Lightning restores this decision, but not the trainer's flag to stop, which
+    `on_train_start` sets again. Otherwise a run that was killed during its test would continue to train.
     """
 
     def __init__(self, patience: int) -> None:
@@ -341,7 +342,7 @@ class StopEarly(EarlyStopping):
 
     @property
     def stopped(self) -> bool:
-        """True if early stopping was triggered; the trainer still trains until its `min_epochs` and `min_steps`."""
+        """True if training shall stop early; the trainer still trains until its `min_epochs` and `min_steps`."""
         return self.stopping_reason is not EarlyStoppingReason.NOT_STOPPED
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
@@ -350,7 +351,10 @@ class StopEarly(EarlyStopping):
 
 
 class LogMetrics(pl.Callback):
-    """Callback that logs losses and the learning rate every `every_steps` steps and at the end of an epoch."""
+    """Callback that logs training loss and learning rate every `every_steps` steps, and the loss of every validation.
+
+    The last step of an epoch is logged too.
+    """
 
     def __init__(self, tracker: Tracker, every_steps: int) -> None:
         self.tracker = tracker
@@ -359,7 +363,7 @@ class LogMetrics(pl.Callback):
     def on_train_batch_end(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        """Log the training loss, the learning rate and the scalars of the objectives."""
+        """Log the training loss, the learning rate and the values in `Objective.logged_terms`."""
         if (trainer.global_step % self.every_steps == 0 or trainer.is_last_batch) and trainer.is_global_zero:
             assert isinstance(pl_module, Training)
             rate = trainer.optimizers[0].param_groups[0]["lr"]
@@ -417,7 +421,7 @@ class StopAtBatch(pl.Callback):
             self.stopper.stop()
 
     def _signal_received(self, trainer: pl.Trainer) -> bool:
-        """Return whether any rank received a signal; the result is the same on all ranks, so that all save and stop."""
+        """Return whether any rank received a signal; all ranks get the same answer, so that all save and stop."""
         return trainer.strategy.reduce_boolean_decision(self.stopper.received is not None, all=False)
 
     def on_validation_batch_end(

@@ -12,11 +12,11 @@ from framework.training.module import Training
 
 @final
 class Progress(pl.Callback):
-    """Callback that shows the epoch (from 1), the epoch's mean training loss so far, and the last validation loss.
+    """Callback that shows the epoch (from 1), its mean training loss so far, and the last validation loss.
 
     Args:
         console: the console to write to; it is quiet in all ranks but the first.
-        seconds: interval of lines within a long epoch, in a log.
+        seconds: time between two lines within a long epoch, if the console is no terminal.
     """
 
     def __init__(self, console: Console, seconds: float = 30.0) -> None:
@@ -59,7 +59,7 @@ class Progress(pl.Callback):
             self._line(trainer, f", step {batch_idx + 1} of {trainer.num_training_batches}")
 
     def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Write the line of an epoch, if there is no bar."""
+        """Write a line about the finished epoch, if there is no bar."""
         if self._bar is None:
             self._line(trainer)
 

@@ -1,4 +1,4 @@
-"""Processes of several ranks that end together: if one dies, the others end, and the run is closed."""
+"""Processes of several ranks that end together: if one process dies, the others end, and the run is closed."""
 
 import os
 import select
@@ -27,18 +27,18 @@ from framework.tracking.signals import ENDING, SIGNALS, Stopped, Stopper, end_wi
 _GRACE = 4.0
 """Seconds that this rank has to leave the training by itself after another rank has died."""
 _CLOSING = 3.0
-"""Seconds for closing the run if this rank has not left the training by itself."""
+"""Seconds that closing the run may take if this rank has not left the training by itself."""
 _MOMENT = 5.0
-"""Seconds within which a rank ends after it has closed its connections."""
+"""Seconds that this rank waits, after a collective operation has failed, for the process of another rank to end."""
 _COLLECTIVE_WORDS = ("gloo", "NCCL", "c10d", "ProcessGroup", "Connection")
 """Words that identify the message of an error of a collective operation in compiled code."""
 _PAUSE = 0.1
-"""Seconds between two checks."""
+"""Seconds between two checks of the ranks."""
 
 
 @final
 class RankStopped(Stopped):
-    """Exception for another rank that was killed, or that received a signal to stop which this rank did not receive."""
+    """Exception of this rank if another rank was killed, or was stopped by a signal that this rank did not receive."""
 
     def __init__(self, rank: int, number: int) -> None:
         super().__init__(number)
@@ -47,21 +47,21 @@ class RankStopped(Stopped):
 
 @final
 class RankFailed(UserError):
-    """Error for another rank that ended with an error of its own."""
+    """Error of this rank if another rank ended with an error."""
 
 
 @final
 class RankLauncher(_SubprocessScriptLauncher):
-    """Lightning's launcher of ranks, changed so that the other ranks die with this process.
+    """Launcher of the other ranks, derived from Lightning's; the ranks that it starts die with this process.
 
-    Lightning's own launcher kills this process if another rank dies (`_ChildProcessObserver`), with a signal that
-    leaves no time to close the run; this launcher does not.
+    If another rank dies, Lightning's own launcher kills this process with a signal that leaves no time to close the run
+    (`_ChildProcessObserver`). This launcher does not.
     """
 
     def launch(
         self, function: Callable[..., Any], *args: Any, trainer: pl.Trainer | None = None, **kwargs: Any
     ) -> Any:
-        """Start the other ranks, and return the result of `function` in this one."""
+        """Start the other ranks, call `function` in this one, and return its result."""
         self.cluster_environment.validate_settings(num_devices=self.num_processes, num_nodes=self.num_nodes)
         if not self.cluster_environment.creates_processes_externally:
             self._call_children_scripts()
@@ -104,13 +104,13 @@ def end_together(
 ) -> Iterator[None]:
     """Make all ranks that train inside the `with` block end together.
 
-    If this rank fails, the error says whether another rank caused it. After another rank has died, or after a signal
-    that this rank cannot handle because it waits in a collective operation, this rank has a few seconds to leave the
-    block. After that, another thread closes the run and ends the process.
+    If this rank fails because of another rank, the error that leaves the block says so. After the death of another
+    rank, and after a signal that this rank cannot handle because it waits in a collective operation, this rank has a
+    few seconds to leave the block. If it does not, another thread closes the run and ends the process.
 
     Args:
         trainer: the trainer of the block.
-        stopper: the receiver of signals.
+        stopper: handler of the signals that stop the run.
         close: function that closes the run after the given error; it has a few seconds.
 
     Raises:
@@ -179,9 +179,9 @@ class _Guard(threading.Thread):
         self._before = signal.set_wakeup_fd(self._writes, warn_on_full_buffer=False)
         self._over = threading.Event()
         self._left: float | None = None
-        """Time at which the main thread left the training with an error; None before that."""
+        """Time at which the main thread left the training with an error; None if it has not."""
         self._caused = False
-        """True if another rank has caused that error."""
+        """True if another rank has caused the error with which the main thread left the training."""
 
     def run(self) -> None:
         """Check the ranks and the signals until the training is over."""
@@ -210,7 +210,10 @@ class _Guard(threading.Thread):
                 self._end(Stopped(signalled[1]))
 
     def cause(self, patience: float) -> RankStopped | RankFailed | Stopped | None:
-        """Return why this rank must stop: another rank or a signal; None if no cause appears in `patience` seconds."""
+        """Return the error with which this rank must stop, caused by another rank or a signal; None without a cause.
+
+        The method waits up to `patience` seconds for a cause to appear.
+        """
         deadline = time.monotonic() + patience
         while True:
             for rank, process in enumerate(self._ranks, 1):
@@ -233,17 +236,18 @@ class _Guard(threading.Thread):
             time.sleep(_PAUSE)
 
     def leave(self, cause: BaseException | None) -> None:
-        """Let the other ranks end after this rank has left the training with an error.
+        """Note that this rank has left the training with an error; the other ranks get seconds to end by themselves.
 
         Args:
-            cause: the error of another rank that caused it; None if this rank's error is its own.
+            cause: the error of another rank or the signal because of which this rank left; None if its error is its
+                own.
         """
         self._release()
         self._caused = cause is not None
         self._left = time.monotonic()
 
     def end(self) -> None:
-        """End the watch after the training has ended."""
+        """Stop watching, because the training has ended."""
         self._over.set()
         self.join()
         self._release()

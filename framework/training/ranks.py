@@ -1,4 +1,7 @@
-"""Training on several ranks with the result of one process: noise and batch statistics are those of the whole batch."""
+"""Training on several ranks that gives the same result as in one process.
+
+Random numbers and batch statistics are those of the whole batch.
+"""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -19,7 +22,7 @@ FACTORIES: set[Callable[..., Tensor]] = {torch.rand, torch.randn}
 LIKE: dict[Callable[..., Tensor], Callable[..., Tensor]] = {
     torch.rand_like: torch.rand, torch.randn_like: torch.randn,
 }  # fmt: skip
-"""Functions that draw a tensor in the shape of another one, and their counterparts for a given shape."""
+"""Functions that draw a tensor shaped like another tensor, each with the function that draws one of a given shape."""
 IN_PLACE = {
     getattr(Tensor, f"{name}_")
     for name in (
@@ -46,7 +49,7 @@ class Share:
 
 
 def rank_share(count: int, device: torch.device) -> Share:
-    """Return which rows of the whole batch this rank's `count` rows are; every rank must call this function."""
+    """Return the share of the whole batch that this rank's `count` rows form; every rank must call this function."""
     counts = [torch.zeros((), dtype=torch.int64, device=device) for _ in range(dist.get_world_size())]
     dist.all_gather(counts, torch.tensor(count, device=device))
     sizes = [int(count) for count in counts]
@@ -61,14 +64,17 @@ def sum_over_ranks(value: Tensor) -> Tensor:
 
 
 def gather_rows(rows: list[int]) -> list[list[int]]:
-    """Return the row numbers of each rank, in the order of ranks; every rank must call this function."""
+    """Return the lists `rows` of all ranks, in the order of ranks; every rank must call this function."""
     lists: list[Any] = [None] * dist.get_world_size()
     dist.all_gather_object(lists, rows)
     return lists
 
 
 class _Sum(torch.autograd.Function):
-    """Sum over ranks; its gradient on every rank is the sum of the gradients on all ranks."""
+    """Sum of a tensor over ranks, with gradient.
+
+    The gradient with respect to each rank's tensor is the sum of the gradients that the ranks have for the sum.
+    """
 
     @staticmethod
     def forward(context: Any, value: Tensor) -> Tensor:
@@ -81,11 +87,12 @@ class _Sum(torch.autograd.Function):
 
 @final
 class WholeBatch(TorchFunctionMode):
-    """Torch mode in which each rank draws noise for the whole batch and uses the part for its own rows.
+    """Torch mode in which each rank draws random numbers for the whole batch and uses those of its own rows.
 
-    All ranks seed their generators alike, so each row gets the noise that it would get in one process. The first
-    dimension whose length equals the number of the rank's rows is assumed to be the batch. Noise of a shape without
-    such a dimension is the same on all ranks. Batch norm computes its training statistics over the rows of all ranks.
+    All ranks use the same seed, so each row gets the random numbers that it would get in one process. The first
+    dimension of a tensor whose length equals the rank's number of rows is assumed to be the batch. Random numbers of a
+    shape without such a dimension are the same on all ranks. Batch norm computes its training statistics over the rows
+    of all ranks.
     """
 
     def __init__(self, rows: Share) -> None:
@@ -128,7 +135,7 @@ class WholeBatch(TorchFunctionMode):
         return func(*args, **kwargs)
 
     def _axis(self, shape: Iterable[int]) -> int | None:
-        """Return the dimension of the batch; None if the shape has none, or if this rank has all rows."""
+        """Return the index of the batch dimension in `shape`; None if it has none, or if this rank has all rows."""
         axes = [axis for axis, size in enumerate(shape) if size == self.rows.count]
         return axes[0] if axes and self.rows.count < self.rows.whole else None
 
@@ -142,7 +149,10 @@ class WholeBatch(TorchFunctionMode):
         return draw(shape).narrow(axis, self.rows.start, self.rows.count).contiguous()
 
     def _bernoulli(self, probability: Tensor, **keywords: Any) -> Tensor:
-        """Draw Bernoulli values for this rank's rows; the unknown probabilities of the other rows count as 0.5."""
+        """Draw Bernoulli values for the whole batch, and return those of this rank's rows.
+
+        The probabilities of the other rows, which this rank does not know, are set to 0.5; their values are dropped.
+        """
 
         def draw(shape: list[int]) -> Tensor:
             axis = self._axis(probability.shape)

@@ -12,8 +12,8 @@ from framework.configuration.settings import OptimizerSettings
 WARMUP_SHARE = 0.25
 """Largest share of a training's steps that the warm-up takes.
 
-A training shorter than four times `warmup_steps` warms up for a quarter of its steps; `cest`, for example, has 400
-steps and warms up for 100 of them. Longer trainings are not affected.
+A training with fewer than 4 `warmup_steps` steps warms up for a quarter of its steps; `cest`, for example, has 400
+steps and warms up for 100 of them. In a longer training, the warm-up takes `warmup_steps` steps.
 """
 
 
@@ -23,7 +23,7 @@ def count_warmup_steps(settings: OptimizerSettings, steps: int) -> int:
 
 
 def make_schedule(settings: OptimizerSettings, steps: int, epoch: int) -> Callable[[int], float]:
-    """Return the schedule: a function from the optimiser step, counted from 0, to the factor of the learning rate.
+    """Return the schedule: a function from the optimiser step, from 0, to the factor that multiplies the learning rate.
 
     Args:
         settings: settings of the optimiser.
@@ -41,28 +41,28 @@ def make_schedule(settings: OptimizerSettings, steps: int, epoch: int) -> Callab
 
 
 def warmup_factor(step: int, warmup_steps: int) -> float:
-    """Return the factor of the warm-up at a step; it rises linearly to 1."""
+    """Return the factor of the warm-up at a step; it rises linearly to 1 in `warmup_steps` steps."""
     return min(1.0, (step + 1) / (warmup_steps + 1))
 
 
 def smooth_factor(step: int, *, total: int | None, warmup_steps: int = 0) -> float:
-    """Return the warm-up's factor at a step, times half a cosine from 1 to 0 over `total` steps if `total` is given."""
+    """Return the warm-up's factor at a step, times a half period of a cosine from 1 to 0 in `total` steps, if given."""
     if total is None:
         return warmup_factor(step, warmup_steps)
     return warmup_factor(step, warmup_steps) * 0.5 * (1 + math.cos(math.pi * min(1.0, step / total)))
 
 
 def step_factor(step: int, *, starts: list[int], factor: float, warmup_steps: int = 0) -> float:
-    """Return the warm-up's factor at a step times `factor` for each of the steps in `starts` that is reached."""
+    """Return the warm-up's factor at a step, times `factor` once for each of the `starts` that are reached."""
     return warmup_factor(step, warmup_steps) * factor ** sum(step >= start for start in starts)
 
 
 class Plateau:
     """Schedule that multiplies the rate by `factor` after `patience` epochs without a lower validation loss.
 
-    Torch's ReduceLROnPlateau is not used: Lightning steps it after it has written an epoch's checkpoint, so a resumed
-    run would miss that step. The state of this class is stored in checkpoints, because LambdaLR stores the attributes
-    of the functions that it calls.
+    Torch's ReduceLROnPlateau is not used: Lightning passes the loss to it after writing an epoch's checkpoint, so a
+    resumed run would miss this loss. The state of this class is stored in checkpoints, because LambdaLR stores the
+    attributes of the functions that it calls.
     """
 
     def __init__(self, factor: float, patience: int, warmup_steps: int = 0) -> None:
@@ -78,7 +78,7 @@ class Plateau:
         return warmup_factor(step, self.warmup_steps) * self.factor**self.reductions
 
     def record_loss(self, loss: float, epochs: int) -> None:
-        """Record the validation loss after `epochs` epochs, and reduce the factor if it is due."""
+        """Record the validation loss after `epochs` epochs; reduce the factor if `patience` epochs had no lower one."""
         if loss < self.best:
             self.best, self.since = loss, epochs
         elif epochs - self.since >= self.patience:
@@ -87,7 +87,7 @@ class Plateau:
 
 
 def update_plateaus(schedules: Any, loss: float, epochs: int) -> None:
-    """Record the validation loss in the `Plateau` schedules of a `LambdaLR`, and set the rates of the next step."""
+    """Record the validation loss in the `Plateau` schedules of a `LambdaLR`, and set the rates for the next step."""
     if not isinstance(schedules, LambdaLR):
         return
     plateaus = [factor for factor in schedules.lr_lambdas if isinstance(factor, Plateau)]
