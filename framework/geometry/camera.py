@@ -11,14 +11,14 @@ from torch import Tensor
 from framework.geometry.rotation import viewpoint_rotation
 
 SHAPES = {"rotation": (3, 3), "translation": (3,), "focal": (2,), "principal": (2,)}
-"""Shapes of the tensors that a camera consists of."""
+"""Shapes of the tensors of a `Camera`, by the name of its attribute."""
 MEANINGS = {"focal": ", (fx, fy), pixels", "principal": ", (cx, cy), pixels"}
-"""Meaning and unit of the numbers of a lens, for messages."""
+"""Meaning and unit of the two numbers of `focal` and of `principal`, for error messages."""
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera without distortion: OpenCV's, whose matrix K is ((fx, 0, cx), (0, fy, cy), (0, 0, 1)).
+    """A pinhole camera without distortion, as in OpenCV: its matrix K is ((fx, 0, cx), (0, fy, cy), (0, 0, 1)).
 
     A world point X is seen at pixel (fx x/z + cx, fy y/z + cy), where (x, y, z) = rotation @ X + translation.
 
@@ -41,12 +41,13 @@ class Camera:
     near: float = 1e-3
 
     def check_shapes(self) -> None:
-        """Check the shapes of the camera's tensors.
+        """Check the shapes of `rotation`, `translation`, `focal` and `principal`.
 
-        Nothing else checks them: a single focal length would count as two, and kernels would read beyond an array.
+        Otherwise a wrong shape would not be noticed: a single focal length would be used for both axes, and kernels
+        would read beyond an array.
 
         Raises:
-            ValueError: rotation, translation, focal or principal has another shape; the message names both shapes.
+            ValueError: one of the four has another shape; the message names both shapes.
         """
         for name, expected_shape in SHAPES.items():
             shape = _shape(getattr(self, name))
@@ -72,12 +73,13 @@ class Camera:
     def to_canonical(self, points: Real[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
         """Return world points in coordinates of the `canonical_camera` of the same image size, metres.
 
-        That camera sees them at the same pixels and depths, so that a cloud alone determines the view and needs no
-        camera.
+        The canonical camera sees them at the same pixels and depths. So the cloud alone determines the view, and the
+        camera is not needed any more.
 
-        Of (x, y, z) = rotation @ X + translation and the canonical focal length f and principal point (c, d) they are
-        ((fx x + (cx - c) z) / f, (fy y + (cy - d) z) / f, z), since then f x'/z + c = fx x/z + cx. The result is
-        differentiable in points and lens. Integers are converted to torch's default float type.
+        With (x, y, z) = rotation @ X + translation, and with the focal length f and the principal point (c, d) of the
+        canonical camera, the new coordinates are ((fx x + (cx - c) z) / f, (fy y + (cy - d) z) / f, z). Their pixel
+        column f x'/z + c equals fx x/z + cx, and the row likewise. The coordinates are differentiable in `points`,
+        `focal` and `principal`. Integers are converted to torch's default float type.
 
         Raises:
             ValueError: as `check_shapes`.
@@ -89,7 +91,7 @@ class Camera:
         return torch.cat([across / focal.new_tensor(plain.focal), depth], -1)
 
     def _in_camera_frame(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return camera coordinates of world points, and focal lengths and principal point as tensors of that type."""
+        """Return world points in camera coordinates, and `focal` and `principal` as tensors of the same type."""
         self.check_shapes()
         if not points.is_floating_point():  # as integers a rotation would have only the entries -1, 0 and 1
             points = points.to(torch.get_default_dtype())
@@ -124,9 +126,9 @@ def focal_length(height: int, field_of_view: float) -> float:
 
 
 def canonical_camera(height: int, width: int) -> Camera:
-    """Return the canonical camera for images of this size, which is at the origin and along the axes.
+    """Return the canonical camera for images of this size: it is at the origin, and its axes are those of the world.
 
-    The focal length is as many pixels as the image has rows. The principal point is the centre of the image.
+    The focal length in pixels is the height of the image. The principal point is the centre of the image.
     """
     return Camera(
         rotation=torch.eye(3),
@@ -146,11 +148,17 @@ def look_from(
     field_of_view: float,
     size: tuple[int, int],
 ) -> Camera:
-    """Return a camera at `distance` (metres) from the origin that looks at it, z up, angles in radians.
+    """Return a camera at `distance` (metres) from the origin that looks at the origin.
 
-    Azimuth rotates about the vertical (0 looks at the object's front, from -y), elevation raises the camera, tilt rolls
-    it in the image plane: the convention of PASCAL3D+ annotations. `field_of_view` is vertical; `size` is (height,
-    width).
+    The world's z axis points up. The angles follow the annotations of PASCAL3D+.
+
+    Args:
+        azimuth: rotation about the vertical, radians; at 0 the camera looks at the object's front, from -y.
+        elevation: angle of the camera above the horizontal, radians.
+        tilt: rotation of the camera in the image plane, radians.
+        distance: metres.
+        field_of_view: vertical, radians.
+        size: (height, width), pixels.
 
     Raises:
         ValueError: as `focal_length`.

@@ -18,18 +18,22 @@ from framework.errors import ConfigError, DataError
 
 Normalisation = Literal["unit_ball", "robust", "none"]
 REACH = 3.0
-"""Radius of "robust", in median distances: points farther from the middle do not count for centre and scale."""
+"""Radius, in median distances, beyond which the normalisation "robust" ignores points for centre and scale."""
 LOOSE, TIGHT = 2.0, 0.01
-"""Bounds on the largest norm of a cloud, relative to a reference; a cloud beyond them was not normalised."""
+"""Largest and smallest accepted norm of a normalised cloud's farthest point, as multiples of a reference length.
+
+A cloud beyond these bounds was not normalised (`require_normalised`).
+"""
 
 
 class NormalisedClouds(NamedTuple):
     """Clouds around the origin, with the centre and scale that map them back (`denormalise_clouds`).
 
     Attributes:
-        clouds: of the input's dtype; attributes and padding are unchanged.
-        centre, scale: of each cloud, in its own units, float64, so that the way back loses no digits of clouds that are
-            far from the origin. The scale of a cloud whose points are all at one position is 1.
+        clouds: normalised clouds, of the input's dtype; attributes of the points and the padding are unchanged.
+        centre: centre of each cloud, in the cloud's own units, float64, so that mapping back loses no digits of clouds
+            that are far from the origin.
+        scale: factor of each cloud, float64; 1 for a cloud whose points are all at one position.
     """
 
     clouds: Float[Tensor, "batch points columns"]
@@ -38,10 +42,14 @@ class NormalisedClouds(NamedTuple):
 
 
 def require_clouds(input_shape: tuple[int, ...], by: str) -> None:
-    """Require inputs that are clouds, (points, columns).
+    """Require that the inputs of a model are clouds, (points, columns).
+
+    Args:
+        input_shape: shape of one input.
+        by: name of the caller, for the message.
 
     Raises:
-        ConfigError: they are not; the message says what `by` wants.
+        ConfigError: the inputs are not clouds; the message says what `by` wants.
     """
     if len(input_shape) != 2 or input_shape[1] < 3:
         raise ConfigError(
@@ -51,11 +59,11 @@ def require_clouds(input_shape: tuple[int, ...], by: str) -> None:
 
 
 def sizes(clouds: Tensor) -> Int[Tensor, "batch"]:
-    """Return the number of points of each cloud of (batch, points, columns), without the padding.
+    """Return the number of points of each cloud of a batch (batch, points, columns), without the padding.
 
     Raises:
-        DataError: no batch of clouds; a cloud without points; a number that is NaN or infinite. The message names the
-            cloud, and its first bad point.
+        DataError: the tensor is no batch of clouds, a cloud has no points, or a number of a point is NaN or infinite.
+            The message names the cloud, and its first bad point.
     """
     if clouds.dim() != 3 or clouds.shape[2] < 3 or clouds.dtype not in (torch.float32, torch.float64):
         raise DataError(
@@ -89,7 +97,12 @@ def sizes(clouds: Tensor) -> Int[Tensor, "batch"]:
 
 
 def point_mask(clouds: Tensor, sizes: Tensor | None) -> Bool[Tensor, "batch points"]:
-    """Return a mask of the rows that hold points, (batch, points): the first `sizes` rows of each cloud; None: all."""
+    """Return a mask (batch, points) of the rows that hold points and no padding.
+
+    Args:
+        clouds: (batch, points, columns).
+        sizes: number of points of each cloud, which are its first rows; None if all rows are points.
+    """
     if sizes is None:
         return clouds.new_ones(clouds.shape[:2], dtype=torch.bool)
     return torch.arange(clouds.shape[1], device=clouds.device) < sizes.to(clouds.device)[:, None]
@@ -99,7 +112,7 @@ def pad(clouds: Sequence[Tensor]) -> Float[Tensor, "batch points columns"]:
     """Return clouds (points, columns) of different sizes as one batch, with rows of NaN at the end of smaller clouds.
 
     Raises:
-        DataError: no cloud, or clouds that differ in their columns.
+        DataError: there is no cloud, or the clouds have different numbers of columns.
     """
     shapes = {tuple(cloud.shape[1:]) for cloud in clouds}
     if len(shapes) != 1 or len(next(iter(shapes))) != 1:
@@ -116,16 +129,14 @@ def normalise_clouds(
 ) -> NormalisedClouds:
     """Return clouds around the origin, within the unit ball; differentiable in the clouds.
 
-    "unit_ball": the mean of the points is subtracted, then all is divided by the largest norm (eq. 6.2). "robust": as
-    "unit_ball", but mean and largest norm are those of the points within `REACH` median distances of the medians of the
-    coordinates, so that far outliers, up to some 30 % of the points, do not shift them at all; outliers end outside of
-    the ball. If half of the points or more are at one position, all count. "none": unchanged, with centre 0 and scale
-    1.
-
     Args:
         clouds: (batch, points, columns).
-        how: "unit_ball", "robust" or "none".
-        counts: result of `sizes`, if it is known.
+        how: "unit_ball": the mean of the points is subtracted, then the coordinates are divided by the largest norm
+            (thesis eq. 6.2). "robust": as "unit_ball", but mean and largest norm are those of the points within `REACH`
+            median distances of the medians of the coordinates. So far outliers, up to some 30 % of the points, do not
+            change the result; they lie outside of the ball. If half of the points or more are at one position, all
+            points are used. "none": the clouds are unchanged, with centre 0 and scale 1.
+        counts: number of points of each cloud, as `sizes` returns them; None if they are not known yet.
 
     Raises:
         DataError: as `sizes`; or squared distances within a cloud exceed float64.
@@ -154,7 +165,10 @@ def normalise_clouds(
 
 
 def _compiled(clouds: Tensor, counts: Tensor) -> NormalisedClouds:
-    """Return the result of "unit_ball" on the CPU, one cloud at a time, in a third of the time of tensor operations."""
+    """Return clouds normalised by "unit_ball" with compiled code for the CPU, one cloud after the other.
+
+    This takes a third of the time of tensor operations.
+    """
     from framework.geometry.clouds_compiled import unit_ball
 
     clouds = clouds.contiguous()  # the function is compiled for contiguous arrays only
@@ -166,7 +180,7 @@ def _compiled(clouds: Tensor, counts: Tensor) -> NormalisedClouds:
 
 
 def _composed(clouds: Tensor, how: Normalisation, counts: Tensor) -> NormalisedClouds:
-    """Return the normalised clouds by operations on tensors, on any device, differentiable."""
+    """Return the normalised clouds, computed by differentiable tensor operations on any device."""
     _, points, columns = clouds.shape
     real = None  # a mask of the points, where there is padding
     if not bool((counts == points).all()):
@@ -200,7 +214,14 @@ def _composed(clouds: Tensor, how: Normalisation, counts: Tensor) -> NormalisedC
 def near_middle(
     offset: Float[Tensor, "batch points 3"], real: Bool[Tensor, "batch points 1"] | None
 ) -> Bool[Tensor, "batch points 1"]:
-    """Return a mask of the points within `REACH` median distances of the medians of the coordinates."""
+    """Return a mask of the points within `REACH` median distances of the point that has the medians as coordinates.
+
+    If half of the points or more are at this point, all points are within.
+
+    Args:
+        offset: coordinates of the points.
+        real: mask of the rows that hold points; None if all do.
+    """
     known = offset if real is None else offset.where(real, math.nan)
     distance = torch.linalg.vector_norm(known - known.nanmedian(1, keepdim=True).values, dim=-1, keepdim=True)
     typical = distance.nanmedian(1, keepdim=True).values
@@ -213,7 +234,7 @@ def denormalise_clouds(
     centre: Float[Tensor, "batch 3"],
     scale: Float[Tensor, "batch"],
 ) -> Float[Tensor, "batch points columns"]:
-    """Return normalised points in their cloud's own units, of the input's dtype; further columns are unchanged."""
+    """Return normalised points in their cloud's own units, of the input's dtype; their attributes are unchanged."""
     back = points[..., :3] * scale[:, None, None] + centre[:, None]
     return torch.cat([back.to(points.dtype), points[..., 3:]], -1)
 
@@ -221,12 +242,12 @@ def denormalise_clouds(
 def require_normalised(
     coordinates: Float[Tensor, "batch points 3"], reach: float, counts: Tensor, by: str
 ) -> None:
-    """Require normalised clouds, because a basis or a grid around the origin cannot describe other clouds.
+    """Require that clouds are normalised, because a basis or a grid around the origin cannot describe other clouds.
 
     Args:
-        coordinates: of clouds that were not normalised by "unit_ball" or "robust".
-        reach: extent of the basis or grid along an axis.
-        counts: sizes of the clouds.
+        coordinates: clouds that `normalise_clouds` did not change, since the caller has chosen "none".
+        reach: largest coordinate of the basis or grid.
+        counts: number of points of each cloud.
         by: name of the caller, for the message.
 
     Raises:
@@ -250,6 +271,6 @@ def require_normalised(
 
 
 def cell_centres(side: int) -> Float[Tensor, "cells 3"]:
-    """Return the centres of the side³ cells of the cube [-1, 1]³, x slowest, float64."""
+    """Return the centres of the side³ cells of the cube [-1, 1]³, float64; x changes slowest, z fastest."""
     axis = (torch.arange(side, dtype=torch.float64) * 2 + 1 - side) / side  # exactly symmetric around 0
     return torch.cartesian_prod(axis, axis, axis)

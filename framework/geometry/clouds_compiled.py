@@ -13,7 +13,9 @@ compiled = compiler(kernel_cache("unit_ball", [Path(__file__)]))
 @compiled
 @no_type_check
 def unit_ball(clouds, counts, normalised, centre, scale):
-    """Fill `normalised` with eq. 6.2 of each cloud; see `framework.geometry.clouds.normalise_clouds`.
+    """Fill `normalised` with clouds that are normalised to the unit ball (thesis eq. 6.2).
+
+    See `framework.geometry.clouds.normalise_clouds`.
 
     Args:
         clouds: (cloud, point, column) float32 or float64.

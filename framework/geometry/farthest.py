@@ -10,16 +10,16 @@ from torch import Tensor
 def farthest(
     positions: Float[Tensor, "batch points 3"], counts: Int[Tensor, "batch"], count: int
 ) -> Int[Tensor, "batch count"]:
-    """Return indices of points of each cloud: each as far as possible from those before, the first from the mean.
+    """Return `count` indices of points of each cloud, each as far as possible from the points chosen before it.
 
-    Of equally far points the first is chosen. No point is chosen twice before all were chosen; then the sequence
-    repeats. So every order of a cloud's points gives the same positions, unless distances are equal, and a
-    smaller `count` gives the beginning of the result of a larger one. The result is
-    computed in float64 on the CPU, on whatever device the clouds are.
+    The first point is the farthest from the mean of the cloud. Of equally far points, the one with the lowest index is
+    chosen. No point is chosen twice before all are chosen; then the sequence repeats. The chosen positions do not
+    depend on the order of the points in the cloud, unless distances are equal. A smaller `count` gives the first
+    indices of a larger one. Everything is computed in float64 on the CPU, on whatever device the clouds are.
 
     Args:
         positions: positions of the points, (batch, points, 3).
-        counts: sizes of the clouds, 1 or more; rows behind them are not read.
+        counts: number of points of each cloud, at least 1; later rows are not read.
         count: number of points to choose.
     """
     from framework.geometry.farthest_compiled import farthest as compiled

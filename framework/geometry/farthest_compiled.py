@@ -18,7 +18,7 @@ def farthest(clouds, counts, count):
 
     Args:
         clouds: (cloud, point, 3) float64, C-contiguous.
-        counts: number of points of each cloud, int64; rows behind them are not read.
+        counts: number of points of each cloud, int64; later rows are not read.
         count: number of points to choose.
     """
     indices = np.empty((len(clouds), count), dtype=np.int64)

@@ -1,8 +1,9 @@
 """Parsers of mesh and cloud files, one function for each format; they never make up what a file does not hold.
 
-Every parser takes the bytes of a file. It raises a ValueError that says what it got, in which line, and what it
-expected; the caller, `geometry.meshes`, names the file. PLY has a module of its own. Comments are skipped, and the
-line ends of all systems are read. Polygons are cut into fans of triangles (correct for convex ones).
+Every parser takes the bytes of a file. If they are wrong, it raises a ValueError that says what it got, in which line,
+and what it expected; the caller, `geometry.meshes`, adds the name of the file. PLY has a module of its own. Comments
+are skipped, and the line ends of all systems are read. Polygons are cut into fans of triangles, which is correct for
+convex polygons.
 """
 
 import re
@@ -23,15 +24,22 @@ XYZ = ("x", "y", "z")
 COLOURS = ("red", "green", "blue")
 NORMALS = ("normal_x", "normal_y", "normal_z")
 OTHER_NAMES = {"r": "red", "g": "green", "b": "blue", "nx": "normal_x", "ny": "normal_y", "nz": "normal_z"}
-"""Names in files of columns that have another name here."""
+"""Other names of columns that files use, and the project's names for these columns."""
 
 
 PADDING = 8
-"""Largest number of blank bytes that may follow a binary file."""
+"""Largest number of blank bytes that may follow the data of a binary file."""
 
 
 class Parsed(NamedTuple):
-    """The content of a file: `attributes` has one column for each of `columns`, with values as in the file."""
+    """The content of a file.
+
+    Attributes:
+        vertices: coordinates.
+        faces: triangles, as rows of `vertices`.
+        columns: names of the vertices' attributes.
+        attributes: one column for each name in `columns`, with values as in the file; None if there are no attributes.
+    """
 
     vertices: Float[np.ndarray, "vertices 3"]
     faces: Int[np.ndarray, "faces 3"]
@@ -40,22 +48,25 @@ class Parsed(NamedTuple):
 
 
 def column_names(names: Sequence[str]) -> tuple[str, ...]:
-    """Return the project's names of columns, in lower case."""
+    """Return the project's names for columns that a file calls `names`, in lower case."""
     small = [name.lower() for name in names]
     return tuple(OTHER_NAMES.get(name, name) for name in small)
 
 
 Place = Callable[[int], int]
-"""Function from the index of a line among some lines to its number in the file (from 1); called for messages."""
+"""Function from the index of a line in a list of lines to its line number in the file (from 1), for messages."""
 
 
 def text_lines(content: bytes, comment: bytes | None = b"#", names: Sequence[bytes] = ()) -> list[bytes]:
-    """Return the lines that are neither blank nor a comment, without their comments and without a byte-order mark.
+    """Return the lines of a file that are neither blank nor a comment, without comments at their ends.
+
+    A byte-order mark is removed.
 
     Args:
         content: bytes of the file.
-        comment: beginning of a comment, but not within a number, such as 1.#INF. None: there are no comments.
-        names: first words of lines whose rest is a name, which may hold the beginning of a comment.
+        comment: sign at which a comment begins, unless it stands within a number such as 1.#INF; None if there are no
+            comments.
+        names: lines with one of these first words are kept whole, because a name follows, which may contain the sign.
 
     Raises:
         ValueError: the text is UTF-16.
@@ -70,14 +81,14 @@ def line_numbers(
     key: bytes = b"",
     first: int = 0,
 ) -> Place:
-    """Return a function that gives the line numbers in the file of the lines of `text_lines`, from `first` on.
+    """Return a function that gives the number in the file (from 1) of a line that `text_lines` returns.
 
     Args:
         content: bytes of the file.
-        comment: as of `text_lines`.
-        names: as of `text_lines`.
-        key: counts only lines with this first word.
-        first: index, among the lines of the file that are kept, of the first of these lines.
+        comment: as for `text_lines`.
+        names: as for `text_lines`.
+        key: if not empty, only lines with this first word are counted.
+        first: number of counted lines before the line to which the function assigns index 0.
     """
 
     def place(line: int) -> int:
@@ -104,10 +115,10 @@ def _lines(content: bytes, comment: bytes | None, names: Sequence[bytes]) -> lis
 
 
 def numbers(lines: Sequence[bytes], dtype: type = np.float64, place: Place | None = None) -> NDArray:
-    """Return all numbers of some lines, concatenated.
+    """Return all numbers in `lines`, concatenated.
 
     Raises:
-        ValueError: a word is no number; the message names the line.
+        ValueError: a word is no number; the message names the line if `place` is given.
     """
     joined = b" ".join(lines).strip()  # NumPy reads blanks alone as a number
     try:
@@ -140,17 +151,23 @@ def _no_number(word: bytes, dtype: type, line: bytes) -> str:
 
 
 def _at(number: int, place: Place | None) -> str:
-    """Return the number of a line, as the beginning of a message."""
+    """Return the line number of the line with the index `number`, as the beginning of a message; '' without `place`."""
     return "" if place is None else f"line {place(number)}: "
 
 
 def rows(
     lines: Sequence[bytes], row_name: str, width: int | None = None, place: Place | None = None
 ) -> Float[np.ndarray, "rows width"]:
-    """Return lines of equally many numbers, (rows, width); `width` None: as many as the first line has.
+    """Return the numbers of `lines`, which all have the same number of them, (rows, width).
+
+    Args:
+        lines: lines of text.
+        row_name: what a line describes, for the message.
+        width: number of numbers in a line; None: as many as in the first line.
+        place: function from the index of a line to its number in the file.
 
     Raises:
-        ValueError: a line has another number of them, or a word that is no number; the message names it.
+        ValueError: a line has another number of numbers, or a word that is no number; the message names the line.
     """
     columns = len(lines[0].split()) if width is None and lines else width or 0
     values = numbers(lines, place=place)
@@ -163,7 +180,7 @@ def rows(
 
 
 def polygons(lines: Sequence[bytes], place: Place | None = None) -> Int[np.ndarray, "faces 3"]:
-    """Return the triangles of faces written as their number of corners and the corners; further words are skipped."""
+    """Return the triangles of faces; a line has the number of corners, the corners, and words that are skipped."""
     if not lines:
         return np.empty((0, 3), np.int64)
     corners = int(numbers(lines[0].split()[:1], np.int64, place)[0])
@@ -190,7 +207,12 @@ def polygons(lines: Sequence[bytes], place: Place | None = None) -> Int[np.ndarr
 def fans(
     counts: Int[np.ndarray, "polygons"], corners: Int[np.ndarray, "corners"]
 ) -> Int[np.ndarray, "faces 3"]:
-    """Return polygons of `counts` corners each, cut into triangles that share the polygon's first corner."""
+    """Return the triangles of polygons; the triangles of a polygon share its first corner.
+
+    Args:
+        counts: number of corners of each polygon.
+        corners: vertices of all polygons, one polygon after the other.
+    """
     if len(counts) and counts.min() < 3:
         number = int(np.flatnonzero(counts < 3)[0])
         raise ValueError(f"face {number} (from 0) has {counts[number]} corners; expected at least 3")
@@ -205,7 +227,7 @@ def fans(
 
 
 def off(content: bytes) -> Parsed:
-    """Parse the Object File Format, also with `OFF` and the counts on one line or without a blank between them.
+    """Parse the Object File Format; `OFF` and the counts may be on one line, also without a blank between them.
 
     Colours after the corners of a face, and lines after the announced faces, are skipped.
     """
@@ -240,7 +262,10 @@ def off(content: bytes) -> Parsed:
 
 
 def join_continued_lines(content: bytes) -> bytes:
-    """Return an OBJ file with continued lines joined, with as many lines as before."""
+    """Return the content of an OBJ file in which every line that ends with a backslash is joined with the next line.
+
+    Empty lines are added, so that the line numbers of the other lines stay the same.
+    """
     if b"\\" not in content:
         return content
     lines: list[bytes] = []
@@ -256,7 +281,7 @@ def join_continued_lines(content: bytes) -> bytes:
 
 
 def statements(content: bytes, names: Sequence[bytes] = ()) -> Iterator[tuple[bytes, bytes]]:
-    """Yield the first word and the rest of each line of an OBJ or MTL file; `names` as of `text_lines`."""
+    """Yield the first word and the rest of each line of an OBJ or MTL file; `names` as for `text_lines`."""
     for line in text_lines(content, names=names):
         key, *rest = line.split(None, 1)
         yield key, rest[0].rstrip() if rest else b""
@@ -265,11 +290,11 @@ def statements(content: bytes, names: Sequence[bytes] = ()) -> Iterator[tuple[by
 def from_zero(
     numbers: Int[np.ndarray, "corners"], before: Sequence[int], counts: Int[np.ndarray, "polygons"]
 ) -> Int[np.ndarray, "corners"]:
-    """Return row indices (from 0) for the numbers by which the faces of an OBJ file name rows.
+    """Return indices (from 0) of the vertices or other elements to which the faces of an OBJ file refer.
 
     Args:
-        numbers: from 1, or from -1 backwards; 0 becomes -1.
-        before: number of rows above each face in the file.
+        numbers: numbers in the file: from 1 on, or negative, where -1 is the last element above the face. 0 gives -1.
+        before: number of elements above each face in the file.
         counts: number of corners of each face.
     """
     return np.where(numbers < 0, numbers + np.repeat(np.array(before, np.int64), counts), numbers - 1)
@@ -306,7 +331,7 @@ def obj(content: bytes) -> Parsed:
 
 
 def stl(content: bytes) -> Parsed:
-    """Parse STL, binary or text, its keywords in capitals or not; every face has corners of its own."""
+    """Parse STL, binary or text, with keywords in lower or upper case; every face has three vertices of its own."""
     announced_faces = int.from_bytes(content[80:84], "little") if len(content) >= 84 else -1
     announced_bytes = 84 + 50 * announced_faces
     if 84 <= announced_bytes <= len(content) and has_only_padding(content, announced_bytes):
@@ -353,15 +378,16 @@ def _stl_text(content: bytes) -> Float[np.ndarray, "corners 3"]:
 
 
 def has_only_padding(content: bytes, end: int) -> bool:
-    """Return whether a binary file has nothing after `end` except blank bytes, which editors and transfers may add."""
+    """Return true if only blank bytes, at most `PADDING`, follow `end` in a binary file; editors may add these."""
     return len(content) - end <= PADDING and not content[end:].strip(b" \t\r\n\x1a")
 
 
 def xyz(content: bytes) -> Parsed:
-    """Parse a point in each line, with numbers separated by blanks, tabs, commas or semicolons.
+    """Parse a text file with one point in each line; blanks, tabs, commas or semicolons separate the numbers.
 
-    The first three numbers are coordinates. A first line of as many names (`x y z red …`, also as a comment) names the
-    columns, which may then be in any order; otherwise they are column_4 and so on.
+    The first three numbers are the coordinates, and the further columns are called column_4 and so on. If the first
+    line has as many names as there are columns (`x y z red …`, also as a comment), these name the columns, which may
+    then be in any order.
     """
     plain = _blank_separated(text.remove_byte_order_mark(content))
     if b"//" in plain:
@@ -406,7 +432,7 @@ NO_NUMBER = re.compile(rb"[,;][ \t]*[,;]")
 
 
 def _blank_separated(content: bytes) -> bytes:
-    """Return a cloud's lines with blanks between the numbers.
+    """Return the content of a cloud's text file with blanks as the only separators between the numbers.
 
     Raises:
         ValueError: a comma is the decimal sign, or a number is missing between two separators; the message names the
@@ -436,19 +462,29 @@ COMMAS = "commas stand for decimal points, or separate beside another separator;
 
 
 def _refuse(content: bytes, wrong: Callable[[bytes], bool], why: str) -> None:
-    """Raise for the first line that is wrong, apart from comments."""
+    """Raise a ValueError for the first line, without its comment, for which `wrong` returns true.
+
+    Args:
+        content: bytes of the file.
+        wrong: function that returns true for a line to be refused.
+        why: reason, for the message.
+    """
     for number, line in enumerate(_lines(content, b"#", ()), 1):
         if not re.match(rb"\s*//", line) and wrong(line):
             raise ValueError(f"line {number}: {why}, got {_excerpt(line)}")
 
 
 def npy(content: bytes) -> Parsed:
-    """Parse a NumPy array of (points, 3 or more) numbers."""
+    """Parse a NumPy array of numbers, (points, 3 or more)."""
     return _table(_points(arrays.read_npy(content)), None)
 
 
 def npz(content: bytes) -> Parsed:
-    """Parse a NumPy archive: `points`, or the only array; `normals`, `colors` and other named columns; `faces`."""
+    """Parse a NumPy archive with points, and perhaps attributes and faces.
+
+    The points are the array `points`, or the only array. `normals`, `colors` and every other array with a row for each
+    point are attributes. `faces` are triangles.
+    """
     stored_arrays = arrays.read_npz(content)
     require_numbers(sum(array.size for array in stored_arrays.values()), MOST_NUMBERS, len(content))
     key = "points" if "points" in stored_arrays or len(stored_arrays) != 1 else next(iter(stored_arrays))
@@ -490,6 +526,6 @@ def _table(values: NDArray, names: tuple[str, ...] | None) -> Parsed:
 
 
 def _excerpt(text: bytes) -> str:
-    """Return the beginning of a word or line, for a message."""
+    """Return at most 60 bytes from the beginning of a word or line, as quoted text for a message."""
     plain = text[:60].decode("utf-8", "replace").strip()
     return repr(plain + ("…" if len(text) > 60 else ""))

@@ -35,10 +35,11 @@ class Mesh:
     Attributes:
         source: origin of the mesh, for messages.
         vertices: coordinates in the file's unit, finite.
-        faces: rows of `vertices`, corners counter-clockwise seen from outside.
-        columns: names of the attributes, "red", "green", "blue" (0…1), "normal_x" and so on, or the file's own.
+        faces: three rows of `vertices` for each triangle, counter-clockwise seen from outside.
+        columns: names of the attributes: "red", "green", "blue" (0…1), "normal_x" and so on, or the file's own names.
         attributes: a number for each vertex and column, as in the file; it may be NaN.
-        dropped: number of vertices that were left out because a coordinate was not finite (only on request).
+        dropped: number of vertices that were left out because a coordinate was not finite (only if `read` was asked
+            to).
     """
 
     source: str
@@ -49,10 +50,10 @@ class Mesh:
     dropped: int = 0
 
     def attribute(self, names: Sequence[str]) -> Float[np.ndarray, "vertices names"]:
-        """Return the attributes with these names.
+        """Return the columns of `attributes` that have these names.
 
         Raises:
-            DataError: there is none of this name, one is not finite, or a colour lies outside 0…1.
+            DataError: no attribute has one of the names, a value is not finite, or a colour lies outside 0…1.
         """
         missing = [name for name in names if name not in self.columns]
         if missing:
@@ -82,16 +83,16 @@ class Mesh:
 
 
 def read(file: Path, *, drop_non_finite: bool = False) -> Mesh:
-    """Read a mesh or cloud file; the suffix of its name gives the format, in capitals or not.
+    """Read a mesh or cloud file; the suffix of its name, in lower or upper case, gives the format.
 
     Args:
         file: path of the file.
-        drop_non_finite: leave out vertices with a NaN or infinite coordinate, and faces that use them, and count them
-            in `dropped`, instead of raising.
+        drop_non_finite: if true, vertices with a NaN or infinite coordinate and the faces that use them are left out
+            and counted in `dropped`; if false, they are an error.
 
     Raises:
-        DataError: no such file or format, damage, no vertices, a face that names a missing vertex, a coordinate that is
-            not finite. Nothing is repaired silently.
+        DataError: the file does not exist or has an unknown format, it is damaged, it has no vertices, a face names a
+            missing vertex, or a coordinate is not finite. Nothing is repaired silently.
     """
     parse = READERS.get(file.suffix.lower())
     if parse is None:
@@ -145,7 +146,7 @@ class Sampled(NamedTuple):
 
     Attributes:
         points: coordinates.
-        face: the face that each point lies in.
+        face: index of the face in which each point lies.
         weights: barycentric weights of the three corners of that face.
     """
 
@@ -155,12 +156,12 @@ class Sampled(NamedTuple):
 
 
 def sample(mesh: Mesh, count: int, random: np.random.Generator) -> Sampled:
-    """Return independent points, uniform by area: faces are drawn with probability proportional to their area.
+    """Return `count` independent points on the surface of a mesh, uniformly distributed over its area.
 
-    A face may have area zero.
+    A face is drawn with probability proportional to its area, which may be zero.
 
     Raises:
-        DataError: the mesh has no faces, or none with an area.
+        DataError: the mesh has no faces, or all have area zero.
     """
     _, areas = _cross(mesh)  # twice the area, in units² of the longest side
     if not areas.sum() > 0:
@@ -180,15 +181,15 @@ def sample(mesh: Mesh, count: int, random: np.random.Generator) -> Sampled:
 
 
 def normals(mesh: Mesh) -> Float[np.ndarray, "faces 3"]:
-    """Return unit normals of the faces, outwards; 0 for a face without area."""
+    """Return unit normals of the faces, which point outwards; 0 for a face of area zero."""
     cross, length = _cross(mesh)
     return np.divide(cross, length, out=np.zeros_like(cross), where=length > 0).T
 
 
 def _cross(mesh: Mesh) -> tuple[Float[np.ndarray, "3 faces"], Float[np.ndarray, "faces"]]:
-    """Return cross products of two sides of every face and their lengths, in units² of the longest side.
+    """Return the cross product of two sides of every face, (3, faces), and its length.
 
-    In these units none over- or underflows.
+    The unit is the square of the longest side, so that no product over- or underflows.
     """
     if not len(mesh.faces):
         raise DataError(
@@ -211,9 +212,11 @@ def _cross(mesh: Mesh) -> tuple[Float[np.ndarray, "3 faces"], Float[np.ndarray, 
 
 
 def stream(seed: int, name: str) -> np.random.Generator:
-    """Return a generator of random numbers for a file; `name` is the name of the file without folders.
+    """Return a generator of random numbers for one file; they do not depend on the files that were read before.
 
-    The numbers do not depend on the files that were read before.
+    Args:
+        seed: seed of the run.
+        name: name of the file, without folders.
     """
     digest = hashlib.blake2b(as_bytes(name), digest_size=8).digest()
     return np.random.default_rng([seed, int.from_bytes(digest, "little")])

@@ -37,14 +37,20 @@ TYPES = {
     **dict.fromkeys(("double", "float64"), "f8"),
 }
 CODES = {"i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I"}
-"""Format characters of integers for `struct`."""
+"""Format characters of the module `struct` for integer types."""
 FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 CORNERS = ("vertex_indices", "vertex_index")
 
 
 @dataclass(frozen=True)
 class Property:
-    """A value of each item; `length`: NumPy's type of the number before a list, None if it is no list."""
+    """A property that the header of a PLY file declares for each item of an element: a number, or a list of numbers.
+
+    Attributes:
+        name: name of the property.
+        kind: NumPy's type of the number, or of the numbers in the list.
+        length: NumPy's type of the length that precedes the list; None if the property is a single number.
+    """
 
     name: str
     kind: str
@@ -53,7 +59,13 @@ class Property:
 
 @dataclass(frozen=True)
 class Element:
-    """Items of a kind (vertices, faces), in the file's order."""
+    """An element that the header of a PLY file declares: a kind of items, such as vertices or faces.
+
+    Attributes:
+        name: name of the kind, such as "vertex".
+        count: number of items.
+        properties: properties of an item, in the order in which they are stored.
+    """
 
     name: str
     count: int
@@ -63,10 +75,11 @@ class Element:
 def ply(content: bytes) -> Parsed:
     """Parse PLY 1.0: x, y, z of the vertices, their other properties as attributes, and faces.
 
-    Integer colours become 0…1.
+    Unsigned integer colours are divided by the largest number of their type, to 0…1.
 
     Raises:
-        ValueError: no PLY, an unknown type, fewer or more data than the header announces, faces as strips.
+        ValueError: the file is no PLY, has an unknown type, fewer or more data than the header announces, or faces as
+            strips of triangles.
     """
     content = text.remove_byte_order_mark(content)
     # The last line of the header ends as the first does: after \r alone, \n may be the first byte of the data.
@@ -130,12 +143,13 @@ def _header(content: bytes) -> tuple[str, list[Element]]:
 
 
 def _text(body: bytes, elements: list[Element], place: Place, before: int) -> tuple[NDArray, NDArray]:
-    """Return properties of the vertices, one column each, and triangles, from a body with one line per item.
+    """Return properties of the vertices, one column each, and triangles, from a text body with one line for each item.
 
     Args:
         body: bytes after the header.
         elements: elements that the header announces.
-        place: function from the index of a line of the body that is not blank to its number.
+        place: function from the index of a line among the lines of the body that are not blank, to its number in the
+            body.
         before: number of lines of the header.
     """
     lines = text_lines(body, None)
@@ -183,7 +197,16 @@ def _binary(body: bytes, elements: list[Element], order: str) -> tuple[NDArray, 
 
 
 def _lists(body: bytes, start: int, element: Element, order: str) -> tuple[Int[np.ndarray, "faces 3"], int]:
-    """Return the triangles of an element whose properties may be lists, and the end of its data."""
+    """Return the triangles of an element in a binary body, and the position at which its data end.
+
+    An element other than faces is skipped, and has no triangles.
+
+    Args:
+        body: bytes after the header.
+        start: position at which the element's data begin.
+        element: an element whose properties may be lists.
+        order: NumPy's sign of the byte order.
+    """
     empty = np.empty((0, 3), np.int64)
     if element.count == 0 or not element.properties:
         return empty, start
@@ -216,7 +239,15 @@ def _lists(body: bytes, start: int, element: Element, order: str) -> tuple[Int[n
 def _locate_lists(
     body: bytes, start: int, element: Element, target_list: Property | None, order: str
 ) -> tuple[Int[np.ndarray, "items"], Int[np.ndarray, "places"]]:
-    """Return the length and the position of the list `target_list` of each item; the last position is the end."""
+    """Return length and position of one list of each item of an element; after the last position, the end of the data.
+
+    Args:
+        body: bytes after the header.
+        start: position at which the element's data begin.
+        element: the element.
+        target_list: the property that is the list; None if only the end is wanted.
+        order: NumPy's sign of the byte order.
+    """
     counts, places = np.zeros(element.count, np.int64), np.zeros(element.count + 1, np.int64)
     lengths = [
         struct.Struct((order or "=") + CODES[entry.length]) if entry.length else None
@@ -245,7 +276,7 @@ def _locate_lists(
 
 
 def _first_record(body: bytes, start: int, element: Element, order: str) -> np.dtype:
-    """Return the record type of the element's first item."""
+    """Return the NumPy record type of an element's first item; its lists have the lengths stored in this item."""
     fields = []
     for number, entry in enumerate(element.properties):
         if entry.length is None:

@@ -1,4 +1,4 @@
-"""Writer of PLY files: triangles of coloured vertices, binary."""
+"""Writer of binary PLY files: triangles and vertices, which may have colours."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ def write_ply(
     faces: Int[np.ndarray, "faces 3"],
     colors: UInt8[np.ndarray, "vertices 3"] | None = None,
 ) -> None:
-    """Write a mesh as binary PLY; a cloud if there are no faces."""
+    """Write a mesh as a binary PLY file; without faces it is a point cloud."""
     columns = [("place", "<f4", 3), *([] if colors is None else [("colour", "u1", 3)])]
     table = np.empty(len(vertices), columns)
     table["place"] = vertices

@@ -6,10 +6,11 @@ from torch import Tensor
 
 
 def viewpoint_rotation(angles: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """Return the rotation of the object seen at (azimuth a, elevation e, tilt t), radians: Rz(t) Rx(e - π/2) Rz(-a).
+    """Return the rotation from object to camera of viewpoints `angles`: Rz(t) Rx(e - π/2) Rz(-a).
 
-    This is the Euler convention of PASCAL3D+ annotations (Xiang et al., WACV 2014), as used for viewpoint evaluation by
-    Tulsiani & Malik (CVPR 2015). The camera frame has x right, y up, z towards the viewer.
+    The angles are azimuth a, elevation e and tilt t, radians. This is the Euler convention of PASCAL3D+ annotations
+    (Xiang et al., WACV 2014), as used for viewpoint evaluation by Tulsiani & Malik (CVPR 2015). The camera frame has x
+    right, y up, z towards the viewer.
     """
     azimuth, elevation, tilt = angles.unbind(-1)
     return about_z(tilt) @ _about_x_elevation(elevation) @ about_z(-azimuth)
@@ -18,11 +19,11 @@ def viewpoint_rotation(angles: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*bat
 def geodesic_distance(
     first: Float[Tensor, "*batch 3 3"], second: Float[Tensor, "*batch 3 3"]
 ) -> Float[Tensor, "*batch"]:
-    """Return the angle between two rotations, radians in [0, π]: ||log(R₁ᵀR₂)||_F / √2 (Tulsiani & Malik).
+    """Return the angle between two rotations R₁ and R₂, radians in [0, π]: ||log(R₁ᵀR₂)||_F / √2 (Tulsiani & Malik).
 
-    It is exact near 0, where the arc cosine of the trace loses half the digits. It is exact near π, where cos(angle /
-    2) from the trace does: there it is computed as sin(angle) / (2 sin(angle / 2)), from the antisymmetric part of
-    R₁ᵀR₂.
+    It is exact near 0, where the arc cosine of the trace of R₁ᵀR₂ loses half the digits. It is exact near π too, where
+    cos(angle / 2), computed from the trace, loses them. There it is computed as sin(angle) / (2 sin(angle / 2)), with
+    sin(angle) from the antisymmetric part of R₁ᵀR₂.
     """
     chord = torch.linalg.matrix_norm(first - second) / 8**0.5  # sin(angle / 2)
     trace = (first * second).sum((-2, -1))

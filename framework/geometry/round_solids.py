@@ -17,7 +17,13 @@ def _circle(sides: int) -> Float[np.ndarray, "sides 2"]:
 
 
 def revolution(profile: Points, sides: int = 24, edges: Edges = "shared") -> Solid:
-    """Return the closed surface of revolution about z of a profile (radius, height), which runs from bottom to top."""
+    """Return a closed surface of revolution about z.
+
+    Args:
+        profile: (radius, height) of each ring, from bottom to top.
+        sides: number of sides of a ring.
+        edges: edges that are creases.
+    """
     radius, height = np.asarray(profile, dtype=np.float64).T
     rings = np.empty((len(profile), sides, 3))
     rings[..., :2] = radius[:, None, None] * _circle(sides)
@@ -44,7 +50,7 @@ def rod(start: Point, end: Point, radius: Number, sides: int = 8) -> Solid:
 
 
 def ring(radius: Number, thickness: Number, at: Point = (0, 0, 0), sides: int = 24) -> Solid:
-    """Return a horizontal torus about `at`; `thickness` is the radius of its tube."""
+    """Return a horizontal torus with its centre at `at`; `thickness` is the radius of its tube."""
     angle = 2 * math.pi * np.arange(sides + 1) / sides
     path = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(sides + 1)])
     return tube(path, [thickness] * (sides + 1), 8).move(*at)
@@ -90,7 +96,7 @@ def bar(
 
 
 def wheel(center: Points, radius: Number, width: Number, sides: int = 16) -> Solid:
-    """Return a disc whose axis is parallel to x."""
+    """Return a disc with its axis parallel to x and its centre at `center`; `width` is its thickness."""
     middle = np.asarray(center, dtype=np.float64)
     half = np.array([width / 2, 0, 0])
     return bar(middle - half, middle + half, radius, sides=sides)
@@ -118,7 +124,7 @@ def _torus_faces(sides: int, around: int) -> Int[np.ndarray, "faces 3"]:
 
 
 def ellipsoid(center: Points, radii: Points, sides: int = 14, layers: int = 9) -> Solid:
-    """Return an ellipsoid with half axes `radii`."""
+    """Return an ellipsoid with centre `center` and half axes `radii` along x, y, z."""
     angle = np.linspace(-np.pi / 2, np.pi / 2, layers)
     unit = revolution(np.stack([np.cos(angle), np.sin(angle)], axis=1), sides, "rims")
     return unit.scale(*radii).move(*center)

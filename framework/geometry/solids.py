@@ -1,6 +1,6 @@
-"""Closed solids as vertices and triangles, z up: how they are moved and joined, and those with flat sides.
+"""Closed solids as vertices and triangles, z up: how they are moved and joined, and solids with flat sides.
 
-The solids that are round stand in `round_solids`.
+Round solids are in `round_solids`.
 """
 
 import math
@@ -16,7 +16,7 @@ Point = Sequence[Number]
 Points = Sequence[Any] | np.ndarray
 """Point (3,), or a list of points (points, 3), or a list of such lists."""
 Edges = Literal["shared", "rims", "sharp"]
-"""Edges of a loft that are creases: none (neighbouring facets share their vertices), the rims of its caps, or all."""
+"""Edges of a `loft` that are creases: none ("shared": facets share their vertices), the rims of its caps, or all."""
 
 _SQUARE = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) / 2
 
@@ -25,9 +25,9 @@ class Solid(NamedTuple):
     """One or several closed surfaces, as triangles; facets that share vertices are shaded smoothly.
 
     Attributes:
-        vertices: Vertices.
-        faces: Vertex indices of the triangles, of one closed surface all counter-clockwise or all clockwise seen from
-            outside.
+        vertices: coordinates.
+        faces: indices of the three vertices of each triangle. Seen from outside, the triangles of one closed surface
+            are all counter-clockwise or all clockwise.
     """
 
     vertices: Float[np.ndarray, "vertices 3"]
@@ -52,7 +52,7 @@ class Solid(NamedTuple):
 
 
 def join(solids: Sequence[Solid]) -> Solid:
-    """Return all solids as one solid."""
+    """Return several solids as one solid."""
     first = np.cumsum([0, *(len(solid.vertices) for solid in solids)])
     return Solid(
         np.concatenate([solid.vertices for solid in solids]),
@@ -68,7 +68,7 @@ def with_mirror(solid: Solid, axis: int) -> Solid:
 
 
 def drop_degenerate(solid: Solid) -> Solid:
-    """Return the solid without triangles of which two corners coincide, as they do on a ring of radius 0."""
+    """Return the solid without triangles in which two corners coincide, as on a ring of radius 0."""
     corners = solid.vertices[solid.faces]
     edge_lengths = np.abs(corners - np.roll(corners, 1, axis=1)).max(-1)
     # 1e-9 instead of 0, because the computed cosine of a right angle is 6e-17
@@ -76,10 +76,13 @@ def drop_degenerate(solid: Solid) -> Solid:
 
 
 def loft(rings: Points, edges: Edges = "shared", caps: bool = True) -> Solid:
-    """Return the surface through a stack of rings (rings, points, 3), which may shrink to points.
+    """Return the surface through a stack of rings, which may shrink to points.
 
-    With `caps`, fans close the first and the last ring, which must then be convex. Only a loft with shared edges can
-    be without caps.
+    Args:
+        rings: (rings, points, 3).
+        edges: edges that are creases.
+        caps: if true, fans of triangles close the first and the last ring, which must then be convex. If false, `edges`
+            must be "shared".
     """
     stack = np.asarray(rings, dtype=np.float64)
     layers, points, _ = stack.shape
@@ -113,7 +116,12 @@ def _loft_faces(layers: int, points: int, edges: Edges, caps: bool) -> Int[np.nd
 
 @cache
 def quad_corners(layers: int, points: int) -> Int[np.ndarray, "layers points 4"]:
-    """Return the vertex indices of the quads between each ring and the next one; the first follows the last."""
+    """Return the vertex indices of the quads between each ring and the next one; after the last ring comes the first.
+
+    Args:
+        layers: number of rings.
+        points: number of points of a ring.
+    """
     layer, point = np.meshgrid(np.arange(layers), np.arange(points), indexing="ij")
     above, after = (layer + 1) % layers, (point + 1) % points
     corners = [layer * points + point, layer * points + after, above * points + after, above * points + point]
@@ -121,12 +129,17 @@ def quad_corners(layers: int, points: int) -> Int[np.ndarray, "layers points 4"]
 
 
 def _levels(levels: Sequence[tuple[np.ndarray, Number]], caps: bool = True) -> Solid:
-    """Return the loft through horizontal outlines (points, 2) at these heights."""
+    """Return the loft through horizontal outlines.
+
+    Args:
+        levels: (outline (points, 2), height) of each ring.
+        caps: as for `loft`.
+    """
     return loft([np.insert(outline, 2, z, axis=1) for outline, z in levels], caps=caps)
 
 
 def box(width: Number, depth: Number, height: Number, at: Point = (0, 0, 0)) -> Solid:
-    """Return a box with width along x and depth along y; `at` is the middle of its bottom."""
+    """Return a box with its width along x and its depth along y; `at` is the middle of its bottom."""
     return frustum(width, depth, width, depth, height, at)
 
 
@@ -143,7 +156,16 @@ def _unit_block() -> Solid:
 def frustum(
     width: Number, depth: Number, top_width: Number, top_depth: Number, height: Number, at: Point = (0, 0, 0)
 ) -> Solid:
-    """Return a box whose top and bottom differ in size (a frustum of a pyramid); `at` is the middle of its bottom."""
+    """Return a box whose top and bottom differ in size (a frustum of a pyramid).
+
+    Args:
+        width: size of the bottom along x.
+        depth: size of the bottom along y.
+        top_width: size of the top along x.
+        top_depth: size of the top along y.
+        height: distance between bottom and top.
+        at: middle of the bottom.
+    """
     return _levels([(_SQUARE * [width, depth], 0), (_SQUARE * [top_width, top_depth], height)]).move(*at)
 
 
@@ -154,7 +176,7 @@ def plate(outline: Points, offset: Points, edges: Edges = "sharp") -> Solid:
 
 
 def side_plate(outline: Sequence[Point], x: Number, thickness: Number) -> Solid:
-    """Return a plate with sharp edges in the plane x = `x` with a convex outline (y, z)."""
+    """Return a plate with sharp edges in the plane x = `x`; its outline (y, z) must be convex."""
     return plate([(x, y, z) for y, z in outline], (thickness, 0, 0))
 
 
@@ -189,9 +211,16 @@ def tray(
     at: Point = (0, 0, 0),
     foot: Number = 1.0,
 ) -> Solid:
-    """Return an open box with walls and a floor of these thicknesses.
+    """Return an open box.
 
-    `foot` is the size of the bottom as a share of the size of the rim; `at` is the middle of the bottom.
+    Args:
+        width: size of the rim along x.
+        depth: size of the rim along y.
+        height: height.
+        wall: thickness of the walls.
+        floor: thickness of the floor.
+        at: middle of the bottom.
+        foot: size of the bottom as a share of the size of the rim.
     """
     outer = np.array([width, depth])
     inner = outer - 2 * wall
@@ -204,7 +233,7 @@ def ribbon(
 ) -> Solid:
     """Return an upright sheet between two lines (x, y): `low` at z = 0 and `high` at z = `height`.
 
-    Both lines have the same number of points, with rising x.
+    Both lines have the same number of points, ordered by increasing x. `thickness` is measured along y.
     """
     rings = [
         np.array(
@@ -221,9 +250,11 @@ def ribbon(
 
 
 def loft_rectangles(levels: Sequence[Point], middle: Number = 0.0) -> Solid:
-    """Return the solid with sharp edges through horizontal rectangles (half width, front y, rear y, z).
+    """Return the solid with sharp edges through a stack of horizontal rectangles.
 
-    The middle of all rectangles lies at x = `middle`.
+    Args:
+        levels: (half width, front y, rear y, z) of each rectangle.
+        middle: x of the middle of all rectangles.
     """
     rings = [
         [(middle + half, near, z), (middle + half, far, z), (middle - half, far, z), (middle - half, near, z)]
@@ -235,9 +266,14 @@ def loft_rectangles(levels: Sequence[Point], middle: Number = 0.0) -> Solid:
 def bevelled(
     width: Number, low: Number, high: Number, y: Number, bevel: Number = 0.25
 ) -> Float[np.ndarray, "8 3"]:
-    """Return a ring (8, 3) in the plane of this y: a rectangle with cut corners.
+    """Return a ring (8, 3) in the plane of constant `y`: a rectangle, centred at x = 0, with cut corners.
 
-    `low` and `high` are its limits in z. The cut has the length of `bevel` times the shorter half side.
+    Args:
+        width: size along x.
+        low: lowest z.
+        high: highest z.
+        y: y of all points.
+        bevel: size of a cut along each side, as a share of the shorter half side.
     """
     half, middle, tall = width / 2, (low + high) / 2, (high - low) / 2
     cut = bevel * min(half, tall)

@@ -1,7 +1,7 @@
 """Exact search for the point of a cloud nearest to each query, and the Chamfer distance (thesis eq. 6.4-6.6).
 
-The CPU uses compiled kernels (`processor`, imported when first needed), other devices use torch (`device`). For clouds
-in pieces see `streamed`; the other modules are for this package alone.
+The CPU uses compiled kernels (`processor`, imported when first needed), other devices use torch (`device`). `streamed`
+is for clouds that are read in pieces. The other modules are used by this package alone.
 """
 
 import math
@@ -18,16 +18,17 @@ from framework.geometry.clouds import point_mask
 from framework.geometry.nearest.exponents import MOST
 
 OFTEN = 2**16
-"""Largest number of queries that can be packed well in less than a second."""
+"""Largest number of queries that `processor.packed_well` packs in less than a second."""
 
 
 class Nearest(NamedTuple):
     """The nearest point of each query.
 
     Attributes:
-        distance: Euclidean, in the unit of the coordinates, of their dtype; NaN for queries beyond `query_sizes`.
-        index: row of the cloud, int64; 0 for queries beyond `query_sizes`. Of points at the same distance, after
-            rounding of its square in the dtype, the lowest row.
+        distance: Euclidean distance, in the unit and the dtype of the coordinates; NaN for queries beyond
+            `query_sizes`.
+        index: row of the nearest point in the cloud, int64; 0 for queries beyond `query_sizes`. If the squares of
+            several distances are equal after rounding to the dtype, it is the lowest row.
     """
 
     distance: Float[Tensor, "batch query"]
@@ -36,11 +37,12 @@ class Nearest(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Queries:
-    """Queries that all clouds share, with results that are computed from them once (`prepare`).
+    """Queries that all clouds share; what is computed from the queries alone is computed once (`prepare`).
 
     Attributes:
-        points: finite.
-        once: true if the queries are used for one batch only, so that packing them well takes longer than it saves.
+        points: coordinates of the queries, finite.
+        once: true if the queries are used for one batch only; then they are packed fast, since packing them well would
+            take longer than it saves.
     """
 
     points: Float[Tensor, "query 3"]
@@ -48,12 +50,12 @@ class Queries:
 
     @cached_property
     def largest(self) -> float:
-        """Largest magnitude of a coordinate."""
+        """Largest magnitude of a coordinate of the queries."""
         return float(self.points.abs().max())
 
     @cached_property
     def packed(self) -> Any:
-        """Queries packed for the kernels of the CPU."""
+        """Queries in the form that the kernels of the CPU read (`pack.Packed`)."""
         from framework.geometry.nearest.processor import packed_once, packed_well
 
         points = self.points.numpy()
@@ -62,6 +64,10 @@ class Queries:
 
 def prepare(queries: Tensor, once: bool = False) -> Queries:
     """Return queries (query, 3) prepared for many clouds: `nearest` takes them in place of the tensor, and is faster.
+
+    Args:
+        queries: (query, 3).
+        once: true if the queries are used for one batch only.
 
     Raises:
         DataError: there is no query, or a coordinate is NaN or infinite.
@@ -77,19 +83,21 @@ def nearest(
 ) -> Nearest:
     """Return the nearest point of each cloud to each query: exact in the dtype of the coordinates, float32 or float64.
 
-    Squares of differences are added in that dtype. The distance, and that of the point that is found, are therefore the
-    smallest to 2.5e-7 of the largest coordinate or distance in float32, 1e-15 in float64. The function uses as many
-    threads as torch does. It has no gradient: gather points by `index` if a gradient is needed.
+    Squared differences are added in this dtype. So the returned distance, and the true distance of the point that is
+    found, exceed the smallest distance by at most 2.5e-7 (float32) or 1e-15 (float64) times the largest coordinate or
+    distance. The function uses as many threads as torch does. It has no gradient: gather points by `index` if a
+    gradient is needed.
 
     Args:
         clouds: (batch, points, 3), on the device of the queries. Rows from `sizes` on are not read.
         queries: (query, 3), shared by all clouds, or (batch, query, 3), separate for each cloud.
-        sizes: (batch,) number of points of each cloud; all if None.
-        query_sizes: (batch,) number of queries of each cloud, for queries (batch, …); all if None.
+        sizes: (batch,) number of points of each cloud; None if all rows are points.
+        query_sizes: (batch,) number of queries of each cloud, for queries (batch, query, 3); None if all rows are
+            queries.
 
     Raises:
-        DataError: an empty cloud, a number that is not finite, a distance that the dtype cannot hold; the message names
-            the cloud.
+        DataError: a cloud is empty, a number is not finite, or the dtype cannot hold a distance; the message names the
+            cloud.
     """
     clouds = clouds.detach()
     own = isinstance(queries, Tensor) and queries.dim() == 3
@@ -119,10 +127,14 @@ def nearest(
 
 
 def require_points(points: Tensor, name: str) -> None:
-    """Check that points are (batch, points ≥ 1, 3) of float32 or float64.
+    """Check that a tensor of points has the shape (batch, points, 3), at least one point, and float32 or float64.
+
+    Args:
+        points: the tensor.
+        name: name of the tensor, for the message.
 
     Raises:
-        DataError: they are not.
+        DataError: shape or dtype is another one.
     """
     if points.dim() != 3 or points.shape[2] != 3 or points.dtype not in (torch.float32, torch.float64):
         raise DataError(
@@ -134,10 +146,15 @@ def require_points(points: Tensor, name: str) -> None:
 
 
 def require_sizes(points: Tensor, sizes: Tensor | None, name: str) -> Tensor | None:
-    """Return the sizes as int64 on the CPU.
+    """Return `sizes` as int64 on the CPU; None if it is None.
+
+    Args:
+        points: (batch, points, 3).
+        sizes: number of points of each item of the batch, or None.
+        name: name of the points, for the message.
 
     Raises:
-        DataError: a size is not in 1…points.
+        DataError: a size is not from 1 to the number of rows of `points`.
     """
     if sizes is None:
         return None
@@ -157,10 +174,15 @@ def require_sizes(points: Tensor, sizes: Tensor | None, name: str) -> Tensor | N
 
 
 def refuse_bad(points: Tensor, sizes: Tensor | None, name: str) -> None:
-    """Raise an error that names the first number that is not finite, if there is one.
+    """Check that all coordinates are finite.
+
+    Args:
+        points: (batch, points, 3).
+        sizes: number of points of each item of the batch; None if all rows are points.
+        name: name of the points, for the message.
 
     Raises:
-        DataError: a number is not finite.
+        DataError: a number is NaN or infinite; the message names the first one.
     """
     bad = ~points.isfinite().all(-1)
     if sizes is not None:
@@ -176,7 +198,7 @@ def refuse_bad(points: Tensor, sizes: Tensor | None, name: str) -> None:
 def on_processor(
     clouds: Tensor, queries: Tensor | Queries, sizes: Tensor | None, query_sizes: Tensor | None
 ) -> Nearest:
-    """Return the nearest points by the compiled kernels of the CPU."""
+    """Return the nearest points, found by the compiled kernels of the CPU; arguments as for `nearest`."""
     from framework.geometry.nearest import processor
 
     shared = isinstance(queries, Queries)
@@ -209,7 +231,7 @@ def on_processor(
 
 
 def on_device(clouds: Tensor, points: Tensor, sizes: Tensor | None, query_sizes: Tensor | None) -> Nearest:
-    """Return the nearest points by torch, on other devices."""
+    """Return the nearest points, found by torch on devices other than the CPU; arguments as for `nearest`."""
     from framework.geometry.nearest.device import nearest_of
 
     refuse_bad(clouds, sizes, "clouds")
@@ -222,19 +244,20 @@ def on_device(clouds: Tensor, points: Tensor, sizes: Tensor | None, query_sizes:
 
 
 def scaling(cloud: Tensor, queries: Tensor) -> float:
-    """Return a power of two, by which multiplying is exact, that scales the largest coordinate to about 1.
+    """Return a power of two that scales the largest coordinate of a cloud and its queries to about 1.
 
-    If the dtype cannot hold such a power, the coordinate only becomes closer to 1, and `nearest` then scales again.
+    Multiplying by it is exact. If the dtype cannot hold such a power, the coordinate only becomes closer to 1, and
+    `nearest` then scales again.
     """
     largest = max(float(cloud.abs().max()), float(queries.abs().max()))
     return 2.0 ** max(-MOST[cloud.dtype], min(MOST[cloud.dtype], -math.frexp(largest)[1]))
 
 
 def unscale(distance: Tensor, scale: float, cloud: int) -> Tensor:
-    """Return distances divided by the scale.
+    """Return distances divided by the factor `scale` by which the coordinates were multiplied.
 
     Raises:
-        DataError: the dtype cannot hold a distance.
+        DataError: the dtype cannot hold a distance; the message names the cloud with the index `cloud`.
     """
     distance = distance / scale
     if not distance.isfinite().all():
@@ -251,13 +274,20 @@ def chamfer(
     sizes_a: Int[Tensor, "batch"] | None = None,
     sizes_b: Int[Tensor, "batch"] | None = None,
 ) -> Float[Tensor, "batch"]:
-    """Return the mean squared distance to the nearest point of the other cloud, both ways added (eq. 6.6).
+    """Return the Chamfer distance of clouds `a` and `b`, one for each item of the batch (thesis eq. 6.6).
 
-    The result is differentiable.
+    It is the mean squared distance from the points of `a` to their nearest points of `b`, plus the same with `a` and
+    `b` exchanged. It is differentiable.
+
+    Args:
+        a: clouds, (batch, points, 3).
+        b: clouds, (batch, points, 3).
+        sizes_a: number of points of each cloud in `a`; None if all rows are points.
+        sizes_b: number of points of each cloud in `b`; None if all rows are points.
 
     Raises:
-        DataError: as `nearest`; or the dtype cannot hold the mean of the squares: it is too large, or too small and not
-            0.
+        DataError: as `nearest`; or the dtype cannot hold the mean of the squares, because it is too large, or too small
+            and not 0.
     """
     forward_offsets, backward_offsets = offsets(a, b, sizes_a, sizes_b), offsets(b, a, sizes_b, sizes_a)
     distance = mean_square(forward_offsets, sizes_a) + mean_square(backward_offsets, sizes_b)
@@ -288,21 +318,33 @@ def offsets(
 
 
 def mean_square(offsets: Float[Tensor, "batch query 3"], sizes: Tensor | None) -> Float[Tensor, "batch"]:
-    """Return the mean of the squared lengths of the first `sizes` offsets of each cloud; the other offsets are 0."""
+    """Return the mean of the squared lengths of the first `sizes` offsets of each cloud; later offsets must be 0.
+
+    Args:
+        offsets: (batch, query, 3).
+        sizes: number of offsets of each cloud; None if all rows count.
+    """
     sizes = offsets.new_full((len(offsets),), offsets.shape[1]) if sizes is None else sizes.to(offsets)
     return MeanSquare.apply(offsets, sizes)  # type: ignore[return-value]
 
 
 class MeanSquare(torch.autograd.Function):
-    """Mean of the squared lengths of offsets, computed in units of the largest, so that no square over- or underflows.
+    """Differentiable mean of the squared lengths of offsets, without over- or underflow of a square.
 
-    A unit is a power of two, by which multiplying is exact. The derivative is that of the formula, since a chain of the
-    single steps would multiply by the square of the unit, which the dtype may not hold.
+    The lengths are computed in a unit near the largest one. The unit is a power of two, so multiplying by it is exact.
+    The gradient is computed from the formula of the mean: automatic differentiation of the steps would multiply by the
+    square of the unit, which the dtype may not hold.
     """
 
     @staticmethod
     def forward(ctx: Any, offsets: Tensor, sizes: Tensor) -> Tensor:  # type: ignore[override]
-        """Return the mean squared length, (batch,)."""
+        """Return the mean squared length, (batch,).
+
+        Args:
+            ctx: storage for `backward`.
+            offsets: (batch, query, 3).
+            sizes: number of offsets of each cloud.
+        """
         ctx.save_for_backward(offsets, sizes)
         exponent = torch.frexp(offsets.abs().amax((1, 2))).exponent.clamp(
             -MOST[offsets.dtype], MOST[offsets.dtype]
@@ -313,6 +355,6 @@ class MeanSquare(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, along: Tensor) -> tuple[Tensor, None]:  # type: ignore[override]
-        """Return the gradient in the offsets."""
+        """Return the gradient with respect to the offsets, given the gradient `along` with respect to the mean."""
         offsets, sizes = ctx.saved_tensors
         return 2 * offsets * (along / sizes)[:, None, None], None

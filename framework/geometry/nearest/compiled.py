@@ -10,7 +10,7 @@ from numba.core.extending import intrinsic
 from framework.storage.kernels import compiler, kernel_cache
 
 PARTS = "compiled", "lanes", "pack", "search", "processor"
-"""Names of the files whose functions call each other."""
+"""Names of the files whose compiled functions call each other; a change in one of them compiles all again."""
 
 
 KEPT_IN = kernel_cache("nearest", (Path(__file__).with_name(f"{part}.py") for part in PARTS))
@@ -18,14 +18,14 @@ compiled = compiler(KEPT_IN)
 
 
 def inlined(function: Callable[..., Any]) -> Any:
-    """Return a function that is inlined into each compiled caller, so that vectors stay in registers."""
+    """Return `function`, compiled so that it is inlined into each compiled caller; vectors then stay in registers."""
     return njit(inline="always", error_model="numpy")(function)
 
 
 @intrinsic
 @no_type_check
 def fetch_and_add(typing, counter, number):
-    """Return counter[0], an int64, and add the number atomically, so that several threads get different values."""
+    """Return counter[0], an int64, and add `number` to it atomically, so that several threads get different values."""
 
     def generate(context, builder, sig, values):
         array = context.make_array(sig.args[0])(context, builder, values[0])

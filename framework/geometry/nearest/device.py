@@ -8,7 +8,7 @@ from framework.geometry.clouds import point_mask
 from framework.geometry.nearest.exponents import MOST
 
 PAIRS = 2**24
-"""Number of squared distances held at a time: three arrays of this size, 192 MiB in float32."""
+"""Number of squared distances held at a time, in each of three arrays: 192 MiB in float32."""
 
 
 def nearest_of(
@@ -20,10 +20,17 @@ def nearest_of(
 ) -> tuple[Float[Tensor, "batch query"], Int[Tensor, "batch query"]]:
     """Return distance and index as in `framework.geometry.nearest.Nearest`, for finite coordinates.
 
-    Differences are computed before they are squared: |p|² - 2 p·q + |q|² would lose the digits of small distances. Each
-    square is rounded before it is added, while the search on the CPU adds it unrounded (fused multiply-add). Distances
-    therefore differ from the CPU's by a unit in the last place, and of two nearly equally far points the other may be
-    chosen.
+    Differences are computed before they are squared, because |p|² - 2 p·q + |q|² would lose the digits of small
+    distances. Each square is rounded before it is added, while the search on the CPU adds it unrounded (fused
+    multiply-add). Distances therefore differ from the CPU's by a unit in the last place, and of two points at nearly
+    equal distance, the CPU may find the other one.
+
+    Args:
+        clouds: (batch, points, 3).
+        queries: (query, 3), shared by all clouds, or (batch, query, 3).
+        sizes: number of points of each cloud; None if all rows are points.
+        query_sizes: number of queries of each cloud; None if all rows are queries.
+        pairs: number of squared distances held at a time.
     """
     batch, points, _ = clouds.shape
     query_count = queries.shape[-2]

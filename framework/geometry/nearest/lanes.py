@@ -1,8 +1,9 @@
 """Short vectors for functions compiled by numba: sixteen numbers that are computed together.
 
-A value of type `Lanes` holds 16 numbers (4 if a name ends in 4) of an array's dtype, or as many truth values. `-`, `+`,
-`*`, `&`, `|` and the comparisons work lane by lane on two values of one type. Vectors are LLVM's own, so that the
-compiler maps them to the registers of the processor: one, two or four. No function checks bounds.
+A value of type `Lanes` holds 16 numbers (4 if the function's name ends in 4) of an array's dtype, or as many truth
+values. The position of a number in the vector is called a lane. `-`, `+`, `*`, `&`, `|` and the comparisons work lane
+by lane on two values of one type. Vectors are LLVM's own, so that the compiler maps each to one, two or four registers
+of the processor. No function checks bounds.
 
 `no_type_check` keeps the type checks that tests switch on away from functions that numba calls while it compiles.
 """
@@ -21,11 +22,11 @@ from numba.core.typing.templates import AbstractTemplate, infer_global, signatur
 LANES = 16
 INT32 = ir.IntType(32)
 Make = Callable[..., Any]
-"""Function that emits code: (builder, element type, values…) → value."""
+"""Function that emits code for an operation: (builder, element type, values…) → resulting value."""
 
 
 class Lanes(types.Type):
-    """Numba type of `count` numbers of the scalar type `element`."""
+    """Numba type of a vector of `count` numbers of the scalar type `element`."""
 
     @no_type_check
     def __init__(self, element, count=LANES):
@@ -35,7 +36,7 @@ class Lanes(types.Type):
 
 @register_model(Lanes)
 class LanesModel(models.PrimitiveModel):
-    """An LLVM vector, in memory and in registers; truth values have one bit."""
+    """Data model of `Lanes` for numba: an LLVM vector, in memory and in registers; truth values have one bit each."""
 
     @no_type_check
     def __init__(self, manager, kind):
@@ -52,13 +53,18 @@ def real(element):
 
 @no_type_check
 def truths(like):
-    """Return the type of truth values with as many lanes as `like`."""
+    """Return the type of a vector of truth values with as many lanes as the type `like`."""
     return Lanes(types.boolean, like.count)
 
 
 @no_type_check
 def arithmetic(of_reals: str, of_integers: str) -> Make:
-    """Return the emitter of an operation on reals or integers."""
+    """Return a function that emits an arithmetic operation on two vectors.
+
+    Args:
+        of_reals: name of the builder's method for floating-point elements.
+        of_integers: name of the builder's method for integer elements.
+    """
 
     def make(builder, element, x, y):
         return getattr(builder, of_reals if real(element) else of_integers)(x, y)
@@ -68,7 +74,7 @@ def arithmetic(of_reals: str, of_integers: str) -> Make:
 
 @no_type_check
 def comparison(sign: str) -> Make:
-    """Return the emitter of a comparison."""
+    """Return a function that emits the comparison `sign` ("<", "==", …) of two vectors; it is false for NaN."""
 
     def make(builder, element, x, y):
         compare = builder.fcmp_ordered if real(element) else builder.icmp_signed  # False for NaN
@@ -79,7 +85,13 @@ def comparison(sign: str) -> Make:
 
 @no_type_check
 def register(operation: Make, make: Make, compares: bool = False) -> None:
-    """Register type and code of an operator on two vectors."""
+    """Register an operator on two vectors with numba: its type, and the function that emits its code.
+
+    Args:
+        operation: the operator, such as `operator.add`.
+        make: function that emits the code.
+        compares: true if the operator returns truth values.
+    """
 
     @infer_global(operation)  # type: ignore[reportOptionalCall]
     class Template(AbstractTemplate):
@@ -108,19 +120,25 @@ register(operator.ne, comparison("!="), compares=True)
 
 @no_type_check
 def least_of(builder, element, x, y):
-    """Emit the smaller value of each lane."""
+    """Emit the smaller number of x and y in each lane."""
     return builder.select(comparison("<")(builder, element, x, y), x, y)
 
 
 @no_type_check
 def most_of(builder, element, x, y):
-    """Emit the larger value of each lane."""
+    """Emit the larger number of x and y in each lane."""
     return builder.select(comparison(">")(builder, element, x, y), x, y)
 
 
 @no_type_check
 def coded(result, arguments, make):
-    """Return the signature of an intrinsic and its code generator, which depends on the values alone."""
+    """Return the signature of an intrinsic and its code generator.
+
+    Args:
+        result: type of the result.
+        arguments: types of the arguments.
+        make: function that emits the code from the builder and the values.
+    """
 
     def generate(context, builder, sig, values):
         return make(builder, *values)
@@ -131,28 +149,31 @@ def coded(result, arguments, make):
 @intrinsic
 @no_type_check
 def least(typing, a, b):
-    """Return the smaller number in each lane; b if a is NaN."""
+    """Return the smaller number of a and b in each lane; b if a is NaN."""
     return coded(a, (a, b), lambda builder, x, y: least_of(builder, a.element, x, y))
 
 
 @intrinsic
 @no_type_check
 def most(typing, a, b):
-    """Return the larger number in each lane; b if a is NaN."""
+    """Return the larger number of a and b in each lane; b if a is NaN."""
     return coded(a, (a, b), lambda builder, x, y: most_of(builder, a.element, x, y))
 
 
 @intrinsic
 @no_type_check
 def where(typing, truth, a, b):
-    """Return a in lanes that are true, b in the others."""
+    """Return a in lanes where `truth` is true, and b in the other lanes."""
     return coded(a, (truth, a, b), lambda builder, t, x, y: builder.select(t, x, y))
 
 
 @intrinsic
 @no_type_check
 def fma(typing, a, b, c):
-    """Return a·b + c, rounded once if the processor can; the result is the same everywhere on one machine."""
+    """Return a·b + c, rounded once if the processor can, otherwise after each step.
+
+    All calls on one machine round in the same way.
+    """
     kind = {types.float32: "f32", types.float64: "f64"}[a.element]
 
     def make(builder, *values):
@@ -180,13 +201,13 @@ def splat(typing, number):
 
 @no_type_check
 def places(indices):
-    """Return a constant vector of lane indices."""
+    """Return a constant vector of the integers `indices`, as LLVM needs it to rearrange lanes."""
     return ir.Constant(ir.VectorType(INT32, len(indices)), indices)
 
 
 @no_type_check
 def folded(vector, combine):
-    """Return the number to which `combine` reduces all lanes."""
+    """Return the intrinsic (as by `coded`) that reduces all lanes of a vector to one number by `combine`."""
 
     def make(builder, value):
         count = vector.count
@@ -227,7 +248,7 @@ def total(typing, vector):
 @intrinsic
 @no_type_check
 def bits(typing, truth):
-    """Return an int64 with lane i as bit i."""
+    """Return an int64 whose bit i is lane i of a vector of truth values."""
 
     def make(builder, value):
         return builder.zext(builder.bitcast(value, ir.IntType(truth.count)), ir.IntType(64))
@@ -238,7 +259,7 @@ def bits(typing, truth):
 @intrinsic
 @no_type_check
 def mask(typing, number):
-    """Return the 16 lowest bits of an int64 as truth values."""
+    """Return the 16 lowest bits of an int64 as a vector of truth values."""
 
     def make(builder, value):
         return builder.bitcast(builder.trunc(value, ir.IntType(LANES)), ir.VectorType(ir.IntType(1), LANES))
@@ -256,14 +277,14 @@ def first(typing, number):
 @intrinsic
 @no_type_check
 def how_many(typing, number):
-    """Return the number of set bits."""
+    """Return the number of bits of an int64 that are set."""
     return coded(types.int64, (number,), lambda builder, x: builder.ctpop(x))
 
 
 @intrinsic
 @no_type_check
 def whole(typing, vector):
-    """Return the numbers rounded towards zero, as int32; they must fit."""
+    """Return the numbers of a vector rounded towards zero, as int32; they must be in its range."""
     result = Lanes(types.int32, vector.count)
     return coded(result, (vector,), lambda builder, x: builder.fptosi(x, ir.VectorType(INT32, vector.count)))
 
@@ -271,14 +292,17 @@ def whole(typing, vector):
 @intrinsic
 @no_type_check
 def lane(typing, vector, index):
-    """Return the number in one lane."""
+    """Return the number in the lane `index` of a vector."""
     return coded(vector.element, (vector, types.intp), lambda builder, x, i: builder.extract_element(x, i))
 
 
 @intrinsic
 @no_type_check
 def with_id(typing, vector, number):
-    """Return four lanes whose last holds the bits of an integer (int32 beside float32, int64 beside float64)."""
+    """Return `vector`, of four lanes, with the bits of an integer in its last lane.
+
+    The integer is stored as int32 in a float32 vector, and as int64 in a float64 vector.
+    """
     width = vector.element.bitwidth
 
     def make(builder, value, whole_number):
@@ -301,7 +325,7 @@ def pointer(context, builder, sig, values):
 @intrinsic
 @no_type_check
 def take(typing, array, index):
-    """Return one element; index ≥ 0."""
+    """Return the element of an array at `index`, which must not be negative."""
 
     def generate(context, builder, sig, values):
         return builder.load(pointer(context, builder, sig, values))
@@ -311,7 +335,16 @@ def take(typing, array, index):
 
 @no_type_check
 def loaded(array, stride, parts, count=LANES):
-    """Return `parts` vectors; part c holds elements c, c + stride, c + 2 stride, … from a start."""
+    """Return the intrinsic that loads `parts` vectors from an array, as by `coded`.
+
+    Vector c holds the elements c, c + stride, c + 2 stride, …, counted from an index that the intrinsic takes.
+
+    Args:
+        array: numba type of the array.
+        stride: distance of the elements of a vector; with 1, a single vector is returned, not a tuple.
+        parts: number of vectors.
+        count: number of lanes.
+    """
     vector = Lanes(array.dtype, count)
 
     def generate(context, builder, sig, values):
@@ -334,35 +367,35 @@ def loaded(array, stride, parts, count=LANES):
 @intrinsic
 @no_type_check
 def load(typing, array, start):
-    """Return 16 elements from a start."""
+    """Return a vector of 16 consecutive elements of an array, from index `start` on."""
     return loaded(array, 1, 1)
 
 
 @intrinsic
 @no_type_check
 def load4(typing, array, start):
-    """Return 4 elements from a start."""
+    """Return a vector of 4 consecutive elements of an array, from index `start` on."""
     return loaded(array, 1, 1, 4)
 
 
 @intrinsic
 @no_type_check
 def load_triples(typing, array, start):
-    """Return x, y, z of 16 points that are stored as x y z x y z and so on."""
+    """Return vectors x, y, z of 16 points that are stored as x y z x y z … from index `start` on."""
     return loaded(array, 3, 3)
 
 
 @intrinsic
 @no_type_check
 def load_quadruples(typing, array, start):
-    """Return the four parts of 16 records that are stored as x y z w x y z w and so on."""
+    """Return four vectors x, y, z, w of 16 records that are stored as x y z w x y z w … from index `start` on."""
     return loaded(array, 4, 4)
 
 
 @intrinsic
 @no_type_check
 def store(typing, array, start, vector):
-    """Write a vector to an array from a start."""
+    """Write a vector to consecutive elements of an array, from index `start` on."""
 
     def generate(context, builder, sig, values):
         address = pointer(context, builder, sig, values)

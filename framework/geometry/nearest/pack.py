@@ -1,11 +1,12 @@
-"""Packing of a cloud for search: points along a space-filling curve, and bounding boxes of every 16 of them.
+"""Packing of a cloud for search: its points along a space-filling curve, and the bounding boxes of groups of 16.
 
 A packed cloud is a tree without pointers. Its leaves hold 16 points that follow each other along a Hilbert curve
-through a grid (counting sort, two passes over the points). Cells that hold too many points, since an outlier has
-stretched the grid or a cluster is dense, are sorted again by a grid of their own. Every 16 leaves are a node, every 16
-nodes a node of the next level, up to a level of at most 16.
+through a grid (counting sort, two passes over the points). If a cell holds too many points, since an outlier has
+stretched the grid or a cluster is dense, its points are sorted again with a grid of their own. Every 16 leaves form a
+node, every 16 nodes form a node of the next level, up to a level with at most 16 nodes.
 
 Clouds are flat arrays x y z x y z …, finite, of moderate size (`MODERATE`); `bits` means 2^bits cells along each axis.
+The `id` of a point is its row in the cloud.
 """
 
 from typing import NamedTuple, no_type_check
@@ -35,24 +36,30 @@ from framework.geometry.nearest.lanes import (
 )
 
 MODERATE = {4: (2.0**-40, 2.0**60), 8: (2.0**-40, 2.0**500)}
-"""Bounds of the largest coordinate, by bytes of a number: squares between them neither overflow nor lose precision."""
+"""Smallest and largest accepted magnitude of the largest coordinate, by the number of bytes of a number.
+
+Squares between these bounds neither overflow nor lose precision.
+"""
 BITS = 6
-"""Largest number of bits: 2^18 cells, whose counts stay in a processor's second cache."""
+"""Largest value of `bits`: 2^18 cells, whose counts fit in the processor's second-level cache."""
 CROWD = 256
-"""Number of points above which one cell is sorted by a grid of its own."""
+"""Number of points above which the points of a cell are sorted again with a grid of their own (a crowded cell)."""
 FLAT = 1e-30
-"""Extent below which points count as one position: its inverse would overflow in float32."""
+"""Extent of a set of points below which they count as one position, because its inverse would overflow in float32."""
 
 
 class Packed(NamedTuple):
-    """A packed cloud of at least one point.
+    """A packed cloud of at least one point (see the module's description).
 
     Attributes:
-        points: leaves in order: 16 x, 16 y, 16 z, 16 ids; the last point is repeated to fill the last leaf.
-        ids: the memory of `points` read as integers (int32 beside float32, int64 beside float64): the row in the cloud.
-        box: lowest x, y, z and highest x, y, z of each node; six concatenated arrays, level after level.
-        low: lowest id of each node.
-        levels: first node of each level in 0…7, number of nodes in 8…15, the topmost level in 16; 17 is free.
+        points: the leaves in order, each as 16 x, 16 y, 16 z and 16 ids; the last point is repeated to fill the last
+            leaf.
+        ids: the memory of `points` read as integers, int32 for float32 and int64 for float64. An id is a row of the
+            cloud.
+        box: lowest x, y, z and highest x, y, z of each node, as six concatenated arrays; nodes are ordered by level.
+        low: lowest id in each node.
+        levels: index of the first node of each level in elements 0…7, number of nodes of each level in 8…15, and the
+            topmost level in 16. Element 17 holds the number of queries if the cloud consists of queries.
     """
 
     points: NDArray[np.floating]
@@ -63,7 +70,13 @@ class Packed(NamedTuple):
 
 
 class Bench(NamedTuple):
-    """Working memory of packing: key of each point, number of points in each cell (a row per thread), crowded cells."""
+    """Working memory of packing.
+
+    Attributes:
+        key: cell of each point.
+        count: number of points in each cell, one row for each thread.
+        crowded: begin and end of each crowded cell in the sorted points.
+    """
 
     key: NDArray[np.int32]
     count: NDArray[np.int32]
@@ -71,7 +84,7 @@ class Bench(NamedTuple):
 
 
 def room(points: int, dtype: np.dtype) -> Packed:
-    """Return memory for a packed cloud of up to `points` points."""
+    """Return uninitialised memory for a packed cloud of up to `points` points of the type `dtype`."""
     leaves = -(-points // LANES)
     nodes, level = 0, leaves
     while True:
@@ -86,7 +99,7 @@ def room(points: int, dtype: np.dtype) -> Packed:
 
 
 def bench(points: int, threads: int = 1) -> Bench:
-    """Return working memory for packing up to `points` points in `threads` threads."""
+    """Return working memory with which `threads` threads pack up to `points` points."""
     cells = 8 ** cell_bits(points)
     return Bench(
         np.empty(points, np.int32),
@@ -98,7 +111,10 @@ def bench(points: int, threads: int = 1) -> Bench:
 @compiled
 @no_type_check
 def cell_bits(points):
-    """Return the largest number of bits with at least one point per cell; cells on a surface then hold more."""
+    """Return the largest `bits` (at most BITS, at least 1) for which the grid has no more cells than there are points.
+
+    If the points lie on a surface, most cells are empty, and the others hold several points.
+    """
     bits = 1
     while bits < BITS and 8 ** (bits + 1) <= points:
         bits += 1
@@ -108,10 +124,11 @@ def cell_bits(points):
 @compiled
 @no_type_check
 def curve(bits):
-    """Return the cells of the grids of 1…bits along the Hilbert curve, concatenated (from (8^b - 8) / 7 on).
+    """Return the cells of grids in the order of the Hilbert curve: of the grids with 1…bits bits, concatenated.
 
-    Cells are numbered (x 2^b + y) 2^b + z. Source: Skilling, Programming the Hilbert curve, 2004: the bits of the
-    transposed index of a cell give the position along the curve.
+    The cells of the grid with b bits begin at index (8^b - 8) / 7. A cell has the number (x 2^b + y) 2^b + z. Source:
+    Skilling, Programming the Hilbert curve, 2004: the bits of the transposed index of a cell give its position along
+    the curve.
     """
     cells = np.empty((8 ** (bits + 1) - 8) // 7, np.int32)
     start = 0
@@ -149,7 +166,13 @@ def curve(bits):
 @compiled
 @no_type_check
 def extent(cloud, size, box):
-    """Write the lowest and highest x, y, z to box (6,); return False if a number is NaN or infinite."""
+    """Write the lowest and highest x, y, z of a cloud to `box` (6,); return false if a number is NaN or infinite.
+
+    Args:
+        cloud: flat array.
+        size: number of points.
+        box: filled.
+    """
     real = cloud.dtype.type
     low0 = splat(real(np.inf))
     low1, low2 = low0, low0
@@ -189,14 +212,32 @@ def extent(cloud, size, box):
 @inlined
 @no_type_check
 def cells_per_unit(size, grid, real):
-    """Return a factor that maps the highest coordinate to the last cell; 0, one cell for all, if there is no extent."""
+    """Return the factor from coordinates, relative to the lowest, to cells; the highest coordinate is in the last cell.
+
+    If the extent is at most FLAT, the factor is 0, and all points are in one cell.
+
+    Args:
+        size: extent of the points along the longest axis.
+        grid: number of cells along an axis.
+        real: type of the factor.
+    """
     return real(grid * 0.9999) / size if size > FLAT else real(0)
 
 
 @compiled
 @no_type_check
 def histogram(cloud, box, bits, begin, end, key, count):
-    """Write the cell of each point from `begin`, a multiple of 16, to `end`, and the number of points in each cell."""
+    """Write the cell of each point from `begin`, a multiple of 16, to `end`, and the number of points in each cell.
+
+    Args:
+        cloud: flat array.
+        box: lowest and highest coordinates of the whole cloud.
+        bits: of the grid.
+        begin: index of the first point.
+        end: index after the last point.
+        key: filled with the cell of each point.
+        count: filled with the number of points in each cell.
+    """
     grid = np.int32(1 << bits)
     scale = cells_per_unit(max(box[3] - box[0], box[4] - box[1], box[5] - box[2]), grid, box.dtype.type)
     x0, y0, z0 = splat(box[0]), splat(box[1]), splat(box[2])
@@ -220,7 +261,17 @@ def histogram(cloud, box, bits, begin, end, key, count):
 @compiled
 @no_type_check
 def places(count, bits, cells, crowded):
-    """Replace the counts (threads, cells) by the position of each cell's first point; return how many are crowded."""
+    """Replace the numbers of points in cells by the positions at which their first points are stored.
+
+    Args:
+        count: number of points of each thread in each cell, (threads, cells); replaced.
+        bits: of the grid.
+        cells: cells in the order of the Hilbert curve, as `curve` returns them.
+        crowded: filled with begin and end of each cell with more than CROWD points.
+
+    Returns:
+        The number of crowded cells.
+    """
     start = (8**bits - 8) // 7
     place = np.int32(0)
     crowded_count = 0
@@ -241,7 +292,18 @@ def places(count, bits, cells, crowded):
 @compiled
 @no_type_check
 def scatter(cloud, size, begin, end, key, count, points, ids):
-    """Write records x y z id to their positions; points of a cell keep their order."""
+    """Write points begin…end as records x y z id to the positions of their cells; points of a cell keep their order.
+
+    Args:
+        cloud: flat array.
+        size: number of points of the cloud.
+        begin: index of the first point.
+        end: index after the last point.
+        key: cell of each point.
+        count: position of the next point of each cell; increased.
+        points: filled with the records.
+        ids: the memory of `points`, read as integers.
+    """
     last = min(end, size - 1)
     for i in range(begin, last):
         cell = take(key, i)
@@ -258,7 +320,14 @@ def scatter(cloud, size, begin, end, key, count, points, ids):
 @compiled
 @no_type_check
 def sort_crowded(points, crowded, crowded_count, cells):
-    """Sort the records of crowded cells by grids of their own, and those of cells that are crowded there."""
+    """Sort the records of each crowded cell with a grid of its own; cells of this grid that are crowded are sorted too.
+
+    Args:
+        points: records x y z id, sorted in place.
+        crowded: begin and end of each crowded cell; used as a stack.
+        crowded_count: number of crowded cells.
+        cells: cells in the order of the Hilbert curve, as `curve` returns them.
+    """
     largest = 0
     for i in range(crowded_count):
         largest = max(largest, crowded[2 * i + 1] - crowded[2 * i])
@@ -307,7 +376,10 @@ def sort_crowded(points, crowded, crowded_count, cells):
 @compiled
 @no_type_check
 def box_leaves(packed, size, begin, end):
-    """Fill the last leaf, turn records into 16 x, 16 y, 16 z, 16 ids, and compute the boxes of leaves begin…end."""
+    """Turn the records of the leaves begin…end into 16 x, 16 y, 16 z and 16 ids, and compute the boxes of these leaves.
+
+    If the last leaf is among them, it is first filled with copies of the last point.
+    """
     points, ids, box, low, _ = packed
     nodes = box.shape[0] // 6
     for i in range(size, min(16 * end, (size + 15) // 16 * 16)):
@@ -331,7 +403,7 @@ def box_leaves(packed, size, begin, end):
 @compiled
 @no_type_check
 def box_nodes(packed, size):
-    """Compute the boxes of all levels above the leaves."""
+    """Compute the boxes of all nodes above the leaves, and `levels`, of a packed cloud of `size` points."""
     _, _, box, low, levels = packed
     nodes = box.shape[0] // 6
     levels[0] = 0
@@ -360,7 +432,16 @@ def box_nodes(packed, size):
 @compiled
 @no_type_check
 def pack(cloud, size, box, cells, bench, packed):
-    """Pack a cloud in one thread; `extent` has computed the box."""
+    """Pack a cloud in one thread.
+
+    Args:
+        cloud: flat array.
+        size: number of points.
+        box: lowest and highest coordinates, as computed by `extent`.
+        cells: cells in the order of the Hilbert curve, as `curve` returns them.
+        bench: working memory.
+        packed: filled with the packed cloud.
+    """
     bits = cell_bits(size)
     count = bench.count[:1]
     histogram(cloud, box, bits, 0, size, bench.key, count[0])

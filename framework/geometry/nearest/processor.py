@@ -1,4 +1,7 @@
-"""Nearest neighbours on the CPU: choice of the kernel for each cloud, and of the number of threads."""
+"""Nearest neighbours on the CPU: choice of the kernel for each cloud, and of the number of threads.
+
+Queries are packed too (`pack`). A packet is a leaf of the packed queries, with sixteen neighbouring queries.
+"""
 
 from functools import lru_cache
 from threading import local
@@ -33,15 +36,18 @@ from framework.storage.threads import POOL
 
 Array = NDArray[np.floating]
 FINE, BAD_CLOUD, BAD_QUERIES, IMMODERATE = 0, 1, 2, 3
-"""Outcome of a cloud: searched; the cloud is not finite; its queries are not finite; must be scaled first."""
+"""Outcomes of a cloud: it was searched; it is not finite; its queries are not finite; it must be scaled first."""
 QUERY_COUNT = 17
-"""Index in `levels` at which packed queries store their number."""
+"""Index in `levels` of packed queries at which their number is stored."""
 LARGE = 2**15
-"""Number of points or queries from which one cloud is shared by several threads."""
+"""Number of points or queries from which several threads work on one cloud."""
 TURNS = 16
-"""Number of parts of each thread's share of the work: one thread then has little left when the others have ended."""
+"""Number of parts into which each thread's share of the work is cut, so that all threads end at about the same time."""
 AT_ONCE = 2**24
-"""Number of points and queries of one call, which takes some tenths of a second: signals are handled between calls."""
+"""Number of points and queries of one call of compiled code, which takes some tenths of a second.
+
+Signals, such as an interruption by the user, are handled between two calls.
+"""
 
 
 class Problem(NamedTuple):
@@ -49,10 +55,15 @@ class Problem(NamedTuple):
 
     Attributes:
         clouds: (batch, 3 points).
-        sizes: (batch,).
-        queries: (batch, 3 queries), query_sizes (batch,); with an empty batch if all clouds share `packets`.
-        moderate: see `MODERATE`; largest: largest coordinate of shared queries.
-        distance, index, outcome: outputs; the last is one of the four above.
+        sizes: number of points of each cloud, (batch,).
+        queries: queries of each cloud, (batch, 3 queries); empty if all clouds share `packets`.
+        query_sizes: number of queries of each cloud, (batch,); empty if all clouds share `packets`.
+        packets: packed queries that all clouds share.
+        moderate: bounds of the largest coordinate (`pack.MODERATE`).
+        largest: largest coordinate of shared queries.
+        distance: filled with the distance of the nearest point to each query.
+        index: filled with its row in the cloud.
+        outcome: filled with FINE, BAD_CLOUD, BAD_QUERIES or IMMODERATE for each cloud.
     """
 
     clouds: Array
@@ -70,9 +81,10 @@ class Problem(NamedTuple):
 @compiled
 @no_type_check
 def worth_packing(size, packets):
-    """Return true if a cloud is searched faster after it is packed, as measured.
+    """Return true if a cloud of `size` points is searched faster after it is packed, for this number of packets.
 
-    Packing a cloud costs as much as comparing it with three packets, a search as much as some hundred points.
+    As measured, packing a cloud costs as much as comparing it with three packets, and the search for a packet in a
+    packed cloud costs as much as comparing it with some hundred points.
     """
     return packets > 3 and size * packets > 8192
 
@@ -80,7 +92,7 @@ def worth_packing(size, packets):
 @compiled
 @no_type_check
 def largest_of(box):
-    """Return the largest magnitude of a coordinate of a box."""
+    """Return the largest magnitude among the six numbers of a box."""
     largest = abs(box[0])
     for i in range(1, 6):
         largest = max(largest, abs(box[i]))
@@ -90,7 +102,17 @@ def largest_of(box):
 @compiled
 @no_type_check
 def search_clouds(problem, begin, end, cells, work, packed, own):
-    """Search clouds begin…end of a batch, one after the other."""
+    """Search clouds begin…end of a batch, one after the other, and write distance, index and outcome of each.
+
+    Args:
+        problem: the batch.
+        begin: index of the first cloud.
+        end: index after the last cloud.
+        cells: cells in the order of the Hilbert curve, as `curve` returns them.
+        work: working memory of packing.
+        packed: memory for a packed cloud.
+        own: memory for the packed queries of a cloud.
+    """
     shared = problem.query_sizes.shape[0] == 0
     box = np.empty(6, problem.clouds.dtype)
     for i in range(begin, end):
@@ -126,7 +148,10 @@ def search_clouds(problem, begin, end, cells, work, packed, own):
 @compiled
 @no_type_check
 def search_clouds_share(problem, counter, step, limit, cells, work, packed, own):
-    """Search one thread's part of a batch: `step` clouds at a time, until `limit` are searched or none are left."""
+    """Search a part of a batch in one thread, `step` clouds at a time, until it has searched `limit` or none are left.
+
+    The threads share `counter`, the index of the next cloud. The other arguments are those of `search_clouds`.
+    """
     batch = problem.sizes.shape[0]
     searched = 0
     while searched < limit:
@@ -140,7 +165,10 @@ def search_clouds_share(problem, counter, step, limit, cells, work, packed, own)
 @compiled
 @no_type_check
 def search_share(packed, packets, counter, step, distance, index):
-    """Search one thread's part of the packets: `step` packets at a time, until none are left."""
+    """Search a packed cloud for a part of the packets in one thread, `step` packets at a time, until none are left.
+
+    The threads share `counter`, the index of the next packet.
+    """
     number = packets.levels[8]
     while True:
         begin = fetch_and_add(counter, step)
@@ -152,7 +180,7 @@ def search_share(packed, packets, counter, step, distance, index):
 @compiled
 @no_type_check
 def search_all_share(cloud, size, packets, counter, step, distance, index):
-    """Search one thread's part of the packets in a cloud that is not packed."""
+    """Search a cloud that is not packed for a part of the packets in one thread, as `search_share` does."""
     number = packets.levels[8]
     while True:
         begin = fetch_and_add(counter, step)
@@ -163,12 +191,12 @@ def search_all_share(cloud, size, packets, counter, step, distance, index):
 
 @lru_cache(maxsize=BITS)
 def curves(bits: int) -> NDArray[np.int32]:
-    """Return the cells along the Hilbert curve, cached."""
+    """Return the cells in the order of the Hilbert curve, as `pack.curve` does, from a cache after the first call."""
     return curve(bits)
 
 
 def packed_once(points: Array) -> Packed:
-    """Return queries in packets of sixteen neighbours by `pack`: fast, for queries that are used once."""
+    """Return packed queries, fast, for queries that are used once: the packets follow the Hilbert curve (`pack`)."""
     size, box = len(points), np.empty(6, points.dtype)
     low, high = MODERATE[points.itemsize]
     flat = points.reshape(-1)
@@ -181,7 +209,10 @@ def packed_once(points: Array) -> Packed:
 
 
 def packed_well(points: Array) -> Packed:
-    """Return queries in packets of sixteen neighbours, by halving at medians: tighter, for queries used often."""
+    """Return packed queries, for queries that are used often: the packets come from repeated halving at the median.
+
+    This takes longer than `packed_once`, but the boxes of the packets are smaller.
+    """
     packets: list[NDArray[np.int64]] = []
     waiting = [np.arange(len(points))]
     while waiting:
@@ -210,13 +241,19 @@ UNUSED = {dtype.itemsize: room(1, dtype) for dtype in (np.dtype(np.float32), np.
 
 
 class Desks(local):
-    """Working memory of each thread; memory for small clouds is reused, since allocating takes as long as searching."""
+    """Working memory of each thread; it is kept for small clouds, since allocating takes as long as searching."""
 
     def __init__(self) -> None:
         self.cached: dict[tuple[int, int, np.dtype], tuple[Bench, Packed, Packed]] = {}
 
     def of(self, points: int, queries: int, dtype: np.dtype) -> tuple[Bench, Packed, Packed]:
-        """Return memory for clouds of up to `points` points, with up to `queries` queries of their own."""
+        """Return working memory of packing, memory for a packed cloud, and memory for its packed queries.
+
+        Args:
+            points: largest number of points of a cloud.
+            queries: largest number of queries of a cloud; 0 if all clouds share their queries.
+            dtype: type of the coordinates.
+        """
         key = points, queries, dtype
         if key in self.cached:
             return self.cached[key]
@@ -231,7 +268,13 @@ DESKS = Desks()
 
 
 class Results(NamedTuple):
-    """Distance and index (batch, queries), NaN and 0 for absent queries; outcome (batch,), one of the four."""
+    """Result of the search in a batch of clouds.
+
+    Attributes:
+        distance: distance of the nearest point, (batch, queries); NaN for queries that do not exist.
+        index: its row in the cloud, (batch, queries); 0 for queries that do not exist.
+        outcome: FINE, BAD_CLOUD, BAD_QUERIES or IMMODERATE for each cloud, (batch,).
+    """
 
     distance: Array
     index: NDArray[np.int64]
@@ -245,9 +288,14 @@ def search_batch(
     query_sizes: NDArray[np.int64] | None,
     largest: float,
 ) -> Results:
-    """Return nearest points of clouds (batch, points, 3) to packed queries, or to queries (batch, queries, 3).
+    """Return the nearest points of clouds for packed queries, which all clouds share, or for separate queries.
 
-    All arrays are contiguous. `largest` is the largest coordinate of packed queries.
+    Args:
+        clouds: (batch, points, 3), contiguous.
+        sizes: number of points of each cloud; None if all rows are points.
+        queries: packed queries, or queries (batch, queries, 3), contiguous.
+        query_sizes: number of queries of each cloud; None if all rows are queries.
+        largest: largest coordinate of packed queries.
     """
     batch, points, _ = clouds.shape
     shared = isinstance(queries, Packed)
@@ -301,7 +349,7 @@ def search_batch(
 
 
 def solve_one(problem: Problem, i: int, cells: NDArray[np.int32], threads: int) -> None:
-    """Search one large cloud, or one with many queries, in several threads; equal to one thread to the bit."""
+    """Search cloud i, which is large or has many queries, in several threads; one thread gives the same numbers."""
     cloud, size = problem.clouds[i], int(problem.sizes[i])
     box = extent_together(cloud, size, threads)
     if box is None:
@@ -332,7 +380,7 @@ def solve_one(problem: Problem, i: int, cells: NDArray[np.int32], threads: int) 
 
 
 def extent_together(cloud: Array, size: int, threads: int) -> Array | None:
-    """Return the box of `extent`, computed in several threads; None if a number is not finite."""
+    """Return the box that `pack.extent` computes, with several threads; None if a number is not finite."""
     threads = max(1, min(threads, size // LARGE))
     cuts = [size * thread // threads for thread in range(threads + 1)]
     boxes, finite = np.empty((threads, 6), cloud.dtype), [False] * threads
@@ -348,7 +396,16 @@ def extent_together(cloud: Array, size: int, threads: int) -> Array | None:
 def pack_together(
     cloud: Array, size: int, box: Array, cells: NDArray[np.int32], packed: Packed, threads: int
 ) -> None:
-    """Pack a cloud in several threads: each counts, then scatters, its share of the points."""
+    """Pack a cloud in several threads; each thread counts, and then stores, its share of the points.
+
+    Args:
+        cloud: flat array.
+        size: number of points.
+        box: lowest and highest coordinates, as computed by `extent`.
+        cells: cells in the order of the Hilbert curve, as `curve` returns them.
+        packed: filled with the packed cloud.
+        threads: largest number of threads.
+    """
     threads = max(1, min(threads, size // LARGE))
     bits, work = cell_bits(size), bench(size, threads)
     leaves = -(-size // LANES)

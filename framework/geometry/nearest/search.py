@@ -1,15 +1,16 @@
 """Exact search for the nearest point of a packed cloud to each of many queries.
 
-Sixteen neighbouring queries, a leaf of the packed queries, walk through the cloud's tree together. A node is opened if
-its box is nearer to the box of the sixteen than the worst of their best distances so far; then the boxes of its
-children are compared with each query. If few of the sixteen need a child, they continue alone, each against sixteen
-boxes or points at a time. The nearest points of the previous sixteen are the first guesses.
+The queries are packed too (`pack`). Sixteen neighbouring queries, a leaf of the packed queries, walk through the
+cloud's tree together. A node is opened if its box is nearer to the box of the sixteen queries than the largest of their
+smallest distances so far. Then the boxes of its children are compared with each query. If only a few of the sixteen
+queries need a child, each of these queries continues alone, and is compared with sixteen boxes or points at a time. The
+nearest points of the previous sixteen queries are the first guesses.
 
-No tolerance is needed: a box's squared distance is computed by the same operations as a point's, each of which rounds
-monotonically, so that the rounded distance is no more than that of any point within.
+No tolerance is needed. A box's squared distance is computed by the same operations as a point's, and each of these
+rounds monotonically. So the rounded distance of a box is not larger than that of any point in it.
 
-Ties go to the lowest id: a query that met its best squared distance a second time, in a point or a box, searches all
-points that are as near (`lowest_id`).
+Of points at the same distance, the one with the lowest id is returned. If a query meets its smallest squared distance a
+second time, at a point or a box, it searches all points at this distance (`lowest_id`).
 """
 
 from typing import no_type_check
@@ -38,28 +39,40 @@ from framework.geometry.nearest.lanes import (
 )
 
 ALONE = 3
-"""Largest number of sixteen queries that continue alone into a node; measured, like `ALONE_IN_LEAF`."""
+"""Largest number of the sixteen queries that need a node for which they continue alone; measured.
+
+ALONE_IN_LEAF is the same number for leaves.
+"""
 ALONE_IN_LEAF = 8
 
 
 @inlined
 @no_type_check
 def squared_length(x, y, z):
-    """Return the squared length of x, y, z."""
+    """Return x² + y² + z²."""
     return fma(z, z, fma(y, y, x * x))
 
 
 @inlined
 @no_type_check
 def interval_distance(low, high, query_low, query_high, zero):
-    """Return the distance between two intervals, 0 if they overlap."""
+    """Return the distance between the intervals low…high and query_low…query_high, 0 if they overlap."""
     return most(zero, most(low - query_high, query_low - high))
 
 
 @inlined
 @no_type_check
 def to_boxes(box, nodes, start, low, high, zero):
-    """Return squared distances of the boxes of 16 nodes from one box."""
+    """Return the squared distances of the boxes of 16 nodes from one box.
+
+    Args:
+        box: boxes of all nodes (`Packed.box`).
+        nodes: number of all nodes.
+        start: index of the first of the 16 nodes.
+        low: lowest x, y, z of the one box, each in all lanes.
+        high: highest x, y, z of the one box, each in all lanes.
+        zero: 0 in all lanes.
+    """
     return squared_length(
         interval_distance(load(box, start), load(box, 3 * nodes + start), low[0], high[0], zero),
         interval_distance(load(box, nodes + start), load(box, 4 * nodes + start), low[1], high[1], zero),
@@ -70,7 +83,15 @@ def to_boxes(box, nodes, start, low, high, zero):
 @inlined
 @no_type_check
 def to_box(box, nodes, node, query, zero):
-    """Return squared distances of one node's box from 16 queries."""
+    """Return the squared distances of the box of one node from 16 queries.
+
+    Args:
+        box: boxes of all nodes (`Packed.box`).
+        nodes: number of all nodes.
+        node: index of the node.
+        query: vectors x, y, z of the 16 queries.
+        zero: 0 in all lanes.
+    """
     return squared_length(
         interval_distance(
             splat(take(box, node)), splat(take(box, 3 * nodes + node)), query[0], query[0], zero
@@ -87,7 +108,7 @@ def to_box(box, nodes, node, query, zero):
 @inlined
 @no_type_check
 def to_point(points, at, query):
-    """Return squared distances of 16 queries from the point whose x is stored at `at`."""
+    """Return the squared distances of 16 queries from the point whose x is stored at index `at` of `points`."""
     return squared_length(
         splat(take(points, at)) - query[0],
         splat(take(points, at + 16)) - query[1],
@@ -98,7 +119,7 @@ def to_point(points, at, query):
 @inlined
 @no_type_check
 def to_leaf(points, leaf, x, y, z):
-    """Return squared distances of a leaf's 16 points from one query."""
+    """Return the squared distances of the 16 points of a leaf from one query x, y, z."""
     at = 64 * leaf
     return squared_length(load(points, at) - x, load(points, at + 16) - y, load(points, at + 32) - z)
 
@@ -106,14 +127,26 @@ def to_leaf(points, leaf, x, y, z):
 @inlined
 @no_type_check
 def children(level, node, levels):
-    """Return the first child of a node of the level above, and a bit for each child."""
+    """Return the index of the first child of a node, and an int64 with a bit set for each child that exists.
+
+    Args:
+        level: level of the children.
+        node: index of the node within the level above.
+        levels: `Packed.levels`.
+    """
     return levels[level] + 16 * node, (1 << min(16, levels[8 + level] - 16 * node)) - 1
 
 
 @inlined
 @no_type_check
 def nearest_bit(open_, gaps, at):
-    """Return the index of the nearest open child, and its distance; `gaps` holds the 16 distances from `at` on."""
+    """Return the index of the nearest child whose bit is set in `open_`, and its distance.
+
+    Args:
+        open_: a bit for each of 16 children.
+        gaps: array with the 16 distances of the children, from index `at` on.
+        at: index of the first distance.
+    """
     gap = where(mask(open_), load(gaps, at), splat(gaps.dtype.type(np.inf)))
     nearest = lowest(gap)
     return first(bits(gap == splat(nearest)) & open_), nearest
@@ -122,9 +155,20 @@ def nearest_bit(open_, gaps, at):
 @compiled
 @no_type_check
 def search_alone(packed, level, node, query, best, leaf, opened, gaps):
-    """Search for one query below a node; return best squared distance, its leaf, and whether it may occur twice.
+    """Search the nodes below one node for one query.
 
-    The node is of the level above `level`.
+    Args:
+        packed: the cloud.
+        level: level of the node's children.
+        node: index of the node within the level above.
+        query: x, y, z.
+        best: smallest squared distance so far.
+        leaf: leaf in which it was found.
+        opened: working memory: open children of each level.
+        gaps: working memory: distances of the children of each level.
+
+    Returns:
+        The smallest squared distance, its leaf, and true if another point may be at this distance.
     """
     points, _, box, _, levels = packed
     nodes = box.shape[0] // 6
@@ -165,7 +209,14 @@ def search_alone(packed, level, node, query, best, leaf, opened, gaps):
 @compiled
 @no_type_check
 def lowest_id(packed, x, y, z, best, number):
-    """Return the lowest id, at most `number`, of the points at squared distance `best`, the smallest."""
+    """Return the lowest id of the points whose squared distance is `best`, the smallest one.
+
+    Args:
+        packed: the cloud.
+        x, y, z: the query.
+        best: smallest squared distance.
+        number: a known id at this distance; the result is not higher.
+    """
     points, ids, box, low, levels = packed
     nodes = box.shape[0] // 6
     zero = splat(box.dtype.type(0))
@@ -196,7 +247,21 @@ def lowest_id(packed, x, y, z, best, number):
 @inlined
 @no_type_check
 def open_node(box, nodes, start, valid, low, high, query, best, worst, near, at):
-    """Store the squared distances of children from each query; return a bit for each child to be searched."""
+    """Return an int64 with a bit set for each child of a node that at least one of the sixteen queries must search.
+
+    Args:
+        box: boxes of all nodes (`Packed.box`).
+        nodes: number of all nodes.
+        start: index of the first child.
+        valid: bits of the children that exist.
+        low: lowest x, y, z of the sixteen queries.
+        high: highest x, y, z of the sixteen queries.
+        query: vectors x, y, z of the queries.
+        best: smallest squared distance of each query so far.
+        worst: largest of these distances.
+        near: filled with the squared distances of the children from each query, from index `at` on.
+        at: index in `near`.
+    """
     zero = splat(box.dtype.type(0))
     close = bits(to_boxes(box, nodes, start, low, high, zero) <= splat(worst)) & valid
     needed = 0
@@ -212,7 +277,16 @@ def open_node(box, nodes, start, valid, low, high, query, best, worst, near, at)
 @compiled
 @no_type_check
 def search(packed, packets, begin, end, distance, index):
-    """Write distance and index of the nearest points to the queries of packets begin…end, by the queries' ids."""
+    """Write distance and index of the nearest point for each query in the packets begin…end.
+
+    Args:
+        packed: the cloud.
+        packets: packed queries.
+        begin: index of the first packet.
+        end: index after the last packet.
+        distance: filled; the id of a query is its position.
+        index: filled; the id of a query is its position.
+    """
     points, ids, box, _, levels = packed
     real = box.dtype.type
     nodes = box.shape[0] // 6
@@ -338,9 +412,9 @@ def search(packed, packets, begin, end, distance, index):
 @compiled
 @no_type_check
 def search_all(cloud, size, packets, begin, end, distance, index):
-    """Write the results of `search` by comparing every query with every point of an unpacked cloud.
+    """Write the same results as `search`, by comparing every query with every point of a cloud that is not packed.
 
-    This is for small clouds or few queries.
+    This is faster for small clouds or few queries.
     """
     queries = packets.points
     blocks = (size + 15) // 16

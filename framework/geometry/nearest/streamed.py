@@ -1,10 +1,12 @@
 """Nearest neighbours in clouds larger than memory: points come in chunks of any size, one after the other.
 
-    middle = Middle()                       # first reading
+The cloud is read three times:
+
+    middle = Middle()                       # first: the mean
     for chunk in chunks(): middle.add(chunk)
-    reach = Reach(middle.mean)              # second
+    reach = Reach(middle.mean)              # second: the largest distance from the mean
     for chunk in chunks(): reach.add(chunk)
-    stream = Stream(queries)                # third
+    stream = Stream(queries)                # third: the search in the normalised cloud
     for chunk in chunks(): stream.add(normalise_chunk(chunk, middle.mean, reach.norm))
 
 A chunk is a cloud (points, columns): x, y, z, then attributes. Memory holds one chunk and the results so far.
@@ -21,10 +23,10 @@ from framework.geometry.nearest import Queries, nearest, prepare
 
 
 class Streamed(NamedTuple):
-    """The nearest point of each query.
+    """The nearest point of each query in a cloud that was read in chunks.
 
     Attributes:
-        distance, index: as in `framework.geometry.nearest.Nearest`; the index counts over all chunks.
+        distance, index: as in `framework.geometry.nearest.Nearest`; the index counts the points of all chunks.
         point: the nearest point, with all its columns.
     """
 
@@ -34,7 +36,10 @@ class Streamed(NamedTuple):
 
 
 class Stream:
-    """The nearest points among all chunks so far; on one device they equal those of `nearest` to the bit."""
+    """Search for the nearest points in a cloud that is read in chunks.
+
+    On one device, the results equal those of `nearest` for the whole cloud exactly.
+    """
 
     def __init__(self, queries: Float[Tensor, "query 3"] | Queries) -> None:
         # copies, here and below: a reader of a large cloud may fill one buffer again and again
@@ -46,7 +51,8 @@ class Stream:
         """Search one more chunk.
 
         Raises:
-            DataError: as `nearest`, or the columns are not those of the chunk before; nothing changes then.
+            DataError: as `nearest`, or the number of columns differs from that of the first chunk; the results so far
+                are then unchanged.
         """
         chunk = chunk.detach()
         if len(chunk) == 0:
@@ -70,7 +76,14 @@ class Stream:
     def nearer(
         self, distance: Float[Tensor, "query"], points: Float[Tensor, "query 3"]
     ) -> Bool[Tensor, "query"]:
-        """Return a mask of points nearer than the best so far; false at a tie, so that the lower index stays."""
+        """Return a mask of queries for which a point of the new chunk is nearer than all points of earlier chunks.
+
+        It is false for equal distances, so that the lower index stays.
+
+        Args:
+            distance: distance of the nearest point in the new chunk.
+            points: this point.
+        """
         assert self.best is not None
         nearer = distance < self.best.distance
         # squared distances that differ may have the same root, and `nearest` compares the squares
@@ -84,7 +97,7 @@ class Stream:
         """Return the nearest points among the chunks so far.
 
         Raises:
-            DataError: no chunk had a point.
+            DataError: no point was added.
         """
         if self.best is None:
             raise DataError(
@@ -94,14 +107,14 @@ class Stream:
 
 
 class Middle:
-    """The mean of all points so far, in float64."""
+    """The mean of the points of all chunks so far, in float64."""
 
     def __init__(self) -> None:
         self.count = 0
         self.first = self.sum = torch.zeros(3, dtype=torch.float64)
 
     def add(self, chunk: Float[Tensor, "points columns"]) -> None:
-        """Add the points of a chunk."""
+        """Add the points of a chunk to the mean."""
         points = finite_points(chunk)
         if len(points) == 0:
             return
@@ -115,19 +128,19 @@ class Middle:
 
     @property
     def mean(self) -> Float[Tensor, "3"]:
-        """Mean of the points, (3,)."""
+        """Mean of the points of all chunks so far, (3,)."""
         return self.first + self.sum / max(1, self.count)
 
 
 class Reach:
-    """The largest distance from a centre of all points so far, in float64; 1 if all points are at the centre."""
+    """The largest distance of a point of all chunks so far from a centre, in float64."""
 
     def __init__(self, centre: Float[Tensor, "3"]) -> None:
         self.centre = centre.detach().double().clone()
         self.largest = 0.0
 
     def add(self, chunk: Float[Tensor, "points columns"]) -> None:
-        """Add the points of a chunk."""
+        """Include the points of a chunk in the largest distance."""
         points = finite_points(chunk)
         if len(points):
             self.largest = max(
@@ -136,15 +149,15 @@ class Reach:
 
     @property
     def norm(self) -> float:
-        """Largest distance from the centre, or 1."""
+        """Largest distance from the centre; 1 if all points are at the centre."""
         return self.largest or 1.0
 
 
 def finite_points(chunk: Tensor) -> Float[Tensor, "points 3"]:
-    """Return coordinates in float64.
+    """Return the coordinates of a chunk's points, in float64.
 
     Raises:
-        DataError: one is NaN or infinite.
+        DataError: a coordinate is NaN or infinite.
     """
     points = chunk.detach()[:, :3].double()
     bad = (~points.isfinite().all(1)).nonzero()
@@ -159,6 +172,6 @@ def finite_points(chunk: Tensor) -> Float[Tensor, "points 3"]:
 def normalise_chunk(
     chunk: Float[Tensor, "points columns"], centre: Tensor, scale: float
 ) -> Float[Tensor, "points columns"]:
-    """Return the chunk minus the centre, divided by the scale (eq. 6.2); dtype and attributes are unchanged."""
+    """Return the chunk minus the centre, divided by the scale (thesis eq. 6.2); dtype and attributes are unchanged."""
     points = (chunk[:, :3].double() - centre) / scale
     return torch.cat([points.to(chunk.dtype), chunk[:, 3:]], 1)
