@@ -389,7 +389,7 @@ def test_every_reader_finds_the_colours_or_refuses_with_a_sentence(
             require_squares(reader(case, folder), wanted, case.off, what)
 
 
-REFUSED = re.compile(r"^(?!.*[<>]).*(Image 1\.|one\.|texture|row 0|an image of mode).*\. ?[A-Z]", re.DOTALL)
+REFUSED = re.compile(r"^(?!.*[<>]).*(Image 1\.|one\.|texture|row 0|An image of mode).*\. ?[A-Z]", re.DOTALL)
 """Require that the message names the file and tells the user what to do."""
 
 

@@ -93,6 +93,7 @@ OWN_CACHE = {
 }
 """Modules that guard files in the project's own cache; `read_npz`, which is tested here, reads these files."""
 OWN_FILES = {
+    "framework/configuration/citations.py": "references.bib of this and of other installed packages",
     "framework/configuration/composition.py": "the package's config.yaml",
     "framework/datasets/images.py": "within a guard",
     "framework/evaluation/cost.py": "/proc",
@@ -100,6 +101,7 @@ OWN_FILES = {
     "framework/runs/repository.py": "the copy of an index that it has made",
     "framework/tracking/watch.py": "/proc",
     "plugins/data/cest/data.py": "the cache, fitted again where it cannot be read",
+    "plugins/density_head/von_mises/coefficients.py": "the package's table of coefficients",
 }
 """Modules outside `framework.storage` that open files, and the files that they open."""
 WHO_READS = """
