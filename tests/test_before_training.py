@@ -65,8 +65,7 @@ def test_targets_of_another_shape_are_refused(kind: Kind, fault: str) -> None:
         require_targets(wrong, TARGETS[kind])
 
 
-@pytest.mark.parametrize("label", [-1, 3, 7, math.nan])
-@pytest.mark.parametrize("workers", [0, 1])
+@pytest.mark.parametrize(("label", "workers"), [(-1, 0), (3, 0), (7, 0), (math.nan, 0), (7, 1)])
 @pytest.mark.parametrize("split", ["train", "val", "test"])
 def test_a_label_of_no_class_is_refused_wherever_it_is_read(label: float, workers: int, split: str) -> None:
     fields = targets(TARGETS["class"])

@@ -125,13 +125,8 @@ def test_an_experiment_of_each_family_can_be_shortened(name: str) -> None:
         assert 1 <= trainer["check_val_every_n_epoch"] <= epochs
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(name, marks=() if name in FAMILIES.values() else pytest.mark.slow, id=name)
-        for name in SHORTENED
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SHORTENED)
 def test_every_experiment_runs_shortened(name: str, framework: Framework) -> None:
     """Run with the cache that all tests share, since generating bodies takes minutes."""
     done = framework(

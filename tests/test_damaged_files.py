@@ -56,6 +56,7 @@ STORE_NOTHING = {"arrays of density_head lorentzian", "arrays of encoder incepti
 networks."""
 
 
+@pytest.mark.slow
 def test_every_reader_of_the_project_is_among_them() -> None:
     """Each module that guards a file reads a whole one where the damaged ones are read; no other module opens files."""
     done = subprocess.run(

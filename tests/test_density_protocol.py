@@ -268,6 +268,7 @@ def pictured(kind: str, made: Made, density: Distribution) -> None:
         close(found, wanted)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name, row", first_of_each(ROWS, lambda case: case[0], lambda case: f"{case[0]}: {case[1].name}")
 )
@@ -1038,6 +1039,7 @@ The first is for all items together. The second is for the mean over items, whos
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", SPREADS)
 def test_told_errors_are_the_spread_over_seeds(case: str) -> None:
     """Compare with repeated estimates, for three members of an ensemble and for structures of their densities."""

@@ -80,6 +80,7 @@ def test_a_folder_that_is_not_utf8_is_refused_before_training(tmp_path: Path) ->
     assert address(other, folder) == Address(other, True)
 
 
+@pytest.mark.slow
 def test_runs_sweeps_and_sync_keep_the_store_in_their_folder(
     forks: Forks, stranger_site: Path, tmp_path: Path
 ) -> None:

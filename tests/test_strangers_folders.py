@@ -23,7 +23,7 @@ import yaml
 
 from framework.errors import UserError
 from framework.sweeps import comparison
-from tests.conftest import TINY, Done, Forks, Once, command
+from tests.conftest import TINY, Done, Forks, Once, command, first_of_each
 
 SECRET = b"the user's own line\nand one that does not end"
 COMMANDS: dict[str, list[str]] = {
@@ -331,7 +331,10 @@ RECORD = {
 }
 
 
-@pytest.mark.parametrize("key", [*RESULTS, *(f"record {key}" for key in RECORD)])
+@pytest.mark.parametrize(
+    "key",
+    first_of_each([*RESULTS, *(f"record {key}" for key in RECORD)], lambda key: key.startswith("record ")),
+)
 def test_a_job_that_says_nonsense_is_left_out_of_the_table(
     key: str,
     tmp_path: Path,

@@ -86,6 +86,7 @@ def surface(body):
     return sheet(body)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["7k", "14k", "27k", "110k"])
 def test_topologies_of_the_default_body(body, surface, name):
     found = topology(body, surface, name)

@@ -57,6 +57,7 @@ def inputs() -> torch.Tensor:
     return torch.randn(50, 2, generator=torch.Generator().manual_seed(0))
 
 
+@pytest.mark.slow
 def test_a_sweep_becomes_an_ensemble_and_its_first_member_is_trained_alike_in_one_pass(
     framework: Framework, tmp_path: Path
 ) -> None:

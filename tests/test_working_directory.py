@@ -67,12 +67,14 @@ def imported(archive: Path, command: Sequence[str], *paths: Path, code: int | No
     return marker.read_text().split() if marker.exists() else []
 
 
+@pytest.mark.slow
 def test_a_run_imports_nothing_of_the_archive(archive: Path, stranger_site: Path) -> None:
     run = ["framework", *TINY, "trainer.max_epochs=1", "workers=1"]
     assert imported(archive, run, stranger_site, code=0) == []
     assert imported(archive, ["framework", "data=strange"], code=2) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", COMMANDS)
 def test_no_command_of_a_plugin_imports_any(command: str, archive: Path) -> None:
     assert imported(archive, [command, "--help"], code=0) == []

@@ -113,6 +113,7 @@ def test_generated_people_lie_in_fausts_layout_and_say_so(generated):
         assert all((path // 3 == second // 3) == (challenge == "intra") for path, second in scan_pairs)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("challenge", faust.CHALLENGES)
 def test_challenges_are_answered_as_they_ask(generated, tmp_path, challenge):
     def registered(scan, off=0.0):

@@ -212,6 +212,7 @@ def command(folder, *arguments):
     return process.returncode, process.stdout + process.stderr
 
 
+@pytest.mark.slow
 def test_a_trained_run_registers_a_users_scan(file, tmp_path):
     small = ["data.train=64", "data.validation=16", "data.test=16", "data.points=200", "trainer.max_epochs=2"]
     code, output = command(

@@ -134,6 +134,7 @@ def place_errors(parameters, wanted):
     return np.degrees(turns.magnitude()), 100 * float((parameters[3:6] - wanted[3:6]).norm())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gradient", ["boundary", "nmr", "soft"])
 def test_a_small_offset_is_found_again(body_model, gradient):
     """Check that every gradient reduces the error, and that the exact one finds the original parameters."""
