@@ -1,4 +1,4 @@
-"""Closed solids that are round: of revolution, balls, tubes, bars, wheels and rings."""
+"""Closed round solids: solids of revolution, balls, tubes, bars, wheels and rings."""
 
 import math
 from collections.abc import Sequence
@@ -34,7 +34,10 @@ def revolution(profile: Points, sides: int = 24, edges: Edges = "shared") -> Sol
 def cylinder(
     radius: Number, height: Number, at: Point = (0, 0, 0), top: Number | None = None, sides: int = 16
 ) -> Solid:
-    """Return an upright cylinder, or a frustum with the upper radius `top`; `at` is the middle of its bottom."""
+    """Return an upright cylinder, or a frustum of a cone if the upper radius `top` is given.
+
+    `at` is the middle of its bottom.
+    """
     return revolution([(radius, 0), (radius if top is None else top, height)], sides).move(*at)
 
 

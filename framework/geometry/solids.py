@@ -42,7 +42,7 @@ class Solid(NamedTuple):
         return Solid(self.vertices * [x, y, z], self.faces)
 
     def rotate(self, axis: str, angle_deg: Number) -> "Solid":
-        """Return the solid rotated about a coordinate axis, counter-clockwise seen from its positive end."""
+        """Return the solid rotated about the axis "x", "y" or "z", counter-clockwise seen from its positive end."""
         c, s = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
         i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
         vertices = self.vertices.copy()
@@ -170,7 +170,7 @@ def frustum(
 
 
 def plate(outline: Points, offset: Points, edges: Edges = "sharp") -> Solid:
-    """Return a plate: a convex plane outline (points, 3), thickened by the vector `offset`, half to either side."""
+    """Return a plate between two copies of a convex plane outline (points, 3), moved by ±`offset` / 2."""
     points, half = np.asarray(outline, dtype=np.float64), np.asarray(offset, dtype=np.float64) / 2
     return loft([points - half, points + half], edges)
 

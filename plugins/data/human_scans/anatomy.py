@@ -15,18 +15,20 @@ from framework.bodies.body import Body
 from framework.bodies.poses import Skeleton, skeleton
 
 AWAY = -1.0
-"""Coordinate along a limb, metres, of vertices of another part of the body."""
+"""Initial value of the coordinate along a limb, metres; coordinates below 0 lie before the limb."""
 
 
 @dataclass(frozen=True)
 class Anatomy:
-    """Measures of each vertex of a `Sheet` (`framework.bodies.topologies`), metres, float32.
+    """Measures of each vertex of a body's sheet, metres, float32.
+
+    The sheet is the mesh of the body whose edges are split in the middle (`framework.bodies.topologies.Sheet`).
 
     Attributes:
         place: position in the template: x to the left, y up, z to the front.
         arms, legs, head: share of the skinning weights that belongs to the joints of these parts.
-        along_arm, along_leg: distance from shoulder and hip along the bones; below 0 before the joint, AWAY on other
-            parts.
+        along_arm, along_leg: distance from the shoulder, or from the hip, along the bones; below 0 before this joint
+            and on other parts of the body.
         on_head: x in half widths of the head, y from 0 (under the chin) to 1 (crown), z from -1 (back) to 1 (nose).
         elbow, wrist, knee, ankle: positions of these joints along arm and leg.
         waist, hips, chest, neck: heights on the trunk.
@@ -57,7 +59,12 @@ class Anatomy:
 
 
 def anatomy(body: Body, carried: Callable[[np.ndarray], np.ndarray]) -> Anatomy:
-    """Return the measures of a body; `carried` interpolates values of the body's vertices to those of the sheet."""
+    """Return the measures of a body.
+
+    Args:
+        body: the body.
+        carried: function that interpolates values of the body's vertices to the vertices of its sheet.
+    """
     where = skeleton(body)
     place = body.template.astype(np.float64)
     shares = {name: body.weights[:, of].sum(1) for name, of in _parts(body, where).items()}
@@ -110,7 +117,16 @@ def _parts(body: Body, where: Skeleton) -> dict[str, list[int]]:
 
 
 def _along(body: Body, chain: list[tuple[int, int]], share: np.ndarray) -> Float[np.ndarray, "vertex"]:
-    """Return each vertex's distance, metres, from the first joint along the bones of the chain on its side."""
+    """Return each vertex's distance, metres, from the first joint of a limb, measured along the bones of the limb.
+
+    For each vertex the limb is that of the body side on which the vertex lies.
+
+    Args:
+        body: the body.
+        chain: joints of the limb from the trunk outwards, each as the pair (left, right).
+        share: share of each vertex's skinning weights that belongs to the limb; where it is 0.5 or less, the distance
+            is below 0.
+    """
     place, joints = body.template.astype(np.float64), body.joints.astype(np.float64)
     distance = np.full(len(place), AWAY)
     for side in (0, 1):
@@ -127,6 +143,6 @@ def _along(body: Body, chain: list[tuple[int, int]], share: np.ndarray) -> Float
 
 
 def _from(place: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Return the distance of points from the bone between two points."""
+    """Return the distance of each point in `place` from the line segment (a bone) from `start` to `end`."""
     along = ((place - start) @ (end - start)) / ((end - start) @ (end - start))
     return np.linalg.norm(place - (start + along.clip(0, 1)[:, None] * (end - start)), axis=1)

@@ -133,7 +133,18 @@ def data_of(description: Description) -> HumanScans:
 def cast(
     data: HumanScans, who: str | None, file: Path | None, frames: int, start: float = 0.0
 ) -> tuple[Actor, list[Moment]]:
-    """Return the person to be drawn, and the person's state in each frame."""
+    """Return the person to be drawn, and the person's state in each frame.
+
+    Args:
+        data: data set that the model was trained on.
+        who: name of a test subject, or the file of a mesh; None for the first test subject.
+        file: motion file; None to keep the pose.
+        frames: number of frames.
+        start: time in the motion file at which the animation starts, s.
+
+    Raises:
+        ConfigError: a motion is given, but only the mesh of the person is known.
+    """
     if who is not None and Path(who).suffix:
         registration = read_registration(Path(who))
     elif data.root is None:
@@ -151,7 +162,7 @@ def cast(
 
 
 def generated_person(data: HumanScans, who: str | None) -> Generated:
-    """Return a test subject of generated data."""
+    """Return the test subject of generated data with the name `who`; the first one if `who` is None."""
     crowd = Crowd(data.renderer, data.counts, data.drawing, data.data_seed)
     names = [f"test_{number:04}" for number in range(data.counts["test"])]
     return Generated(crowd, "test", names.index(_select_subject(who, names)), data.topology)  # pyright: ignore[reportArgumentType]
@@ -160,7 +171,11 @@ def generated_person(data: HumanScans, who: str | None) -> Generated:
 def follow_motion(
     person: Generated, file: Path | None, frames: int, start: float = 0.0
 ) -> tuple[Actor, list[Moment]]:
-    """Return a generated person who follows a motion file at SPEED frames per second, or keeps one pose without it."""
+    """Return a generated person, and the person's state in each frame.
+
+    The person follows the motion file at SPEED frames per second from second `start` on. Without a file, the person
+    keeps the pose of the data set.
+    """
     if file is None:
         return actor(person.registration), [person.first()] * frames
     recorded = motion.read(file)

@@ -1,4 +1,4 @@
-"""Generated people in many poses, cameras that orbit them, and rendered images of both side by side."""
+"""Generated people in many poses, cameras on a circle around them, and images of several renderers side by side."""
 
 import copy
 import math
@@ -29,7 +29,12 @@ SAYS = "synthetic"
 
 
 class Moment(NamedTuple):
-    """State of a person at one time: the registration's vertices, metres, and the scan, or None without one."""
+    """State of a person at one time.
+
+    Attributes:
+        vertices: vertices of the registered mesh, metres.
+        scan: scan of the person in this state; None if only the registered mesh is known.
+    """
 
     vertices: Float[Tensor, "vertices 3"]
     scan: Scan | None
@@ -50,9 +55,9 @@ class Actor:
 class Generated:
     """Person of a generated data set, who can take any pose.
 
-    The registration belongs to the scan in the first pose and is reposed: distances from the body and colours do not
-    change. The scan is generated anew in each pose, with the same clothes, hair and light, and with the shading of
-    the pose.
+    The registered mesh is that of the data set, brought into each pose: its distances from the bare body and its
+    colours do not change. The scan is generated anew in each pose, with the same clothes, hair and light, and with the
+    shading of the pose.
 
     Attributes:
         stood: the pose that photographs of the data set show.
@@ -92,16 +97,20 @@ class Generated:
 
 
 def actor(registration: RegisteredMesh) -> Actor:
-    """Return the person whose mesh a registration is, with colours in linear RGB."""
+    """Return the person that a registered mesh shows; its 8-bit sRGB colours are converted to linear RGB."""
     return Actor(registration.faces, linear_from_bytes(registration.colors))
 
 
 def orbit(moments: Sequence[Moment], azimuths: Sequence[float], size: tuple[int, int]) -> list[Camera]:
-    """Return cameras that look at the middle of all moments, at the smallest common distance that shows each whole.
+    """Return a camera for each azimuth, which looks at the middle of a person in all states.
+
+    All cameras have the same distance from the middle: the smallest at which each camera shows the whole person in
+    every state.
 
     Args:
-        moments: the states that all cameras have to show whole.
-        azimuths: radians; 0 is in front (z), larger angles turn to the subject's left (x).
+        moments: states of the person.
+        azimuths: azimuth of each camera, radians; 0 is in front (z), and larger angles lie towards the subject's left
+            (x).
         size: (height, width), pixels.
     """
     every = torch.cat(
@@ -124,7 +133,10 @@ def orbit(moments: Sequence[Moment], azimuths: Sequence[float], size: tuple[int,
 
 
 def _towards(azimuth: float) -> Float[Tensor, "3 3"]:
-    """Return the rotation from world to camera (x right, y down, z forward) of a camera looking down by LOOK_DOWN."""
+    """Return the rotation from world to camera (x right, y down, z forward) of a camera at an azimuth, radians.
+
+    The camera looks down by the angle LOOK_DOWN.
+    """
     sine, cosine = math.sin(azimuth), math.cos(azimuth)
     level = math.cos(LOOK_DOWN)
     back = torch.tensor([level * sine, math.sin(LOOK_DOWN), level * cosine], dtype=torch.float64)
@@ -133,7 +145,7 @@ def _towards(azimuth: float) -> Float[Tensor, "3 3"]:
 
 
 def on_white(renderer: Renderer, scene: Scene) -> UInt8[np.ndarray, "height width 3"]:
-    """Return an 8-bit sRGB image of the scene on white, for any background colour of the renderer."""
+    """Return an 8-bit sRGB image of the scene on white, whatever background the renderer draws."""
     if renderer.background == 1:
         return bytes_from_linear(renderer(scene)["color"]).numpy()
     assert scene.colors is not None
@@ -164,7 +176,15 @@ def columns(
     renderers: Mapping[str, Renderer],
     camera_of_truth: Renderer,
 ) -> Iterator[dict[str, UInt8[np.ndarray, "height width 3"]]]:
-    """Yield for each frame the image of each renderer by its name, and the "photograph" if the scan is known."""
+    """Yield for each frame a dictionary of images: one for each renderer, and "photograph" if the scan is known.
+
+    Args:
+        actor: the person.
+        moments: state of the person in each frame.
+        cameras: camera of each frame.
+        renderers: renderers that draw the registered mesh, by the name of their image.
+        camera_of_truth: renderer that draws the photograph from the scan.
+    """
     for moment, camera in zip(moments, cameras, strict=True):
         scene = actor.scene(moment, camera)
         images = {name: on_white(renderer, scene) for name, renderer in renderers.items()}
@@ -174,7 +194,10 @@ def columns(
 
 
 def side_by_side(pictures: Mapping[str, UInt8[np.ndarray, "height width 3"]], synthetic: bool) -> Image.Image:
-    """Return one image of all images in a row with their names below, and with a note if they are synthetic."""
+    """Return one image that shows all images in a row, with their names below.
+
+    If the images are synthetic, the image has a note that says so.
+    """
     height, width = next(iter(pictures.values())).shape[:2]
     sheet = Image.new("RGB", (width * len(pictures), height + CAPTION), "white")
     pen, font = ImageDraw.Draw(sheet), ImageFont.load_default(11)

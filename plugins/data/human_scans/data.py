@@ -31,7 +31,7 @@ from framework.target import Target
 from plugins.data.human_scans.scan_generator import Crowd, Drawing, scans_root
 
 VERSION = 1
-"""Version of the reading code; any change of what it returns takes a new number."""
+"""Version of the reading code, part of the fingerprint; increase it if the data that are read change."""
 Number = Annotated[int, Field(ge=1, le=100_000)]
 Seed = Annotated[int, Field(ge=0, lt=2**31)]
 Shows = Literal["photograph", "subject"]
@@ -52,9 +52,9 @@ class Variation:
     """Random changes of the training images.
 
     Attributes:
-        mirrored: whether half of the training images are mirrored, points and photograph.
-        recoloured: share of the training images whose red, green and blue are permuted, in points and photograph alike:
-            white light prefers no colour, and clothes have any colour.
+        mirrored: whether half of the training samples are mirrored, both the points and the photograph.
+        recoloured: share of the training samples whose red, green and blue are permuted, in the points and in the
+            photograph. This is plausible, because the light is white and clothes have any colour.
     """
 
     mirrored: bool = True
@@ -74,8 +74,8 @@ class HumanScans(Data, SubjectFolder):
         renderer: draws the photographs of generated people.
         root: a folder in the layout of framework.datasets.scan_layout; None: people are generated into the cache once.
         topology: name of the registered meshes to read; 7k (6,890 vertices) and 27k (27,578) are generated.
-        shows: what the target is: "photograph", or "subject", one number per pixel, 1 where the subject covers half of
-            it or more and else 0, for a network that segments (thesis §7.3.1).
+        shows: kind of the target. "photograph": the photograph. "subject": the segmentation (thesis §7.3.1), one number
+            per pixel, which is 1 if the subject covers half of the pixel or more, and 0 otherwise.
         counts, drawing: settings of generated people.
         data_seed: seed of the draws of generated people, independent of the seed of the run.
         variation: random changes of the training images.
@@ -119,7 +119,12 @@ class HumanScans(Data, SubjectFolder):
 
     @property
     def place(self) -> Path:
-        """Return the folder of the data set, which need not exist; raises as `prepare`."""
+        """Return the folder of the data set; it may not exist yet.
+
+        Raises:
+            DataError: the body or the skins of generated people are not available.
+            ConfigError: the settings of generated people do not fit together.
+        """
         if self.root is not None:
             return Path(self.root).expanduser()
         return Crowd(self.renderer, self.counts, self.drawing, self.data_seed).root
@@ -155,9 +160,10 @@ class HumanScans(Data, SubjectFolder):
         return self._splits
 
     def read(self, files: Sequence[Path]) -> Dataset[Batch]:
-        """Return coloured meshes as cameras see them.
+        """Return one sample for each coloured mesh and each of its cameras.
 
-        The cameras are those of a cameras.json beside the file, else one in front that sees the mesh whole.
+        The cameras of a mesh are those of a file cameras.json in the same folder. Without such a file there is one
+        camera, which sees the whole mesh from the front.
         """
         if not files:
             raise DataError("The list of files is empty; expected one or more meshes with vertex colours.")
@@ -223,7 +229,10 @@ class HumanScans(Data, SubjectFolder):
         }
 
     def preview(self, inputs: Tensor) -> np.ndarray:
-        """Return an image of the points that the canonical camera sees, on white: one pixel each, nearest in front."""
+        """Return an image on white in which each point that the canonical camera sees colours one pixel.
+
+        If several points fall on a pixel, the nearest one is shown.
+        """
         height, width = self.size
         points = inputs.detach().cpu().float()
         points = points[points.isfinite().all(1)]
@@ -273,7 +282,10 @@ def photograph(view: View) -> tuple[Float[Tensor, "height width 3"], Float[Tenso
 
 
 def in_front(vertices: Float[Tensor, "vertices 3"], height: int, width: int) -> Camera:
-    """Return an upright camera that sees a mesh whole from the front (its z axis), y up, with the canonical lens."""
+    """Return an upright camera that sees the whole mesh from the front, with the lens of the canonical camera.
+
+    The front of the mesh faces along z, and y points up.
+    """
     low, high = vertices.min(0).values, vertices.max(0).values
     middle, extent = (low + high) / 2, high - low
     # the front of the mesh fills nine tenths of the image at most; the focal length is `height` pixels
@@ -285,13 +297,13 @@ def in_front(vertices: Float[Tensor, "vertices 3"], height: int, width: int) -> 
 
 
 def _mirror(images: Tensor, which: Tensor) -> Tensor:
-    """Return images (image, height, width, ...), some of them with left and right exchanged."""
+    """Return images (image, height, width, ...); left and right are exchanged in those where `which` is true."""
     chosen = which.to(images.device).view(-1, *[1] * (images.dim() - 1))
     return torch.where(chosen, images.flip(2), images)
 
 
 def _permute_colors(colors: Float[Tensor, "batch ... 3"], orders: Tensor) -> Tensor:
-    """Return the colours with each sample's three channels permuted by its order."""
+    """Return the colours with permuted channels; `orders`, (batch, 3), holds the permutation of each sample."""
     places = orders.to(colors.device).view(-1, *[1] * (colors.dim() - 2), 3)
     return colors.gather(-1, places.expand(colors.shape))
 

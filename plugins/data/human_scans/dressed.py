@@ -35,10 +35,14 @@ ERROR = 0.0015
 
 @dataclass(frozen=True)
 class Scan:
-    """Mesh that photographs show; metres, linear RGB that includes the shading by the scanner's light.
+    """Mesh of a dressed person, which the photographs show.
+
+    It consists of the body's sheet with clothes and short hair, and of separate surfaces for a skirt and long hair.
 
     Attributes:
-        vertices, faces, colors: the body's sheet, and skirt and hair that hang beside it.
+        vertices: positions, metres.
+        faces: triangles.
+        colors: linear RGB of each vertex, including the shading by the scanner's light.
     """
 
     vertices: Float[np.ndarray, "vertices 3"]
@@ -48,7 +52,14 @@ class Scan:
 
 @dataclass(frozen=True)
 class RegisteredBody:
-    """The smooth body on every vertex of the sheet; each topology uses some of them. Metres, 8-bit sRGB."""
+    """The smooth body registered to a scan, with a position and a colour for every vertex of the sheet.
+
+    Each topology uses some of these vertices.
+
+    Attributes:
+        vertices: positions, metres.
+        colors: 8-bit sRGB.
+    """
 
     vertices: Float[np.ndarray, "sheet 3"]
     colors: UInt8[np.ndarray, "sheet 3"]
@@ -60,7 +71,7 @@ class Clothes(NamedTuple):
     Attributes:
         colors: linear RGB of each vertex of the sheet.
         raised: distance of cloth and hair from the skin, metres.
-        cover: share of the body's shape that cloth hides.
+        cover: share of the body's details that cloth hides at each vertex, 0 to 1.
         skirt: skirt that hangs beside the body, or None.
         hair: hair of the person.
     """
@@ -73,10 +84,11 @@ class Clothes(NamedTuple):
 
 
 class Wardrobe:
-    """Clothing of posed people of one body; holds what is the same for all of them.
+    """Functions that dress posed people of one body model, and the data that all these people share.
 
     Args:
-        stages: how often the body's edges are split for the scan.
+        body: the body model.
+        stages: how often the body's edges are split to obtain its sheet, the surface of the scan.
     """
 
     def __init__(self, body: Body, stages: int = 2) -> None:
@@ -102,9 +114,9 @@ class Wardrobe:
         skin: UInt8[np.ndarray, "height width 3"] | None,
         random: Generator,
     ) -> tuple[Scan, RegisteredBody]:
-        """Return scan and registration of a posed body with random clothes, hair and skin.
+        """Return the scan of a posed body with random clothes, hair and skin, and the registration to this scan.
 
-        `skin` is an image of a skin in the body's texture layout; None: the skin is painted by procedure.
+        `skin` is an image of a skin in the body's texture layout; if it is None, the skin is painted procedurally.
         """
         scan, visible = self.scan(posed, self.clothes(skin, random), random)
         return scan, self.register(posed, scan, visible, random)
@@ -169,17 +181,24 @@ class Wardrobe:
         return scan, visible
 
     def normals(self, vertices: Float[np.ndarray, "sheet 3"]) -> Float[np.ndarray, "sheet 3"]:
-        """Return unit normals of the sheet's vertices, outwards, means over their faces by area."""
+        """Return outward unit normals of the sheet's vertices: area-weighted means over the faces at each vertex."""
         return _unit(self._spread @ _cross(vertices, self.faces))
 
     def register(
         self, posed: np.ndarray, scan: Scan, visible: np.ndarray, random: Generator
     ) -> RegisteredBody:
-        """Return the body moved towards the nearest points of the scan, with their colours, as a registration.
+        """Return the registration of the body to a scan.
 
-        Vertices move along their normals, no farther than FURTHEST, and each as its neighbours do. Details thinner than
-        some edges (wrinkles, hems), or too far from the body (a wide skirt, a tail of hair), are therefore only in the
-        scan.
+        The vertices of the body move along their normals towards the nearest points of the scan, at most FURTHEST, and
+        take the colours of these points. The distances are averaged over neighbouring vertices. The registration
+        therefore lacks details of the scan that are only a few edges wide (wrinkles, hems) or too far from the body (a
+        wide skirt, a tail of hair).
+
+        Args:
+            posed: vertices of the bare body in the pose of the scan, metres.
+            scan: the scan.
+            visible: whether a scanner sees each point of the scan.
+            random: source of the remaining error.
         """
         points = scan.vertices[visible]
         tree = KDTree(points, balanced_tree=False, compact_nodes=False)
@@ -201,7 +220,13 @@ class Wardrobe:
         stood: Float[np.ndarray, "vertices 3"],
         posed: Float[np.ndarray, "vertices 3"],
     ) -> Float[np.ndarray, "sheet 3"]:
-        """Return a registration of the pose `stood` in another pose, at the same distances along the body's normals."""
+        """Return a registration in another pose, at the same distances from the bare body along its normals.
+
+        Args:
+            registration: vertices of the registration in the first pose, metres.
+            stood: vertices of the bare body in the first pose, metres.
+            posed: vertices of the bare body in the other pose, metres.
+        """
         off = ((registration[: self.vertices] - stood) * self._outwards(stood)).sum(1)
         return self.sheet.interpolate(posed + off[:, None] * self._outwards(posed))
 
@@ -209,9 +234,9 @@ class Wardrobe:
         return _unit(self._own_spread @ _cross(posed, self.body.faces))
 
     def _smoothed(self, posed: np.ndarray, cover: np.ndarray) -> np.ndarray:
-        """Return the body without the details that cloth hides.
+        """Return the vertices of a posed body, smoothed where cloth hides its details, by the share `cover`.
 
-        Each step blurs, and then undoes the shrinking that blurring causes (Taubin 1995).
+        Each step averages over neighbours, and then undoes the shrinking that averaging causes (Taubin 1995).
         """
         smooth = posed.astype(np.float64)
         for _ in range(12):
@@ -220,7 +245,10 @@ class Wardrobe:
         return smooth
 
     def _head(self, posed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the affine transform from the template's head to the posed head, and the former's bounding box."""
+        """Return the affine transform from the template's head to the posed head, and the box of the template's head.
+
+        The transform is (4, 3) and applies to rows (x, y, z, 1). The box is (3, 2): smallest and largest x, y, z.
+        """
         head = self.anatomy.head[: self.vertices] > 0.9
         if head.sum() < 4:
             head = np.ones(self.vertices, bool)
@@ -239,7 +267,7 @@ class Light:
         self.key = random.uniform(0.35, 0.6)
 
     def on(self, piece: Piece, normals: Float[np.ndarray, "vertices 3"]) -> Float[np.ndarray, "vertices 3"]:
-        """Return the linear RGB that a matt surface of these colours reflects."""
+        """Return the linear RGB that the matt surface `piece` reflects under this light."""
         around = 0.62 + 0.22 * normals[:, 1]
         side = ((normals @ self.towards + 0.3) / 1.3).clip(0, 1)
         return piece.colors * (around + self.key * side)[:, None]
@@ -261,7 +289,7 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 
 
 def _spread(faces: np.ndarray, vertices: int) -> csr_matrix:
-    """Return the matrix that sums values of faces to each of their vertices."""
+    """Return the matrix, (vertices, faces), that sums values of faces over the faces at each vertex."""
     columns = np.repeat(np.arange(len(faces)), 3)
     return csr_matrix((np.ones(len(columns)), (faces.ravel(), columns)), (vertices, len(faces)))
 

@@ -13,7 +13,7 @@ WAVES = 10
 
 
 def hue(degrees: float | int, saturation: float | int, value: float | int) -> Color:
-    """Return the linear RGB of a colour given by hue, saturation and value of its sRGB numbers."""
+    """Return the linear RGB of the sRGB colour with a hue (degrees), a saturation and a value (0 to 1)."""
     sector = (np.array([5.0, 3.0, 1.0]) + degrees / 60) % 6
     return (value * (1 - saturation * np.minimum(sector, 4 - sector).clip(0, 1))) ** 2.2
 
@@ -37,9 +37,10 @@ def noise(
     squeezed: tuple[float, float, float] = (1.0, 1.0, 1.0),
     waves: int = WAVES,
 ) -> Float[np.ndarray, "points"]:
-    """Return smooth noise of standard deviation 1, a sum of waves within a factor 1.5 of a wavelength, metres.
+    """Return smooth noise of standard deviation 1 at the given positions.
 
-    Along x, y and z the wavelength is divided by `squeezed`.
+    It is a sum of plane waves in random directions, whose wavelengths differ from `wavelength` (metres) at most by the
+    factor 1.5. Along x, y and z the wavelength is divided by the numbers in `squeezed`.
     """
     direction = random.normal(size=(3, waves))
     direction /= np.linalg.norm(direction, axis=0)
@@ -54,7 +55,10 @@ def folds(
     across: tuple[float, float, float],
     random: Generator,
 ) -> Float[np.ndarray, "points"]:
-    """Return random wrinkles across a direction: ridges about 1 high between wide valleys, with a mean near 0."""
+    """Return the heights of random wrinkles at the given positions: ridges about 1 high between wide valleys.
+
+    The mean is near 0. The ridges are perpendicular to `across` and about `wavelength` (metres) from each other.
+    """
     direction = np.array(across)[:, None] + 0.35 * random.normal(size=(3, 5))
     direction /= np.linalg.norm(direction, axis=0)
     number = 2 * np.pi / (wavelength * 1.4 ** random.uniform(-1, 1, 5))
@@ -66,7 +70,10 @@ def folds(
 
 
 def _sum_waves(place: np.ndarray, waves: Float[np.ndarray, "3 waves"], phases: np.ndarray) -> np.ndarray:
-    """Return the sum of sine waves; adding them one after the other keeps the arrays in the processor's cache."""
+    """Return the sum of the sine waves sin(wave · point + phase) at each point.
+
+    The waves are added one after the other, which keeps the arrays in the processor's cache.
+    """
     points = np.ascontiguousarray(place, np.float32)
     total, term = np.zeros((2, len(points)), np.float32)
     for wave, phase in zip(waves.T.astype(np.float32), phases.astype(np.float32), strict=True):

@@ -53,7 +53,10 @@ def _focal(scene: Scene) -> float:
 def _inside(
     depth: Float[Tensor, "height width"], slack: Float[Tensor, "height width"]
 ) -> Bool[Tensor, "height width"]:
-    """Return the pixels whose neighbours all show the same surface; pixels at the border are not among them."""
+    """Return a mask of the pixels whose neighbours all show the same surface; it is false at the image's border.
+
+    Pixels show the same surface if their depths differ by less than twice `slack`.
+    """
     far = torch.nn.functional.pad(depth, (1, 1, 1, 1), value=torch.inf)[None]
     highest, lowest = (sign * max_pool2d(sign * far, 3, 1)[0] for sign in (1, -1))
     return depth.isfinite() & ((highest - lowest) < 2 * slack)
@@ -62,7 +65,11 @@ def _inside(
 def warp(
     picture: Float[Tensor, "height width channels"], place: Float[Tensor, "height width 2"]
 ) -> Float[Tensor, "height width channels"]:
-    """Return the first image at these positions, interpolated between pixel centres."""
+    """Return the colours of `picture` at the positions `place` (column, row), interpolated between pixel centres.
+
+    With the first image and the flow from the second image to the first, the result is the first image as the second
+    camera would show it.
+    """
     height, width = picture.shape[:2]
     share = 2 * place / (torch.tensor([width, height]) - 1).clamp(min=1) - 1
     sampled = grid_sample(

@@ -227,7 +227,11 @@ def _jacket(body: Anatomy, random: Generator) -> Garment:
 
 
 def _trunk(body: Anatomy, hem: float, opening: float) -> Float[np.ndarray, "vertices"]:
-    """Return the metres from the borders of a garment on the trunk, from a hem to a round opening about the neck."""
+    """Return the signed distance of each vertex from the nearest border of a garment on the trunk, metres.
+
+    The distance is positive inside the garment, which reaches from the height `hem` to an opening around the neck of
+    radius `opening`. The garment has no border on the arms.
+    """
     down = np.where(body.on_arm, FAR, body.place[:, 1] - hem)
     # the opening is deeper in front
     centre = body.neck_place + np.array([0, 0.015, 0.03])
@@ -269,7 +273,15 @@ def _add_print(body: Anatomy, colors: np.ndarray, front: np.ndarray, random: Gen
 def _add_weave(
     body: Anatomy, colors: np.ndarray, wrinkles: np.ndarray, inside: np.ndarray, random: Generator
 ) -> Float[np.ndarray, "vertices 3"]:
-    """Return colours with the weave's noise, darker valleys, and stitches along the border."""
+    """Return the colours of a garment with the noise of the weave, darker valleys, and stitches along the border.
+
+    Args:
+        body: anatomy of the wearer.
+        colors: colours before.
+        wrinkles: displacement outwards, metres.
+        inside: signed distance from the garment's border, metres.
+        random: source of the noise.
+    """
     weave = 1 + 0.04 * noise(body.place, 0.008, random) + 0.04 * noise(body.place, 0.05, random)
     depth = 1 + 0.18 * np.tanh(wrinkles / 0.004)
     border = np.where(np.abs(inside - SEAM) < 0.002, 0.75, 1.0)
@@ -277,14 +289,18 @@ def _add_weave(
 
 
 def _on_trunk(body: Anatomy) -> tuple[np.ndarray, np.ndarray]:
-    """Return coordinates across and along upper garments: around the trunk and up, or around an arm and down it."""
+    """Return the coordinates of each vertex across and along the cloth of an upper garment, metres.
+
+    On the trunk, they run around the trunk and upwards. On an arm, they run around the arm and from the wrist to the
+    shoulder.
+    """
     x, y, z = body.place.T
     across = 0.22 * np.arctan2(x, np.abs(z) + 0.15)  # nearly x in front and behind, an angle at the sides
     return np.where(body.on_arm, 1.3 * z, across), np.where(body.on_arm, -body.along_arm, y)
 
 
 def _on_legs(body: Anatomy) -> tuple[np.ndarray, np.ndarray]:
-    """Return coordinates across and along trousers, metres.
+    """Return the coordinates of each vertex across and along the cloth of trousers, metres.
 
     The coordinate across is 0 in front and behind, and below 0 on the inner side of a leg.
     """

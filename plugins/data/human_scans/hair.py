@@ -24,7 +24,8 @@ class Hair(NamedTuple):
     Attributes:
         style: name of the hairstyle.
         color: linear RGB.
-        share: 1 where hair covers the skin, 0 elsewhere, between at its border.
+        share: share of the skin that hair covers at each vertex: 1 in the hair, 0 outside, between 0 and 1 at the
+            border.
         raised: height above the scalp, metres.
         colors: linear RGB of every vertex.
     """
@@ -139,7 +140,16 @@ def grid(rows: int, columns: int) -> np.ndarray:
 def _curtain(
     middle: np.ndarray, half: np.ndarray, random: Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return long hair, around the back of the head from ear to ear, and down."""
+    """Return long hair, which hangs down around the back of the head from ear to ear.
+
+    Args:
+        middle: centre of the head.
+        half: half width, half height and half depth of the head.
+        random: source of the random shape.
+
+    Returns:
+        Vertices, triangles, and the coordinate of each vertex across the strands, metres.
+    """
     length, reach = random.uniform(0.2, 0.42), random.uniform(1.5, 1.9)
     angle, down = np.meshgrid(np.linspace(-reach, reach, 120), np.linspace(0, 1, 60))
     lock = 0.006 * np.sin(9 * angle + 3 * np.sin(2 * angle) + random.uniform(0, 6))
@@ -163,7 +173,7 @@ def _curtain(
 def _tail(
     middle: np.ndarray, half: np.ndarray, random: Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return a tail that leaves the back of the head and hangs down."""
+    """Return a tail that leaves the back of the head and hangs down; arguments and results are those of `_curtain`."""
     length, thick, high = random.uniform(0.18, 0.36), random.uniform(0.022, 0.034), random.uniform(-0.1, 0.5)
     angle, down = np.meshgrid(np.linspace(0, 2 * np.pi, 49), np.linspace(0, 1, 48))
     radius = thick * (0.45 + 1.1 * np.sqrt(down.clip(0, 1))) * np.sqrt((1 - down).clip(0.002, None)) * 1.35
@@ -184,7 +194,7 @@ def _tail(
 def _bun(
     middle: np.ndarray, half: np.ndarray, random: Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return a bun: a ball at the back of the head, or on top of it."""
+    """Return a bun, a ball at the back or on top of the head; arguments and results are those of `_curtain`."""
     size, lift = random.uniform(0.032, 0.05), random.uniform(0.2, 1.3)
     angle, down = np.meshgrid(np.linspace(0, 2 * np.pi, 49), np.linspace(0, np.pi, 32))
     radius = size * (1 + 0.07 * np.sin(5 * angle + 6 * down))

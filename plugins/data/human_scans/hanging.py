@@ -24,7 +24,11 @@ def hang_skirt(
 ) -> Piece:
     """Return the mesh of a skirt on a posed body.
 
-    `held` are the posed vertices of trunk and legs; `top` says which of them lie at the skirt's upper border.
+    Args:
+        skirt: the skirt.
+        trunk_and_legs: posed vertices of trunk and legs, metres.
+        top: whether each of these vertices lies at the skirt's upper border.
+        random: source of the folds.
     """
     waist = trunk_and_legs[top].mean(0)
     angle = np.linspace(0, 2 * np.pi, AROUND)

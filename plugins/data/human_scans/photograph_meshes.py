@@ -1,7 +1,8 @@
 """`python -m plugins.data.human_scans.photograph_meshes <meshes> <root>` makes data of `human_scans` from meshes.
 
-<meshes> holds the folders train, validation and test. Each of them has `<name>_scan.ply` (.obj, ...), which photographs
-show, and `<name>_registration.ply`, which renderers get, all of one topology. Metres, y up, facing z, vertex colours.
+<meshes> holds the folders train, validation and test. For each person they hold two meshes with vertex colours:
+`<name>_scan.ply` (.obj, ...), which the photographs show, and `<name>_registration.ply`, which is the input of a
+renderer. All registrations have one topology. Meshes are in metres, with y up, and face z.
 """
 
 import argparse
@@ -30,7 +31,7 @@ Pair = tuple[Path, Path]
 
 
 def main(arguments: list[str]) -> None:
-    """Write the root, whole or not at all.
+    """Write the data set to the folder <root>, completely or not at all.
 
     Raises:
         UserError: a mesh is missing, cannot be read or has no colours; the root exists already.
@@ -117,7 +118,10 @@ def pairs(folder: Path) -> Mapping[str, Mapping[str, Pair]]:
 def write_person(
     folder: Path, pair: Pair, topology: str, renderer: Renderer, views: int, size: tuple[int, int]
 ) -> None:
-    """Write photographs of a scan from camera positions that depend on its name alone, and its registration."""
+    """Write the photographs of a person's scan and the registration to a folder.
+
+    The camera positions depend only on the name of the folder, which is the name of the person.
+    """
     scan, registration = (meshes.read(file) for file in pair)
     scan_layout.write_registration(
         folder / f"registration_{topology}.ply",

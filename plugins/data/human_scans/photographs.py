@@ -19,7 +19,7 @@ from framework.renderer import Renderer, Scene
 SAMPLES = 4
 """Number of samples of a pixel along each axis."""
 AROUND, HEIGHTS = 20, (-8.0, 6.0, 22.0)
-"""Camera positions of the rig: a number of positions around the person at each of these elevations, degrees."""
+"""Camera positions of the rig: AROUND positions around the person at each of the elevations HEIGHTS, degrees."""
 TOGETHER = 4
 """Number of photographs that are drawn at once; each takes some 30 MB before pooling."""
 FOCAL = 1.25
@@ -31,10 +31,11 @@ MARGIN = 0.03
 def place_cameras(
     vertices: Float[np.ndarray, "vertices 3"], count: int, size: tuple[int, int], random: Generator
 ) -> list[Camera]:
-    """Return cameras at different positions that see all of a person; if positions are too few, they are used again.
+    """Return `count` cameras at positions of the rig, in random order, each of which sees the whole person.
 
-    Each camera looks at the middle of the person from the smallest distance that shows it whole, or a little farther
-    away. It is rolled by a degree or two, and its principal point is a little off the middle.
+    Every position is used once before a position is used again. Each camera looks at the middle of the person from the
+    smallest distance at which it sees the whole person, or a little farther away. It is rolled by a degree or two, and
+    its principal point is a little off the middle of the image.
     """
     places = AROUND * len(HEIGHTS)
     order = np.concatenate([random.permutation(places) for _ in range(-(-count // places))])[:count]
@@ -95,13 +96,16 @@ def take_photographs(renderer: Renderer, scene: Scene, cameras: Sequence[Camera]
 
 
 def _with_cover(colors: Tensor | None) -> Float[Tensor, "vertices 4"]:
-    """Return the colours with a fourth channel of ones: it renders as the share of a pixel that the subject covers."""
+    """Return the colours with a fourth channel of ones, whose render is the share of each pixel that is covered."""
     assert colors is not None
     return torch.cat([colors, torch.ones_like(colors[:, :1])], 1)
 
 
 def _finer(camera: Camera) -> Camera:
-    """Return the camera of an image SAMPLES times as large: the centre of pixel p becomes S p + (S - 1) / 2."""
+    """Return the camera of the same image with S = SAMPLES times as many rows and columns.
+
+    The centre of pixel p lies at S p + (S - 1) / 2 in the larger image.
+    """
     (fx, fy), (cx, cy) = (tuple(map(float, pair)) for pair in (camera.focal, camera.principal))
     shift = (SAMPLES - 1) / 2
     return Camera(
@@ -130,7 +134,17 @@ def texture(
     colors: Float[Tensor, "places 3"],
     side: int,
 ) -> UInt8[np.ndarray, "side side 3"]:
-    """Return a square texture from linear RGB at texture coordinates, v upwards; uncovered texels copy the nearest."""
+    """Return a square 8-bit sRGB texture, drawn from colours at texture coordinates.
+
+    A texel that no triangle covers has the colour of the nearest covered texel.
+
+    Args:
+        renderer: renderer that draws the triangles.
+        uv: texture coordinates, v upwards.
+        uv_faces: triangles between the texture coordinates.
+        colors: linear RGB at each texture coordinate.
+        side: side of the texture, texels.
+    """
     place = np.stack([uv[:, 0] * side - 0.5, (1 - uv[:, 1]) * side - 0.5, np.ones(len(uv))], 1)
     camera = Camera(torch.eye(3), torch.zeros(3), (1.0, 1.0), (0.0, 0.0), side, side)
     scene = Scene(torch.from_numpy(place).float(), torch.from_numpy(uv_faces), _with_cover(colors), camera)

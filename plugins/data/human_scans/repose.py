@@ -41,13 +41,15 @@ Poses = dict[str, Float[np.ndarray, "joint 3"]]
 
 @dataclass(frozen=True)
 class Subject:
-    """Model of one person: the body's with offsets in the rest pose (the thesis's template of a subject).
+    """Model of one person: the body model with offsets in the rest pose (the thesis's template of a subject).
 
     Attributes:
         model: body model, float64, in the registration's topology.
+        registration: registered mesh of the person.
         fit: pose, shape and translation of the registration.
-        offsets: displacements of its vertices from the model's in the rest pose, metres.
-        folded: number of vertices that are the model's own along some direction, see framework.bodies.unposing.
+        offsets: displacements of the person's vertices from those of the fitted body model in the rest pose, metres.
+        folded: number of vertices whose displacement cannot be determined along some direction
+            (framework.bodies.unposing); along this direction they stay near the vertices of the body model.
     """
 
     model: BodyModel
@@ -60,7 +62,12 @@ class Subject:
     def posed(
         self, pose: Float[np.ndarray, "joint 3"] | None = None, change: Float[Tensor, "shape"] | None = None
     ) -> RegisteredMesh:
-        """Return the person in a pose (None: as registered), with a change of shape coefficients."""
+        """Return the mesh of the person in a pose and with a changed shape.
+
+        Args:
+            pose: rotations of the joints; None for the pose of the registration.
+            change: numbers that are added to the shape coefficients; None for no change.
+        """
         shape = self.fit.shape if change is None else self.fit.shape + change
         turned = self.fit.pose if pose is None else torch.from_numpy(pose)[None]
         vertices = self.model(shape, turned, offsets=self.offsets)[0]
@@ -72,10 +79,13 @@ class Subject:
 
 
 def subject(body: Body, few: Body, registration: RegisteredMesh, source: str) -> Subject:
-    """Return the model of a person.
+    """Return the model of the person that a registered mesh shows.
 
-    `body` is the unchanged body; `few` has few shape coefficients, see framework.bodies.shape_space. `source` names
-    the mesh in messages.
+    Args:
+        body: the body model.
+        few: the body model with a reduced number of shape coefficients (framework.bodies.shape_space), which is fitted.
+        registration: the registered mesh.
+        source: name of the mesh in messages.
 
     Raises:
         DataError: the mesh is of another body.
@@ -162,7 +172,10 @@ def shape_change(text: str, count: int) -> Float[Tensor, "shape"]:
 
 
 def around(vertices: Float[Tensor, "vertex 3"], views: int, size: tuple[int, int]) -> dict[str, Camera]:
-    """Return cameras that see all vertices, at equal angles around the vertical, the first in front."""
+    """Return `views` cameras by number, each of which sees all vertices.
+
+    They lie at equal angles around the vertical axis; the first one is in front.
+    """
     cameras = {}
     for view in range(views):
         angle = 2 * math.pi * view / views

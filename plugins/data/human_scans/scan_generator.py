@@ -31,7 +31,7 @@ from plugins.data.human_scans.dressed import Wardrobe
 from plugins.data.human_scans.photographs import place_cameras, take_photographs, texture
 
 VERSION = 1
-"""Version of the random draws; any change of them takes a new number."""
+"""Version of the random draws; increase it if the draws change, so that people are generated anew."""
 SPLITS = ("train", "validation", "test")
 CALM = 0.4
 """Spread of the movements of people who stand still in an A-pose, as a share of the usual spread."""
@@ -45,12 +45,12 @@ class Drawing:
 
     Attributes:
         views: number of photographs of each person.
-        height, width: pixels of a photograph.
-        topologies: meshes registered to each scan.
+        height, width: size of a photograph, pixels.
+        topologies: names of the topologies in which a mesh is registered to each scan.
         posed: share of the test subjects that have a random pose instead of an A-pose.
-        texture_side: texels along a side of texture.png; 0: no texture is made.
-        skins: folder of images of skin in the default body's texture layout, each used in one split alone; None: skin
-            is painted by procedure.
+        texture_side: texels along a side of texture.png; 0 for no texture.
+        skins: folder of images of skin in the default body's texture layout, each of which is used in one split only;
+            None for skin that is painted procedurally.
         body: file of a body model of the SMPL family (.npz, .pkl); None: the default body.
     """
 
@@ -76,7 +76,14 @@ def scans_root(renderer: Renderer, counts: Mapping[str, int], drawing: Drawing, 
 
 
 class Person(NamedTuple):
-    """Shape coefficients, pose, an image of skin or None, and the generator of further random draws."""
+    """A generated person without clothes.
+
+    Attributes:
+        shape: shape coefficients.
+        pose: rotations of the joints.
+        skin: image of the skin; None if the skin is to be painted.
+        random: generator of further random draws for this person.
+    """
 
     shape: Float[Tensor, "1 shape"]
     pose: Float[Tensor, "1 joint 3"]
@@ -85,7 +92,7 @@ class Person(NamedTuple):
 
 
 class Crowd:
-    """All people of a data set; each is a function of the seed, the split and its number there."""
+    """All generated people of a data set; each depends only on the settings, the seed, the split and a number in it."""
 
     def __init__(self, renderer: Renderer, counts: Mapping[str, int], drawing: Drawing, seed: int) -> None:
         self.renderer, self.counts, self.drawing, self.seed = renderer, dict(counts), drawing, seed
@@ -107,7 +114,7 @@ class Crowd:
 
     @cached_property
     def wardrobe(self) -> Wardrobe:
-        """Return the clothing of the body; it is computed once."""
+        """Return the `Wardrobe` that dresses all people; it is built once."""
         return Wardrobe(self.body)
 
     @cached_property

@@ -76,16 +76,16 @@ BLANK = 128
 def fill_blanks(
     colors: Float[np.ndarray, "vertices 3"], body: Anatomy, count: int, average: Carry, carried: Carry
 ) -> Float[np.ndarray, "vertices 3"]:
-    """Return the linear RGB of a skin at all vertices, with blank vertices filled.
+    """Return the linear RGB of a skin at all vertices of the sheet, with colours for vertices that the skin left blank.
 
-    They get the median colour of the face, blended into their surroundings.
+    Blank vertices get the median colour of the face, blended into their surroundings.
 
     Args:
         colors: linear RGB of all vertices.
         body: anatomy of all vertices.
-        count: number of vertices of the unsplit body, which are the first of `colors`.
-        average: function from values of these to their means over neighbours.
-        carried: function that interpolates values of these to all vertices.
+        count: number of vertices of the body before its edges were split; they are the first ones in `colors`.
+        average: function that averages values of these first vertices over their neighbours.
+        carried: function that interpolates values of these first vertices to all vertices.
     """
     grey = float(linear_from_bytes(torch.tensor(BLANK, dtype=torch.uint8)))
     blank = np.asarray(np.abs(colors - grey).max(1) < 0.002)

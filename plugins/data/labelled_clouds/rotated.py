@@ -13,9 +13,10 @@ from plugins.data.labelled_clouds.reading import Clouds
 
 
 class Rotated(Dataset[dict[str, Tensor]]):
-    """Data set with `rotations` copies of each cloud: first all unrotated, then all rotated by 2π/rotations, and so on.
+    """Data set with `rotations` copies of each cloud, rotated about the up axis by multiples of 2π/`rotations`.
 
-    Normals, which are the fourth to sixth column if a cloud has them, rotate with their points.
+    The first samples are all unrotated clouds; then follow all clouds rotated by 2π/`rotations`, and so on. Normals,
+    which are the fourth to sixth column if a cloud has them, rotate with their points.
     """
 
     def __init__(self, clouds: Clouds, rotations: int) -> None:

@@ -16,7 +16,7 @@ SEEDS = {"data_seed": 1, "generator_seed": 1}
 
 
 def folder_of_classes(folder: Path) -> Mapping[str, str]:
-    """Write meshes and clouds of many sizes, in two classes."""
+    """Write meshes and clouds of many sizes in two classes, and return the settings that name the folder."""
     for number in range(16):
         vertices, faces = surface(number, side=3 + number % 3)
         class_folder = folder / ("hills" if number % 2 else "plains")
@@ -42,7 +42,7 @@ def objects(counts: tuple[int, ...] = (11, 10, 12)) -> dict[str, np.ndarray]:
 
 
 def archive(folder: Path) -> Mapping[str, str]:
-    """Write a few objects as one `.npz` archive."""
+    """Write a few objects as one `.npz` archive, and return the settings that name it."""
     np.savez(folder / "objects.npz", **objects())  # type: ignore[arg-type]
     return {"root": str(folder / "objects.npz")}
 

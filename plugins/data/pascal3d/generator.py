@@ -122,7 +122,10 @@ def _save(part: Path, folder: str, name: str, shot: Shot) -> None:
 
 
 def _objects(shot: Shot) -> np.ndarray:
-    """Return the struct array `record.objects`; `symmetry` and `blur` are not in the official files."""
+    """Return the struct array `record.objects` of an annotation file.
+
+    Its fields are those of the official files, and the fields `symmetry` and `blur`, which official files do not have.
+    """
     entries = [
         {
             "class": annotated.category,
@@ -145,7 +148,10 @@ def _objects(shot: Shot) -> np.ndarray:
 
 
 def _viewpoint(annotated: AnnotatedObject) -> dict[str, float]:
-    """Return the official fields; `focal` × `viewport` is the focal length, (px, py) the principal point, pixels."""
+    """Return the fields of the official struct `viewpoint`.
+
+    The focal length in pixels is `focal` × `viewport`; (`px`, `py`) is the principal point, pixels counted from 1.
+    """
     view = annotated.view
     coarse = {
         "azimuth_coarse": float(45 * round(view.azimuth / 45) % 360),
@@ -166,7 +172,16 @@ def _viewpoint(annotated: AnnotatedObject) -> dict[str, float]:
 
 
 def _save_lists(part: Path, category: str, names: Sequence[tuple[str, str]], easy: Sequence[bool]) -> None:
-    """Write the lists of images; those of VOC flag an image with 1, or with 0 if all its objects are difficult."""
+    """Write the lists of images of a class.
+
+    The lists of VOC give each image a flag: 0 if all its objects of the class are difficult, otherwise 1.
+
+    Args:
+        part: Folder of the class.
+        category: Name of the class.
+        names: List and name of each image.
+        easy: Whether each image shows an object of the class that is not difficult.
+    """
     (part / "Image_sets").mkdir()
     (part / VOC_LISTS).mkdir(parents=True)
     for split in SHARES:

@@ -77,9 +77,10 @@ def check_root(root: Path, category: str) -> None:
 
 
 def split_lists(category: str) -> dict[str, list[tuple[str, Path]]]:
-    """Return sources and lists for training (VOC train, all of ImageNet) and test (VOC val).
+    """Return the lists of images of each split, each with its source ("pascal" or "imagenet").
 
-    The protocol is that of Tulsiani & Malik (CVPR 2015) and of Su et al. (ICCV 2015), thesis §3.6.1.
+    "train" has the training images of VOC and all images of ImageNet; "test" has the validation images of VOC. The
+    protocol is that of Tulsiani & Malik (CVPR 2015) and of Su et al. (ICCV 2015), thesis §3.6.1.
     """
     return {
         "train": [
@@ -171,7 +172,16 @@ def _load(file: Path) -> Struct:
 
 
 def _image(folder: Path, name: str, source: str, recorded: str) -> Path:
-    """Return the path of the image of an annotation; if there is no such file, the path that is most likely."""
+    """Return the path of the image of an annotation.
+
+    If no possible path exists, return the first one, so that the message about the missing image names it.
+
+    Args:
+        folder: Folder of the images.
+        name: Name of the annotation without suffix.
+        source: "pascal" or "imagenet", which have different suffixes.
+        recorded: Path of the image in the annotation; it may be empty.
+    """
     candidates = [folder / f"{name}{suffix}" for suffix in SUFFIXES[source]]
     if recorded:
         candidates.append(folder / Path(recorded).name)

@@ -86,7 +86,7 @@ def camera_of(view: View) -> Camera:
 
 
 def crop_camera(camera: Camera, corner: tuple[int, int], size: tuple[int, int], scale: int) -> Camera:
-    """Return the camera of a part of the image, with `scale` × `scale` pixels for each pixel.
+    """Return the camera of a part of the image, in which each pixel is divided into `scale` × `scale` pixels.
 
     The part begins at `corner` (x, y) and has `size` (height, width) pixels of the original image.
     """
@@ -102,7 +102,7 @@ def crop_camera(camera: Camera, corner: tuple[int, int], size: tuple[int, int], 
 
 
 def projected_edges(mesh: Mesh, camera: Camera) -> Edges:
-    """Return the edges of the projected vertices."""
+    """Return the edges of the box around the projected vertices, pixels."""
     inside = camera.rotation.double().numpy() @ mesh.vertices.T + camera.translation.double().numpy()[:, None]
     column = camera.focal[0] * inside[0] / inside[2] + camera.principal[0]
     row = camera.focal[1] * inside[1] / inside[2] + camera.principal[1]
@@ -204,7 +204,14 @@ def shoot(category: str, random: Generator, renderer: RenderFunction) -> Shot:
 
 
 class _Piece(NamedTuple):
-    """Rendered object; `inside` is the share of its bounding box that lies in the image."""
+    """Rendered object of an image.
+
+    Attributes:
+        category: Name of the class.
+        view: Viewpoint.
+        layer: Render of the object.
+        inside: Share of the object's bounding box that lies in the image.
+    """
 
     category: str
     view: View
@@ -215,7 +222,10 @@ class _Piece(NamedTuple):
 def _place(
     category: str, random: Generator, renderer: RenderFunction, size: tuple[int, int], *, aside: bool
 ) -> _Piece:
-    """Return a new object of `category`, rendered at a random position; `aside` lets it extend beyond the image."""
+    """Return a new object of `category`, rendered at a random position.
+
+    If `aside` is true, the object may extend beyond the image; otherwise the whole object lies in the image.
+    """
     mesh = FAMILIES[category].build(random).mesh()
     view = View(*viewpoint(category, random), float(random.uniform(2.2, 6.0)), 1.0, (0.0, 0.0))
     camera = camera_of(view)
@@ -251,7 +261,7 @@ def box_of(layer: Layer) -> tuple[int, int, int, int]:
 
 
 def _annotate(piece: _Piece, hidden: NDArray[np.float32], random: Generator) -> AnnotatedObject:
-    """Return the annotation of an object; `hidden` (height, width) is the opacity of what is in front of it."""
+    """Return the annotation of an object; `hidden` (height, width) is the opacity of everything in front of it."""
     opacity = piece.layer.opacity
     share = float((opacity * hidden).sum() / opacity.sum())
     left, top, right, bottom = box_of(piece.layer)

@@ -49,7 +49,7 @@ class Body:
         self.add(solid.scale(-1, 1, 1).move(), color)  # adding 0 turns -0 into 0
 
     def rotated_copies(self, *angles: Number) -> "Body":
-        """Return a body of one copy of this body for each angle (radians), rotated by this angle about z."""
+        """Return a body that consists of one copy of this body for each angle (radians), rotated by it about z."""
         whole = Body()
         for angle in angles:
             cos, sin = np.cos(angle), np.sin(angle)

@@ -79,12 +79,22 @@ def car(random: Generator) -> Body:
     end = rear - room * length
 
     def level(share: float, grow: float = 0.0) -> tuple[float, float, float, float]:
-        """Return the outline of the cabin at a share of its height, enlarged by `grow`."""
+        """Return the rectangle of the cabin at a share of its height: half width, front y, rear y, z.
+
+        The rectangle is enlarged by `grow` on each side.
+        """
         half, z = (0.47 - 0.09 * share) * width + grow, belt - 0.03 + share * (roof - belt + 0.03)
         return half, start + share * rake - grow, end - share * slope + grow, z
 
     def pillar(low: float, high: float, along: float, grow: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return the foot and the tip of a post at the share `along` of the cabin's length."""
+        """Return the foot and the tip of a post at the side of the cabin.
+
+        Args:
+            low: Height of the foot, as a share of the cabin's height.
+            high: Height of the tip, as a share of the cabin's height.
+            along: Position of the post, as a share of the cabin's length from the front.
+            grow: Distance by which the post lies outside of the cabin.
+        """
         (x, near, far, z), (top_x, top_near, top_far, top_z) = level(low, grow), level(high, grow)
         foot, tip = near + along * (far - near), top_near + along * (top_far - top_near)
         return np.array([x, foot, z]), np.array([top_x, tip, top_z])

@@ -16,9 +16,9 @@ Random = np.random.Generator
 def fronts(
     random: Random, width: Number, height: Number, at: Point, rows: int, columns: int, doors: bool = False
 ) -> list[Solid]:
-    """Return rows and columns of drawers, or of doors, with handles.
+    """Return the fronts of drawers or doors in `rows` rows and `columns` columns, most of them with handles.
 
-    `at` is the middle of their lower edge on the front of the cabinet.
+    Together they fill `width` × `height`; `at` is the middle of the lower edge of this area on the cabinet's front.
     """
     x, y, z = at
     wide, tall = width / columns, height / rows
@@ -42,7 +42,10 @@ def fronts(
 
 
 def case(width: Number, depth: Number, height: Number, board: Number, z: Number, back: bool) -> list[Solid]:
-    """Return the boards of an open cabinet, above `z`."""
+    """Return the sides, bottom, top and (if `back`) rear of an open cabinet that stands at height `z`.
+
+    `board` is the thickness of the boards.
+    """
     parts = [box(board, depth, height, (side * (width - board) / 2, 0, z)) for side in (-1, 1)]
     parts += [box(width, depth, board, (0, 0, level)) for level in (z, z + height - board)]
     if back:
@@ -51,7 +54,7 @@ def case(width: Number, depth: Number, height: Number, board: Number, z: Number,
 
 
 def feet(random: Random, width: Number, depth: Number, foot: Number, thick: Number = 0.06) -> list[Solid]:
-    """Return the base of a cabinet: nothing, legs, or a plinth."""
+    """Return the base of a cabinet of height `foot`: legs or a plinth, or nothing if `foot` is 0."""
     if not foot:
         return []
     if random.random() < 0.3:

@@ -9,7 +9,10 @@ Random = np.random.Generator
 
 
 def legs(random: Random, width: float, depth: float, height: float, thick: float) -> Solid:
-    """Return four legs, straight or splayed, square or round, below a top of this size."""
+    """Return four legs of length `height` and thickness `thick` below a top of `width` × `depth`.
+
+    They are straight or splayed, and square or round.
+    """
     inset = random.uniform(0.5, 1.6) * thick
     x, y = width / 2 - inset, depth / 2 - inset
     splay = random.choice([0.0, 0.0, 0.08, 0.14]) * height
@@ -30,7 +33,7 @@ def rails(random: Random, width: float, depth: float, height: float, thick: floa
 
 
 def top(random: Random, width: float, depth: float, height: float, thick: float, bar: float) -> list[Solid]:
-    """Return a table's top on four legs, optionally with an apron."""
+    """Return the top of a table on four legs of thickness `bar`, sometimes with bars between the legs and an apron."""
     parts = [
         box(width, depth, thick, (0, 0, height)),
         legs(random, width, depth, height, bar),
@@ -159,7 +162,16 @@ def stool(random: Random) -> Solid:
 
 
 def back(random: Random, width: float, height: float, tall: float, y: float, bar: float) -> list[Solid]:
-    """Return the back of a chair: a board, or upright or horizontal slats."""
+    """Return the back of a chair: a board, or upright or horizontal slats.
+
+    Args:
+        random: Source of all random numbers.
+        width: Width of the back.
+        height: Height of its lower edge.
+        tall: Height of the back itself.
+        y: Position of the back, from the front to the rear.
+        bar: Thickness of its posts.
+    """
     lean = random.uniform(0, 12)
     style = random.integers(3)
     if style == 0:

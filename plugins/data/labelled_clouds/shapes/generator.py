@@ -64,9 +64,9 @@ CLASSES: dict[str, Callable[[np.random.Generator], Solid]] = {
 """Classes of ModelNet40, in its order, and the functions that make their objects."""
 SPLITS = ("train", "test")
 JITTER_DEG, QUARTERS = 12.0, 0.25
-"""Largest rotation of objects about the up axis, degrees, and share of objects that are also rotated by quarter turns.
+"""Largest random rotation of an object about the up axis, degrees; share of objects also rotated by 90°, 180° or 270°.
 
-The official models are not aligned either.
+The objects are rotated because the official models are not aligned either.
 """
 STRETCH = 0.2
 """Standard deviation of the logarithm of the factor by which each axis is stretched."""

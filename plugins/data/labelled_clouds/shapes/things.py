@@ -149,7 +149,7 @@ def guitar(random: Random) -> Solid:
 
 
 def key_rows(random: Random, width: Number, depth: Number, at: tuple[Number, Number, Number]) -> list[Solid]:
-    """Return a field of keys with its middle at `at`; the front row has a long key."""
+    """Return rows of keys on an area of `width` × `depth` with its middle at `at`; the front row has a long key."""
     x, y, z = at
     rows, columns = int(random.integers(4, 7)), int(random.integers(9, 16))
     wide, deep = width / columns, depth / rows

@@ -37,7 +37,10 @@ def smooth_profile(random: Random, controls: Sequence[Point], steps: int = 14) -
 
 
 def ear(reach: Number, low: Number, high: Number, out: Number, thick: Number) -> Solid:
-    """Return a handle on the side x > 0 of a vessel of radius `reach`, between two heights."""
+    """Return a handle on the side x > 0 of a vessel of radius `reach`, between the heights `low` and `high`.
+
+    `out` is its distance from the vessel, and `thick` the radius of its tube.
+    """
     bend = np.linspace(math.radians(-80), math.radians(80), 9)
     middle, tall = (low + high) / 2, (high - low) / 2
     path = [(0.95 * reach + out * math.cos(b), 0.0, middle + tall * math.sin(b)) for b in bend]
@@ -47,7 +50,16 @@ def ear(reach: Number, low: Number, high: Number, out: Number, thick: Number) ->
 def leaves(
     random: Random, count: int, start: Point, spread: Number, tall: Number, long: Number
 ) -> list[Solid]:
-    """Return stems that grow from one point up and outwards, each with a leaf."""
+    """Return `count` stems that grow upwards and outwards from the point `start`, each with a leaf at its tip.
+
+    Args:
+        random: Source of all random numbers.
+        count: Number of stems.
+        start: The point.
+        spread: Largest horizontal distance of a tip from the point.
+        tall: Largest height of a tip above the point.
+        long: Typical length of a leaf.
+    """
     x, y, z = start
     parts = []
     for _ in range(count):
@@ -61,7 +73,10 @@ def leaves(
 
 
 def fronds(random: Random, count: int, start: Point, reach: Number, tall: Number) -> list[Solid]:
-    """Return long blades that rise and bend over, like those of a palm or of grass."""
+    """Return `count` long leaves that rise from the point `start` and bend over, like those of a palm or of grass.
+
+    `reach` is their largest horizontal extent, and `tall` determines their height.
+    """
     x, y, z = start
     parts = []
     for _ in range(count):
