@@ -28,7 +28,7 @@ SPLIT_SEED = 13
 
 
 class Labelled(NamedTuple):
-    """One image and its angles, radians of any size, in the order of the target's names."""
+    """One image and its angles, in radians, not wrapped to one turn, in the order of the target's names."""
 
     file: Path
     angles: tuple[float, ...]
@@ -81,7 +81,8 @@ class Labels(NamedTuple):
     Attributes:
         samples: Labelled images by split; without "validation" the published test set is halved.
         faults: Errors of labels that could not be read; they count as unreadable images.
-        left_out: Clause about images that were left out for another reason, for the message about an empty split.
+        left_out: Clause about images that were left out for other reasons; it is part of the message about an empty
+            split.
     """
 
     samples: dict[str, list[Labelled]]
@@ -146,7 +147,10 @@ class Heads(Data):
 
 
 def halves(samples: Sequence[Labelled]) -> tuple[list[Labelled], list[Labelled]]:
-    """Return a validation and a test half of the published test set, chosen as in the thesis authors' code."""
+    """Return the two halves of the published test set, for validation and for the test.
+
+    They are chosen at random, as in the thesis authors' code.
+    """
     order = np.random.RandomState(SPLIT_SEED).choice(len(samples), len(samples), replace=False)
     shuffled = [samples[index] for index in order]
     return shuffled[: len(samples) // 2], shuffled[len(samples) // 2 :]

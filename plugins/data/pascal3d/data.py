@@ -33,7 +33,12 @@ MIRRORED = (-1.0, 1.0, -1.0)
 
 
 class Sample(NamedTuple):
-    """One object, and the index of its class among the groups of the data set."""
+    """One object as a sample.
+
+    Attributes:
+        annotation: Annotation of the object.
+        group: Index of the object's class among the groups of the data set.
+    """
 
     annotation: Annotation
     group: int
@@ -165,7 +170,10 @@ class Pascal3D(Data):
         self._digest = _digest(samples)
 
     def _roots(self) -> dict[str, Path]:
-        """Return the root of every class; roots are generated if none is given."""
+        """Return the root of each class by the name of the class.
+
+        If no root is given, there is one generated root for each class.
+        """
         for category in self.categories:
             if category not in CLASSES:
                 raise DataError(
@@ -286,7 +294,10 @@ def reason_to_exclude(annotation: Annotation, include_occluded: bool) -> str | N
 
 
 def validation_files(annotations: Sequence[Annotation], share: float) -> set[Path]:
-    """Return the annotation files of the images for validation; no image is in both splits."""
+    """Return the annotation files of the images that are moved from training to validation, a random `share` of all.
+
+    All objects of an image are in the same split.
+    """
     files = sorted({annotation.file for annotation in annotations})
     order = np.random.default_rng(SPLIT_SEED).permutation(len(files))
     return {files[index] for index in order[: round(share * len(files))]}
