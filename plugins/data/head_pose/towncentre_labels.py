@@ -22,7 +22,7 @@ TRAIN_SHARE, VALIDATION_SHARE = 0.8, 0.1
 
 
 class Head(NamedTuple):
-    """Image of person number `person`; pan is in radians, of any size."""
+    """Image of person number `person`; pan is in radians, not wrapped to one turn."""
 
     image: Path
     person: int

@@ -35,7 +35,7 @@ class Annotation:
         file: File of the annotation.
         image: Path of the image, which may not exist.
         box: Left, top, right and bottom edge, pixels from the corner of the image; it may reach beyond the image.
-        angles: Azimuth, elevation and tilt in degrees, of any size; None if there is only a coarse label, or none.
+        angles: Azimuth, elevation and tilt in degrees, not wrapped to one turn; None if the object has no fine label.
         truncated, occluded, difficult: Flags of the annotation.
         symmetry: Symmetry of a generated object (`Family.symmetry`); 1 for a real object.
         blur: Blur of a generated image, pixels; None for a real image.

@@ -29,9 +29,9 @@ class DenseBlocks(Encoder):
             longer if the features hardly vary around their mean.
         batch_norm: whether layers normalise over the batch. With this or `standardise`, training needs batches of at
             least two.
-        bottleneck: length of a last linear layer without activation; None for no such layer. The linear layer in front
-            of a density head with very many distribution parameters then has this rank, and is smaller and faster in
-            proportion.
+        bottleneck: length of an additional last linear layer without activation, and so of the features; None for no
+            such layer. A short last layer makes the linear layer that follows it smaller and faster in proportion,
+            which matters for a density head with very many distribution parameters.
 
     Raises:
         ConfigError: a sample holds no numbers.

@@ -16,9 +16,9 @@ from framework.flights.frames import GRAVITY, PARTS
 from plugins.encoder.flights.parabolas_compiled import fill_features
 
 SPANS = (1.0, 0.7, 0.5, 0.35)
-"""Shares of the frames, counted from the last one, that parabolas are fitted to.
+"""Shares of the observed frames to which parabolas are fitted; each span of frames ends with the last frame.
 
-The longest span that a parabola fits is used, so that a bounce is left out.
+The longest span that a parabola fits is used. A span with a bounce is therefore not used.
 """
 SPEED, GROWTH = (0.4, 0.4, 3.0), (0.5, 0.5, 6.0)
 """Growth of the unit of x, y and z with time, m/s, and with the square of time, m/s².

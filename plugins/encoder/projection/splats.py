@@ -106,7 +106,7 @@ def compute_surface_in_torch(
     depth = (nearest + (farthest - nearest) * numbers[:, 3]).detach().where(shown, torch.inf)
 
     def shift(maps: Tensor, offset: np.ndarray, beyond: float) -> Tensor:
-        """Return the maps shifted so that each pixel has the value of the pixel at `offset` from it."""
+        """Return maps in which each pixel has the value of the pixel at `offset` from it, or `beyond` outside."""
         row, column = (int(component) + radius for component in offset)
         wide = functional.pad(maps, (radius,) * 4, value=beyond)
         return wide[..., row : row + height, column : column + width]

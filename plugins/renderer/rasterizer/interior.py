@@ -67,10 +67,10 @@ def interior(
     """Add the gradients through weights, colours and depths inside of faces to the float64 arrays `grad_*`.
 
     Gradients that are None are not computed; `grad_points` and `grad_lens` must both be given, or both be None.
-    `colors`, `texture`, `lens` and `face` are as in `shading`. `scratch` holds (faces) int32 of -1, and (faces or
-    pixels, 20) and (faces or pixels) with any content, with one row for each face in view. `grad_image` and
-    `grad_depth` are the gradients of the loss with respect to the colours, (height, width, channels), and the depths,
-    (height, width), or None.
+    `colors`, `texture`, `lens` and `face` are as in `shading`. `scratch` holds three working arrays: int32 (faces,)
+    filled with -1, and two with any content, (n, 20) and int32 (n,), where n is at least the number of faces in view.
+    `grad_image` and `grad_depth` are the gradients of the loss with respect to the colours, (height, width, channels),
+    and the depths, (height, width), or None.
     """
     top, bottom, left, right = box
     slots, sums, owners = scratch

@@ -8,11 +8,12 @@ the soft silhouette, which the paper returns separately; here it blends A_S with
     A_S = Σ_j w_j C_j + w_b 0
     A_O = 1 - Π_j (1 - D_j)
 
-d is the distance from the pixel to the face's border, in units in which the image's shorter side is 2; z_j, "normalised
-inverse depth", is the depth of the nearest vertex in view over the depth of face j. Outside of a face, its colour and
-depth use its barycentric weights, clipped at 0 and scaled to the sum 1. This follows the published kernel, which also
-ignores a face at pixels with D < 1e-4. Unlike there, colours and depths are perspective-correct. Corners are not
-rounded. A face that the near plane cuts is left out.
+C_j is the colour of face j at the pixel, and w_b = 1 - Σ_j w_j is the weight of the background, whose colour is 0. d is
+the distance from the pixel to the face's border, in units in which the image's shorter side is 2; z_j, "normalised
+inverse depth", is the depth of the nearest vertex in view over the depth of face j, and ε (`BACKGROUND`) is that of the
+background. Outside of a face, its colour and depth use its barycentric weights, clipped at 0 and scaled to the sum 1.
+This follows the published kernel, which also ignores a face at pixels with D < 1e-4. In contrast to that kernel,
+colours and depths are perspective-correct. Corners are not rounded. A face that the near plane cuts is left out.
 """
 
 import math
