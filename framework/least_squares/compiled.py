@@ -1,8 +1,9 @@
 """One step of many small least-squares problems on one CPU core; compiled functions on NumPy arrays.
 
-framework.least_squares.solver explains the quantities and the rules. The first dimension of arrays is the problem. All
-functions share these names:
-    at, lower, upper, gradient, scale, move: (problem, p) float64.
+framework.least_squares.solver explains the method. Its class `_Active` describes the state of the problems, and
+`compute_steps` describes the arrays of a step. The first dimension of every array is the problem, and p is the number
+of parameters of a problem. All functions share these names:
+    at (the parameters), lower, upper (their bounds), gradient, scale, move: (problem, p) float64.
     gram, curve: (problem, p, p) float64.
     cost, damping, gain, slope, least: (problem,) float64.
     cut, careful: (problem,) bool.
@@ -21,9 +22,9 @@ EPSILON = float(np.finfo(np.float64).eps)
 LEAST_DAMPING, MOST_DAMPING = 1e-30, 1e20
 """Smallest and largest damping."""
 SLIGHT = 1e-2
-"""Damping, in squares of the smallest pivot of the factor, below which a step is as good as an undamped step.
+"""Damping below which a step is as good as an undamped one; less damping would not lower the cost further.
 
-Such a step gains all that can be gained, and more damping would change nothing.
+The unit is the square of the smallest pivot of the Cholesky factor.
 """
 QUIET = 4
 """Number of successive steps that end a problem if their gain is negligible or less than rounding hides."""
@@ -32,17 +33,18 @@ SINGULAR = 1e-7
 CLIPS = 3
 """Number of times that a step that leaves the bounds is solved again, with the parameters beyond a bound held there."""
 NEAR = 0.1
-"""Largest share of the cost that a step saves when the minimum is near."""
+"""Share of the cost: the minimum counts as near after a step that lowers the cost by at most this share."""
 GOES_ON, LIMIT, STEP, COST, GRADIENT = 10, 0, 3, 2, 1
-"""Mark of a problem that goes on, and some values of framework.least_squares.solution.Status."""
+"""Value of `ended`: GOES_ON for a problem that has not ended, else one of framework.least_squares.solution.Status."""
 
 
 @compiled
 @no_type_check
 def factorise(normal, fixed, damping, factor):
-    """Fill `factor` with the Cholesky factor of the damped matrix of the parameters that are not fixed.
+    """Fill `factor` with the lower Cholesky factor of `normal` + `damping` · identity, and return its smallest pivot.
 
-    The function returns the smallest pivot of the factor, or NaN if there is no factor.
+    Rows and columns of parameters that are `fixed` are replaced by those of the identity. The function returns NaN if
+    the matrix is not positive definite.
     """
     size = normal.shape[0]
     least = np.inf
@@ -71,7 +73,7 @@ def factorise(normal, fixed, damping, factor):
 @compiled
 @no_type_check
 def solve(factor, right):
-    """Solve L Lᵀ x = right in place."""
+    """Solve L Lᵀ x = `right`, where L is the Cholesky factor `factor`; x overwrites `right`."""
     size = factor.shape[0]
     for row in range(size):
         total = right[row]
@@ -90,12 +92,12 @@ def solve(factor, right):
 def compute_steps(
     at, lower, upper, cost, gradient, gram, curve, scale, damping, move, gain, slope, least, cut, careful
 ):
-    """Fill the arrays of the damped step within the box.
+    """Compute the damped step of every problem within its bounds, and fill the arrays that describe it.
 
-    `move` is the step. `gain` is the expected decrease of the cost. `slope` is the largest cosine between the residuals
-    and a column of the Jacobian. `least` is the square of the factor's smallest pivot. `cut` is true if the box cut the
-    step. `careful` is true if the matrix has lost digits that the Jacobian still has, so that the step must be computed
-    from the Jacobian.
+    `move` is the step. `gain` is the expected decrease of the cost. `slope` is the largest cosine of the angle between
+    the residuals and a column of the Jacobian. `least` is the square of the smallest pivot of the Cholesky factor.
+    `cut` is true if a bound made the step shorter. `careful` is true if the normal matrix has lost digits that the
+    Jacobian still has, so that the step must be computed from the Jacobian.
     """
     count, size = at.shape
     normal, factor = np.empty((size, size)), np.empty((size, size))
@@ -177,7 +179,13 @@ def judge_steps(
     move, gain, slope, least, cut, tried, new_cost, new_gradient, new_gram,
     most, decrease, shortest, ended, near,
 ):  # fmt: skip
-    """Accept or reject each step, in place; fill `ended` and `near` (true where second derivatives are needed)."""
+    """Accept or reject the step of every problem, and update the state of the problem accordingly.
+
+    `tried` are the parameters after the step, and `new_cost`, `new_gradient` and `new_gram` the values there. `most`,
+    `decrease` and `shortest` are the settings `most`, `decrease` and `step` of the solver. The function fills `ended`
+    with GOES_ON or with the status of a problem that has ended, and `near` with whether the minimum is near, so that
+    the second derivatives are needed.
+    """
     count, size = at.shape
     for problem in range(count):
         moved, reached, finite = 0.0, 0.0, 0.0
@@ -234,9 +242,10 @@ def judge_steps(
 @compiled
 @no_type_check
 def invert(gram, inverse, trace):
-    """Fill `inverse` with the inverse of each matrix, and `trace` with the trace of the inverse of the scaled matrix.
+    """Fill `inverse` with the inverse of each matrix in `gram`, and `trace` with the trace of an inverse.
 
-    The scaled matrix has a diagonal of 1. The trace is NaN if the matrix has no inverse.
+    The trace is that of the inverse of the matrix after its rows and columns were scaled to a diagonal of 1. It is NaN
+    if the matrix has no inverse.
     """
     count, size = gram.shape[0], gram.shape[1]
     normal, factor = np.empty((size, size)), np.empty((size, size))

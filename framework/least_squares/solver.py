@@ -24,10 +24,11 @@ Model = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 search.
 """
 Normal = Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor, Tensor]]
-"""The sums of a model: `normal(parameters, rows) -> (cost, gradient Jᵀr, gram JᵀJ, number of residuals)`.
+"""`normal(parameters, rows) -> (cost, gradient Jᵀr, gram JᵀJ, number of residuals)`.
 
-Their shapes are (active,), (active, p), (active, p, p) and (active,). It is for models whose sums can be computed
-faster than their residuals and Jacobian can be stored.
+The function gives sums over the residuals r of a model and its Jacobian J, with the shapes (active,), (active, p),
+(active, p, p) and (active,). It is for models whose sums can be computed faster than their residuals and Jacobian can
+be stored.
 """
 Curvature = Callable[[Tensor, Tensor], Tensor]
 """`curvature(parameters, rows) -> (active, p, p)`: Σ_i residual_i ∇²residual_i over the residuals that are not missing.
@@ -37,11 +38,13 @@ It is the difference between the Hessian of the cost and JᵀJ.
 
 
 class _Active(NamedTuple):
-    """The problems that are being solved; the first dimension of each tensor counts them.
+    """State of the problems that are being solved; the first dimension of each tensor counts them.
 
-    `gram` is JᵀJ. `curve` is the difference between the Hessian and JᵀJ, 0 far from the minimum. `scale` is the largest
-    length of each column of the Jacobian so far. `damping` is in units of its square. `streak` counts successive steps
-    that were accepted (above 0) or rejected (below 0). `quiet` counts successive steps without gain.
+    `rows` are the numbers of the problems among all problems, and `at` their parameters. `gram` is JᵀJ for the Jacobian
+    J. `curve` is the difference between the Hessian of the cost and JᵀJ, and is 0 far from the minimum. `scale` is the
+    largest length so far of each column of J. `damping` is in units of the square of `scale`. `streak` is the number of
+    successive steps that were accepted, or minus the number of successive steps that were rejected. `quiet` counts
+    successive steps without gain, and `steps` all steps.
     """
 
     rows: Tensor
@@ -59,11 +62,11 @@ class _Active(NamedTuple):
     steps: Tensor
 
     def only(self, which: Tensor) -> "_Active":
-        """Return the problems at these rows."""
+        """Return the state of only some of the problems; `which` holds their indices, or true for each of them."""
         return _Active(*(part[which] for part in self))
 
     def arrays(self, *names: str) -> list[np.ndarray]:
-        """Return fields as NumPy arrays that share memory with them."""
+        """Return the fields with these names as NumPy arrays, which share memory with the tensors."""
         return [getattr(self, name).numpy() for name in names]
 
 
@@ -78,7 +81,9 @@ class _Step(NamedTuple):
 
 
 class _Problems:
-    """The functions to minimise, evaluated on the device of the start; results are in double on the processor.
+    """Functions that evaluate the problems: residuals, Jacobians and their sums.
+
+    The user's functions are called on the device of the start; their results are converted to float64 on the CPU.
 
     Attributes:
         curved: True if second derivatives are available.
@@ -95,7 +100,10 @@ class _Problems:
         self._present: Tensor | None = None
 
     def residuals_and_jacobian(self, at: Tensor, rows: Tensor, first: bool = False) -> tuple[Tensor, Tensor]:
-        """Return residuals and Jacobian, with 0 for missing residuals."""
+        """Return residuals and Jacobian of the problems `rows` at the parameters `at`, with 0 for missing residuals.
+
+        `first` is true at the start of the search, where residuals that are NaN are recorded as missing.
+        """
         residuals, jacobian = self._call(self._model, at, rows)
         if self._normal is not None:
             present = ~residuals.isnan()
@@ -113,7 +121,10 @@ class _Problems:
         return residuals, jacobian
 
     def normal(self, at: Tensor, rows: Tensor, first: bool = False) -> tuple[Tensor, Tensor, Tensor]:
-        """Return cost, gradient and normal matrix JᵀJ."""
+        """Return cost, gradient and normal matrix JᵀJ of the problems `rows` at the parameters `at`.
+
+        `first` is true at the start of the search.
+        """
         if self._normal is None:
             residuals, jacobian = self.residuals_and_jacobian(at, rows, first)
             gradient = torch.bmm(jacobian.mT, residuals.unsqueeze(-1)).squeeze(-1)
@@ -124,19 +135,19 @@ class _Problems:
         return cost, gradient, gram
 
     def curve(self, at: Tensor, rows: Tensor) -> Tensor:
-        """Return the second derivatives, see `Curvature`."""
+        """Return the sum of residuals times second derivatives (`Curvature`) of the problems `rows` at `at`."""
         assert self._curvature is not None
         curvature = self._curvature
         return self._call(lambda *arguments: (curvature(*arguments),), at, rows)[0]
 
     def _call(self, function: Callable[..., tuple[Tensor, ...]], *arguments: Tensor) -> tuple[Tensor, ...]:
-        """Call a function on the device of the start, and return its results in double on the processor."""
+        """Call a function with arguments on the device of the start, and return its results in float64 on the CPU."""
         results = function(*(part.to(self._device) for part in arguments))
         return tuple(part.to("cpu", torch.float64) for part in results)
 
 
 class _Rules(NamedTuple):
-    """Settings that do not change from step to step."""
+    """Settings of the search: the arguments `most`, `decrease` and `step` of `least_squares`."""
 
     most: int
     decrease: float
@@ -232,7 +243,7 @@ def _require_box(start: Tensor, lower: Tensor, upper: Tensor) -> None:
 def _begin(
     problems: _Problems, rows: Tensor, solution: Solution, lower: Tensor, upper: Tensor, damping: float
 ) -> _Active:
-    """Return the problems at these rows at their start, without those that cannot be evaluated there."""
+    """Return the initial state of the problems `rows`, without those that are not finite at their start."""
     at = solution.parameters[rows]
     cost, gradient, gram = problems.normal(at, rows, first=True)
     active = _Active(
@@ -277,7 +288,7 @@ def _advance(problems: _Problems, rules: _Rules, active: _Active) -> Tensor:
 
 
 def _step(problems: _Problems, active: _Active) -> _Step:
-    """Return the damped step within the box."""
+    """Return the damped step of every problem within its bounds."""
     gain, slope, least = (torch.empty_like(active.cost) for _ in range(3))
     cut, careful = (torch.empty(len(gain), dtype=torch.bool) for _ in range(2))
     step = _Step(torch.empty_like(active.at), gain, slope, least, cut)
@@ -291,7 +302,10 @@ def _step(problems: _Problems, active: _Active) -> _Step:
 
 
 def _careful_step(problems: _Problems, active: _Active, step: _Step) -> _Step:
-    """Return the damped step from the singular values of the Jacobian, because JᵀJ has lost digits."""
+    """Return the damped step within the bounds, computed from the singular values of the Jacobian.
+
+    It is for problems whose matrix JᵀJ has lost too many digits. `step` is the step that was computed from JᵀJ.
+    """
     fixed = (active.at <= active.lower) & (active.gradient >= 0)
     fixed |= (active.at >= active.upper) & (active.gradient <= 0)
     fixed |= active.gram.diagonal(dim1=-2, dim2=-1).sqrt() <= EPSILON * active.scale
@@ -320,7 +334,10 @@ def _careful_step(problems: _Problems, active: _Active, step: _Step) -> _Step:
 def _solve_damped(
     jacobian: Tensor, residuals: Tensor, fixed: Tensor, known: Tensor, damping: Tensor
 ) -> Tensor:
-    """Return the scaled step m that minimises |J m + r|² + damping |m|²; parameters in `fixed` move by `known`."""
+    """Return the scaled step m that minimises |J m + r|² + damping |m|², for the residuals r and the scaled Jacobian J.
+
+    Parameters that are `fixed` do not take part: their step is `known`.
+    """
     residuals = residuals + torch.bmm(jacobian, known.unsqueeze(-1)).squeeze(-1)
     left, values, right = torch.linalg.svd(jacobian * ~fixed.unsqueeze(-2), full_matrices=False)
     values = values.where(values > EPSILON * values.amax(-1, keepdim=True), 0.0)
@@ -330,7 +347,7 @@ def _solve_damped(
 
 
 def _finish(problems: _Problems, active: _Active, status: Tensor, solution: Solution) -> None:
-    """Store the results of problems that have ended, with their covariance and rank."""
+    """Store in `solution` the results of the problems in `active`, which have ended, with covariance and rank."""
     size = active.at.shape[-1]
     inverse, trace = torch.empty_like(active.gram), torch.empty_like(active.cost)
     compiled.invert(active.gram.numpy(), inverse.numpy(), trace.numpy())

@@ -24,7 +24,7 @@ compiled = compiler(kernel_cache("spectra", [Path(__file__)]), fastmath={"reasso
 def evaluate_lines(parameters, measured, offsets, centres, jacobian, residuals):
     """Fill `jacobian` (p, offset) and `residuals` (offset,) of one spectrum, and return the number of measured offsets.
 
-    Both are 0 where nothing was measured.
+    `jacobian` and `residuals` are 0 at offsets where nothing was measured.
     """
     pools, size, count = centres.shape[0], parameters.shape[0], offsets.shape[0]
     shift = 2 * pools
@@ -63,10 +63,10 @@ def evaluate_lines(parameters, measured, offsets, centres, jacobian, residuals):
 @compiled
 @no_type_check
 def compute_sums(parameters, rows, measured, offsets, centres, cost, gradient, gram, measured_counts):
-    """Fill the sums over offsets of many spectra, with residuals r and their Jacobian J.
+    """Fill arrays with sums over the offsets of each spectrum, for the residuals r and their Jacobian J.
 
-    They are half the sum of squared residuals (spectrum,), Jᵀr (spectrum, p), JᵀJ (spectrum, p, p), and the number of
-    measured offsets (spectrum,).
+    `cost` (spectrum,) is half the sum of squared residuals, `gradient` (spectrum, p) is Jᵀr, `gram` (spectrum, p, p) is
+    JᵀJ, and `measured_counts` (spectrum,) is the number of measured offsets.
     """
     size = parameters.shape[1]
     jacobian, residuals = np.empty((size, offsets.shape[0])), np.empty(offsets.shape[0])
@@ -93,7 +93,10 @@ def compute_sums(parameters, rows, measured, offsets, centres, cost, gradient, g
 @compiled
 @no_type_check
 def compute_curvature(parameters, rows, measured, offsets, centres, curvature):
-    """Fill `curvature` with Σ residual ∇²Z (spectrum, p, p)."""
+    """Fill `curvature` (spectrum, p, p) with the sum over the offsets of the residual times ∇²Z.
+
+    ∇²Z is the matrix of second derivatives of Z by the parameters.
+    """
     pools, size, count = centres.shape[0], parameters.shape[1], offsets.shape[0]
     shift = 2 * pools
     jacobian, residuals = np.empty((size, count)), np.empty(count)

@@ -15,16 +15,16 @@ from framework.spectra.spectrum import COUNT, Misfit, Parameters
 CUT = 10.0
 """Limit on the absolute value of a measured number; Z lies between 0 and about 1, so larger numbers are clipped."""
 DECREASE = 1e-10
-"""Share of the cost below which the gain of a step ends the search.
+"""Share of the cost: the search ends when a step lowers the cost by less than this share.
 
-After Newton's last step, the remaining gain is about the square of this share.
+The last step is Newton's, after which the share that could still be gained is about the square of this one.
 """
 CAREFUL, BOLD = 1e-1, 1e-3
-"""Damping at the first step from the preset's start, and from a start that is near the minimum."""
+"""Damping at the first step: CAREFUL from the preset's start, and BOLD from a given start near the minimum."""
 DOUBTFUL = 1e-4
-"""Smallest pivot of a scaled inverse covariance whose factor has eight correct digits."""
+"""Smallest pivot with which the Cholesky factor of a scaled inverse covariance has eight correct digits."""
 LEAST_SHARE = 1e-9
-"""Smallest standard error, in sides of the box, for a spectrum without noise."""
+"""Smallest standard deviation that residuals are taken to have, so that a spectrum without noise has a covariance."""
 
 
 class Fit(NamedTuple):
@@ -52,10 +52,10 @@ def fit(
 ) -> Fit:
     """Fit each spectrum by least squares, from the preset's start or a given one.
 
-    The covariance comes from the Jacobian J with the residuals' variance s², and from a box whose sides u - l count
-    as much as a uniform density: (JᵀJ / s² + diag 12 / (u - l)²)⁻¹. If the data determine a parameter, the second
-    term is negligible. If they do not (a pool without amplitude has no width), the first term is negligible, and the
-    parameter may be anywhere in its box.
+    The covariance of the parameters is (JᵀJ / s² + diag 12 / (u - l)²)⁻¹. J is the Jacobian, s² the variance of the
+    residuals, l and u are the bounds of the parameters, and (u - l)² / 12 is the variance of a uniform density between
+    the bounds. If the data determine a parameter, the second term is negligible. If they do not (a pool without
+    amplitude has no width), the first term is negligible, and the parameter may be anywhere between its bounds.
 
     If a pool has vanished (amplitude 0), it has no width that could lead the search back. Such spectra are fitted once
     more from another start, and the better fit is kept. The same is done for all spectra if centres are free and no
@@ -117,9 +117,10 @@ def fit(
 
 
 def _root(misfit: Misfit, parameters: Tensor, sides: Tensor) -> Tensor:
-    """Return the Cholesky factor of the covariance.
+    """Return the lower Cholesky factor of the covariance of the parameters, (spectrum, p, p).
 
-    It is computed for parameters in sides of the box, whose values have similar sizes.
+    `sides` are the distances between lower and upper bounds. The factor is computed for parameters divided by `sides`,
+    because these have similar magnitudes.
     """
     size = parameters.shape[1]
     rows = torch.arange(len(parameters))
@@ -147,7 +148,10 @@ def _root(misfit: Misfit, parameters: Tensor, sides: Tensor) -> Tensor:
 def _careful_root(
     misfit: Misfit, parameters: Tensor, rows: Tensor, variance: Tensor, sides: Tensor
 ) -> Tensor:
-    """Return the factor as `_root` does, from the Jacobian itself, because JᵀJ has lost digits."""
+    """Return the same factor as `_root`, computed from the Jacobian J for spectra whose JᵀJ has lost too many digits.
+
+    `rows` are the rows of `misfit.measured`, and `variance` is the variance of their residuals.
+    """
     size = parameters.shape[1]
     residuals, jacobian = misfit(parameters, rows)
     jacobian = jacobian.where(~residuals.isnan().unsqueeze(-1), 0.0) * sides
@@ -163,10 +167,11 @@ def _careful_root(
 def density(
     fitted: Fit, target_count: int, shape: torch.Size | tuple[int, ...], zero: Tensor
 ) -> Distribution:
-    """Return the Gaussian over the first `target_count` parameters.
+    """Return the Gaussian density of the first `target_count` parameters, with batch_shape `shape`.
 
-    It has the type of `zero` (*shape, 1), which is added to its mean. The first rows of a lower Cholesky factor are the
-    factor of the marginal.
+    `zero` (*shape, 1) is added to the mean. It holds zeros that have the dtype, the device and the gradient of the
+    head's input. The factor of the marginal covariance consists of the first rows and columns of the lower Cholesky
+    factor.
     """
     mean = fitted.parameters[:, :target_count].reshape(*shape, target_count).to(zero) + zero
     return JointNormal(

@@ -50,7 +50,7 @@ class Parameters(NamedTuple):
 
     @property
     def second_start(self) -> tuple[float, ...]:
-        """Second start of the search, at which the search is repeated (`fit`)."""
+        """Second start, from which `framework.spectra.fit.fit` repeats the search for some spectra."""
         return tuple(ELSEWHERE.get(name, at) for name, at in zip(self.names, self.start, strict=True))
 
     @property
@@ -60,7 +60,7 @@ class Parameters(NamedTuple):
 
 
 def _parameters(free: bool) -> Parameters:
-    """Return the parameters with fixed or free centres."""
+    """Return the parameters of five pools; `free` says whether the centres of all lines are fitted."""
     columns = (
         *((f"{pool}_amplitude", 0.0, 1.0, start) for pool, start in zip(POOLS, AMPLITUDES, strict=True)),
         *((f"{pool}_width_ppm", *box) for pool, box in zip(POOLS, WIDTHS, strict=True)),
@@ -78,7 +78,7 @@ WIDTHS = ((0.2, 8.0, 1.0), (0.3, 8.0, 0.6), (0.5, 12.0, 4.0), (8.0, 200.0, 50.0)
 PLACES = ((-1.0, 1.0, 0.0), (3.0, 4.0, 3.5), (-4.5, -2.5, -3.5), (-4.5, 0.5, -2.5), (1.2, 2.8, 2.0))
 """Lower bound, upper bound and start of each centre, ppm; wide, so that few fits end at a bound."""
 ELSEWHERE = {"amide_amplitude": 0.03, "amide_width_ppm": 1.2, "amine_amplitude": 0.05, "amine_width_ppm": 2.0}
-"""Values of a second start, in which the sharper of the two overlapping lines is the other one."""
+"""Values at which the second start differs from the first: a broader line of amide and a narrower line of amine."""
 PRESETS: dict[Preset, Parameters] = {"ten": _parameters(False), "fifteen": _parameters(True)}
 
 
@@ -94,7 +94,7 @@ def centres(parameters: Float[Tensor, "batch p"]) -> Float[Tensor, "batch pool"]
 def spectrum(
     parameters: Float[Tensor, "batch p"], offsets: Float[Tensor, "offset"]
 ) -> Float[Tensor, "batch offset"]:
-    """Return Z for the parameters of either preset."""
+    """Return Z at the offsets (ppm) for parameters of either preset."""
     amplitude, width = parameters[:, :COUNT, None], parameters[:, COUNT : 2 * COUNT, None]
     square = (width / 2).square()
     lines = amplitude * square / (square + (offsets - centres(parameters).unsqueeze(-1)).square())
@@ -114,9 +114,9 @@ class Misfit:
         self.offsets = offsets
 
     def __call__(self, parameters: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """Return residuals (batch, offset) and their Jacobian (batch, offset, p).
+        """Return the residuals (batch, offset) and their Jacobian (batch, offset, p).
 
-        They are computed in few passes over the numbers.
+        `rows` are the rows of `measured` that belong to the rows of `parameters`.
         """
         amplitude, half = parameters[:, :COUNT, None], parameters[:, COUNT : 2 * COUNT, None] / 2
         # With e = 1 / (h² + d²): ∂Z/∂A = -h² e, ∂Z/∂w = -A h d² e², ∂Z/∂δ = -2 A h² d e².
@@ -136,10 +136,10 @@ class Misfit:
         return residuals, jacobian.mT
 
     def normal(self, parameters: Tensor, rows: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return the cost, its gradient, the normal matrix and the number of measured offsets, on the processor.
+        """Return the cost, its gradient, the normal matrix and the number of measured offsets, computed on the CPU.
 
-        The cost (batch,) is half the sum of squared residuals. The gradient (batch, p) and the normal matrix (batch, p,
-        p) are those of the residuals' Jacobian. The number of measured offsets is (batch,).
+        The cost (batch,) is half the sum of squared residuals r. With their Jacobian J, the gradient (batch, p) is Jᵀr,
+        and the normal matrix (batch, p, p) is JᵀJ. The number of measured offsets is (batch,).
         """
         gram = parameters.new_empty(*parameters.shape, parameters.shape[1])
         cost, gradient, measured_counts = (
@@ -154,7 +154,10 @@ class Misfit:
         return cost, gradient, gram, measured_counts
 
     def curvature(self, parameters: Tensor, rows: Tensor) -> Tensor:
-        """Return Σ residual ∇²Z, (batch, p, p), on the processor."""
+        """Return the sum over offsets of the residual times ∇²Z, (batch, p, p), computed on the CPU.
+
+        ∇²Z is the matrix of second derivatives of Z by the parameters.
+        """
         curvature = parameters.new_empty(*parameters.shape, parameters.shape[1])
         compiled.compute_curvature(*self._arrays(parameters, rows), curvature.numpy())
         return curvature
