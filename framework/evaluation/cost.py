@@ -23,13 +23,13 @@ class Cost:
         latency_milliseconds: median wall time of a batch of one.
         flops_per_sample: floating-point operations of matrix products, convolutions and attention; one multiply-add
             counts as two. Not counted are element-wise and special functions, normalisation, pooling, sorting, random
-            numbers, compiled graphs, and everything outside torch. So 0 means that no counted kind of operation ran,
-            not that the prediction was free. None if `parameters` is None.
-        parameters: number of parameters of the predictor, as the caller counted them. None if torch does not compute
-            with them (trees), so that neither parameters nor FLOPs can be counted.
-        peak_memory_mib: largest growth of memory during one call on the batch, MiB, without weights and inputs. On a
-            CPU this is resident memory, on CUDA allocated memory. NaN if the system does not report it (a CPU without
-            Linux's /proc or without glibc).
+            numbers, compiled graphs, and everything outside torch. So 0 means that no operation of a counted kind ran,
+            not that the prediction took no time. None if `parameters` is None.
+        parameters: number of parameters of the predictor, as the caller counted them. None if the predictor
+            does not compute with torch (trees); then neither parameters nor FLOPs can be counted.
+        peak_memory_mib: largest growth of memory during one call on the batch, MiB; weights and inputs exist before the
+            call and are not included. On a CPU it is resident memory, on CUDA allocated memory. NaN if the system does
+            not report it (a CPU without Linux's /proc or without glibc).
         batch_size: number of samples in the batch.
         device: the device, e.g. "cpu (AMD EPYC)".
         threads: number of CPU threads that torch used for one operation.
@@ -59,10 +59,10 @@ def measure(
     The states of torch's global random generators are restored afterwards.
 
     Args:
-        predict: function whose result a user waits for, such as the density and the point prediction; it is called
-            without gradient.
-        inputs: a batch, first dimension the samples, on the device to measure.
-        parameters: number of parameters for the report; None as in `Cost`.
+        predict: function to measure, which returns what a user needs, such as the density and the point prediction; it
+            is called without gradient.
+        inputs: a batch, whose first dimension is the sample, on the device to measure.
+        parameters: number of parameters, which is only copied into the result; None as in `Cost`.
         repeats: number of timed calls with the batch, and with a batch of one.
         budget_seconds: if `repeats` calls would take longer than this, fewer calls are timed, but at least three.
 

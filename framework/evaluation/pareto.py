@@ -1,4 +1,4 @@
-"""Pareto front of error and run time, up to noise."""
+"""Pareto front of error and run time, in which differences that may be noise do not count."""
 
 from collections.abc import Sequence
 
@@ -15,13 +15,13 @@ NOISE = f"front: {RULE}; run times within {100 * TIME_NOISE:g} % count as equal"
 def front(
     errors: Sequence[float] | Sequence[Mean], times: Sequence[float], time_noise: float = 0.0
 ) -> list[bool]:
-    """Return which points are on the front of low error and short time.
+    """Return for each point whether it is on the Pareto front of low error and short run time.
 
     A point beats another if it is better in one of the two quantities by more than noise, and not worse in the other by
-    more than noise. The front is the only set of points in which no point beats another, and which contains, for each
-    point outside, a point that beats it (the kernel). So two equal points are both on the front, and so is a point that
-    is only beaten by a beaten point. If points beat each other in a ring, because their errors have unequal
-    uncertainty, the fastest of them is on the front. Points that are not finite are not on the front.
+    more than noise. The front is the only set of points with two properties: none of its points beats another of them,
+    and each point outside is beaten by one of them (the kernel). So two equal points are both on the front, and so is a
+    point that is beaten only by points outside the front. If points beat each other in a ring, because their errors
+    have unequal uncertainty, the fastest of them is on the front. Points that are not finite are not on the front.
 
     Errors on the same samples are positively correlated, so the test understates the significance of differences.
 

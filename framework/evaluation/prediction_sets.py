@@ -22,13 +22,14 @@ Ends = Sequence[tuple[float, float]]
 def set_columns(target: Target, prediction: Prediction) -> dict[str, list[Any]]:
     """Return the columns of the prediction sets (`protocol.value_set`), in the user's names and units.
 
-    There are no columns if the densities have no sets. `x` stands for the target's name.
+    There are no columns if the densities have no prediction sets. In the names of columns below, `x` stands for the
+    name of the target.
 
     - For classes: `set`, a JSON list of class names, and `set_size`, their number.
     - For one real number: `x_set`, a JSON list of [low, high] pairs; `x_low` and `x_high`, the lowest and highest end;
     and `set_size`, the total length. Ends may be infinite; for an empty set they are NaN.
-    - For one angle: the same in degrees. `x_low_deg`, in [-180, 180), and `x_high_deg`, which may exceed 180, are the
-    ends of the shortest arc that contains the set, counter-clockwise.
+    - For one angle: the same columns in degrees, with names that end in `_deg`. `x_low_deg`, in [-180, 180), and
+    `x_high_deg`, which may exceed 180, are the ends of the shortest arc that contains the set, counter-clockwise.
     - For several numbers: only `set_size`, the volume; in radians for angles.
     """
     sets = value_set(prediction.density)
@@ -55,12 +56,15 @@ def set_columns(target: Target, prediction: Prediction) -> dict[str, list[Any]]:
 
 
 def _around(intervals: Ends) -> tuple[float, float]:
-    """Return the lowest and the highest end of ascending intervals; NaN if there is no interval."""
+    """Return the lowest and the highest end of `intervals`, which are in ascending order; NaN if there are none."""
     return (intervals[0][0], intervals[-1][1]) if intervals else (math.nan, math.nan)
 
 
 def _arc_around(arcs: Ends) -> tuple[float, float]:
-    """Return the ends of the shortest arc that contains ascending arcs, degrees: the complement of the widest gap."""
+    """Return the ends of the shortest arc that contains all `arcs` (degrees, ascending).
+
+    It is the complement of the widest gap between two arcs.
+    """
     if not arcs:
         return math.nan, math.nan
     starts = [low for low, _ in arcs]
@@ -72,7 +76,7 @@ def _arc_around(arcs: Ends) -> tuple[float, float]:
 
 
 def require_interval(target: Target, mass: float, by: str) -> None:
-    """Raise an error if intervals are requested for a target that has none.
+    """Raise an error if intervals are requested for a target that has none, such as a class.
 
     Args:
         target: the predicted quantity.
@@ -94,10 +98,15 @@ def require_interval(target: Target, mass: float, by: str) -> None:
 
 
 def require_matching_set(sets: ValueSet, mass: float, by: str) -> None:
-    """Raise an error if the requested interval could be confused with a prediction set of another probability.
+    """Raise an error if the model predicts sets from which intervals of the requested probability cannot be read.
+
+    Args:
+        sets: prediction sets of the model.
+        mass: probability of the requested intervals.
+        by: setting that requests them.
 
     Raises:
-        ConfigError: the probabilities differ, or the set has no ends; the message gives the probability of the set.
+        ConfigError: the sets have no stated probability, another one than `mass`, or no ends that could be printed.
     """
     if (
         sets.stated_probability is not None
@@ -120,7 +129,7 @@ def require_matching_set(sets: ValueSet, mass: float, by: str) -> None:
 def interval_columns(target: Target, interval: Interval) -> dict[str, Tensor]:
     """Return columns with the ends of intervals and the standard errors of the ends, (batch,) each.
 
-    Angles are in degrees. `low` is in [-180, 180), and the interval runs counter-clockwise from `low` to `high`.
+    Angles are in degrees; their interval runs counter-clockwise from `low`, which is in [-180, 180), to `high`.
     """
     unit, end = (180 / math.pi, "_deg") if target.kind == "angle" else (1.0, "")
     return {

@@ -1,4 +1,4 @@
-"""Error of log-likelihoods compared with a reference, which is computed at a far more expensive value of the knob."""
+"""Error of log-likelihoods at a value of a knob, compared with a reference at a far more expensive value."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -15,7 +15,7 @@ COLUMNS = {
     "sample_error_nats": "one sample's error (nats)",
     "log_likelihood_nats": "log-likelihood (nats)",
 }
-"""Headings of the numbers that `errors` returns, by key."""
+"""Headings, in tables, of numbers that `errors` returns, by key."""
 BETTER: Mapping[str, Literal["higher", "lower"]] = {
     "error_nats": "lower",
     "bias_nats": "lower",
@@ -50,9 +50,10 @@ class Reference:
 def reference_value(log_probs: LogProbs, value: int, seeds: Sequence[int]) -> Reference:
     """Return the log-likelihood at a large value of the knob, averaged over seeds.
 
-    The densities are averaged, not their logarithms. If the knob counts Monte Carlo samples, this equals one estimate
-    with len(seeds) times as many samples, and the bias of the logarithm (Jensen) shrinks accordingly. The standard
-    error is the jackknife's over the seeds, sqrt((R - 1)/R Σ_r (θ_(r) - θ_(·))²) (Efron & Tibshirani 1993, eq. 11.5).
+    The densities of the seeds are averaged, not their logarithms. If the knob counts Monte Carlo samples, this equals
+    one estimate with len(seeds) times as many samples, and the bias of the logarithm (Jensen) shrinks accordingly. The
+    standard error is the jackknife's over the seeds, sqrt((R - 1)/R Σ_r (θ_(r) - θ_(·))²) (Efron & Tibshirani 1993, eq.
+    11.5); R is the number of seeds, θ_(r) the mean log-likelihood without seed r, and θ_(·) the mean of all θ_(r).
 
     Args:
         log_probs: log-likelihoods at a value and a seed.
@@ -82,11 +83,11 @@ def errors(log_probs: LogProbs, value: int, seeds: Sequence[int], reference: Ref
     """Return the errors of log-likelihoods at one value of the knob, nats; infinite if a log-likelihood is infinite.
 
     "error_nats" is the root mean square, over the seeds, of the mean log-likelihood minus the reference. "bias_nats" is
-    the absolute value of their mean difference. "sample_error_nats" is the root mean square, over seeds and samples, of
-    one sample's log-likelihood minus its reference, which is the typical error for a single sample.
-    "log_likelihood_nats" is averaged over samples and seeds. The standard errors "<key>_sem" are over the seeds, NaN
-    for a single seed. The standard error of a root mean square sqrt(m) is that of m divided by 2 sqrt(m) (delta
-    method).
+    the absolute value of the mean of these differences over the seeds. "sample_error_nats" is the root mean square,
+    over seeds and samples, of one sample's log-likelihood minus its reference, which is the typical error for a single
+    sample. "log_likelihood_nats" is averaged over samples and seeds. The standard errors "<key>_sem" are over the
+    seeds, NaN for a single seed. The standard error of a root mean square sqrt(m) is that of m divided by 2 sqrt(m)
+    (delta method).
     """
     per_seed = torch.stack([log_probs(value, seed) for seed in seeds]).double()  # (repeats, samples)
     means = per_seed.mean(1)

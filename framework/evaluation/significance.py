@@ -15,7 +15,7 @@ It is one percentage point below the stated 5 %, because Welch's test is only ap
 standard deviations.
 """
 RULE = "every difference significant at 95 %, Welch's t-test"
-"""Rule of significance, as text for a caption."""
+"""Rule by which differences are significant, as text for the caption of a table or figure."""
 
 _SOURCES = ("runs", "samples")
 
@@ -26,10 +26,10 @@ class Mean:
 
     Attributes:
         value: the mean.
-        standard_error: standard error of the mean; 0 if the mean is exact, NaN if the error is not known.
+        standard_error: standard error of the mean; 0 if the mean is exact, NaN if the standard error is not known.
         degrees: degrees of freedom of the standard error; infinite if it comes from many test samples.
-        source: "runs" or "samples", over which the standard error was computed; "" if the mean is exact or the error
-            not known.
+        source: "runs" or "samples": what the standard error was computed over; "" if the mean is exact or the standard
+            error is not known.
     """
 
     value: float
@@ -41,9 +41,9 @@ class Mean:
 def mean(numbers: Mapping[str, object], key: str, runs: object) -> Mean:
     """Return the mean `key` of a result with its standard error.
 
-    The error is "<key>_sem", the standard error over the test samples of one run. If there is none, it is computed from
-    "<key>_std", the standard deviation over `runs` runs. A whole number (such as a count of parameters) without either
-    is exact.
+    The standard error is "<key>_sem", over the test samples of one run. If `numbers` lacks it, it is computed from
+    "<key>_std", the standard deviation over `runs` runs. A whole number (such as a count of parameters) with neither
+    of these keys is exact.
 
     Args:
         numbers: a result, as for `framework.reports.table`. "repeats", if given, is the number of repeats over which
@@ -76,8 +76,8 @@ def least_significant(means: Sequence[Mean]) -> Float[np.ndarray, "means means"]
 
     It is the quantile of Student's t times the standard error of the difference, with the degrees of freedom of B. L.
     Welch (1947), "The generalization of 'Student's' problem when several different population variances are
-    involved", Biometrika 34, 28-35. It is NaN if an error is not known, or if one error was computed over runs and the
-    other over the samples of a single run, which does not include the differences between runs.
+    involved", Biometrika 34, 28-35. It is NaN if a standard error is not known, or if one standard error was computed
+    over runs and the other over the samples of a single run, which does not include the differences between runs.
     """
     from scipy.special import stdtrit
 
@@ -101,10 +101,11 @@ def least_significant(means: Sequence[Mean]) -> Float[np.ndarray, "means means"]
 def significantly_best(
     means: Sequence[Mean], better: Literal["higher", "lower"]
 ) -> Bool[np.ndarray, "means"]:
-    """Return which mean is better than every other mean by more than chance explains: at most one.
+    """Return for each mean whether it is better than every other mean by more than chance explains; at most one is.
 
-    No correction for the number of means is needed, because the best must differ from every other mean, and so from
-    the second best, which is the nearest (an intersection-union test: R. L. Berger (1982), Technometrics 24, 295-300).
+    The test needs no correction for the number of means, because the best mean must differ from every other mean,
+    including the second best, which is the nearest (an intersection-union test: R. L. Berger (1982), Technometrics 24,
+    295-300).
     """
     values = np.array([mean.value for mean in means], np.float64) * (1 if better == "higher" else -1)
     with np.errstate(invalid="ignore"):

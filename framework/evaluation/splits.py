@@ -19,19 +19,19 @@ from framework.prediction import Prediction, Split
 BLOCK = 64
 """Number of samples that are evaluated at once.
 
-Random samples are a function of (seed, sample) only if this number is the same everywhere, because a density may draw
-for a whole batch at once. No gradients are kept, so the evaluation takes less memory than training on as many samples.
+Only with the same number everywhere are random values a function of (seed, sample), because a density may draw for a
+whole batch at once. Evaluation keeps no gradients, so it takes less memory than training with batches of this size.
 """
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Metrics of one split, over all samples and, if there are several groups, per group."""
+    """Values of the metrics on one split: in total over all samples, and per group if there are several groups."""
 
     total: dict[str, float]
     groups: dict[str, dict[str, float]]
     metrics: list[Metric]
-    """Metrics over all samples, in their final state."""
+    """Metric objects after all samples, from which figures can be drawn."""
 
 
 def on_device(batches: Iterable[Batch], device: torch.device) -> Iterator[Batch]:
@@ -52,9 +52,10 @@ def evaluate(
     device: torch.device,
     outliers: Iterable[Batch] = (),
 ) -> Evaluation:
-    """Return every metric over all batches.
+    """Return the value of every metric over all batches, in total and per group.
 
-    Noise is a function of (seed, batch, metric), so a second call returns the same bits, even with other metrics added.
+    Random numbers are a function of (seed, batch, metric), so a second call returns the same bits, even with more
+    metrics.
 
     Args:
         predictor: the trained predictor; it is moved to `device`.
@@ -62,9 +63,9 @@ def evaluate(
         metrics: metrics to compute; they are copied.
         groups: names of the groups.
         samples: as in `Prediction`.
-        seed: seed of the noise.
+        seed: seed of the random numbers.
         device: device to predict on.
-        outliers: batches of another data set, which are passed to the metrics that read outliers, in every group.
+        outliers: batches of outliers; the metrics that read outliers get all of them, in total and in every group.
     """
     predictor.eval().to(device)
     several = len(groups) > 1
@@ -110,7 +111,7 @@ def _update(
     draw: Draw,
     split: Split = "test",
 ) -> None:
-    """Update the metrics that read this split with the prediction for a batch."""
+    """Update the metrics that read `split` with the prediction for a batch."""
     readers = [metric for metric in metrics if split in metric.splits]
     reads = {channel for metric in readers for channel in metric.reads}
     prediction = predict(predictor, batch, samples, draw, split, reads)
@@ -145,7 +146,7 @@ def require_unique_name(owners: dict[str, Metric], name: str, metric: Metric) ->
     """Raise an error if another metric already uses a name, because one of the two numbers would be lost.
 
     Args:
-        owners: the metric of each name so far; `name` is added to it.
+        owners: metrics so far, by the names that they use; `name` is added.
         name: the name to check.
         metric: the metric that uses it.
 

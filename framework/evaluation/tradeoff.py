@@ -45,7 +45,7 @@ class Point:
 
 @dataclass(frozen=True)
 class Curve:
-    """Points of one method in the order of the knob's values, and the conditions of the measurement."""
+    """Curve of one method: its points in the order of the knob's values, and the conditions of the measurement."""
 
     knob: str
     points: list[Point]
@@ -58,10 +58,10 @@ class Curve:
 
 
 def knob_owners(predictor: Predictor, knob: str) -> list[Uncertainty | DensityHead]:
-    """Return the wrappers that have the knob, or, if no wrapper has it, the heads; the name "" returns no parts.
+    """Return the uncertainty wrappers with the knob or, if there are none, the heads with it; [] for `knob=""`.
 
     Raises:
-        ConfigError: no part has the knob; the message lists the existing knobs.
+        ConfigError: no wrapper or head has the knob; the message lists the existing knobs.
     """
     if not knob:
         return []
@@ -78,10 +78,10 @@ def knob_owners(predictor: Predictor, knob: str) -> list[Uncertainty | DensityHe
 
 
 def first_knob(predictor: Predictor) -> str:
-    """Return the first knob of the outermost part that has knobs.
+    """Return the first knob of the outermost uncertainty wrapper or head that has knobs.
 
     Raises:
-        ConfigError: no part has a knob.
+        ConfigError: no wrapper or head has a knob.
     """
     for part in parts_with_knobs(predictor):
         return next(iter(part.knobs))
@@ -110,7 +110,7 @@ def tradeoff(
     timed_calls: int = 20,
     budget_seconds: float = 20.0,
 ) -> Curve:
-    """Return the curve of a trained predictor: metrics, errors against a reference, and run time for each knob value.
+    """Measure metrics, errors against a reference, and run time of a trained predictor for each value of a knob.
 
     Run times are those of the whole predictor, from input to log-likelihood, on the first batch. The predictor's mode,
     its knob and the states of torch's random generators are restored afterwards.
@@ -121,10 +121,10 @@ def tradeoff(
         metrics: metrics to compute at each value.
         knob: name of the knob, as in `knob_owners`.
         values: values of the knob to try.
-        reference: a value so large that its own error is negligible, at least the largest of `values`; None: no
-            comparison with a reference.
+        reference: value of the knob for the reference, at least the largest of `values` and so large that its own error
+            is negligible; None: no comparison with a reference.
         samples: as in `Prediction`.
-        repeats: number of seeds for each value and for the reference, which needs two.
+        repeats: number of seeds for each value and for the reference; a reference needs at least two.
         seed: seed of all random numbers.
         timed_calls: number of timed calls, as in `run_times`.
         budget_seconds: limit of the timing, as in `run_times`.
@@ -207,8 +207,8 @@ def run_times(
     """Return the median wall time of `predict(value)` for each value, seconds, after two warm-up calls.
 
     In every round, each value is timed once, so that a slowdown of the machine affects all values. An untimed call
-    precedes each timed call, so that caches filled by another value do not matter. There are `calls` rounds, or fewer,
-    but at least three, if they would last longer than `budget_seconds`.
+    precedes each timed call, so that caches filled by another value do not matter. There are `calls` rounds; if these
+    would last longer than `budget_seconds`, there are fewer, but at least three.
     """
     times_by_value: list[list[float]] = [[] for _ in values]
     start = perf_counter()
@@ -311,7 +311,7 @@ def _check(
 def _restore_afterwards(
     predictor: Predictor, parts: Sequence[Uncertainty | DensityHead], knob: str, device: torch.device
 ) -> Iterator[None]:
-    """Set evaluation mode inside the `with` block; restore mode, knob and random generators afterwards."""
+    """Set evaluation mode inside the block; afterwards restore the mode, the knob and the random generators."""
     training = predictor.training
     before = [getattr(part, knob) for part in parts]
     try:
