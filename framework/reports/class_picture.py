@@ -1,4 +1,4 @@
-"""Contact sheet of classified samples: certain, ambiguous and failed ones, with their most likely classes."""
+"""Figure of classified samples in rows of certain, ambiguous and failed ones, each with its most likely classes."""
 
 from collections.abc import Mapping, Sequence
 
@@ -20,11 +20,12 @@ LONGEST = 18
 def choose_classified(
     probability: Float[np.ndarray, "samples classes"], label: Int[np.ndarray, "samples"], count: int = 6
 ) -> dict[str, list[int]]:
-    """Return the indices of up to `count` samples for each row of the figure; no sample occurs twice.
+    """Return the indices of up to `count` samples for each row of the figure, by row name; no sample occurs twice.
 
-    "failed": wrong predictions, most probable first. "ambiguous": right or wrong, smallest difference between the two
-    most likely classes first. "certain": right, the most probable sample of each class before a second one of any
-    class. The choice is deterministic.
+    "failed" has samples whose most likely class is wrong, in descending order of its probability. "certain" has samples
+    whose most likely class is right, in descending order of its probability, but first one sample of each class, then a
+    second one of each class, and so on. "ambiguous" has other samples, right or wrong, in ascending order of the
+    difference between the probabilities of the two most likely classes. The choice is deterministic.
     """
     if len(probability) == 0:
         return {"certain": [], "ambiguous": [], "failed": []}
@@ -71,7 +72,7 @@ def draw_classified(
         probability: predicted probabilities.
         label: true classes.
         names: names of the classes.
-        rows: heading and number of samples of each row, in the order of the samples; a number may be 0.
+        rows: number of samples in each row, by the row's heading; the samples are ordered by row. A number may be 0.
         title: title of the figure.
         synthetic: whether the data are generated.
     """
@@ -91,7 +92,7 @@ def draw_classified(
 
 
 def _bars(axes: Axes, probability: Float[np.ndarray, "classes"], label: int, names: Sequence[str]) -> None:
-    """Draw bars for the most likely classes; the true class replaces the last bar if it is not among them."""
+    """Draw bars for the LISTED most likely classes; the true class, if it is not one of them, replaces the last."""
     shown: list[int] = np.argsort(-probability, kind="stable")[:LISTED].tolist()
     if label not in shown:
         shown[-1] = label

@@ -1,4 +1,7 @@
-"""Figure of classifiers' probabilities over a plane of two inputs, one panel per model (thesis Figure 2.3)."""
+"""Figure of the probabilities that classifiers predict over a plane of two inputs, one panel per model.
+
+It corresponds to Figure 2.3 of the thesis.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,12 +19,12 @@ from framework.model import Predictor
 POINTS = 61
 """Number of grid points along each side of the plane."""
 SHOWN = 300
-"""Largest number of samples of a class, and of outliers, that are drawn over a landscape."""
+"""Largest number of samples of each class, and of outliers, that are drawn in a panel."""
 
 
 @dataclass(frozen=True)
 class Plane:
-    """Samples and axes that are drawn over the landscapes.
+    """Samples and axes that every panel shows in addition to the probabilities.
 
     Attributes:
         points: the two inputs of each sample.
@@ -41,13 +44,13 @@ class Plane:
 
 
 def half_width(*points: Float[np.ndarray, "_ 2"]) -> float:
-    """Return half the side of the smallest square around 0 that contains all points, plus a tenth."""
+    """Return 1.1 times half the side of the smallest square, centred at 0, that contains all points."""
     return 1.1 * max((float(np.abs(group).max()) for group in points if len(group)), default=1.0)
 
 
 @torch.no_grad()
 def probabilities(predictor: Predictor, half_width: float, rows_at_once: int = 4096) -> np.ndarray:
-    """Return the drawn number at each grid point of the plane, (POINTS, POINTS), first row at the bottom.
+    """Return the number to draw at each grid point of the plane, (POINTS, POINTS); the first row is at the bottom.
 
     For two classes it is p(y = 1); for K > 2 classes, the entropy divided by its largest value, log K.
     """

@@ -1,4 +1,4 @@
-"""Figures of predictions for samples of the test split, depending on the kind of target."""
+"""Figures of predictions for samples of the test split; the kind of target decides which figures are drawn."""
 
 import math
 from collections.abc import Iterator
@@ -27,14 +27,14 @@ PICTURED = 128
 
 
 UNRESOLVED, DRAWS, TIMES = 0.01, 1000, 10
-"""Largest error of a grid's total probability at which the grid is considered to resolve the density.
+"""Largest difference from 1 of a density's integral over a grid, at which the grid counts as fine enough.
 
-Otherwise the density is estimated from DRAWS × TIMES random values.
+If the difference is larger, the density is estimated from DRAWS × TIMES random values.
 """
 
 
 def prediction_pictures(session: Session) -> Iterator[tuple[str, Figure]]:
-    """Yield the name and the figure of each plot for the kind of target."""
+    """Yield the name and the figure of each plot that exists for the target of the session."""
     kind = session.target.kind
     if kind == "angle":
         yield "predicted_densities", _densities_figure(session)
@@ -46,7 +46,7 @@ def prediction_pictures(session: Session) -> Iterator[tuple[str, Figure]]:
 
 @torch.no_grad()
 def _densities_figure(session: Session) -> Figure:
-    """Return the figure of the first angle's densities, for some of the first PICTURED test samples."""
+    """Return the figure of predicted densities of the first angle, for some of the first PICTURED test samples."""
     predictor, data = session.predictor, session.data
     inputs: list[Tensor] = []
     columns: list[tuple[Tensor, ...]] = []
@@ -86,7 +86,7 @@ def _densities_figure(session: Session) -> Figure:
 
 @torch.no_grad()
 def _classified_figure(session: Session) -> Figure:
-    """Return the figure of classified samples; the samples are spread over the whole test split."""
+    """Return the figure of some of PICTURED classified samples, which are spread evenly over the test split."""
     predictor, data = session.predictor, session.data
     dataset = data.splits().test
     length: int = len(dataset)  # pyright: ignore[reportArgumentType]
@@ -129,9 +129,9 @@ def _landscape_figure(session: Session) -> Figure:
 
 
 def log_density_on_circle(density: Distribution, points: int = 720) -> tuple[Tensor, Tensor]:
-    """Return a grid of angles (points,) and the log-density on it (points, batch), even of a very narrow density.
+    """Return a grid of angles (points,), and the log-densities at them (points, batch), also of very narrow densities.
 
-    If a density is too narrow for the grid, it is estimated from the share of random values in each grid cell.
+    A density that is too narrow for the grid is estimated from the share of its random values in each grid cell.
     """
     angles, log_density = circular_grid(density, points)
     width = 2 * math.pi / points
@@ -148,20 +148,24 @@ def log_density_on_circle(density: Distribution, points: int = 720) -> tuple[Ten
 
 
 def deviation(truth: Tensor, point: Tensor, symmetry: Tensor) -> Tensor:
-    """Return the distance of a point prediction to the nearest true angle, radians; 0 if all angles are true."""
+    """Return the distance of a point prediction to the nearest true angle, radians.
+
+    An object with n-fold `symmetry` has n true angles, 2π/n apart. A `symmetry` of 0 means that every angle is true;
+    the distance is then 0.
+    """
     folds = symmetry.clamp(min=1)
     return torch.where(symmetry == 0, 0.0, angular_distance(folds * truth, folds * point) / folds)
 
 
 def _caption(error: float, entropy: float, symmetry: int) -> str:
-    """Return the text below a panel: error and entropy."""
+    """Return the text below a panel, with the error (given in radians), the entropy (nats) and the symmetry."""
     error_text = f"error {math.degrees(error):.0f}°" if symmetry else "any direction is true"
     note = f", {symmetry}-fold symmetric" if symmetry > 1 else ""
     return f"{error_text}, entropy {entropy:.2f} nats{note}"
 
 
 def _equally_true(truth: float, symmetry: int) -> np.ndarray:
-    """Return all angles that are true because of the symmetry, radians; none if all angles are true."""
+    """Return the angles that are true because of the n-fold `symmetry`, radians; none for 0, if every angle is true."""
     return truth + 2 * math.pi / symmetry * np.arange(symmetry) if symmetry else np.zeros(0)
 
 

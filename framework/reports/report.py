@@ -74,7 +74,7 @@ def report_test(run: Run, session: Session) -> None:
 
 
 def _logged_names(run: Run) -> set[str]:
-    """Return the names of numbers that a resumed run already logged; computed again, they have the same values."""
+    """Return the names of numbers that a resumed run has logged already and need not log again; else the empty set."""
     return {name for line in run.tracker.journal.lines() for name in line.values} if run.resumed else set()
 
 
@@ -122,7 +122,7 @@ def _results(
 
 
 def _plain(value: Any) -> Any:
-    """Return a value for JSON, where NaN becomes null; tables print null as "not available"."""
+    """Return a value for results.json, where NaN becomes null; tables print null as "not available"."""
     return None if isinstance(value, float) and math.isnan(value) else value
 
 
@@ -132,7 +132,7 @@ def report_training(run: Run, session: Session, *, kept_epoch: int) -> None:
     Args:
         run: the run with the journal.
         session: the session of the run.
-        kept_epoch: epoch of the kept weights, from 0.
+        kept_epoch: epoch, from 0, of the weights that are kept and tested.
     """
     if not run.settings.pictures:
         return

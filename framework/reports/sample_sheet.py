@@ -1,4 +1,4 @@
-"""An empty contact sheet of samples with one row for each kind of sample."""
+"""Empty figure with panels for samples, in one row for each kind of sample."""
 
 from collections.abc import Mapping, Sequence
 
@@ -19,16 +19,16 @@ def sample_sheet(
     title: str,
     synthetic: bool,
 ) -> tuple[Figure, list[np.ndarray]]:
-    """Return the figure and, for each sample in the order of the rows, its panels from top to bottom.
+    """Return an empty figure and, for each sample in the order of the rows, its panels from top to bottom.
 
     A row without samples contains a text that says so. Lengths are in inches.
 
     Args:
-        rows: heading and number of samples of each row; a number may be 0.
-        least: smallest number of columns of panels.
+        rows: number of samples in each row, by the row's heading. A number may be 0.
+        least: smallest number of columns; a row with more samples needs more.
         width: width of a panel.
-        heights: heights of the panels of a sample.
-        flat: heights of the panels in a row without samples.
+        heights: heights of the panels of one sample, from top to bottom.
+        flat: heights that replace `heights` in a row without samples.
         margin: height for title and legend.
         title: title of the figure.
         synthetic: whether the data are generated.

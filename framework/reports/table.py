@@ -20,15 +20,15 @@ from framework.evaluation.significance import RULE, mean, significantly_best
 Row = Mapping[str, object]
 """Names and numbers of one result.
 
-"<key>_std" (standard deviation over runs, see `aggregate`) or "<key>_sem" (standard error of the mean) is printed
-after the number "<key>" as ±. "synthetic" is true if the data were generated.
+The number "<key>_std" (standard deviation over runs, see `aggregate`) or "<key>_sem" (standard error of the mean) is
+printed after the number "<key>" as ±. "synthetic" is true if the data were generated.
 """
 
 Better = Mapping[str, Literal["higher", "lower"]]
 """Direction in which the values of a column are better.
 
-The best value is bold if it differs significantly from every other value (`framework.evaluation.significance`), so
-never if an error is not known.
+The best value of a column is bold if it differs significantly from every other value
+(`framework.evaluation.significance`). If a standard error is not known, no value is bold.
 """
 
 COST_COLUMNS = {
@@ -38,13 +38,13 @@ COST_COLUMNS = {
 }
 """Headings of the costs in every result table (framework.evaluation.cost.Cost), by key."""
 COST_BETTER: Better = dict.fromkeys(COST_COLUMNS, "lower")
-"""Direction in which costs are better."""
+"""Direction in which costs are better, by the keys of COST_COLUMNS."""
 NOT_AVAILABLE = "not available"
 NO_BREAK = "\u00a0"
 WIDTH = 100
 """Width of a line of the terminal, in characters, into which a table should fit."""
 SPREADS = {"_std": "standard deviation over runs", "_sem": "standard error of the mean"}
-"""Meaning of the errors, by the suffix of their keys."""
+"""Meaning of the numbers after ±, by the suffix of their keys."""
 
 
 def results_table(
@@ -52,15 +52,15 @@ def results_table(
 ) -> Table:
     """Return a table for the terminal.
 
-    Each result is a line. If the table would be wider than 100 characters, each result is a column instead, unless
-    that is even wider.
+    Each result is a line. If the table would be wider than WIDTH characters, each result is a column instead, unless
+    that table would be even wider.
 
     Args:
-        rows: one result each.
+        rows: the results, one per row.
         columns: headings by key, in order; the first column names the result.
-        title: title above the table. "(synthetic data)" is added if all results are synthetic; a column says which are
-            if only some are.
-        better: directions for bold numbers; a single result is never bold.
+        title: title above the table. If all results are synthetic, "(synthetic data)" is added to it; if only some are,
+            a further column says which.
+        better: directions of the columns in which the best number may be bold; a single result is never bold.
     """
     synthetic = [_synthetic(row) for row in rows]
     if rows and all(synthetic) and "synthetic" not in title.lower():
@@ -79,7 +79,7 @@ def results_table(
 
 
 def markdown(rows: Sequence[Row], columns: Mapping[str, str], *, better: Better | None = None) -> str:
-    """Return the table in Markdown; if any result is synthetic, a column says which are."""
+    """Return a table of the results in Markdown; if any result is synthetic, a column says which ones are."""
     lines = _lines(rows, columns, better or {}, origin=any(map(_synthetic, rows)))
     cells = [[_escape(cell) for cell in line] for line in lines]
     rule = ["---", *["---:"] * (len(cells[0]) - 1)]
@@ -89,11 +89,13 @@ def markdown(rows: Sequence[Row], columns: Mapping[str, str], *, better: Better 
 
 
 def write_csv(rows: Sequence[Row], columns: Iterable[str] | None, path: Path) -> None:
-    """Write a CSV file with keys as headings, all digits, and errors in columns of their own; missing values are empty.
+    """Write results to a CSV file with keys as headings and all digits.
+
+    Standard deviations and standard errors have columns of their own; the cells of missing values are empty.
 
     Args:
-        rows: one result each.
-        columns: the keys, in order; None: all keys of any row.
+        rows: the results, one per row.
+        columns: the keys to write, in order; None: every key that any row has.
         path: file to write.
     """
     if columns is None:
@@ -114,18 +116,19 @@ def write_csv(rows: Sequence[Row], columns: Iterable[str] | None, path: Path) ->
 
 
 def aggregate(rows: Sequence[Row], by: Sequence[str], over: str = "seed") -> list[dict[str, object]]:
-    """Return means and standard deviations over runs that differ in `over` only.
+    """Return means and standard deviations over groups of runs that differ in `over` only.
 
     Args:
-        rows: one run each.
+        rows: the results of runs, one per row.
         by: keys that distinguish the groups; synthetic and real results are always in different groups.
         over: the key that distinguishes the runs of a group.
 
     Returns:
-        One row per group, in order of first appearance. It has the keys of `by`; for every number, the mean "<key>"
-        and the sample standard deviation "<key>_std" (NaN for one run); "n", the number of runs; and every other value
-        that all runs of the group share. A number that one of the runs lacks is NaN. The standard errors "<key>_sem" of
-        a single run are kept; those of several runs are left out, because their mean has no meaning.
+        One row per group, in order of first appearance. It has the keys of `by`; for every number, the mean "<key>" and
+        the sample standard deviation "<key>_std" (NaN for one run); "n", the number of runs; and each other value that
+        is equal in all runs of the group. A number that one of the runs lacks is NaN. The standard errors "<key>_sem"
+        are kept in a group of a single run; in a group of several runs they are left out, because their mean has no
+        meaning.
 
     Raises:
         ConfigError: a row lacks a key, or two runs of a group have the same `over`.
@@ -143,10 +146,11 @@ def aggregate(rows: Sequence[Row], by: Sequence[str], over: str = "seed") -> lis
 
 
 def format_number(value: int | float, spread: int | float = math.nan) -> str:
-    """Return a number with its error, such as "1.23 ± 0.04" or "22.8 ± 1.0", or with three significant digits.
+    """Return the text of a number with its error `spread`, such as "1.23 ± 0.04" or "22.8 ± 1.0".
 
-    The error has one significant digit, or two if the first is 1, and determines the digits of the number. Whole
-    numbers (`int`) are exact below 100,000 and abbreviated above, such as "1.23 M". NaN is "not available".
+    The error has one significant digit, or two if the first is 1, and determines the digits of the number. Without an
+    error, the number has three significant digits. Whole numbers (`int`) are written exactly below 100,000, and
+    abbreviated from there on, such as "1.23 M". NaN is "not available".
     """
     if math.isnan(value):
         return NOT_AVAILABLE
@@ -170,12 +174,12 @@ def format_number(value: int | float, spread: int | float = math.nan) -> str:
 
 
 def machine(device: object, threads: object) -> str:
-    """Return a description of the machine of a measurement, such as "cpu (AMD EPYC), 2 threads"."""
+    """Return a description of the machine on which something was measured, such as "cpu (AMD EPYC), 2 threads"."""
     return f"{device}, {threads} thread{'' if threads == 1 else 's'}"
 
 
 def _plain(value: int | float) -> str:
-    """Return a number without its error."""
+    """Return the text of a number that has no error."""
     if isinstance(value, Integral) and abs(value) < 1e15:
         if abs(value) < 1e5:
             return str(value)
@@ -189,7 +193,7 @@ def _plain(value: int | float) -> str:
 
 
 def _unit(value: int | float) -> tuple[float, str]:
-    """Return the factor and the decimal prefix for a large number, such as (1e3, "k")."""
+    """Return the factor by which a large number is divided, and its decimal prefix, such as (1e3, "k")."""
     return next(pair for pair in ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k")) if abs(value) >= pair[0])
 
 
@@ -201,7 +205,10 @@ def _exponent(value: int | float) -> int:
 def _lines(
     rows: Sequence[Row], columns: Mapping[str, str], better: Better, *, origin: bool
 ) -> list[list[Text]]:
-    """Return lines of cells, headings first; `origin` adds a column that says which data are synthetic."""
+    """Return the lines of a table, headings first, each as a list of cells.
+
+    If `origin` is True, a further column says which results have synthetic data.
+    """
     lines = [[Text(_cell(row, key)) for key in columns] for row in rows]
     for index, key in enumerate(columns):
         values = {
@@ -225,7 +232,7 @@ def _lines(
 
 
 def _cell(row: Row, key: str) -> str:
-    """Return the text of a cell."""
+    """Return the text of the cell of `row` in the column `key`."""
     value = row.get(key)
     if value is None:
         return NOT_AVAILABLE
@@ -240,7 +247,7 @@ def _cell(row: Row, key: str) -> str:
 
 
 def _spread(row: Row, key: str) -> float | None:
-    """Return the error that is printed after ±; None if there is none."""
+    """Return the number that is printed after ± in the column `key`; None if there is none."""
     spreads = (_number(row.get(key + suffix)) for suffix in SPREADS)
     return next((spread for spread in spreads if spread is not None), None)
 
@@ -282,7 +289,7 @@ def _caption(rows: Sequence[Row], columns: Mapping[str, str], lines: Sequence[Se
 
 
 def _width(lines: Sequence[Sequence[Text]]) -> int:
-    """Return the width of a table in characters if only headings are wrapped, at every space."""
+    """Return the smallest width of a table, in characters, if headings are wrapped at every space and cells are not."""
     widths = [
         max(map(len, [*_wrap(head.plain, 0).splitlines(), *_column(lines, index)]), default=0)
         for index, head in enumerate(lines[0])
@@ -295,7 +302,7 @@ def _column(lines: Sequence[Sequence[Text]], index: int) -> list[Text]:
 
 
 def _wrap(heading: str, width: int) -> str:
-    """Return a heading wrapped between words to lines of `width` characters; a longer word widens all lines."""
+    """Return a heading, wrapped between words to lines of `width` characters or, if longer, of its longest word."""
     # A single sign, such as "°" or "/", stays with the word before it.
     words = re.sub(r" (?=[^\w\s]( |$))", NO_BREAK, heading)
     width = max([1, width, *map(len, words.split(" "))])

@@ -27,9 +27,9 @@ SIDES = ((9, 6), (9, -6), (-9, 6), (-9, -6), (0, 13), (0, -13), (12, 15), (12, -
 
 Style = dict[str, Any]
 PARETO: Style = {"ls": "", "marker": "o", "mfc": "none", "markersize": 13, "mec": "black"}
-"""Style of the rings around the points of a front."""
+"""Style of the rings around the points of the Pareto front."""
 FRONT = "front"
-"""Identifier (gid) of the rings around the points of a front."""
+"""Matplotlib identifier (gid) of the rings around the points of the Pareto front."""
 SHADE = "0.87"
 """Grey level of the area in which errors are not meaningful."""
 ACROSS = 3
@@ -38,7 +38,7 @@ ACROSS = 3
 
 @dataclass(frozen=True)
 class Floor:
-    """Level below which an error is not meaningful, and the legend's text about it."""
+    """Value below which an error is not meaningful, and the text that explains it in the legend."""
 
     height: float
     meaning: str
@@ -46,7 +46,7 @@ class Floor:
 
 @dataclass(frozen=True)
 class _Series:
-    """Rows that are drawn in one style: those of a method, or of a method in a group."""
+    """Rows that are drawn in one style: those of a method or, if there are groups, of a method in a group."""
 
     method: str
     group: str
@@ -67,13 +67,13 @@ def error_against_run_time(
     floors: Mapping[str, Floor] | None = None,
     note: str = "",
 ) -> Figure:
-    """Draw numbers of each result against the run time.
+    """Draw the numbers of each result against its run time, in one panel for each key of `labels`.
 
     The axis of run time is logarithmic, and so is the axis of an error without negative values. Rows of a method that
-    have a "knob" are connected in their order, and the knob's "value" is written beside each point. Error bars are a
-    row's "<key>_std" or "<key>_sem". Rings mark the Pareto front of each group (`framework.evaluation.pareto`); errors
-    of different groups are not compared. A panel without standard errors has no rings, but a text that says so. On a
-    logarithmic axis an error of 0 is drawn on the lower edge and labelled.
+    have a "knob" are connected in their order, and the knob's "value" is written beside each point. The length of error
+    bars is a row's "<key>_std" or "<key>_sem". Rings mark the Pareto front of each group
+    (`framework.evaluation.pareto`); errors of different groups are not compared. A panel without standard errors has no
+    rings, but a text that says so. On a logarithmic axis an error of 0 is drawn on the lower edge and labelled.
 
     Args:
         rows: as for `framework.reports.table`, each with its "method".
@@ -83,7 +83,8 @@ def error_against_run_time(
         synthetic: whether the data are generated.
         machine: machine and number of threads of the measurement, which is written on every time axis.
         time: key of the run time.
-        group: key of the group; None: all rows are one group. Up to 14 methods and 12 groups have different styles.
+        group: key whose value is a row's group; None: all rows are one group. Up to 14 methods and 12 groups have
+            different styles.
         floors: floors by key; the area below a floor is shaded.
         note: text below the figure.
     """
@@ -145,7 +146,8 @@ def _panel(
     """Draw the panel of one metric.
 
     Returns:
-        The texts beside points as (x, y, text, colour), and the drawn lines, which texts should not cover.
+        The texts to write beside points, each as (x, y, text, colour), and the drawn lines, which the texts should not
+        cover.
     """
     drawn_rows = [[row for row in entry.rows if _drawable(row, key, time)] for entry in series]
     positions = [
@@ -240,12 +242,12 @@ def _legends(
 
 
 def _room(low: float, high: float) -> float:
-    """Return the margin of a logarithmic axis as a factor; a single number is placed in the middle."""
+    """Return the factor by which a logarithmic axis extends beyond `low` and `high`; 2 if they are equal."""
     return (high / low) ** 0.1 if high > low else 2.0
 
 
 def _plain_ticks(axis: Axis) -> None:
-    """Label a logarithmic axis with plain numbers, however short the axis is."""
+    """Label a logarithmic axis with plain numbers, also if it covers less than a power of ten."""
     low, high = axis.get_view_interval()
     decades = math.log10(high / low)
     steps = (1.0,) if decades > 3 else (1.0, 2.0, 5.0) if decades > 1.2 else (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)
@@ -255,7 +257,7 @@ def _plain_ticks(axis: Axis) -> None:
 
 
 def _annotate(axes: Axes, notes: Sequence[tuple[Any, ...]], lines: Sequence[np.ndarray]) -> None:
-    """Write the text of each point (x, y, text, colour) on the side where it covers the least."""
+    """Write each text of `notes` (x, y, text, colour) beside its point, on the side where it covers the least."""
     pen = axes.figure.dpi / 72  # pixels per typographical point
     edges = [np.zeros((0, 4))]  # boxes of the drawn lines: left, bottom, right, top in pixels
     for line in lines:
@@ -282,7 +284,7 @@ def _annotate(axes: Axes, notes: Sequence[tuple[Any, ...]], lines: Sequence[np.n
 
 
 def _drawable(row: Row, key: str, time: str) -> bool:
-    """Return whether a row has a finite number and a positive, finite run time."""
+    """Return whether a row has a finite number `key`, and a finite run time `time` above 0."""
     return math.isfinite(_value(row, key)) and 0 < _value(row, time) < math.inf
 
 

@@ -10,7 +10,7 @@ from matplotlib.ticker import MaxNLocator
 from framework.figures.style import BLUE, GREEN, RED, titled_figure
 
 FEW = 30
-"""Number of points below which each point has a marker, because a line through a single point is invisible."""
+"""Number of points below which every point gets a marker, because a line through a single point is invisible."""
 
 
 def training_curve(
@@ -28,7 +28,7 @@ def training_curve(
     Args:
         epochs: epochs at which the training loss was recorded.
         train: training loss at these epochs.
-        validation: pairs (epoch, value).
+        validation: validation losses as pairs (epoch, loss).
         best_epoch: epoch of the kept weights; None if no weights were kept.
         title: title of the figure.
         synthetic: whether the data are generated.

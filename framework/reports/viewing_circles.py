@@ -29,10 +29,11 @@ def choose(
     log_density: Float[np.ndarray, "points samples"],
     count: int = 4,
 ) -> dict[str, list[int]]:
-    """Return the indices of up to `count` samples for each row of Figure 3.6; the choice is deterministic.
+    """Return the indices of up to `count` samples for each row of the figure (thesis Figure 3.6), by the row's name.
 
-    "certain": one peak, entropy at most the median, error at most π/6. "ambiguous": several peaks. "failed": confident
-    mistakes, which differ from "certain" by a larger error. Each row has its samples of lowest entropy.
+    "certain" has samples whose density has one peak, an entropy of at most the median, and an error of at most π/6.
+    "failed" has samples with one peak, such an entropy, but a larger error. "ambiguous" has samples with several peaks.
+    Of these samples, each row has those of lowest entropy. The choice is deterministic.
 
     Args:
         entropy: entropy of each density, nats.
@@ -58,14 +59,14 @@ def choose(
 
 
 def count_peaks(log_density: Float[np.ndarray, "points samples"]) -> np.ndarray:
-    """Return the number of separate arcs with more than a quarter of the highest density, (samples,)."""
+    """Return the number of separate arcs on which a density exceeds a quarter of its maximum, (samples,)."""
     high = log_density > log_density.max(0) - math.log(4)
     starts = (high & ~np.roll(high, 1, axis=0)).sum(0)
     return np.maximum(starts, 1)  # an arc that covers the whole circle has no start
 
 
 def outer_density(peak: float) -> float:
-    """Return the density of the outer circle, per radian: the first of 1.5, 3, 6, 15, 30, … not below `peak`."""
+    """Return the density of the outer circle, per radian: the first of 1.5, 3, 6, 15, 30, … that is at least `peak`."""
     steps = (step * 10.0**power for power in range(308) for step in (1.5, 3.0, 6.0))
     return next(step for step in steps if step >= peak)
 
@@ -84,7 +85,7 @@ def viewing_circles(
     synthetic: bool,
     directions: Sequence[str] = (),
 ) -> Figure:
-    """Draw predicted densities on the viewing circle around each image, as in Figures 3.2 and 3.6.
+    """Draw predicted densities on the viewing circle around each image, as in Figures 3.2 and 3.6 of the thesis.
 
     Angle 0 is at the bottom, and angles run counter-clockwise. A density is drawn as a band outside the circle, whose
     thickness is proportional to the density. The band stays inside an outer circle; the density that the outer circle
@@ -92,13 +93,13 @@ def viewing_circles(
 
     Args:
         images: images of the samples, as `Data.preview` gives them.
-        log_density: nats, at `angles`.
+        log_density: log-density of each sample at `angles`, nats.
         angles: a regular grid over the whole circle, radians.
         truths: true angles, radians; NaN if there is no true direction, which is then not drawn.
         predictions: point predictions, radians.
         captions: text below each panel.
         modes: for each sample, all angles that are equally true because the object is symmetric, radians.
-        rows: heading and number of samples of each row, in the order of the samples; a number may be 0.
+        rows: number of samples in each row, by the row's heading; the samples are ordered by row. A number may be 0.
         title: title of the figure.
         synthetic: whether the data are generated.
         directions: words for the viewing directions 0°, 90°, 180° and 270°; without words the angles are written.
@@ -166,7 +167,7 @@ def _viewing_circle(
 
 
 def _marks(axes: Axes, truth: float, prediction: float, modes: Sequence[float] | np.ndarray) -> None:
-    """Mark the true angle, the equally true ones, and the point prediction."""
+    """Mark the true angle, all angles that are equally true (`modes`), and the point prediction."""
     for angle, face in (*((mode, "none") for mode in modes), (truth, GREEN)):
         if math.isnan(angle):
             continue
