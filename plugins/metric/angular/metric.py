@@ -19,9 +19,9 @@ BEYER = "beyer2015biternion"
 class MeanAngularDeviation(Mean):
     """Mean absolute angular deviation (MAAD) of the point prediction, degrees, with its standard error.
 
-    `maad_deg` is the mean over samples of the mean over a sample's angles, and its standard error is over samples.
-    `maad_<angle>_deg` is the mean deviation of one angle. The point prediction minimises this loss (thesis eq. 3.23 and
-    3.24).
+    The deviation of a sample is the mean over its angles, and `maad_deg` is the mean deviation over samples, with its
+    standard error. `maad_<angle>_deg` is the mean deviation of one angle. The point prediction is the value with the
+    smallest expected deviation under the density (thesis eq. 3.23 and 3.24).
 
     Raises:
         ConfigError: the target does not consist of angles.

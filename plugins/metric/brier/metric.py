@@ -15,9 +15,9 @@ from framework.target import Target
 class Brier(Mean):
     """Mean Brier score, a proper scoring rule of class probabilities (thesis eq. 2.26), with its standard error.
 
-    For two classes it is the squared error of the second class's probability, in [0, 1]: eq. 2.26 as a mean. For more
-    classes it is the sum of the squared errors of all probabilities, in [0, 2] (Brier 1950). For two classes this sum
-    would be twice as large.
+    For two classes, the score of a sample is the squared error of the second class's probability, in [0, 1]; the metric
+    is eq. 2.26 as a mean over samples. For more classes, the score is the sum of the squared errors of all
+    probabilities, in [0, 2] (Brier 1950). For two classes, this sum would be twice the score of eq. 2.26.
 
     Raises:
         ConfigError: the target is not a class.
@@ -46,7 +46,11 @@ class Brier(Mean):
 def brier(
     probability: Float64[Tensor, "batch class"], label: Int[Tensor, "batch"]
 ) -> Float64[Tensor, "batch"]:
-    """Return (y - p(y = 1))² for two classes (eq. 2.26), else Σ_k (p_k - 1[y = k])² (Brier 1950, eq. 2)."""
+    """Return the Brier score of each sample.
+
+    For the label y, it is (y - p(y = 1))² for two classes (eq. 2.26), and Σ_k (p_k - 1[y = k])² for more classes (Brier
+    1950, eq. 2).
+    """
     classes = probability.shape[-1]
     error = probability - torch.nn.functional.one_hot(label, classes)
     return error[:, 1].square() if classes == 2 else error.square().sum(-1)

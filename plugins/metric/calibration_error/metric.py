@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 NEAR = 2.0**-20
-"""Largest difference of confidences that count as equal for the choice of bins.
+"""Largest difference of two confidences that count as equal when samples are assigned to bins.
 
-The same probability in float32 may differ by a few times 2^-24 between devices.
+The same probability, computed in float32 on two devices, may differ by a few times 2^-24.
 """
 
 
@@ -141,7 +141,8 @@ class CalibrationError(Metric, HasFigure):
     def _collect_samples(self, first: int = 0) -> tuple[Float64[Tensor, "sample"], Float64[Tensor, "sample"]]:
         """Return the confidences in ascending order, and whether each prediction is right (0 or 1).
 
-        Sorting makes sums independent of the order of the samples. `first` is the column of the confidences.
+        Sorting makes sums independent of the order of the samples. `first` is the column of the state that holds the
+        confidences; the next column holds whether the prediction is right.
         """
         samples = dim_zero_cat(self.samples) if len(self.samples) else torch.zeros(0, 4, dtype=torch.float64)
         confidence, order = samples[:, first].contiguous().sort()
@@ -174,9 +175,10 @@ class Bins:
 
 
 def equal_width(confidence: Float64[Tensor, "sample"], bins: int) -> Int[Tensor, "sample"]:
-    """Return index l - 1 of the bin (l - 1)/L ≤ confidence < l/L (eq. 2.28), with edges lowered by NEAR/2.
+    """Return the index of the bin of each sample, for L = `bins` bins of equal width.
 
-    A confidence of 1 belongs to the last bin.
+    The bin with index l - 1 holds the confidences with (l - 1)/L ≤ confidence < l/L (eq. 2.28), with edges lowered by
+    NEAR/2. A confidence of 1 belongs to the last bin.
     """
     edges = torch.arange(1, bins, dtype=torch.float64, device=confidence.device) / bins
     return torch.bucketize(confidence, edges - NEAR / 2, right=True)
@@ -201,9 +203,9 @@ def equal_mass(confidence: Float64[Tensor, "sample"], bins: int) -> Int[Tensor, 
 
 
 def group_near_confidences(confidence: Float64[Tensor, "sample"]) -> Float64[Tensor, "sample"]:
-    """Return, for each sample, the smallest confidence of its group.
+    """Return, for each sample, the smallest confidence of the group of nearly equal confidences to which it belongs.
 
-    Groups are formed from below: a group consists of the smallest confidence that has no group yet, and of all
+    Groups are formed in ascending order: a group consists of the smallest confidence that has no group yet, and of all
     confidences up to NEAR above it. Rounding to a grid instead could separate nearly equal confidences.
     """
     ordered, order = confidence.sort()
@@ -234,15 +236,19 @@ def sum_by_bin(
 
 
 def expected_error(bins: Bins) -> Float64[Tensor, ""]:
-    """Return Σ_l |B_l|/Q |conf(B_l) - acc(B_l)| (eq. 2.31) = Σ_l |Σ conf - Σ right| / Q; NaN without samples.
+    """Return the expected calibration error Σ_l |B_l|/Q |conf(B_l) - acc(B_l)| (eq. 2.31); NaN without samples.
 
-    Empty bins add 0.
+    conf(B_l) is the mean confidence in bin l, acc(B_l) the share of right predictions, |B_l| the number of samples in
+    the bin, and Q the number of all samples. It is computed as Σ_l |Σ conf - Σ right| / Q, so that empty bins add 0.
     """
     return (bins.confidence - bins.right).abs().sum() / bins.count.sum()
 
 
 def largest_error(bins: Bins) -> Float64[Tensor, ""]:
-    """Return max_l |conf(B_l) - acc(B_l)| over nonempty bins (Guo et al. 2017, eq. 5); NaN without samples."""
+    """Return max_l |conf(B_l) - acc(B_l)| over nonempty bins (Guo et al. 2017, eq. 5); NaN without samples.
+
+    conf(B_l) is the mean confidence in bin l, and acc(B_l) the share of right predictions.
+    """
     nonempty = bins.nonempty
     gaps = (nonempty.confidence - nonempty.right).abs() / nonempty.count
     return gaps.max() if len(gaps) else gaps.new_tensor(torch.nan)
@@ -251,9 +257,11 @@ def largest_error(bins: Bins) -> Float64[Tensor, ""]:
 def squared_error_debiased(bins: Bins) -> Float64[Tensor, ""]:
     """Return Σ_l |B_l|/Q [(conf - acc)² - acc (1 - acc) / (|B_l| - 1)], over bins of at least two samples.
 
-    This is the squared error minus an unbiased estimate of the variance of acc, which the squared error contains
-    (Bröcker 2012; Kumar et al. 2019, §5). The result is unbiased if the confidences within a bin are equal. If they
-    differ, it is too low by about their variance over |B_l|.
+    conf is the mean confidence in bin l, acc the share of right predictions, |B_l| the number of samples in the bin,
+    and Q the number of samples in all these bins. The formula is the squared calibration error minus an unbiased
+    estimate of the variance of acc, which the squared error contains (Bröcker 2012; Kumar et al. 2019, §5). It is
+    unbiased if the confidences within a bin are equal. If they differ, it is too low by about their variance divided by
+    |B_l|.
     """
     several = bins.with_at_least(2)
     confidence, right = several.confidence / several.count, several.right / several.count

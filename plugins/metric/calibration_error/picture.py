@@ -108,7 +108,10 @@ def _curve(axes: Axes, count: Numbers, confidence: Numbers, right: Numbers) -> N
 
 
 def wilson(right: Numbers, count: Numbers) -> tuple[Numbers, Numbers]:
-    """Return both ends of the 95 % score interval of a share (Wilson 1927), also valid for shares of 0 and 1."""
+    """Return both ends of the 95 % confidence interval of the share `right` / `count`.
+
+    It is the score interval (Wilson 1927), which is also valid for shares of 0 and 1.
+    """
     share, spread = right / count, QUANTILE**2 / count
     centre = (share + spread / 2) / (1 + spread)
     half = np.sqrt(spread * (share * (1 - share) + spread / 4)) / (1 + spread)

@@ -1,4 +1,7 @@
-"""Mass of the highest-density region that ends at the target, and size of the region of a given mass."""
+"""Mass of the highest-density region that ends at the target, and size of the region of a given mass.
+
+A highest-density region holds all values whose density is at least a level. Its mass is its probability.
+"""
 
 import math
 from collections.abc import Callable
@@ -78,7 +81,11 @@ def border(density: Distribution, value: Tensor, mass: float, samples: int) -> B
 
 
 def class_border(density: Distribution, value: Int[Tensor, "batch"], mass: float) -> Border:
-    """Return the result for classes by enumeration; only the required part of the last label counts in the size."""
+    """Return the masses and the size of highest-density regions (`Border`) for classes, by summing over all classes.
+
+    The size is the number of most likely labels that hold the given mass. Of the last label only the part that is
+    needed counts, so that the size is not an integer.
+    """
     probability = class_probabilities(density).T
     at = probability.gather(0, require_labels(value.long(), len(probability)).unsqueeze(0))
     equal = EQUAL[torch.float32]
@@ -88,7 +95,15 @@ def class_border(density: Distribution, value: Int[Tensor, "batch"], mass: float
 
 
 def angle_border(moments: CircularMoments, log_prob: Float[Tensor, "batch"], mass: float) -> Border:
-    """Return the result for an angle by cubic interpolation of the density and its slope on a fine grid."""
+    """Return the masses and the size of highest-density regions (`Border`) for one angle.
+
+    They are computed by cubic interpolation of the density and its derivative on a fine grid.
+
+    Args:
+        moments: moments of the density, which give its values on the grid.
+        log_prob: log-density at the target.
+        mass: mass of the region whose size is returned.
+    """
     rows = max(1, BLOCK // (2 * FINER * len(moments.moments)))
     parts = zip(
         moments.moments.split(rows, 1), moments.resolved.split(rows), log_prob.split(rows), strict=True
@@ -132,7 +147,7 @@ class Cubic(NamedTuple):
 
     @classmethod
     def of(cls, moments: CircularMoments) -> "Cubic":
-        """Return the polynomials through density and slope of the given moments."""
+        """Return the polynomials that have the values and derivatives of the density with these moments."""
         density = moments.density(FINER)
         return cls(density, moments.density(FINER, slope=True) * (2 * math.pi / len(density)))
 
@@ -141,7 +156,7 @@ class Cubic(NamedTuple):
         return Cubic(self.density[:, chosen], self.slope[:, chosen])
 
     def above(self, level: Float[Tensor, "batch"]) -> tuple[Float[Tensor, "batch"], Float[Tensor, "batch"]]:
-        """Return the mass of the region in which the density is at least the level, and its length in radians."""
+        """Return the mass and the length, radians, of the region in which the density is at least `level`."""
         left, right = self.density, self.density.roll(-1, 0)
         rise, fall = self.slope, self.slope.roll(-1, 0)
         first, second = left >= level, right >= level
@@ -194,12 +209,15 @@ class Cubic(NamedTuple):
 def _border_part(
     ends: Float[Tensor, "4 cell"], level: Float[Tensor, "cell"], *, turning: bool
 ) -> tuple[Float[Tensor, "cell"], Float[Tensor, "cell"]]:
-    """Return the corrections of mass and length, in units of cells, for cells that a border crosses.
+    """Return what cells in which the region begins or ends add to its mass and length.
+
+    A border is a point at which the density crosses the level. The unit of length is the width of a cell.
 
     Args:
-        ends: density at the left and right end, slopes at the left and right end.
+        ends: density at the left and right end of each cell, then slopes at the left and right end.
         level: density at the border.
-        turning: whether the cell may hold two borders, one on each side of an extremum; otherwise it holds one.
+        turning: True if the cell may hold two borders, one on each side of an extremum; the cell was then counted as if
+            it held none, and the result corrects this. False if the cell holds one border and was not counted.
     """
     left, right, rise, fall = ends
     square, cube = 3 * (right - left) - 2 * rise - fall, 2 * (left - right) + rise + fall
@@ -238,9 +256,11 @@ def _root(function: Callable[[Tensor], Tensor], low: Tensor, high: Tensor) -> Te
 
 
 def sampled_border(density: Distribution, value: Tensor, mass: float, samples: int) -> Border:
-    """Return the result from the rank of the target's density among the densities of draws.
+    """Return the masses and the size of highest-density regions (`Border`), estimated from samples of the density.
 
-    The size of a region of one number is estimated as E[1{p(X) ≥ t} / p(X)].
+    The masses follow from the rank of the target's density among the densities of the samples. For one number, the size
+    of the region {x: p(x) ≥ t} is estimated as E[1{p(X) ≥ t} / p(X)], where the level t is the quantile of the sampled
+    densities with the given mass above it. For several numbers the size is NaN.
     """
     draws = density.sample(torch.Size((samples,)))
     log_prob, at = density.log_prob(draws).double(), density.log_prob(value).double()
@@ -260,7 +280,7 @@ def _sum_where(chosen: Tensor, probability: Tensor) -> Tensor:
 
 
 def _count_cells(mass: Float[Tensor, "cell batch"], wanted: float) -> Float[Tensor, "batch"]:
-    """Return the number of cells that hold the mass `wanted`, heaviest first, with a fraction of the last cell."""
+    """Return how many of the cells with the largest masses hold the mass `wanted`, with a fraction of the last one."""
     ordered = mass.sort(0, descending=True).values
     before = ordered.cumsum(0) - ordered
     share = torch.where(ordered > 0, (wanted - before) / ordered, 0.0)
@@ -270,9 +290,10 @@ def _count_cells(mass: Float[Tensor, "cell batch"], wanted: float) -> Float[Tens
 def coverage_probability(
     low: Tensor, high: Tensor, levels: Float[Tensor, "level"]
 ) -> Float[Tensor, "batch level"]:
-    """Return the probability that a number drawn uniformly between low and high is at most each level.
+    """Return for each level the probability that a number drawn uniformly from [`low`, `high`] is at most it.
 
-    This breaks ties without random numbers (nonrandomized transform of Czado, Gneiting & Held 2009, eq. 2).
+    With it, targets whose density equals that of other values count without random numbers (nonrandomized transform of
+    Czado, Gneiting & Held 2009, eq. 2).
     """
     low, high = low.unsqueeze(-1), high.unsqueeze(-1)
     width = high - low

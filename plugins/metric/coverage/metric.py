@@ -34,8 +34,9 @@ class Coverage(Metric, HasFigure):
       0.9, for classes, one angle and one real number. Of two models with the right coverage, the one with smaller
       regions is better.
 
-    If many values are equally dense, as classes often are, h is any number between two masses. A target then counts
-    with the probability that a number drawn uniformly between these masses lies below the level.
+    If many values have the same density as the target, as classes often do, h can be any number between two masses:
+    that of all denser values, and that of all values at least as dense. A target is then counted with the probability
+    that a number drawn uniformly between these two is at most the mass of the region.
 
     Args:
         samples: number of draws for a density whose regions are not known: several angles, rotations, mixtures over

@@ -65,7 +65,7 @@ def _draws(density: Distribution, samples: int) -> Tensor:
 
 
 def normal_mixture_score(density: Normals, value: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-    """Return the score of a mixture of K normals in closed form (Grimit et al. 2006, eq. 8), in O(K²)."""
+    """Return the score of a mixture of K normals by its formula (Grimit et al. 2006, eq. 8), with O(K²) operations."""
     weights = density.log_weights.exp()
     to_value = _weighted(weights, absolute_mean(value.unsqueeze(-1) - density.mean, density.scale)).sum(-1)
     if density.mean.shape[-1] == 1:
@@ -79,7 +79,10 @@ def normal_mixture_score(density: Normals, value: Float[Tensor, "*batch"]) -> Fl
 
 
 def _between(weights: Tensor, mean: Tensor, scale: Tensor) -> Tensor:
-    """Return ΣΣ w_i w_j E|X_i - X_j|; each argument is (rows, component)."""
+    """Return Σ_i Σ_j w_i w_j E|X_i - X_j| for independent X_i ~ N(`mean`_i, `scale`_i²) with the weights w_i.
+
+    Each argument is (rows, component), and the sums are over the components.
+    """
     difference = mean.unsqueeze(-1) - mean.unsqueeze(-2)
     both = torch.hypot(scale.unsqueeze(-1), scale.unsqueeze(-2))
     pairs = weights.unsqueeze(-1) * weights.unsqueeze(-2)
@@ -92,7 +95,11 @@ def _weighted(weights: Tensor, numbers: Tensor) -> Tensor:
 
 
 def absolute_mean(mean: Tensor, scale: Tensor) -> Tensor:
-    """Return E|Z| for Z ~ N(μ, σ²): 2σφ(μ/σ) + μ(2Φ(μ/σ) - 1) (Grimit et al. 2006, after eq. 8); |μ| if σ = 0."""
+    """Return E|Z| for Z ~ N(μ, σ²), with μ in `mean` and σ in `scale`.
+
+    It is 2σφ(μ/σ) + μ(2Φ(μ/σ) - 1) with the standard normal density φ and distribution function Φ (Grimit et al. 2006,
+    after eq. 8), and |μ| if σ = 0.
+    """
     standard = torch.where(mean == 0, mean, mean / scale)
     bell = torch.exp(-standard.square() / 2) * math.sqrt(2 / math.pi)
     return scale * bell + mean * torch.erf(standard / math.sqrt(2))
@@ -101,7 +108,10 @@ def absolute_mean(mean: Tensor, scale: Tensor) -> Tensor:
 def fair_estimate(
     draws: Float[Tensor, "samples *batch"], value: Float[Tensor, "*batch"], *, circular: bool
 ) -> Score:
-    """Return the mean of unbiased estimates from `REPLICATES` parts of the draws, and its standard error."""
+    """Return the score that is estimated without bias from draws of the density, and its standard error.
+
+    The estimate is the mean of the estimates from `REPLICATES` parts of the draws. `circular` is true for an angle.
+    """
     size = len(draws) // REPLICATES
     parts = draws[: size * REPLICATES].unflatten(0, (REPLICATES, size)).transpose(0, 1)
     if circular:
@@ -125,8 +135,9 @@ def mean_distance(draws: Float[Tensor, "samples *batch"]) -> Float[Tensor, "*bat
 def mean_angular_distance(draws: Float[Tensor, "samples *batch"]) -> Float[Tensor, "*batch"]:
     """Return the mean angular distance over all pairs of S angles, radians, in O(S log S).
 
-    The distance of two angles is the measure of all diameters t in [0, π) that separate them. If n(t) angles are on one
-    side of a diameter, n (S - n) pairs are separated. n(t) changes by one at each angle modulo π.
+    A diameter of the circle at the angle t separates two angles if they lie on different sides of it. The angular
+    distance of two angles is the measure of all t in [0, π) at which the diameter separates them. If n(t) angles are on
+    one side of the diameter, it separates n (S - n) pairs. n(t) changes by one at each angle modulo π.
     """
     count = len(draws)
     angle = wrap(draws)

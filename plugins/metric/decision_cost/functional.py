@@ -32,7 +32,10 @@ def decide(expected: Float[Tensor, "*batch action"]) -> Int[Tensor, "*batch"]:
 def expected_costs(
     probability: Float[Tensor, "*batch truth"], costs: Float[Tensor, "truth action"]
 ) -> Float[Tensor, "*batch action"]:
-    """Return Σ_truth p(truth) cost(truth, action), float64; probability 0 times an infinite cost is 0."""
+    """Return the expected cost of each action, Σ_truth p(truth) cost(truth, action), float64.
+
+    A truth is a class or region that may be the true one. Probability 0 times an infinite cost counts as 0.
+    """
     probability = probability.double().unsqueeze(-1)
     return torch.where(probability == 0, 0.0, probability * costs.double()).sum(-2)
 
@@ -44,7 +47,9 @@ def decide_by_draws(
     actions: Sequence[str],
     samples: int = 1000,
 ) -> tuple[Int[Tensor, "*batch"], Float[Tensor, "*batch action"]]:
-    """Return the best action under any cost function, and the expected costs: means over draws of the density.
+    """Return the action with the lowest expected cost under any cost function, and the expected costs of all actions.
+
+    Expected costs are means over draws of the density.
 
     Args:
         density: density of any kind, batch_shape (*batch).
@@ -100,8 +105,8 @@ def region_probabilities(
 def regions(value: Tensor, edges: Float[Tensor, "edge"], *, around: bool) -> Int[Tensor, "*shape"]:
     """Return the index of the region in which each value lies; an edge belongs to the region above it.
 
-    On a line, region 0 is below the first edge. On a circle, region 0 begins at the first edge, counter-clockwise, and
-    the last region ends there.
+    On a line (`around` is false), region 0 is below the first edge. On a circle (`around` is true), region 0 begins
+    counter-clockwise at the first edge, and the last region ends there.
     """
     if not around:
         return torch.bucketize(value.double().contiguous(), edges, right=True)
@@ -120,7 +125,10 @@ def _intervals(density: Distribution, edges: Tensor) -> Tensor | None:
 
 
 def _arcs(density: Distribution, edges: Tensor) -> Tensor:
-    """Return the probabilities of the arcs; infinite for densities that are too narrow for the grid."""
+    """Return the probabilities of the arcs from each edge to the next.
+
+    They are infinite for densities that are too narrow for the grid on which probabilities are computed.
+    """
     shape = torch.Size((len(edges), *density.batch_shape))
     start, end = (
         e.reshape(-1, *(1,) * len(density.batch_shape)).expand(shape) for e in (edges, edges.roll(-1))

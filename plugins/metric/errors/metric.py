@@ -16,7 +16,10 @@ FIRST = 6
 
 
 class Errors(Mean):
-    """Base class of errors that are a mean power of the error, over all numbers of the target and for each number.
+    """Base class of metrics that are computed from the mean of |error| or error², such as MAE and RMSE.
+
+    The error is that of the point prediction. The metric is computed over all numbers of the target, and for each
+    number separately if there are few.
 
     Raises:
         ConfigError: the target is not real-valued.
@@ -33,11 +36,16 @@ class Errors(Mean):
 
     @abstractmethod
     def power(self, error: Float[Tensor, "batch number"]) -> Float[Tensor, "batch number"]:
-        """Return the power of the error, such as its square."""
+        """Return the function of the error whose mean is taken, such as its square."""
 
     @abstractmethod
     def result(self, mean: Tensor, error: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the reported result and its standard error, from the mean power and its standard error."""
+        """Return the reported number and its standard error.
+
+        Args:
+            mean: mean of `power` over samples.
+            error: standard error of this mean.
+        """
 
     def update(self, prediction: Prediction) -> None:
         # convert to float64 first, so that the difference is not rounded to float32

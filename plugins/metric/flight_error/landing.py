@@ -1,4 +1,4 @@
-"""Landing places, at which paths come down through a plane, and accuracy of sampled landing places."""
+"""Landing places of a ball, where its path comes down through a horizontal plane, and accuracy of sampled ones."""
 
 from typing import NamedTuple
 
@@ -39,7 +39,7 @@ def last_seen(inputs: Tensor | None, truth: Float[Tensor, "batch time 3"]) -> Fl
 
 
 def from_start(start: Float[Tensor, "batch 3"], path: Float[Tensor, "*draw batch time 3"]) -> Tensor:
-    """Return the path with the start as an additional first position."""
+    """Return `path` with `start` inserted as its first position, (*draw, batch, time + 1, 3)."""
     first = start.expand(*path.shape[:-3], -1, -1).unsqueeze(-2)
     return torch.cat([first.to(path), path], -2)
 
@@ -67,13 +67,16 @@ def crossing(
 def landings(
     draws: Float[Tensor, "draw batch time 3"], truth: Float[Tensor, "batch time 3"], height: float
 ) -> Float[Tensor, "4"]:
-    """Return sums over the windows whose true path lands.
+    """Return four sums over the samples whose true path lands.
 
-    The sums are: number of windows, CRPS (m), number of true places inside the ellipse, share of draws that do not
-        land.
+    The sums are: the number of these samples; the CRPS of the landing place (m); the number of true landing places
+    inside the ellipse; and the share of draws that do not land.
 
-    The CRPS of draws x_i is mean |x_i - y| - 1/2 mean |x_i - x_j|, i ≠ j (Gneiting & Raftery 2007, eq. 21). The ellipse
-    holds 90 % of a normal with the mean and covariance of the draws: (y - m)ᵀ C⁻¹ (y - m) ≤ χ²(0.9) = 4.605.
+    With the true landing place y, the CRPS of draws x_i is mean |x_i - y| - 1/2 mean |x_i - x_j| over i ≠ j, as a mean
+    over x and y coordinates (Gneiting & Raftery 2007, eq. 21). The ellipse holds 90 % of a normal density with the mean
+    m and the covariance C of the draws: (y - m)ᵀ C⁻¹ (y - m) ≤ 4.605, the 90 % quantile of χ² with two degrees of
+    freedom. If fewer than 10 draws land, the CRPS is replaced by the mean distance of the draws' last positions from y,
+    and y counts as outside of the ellipse.
     """
     place, lands = crossing(truth, height)
     points, lands_there = crossing(draws, height)

@@ -13,7 +13,7 @@ from framework.prediction import Prediction
 
 
 class Moments(Metric):
-    """Base class of both metrics: moments of log-likelihoods, and sums for the error due to sampling."""
+    """Base class of the metrics of log-likelihood; its states are moments, and sums for the sampling error."""
 
     moments: Tensor
     sampling: Tensor
@@ -81,7 +81,15 @@ class NegativeLogLikelihood(Moments):
 def summary(
     name: str, moments: Float[Tensor, "3"], sampling: Float[Tensor, "5"]
 ) -> dict[str, Float[Tensor, ""]]:
-    """Return mean and standard error under `name`, and the sampling error if log_prob is an estimate."""
+    """Return the results of a metric: the mean under the key `name`, and its standard error under `<name>_sem`.
+
+    If log_prob is a Monte Carlo estimate, the results of the sampling are returned too.
+
+    Args:
+        name: key of the mean.
+        moments: moments as returned by `compute_moments`.
+        sampling: sums as returned by `summarize_sampling`.
+    """
     count, mean, squares = moments
     has_samples = count > 0
     results = {
@@ -103,7 +111,7 @@ def summary(
 
 
 def compute_moments(values: Float[Tensor, "samples"]) -> Float[Tensor, "3"]:
-    """Return (n, mean, Σ(x - mean)²) in float64; zeros if there are no values."""
+    """Return the number n of values x, their mean, and Σ(x - mean)², in float64; zeros if there are no values."""
     values = values.detach().double()
     count = values.new_tensor(len(values))
     if len(values) == 0:
@@ -113,7 +121,7 @@ def compute_moments(values: Float[Tensor, "samples"]) -> Float[Tensor, "3"]:
 
 
 def summarize_sampling(estimate: Estimate) -> Float[Tensor, "5"]:
-    """Return sums and a maximum of the sampling of an estimate, float64.
+    """Return sums over the items of an estimate of log-likelihoods, and a maximum, float64.
 
     Returns:
         Sum of debiased log-likelihoods, sum of squared errors, number of samples, number of items above the tolerance,
@@ -133,7 +141,7 @@ def summarize_sampling(estimate: Estimate) -> Float[Tensor, "5"]:
 
 
 def merge_sampling(parts: Float[Tensor, "parts 5"]) -> Float[Tensor, "5"]:
-    """Return the result of `summarize_sampling` for all items, from the results for disjoint parts."""
+    """Return what `summarize_sampling` gives for all items, from its results for disjoint parts of the items."""
     return torch.cat([parts[:, :4].sum(0), parts[:, 4:].amax(0)])
 
 

@@ -88,9 +88,9 @@ class OutOfDistribution(Metric):
 def uncertainty_score(density: Distribution) -> Float64[Tensor, "batch"]:
     """Return a score that is high for uncertain densities.
 
-    For classes, the score is 1 - max_k p_k; for other targets, it is the negative log-density at the mode. 1 - p is
-    computed as the sum over the other classes. This keeps its digits, and so the order of almost certain samples, even
-    if p rounds to 1.
+    For classes, the score is 1 - max_k p_k; for other targets, it is the negative log-density at the mode. 1 - max_k
+    p_k is computed as the sum of the probabilities of all other classes. So the score of almost certain samples keeps
+    its digits, and their order, even if the largest probability rounds to 1.
     """
     if density.has_enumerate_support:
         return class_probabilities(density).sort(-1).values[:, :-1].sum(-1)

@@ -46,14 +46,20 @@ def _circular(density: Distribution, value: Tensor, samples: int) -> Tensor:
 
 
 def _rank(ahead: Float[Tensor, "samples batch"]) -> Float[Tensor, "batch"]:
-    """Return the rank of zero among the samples as a share in (0, 1); a tie counts half. NaN if a sample is NaN."""
+    """Return the rank of 0 among the numbers in `ahead` as a share in (0, 1); NaN if a number is NaN.
+
+    `ahead` holds the difference of each sample from the target. A sample that equals the target counts half.
+    """
     below = (ahead < 0).double().sum(0) + (ahead == 0).double().sum(0) / 2
     share = (below + 0.5) / (len(ahead) + 1)
     return torch.where(ahead.isnan().any(0), torch.nan, share)
 
 
 def kolmogorov_smirnov(values: Float[Tensor, "count"]) -> Float[Tensor, ""]:
-    """Return sup |F̂(u) - u| over [0, 1]; NaN without values or if a value is NaN."""
+    """Return sup |F̂(u) - u| over u in [0, 1]; NaN without values or if a value is NaN.
+
+    F̂ is the empirical distribution function of `values`.
+    """
     count = len(values)
     if count == 0:
         return values.new_tensor(torch.nan)
@@ -63,9 +69,9 @@ def kolmogorov_smirnov(values: Float[Tensor, "count"]) -> Float[Tensor, ""]:
 
 
 def cramer_von_mises(values: Float[Tensor, "count"]) -> Float[Tensor, ""]:
-    """Return ∫ (F̂(u) - u)² du, the Cramér-von Mises statistic divided by the count.
+    """Return ∫ (F̂(u) - u)² du over [0, 1], the Cramér-von Mises statistic divided by the number of values.
 
-    The result is NaN without values or if a value is NaN.
+    F̂ is the empirical distribution function of `values`. The result is NaN without values or if a value is NaN.
     """
     count = len(values)
     if count == 0:

@@ -12,9 +12,10 @@ from framework.errors import UserError
 
 
 class Transform(NamedTuple):
-    """F at both ends of the interval that is rounded to each stored value, (*batch, *event), float64.
+    """Distribution function at both ends of the interval of numbers that are rounded to a stored value.
 
-    The probability integral transform of a rounded value is any number between `low` and `high`.
+    `low` and `high` are (*batch, *event), float64. The probability integral transform of the number before it was
+    rounded lies between them.
     """
 
     low: Tensor
@@ -22,7 +23,7 @@ class Transform(NamedTuple):
 
 
 def transform(density: Distribution, value: Tensor, steps: int) -> Transform:
-    """Return the distribution function at both ends of the interval that is rounded to each stored value.
+    """Return the distribution function at both ends of the interval of numbers that are rounded to each stored value.
 
     A stored value stands for all values that are rounded to it: half a step to either side; a stored 0 or 1 also stands
     for all values below or above.
@@ -52,9 +53,10 @@ def transform(density: Distribution, value: Tensor, steps: int) -> Transform:
 def coverage(transforms: Transform, levels: Float[Tensor, "level"]) -> Float[Tensor, "level"]:
     """Return the share of the values that lie in their central intervals of each mass; NaN without values.
 
-    A value counts with the probability that a number drawn uniformly between `low` and `high` lies between
-    (1 - level) / 2 and (1 + level) / 2. This needs no random numbers (nonrandomized transform of Czado, Gneiting & Held
-    2009, eq. 2). The expected share equals the level if the densities are those of the true values before rounding.
+    The levels are the masses of the intervals. A value counts with the probability that a number drawn uniformly
+    between `low` and `high` of its transform lies between (1 - level) / 2 and (1 + level) / 2. This needs no random
+    numbers (nonrandomized transform of Czado, Gneiting & Held 2009, eq. 2). The expected share equals the level if the
+    densities are those of the true values before rounding.
     """
     low, high = (part.flatten() for part in transforms)
     width = high - low

@@ -33,7 +33,10 @@ class FittedImage(NamedTuple):
 def place_errors(
     predicted: Float[Tensor, "*batch number"], true: Float[Tensor, "*#batch number"]
 ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
-    """Return the degrees between two rotations and the centimetres between two translations, float64."""
+    """Return the angle between two rotations, degrees, and the distance between two translations, cm, float64.
+
+    The first three numbers of a target are the rotation, axis times angle, and the next three the translation, metres.
+    """
     predicted, true = predicted.double(), true.double().expand_as(predicted)
     predicted_rotation, true_rotation = (
         rotation_minus_identity(numbers[..., :3]) + torch.eye(3, dtype=torch.float64, device=numbers.device)

@@ -45,7 +45,10 @@ def draw_error_curves(axis: Axes, path: Float[Tensor, "step 4"]) -> None:
 
 
 def draw_errors(degrees_and_centimetres: Float[Tensor, "sample 2"], title: str, *, synthetic: bool) -> Figure:
-    """Return a figure of both errors of every sample, for predictions without a descent to show."""
+    """Return a figure of the rotation error and the translation error of every sample.
+
+    It is for predictions that store no descent.
+    """
     figure = titled_figure((5.0, 4.2), title, synthetic)
     axis = figure.subplots()
     degrees, centimetres = degrees_and_centimetres.clamp(min=1e-3).T

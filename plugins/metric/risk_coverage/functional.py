@@ -8,10 +8,11 @@ from torch import Tensor
 
 
 def curve(confidence: Float[Tensor, "count"], risk: Float[Tensor, "count"]) -> Float[Tensor, "count"]:
-    """Return the mean risk of the k most confident predictions, k = 1 ... n, averaged over the orders of ties.
+    """Return the mean risk of the k most confident predictions for k = 1 ... n.
 
-    If a group of ties with mean risk g follows a samples with total risk A, any j samples of the group have the
-    expected total risk j·g. The mean risk of the first a + j samples is then (A + j·g)/(a + j).
+    Ties are predictions of equal confidence; the result is the average over all their orders. Let the a most confident
+    predictions have the total risk A, and a group of ties with the mean risk g follow. Any j predictions of the group
+    have the expected total risk j·g, so the mean risk of the first a + j predictions is (A + j·g)/(a + j).
     """
     count = len(risk)
     risk = risk.double()
@@ -30,9 +31,9 @@ def area(curve: Float[Tensor, "count"]) -> Float[Tensor, ""]:
 
 
 def at_coverage(curve: Float[Tensor, "count"], coverage: float) -> Float[Tensor, ""]:
-    """Return the risk at a coverage, for the smallest number of predictions that is at least this share.
+    """Return the mean risk of the most confident predictions that make up a share `coverage` of all.
 
-    The result is NaN without predictions.
+    Their number is rounded up. The result is NaN without predictions.
     """
     if len(curve) == 0:
         return curve.new_tensor(torch.nan)

@@ -147,10 +147,19 @@ def entropy_and_mode_mass(
     points: int,
     samples: int,
 ) -> tuple[Float[Tensor, "batch"], Float[Tensor, "batch modes"]]:
-    """Return the entropy (nats) of a density of one angle, and its mass within ±π/(2n) of azimuth + 2πk/n, k < n.
+    """Return the entropy (nats) of a density of one angle, and its mass around each mode of the true posterior.
 
-    Both integrals use the trapezium rule on the circle. A grid cell that the edge of a window cuts counts with the part
-    inside the window.
+    For the symmetry n, the mass of mode k < n is that in the window of ±π/(2n) around azimuth + 2πk/n. Both integrals
+    use the trapezium rule on the circle. A grid cell that the edge of a window cuts counts with the part inside the
+    window. If the density is too narrow for the grid of `points` angles, both are estimated from `samples` draws.
+
+    Args:
+        density: density of the azimuth, batch_shape (batch,).
+        azimuth: annotated azimuth, radians.
+        symmetry: n of each sample; 0 is read as 1.
+        modes: largest n; the masses of modes that a sample does not have are 0.
+        points: number of angles on the grid.
+        samples: number of draws for a density that is too narrow.
     """
     step = 2 * math.pi / points
     # the grid starts at the annotated azimuth, so that windows and modes lie at the same grid points for every sample

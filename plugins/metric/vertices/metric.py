@@ -160,7 +160,11 @@ def bins(distance: Float[Tensor, "batch vertex"]) -> Tensor:
 
 
 def quantile(histogram: Float[Tensor, "bins"], share: float) -> Float[Tensor, ""]:
-    """Return the middle of the bin that reaches the cumulated share; 0 for the first bin, NaN if all are empty."""
+    """Return the quantile `share` of the distances in a histogram, centimetres.
+
+    It is the middle of the bin in which the cumulated share of distances reaches `share`; 0 if this is the first bin,
+    and NaN if all bins are empty.
+    """
     total = histogram.sum()
     index = torch.searchsorted(histogram.cumsum(0), share * total).clamp(max=BINS - 1)
     middle = LOWEST * (HIGHEST / LOWEST) ** ((index.double() + 0.5) / BINS)

@@ -59,7 +59,10 @@ class Viewpoint(Metric):
 
 
 def _median(values: Tensor) -> Tensor:
-    """Return the median (of an even count, the mean of the middle two); NaN without values or if a value is NaN."""
+    """Return the median of the values, for an even number of values the mean of the middle two.
+
+    It is NaN without values or if a value is NaN.
+    """
     if len(values) == 0 or values.isnan().any():
         return values.new_tensor(torch.nan)
     ordered, count = values.sort().values, len(values)
