@@ -1,1 +1,1 @@
-"""Frozen models: one CPU core, no gradient, and no parts that only training needs."""
+"""Deployment of trained models: as frozen models on one CPU core without gradients, and on MLflow's server."""

@@ -1,9 +1,9 @@
 """The deployable form of a trained model, without gradients and without the parts that only training needs.
 
 The computation from features to raw parameters is read from the model's graph (torch.export), so no encoder has to
-declare its layers. If the graph has fully connected layers only, batch norm is folded into the neighbouring weights,
-dropout is removed, and NumPy and one compiled function compute the result, on one CPU core. Any other model is run by
-torch unchanged, without gradients.
+declare its layers. If the graph contains fully connected layers only, batch norm is folded into the weights of the
+neighbouring layers, dropout is removed, and NumPy and one compiled function compute the raw parameters on one CPU core.
+Any other model is run by torch unchanged, without gradients.
 """
 
 import copy
@@ -46,12 +46,12 @@ def freeze(
 
 
 def freeze_predictor(predictor: Predictor, input_shape: Sequence[int] | None = None) -> "Frozen":
-    """Return the deployable form of a copy of a predictor, which later training does not change.
+    """Return the deployable form of a copy of a predictor; training the original later does not change the copy.
 
     Args:
-        predictor: a predictor that was not loaded from a run.
-        input_shape: shape of one sample, for a predictor without fixed encoders in front. If it is not given, the first
-            call determines it and takes seconds.
+        predictor: a trained predictor that was not loaded from a run or checkpoint.
+        input_shape: shape of one input, for a predictor that does not begin with fixed encoders. If it is None, it is
+            read from the inputs of the first call, which then takes seconds.
 
     Raises:
         ConfigError: the predictor was loaded from a run and reads raw input; use `freeze` instead.
@@ -65,12 +65,13 @@ def freeze_predictor(predictor: Predictor, input_shape: Sequence[int] | None = N
 
 @final
 class Frozen:
-    """Deployable model: a function from inputs to predictions.
+    """Deployable form of a predictor: a function from inputs to predictions.
 
-    Its results have the type of the predictor's parameters and agree with the predictor's to 1e-6.
+    Its predictions have the data type of the predictor's parameters, and differ by at most 1e-6 from those of the
+    predictor.
 
     Attributes:
-        form: description of how the results are computed.
+        form: sentence that describes how the predictions are computed.
     """
 
     def __init__(
@@ -103,7 +104,8 @@ class Frozen:
 
         Raises:
             DataError: `inputs` is no input of this model.
-            ValueError: a raw parameter is not finite; the message names the first such batch row.
+            ValueError: a raw parameter is not finite; the message names the first row of the batch with such a
+                parameter.
         """
         features, network, frame = self._features(inputs)
         if network is not None and network.classes:
@@ -130,10 +132,10 @@ class Frozen:
         return density if frame is None else AffineDensity(density, *frame)
 
     def _features(self, inputs: Any) -> tuple[Any, Network | None, Frame | None]:
-        """Return the features for the inner predictor, its network, and the coordinate frame of the predictions.
+        """Return the features, the network that reads them, and the map from predictions to the user's unit (`Frame`).
 
-        The network is None if torch computes the prediction. The features have the type and shape that the network
-        (an array) or torch (a tensor) requires.
+        The network is None if torch computes the raw parameters; the features are then a tensor, and otherwise an array
+        (batch, length). The map is None if predictions are in the user's unit already.
         """
         frame = None
         if self.data is not None:
@@ -159,7 +161,7 @@ class Frozen:
         return np.ascontiguousarray(flat, dtype=network.dtype), network, frame
 
     def _density(self, features: Any, network: Network | None) -> Distribution:
-        """Return the density for features, computed by the network or by torch."""
+        """Return the density for features, computed with `network` or, if it is None, by torch."""
         if network is None:
             return self.inner(features)
         raw = torch.from_numpy(network(features))
@@ -169,7 +171,7 @@ class Frozen:
         return self.inner.head(raw)
 
     def _read(self, shape: tuple[int, ...]) -> None:
-        """Read the model's network for features of this shape, if all its layers are fully connected."""
+        """Set `network` to the model's layers, for features of this shape, if all are fully connected; set `form`."""
         if not isinstance(self.inner, Model):
             self.form = f"{type(self.inner).__name__} in torch, without gradient"
             return

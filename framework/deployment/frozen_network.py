@@ -22,15 +22,15 @@ from framework.model import Model
 from framework.storage.kernels import compiler, kernel_cache
 
 LEAVES = (nn.Linear, nn.BatchNorm1d, nn.ReLU, nn.Dropout, nn.Flatten, nn.Identity, nn.Sequential)
-"""Layers that a network may have; models with other layers are not exported, which would take long and fail."""
+"""Layers that a network may have; a model with other layers is not exported, because that takes long and fails."""
 MOST_RAW = 2048  # largest number of raw parameters of a head that is tested for a softmax
 
 
 @dataclass
 class Layer:
-    """Step of a fully connected layer: register `source` @ `weight` + `bias`.
+    """Step of a `Network` that computes a fully connected layer: registers[source] @ weight + bias.
 
-    `weight` has the shape (inputs, outputs). If `rectified` is True, negative results are set to 0.
+    `weight` has the shape (inputs, outputs). If `rectified` is True, negative outputs are set to 0.
     """
 
     source: int
@@ -39,7 +39,7 @@ class Layer:
     rectified: bool = False
 
     def __call__(self, registers: Sequence[np.ndarray]) -> np.ndarray:
-        """Return the result of the layer, (batch, outputs)."""
+        """Return the outputs of the layer, (batch, outputs)."""
         numbers = registers[self.source]
         if len(numbers) == 1:
             result = np.empty((1, len(self.bias)), self.bias.dtype)
@@ -55,7 +55,7 @@ class Layer:
 
 
 class Concatenation(NamedTuple):
-    """Step that concatenates registers along the second dimension."""
+    """Step of a `Network` that concatenates the registers `sources` along the second dimension."""
 
     sources: tuple[int, ...]
 
@@ -66,15 +66,16 @@ class Concatenation(NamedTuple):
 
 @dataclass
 class Network:
-    """Steps from features (batch, length), which are register 0, to raw parameters.
+    """Sequence of steps that computes raw parameters from features.
 
-    Each step reads earlier registers, and its result is the next register.
+    The intermediate arrays are called registers and numbered. Register 0 has the features, (batch, length). Each step
+    reads registers of earlier numbers, and its output is the next register.
 
     Attributes:
         steps: the steps, in order.
         result: number of the register with the raw parameters.
-        dtype: type of all numbers.
-        classes: True if the result is class logits instead of the head's raw parameters.
+        dtype: data type of all numbers.
+        classes: True if the register `result` has class logits instead of raw parameters.
     """
 
     steps: list[Layer | Concatenation]
@@ -140,7 +141,10 @@ def read_network(model: Model, shape: tuple[int, ...]) -> Network | None:
 
 @torch.no_grad()
 def agrees(network: "Network", module: nn.Module, inputs: Tensor) -> bool:
-    """Return whether network and module give the same raw parameters, up to rounding that batch norm may amplify."""
+    """Return whether network and module give the same raw parameters for `inputs`, up to rounding errors.
+
+    Batch norm may amplify rounding errors, so 10⁴ times the machine precision is allowed.
+    """
     actual, expected = network(inputs.flatten(1).double().numpy()), module(inputs).numpy()
     allowed = 1e4 * np.finfo(expected.dtype).eps * max(1.0, float(np.abs(expected).max()))
     return bool(np.abs(actual - expected).max() <= allowed)
@@ -151,7 +155,10 @@ class UnreadableGraph(Exception):
 
 
 class Signal(NamedTuple):
-    """Value of a graph node as scale * register + shift, element by element; None stands for scale 1 and shift 0."""
+    """Value of a node of a model's graph as scale * (content of the register) + shift, element by element.
+
+    None stands for a scale of 1 and a shift of 0.
+    """
 
     register: int
     scale: np.ndarray | None = None
@@ -159,7 +166,7 @@ class Signal(NamedTuple):
 
 
 class _Reader:
-    """Converter of an exported graph into a network of float64."""
+    """Converter of a model's exported graph (torch.export) into a `Network` of float64."""
 
     def __init__(self, exported: torch.export.ExportedProgram) -> None:
         self.graph = exported.graph
@@ -192,7 +199,7 @@ class _Reader:
         return Network(self.steps, result.register, np.dtype(np.float64))
 
     def _signal(self, node: Node, name: str) -> Signal:
-        """Return the signal of a node; add a step if the node needs one."""
+        """Return the value of a node; add a step to the network if the node needs one."""
         arguments: Any = node.args
         if name == "cat":
             return self._concatenate(arguments[0], arguments[1:])
@@ -219,7 +226,7 @@ class _Reader:
         raise UnreadableGraph
 
     def _add_layer(self, source: Signal, arguments: Any) -> Signal:
-        """Add a fully connected layer, and return its signal."""
+        """Add a step for a fully connected layer, and return the value of its node."""
         weight = self.numbers[arguments[1].name].T
         bias = self._parameter(arguments, 2, np.zeros(weight.shape[1]))
         if source.scale is not None:
@@ -231,7 +238,7 @@ class _Reader:
     def _fold_batch_norm(self, source: Signal, arguments: Any) -> Signal:
         """Fold batch norm, (x - mean) / √(variance + ε) * weight + bias, into a neighbouring layer.
 
-        This is the layer before it if possible, and otherwise the layer after it.
+        It is folded into the layer before it if no other node reads that layer, and otherwise into the layer after it.
         """
         mean, variance = (self.numbers[arguments[index].name] for index in (3, 4))
         scale = self._parameter(arguments, 1, np.ones_like(mean)) / np.sqrt(variance + arguments[7])
@@ -244,7 +251,7 @@ class _Reader:
         return Signal(source.register, source.scale * scale, source.shift * scale + shift)
 
     def _concatenate(self, nodes: Sequence[Node], axis: Sequence[int]) -> Signal:
-        """Add a concatenation, and return its signal."""
+        """Add a step for a concatenation, and return the value of its node."""
         if any(node.meta["val"].dim() != 2 for node in nodes) or list(axis) not in ([1], [-1]):
             raise UnreadableGraph
         signals = [self.signals[node] for node in nodes]
@@ -258,7 +265,7 @@ class _Reader:
         return Signal(len(self.steps), np.concatenate(scale), np.concatenate(shift))
 
     def _exclusive_layer(self, node: Node) -> Layer | None:
-        """Return the layer that computes a node, if no other node reads the layer's result; otherwise None."""
+        """Return the layer that computes a node if no other node reads the layer's output; None otherwise."""
         register = self.signals[node].register
         step = self.steps[register - 1] if register else None
         nodes = [other for other, signal in self.signals.items() if signal.register == register]
@@ -266,7 +273,7 @@ class _Reader:
         return step if isinstance(step, Layer) and not step.rectified and exclusive else None
 
     def _parameter(self, arguments: Any, index: int, otherwise: np.ndarray) -> np.ndarray:
-        """Return the parameter at `index` of a node's arguments, or `otherwise` if it is missing."""
+        """Return the parameter at position `index` in the arguments of a node, or `otherwise` if there is none."""
         present = len(arguments) > index and arguments[index] is not None
         return self.numbers[arguments[index].name] if present else otherwise
 
@@ -275,9 +282,9 @@ class _Reader:
 def affine_logits(head: DensityHead) -> tuple[np.ndarray, np.ndarray] | None:
     """Return matrix (size, class) and constant (class,) of a head whose density is softmax(raw @ matrix + constant).
 
-    They are computed in float64 from the head's densities at 0 and at each unit vector, and checked at random raw
-    parameters of several magnitudes. So no head has to declare them. For a head that is not affine at these points the
-    result is None, and torch computes its density.
+    They are computed in float64 from the head's densities for the raw parameters 0 and each unit vector, and checked
+    with random raw parameters of several magnitudes. So no head has to declare them. The function returns None for any
+    other head, whose density torch computes.
     """
     if head.size > MOST_RAW:
         return None
@@ -305,8 +312,8 @@ compiled = compiler(kernel_cache("frozen_network", [Path(__file__)]))
 def compute_layer(numbers, weight, bias, rectified, outputs):
     """Compute outputs = numbers @ weight + bias for one sample, without reading the weights of inputs that are 0.
 
-    For one sample, most of the time is spent on reading weights, and after a ReLU about half of the inputs are 0. Eight
-    inputs are added at a time, so that the outputs are read and written an eighth as often.
+    For one sample, reading the weights takes most of the time, and after a ReLU about half of the inputs are 0. Eight
+    inputs are processed at a time, so that the outputs are read and written eight times less often.
     """
     length, width = weight.shape
     nonzero = np.empty(length, np.int64)
@@ -341,7 +348,7 @@ def compute_layer(numbers, weight, bias, rectified, outputs):
 @compiled
 @no_type_check
 def softmax(logits):
-    """Replace each row of logits by its softmax; a row with a number that is not finite becomes NaN."""
+    """Replace each row of `logits`, in place, by its softmax; a row with a number that is not finite becomes NaN."""
     for row in range(logits.shape[0]):
         largest = logits[row, 0]
         for j in range(logits.shape[1]):

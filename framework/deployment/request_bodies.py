@@ -20,16 +20,16 @@ MOST_FILES = 64
 MOST_ROWS = 2**17
 """Largest number of rows of a request, and of samples in its files."""
 MOST_VALUES = 2**20
-"""Largest number of values in a body of JSON or CSV; lists, dictionaries and empty cells count as one value each."""
+"""Largest number of values in a body of JSON or CSV; each list, dictionary and empty cell counts as one value."""
 MOST_DEPTH = 32
 """Largest depth of nested lists and dictionaries in JSON."""
 MOST_INPUTS = 2**25
 """Largest number of numbers in all model inputs of a request."""
 AT_ONCE = 2**28
-"""Largest total size of the bodies that the server keeps at a time, bytes; a single body is always accepted."""
+"""Largest total size, in bytes, of the bodies that the server holds at a time; a single body may exceed it."""
 
 FORMS = ("dataframe_split", "dataframe_records", "instances", "inputs")
-"""Keys of JSON under which MLflow accepts rows."""
+"""Keys of a JSON body under which MLflow accepts rows."""
 
 
 class Refusal(Exception):
@@ -85,7 +85,10 @@ def require_bounded(body: bytes, kind: str) -> None:
 
 
 def _require_few_values(body: bytes) -> None:
-    """Check number of values and depth of possibly malformed JSON, in bounded memory and without parsing it."""
+    """Refuse JSON with too many values or too deep nesting, in bounded memory and without parsing it.
+
+    The JSON may be malformed.
+    """
     # Remove escaped backslashes and quotation marks, so that every remaining quotation mark begins or ends a text.
     plain = body.replace(b"\\\\", b"").replace(b'\\"', b"").translate(None, _WITHOUT_MEANING)
     if plain.count(b'"') > 4 * MOST_VALUES:
@@ -173,7 +176,10 @@ def _require_split(table: object) -> None:
 
 
 def _require_records(records: object, form: str) -> None:
-    """Raise a Refusal if records have different keys: 1000 records of 1000 keys could make a table of 10⁹ cells."""
+    """Raise a Refusal if the rows in `records` have different keys.
+
+    A table has a column for each key, so 1000 rows of 1000 different keys each would make 10⁹ cells.
+    """
     if not isinstance(records, list) or not records:
         raise Refusal(400, f"{form!r} is {_describe(records)}. Send a list of rows, {{column: value}}.")
     if len(records) > MOST_ROWS:
@@ -209,14 +215,14 @@ def _describe(value: object) -> str:
 
 
 def expected_body(kind: str) -> str:
-    """Return a description of the expected body, for a media type."""
+    """Return a description of the body that is expected for the media type `kind`."""
     if kind == "text/csv":
         return "a line with the names of the columns, and a line for each row"
     return f"a dictionary with one of the keys {', '.join(FORMS)}"
 
 
 def too_large_message(size: str) -> str:
-    """Return the message about a body of too many bytes, such as "5 bytes"."""
+    """Return the message about a body that is too large; `size` is its size in words, such as "5 bytes"."""
     return f"The body has {size}, but at most {MOST_BODY} are read. Send fewer rows in one request, or smaller files."
 
 

@@ -46,8 +46,8 @@ class Ticket:
     Attributes:
         seconds: time limit of the request.
         deadline: end of the time limit, as a value of `time.monotonic`.
-        sentence: message that says why the model refused the request.
-        remarks: remarks of the model, which are sent along with the table of predictions.
+        sentence: message that says why the model refused the request; "" if it did not.
+        remarks: remarks of the uncertainty wrappers, which are sent to the client with the table of predictions.
     """
 
     seconds: float
@@ -67,7 +67,7 @@ class Ticket:
 
 
 REMARK = b"x-model-remark"
-"""Header of a response with a remark that a wrapper of the model made when it was calibrated."""
+"""Name of the response header for a remark that an uncertainty wrapper of the model made when it was calibrated."""
 
 
 @dataclass
@@ -79,7 +79,7 @@ class ReceivedBody:
 
 
 TICKET: ContextVar[Ticket | None] = ContextVar("ticket", default=None)
-"""Ticket of the request that is being answered; None in a process that is not a server."""
+"""Data of the request that is being answered (`Ticket`); None in a process that is not a server."""
 
 
 def too_long_message(seconds: float) -> str:
@@ -97,8 +97,8 @@ class BoundedApp:
     Args:
         app: MLflow's application.
         seconds: time limit of a request, from its first byte to the response.
-        samples: bodies of JSON that are answered before the server listens, so that no client waits for imports and
-            compilation.
+        samples: JSON bodies of sample requests, which are answered before the server accepts connections, so that no
+            client waits for imports and compilation.
     """
 
     def __init__(self, app: App, seconds: float, samples: Iterable[bytes] = ()) -> None:
@@ -106,7 +106,7 @@ class BoundedApp:
         self.stored_bytes = 0  # size of all bodies that are in memory now
 
     async def __call__(self, scope: MutableMapping[str, Any], receive: Receive, send: Send) -> None:
-        """Answer a request to the model within the limits; pass any other request on unchanged."""
+        """Answer a request for predictions within the limits; pass any other request on to `app` unchanged."""
         if scope["type"] == "lifespan":
             await self._warm_up()
         if scope["type"] != "http" or scope["path"] != INVOCATIONS or scope["method"] != "POST":
@@ -147,7 +147,7 @@ class BoundedApp:
     async def _body(
         self, headers: Mapping[bytes, bytes], receive: Receive, received: ReceivedBody
     ) -> bytes | None:
-        """Receive and return the body; None if the client has disconnected."""
+        """Receive the body of a request and return it; None if the client has disconnected."""
         length = headers.get(b"content-length", b"")
         if length.isdigit() and int(length[:20]) > MOST_BODY:
             raise Refusal(413, too_large_message(f"{int(length[:20])} bytes"))
@@ -257,10 +257,10 @@ def bound_server(samples: Iterable[bytes]) -> None:
 
 
 def _client_status(status: int) -> int:
-    """Return the status for the client.
+    """Return the HTTP status for the client if MLflow has answered with `status`.
 
-    A body that MLflow cannot process is a client error (4xx), whatever status MLflow returns; 504 is MLflow's time
-    limit.
+    A body that MLflow cannot process is an error of the client (4xx), although MLflow may answer with 5xx. The status
+    504, by which MLflow reports its time limit, becomes 413.
     """
     return {504: 413}.get(status, status if status < 500 else 400)
 
@@ -276,9 +276,10 @@ def _parse_message(content: bytes, kind: str) -> str:
 
 
 async def _refuse(receive: Receive | None, send: Send, refusal: Refusal) -> None:
-    """Send the refusal, and discard the rest of the body.
+    """Send the refusal to the client, and receive and discard the rest of the body.
 
-    Many clients read only after they have sent everything.
+    The rest is received because many clients read a response only after they have sent the whole body. `receive` is
+    None if the body is complete.
     """
     name = "TEMPORARILY_UNAVAILABLE" if refusal.status == 503 else "INVALID_PARAMETER_VALUE"
     content = json.dumps({"error_code": name, "message": str(refusal)}).encode()
@@ -304,7 +305,7 @@ async def _send(
     remarks: Iterable[str] = (),
     close: bool = False,
 ) -> None:
-    """Send a response; with `close` the caller ends the connection.
+    """Send a response; if `close` is True, leave it open, and the caller ends it later.
 
     Each remark is sent as a header, because a table of predictions has no field for remarks.
     """

@@ -35,23 +35,26 @@ from framework.prediction import named_columns, table_columns
 from framework.storage.old_versions import PREDICTION_SETTINGS
 
 CONTENT, NAME = "base64", "name"
-"""Columns of a request with files: their content, and their names, which are needed if the suffix says the format."""
+"""Columns of a request with files: content of a file, and its name, which is needed if its suffix states the format."""
 
 _log = logging.getLogger(__name__)
 
 
 @final
 class ServedModel:
-    """Model from raw input to a table with the numbers of `mode=predict` and the modes of the densities."""
+    """Model that MLflow serves: it reads raw input and returns a table of predictions.
+
+    The table has the numbers that `mode=predict` writes, and the modes of the densities.
+    """
 
     def __init__(self, predictor: Predictor, description: Description, data: Data) -> None:
         self.predictor, self.description, self.data = predictor, description, data
 
     def predict(self, inputs: Any, params: object = None) -> pd.DataFrame:
-        """Return the result of `predict_table`; MLflow calls this method.
+        """Return the table of `predict_table`; MLflow calls this method.
 
-        Every error becomes an MlflowException, because it is the only error whose message MLflow's server sends to the
-        client.
+        Errors are converted to an MlflowException, the only error whose message MLflow's server sends to the client.
+        Outside a server, unexpected errors are not converted.
         """
         ticket = TICKET.get()
         if ticket is not None:
@@ -78,8 +81,8 @@ class ServedModel:
     def predict_table(self, inputs: Any) -> pd.DataFrame:
         """Return a table with one row per sample, including the columns of prediction sets (`set_columns`).
 
-        A predicted image is a PNG file in base64. `attrs["remarks"]` of the table has the remarks that `mode=predict`
-        prints about the sets.
+        A predicted image is a PNG file in base64. The entry "remarks" of the table's `attrs` has the remarks that
+        `mode=predict` prints about the prediction sets.
 
         Args:
             inputs: inputs that the model of `framework.load` accepts, but files only as `pathlib.Path`. Or the content
@@ -126,7 +129,7 @@ class ServedModel:
         return table
 
     def warm_up(self) -> None:
-        """Predict for generated samples, so that no later prediction waits for imports and compilation."""
+        """Predict for `sample_requests`, so that no later prediction waits for imports and compilation."""
         for sample in self.sample_requests():
             try:
                 self.predict_table(sample)
@@ -144,7 +147,7 @@ class ServedModel:
                 yield pd.DataFrame({CONTENT: [base64.b64encode(content).decode()], NAME: [f"sample{suffix}"]})
 
     def _read_request(self, inputs: Any) -> Batch:
-        """Return the batch of a request's inputs."""
+        """Return the batch that the model reads for the inputs of a request."""
         if (
             isinstance(inputs, pd.DataFrame)
             and CONTENT in inputs.columns
@@ -164,7 +167,7 @@ class ServedModel:
         return read_batch(self.predictor, self.data, inputs)
 
     def _read_contents(self, texts: Sequence[Any], names: Sequence[str]) -> Batch:
-        """Return the batch of files whose contents are base64 texts."""
+        """Return the batch that the model reads for files, whose contents in base64 are `texts`."""
         if not texts or (TICKET.get() is not None and len(texts) > MOST_FILES):
             raise DataError(
                 f"Got {len(texts)} files, but 1 to {MOST_FILES} files are allowed in one request. Use several "
@@ -184,7 +187,7 @@ class ServedModel:
                 raise type(error)(_name_rows(str(error), Path(folder), names)) from error
 
     def _read_files(self, files: Sequence[Path]) -> Batch:
-        """Read files one by one, and stop as soon as they expand to more numbers than a request may have."""
+        """Return the batch of several files; raise an error as soon as they contain too many numbers for a request."""
         ticket = TICKET.get()
         parts: list[Batch] = []
         numbers = 0
@@ -224,7 +227,7 @@ def require_few_numbers(rows: int, numbers: int) -> None:
 
 
 def sample_file(suffix: str, columns: Sequence[str]) -> bytes | None:
-    """Return the content of a small file of the format that a suffix stands for; None for an unknown suffix."""
+    """Return the content of a small sample file in the format of a suffix; None for an unknown suffix."""
     if suffix == ".csv":
         return "\n".join([",".join(columns), *[",".join("0" for _ in columns)] * 2, ""]).encode()
     if suffix in (".png", ".jpg", ".jpeg"):
@@ -268,7 +271,7 @@ def _decode(row: int, text: Any) -> bytes:
 
 
 def _file_name(name: str) -> str:
-    """Return the end of a file name, with characters and a length that every file system allows."""
+    """Return the last characters of a file name, changed so that every file system allows the name."""
     name = re.sub(r"[^\w.-]|^\.+", "_", name)[-100:]
     while len(name.encode()) > 240:
         name = name[1:]
@@ -297,7 +300,7 @@ def _are_texts(inputs: Sequence[Any] | np.ndarray) -> bool:
 
 
 def _load_pyfunc(path: str) -> ServedModel:
-    """Load a checkpoint as the model for MLflow, which calls this function; raises the errors of `framework.load`."""
+    """Load the checkpoint at `path` as a model; MLflow calls this function. Errors are those of `framework.load`."""
     predictor, description = load_with_description(path)
     served = ServedModel(predictor, description, reader(description))
     for remark in description.remarks:
