@@ -18,7 +18,10 @@ SUFFIXES = (".mat", ".npz", ".nii", ".gz")
 SPECTRA = ("spectra", "rawData")
 KNOWN = ("offsets", "M0", "mask", "region", "affine")
 UNSATURATED = 100.0
-"""Offset, ppm, from which nothing is saturated: images at such offsets are M0, by which the others are divided."""
+"""Smallest absolute value of an offset, ppm, at which nothing is saturated.
+
+Images at such offsets, and at larger ones, are M0. All other images are divided by M0.
+"""
 PLAUSIBLE = 2.0
 """Upper limit of a plausible Z, which is about 1 at most; a volume with larger numbers was not divided by M0."""
 LAYOUT = (

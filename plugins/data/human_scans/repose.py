@@ -131,7 +131,7 @@ def _numbers(text: str) -> dict[str, float]:
 
 
 def requested_poses(body: Body, options: argparse.Namespace) -> Poses:
-    """Return all poses that the arguments ask for."""
+    """Return the poses that the command's arguments name: changed A-poses, random poses, and frames of a motion."""
     where = poses.skeleton(body)
     poses_by_name: Poses = {}
     for number, changes in enumerate(options.pose):

@@ -216,8 +216,8 @@ def _number(entry: Struct, name: str) -> float | None:
 def _angles(viewpoint: Any) -> tuple[float, float, float] | None:
     """Return azimuth, elevation and tilt of the fine label, degrees; None if there is no fine label.
 
-    An object has a fine label if the three fields are filled and its distance is not 0. In a damaged file the angles
-    may be NaN.
+    An object has a fine label if its fields of azimuth, elevation and tilt are filled and its distance is not 0. In a
+    damaged file the angles may be NaN.
     """
     if not isinstance(viewpoint, dict) or _number(viewpoint, "distance") == 0:
         return None

@@ -13,7 +13,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 EQUAL = 1e-6
-"""Difference of second moments, as a share of the largest, below which they are equal to the rounding of float32."""
+"""Difference of second moments, as a share of the largest one, below which they count as equal.
+
+It allows for the rounding of float32.
+"""
 TIE = 1e-6
 """Relative difference below which lengths count as equal, and absolute difference below which values of log L do."""
 GENERIC = (1.3, 0.9, 0.5)

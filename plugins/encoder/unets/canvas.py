@@ -91,7 +91,9 @@ class Canvas:
         head: nn.Conv2d,
         training: bool,
     ) -> tuple[Float[Tensor, "batch outputs height width"], CropReport | None]:
-        """Return the outputs of the network, and the report of a cropped evaluation, or None without a crop.
+        """Return the outputs of the network, and the report of a cropped evaluation.
+
+        The report is None in training, without a crop, and for an empty batch.
 
         In evaluation, each call folds the normalisation into the convolutions again. This costs less than checking
         whether a weight has changed.

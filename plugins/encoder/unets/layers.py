@@ -34,9 +34,10 @@ class Layer(nn.Module):
 
     Args:
         size: side of the kernel, pixels; 3 keeps the size of the image, 2 halves it.
-        normalisation: "batch" normalises by the moments of the batch; "renorm" does so too, and corrects the result
-            towards the running moments (Ioffe 2017); "group" normalises by the moments of each image's groups of
-            channels. "batch" and "renorm" use the running moments in evaluation.
+        normalisation: "batch" normalises by the moments of the batch. "renorm" normalises by the moments of the batch,
+            and then corrects the numbers towards those that the running moments give (Ioffe 2017). "group" normalises
+            by the moments of each image's groups of channels. "batch" and "renorm" use the running moments in
+            evaluation.
     """
 
     mean: Tensor

@@ -27,8 +27,8 @@ class UNet(Encoder):
         input_shape: (channels, height, width); the network also reads images of other heights and widths.
         width: channels of the first level; each further level has twice as many as the one above.
         levels: number of levels.
-        normalisation: "batch", by the moments of the batch; "renorm", the same corrected towards the running moments;
-            or "group", by the moments of each image's groups of channels. See `layers.Layer`.
+        normalisation: "batch", by the moments of the batch; "renorm", by the moments of the batch, corrected towards
+            the running moments; or "group", by the moments of each image's groups of channels. See `layers.Layer`.
         colors: number of outputs that are colours, 0 to 1.
         scales: number of further outputs, the logarithms of scales.
         crop: margin, pixels, around the subject's box outside which evaluation computes nothing; None computes

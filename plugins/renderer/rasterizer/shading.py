@@ -5,7 +5,7 @@ because its corners were rounded lies less than 1/256 pixel beside the face; it 
 
 Args:
     colors: (vertices, channels), or None for white vertices.
-    texture: `textures.Laid`, or None.
+    texture: `textures.TextureArrays`, or None.
     lens: fx, fy, cx, cy, pixels.
     face: (height, width) int32, index of the face that each pixel shows, -1 for background.
 """
