@@ -74,7 +74,7 @@ def test_it_is_the_model_that_was_trained_with_the_wrappers(framework: Framework
     assert drops.code == 2 and "uncertainty=platt would be put around a model that predicts sets" in drops.out
     other = ("mode=calibrate", f"checkpoint={plain.folder}", "uncertainty=[temperature]")
     for change, sentence in (
-        ("data=dial", "trained on"),
+        ("data=dial", "but the data have targets"),
         ("uncertainty=[]", "no wrapper is chosen. Add uncertainty="),
         ("checkpoint=null", "needs checkpoint="),
         ("checkpoint=nowhere", "nowhere is neither a file"),

@@ -186,5 +186,5 @@ def test_runs_on_other_features_do_not_join():
     whole = FrozenFrontEnd([Squares()], Model([], Shares()))
     assert _inner_predictor(whole, first, 0) is first.predictor
     assert whole.encoders[0].factor == 2.0
-    with pytest.raises(CheckpointError, match=r"member 1 .* differ in 0\.factor"):
+    with pytest.raises(CheckpointError, match=r"Member 1 .* differ in 0\.factor"):
         _inner_predictor(whole, other, 1)

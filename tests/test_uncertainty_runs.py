@@ -217,5 +217,5 @@ def test_too_small_a_validation_split_is_said_before_training(
     done = framework(*SMALL, "data.validation=1", f"uncertainty=[{wrappers}]", "pictures=false", folder="few")
     assert done.code == code, done.out
     if code:
-        assert "got one sample of it; wanted 2 or more" in done.out
+        assert "are required, but got one sample" in done.out
         assert "run folder" not in done.out and not (done.folder / "run.json").exists()
