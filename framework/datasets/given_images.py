@@ -14,7 +14,7 @@ from framework.errors import DataError, shorten
 
 
 def to_inputs(data: Data, images: Any) -> Tensor:
-    """Return images as a batch of inputs: the method `Data.inputs` for data sets of square images.
+    """Return a user's images as a batch of inputs; data sets of square images use this function as `Data.inputs`.
 
     `input_shape` of the data set is (channels, side, side). Besides files and arrays of that shape, the function
     accepts Pillow images, and arrays of bytes with the shape of a Pillow image: (height, width), (height, width,
@@ -23,7 +23,7 @@ def to_inputs(data: Data, images: Any) -> Tensor:
     0…1.
 
     Raises:
-        DataError: `images` is none of these.
+        DataError: `images` has none of these forms.
     """
     items = images if isinstance(images, list | tuple) else [images]
     if items and all(isinstance(item, Image.Image) for item in items):
