@@ -120,7 +120,7 @@ def hold_lock(path: Path) -> Iterator[None]:
     """Hold the lock file `path` during the block, after waiting for other processes and threads.
 
     The lock is released when the process ends, even if it is killed. On a file system without `flock` (some mounts of
-    Lustre and NFS), a POSIX record lock is used; on a file system without both, a warning is logged.
+    Lustre and NFS), a POSIX record lock is used; on a file system without either lock, a warning is logged.
     """
     lock = FileLock(path, thread_local=False)
     try:

@@ -39,7 +39,7 @@ def read_json(file: Path, expected: str, remedy: str = RESTORE) -> dict[str, Any
     """Return the object in a JSON file.
 
     Raises:
-        DataError: The file is missing or damaged, or contains something else. The message contains
+        DataError: The file is missing or damaged, or contains another value than an object. The message contains
             `expected`, a description of the file, and `remedy`.
     """
     with translate_errors(file, expected, remedy):

@@ -180,7 +180,7 @@ def describe_mismatch(
 
 LARGEST = torch.finfo(torch.float64).max
 FINITE, FROM_0, ABOVE_0 = (-LARGEST, LARGEST), (0.0, LARGEST), (torch.finfo(torch.float64).tiny, LARGEST)
-"""Least and largest value of a buffer, for `require_state`: any finite number, 0 or more, above 0."""
+"""Bounds (least, largest) of a buffer for `require_state`: any finite number; at least 0; above 0."""
 
 
 def require_state(module: nn.Module, **bounds: tuple[float, float] | tuple[Tensor, Tensor]) -> None:
