@@ -19,8 +19,9 @@ from framework.prediction import Prediction, Split
 BLOCK = 64
 """Number of samples that are evaluated at once.
 
-Only with the same number everywhere are random values a function of (seed, sample), because a density may draw for a
-whole batch at once. Evaluation keeps no gradients, so it takes less memory than training with batches of this size.
+The number must be the same everywhere: a density may draw for a whole batch at once, so the random values of a sample
+would otherwise depend on the size of its batch. Evaluation keeps no gradients, so it takes less memory than training
+with batches of this size.
 """
 
 
