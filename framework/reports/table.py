@@ -25,7 +25,7 @@ printed after the number "<key>" as ±. "synthetic" is true if the data were gen
 """
 
 Better = Mapping[str, Literal["higher", "lower"]]
-"""Direction in which the values of a column are better.
+"""Direction in which the values of a column are better, by the key of the column.
 
 The best value of a column is bold if it differs significantly from every other value
 (`framework.evaluation.significance`). If a standard error is not known, no value is bold.
