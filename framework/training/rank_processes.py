@@ -236,7 +236,7 @@ class _Guard(threading.Thread):
             time.sleep(_PAUSE)
 
     def leave(self, cause: BaseException | None) -> None:
-        """Note that this rank has left the training with an error; the other ranks get seconds to end by themselves.
+        """Note that this rank has left the training with an error; the others have a few seconds to end.
 
         Args:
             cause: the error of another rank or the signal because of which this rank left; None if its error is its
