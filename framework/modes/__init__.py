@@ -16,7 +16,7 @@ from framework.storage.enclosed import require_enclosed
 
 
 def run(values: dict[str, Any], folder: Path, overrides: Sequence[str]) -> float | None:
-    """Run the chosen mode with the composed config; return the value that a sweeper minimises, or None.
+    """Run the chosen mode with the composed config; return the value that a sweeper minimises, if the mode has one.
 
     Raises:
         ConfigError: The mode is unknown, or the config has a fault.

@@ -1,4 +1,4 @@
-"""mode=calibrate: fit uncertainty wrappers around a trained model to the validation split, and test the result."""
+"""mode=calibrate: fit uncertainty wrappers around a trained model to the validation split, and test it with them."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -29,7 +29,7 @@ class CalibrateOptions(Options):
 
 
 def run(config: Config) -> None:
-    """Calibrate the wrappers, write checkpoints/model.ckpt for the other modes, and print the table row of its test.
+    """Calibrate the wrappers, write checkpoints/model.ckpt for the other modes, test the model and print its table row.
 
     Raises:
         ConfigError: No wrapper is chosen, or a chosen wrapper must be trained or has been fitted already.

@@ -35,7 +35,7 @@ class CombineOptions(Options):
 
 
 def run(config: Config) -> None:
-    """Join the members, write checkpoints/model.ckpt for the other modes, and print the table row of its test."""
+    """Join the members, write checkpoints/model.ckpt for the other modes, test the model and print its table row."""
     options = config.options(CombineOptions)
     console = set_up_process(config.settings)
     sources = find_members(options.members)

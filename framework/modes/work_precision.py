@@ -111,7 +111,7 @@ def _refuse_unmeasured(config: Config, measured: bool, compared: bool) -> None:
         compared: Whether the error of the log-likelihood against a reference is measured.
 
     Raises:
-        ConfigError: There is such a setting; the message names the first one.
+        ConfigError: The command contains a setting without effect; the message names the first one.
     """
     for key, used, why in (
         ("metric", measured, f"only {ERROR} is measured here, unless mode.metrics=[...] names metrics"),
