@@ -59,10 +59,10 @@ class Splits(NamedTuple):
 class Data(ABC):
     """A data set with three splits. The framework handles order, batching, workers and resuming.
 
-    The constructor only keeps its keyword-only parameters (the config) and reads nothing. `prepare` does the work. The
-    framework calls it once, before every other method but `read`. After it all attributes below are set. Bad input
-    raises a DataError that says which file is bad, what was expected and what to do. A sample that cannot be read is
-    never replaced silently.
+    The constructor only keeps its keyword-only parameters (the config) and reads nothing. The framework calls `prepare`
+    once before it uses the splits. After this call all attributes below are set. Methods that work without `prepare`
+    say so. Bad input raises a DataError that says which file is bad, what was expected and what to do. A sample that
+    cannot be read is never replaced silently.
 
     A data set that cannot be shipped may be generated. Its generator writes the official layout to the cache
     (`framework.storage.cache.folder`), and the same loader reads it. `synthetic` is then True, and the framework says
@@ -77,12 +77,12 @@ class Data(ABC):
     input_shape: tuple[int, ...]
     """Shape of one input, without the batch dimension; for point clouds (points, columns) of the largest cloud."""
     suffixes: tuple[str, ...] = ()
-    """Suffixes, in small letters, of the files that `read` reads. () allows every suffix.
+    """Suffixes, in lower case, of the files that `read` reads. () allows every suffix.
 
     A folder may hold other files beside them.
     """
     companions: tuple[str, ...] = ()
-    """Endings, in small letters, of files that are read along with another file and hold no samples themselves."""
+    """Endings, in lower case, of files that are read along with another file and hold no samples themselves."""
     columns: tuple[str, ...] = ()
     """Names of the numbers in the last dimension of an input, if they have names: ("x", "y", "z", "red", ...)."""
     plane: bool = False

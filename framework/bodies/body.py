@@ -126,7 +126,7 @@ class Body:
 
 
 def _depths(parents: Sequence[int]) -> list[int]:
-    """Return the number of steps from each joint up to a root; -1 if no root is reached."""
+    """Return the number of steps from each joint up to a root, or -1 for a joint without a root above it."""
     depths = []
     for joint in range(len(parents)):
         depth, at = 0, joint
@@ -338,8 +338,8 @@ class BodyModel(nn.Module):
             )
             raise ValueError(
                 f"The body parameters have wrong shapes: shape parameters {tuple(shape.shape)}, expected (batch, at "
-                f"most {most}); pose {tuple(pose.shape)}, expected (batch, {joints}, 3){moved}. Give all of them the "
-                "same batch."
+                f"most {most}); pose {tuple(pose.shape)}, expected (batch, {joints}, 3){moved}. Use the same batch "
+                "size for all of them."
             )
         for name, values in (("shape", shape), ("pose", pose), ("translation", translation)):
             # angles whose squares are infinite in float64 are also refused
@@ -358,7 +358,8 @@ def _rows(values: np.ndarray) -> np.ndarray:
 def rotation_minus_identity(vectors: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
     """Return R - 1 of rotations given as axis times angle, radians, accurate also for tiny angles.
 
-    R - 1 = (sin θ / θ) K + ((1 - cos θ) / θ²) K² with K x = v × x (Rodrigues; Murray, Li & Sastry 1994, eq. 2.14).
+    For a vector v of length θ, R - 1 = (sin θ / θ) K + ((1 - cos θ) / θ²) K², where K is the matrix with K x = v × x
+    (Rodrigues; Murray, Li & Sastry 1994, eq. 2.14).
     """
     x, y, z = vectors.unbind(-1)
     zero = torch.zeros_like(x)
@@ -378,7 +379,7 @@ def quaternion_minus_identity(vectors: Float[Tensor, "*batch 3"]) -> Float[Tenso
 
 
 def sine_over_angle(square: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-    """Return sin θ / θ as a function of θ²; it is smooth at 0 too."""
+    """Return sin θ / θ for θ² in `square`; the function is also smooth at 0."""
     small = square < 1e-2
     root = square.where(~small, 1).sqrt()
     # the series of sin θ / θ; its remainder is below 1e-20 up to θ² = 1e-2

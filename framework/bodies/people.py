@@ -63,7 +63,11 @@ def load_body(file: str | None) -> tuple[Body, Traits | None]:
 def sample_adults(
     labels: Sequence[str], count: int, random: np.random.Generator
 ) -> Float[np.ndarray, "person trait"]:
-    """Return random traits of adults: uniform gender and age (2/3: young, 1: old), others normal in 0.05…0.95."""
+    """Return random traits of adults, in the order of `labels`.
+
+    Gender is uniform in 0…1, and age in 0.6…0.95 (2/3: young, 1: old). The other traits are normal around 0.5 and
+    clipped to 0.05…0.95.
+    """
     values = random.random((count, len(labels)))
     for place, label in enumerate(labels):
         if label == "age":

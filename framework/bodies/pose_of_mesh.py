@@ -14,7 +14,7 @@ from framework.errors import DataError
 OFF = 0.01
 """Standard deviation of vertices from the model's, metres: clothes, hair, errors of the registration."""
 INDEPENDENT = 35
-"""Number of independent vertex errors of a mesh of any size: errors of vertices under one garment are alike."""
+"""Number of independent vertex errors of a mesh of any size, since errors of vertices under one garment are similar."""
 BENT = 0.7
 """Standard deviation of the angles of all joints except the root, radians, which spreads a bend over several joints."""
 STEPS = 60

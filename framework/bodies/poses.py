@@ -65,7 +65,7 @@ LEGS: Kinds = {
     "lifted": (0.08, {"hip": (50, 28), "knee": (55, 30), "spread": (8, 8)}),
 }
 ALIKE = 0.6
-"""Share of poses in which both arms have the same kind; the kind of the legs is always common to both."""
+"""Share of poses in which the right arm takes the kind of the left arm; both legs always have the same kind."""
 TAIL, WIDER = 0.1, 1.8
 """Share of poses from a heavier tail, and the factor of their standard deviations (thesis §6.5.2)."""
 MOVEMENTS = (*CENTRAL, *(f"{side} {name}" for side in ("left", "right") for name in SIDED))
@@ -183,7 +183,10 @@ def _limited(
     wide: np.ndarray,
     random: Generator,
 ) -> Float[np.ndarray, "pose"]:
-    """Return normal numbers, folded back at the limits so that none accumulate there."""
+    """Return random normal numbers between the limits.
+
+    A number beyond a limit is mirrored at this limit, so that no numbers accumulate there.
+    """
     _, _, least, most = limits
     values = random.normal(mean, spread * wide)
     folded = np.where(values < least, 2 * least - values, np.where(values > most, 2 * most - values, values))

@@ -211,7 +211,7 @@ class _Plain:
     An object that is referenced twice is converted once, so that nesting cannot multiply it.
 
     Args:
-        size: size of the file, bytes, which limits the size of the result.
+        size: size of the file, bytes, which limits the total size of the arrays.
     """
 
     def __init__(self, size: int) -> None:
@@ -293,7 +293,10 @@ class _Plain:
             _refuse("it expands to much more data than the file holds")
 
     def _sparse(self, kind: str, state: Mapping[str, Any]) -> np.ndarray:
-        """Return the matrix as a dense array; entries at the same position are added."""
+        """Return a sparse matrix as a dense array; entries at the same position are added.
+
+        `kind` is the storage format of the matrix, and `state` its attributes.
+        """
         rows, columns = state.get("_shape", state.get("shape"))
         if not _side(rows) or not _side(columns) or rows * columns > self.sparse_left:
             _refuse(f"a sparse matrix of {rows} x {columns} is too large for a body model")
@@ -348,7 +351,11 @@ def _side(value: Any) -> bool:
 
 
 def _line(values: Any, kinds: str) -> np.ndarray:
-    """Return the one-dimensional numbers of a sparse matrix; refuse anything else."""
+    """Return `values` if they are a one-dimensional array of one of the kinds of dtype in `kinds`.
+
+    Raises:
+        PickleRefused: they are not.
+    """
     if not isinstance(values, np.ndarray) or values.ndim != 1 or values.dtype.kind not in kinds:
         _refuse("a sparse matrix has no numbers")
     return values

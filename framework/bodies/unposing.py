@@ -41,9 +41,10 @@ def unpose(
 ) -> Unposed:
     """Return the offsets with which the model, in this pose, has these vertices (metres).
 
-    With A = Σ_j w_j R_j the offsets are A⁻¹ r, where r is the difference of the vertices from the bare model's in this
-    pose: skinning is affine, and B_P(θ) is in both. Only r is multiplied by A⁻¹, so that the effect of errors of A does
-    not grow with the distance from the origin.
+    With A = Σ_j w_j R_j (`BodyModel.skinning`) the offsets are A⁻¹ r, where r is the difference of `vertices` from the
+    vertices of the model without offsets in this pose. This is exact, because skinning is affine and the pose blend
+    shapes B_P(θ) are the same with and without offsets. Only r is multiplied by A⁻¹, so that the effect of errors of A
+    does not grow with the distance from the origin.
 
     Let A = U diag(σ) Vᵀ. If a singular value σ is below SMALLEST, the mesh hardly determines the offset along the
     corresponding column v of V, because many positions in the rest pose are mapped to nearly the same point. For such a

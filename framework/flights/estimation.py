@@ -122,7 +122,7 @@ def estimate_states(
 
 
 def cauchy(residual: Float[Tensor, "*shape"]) -> tuple[Float[Tensor, "*shape"], Float[Tensor, "*shape"]]:
-    """Return c √log(1 + (r/c)²) with the sign of the residual r, and its derivative."""
+    """Return c √log(1 + (r/c)²) with the sign of the residual r, and its derivative by r; c is CAUCHY."""
     square = (residual / CAUCHY).square()
     root = CAUCHY * torch.log1p(square).sqrt()
     steep = torch.where(residual.abs() < 1e-6, 1.0, residual.abs() / (root * (1 + square)))

@@ -53,7 +53,11 @@ class Constants:
 
 @no_type_check
 def acceleration(velocity: Vector, spin: Vector, constants: Constants) -> Vector:
-    """Return v' = g - k |v| v + m ω × v, m/s² (Mülling, Kober & Peters 2011, eq. 1, with Magnus's term)."""
+    """Return the acceleration g - k |v| v + m ω × v of a flying ball, m/s².
+
+    v is the velocity, ω the spin, g gravity, k the drag and m the lift of `Constants` (Mülling, Kober & Peters 2011,
+    eq. 1, with Magnus's term).
+    """
     (u, v, w), (a, b, c) = velocity, spin
     # The small constant keeps the root differentiable where the ball rests.
     drag = constants.drag * (u * u + v * v + w * w + 1e-24) ** 0.5
@@ -67,7 +71,10 @@ def acceleration(velocity: Vector, spin: Vector, constants: Constants) -> Vector
 
 @no_type_check
 def slip(velocity: Vector, spin: Vector, radius: float) -> tuple[Any, Any]:
-    """Return the velocity of the ball's lowest point along the table, v + ω × (-r ẑ), m/s."""
+    """Return the velocity of the ball's lowest point along the table, m/s.
+
+    It is the horizontal part of v + ω × (-r ẑ), for the velocity v, the spin ω and the radius r; ẑ points up.
+    """
     return velocity[0] - radius * spin[1], velocity[1] + radius * spin[0]
 
 
@@ -76,8 +83,9 @@ def bounce(velocity: Vector, spin: Vector, constants: Constants) -> tuple[Vector
     """Return velocity and spin after an instantaneous bounce.
 
     The model is that of Nakashima et al. (2010), for a hollow sphere, I = 2/3 m r². The table's friction stops the slip
-    if it can: this takes an impulse of 2/5 of the slip per unit of mass. Friction can give at most μ times the upward
-    impulse, (1 + e) |w|; if this is not enough, the ball goes on sliding.
+    (the velocity of the contact point) if it can: this takes an impulse of 2/5 of the slip per unit of mass. Friction
+    can give at most μ times the upward impulse (1 + e) |w|, where w is the vertical velocity before the bounce, e the
+    restitution and μ the friction of `Constants`. If this is not enough, the ball goes on sliding.
     """
     u, v, w = velocity
     along, across = slip(velocity, spin, constants.radius)

@@ -11,7 +11,7 @@ from framework.target import Target
 class Unit(NamedTuple):
     """Location and scale of a target, (number,) each in double precision.
 
-    Both are None if the head computes in the target's own unit.
+    Location and scale are None if the head computes in the target's own unit.
     """
 
     location: Tensor | None

@@ -1,4 +1,4 @@
-"""The result of framework.least_squares.solver."""
+"""Solutions of many least-squares problems, as framework.least_squares.solver returns them."""
 
 from enum import IntEnum
 from typing import NamedTuple

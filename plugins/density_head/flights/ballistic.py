@@ -1,4 +1,4 @@
-"""Physics as a density head: the state of a ball from its frames, its flight, and the uncertainty of both."""
+"""Physics as a density head: estimates the state of a ball, computes its flight, and gives the uncertainty of both."""
 
 import math
 from collections.abc import Mapping

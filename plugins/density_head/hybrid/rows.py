@@ -15,7 +15,10 @@ BOUND: Mapping[str, str] = dict.fromkeys(
     "log_prob is the importance-weighted bound (eq. 3.19); all other results are of the mixture sampled from the prior",
 )
 DEEP = {"float32 against float64": 256.0}
-"""Limit for seven layers in sequence, the last of which multiplies outputs of the one before by a latent vector."""
+"""Limits of checks that are wider than usual, because rounding errors grow over seven layers in sequence.
+
+The last layer multiplies outputs of the layer before by a latent vector.
+"""
 ROWS = {
     "hybrid": (
         HeadRow("three numbers", THREE, {"further": 4, "hidden": 8}),

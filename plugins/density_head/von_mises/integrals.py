@@ -38,7 +38,7 @@ def kl_divergence(
 
 
 def cdf(value: Tensor, mean: Tensor, concentration: Tensor) -> Tensor:
-    """Return the probability of the arc from mean - π to value, in [0, 1] within one turn; each further turn adds 1.
+    """Return the probability of the arc from mean - π to `value`; each further full rotation of `value` adds 1.
 
     The convention is SciPy's. Quadrature in float64 has an absolute error below 1e-15; the relative error of the lower
     tail is below 4e-15 times the greater of 1 and its logarithm. The result is differentiable, once, in all three

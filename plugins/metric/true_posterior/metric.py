@@ -33,8 +33,7 @@ class TruePosterior(Metric):
 
     A result is NaN if no sample has the symmetry to which the result refers. Integrals are sums over `points` equally
     spaced azimuths: each sample costs `points` evaluations of the azimuth marginal. A density that is too narrow for
-        the
-    grid (its sum on the grid is not 1 within 1e-4) is evaluated from `prediction.samples` draws instead.
+    the grid (its sum on the grid is not 1 within 1e-4) is evaluated from `prediction.samples` draws instead.
 
     Args:
         target: a target that contains an angle named "azimuth".
