@@ -29,7 +29,7 @@ from framework.storage.progress import track_progress
 READERS = min(8, os.cpu_count() or 1)
 """Number of threads that decode images at the same time."""
 FORMATS = ("AVIF", "BMP", "GIF", "ICO", "JPEG", "JPEG2000", "PCX", "PNG", "PPM", "SGI", "TGA", "TIFF", "WEBP")
-"""Pillow formats that are read: those that only decode pixels. EPS, for example, would start another program."""
+"""Pillow formats that are read, because reading them only decodes pixels. EPS, for example, would start a program."""
 SUFFIXES = (".avif", ".bmp", ".gif", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp")
 """Usual suffixes of image files; a file with another suffix is read as an image if it can be decoded."""
 ORIENTATION = 0x0112
