@@ -1,4 +1,4 @@
-"""Adaptive quadrature of densities of one or two numbers: a box is split where two rules disagree on its integral."""
+"""Adaptive quadrature of densities of one or two numbers: a box is split where two quadrature rules disagree."""
 
 import math
 from collections.abc import Callable
@@ -15,35 +15,42 @@ from framework.distributions.circular import Circular, wrap
 from framework.distributions.protocol import mode_candidates
 
 RULES = {1: (10, 6), 2: (8, 5)}
-"""Gauss-Legendre points per side of the two rules; a box on which their sums differ is split."""
+"""Gauss-Legendre points per side of a box in each of the two rules, by the number of numbers of the density.
+
+A box on which the integrals by the two rules differ is split.
+"""
 TOLERANCE = {1: 1e-10, 2: 1e-8}
-"""Largest difference between the two rules on a box that is not split, in probability."""
+"""Largest difference of the two integrals over a box that is not split, by the number of numbers of the density."""
 ROUNDS = {1: 60, 2: 40}
-"""Largest number of rounds of splitting."""
+"""Largest number of rounds, in each of which boxes are split, by the number of numbers of the density."""
 MOST = {1: 128, 2: 48}
-"""Largest number of boxes of a batch row that are split in one round."""
+"""Largest number of boxes of one density that are split in one round, by the number of numbers of the density."""
 MOST_PEAKS = 64
-"""Largest number of mode candidates that are used."""
+"""Largest number of `mode_candidates` of a density that are used."""
 HIDDEN = 2.0
-"""Ratio above which a box is split: a known value of the integrand in the box, divided by that at its highest node."""
+"""Ratio above which a box is split, since it may hide a peak.
+
+It is the ratio of the integrand at a known point in the box to the largest integrand at the nodes of the box.
+"""
 LARGEST_COORDINATE = 36.0
 """Largest coordinate s, where values are mode + a sinh(s) and a is the width of the density.
 
-Reals are integrated up to sinh 36 = 2e15 widths from the mode, angles up to half a turn from it.
+Densities of real numbers are integrated up to sinh 36 = 2e15 widths from the mode, densities of angles up to half a
+turn from it.
 """
 
 
 @dataclass(frozen=True)
 class Boxes:
-    """Boxes into which the domain of a density with batch_shape (rows,) was split, with their masses.
+    """Boxes into which the domain of a density with batch_shape (rows,) was split, with their masses (probabilities).
 
     Attributes:
-        value: Nodes of all boxes, as values of the density, (node, rows, number).
+        value: Nodes of all boxes, which are the values at which the density is evaluated, (node, rows, number).
         log_prob: Log-density at `value`, (node, rows), nats.
         weight: Quadrature weight of each node, (node, rows); Σ weight · exp(log_prob) is the integral.
         border: Borders of the boxes, ascending, (box + 1, rows); empty for densities of two numbers.
         mass: Mass of each box, (box, rows).
-        mapping: Map from the coordinates in which boxes are cut to values.
+        mapping: Map from coordinates to values. The boxes are rectangles in these coordinates.
         low, high: Lower and upper corners of the boxes in these coordinates, (box, rows, number).
     """
 
@@ -57,7 +64,11 @@ class Boxes:
     high: Tensor
 
     def mean(self, integrand: Tensor) -> Tensor:
-        """Return ∫ p f, (rows,), for a function f whose values at the nodes are `integrand`, (node, rows)."""
+        """Return ∫ p f for the density p and a function f, (rows,).
+
+        Args:
+            integrand: Values of f at the nodes, (node, rows).
+        """
         share = self.weight * self.log_prob.exp()
         return torch.where(share > 0, share * integrand, 0.0).sum(0)
 
@@ -66,10 +77,14 @@ class Boxes:
         return -self.mean(self.log_prob)
 
     def error_bound(self, function: Callable[[Tensor], Tensor]) -> Tensor:
-        """Return a bound on the error of ∫ p f, (rows,), for a function f of values.
+        """Return a bound on the error of ∫ p f for the density p and a function f, (rows,).
 
-        The boxes are cut for p rather than for f, and they end at a finite distance. The bound is the difference of the
-        two rules, plus a bound on the integral beyond the outermost boxes for tails that fall like a power.
+        The integral has an error because the boxes were split for p and not for f, and because they end at a finite
+        distance. The bound is the difference of the integrals by the two rules, plus a bound on the integral beyond the
+        outermost boxes for tails that fall like a power.
+
+        Args:
+            function: f, a function of values of the density.
         """
         shares = []
         for points in RULES[self.low.shape[-1]]:
@@ -84,9 +99,12 @@ class Boxes:
         return rules + 100 * torch.where(outermost, shares[0].abs(), 0.0).sum(0)
 
     def mass_below(self, value: Tensor) -> Tensor:
-        """Return the mass between the first border and each value, both (value, rows), for densities of one number.
+        """Return the mass between the first border and each value, (value, rows), for densities of one number.
 
         For angles the first border is half a turn before the mode.
+
+        Args:
+            value: Values, (value, rows).
         """
         coordinates = self.mapping.coordinates(value.unsqueeze(-1))
         border = self.mapping.coordinates(self.border.unsqueeze(-1))[..., 0]
@@ -101,10 +119,14 @@ class Boxes:
 
 
 class _Map:
-    """Map from the coordinates in which boxes are cut to values: origin + width · sinh(coordinate) on each axis.
+    """Map from the coordinates in which boxes are split to values: origin + width · sinh(coordinate) on each axis.
 
-    The axes and widths are estimated from the density. The origin is the candidate with the highest density, since the
-    mode that the density states may be wrong.
+    The directions of the axes and the widths are estimated from the density.
+
+    Args:
+        density: Density with batch_shape (rows,).
+        candidates: Values, (candidate, rows, number). The one with the highest density is the origin, since the mode
+            that the density states may be wrong.
     """
 
     def __init__(self, density: Distribution, candidates: Tensor) -> None:
@@ -150,9 +172,10 @@ class _Map:
         return torch.stack(widths, -1)
 
     def _whiten(self) -> None:
-        """Set the slope at which the conditional mode of the second number moves with the first number.
+        """Set `slope`: the change of the most likely second number per change of the first number.
 
-        The slope is estimated by mixed second differences of log p, one width apart.
+        The slope is estimated by mixed second differences of log p, one width apart. The width of the first number is
+        then measured along this slope.
         """
         first, second = self.scale[:, 0], self.scale[:, 1]
         corner = {}
@@ -189,7 +212,7 @@ class _Map:
 
 
 def _rule(points: int, numbers: int) -> tuple[Tensor, Tensor]:
-    """Return the Gauss-Legendre nodes of the unit box, (points^numbers, numbers), and their weights."""
+    """Return nodes (points^numbers, numbers) and weights of the Gauss-Legendre rule in the unit box."""
     node, weight = (torch.from_numpy(part) for part in np.polynomial.legendre.leggauss(points))
     nodes = torch.cartesian_prod(*[(node + 1) / 2] * numbers).reshape(-1, numbers)
     weights = torch.cartesian_prod(*[weight / 2] * numbers).reshape(-1, numbers).prod(-1)
@@ -198,7 +221,7 @@ def _rule(points: int, numbers: int) -> tuple[Tensor, Tensor]:
 
 @lru_cache(maxsize=4)
 def boxes(density: Distribution) -> Boxes:
-    """Integrate a density of one or two numbers, batch_shape (rows,), over boxes on which two rules agree.
+    """Integrate a density of one or two numbers, batch_shape (rows,): split boxes until two rules agree on each.
 
     A box is also split while it may hide a peak or a ridge of the density. Peaks are searched for at the mode, at the
     values that `mode_candidates` returns, and at draws.
@@ -242,14 +265,26 @@ def boxes(density: Distribution) -> Boxes:
 
 
 def _gather_boxes(part: Tensor, index: Tensor) -> Tensor:
-    """Return the boxes of each row that `index` (chosen box, row) names, from a tensor (box, row, ...)."""
+    """Return the boxes with the indices `index` from a tensor of boxes.
+
+    Args:
+        part: Tensor (box, rows, ...).
+        index: Indices of boxes, (chosen box, rows).
+    """
     if part.dim() == 3:
         index = index.unsqueeze(-1).expand(*index.shape, part.shape[-1])
     return part.gather(0, index)
 
 
 def _nodes(mapping: _Map, low: Tensor, high: Tensor, points: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the nodes of boxes (box · node, rows, number), and their log-densities and weights, (box, node, rows)."""
+    """Return the nodes of boxes (box · node, rows, number), and their log-densities and weights, (box, node, rows).
+
+    Args:
+        mapping: Map from coordinates to values.
+        low: Lower corners of the boxes, in coordinates.
+        high: Upper corners of the boxes, in coordinates.
+        points: Gauss-Legendre points per side.
+    """
     nodes, weights = _rule(points, low.shape[-1])
     coordinates = low.unsqueeze(1) + (high - low).unsqueeze(1) * nodes[:, None]
     value, volume = mapping.values_and_volumes(coordinates.flatten(0, 1))
@@ -269,8 +304,16 @@ def _evaluate_boxes(
     """Return the corners of boxes, their masses, the urgency to split each, and the axis along which to split it.
 
     The corners are `low` and `high`. Masses and urgency have shape (box, rows). The axis is a mask (box, rows, number).
-    The urgency is the difference of the two rules, or more where the integrand at a candidate or near a known peak is
-    far above that at every node.
+    The urgency is the difference of the integrals by the two rules. It is larger if the integrand at a candidate or
+    near a known peak is far above the integrand at every node.
+
+    Args:
+        mapping: Map from coordinates to values.
+        low: Lower corners, in coordinates.
+        high: Upper corners, in coordinates.
+        candidate_coordinates: Coordinates of values where the density may be high.
+        candidate_log_prob: Log-densities there.
+        peak_coordinates: Coordinates of the `mode_candidates`.
     """
     numbers = low.shape[-1]
     sums, highest, rough = [], torch.zeros_like(low[..., 0]), torch.zeros_like(low)
@@ -304,9 +347,15 @@ def _evaluate_boxes(
 
 
 def _roughness(integrand: Tensor, points: int, numbers: int) -> Tensor:
-    """Return the part of the integrand (box, node, rows) in the two highest Legendre polynomials of each number.
+    """Return a measure of how many nodes each box needs along each number, (box, rows, number); 0 for one number.
 
-    The result has shape (box, rows, number). A box needs more nodes along the number for which the result is largest.
+    It is the size of the part of the integrand in the two highest Legendre polynomials of this number. A box is split
+    along the number with the largest measure, unless it may hide a peak.
+
+    Args:
+        integrand: Integrand at the nodes, (box, node, rows).
+        points: Nodes per side.
+        numbers: 1 or 2.
     """
     if numbers == 1:
         return torch.zeros_like(integrand[:, :1]).movedim(1, -1)
@@ -322,7 +371,10 @@ def _roughness(integrand: Tensor, points: int, numbers: int) -> Tensor:
 
 
 def _highest_polynomials(points: int) -> Tensor:
-    """Return the matrix (2, points) from node values to coefficients of the two highest Legendre polynomials."""
+    """Return a matrix (2, points): it maps values at `points` nodes to coefficients of the two highest polynomials.
+
+    The polynomials are Legendre's, of degree points - 2 and points - 1.
+    """
     node, weight = np.polynomial.legendre.leggauss(points)
     values = np.polynomial.legendre.legvander(node, points - 1)[:, -2:]
     matrix = weight[:, None] * values * np.arange(2 * points - 3, 2 * points, 2)
@@ -330,11 +382,18 @@ def _highest_polynomials(points: int) -> Tensor:
 
 
 def _integrands_near_peaks(mapping: _Map, low: Tensor, high: Tensor, peak_coordinates: Tensor) -> Tensor:
-    """Return the highest integrand at points of each box that are close to known peaks, (probe, box, rows).
+    """Return the largest integrand in each box at points that are close to known peaks, (probe, box, rows).
 
-    The first probe is the point of the box that is nearest to a peak. For densities of two numbers there are two more
-    probes: one coordinate is that of the nearest point, the other is the middle of the box. They detect a ridge, a peak
-    that is narrow in one number and broad in the other, which also crosses boxes that hold no peak.
+    A probe is a kind of such points. The first probe is the point of the box that is nearest to a peak. Densities of
+    two numbers have two more probes: one coordinate is that of the nearest point, and the other is the middle of the
+    box. These detect a ridge, which is a peak that is narrow in one number and broad in the other, and which also
+    crosses boxes that contain no peak.
+
+    Args:
+        mapping: Map from coordinates to values.
+        low: Lower corners of the boxes, in coordinates.
+        high: Upper corners of the boxes, in coordinates.
+        peak_coordinates: Coordinates of the known peaks.
     """
     numbers = low.shape[-1]
     near = peak_coordinates.unsqueeze(1).clamp(low, high)  # (peak, box, rows, number)

@@ -15,7 +15,9 @@ CHANNELS = frozenset({"color", "mask", "depth"})
 
 
 def ball(place: Tensor, size: tuple[int, int], channels: Collection[str] = CHANNELS) -> dict[str, Tensor]:
-    """Return images of a ball that moves with `place`: by an eighth of the image's shorter side for each unit.
+    """Return images of a ball whose position depends on `place`.
+
+    The ball moves by an eighth of the image's shorter side for each unit of `place`.
 
     Args:
         place: Location of a density, (batch, number). The first number moves the ball to the right, the last one

@@ -47,18 +47,18 @@ def doll() -> dict[str, np.ndarray]:
 
 
 def write_body_file(folder: Path) -> Mapping[str, str]:
-    """Write the doll to a folder, and return the parameter that names its file."""
+    """Write the doll to a file in a folder, and return {name of the parameter of plugins: path of this file}."""
     np.savez(folder / "doll.npz", **doll())  # type: ignore[arg-type]
     return {"body": str(folder / "doll.npz")}
 
 
 def small_body() -> Mapping[str, str]:
-    """Return the parameter of the doll's file, in a folder that lasts as long as this process."""
+    """Return what `write_body_file` returns, for a folder that lasts as long as this process."""
     return write_body_file(Path(FOLDER.name))
 
 
 def person(number: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mesh of a person with its own shape and pose, 40 vertices, metres, and a scan of 300 points."""
+    """Return a mesh of a person, 40 vertices in metres, and a scan of 300 points; shape and pose depend on `number`."""
     mesh = np.random.default_rng(0).normal(0, 0.3, (40, 3))
     mesh = mesh * (1 + number // 10 / 20) + 0.1 * np.sin(3 * mesh[:, [1, 2, 0]] + number % 10) + [0, 1.0, 0]
     near = np.random.default_rng(number).integers(0, 40, 300)
@@ -66,7 +66,7 @@ def person(number: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def write_subjects(folder: Path) -> Mapping[str, str]:
-    """Write six subjects of 40 coloured vertices, and return the parameter that names their folder.
+    """Write six subjects of 40 coloured vertices, and return {name of the parameter of plugins: path of their folder}.
 
     Each subject has two photographs and masks of 12 × 9 random pixels, and a texture.
     """

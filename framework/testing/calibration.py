@@ -17,11 +17,11 @@ from framework.testing.wrappers import Build, in_units, inputs, wrapped_models
 from framework.uncertainty import Uncertainty
 
 SPREADS = {"calibrated": 1.0, "overconfident": 3.0, "underconfident": 0.3}
-"""Kind of model → factor by which targets lie farther from the mode than draws from the model's densities do."""
+"""Kind of model → ratio of the distances from the mode, of targets to draws from the model's densities."""
 ROWS = 200
-"""Number of rows of the validation data and of the new data."""
+"""Number of samples of the validation data and of the new data."""
 UNEVEN = ((50, 0.5), (50, 2.0), (30, 1.0), (4, 8.0))
-"""Number of rows of each batch, and the factor by which its targets are spread (see SPREADS)."""
+"""Number of samples of each batch, and ratio of distances from the mode of its targets (see SPREADS)."""
 FAR = 8.0
 """Factor on the inputs, so that models with different weights predict locations far from each other."""
 
@@ -39,18 +39,18 @@ class Calibration:
     build: Build
 
     def checks(self) -> Iterator[tuple[str, float, Callable[[Worst], None]]]:
-        """Yield name, limit and function of each check."""
+        """Yield the name, the limit (largest error that passes) and the function of each check."""
         yield "calibration does not harm", 4.0, self.no_harm
         yield "calibration uses every row", 0.05, self.use_of_all_rows
         yield "wrapped models are calibrated first", 0.0, self.wrapped_first
 
     @cached_property
     def target(self) -> Target:
-        """Target of the row, in another unit if it is real-valued, since no code may assume targets of size 1."""
+        """Target of the contract row; a real-valued one gets another unit, as no code may assume targets of size 1."""
         return in_units(self.row.target)[:2][-1]
 
     def make(self, target: Target | None = None) -> Uncertainty:
-        """Return a new wrapper in float64, in evaluation mode, around models that are marked as calibrated."""
+        """Return a new wrapper, in float64 and evaluation mode, around models that are marked as calibrated."""
         seed(SEED)
         wrapper = self.build(target or self.target).eval().double()
         for model in wrapped_models(wrapper):
@@ -58,11 +58,11 @@ class Calibration:
         return wrapper
 
     def draw_batch(self, target: Target, count: int, spread: float, number: int) -> Batch:
-        """Return a batch of seeded inputs, and of targets around the densities that the uncalibrated wrapper predicts.
+        """Return a batch of seeded inputs, with targets around the densities that the uncalibrated wrapper predicts.
 
         Args:
             target: Target of the wrapper.
-            count: Number of rows.
+            count: Number of samples.
             spread: Factor by which targets lie farther from the mode than draws from the densities do.
             number: Number that selects the seed.
         """
@@ -78,7 +78,7 @@ class Calibration:
 
     @cached_property
     def densities(self) -> dict[str, Distribution]:
-        """Description → densities, float64, of three inputs for which models with different weights differ much.
+        """Description → densities, float64, of three inputs at which models with different weights differ much.
 
         The first entry is the wrapper as built. Each further entry is the calibrated wrapper in one unit of the target.
         """
@@ -101,7 +101,7 @@ class Calibration:
             return {"as built": self.make(self.row.target)(FAR * inputs(64).double())}
 
     def no_harm(self, worst: Worst) -> None:
-        """Check that calibration does not lower the mean log-likelihood of the validation rows or of new rows.
+        """Check that calibration does not lower the mean log-likelihood of the validation samples or of new samples.
 
         The error is in standard errors of the mean.
         """
@@ -121,7 +121,7 @@ class Calibration:
                 )
 
     def use_of_all_rows(self, worst: Worst) -> None:
-        """Check that the result does not depend on how the validation rows are passed.
+        """Check that the calibrated densities do not depend on how the validation samples are passed.
 
         They are passed in batches, in batches in reverse order, as one batch, and by an iterator that can be read only
         once. The error is the mean difference of log-densities, nats.
@@ -166,9 +166,10 @@ class Calibration:
 
 
 def draw_spread(density: Distribution, factor: float) -> Tensor:
-    """Return one target for each row: a draw from the density, moved to `factor` times its distance from the mode.
+    """Return one target for each item of the batch: a draw from the density, moved away from the mode.
 
-    For classes the target is a draw from the probabilities p^(1/factor), normalised.
+    Its distance from the mode is multiplied by `factor`. For classes the target is a draw from the probabilities
+    p^(1/factor), normalised.
     """
     if density.has_enumerate_support:
         logits = density.log_prob(density.enumerate_support()).movedim(0, -1)
@@ -180,13 +181,13 @@ def draw_spread(density: Distribution, factor: float) -> Tensor:
 
 
 def split_batch(batch: Batch, rows: int) -> list[Batch]:
-    """Split a batch into batches of at most `rows` rows."""
+    """Split a batch into batches of at most `rows` samples."""
     parts = {name: field.split(rows) for name, field in batch.items()}
     return [{name: part[at] for name, part in parts.items()} for at in range(len(parts["target"]))]
 
 
 @torch.no_grad()
 def log_prob(wrapper: Uncertainty, batch: Batch) -> Tensor:
-    """Return the log-density at the targets, (rows,) float64, with the same random numbers at each call."""
+    """Return the log-density at a batch's targets, (samples,) float64, with the same random numbers at each call."""
     seed(SEED)
     return wrapper(batch["input"]).log_prob(batch["target"]).double()

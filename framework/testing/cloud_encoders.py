@@ -13,7 +13,7 @@ from framework.testing.finding import SEED, Worst
 
 Make = Callable[[], Encoder]
 NO_CLOUDS = ((7,), (3, 32, 32), (100, 2))
-"""Input shapes that are not those of clouds, and must be refused."""
+"""Input shapes that are not shapes of clouds; an encoder of clouds must refuse them."""
 
 
 def different_clouds(points: int, columns: int) -> list[Tensor]:

@@ -30,7 +30,7 @@ TARGETS = (
     Target("real", ("x", "y")),
     Target("class", ("first", "second", "third")),
 )
-"""Targets that a plugin without rows is tried with."""
+"""Targets with which a plugin without rows is checked, as far as it accepts them."""
 ROW_OF = {
     "data": DataRow,
     "density_head": HeadRow,
@@ -42,7 +42,7 @@ ROW_OF = {
 }
 """Registry → class of the rows of its plugins."""
 SHAPES = ((3, 64, 64), (1, 96, 80), (16,))
-"""Input shapes that an encoder without rows is tried with; an encoder may refuse some of them with a ConfigError."""
+"""Input shapes with which an encoder without rows is checked; it may refuse some of them with a ConfigError."""
 
 
 @dataclass(frozen=True)
@@ -64,12 +64,18 @@ class Contract:
 
 
 def contract(group: str, name: str, config: Mapping[str, Any] | None = None) -> Contract:
-    """Return the contract of the plugin `name`, with an additional row for `config` if no row has that configuration.
+    """Return the contract rows of the plugin `name`; if no row has the configuration `config`, a row for it is added.
 
-    No row is added if `config` equals the configuration of a shipped row or the defaults. If the plugin ships rows, the
-    additional row is a copy of a shipped row with the parameters of `config`. The shipped row is one whose parts have
-    the same names, else the first whose target the configured plugin accepts. The copy keeps the target and the
-    properties that are left out, but not the reference cases.
+    No row is added if `config` is None, or if it equals the configuration of a shipped row or the defaults. If the
+    plugin ships rows, the added row is a copy of one of them with the parameters of `config`. It is a row whose nested
+    plugins have the same names, otherwise the first row whose target the configured plugin accepts. The copy keeps the
+    target and the properties that are left out, but not the reference cases. If the plugin ships no rows, rows are made
+    for the default targets or input shapes. Data sets use `configured_row`.
+
+    Args:
+        group: Name of the registry.
+        name: Name of the plugin.
+        config: Parameters of the plugin.
 
     Raises:
         ConfigError: The plugin does not exist, its registry has no contract, a parameter is invalid, or the configured
@@ -101,7 +107,11 @@ def contract(group: str, name: str, config: Mapping[str, Any] | None = None) -> 
 
 
 def _nearest(group: str, chosen: Mapping[str, Any], shipped: tuple[Row, ...]) -> Row:
-    """Return a row whose parts have the names of those in `chosen`, else the first whose target `chosen` accepts."""
+    """Return the shipped row that is closest to the configuration `chosen`.
+
+    It is a row whose nested plugins have the same names, otherwise the first row whose target the plugin accepts with
+    the configuration `chosen`.
+    """
 
     def same_parts(row: Row) -> bool:
         resolved = resolve(group, {"name": chosen["name"], **row.config})
@@ -122,7 +132,7 @@ def _nearest(group: str, chosen: Mapping[str, Any], shipped: tuple[Row, ...]) ->
 
 
 def _shipped(group: str, name: str) -> tuple[Row, ...]:
-    """Return the rows from the `rows.py` beside the module of the plugin's class, or from a folder above it.
+    """Return the rows of a plugin from its `rows.py`, which is beside the module of its class or in a folder above.
 
     A family of plugins keeps its rows in its folder, `plugins/<group>/<family>`. The search ends at the folder that is
     named like the registry, or at the top of a third-party package without such a folder.
@@ -141,7 +151,11 @@ def _shipped(group: str, name: str) -> tuple[Row, ...]:
 
 
 def _defaults(group: str, name: str, config: Mapping[str, Any], label: str) -> tuple[Row, ...]:
-    """Return a row with `config` for each of TARGETS or SHAPES that the plugin accepts."""
+    """Return rows with the parameters `config`: one for each of TARGETS or SHAPES that the plugin accepts.
+
+    For data sets and renderers, which have neither, it is a single row. `label` describes the configuration in the
+    names of the rows.
+    """
     resolved = resolve(group, {"name": name, **config})
     if group == "data":
         return (DataRow(label, config, leave_out=NEEDS_ROWS),)
@@ -170,7 +184,7 @@ def _defaults(group: str, name: str, config: Mapping[str, Any], label: str) -> t
 
 
 def _try_target(group: str, resolved: Mapping[str, Any], target: Target) -> None:
-    """Build the plugin for a target; a wrapper is also calibrated on a model of that target.
+    """Build the plugin for a target; a wrapper is also calibrated around a model of that target.
 
     Raises:
         ConfigError: The plugin does not accept the target.

@@ -95,7 +95,7 @@ def examine_data(row: DataRow, build: Build) -> Iterator[Finding]:
 
 
 def _applies(name: str, bench: Workbench) -> bool:
-    """Return whether the check of this property applies to the row and the data set."""
+    """Return whether the property `name` can be checked for the contract row and the data set."""
     row = bench.row
     match name:
         case "angles are radians":
@@ -215,9 +215,10 @@ def _sample_batch(data: Data, batch: Batch, indices: Sequence[int], where: str, 
 
 
 def _samples_differ(bench: Workbench, worst: Worst) -> None:
-    """Check that at most half of the samples of a split, if their inputs are measured, repeat others.
+    """Check that at most half of the samples of a split repeat other samples.
 
-    In the training split, neither all inputs nor all targets may be equal.
+    This is checked only for measured inputs (`_measured`). In the training split, neither all inputs nor all targets
+    may be equal.
     """
     for name, split in splits_by_name(bench.data).items():
         hashes_by_sample = bench.contents[name].hashes
@@ -239,7 +240,7 @@ def _samples_differ(bench: Workbench, worst: Worst) -> None:
 
 
 def _measured(inputs: Tensor) -> bool:
-    """Return whether inputs are measured, rather than a few integers that may be equal in two samples by chance."""
+    """Return true for measured inputs, and false for a few integers, which may be equal in two samples by chance."""
     trimmed_inputs = remove_padding(inputs)
     return trimmed_inputs.numel() >= 16 or (
         trimmed_inputs.is_floating_point() and bool((trimmed_inputs != trimmed_inputs.round()).any())
@@ -312,7 +313,7 @@ def _angle_size(bench: Workbench, worst: Worst) -> None:
 
 
 def _disjoint(bench: Workbench, worst: Worst) -> None:
-    """Check that no sample, that is, pair of input and target, occurs in two splits."""
+    """Check that no pair of input and target occurs in two splits."""
     earlier: dict[tuple[int, int], str] = {}
     for name, split in splits_by_name(bench.data).items():
         own: dict[tuple[int, int], str] = {}
@@ -382,7 +383,7 @@ def _fetching(bench: Workbench, worst: Worst) -> None:
 
 
 def _own_memory(bench: Workbench, worst: Worst) -> None:
-    """Check that each batch and sample has its own memory, so that it is not changed with another one."""
+    """Check that each batch and each sample has memory of its own, so that changing one does not change another."""
     for name, split in splits_by_name(bench.data).items():
         order = list(bench.contents[name].hashes)
         expected = [bench.contents[name].hashes[number] for number in order[:16]]

@@ -28,7 +28,10 @@ from framework.testing.rows import DAMAGES, Damage
 
 
 def read_back(bench: Workbench, worst: Worst) -> None:
-    """Check that generated files give the same samples when read by `root`, and are synthetic only while marked so."""
+    """Check that generated files give the same samples when `root` names their folder.
+
+    They must count as synthetic as long as the folder contains the mark of synthetic data, and only then.
+    """
     for mark_state, synthetic in {"generated files": True, "generated files without mark": False}.items():
         workspace, source = bench.copy_files(
             lambda root, keep=synthetic: None if keep else (root / MARK).unlink()
@@ -101,7 +104,7 @@ def skipped_files(bench: Workbench, worst: Worst) -> None:
 
 
 def own_files(bench: Workbench, worst: Worst) -> None:
-    """Check that user files are read without `prepare`, in the given order, as samples like those of the splits."""
+    """Check that user files are read without `prepare` and in the given order, as samples like those of the splits."""
     files, data = _user_files(bench)
     unknown = [file.name for file in files if data.suffixes and file.suffix.lower() not in data.suffixes]
     worst.count(bool(unknown), f"`suffixes` lacks the suffix of {', '.join(unknown)}")
@@ -130,7 +133,10 @@ def own_files(bench: Workbench, worst: Worst) -> None:
 
 
 def _copy_exchanged(files: Sequence[Path], folder: Path) -> list[Path]:
-    """Copy the first two files under each other's names; return the copies, or no files if the suffixes differ."""
+    """Copy the first two files to a folder, each under the name of the other one, and return the copies.
+
+    No file is copied if there are fewer than two files, or if their suffixes differ.
+    """
     if len(files) < 2 or files[0].suffix != files[1].suffix or not all(file.is_file() for file in files[:2]):
         return []
     return [
@@ -139,7 +145,7 @@ def _copy_exchanged(files: Sequence[Path], folder: Path) -> list[Path]:
 
 
 def raw_input(bench: Workbench, worst: Worst) -> None:
-    """Check that a data set built from config and stored state alone reads files as the prepared data set does."""
+    """Check that a data set that only loads a stored state, without `prepare`, reads files like the prepared one."""
     files = list(bench.row.files(bench.make_folder())) if bench.row.files else []
     nowhere = {key: str(bench.make_folder() / "nowhere") for key in bench.location_keys}
     data, trained = bench.build_in(bench.first, **nowhere), bench.data
@@ -186,7 +192,14 @@ def damaged_own_files(bench: Workbench, worst: Worst) -> None:
 
 
 def check_refused(act: Callable[[], object], expected: Sequence[str], situation: str, worst: Worst) -> None:
-    """Check that a call raises a DataError that contains the expected words and is long enough to say what to do."""
+    """Check that a call raises a DataError whose message contains given words and is long enough to say what to do.
+
+    Args:
+        act: The call.
+        expected: Words that the message must contain.
+        situation: Description of the call, for the finding.
+        worst: Recorder of the largest error.
+    """
     try:
         act()
     except DataError as error:
@@ -206,7 +219,7 @@ def check_refused(act: Callable[[], object], expected: Sequence[str], situation:
 
 
 def _user_files(bench: Workbench) -> tuple[list[Path], Data]:
-    """Return the user files of the row, and a data set that is not prepared."""
+    """Return the user files that the contract row writes, and a data set that is not prepared."""
     assert bench.row.files is not None
     return list(bench.row.files(bench.make_folder())), bench.build_in(bench.first)
 

@@ -24,7 +24,7 @@ Build = Callable[[Mapping[str, Any]], Data]
 
 @contextmanager
 def cache_in(folder: Path) -> Iterator[None]:
-    """Generate data in `folder`, instead of in the user's cache, within the block."""
+    """Generate data in `folder`, instead of in the user's cache, within the `with` block."""
     before = os.environ.get("FRAMEWORK_CACHE")
     os.environ["FRAMEWORK_CACHE"] = str(folder)
     try:
@@ -36,7 +36,7 @@ def cache_in(folder: Path) -> Iterator[None]:
 
 
 class _Entries:
-    """Result of `os.scandir`, sorted by name in reverse order."""
+    """Iterator like that of `os.scandir`, but sorted by name in reverse order."""
 
     def __init__(self, entries: Any) -> None:
         with entries:
@@ -60,7 +60,10 @@ class _Entries:
 
 @contextmanager
 def list_folders_backwards() -> Iterator[None]:
-    """List the files of folders in reverse order within the block, since the order depends on the file system."""
+    """List the files of folders in reverse order within the `with` block.
+
+    A data set must not depend on this order, which differs between file systems.
+    """
     listdir, scandir = os.listdir, os.scandir
     os.listdir = lambda *path: sorted(listdir(*path), reverse=True)  # type: ignore[assignment]
     os.scandir = lambda *path: _Entries(scandir(*path))  # type: ignore[assignment]
@@ -76,7 +79,7 @@ class Workspace:
     Attributes:
         files: Folder of the files that the row's `write` wrote; empty for generated data.
         cache: Folder for generated data.
-        source: Parameters that locate the written files.
+        source: Parameters of the data set that name the written files.
     """
 
     def __init__(self, row: DataRow, folder: Path) -> None:
@@ -86,11 +89,11 @@ class Workspace:
 
 
 class Workbench:
-    """Builder of a row's data set, which prepares it as often as the checks need.
+    """Object that builds and prepares the data set of a contract row as often as the checks need.
 
     Args:
         row: Contract row of the data set.
-        build: Function from parameters to the data set, which it does not prepare.
+        build: Function that returns the data set for given parameters, without preparing it.
         scratch: Empty folder for the files of all preparations.
     """
 
@@ -106,7 +109,7 @@ class Workbench:
         return path
 
     def make_workspace(self) -> Workspace:
-        """Return a new workspace with the row's files."""
+        """Return a new workspace, to which the files of the contract row are written."""
         return Workspace(self.row, self.make_folder())
 
     def build_in(self, workspace: Workspace, **config: Any) -> Data:
@@ -142,14 +145,17 @@ class Workbench:
 
     @cached_property
     def location_keys(self) -> list[str]:
-        """Names of the parameters that locate the data: those that `write` returned, else `root` if there is one."""
+        """Names of the parameters that locate the data.
+
+        They are the parameters with a path that `write` returned or, without `write`, `root` if the data set has it.
+        """
         if self.row.write is None:
             return ["root"] if "root" in inspect.signature(type(self.data)).parameters else []
         folder = self.first.files
         return [key for key, value in self.first.source.items() if Path(str(value)).is_relative_to(folder)]
 
     def default(self, key: str) -> Any:
-        """Return the default value of a constructor parameter."""
+        """Return the default value of the parameter `key` of the data set's constructor."""
         return inspect.signature(type(self.data)).parameters[key].default
 
     @cached_property
@@ -160,7 +166,11 @@ class Workbench:
         return next((mark.parent for mark in sorted(self.first.cache.rglob(MARK))), None)
 
     def copy_files(self, change: Callable[[Path], None]) -> tuple[Workspace, dict[str, Any]]:
-        """Copy the data set's files and apply `change` to the copy; return its workspace and parameters to read it."""
+        """Copy the data set's files and apply `change` to the folder of the copy.
+
+        Returns:
+            The workspace of the copy, and the parameters with which the data set reads the copy.
+        """
         workspace = self.make_workspace()
         if self.generated is None:
             change(workspace.files)
@@ -171,7 +181,7 @@ class Workbench:
 
 
 def damage(file: Path, kind: Damage) -> None:
-    """Damage a file in the given way."""
+    """Damage a file in the way that `kind` names (see `framework.testing.rows.Damage`)."""
     content = file.read_bytes()
     file.unlink()
     if kind == "empty":
@@ -199,10 +209,10 @@ def first_match(folder: Path, pattern: str) -> Path:
 
 
 def configured_row(row: DataRow, own: Mapping[str, Any]) -> DataRow:
-    """Return a row with a user's parameters added to the parameters of `row`.
+    """Return a contract row with the parameters of `row`, overridden by a user's parameters `own`.
 
-    If the user's parameters locate the data, only the limits and the properties left out are kept. The files are then
-    the user's own: they are read but not damaged, and the row does not know their columns.
+    If `own` locates the data, only the limits and the properties left out are kept from `row`. The files are then the
+    user's own: they are read but not damaged, and the row does not know their columns.
     """
     with TemporaryDirectory() as folder:
         location_keys = {"root", *(row.write(Path(folder)) if row.write else ())}

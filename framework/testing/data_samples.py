@@ -83,7 +83,7 @@ def samples(split: Any) -> Iterator[tuple[int, Batch]]:
 
 
 def batches(indices: Sequence[int], sizes: Sequence[int]) -> Iterator[list[int]]:
-    """Yield the indices in consecutive batches; after the last of `sizes` the first follows again."""
+    """Yield `indices` in consecutive batches, whose sizes are those in `sizes`, again and again."""
     start = count = 0
     while start < len(indices):
         size = sizes[count % len(sizes)]
@@ -144,7 +144,12 @@ class Contents:
 
 
 def hash_split(split: Any, indices: Sequence[int] | None = None) -> Contents:
-    """Return the hashes of samples as `split[index]` returns them, for `indices` or, if None, for those to check."""
+    """Return the hashes of samples as `split[index]` returns them.
+
+    Args:
+        split: Split of a data set.
+        indices: Indices of the samples; None for those that `indices_to_check` returns.
+    """
     indices = indices_to_check(split) if indices is None else indices
     one_by_one = ((number, split[number]) for number in indices)
     hashes = {
@@ -157,7 +162,7 @@ def hash_split(split: Any, indices: Sequence[int] | None = None) -> Contents:
 def check_equal_hashes(
     actual: Hashes, expected: Hashes, label: str, worst: Worst, *, only: Sequence[str] = ()
 ) -> None:
-    """Check that two samples have the same content in all fields, or in those of `only`."""
+    """Check that two samples have equal hashes in all fields, or in the fields `only` if this is not empty."""
     if not only and actual == expected:
         return
     if not only:
@@ -169,7 +174,7 @@ def check_equal_hashes(
 def check_equal_splits(
     actual: Data, expected: Mapping[str, Contents], label: str, worst: Worst, *, only: tuple[str, ...] = ()
 ) -> None:
-    """Check that every split has the same samples as `expected`, in all fields or in those of `only`."""
+    """Check that every split of `actual` has the same samples as `expected`, in all fields or in the fields `only`."""
     for name, split in splits_by_name(actual).items():
         before = expected[name]
         worst.same(f"{label}: length of {name}", len(split), before.length)
@@ -183,7 +188,7 @@ def check_equal_splits(
 def check_equal_fields(
     actual: Batch, expected: Batch, label: str, worst: Worst, *, only: tuple[str, ...] = ()
 ) -> None:
-    """Check that two samples or batches are equal to the last bit, in all fields or in those of `only`."""
+    """Check that two samples or batches are equal to the last bit, in all fields or in the fields `only`."""
     if not only:
         worst.same(f"{label}: fields", sorted(actual), sorted(expected))
     for key in only or set(actual) & set(expected):

@@ -1,4 +1,4 @@
-"""Check by nearest neighbours that targets belong to their inputs, where inputs predict targets at all."""
+"""Check by nearest neighbours that targets belong to their inputs, if targets can be predicted from inputs at all."""
 
 import torch
 from torch import Tensor
@@ -17,9 +17,9 @@ NEIGHBOURS = 7
 SIZE = 64
 """Dimension of the space in which neighbours are searched for; larger inputs are projected to it at random."""
 SURE, CHANCE = 0.2, 0.8
-"""Bounds on the prediction error, relative to that for random targets.
+"""Bounds on the error of predicting targets from inputs, relative to the error for random targets.
 
-Inputs predict targets if the error is below the first bound. They do not if it is above the second.
+Below the first bound, inputs predict targets. Above the second bound, they do not.
 """
 
 
@@ -27,7 +27,7 @@ def check_targets_belong(data: Data, worst: Worst) -> None:
     """Check that inputs predict their own targets in every block of a split, if they do in most blocks.
 
     A target is predicted by the median target of the samples with the nearest inputs. If inputs do not predict their
-    own targets, they must not predict those of the previous or the next sample either.
+    own targets, they must not predict the targets of the previous or the next sample either.
     """
     for name, split in splits_by_name(data).items():
         indices = indices_to_check(split)[:MOST]
@@ -68,7 +68,12 @@ def check_targets_belong(data: Data, worst: Worst) -> None:
 
 
 def _error(targets: Tensor, near: Tensor) -> Tensor:
-    """Return the squared error of the median target of each sample's neighbours, (samples,)."""
+    """Return the squared error of predicting each target by the median target of its neighbours, (samples,).
+
+    Args:
+        targets: Targets as numbers, (samples, number).
+        near: Indices of the neighbours of each sample.
+    """
     return 2 * (targets - targets[near].median(1).values).square().sum(-1)
 
 
@@ -83,7 +88,10 @@ def _input_features(inputs: Tensor) -> Tensor:
 
 
 def _target_features(data: Data, targets: Tensor) -> Tensor:
-    """Return targets as numbers whose distances are meaningful, (samples, number)."""
+    """Return targets as numbers whose distances measure how different the targets are, (samples, number).
+
+    They are sine and cosine of angles, one number for each class, or real numbers in standard deviations, up to 3.
+    """
     if data.target.kind == "class":
         return torch.nn.functional.one_hot(targets.long(), len(data.target.names)).double()
     flat = targets.double().flatten(1)

@@ -36,7 +36,7 @@ from framework.testing.quadrature import cells, count_samples, density_at, side
 DRAWS = 20_000
 """Number of draws that are compared with a density."""
 SCALES = (1e-2, 0.1, 1.0, 10.0, 1e2, 1e3)
-"""Standard deviations of the random raw parameters at which densities are checked, in addition to the row's scale."""
+"""Standard deviations of the random raw parameters at which densities are checked, in addition to the row's `scale`."""
 CELLS = 24
 """Number of cells of about equal mass in which draws of one number are counted."""
 MEDIAN_DRAWS = 2000
@@ -51,9 +51,9 @@ class Property(NamedTuple):
         name: Name of the property.
         limit: Largest error that passes.
         check: Function that runs the check.
-        batch: Choice of the raw parameters. "scales": each scale of SCALES and the row's own. "own": the row's own
-            scale, at which a fixed grid resolves the densities. "many": 64 batch rows each of the scales 0.01, 1 and
-            100.
+        batch: Choice of the raw parameters. "scales": each scale of SCALES and the row's `scale`. "own": the row's
+            `scale`, at which a fixed grid resolves the densities. "many": 64 items of the batch for each of the scales
+            0.01, 1 and 100.
     """
 
     name: str
@@ -63,9 +63,9 @@ class Property(NamedTuple):
 
 
 def examine_densities(subject: HeadSubject) -> Iterator[Finding]:
-    """Yield one finding for each property of the row's densities, in float64.
+    """Yield one finding for each property of the densities of a contract row, in float64.
 
-    A density whose log_prob draws random numbers is checked at the row's own scale only, since its log_prob varies
+    A density whose log_prob draws random numbers is checked only at the row's `scale`, since its log_prob varies
     between calls by more than the error of any quadrature.
     """
     draws = subject.draws()
@@ -105,25 +105,30 @@ def examine_densities(subject: HeadSubject) -> Iterator[Finding]:
 
 
 def _examine_protocol(subject: HeadSubject, draws: bool) -> Iterator[Finding]:
-    """Yield findings for the optional functions of framework.distributions.protocol, and for mixtures and powers."""
+    """Yield findings for the optional functions of framework.distributions.protocol, and for mixtures and powers.
+
+    Args:
+        subject: Contract row of the head.
+        draws: True if log_prob draws random numbers.
+    """
 
     @cache
     def pairs() -> Distribution:
-        """Return densities of batch_shape (3, 2)."""
+        """Return densities of the head with batch_shape (3, 2)."""
         head = subject.make().double()
         head.requires_grad_(False)
         return head(subject.row.scale * subject.raw_parameters(3, 2).double())
 
     @cache
     def rows() -> Distribution:
-        """Return densities of batch_shape (3,)."""
+        """Return densities of the head with batch_shape (3,)."""
         head = subject.make().double()
         head.requires_grad_(False)
         return head(subject.row.scale * subject.raw_parameters(3).double())
 
     @cache
     def mixture() -> Distribution:
-        """Return mixtures of two densities, batch_shape (3,)."""
+        """Return mixtures of two densities of the head, batch_shape (3,)."""
         return mix_pairs(pairs())
 
     numbers, kind = _numbers(subject), subject.row.target.kind
@@ -173,7 +178,7 @@ def _examine_protocol(subject: HeadSubject, draws: bool) -> Iterator[Finding]:
 
 
 def _numbers(subject: HeadSubject) -> int:
-    """Return how many numbers a target has."""
+    """Return how many numbers a target of the contract row has."""
     return math.prod(subject.row.target.event_shape)
 
 
@@ -213,9 +218,9 @@ def integral_by_draws(density: Distribution, worst: Worst) -> None:
     """Check by draws that the density integrates to 1; the error is in standard errors.
 
     Let p be the density and q a normal density. The check compares E_p[q/(p + q)] with E_q[p/(p + q)]. Both are equal
-    to ∫ pq/(p + q) if p integrates to 1 and its draws follow it. Both averages are of values in [0, 1], also for heavy
-    tails. q is fitted to other draws than those in the average, where a fitted q would be too high: for ten numbers by
-    several standard errors.
+    to ∫ pq/(p + q) if p integrates to 1 and its draws follow it. All averaged values are in [0, 1], also for heavy
+    tails. q is fitted to one half of the draws from p, and the average over p is taken over the other half. With the
+    same draws, q would be too high at them: for ten numbers, the error would be several standard errors.
     """
     fit_draws, test_draws = density.sample(torch.Size((2 * DRAWS,))).double().chunk(2)
     support = density.support
@@ -284,7 +289,7 @@ def samples_follow_marginals(density: Distribution, worst: Worst) -> None:
 
 
 def _compare_draws(density: Distribution, draws: Tensor, worst: Worst, prefix: str) -> None:
-    """Check by a χ² test that draws follow a density of one number."""
+    """Check by a χ² test that draws follow a density of one number; `prefix` begins the description of a case."""
     quadrature = boxes(density)
     coordinate, border = (
         quadrature.mapping.coordinates(draws)[..., 0],
@@ -302,7 +307,7 @@ def _compare_draws(density: Distribution, draws: Tensor, worst: Worst, prefix: s
 
 
 def _chi_square(expected: Tensor, count: Tensor, worst: Worst, prefix: str) -> None:
-    """Record the normal deviate of χ² for expected and actual counts, (cell, *batch)."""
+    """Record the standard normal deviate of χ² for expected and actual counts of draws, (cell, *batch)."""
     rare = expected < 5
     score = ((count - expected).square() / expected).where(~rare, 0).sum(0)
     rest, rest_count = expected.where(rare, 0).sum(0), count.where(rare, 0).sum(0)
@@ -314,9 +319,10 @@ def _chi_square(expected: Tensor, count: Tensor, worst: Worst, prefix: str) -> N
 
 
 def draws_are_independent(density: Distribution, worst: Worst) -> None:
-    """Check that a draw is independent of the previous draw and of the draw of the next batch row.
+    """Check that a draw is independent of the previous draw, and of the draw for the next item of the batch.
 
-    The error is the correlation of their signs about the median, in standard errors.
+    The error is the correlation of the signs of the distances from the median, in standard errors. For classes, the
+    sign says whether the draw is the mode.
     """
     draws = density.sample(torch.Size((4000,))).double()
     if density.event_shape:
@@ -342,7 +348,8 @@ def draws_are_independent(density: Distribution, worst: Worst) -> None:
 def periodic(density: Distribution, worst: Worst) -> None:
     """Check that log_prob is the same after up to a thousand turns.
 
-    The error is relative to the gradient of log_prob, since 2π is not exact in floating point.
+    The error is relative to |log p| plus the gradient of log p, and to the size of the angle, since 2π is not exact in
+    floating point.
     """
     generator = torch.Generator().manual_seed(SEED)
     shape = torch.Size((8, *density.batch_shape, *density.event_shape))
@@ -365,9 +372,9 @@ def periodic(density: Distribution, worst: Worst) -> None:
 def entropy(density: Distribution, worst: Worst) -> None:
     """Check that the entropy is -∫ p log p.
 
-    The integral is a sum for classes, a quadrature for one or two numbers, and else a mean over draws. The unit of the
-    error is 1e-6 nats (relative above 1 nat), plus a statistical error where the entropy or the integral is estimated
-    from draws.
+    The integral is a sum for classes, is computed by quadrature for one or two numbers, and is a mean over draws for
+    more numbers. The unit of the error is 1e-6 nats (relative above 1 nat). Where the entropy or the integral is
+    estimated from draws, the statistical error is added to this unit.
     """
     entropies = torch.stack([_call_seeded(number, density.entropy) for number in range(2)]).double()
     noise = torch.zeros_like(entropies[0])
@@ -399,7 +406,7 @@ def entropy(density: Distribution, worst: Worst) -> None:
 
 
 def _surprise(density: Distribution, value: Tensor) -> Tensor:
-    """Return -log_prob in float64."""
+    """Return -log_prob of `value` in float64."""
     return torch.cat([-density.log_prob(part) for part in value.split(2000)]).double()
 
 
@@ -421,10 +428,10 @@ def mode_is_highest(density: Distribution, worst: Worst) -> None:
 
 
 def mode_of_mixture(density: Distribution, worst: Worst) -> None:
-    """Check the mode of a mixture; the error is in units of the height by which the search for the mode may be wrong.
+    """Check that no draw and no node of the quadrature has a higher density than the mode of a mixture.
 
-    This height is 0.05 nats if `quadratic_bound` is known, so that the search can climb from the components' modes.
-    Otherwise it is log 2 nats.
+    The search for this mode may be wrong by 0.05 nats if `quadratic_bound` is known, so that it can climb from the
+    components' modes, and otherwise by log 2 nats. The error is in units of this number.
     """
     known = density.has_enumerate_support or quadratic_bound(density, density.mode) is not None
     inner = Worst()
@@ -457,8 +464,8 @@ def marginals(density: Distribution, worst: Worst) -> None:
 def median_is_best(density: Distribution, worst: Worst) -> None:
     """Check that half of the mass lies on each side of the median.
 
-    The median of an angle must also have the smallest expected distance. The error is in standard errors of a median of
-    MEDIAN_DRAWS draws or, if the median is computed without draws, in units of 1e-6 of the mass.
+    The median of an angle must also have the smallest expected distance. If the median depends on draws, the error is
+    in standard errors of a median of MEDIAN_DRAWS draws. Otherwise it is in units of 1e-6 of the mass.
     """
     chosen = _call_seeded(SEED, lambda: median(density, MEDIAN_DRAWS)).double()
     deterministic = torch.equal(
@@ -497,11 +504,11 @@ def median_is_best(density: Distribution, worst: Worst) -> None:
 
 
 def moments(density: Distribution, worst: Worst) -> None:
-    """Compare mean and variance, where the density has them, with the quadrature; errors are in standard deviations.
+    """Compare mean and variance, if the density has them, with the quadrature; errors are in standard deviations.
 
-    The quadrature adapts to the density, so that its moments have an error for heavy tails. Only differences beyond
-    this error count. If the density states that its variance does not exist, the variance of the quadrature must be
-    huge, and the mean need not exist either.
+    The nodes of the quadrature are chosen for the density, so that its moments have an error for heavy tails. Only
+    differences beyond this error count. If the density states that its variance does not exist, the variance by the
+    quadrature must be huge, and the mean need not exist either.
     """
     quadrature = boxes(density)
     offset = quadrature.value - quadrature.mapping.mode  # keeps the digits of a narrow density far from 0
@@ -542,7 +549,10 @@ def moments(density: Distribution, worst: Worst) -> None:
 
 
 def masses(density: Distribution, worst: Worst) -> None:
-    """Compare cdf and arc_probability, where known, with the quadrature at mode ± {0, 0.3, 1, 3, 30} widths."""
+    """Compare `cdf` or `arc_probability`, if known, with the quadrature.
+
+    The values are the mode ± {0, 0.3, 1, 3, 30} widths of the density.
+    """
     quadrature = boxes(density)
     offset = torch.tensor([-30, -3, -1, -0.3, 0, 0.3, 1, 3, 30], dtype=torch.float64)[:, None]
     value = quadrature.mapping.mode[:, 0] + offset * quadrature.mapping.scale[:, 0]

@@ -1,8 +1,8 @@
 """Check on the CPU that code would not mix tensors on the CPU with tensors on a GPU.
 
-`OneDevice` runs code whose input tensors are labelled as on the device, as if they were on a GPU. Tensors created
-without `device=` are labelled as on the CPU. A result inherits the label of the tensors from which it is computed. A
-call that mixes both labels where CUDA would raise an error is recorded. No tensor is moved, and no value changes.
+`OneDevice` runs code whose input tensors carry the label "on the device", as if they were on a GPU. Tensors created
+without `device=` get the label "on the CPU". A result inherits the label of the tensors from which it is computed. A
+call with tensors of both labels is recorded if CUDA would raise an error. No tensor is moved, and no value changes.
 """
 
 import dis
@@ -32,28 +32,28 @@ FACTORIES = frozenset(
 )  # fmt: skip
 """Functions whose result is on the CPU unless `device=` is given."""
 CONVERSIONS = frozenset(("tensor", "as_tensor", "asarray"))
-"""Functions whose result is on the device of their argument if that is a tensor, else as for FACTORIES."""
+"""Functions whose result is on the device of their argument if that is a tensor; otherwise as for FACTORIES."""
 LIKE_THE_FIRST = frozenset(
     ("expand_as", "view_as", "reshape_as", "copy_", "set_", "resize_as_", "__deepcopy__", "is_same_size", "align_as",
      "_make_subclass", "backward", "register_hook", "new_tensor", "new_zeros", "new_ones",
      "new_full", "new_empty", "new_empty_strided", "zeros_like", "ones_like", "empty_like", "full_like", "rand_like",
      "randn_like", "randint_like")
 )  # fmt: skip
-"""Functions whose result is on the device of their first argument, for any device of the other arguments."""
+"""Functions whose result is on the device of their first argument, whatever the devices of the other arguments are."""
 ELEMENTWISE_RESULTS = frozenset(("broadcast_tensors", "atleast_1d", "atleast_2d", "atleast_3d"))
-"""Functions that return one result for each argument, on the device of that argument."""
+"""Functions that return one tensor for each argument, on the device of that argument."""
 STRICT = frozenset(
     ("cat", "concat", "concatenate", "stack", "hstack", "vstack", "dstack", "column_stack", "row_stack", "block_diag",
      "searchsorted", "bucketize", "gather", "scatter", "scatter_", "scatter_add", "scatter_add_", "scatter_reduce",
      "scatter_reduce_", "index_select", "index_add", "index_add_", "index_copy", "index_copy_", "take",
      "take_along_dim", "equal", "allclose", "isclose", "outer", "kron", "tensordot", "einsum", "isin")
 )  # fmt: skip
-"""Functions that refuse tensors on two devices even if the CPU tensors have no dimensions."""
+"""Functions that refuse tensors on two devices, even if the tensors on the CPU have no dimensions."""
 _LIBRARIES = frozenset(("torch", "torchmetrics", "jaxtyping", "beartype", "numpy", "scipy"))
 Calls = Iterator[tuple[str, Callable[[], Any]]]
 """Names of calls to check, each with a function that performs the call."""
 _on_device: Any = WeakTensorKeyDictionary()
-"""Tensor → True if labelled as on the device, False if on the CPU; tensors that are absent have no label."""
+"""Tensor → true if its label is "on the device", false if it is "on the CPU"; tensors without a label are absent."""
 
 
 class OneDevice(TorchFunctionMode):
@@ -171,7 +171,8 @@ class OneDevice(TorchFunctionMode):
     def _label_moved(self, name: str, result: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> Any:
         """Label the result of `.to`, `.cpu` and similar calls.
 
-        The result is a new tensor if its label differs from that of its source.
+        If its label differs from that of the tensor that was moved, a new tensor is returned, so that this tensor keeps
+        its label.
         """
         source = args[0]
         inside = _on_device.get(source)
@@ -246,7 +247,7 @@ def check_devices(make_calls: Callable[[OneDevice], Calls], worst: Worst) -> Non
     error is left to other checks.
 
     Args:
-        make_calls: Function that builds the object, labels its tensors and its inputs by the mode that it receives, and
+        make_calls: Function that receives the `OneDevice`. It builds the object, labels its tensors and its inputs, and
             yields the calls to perform.
         worst: Recorder of the faults.
     """
@@ -266,7 +267,7 @@ def check_devices(make_calls: Callable[[OneDevice], Calls], worst: Worst) -> Non
 
 
 def _perform(mode: OneDevice, call: Callable[[], Any]) -> None:
-    """Perform a call under the mode, and add a fault if it raises an error only there."""
+    """Perform a call with labels; record a fault if it raises an error that it does not raise without labels."""
     error_message = ""
     for labelled in (True, False):
         seed(SEED)
@@ -349,7 +350,7 @@ def _tests_device(code: CodeType) -> bool:
 
 
 _TESTS_DEVICE: dict[CodeType, bool] = {}
-"""Code of a function → result of `_tests_device`."""
+"""Code of a function → result of `_tests_device` for it, so that it is computed once."""
 
 
 def _call_site() -> str:

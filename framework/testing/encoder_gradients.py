@@ -28,10 +28,10 @@ LARGEST = 30.0
 def check_parameter_gradients(make: Make, inputs: Inputs, worst: Worst, *, slow: bool) -> None:
     """Compare directional derivatives in groups of parameters with central differences, in float64.
 
-    The derivatives are of a loss that depends on all features. The error is relative to the norm of the gradient. The
-    step with the best agreement counts, since no step agrees with a wrong gradient. The check runs in evaluation mode
-    and, unless the encoder is slow, in training mode. In training, batch norm over few samples makes the loss of a
-    slow, deep network too nonlinear for differences.
+    The derivatives are of a loss that depends on all features. The error is relative to the norm of the gradient. Of
+    several step lengths, the one with the smallest error counts, since no step agrees with a wrong gradient. The check
+    runs in evaluation mode and, unless the encoder is slow, in training mode. In training, batch norm over few samples
+    makes the loss of a slow, deep network too nonlinear for differences.
     """
     for training, count in ((False, 2),) if slow else ((True, 6), (False, 3)):
         encoder = make().double().train(training)
@@ -40,7 +40,7 @@ def check_parameter_gradients(make: Make, inputs: Inputs, worst: Worst, *, slow:
 
 
 def perturb_parameters(encoder: Encoder) -> None:
-    """Add small random numbers to the parameters, so that none is 0, as after some training."""
+    """Add small random numbers to the parameters, as after some training, so that none is 0."""
     generator = torch.Generator().manual_seed(SEED)
     with torch.no_grad():
         for value in encoder.parameters():

@@ -260,10 +260,10 @@ def _round_trip(make: Callable[..., Encoder], inputs: Callable[[int], Tensor], w
 
 
 def _stated_attributes(make: Callable[..., Encoder], inputs: Callable[[int], Tensor], worst: Worst) -> None:
-    """Check that the attributes `fixed` and `vectorises` are true.
+    """Check that the encoder behaves as its attributes `fixed` and `vectorises` state.
 
-    If `fixed`, features depend on the inputs alone. If `vectorises`, torch.vmap over the parameters of several encoders
-    gives the features of each.
+    If `fixed` is true, features depend on the inputs alone. If `vectorises` is true, torch.vmap over the parameters of
+    several encoders gives the features of each.
     """
     encoder = make()
     worst.count(False, "neither fixed nor vectorises")
@@ -316,8 +316,9 @@ def _gradients(make: Make, inputs: Callable[[int], Tensor], worst: Worst) -> Non
 def _against_differences(make: Make, inputs: Callable[[int], Tensor], worst: Worst) -> None:
     """Compare a directional derivative in the input with central differences, in evaluation mode and float64.
 
-    The derivative is that of the mean square of the features. The error is relative to the norm of the gradient. The
-    step with the best agreement counts, since long steps cross kinks and short steps lose digits.
+    The derivative is that of the mean square of the features. The error is relative to the norm of the gradient. Of
+    several step lengths, the one with the smallest error counts, since long steps cross kinks and short steps lose
+    digits.
     """
     encoder, batch = make().double(), inputs(2).double()
     encoder.requires_grad_(False)

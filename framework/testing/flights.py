@@ -35,7 +35,7 @@ def simulate_windows(
 
     Args:
         count: Number of flights.
-        outliers: Whether a tenth of the frames is 0.4 m off.
+        outliers: If true, the observed position is wrong by 0.4 m in a tenth of the frames.
     """
     random = np.random.default_rng(0)
     states = torch.from_numpy(

@@ -14,17 +14,17 @@ from framework.testing.heads import HeadSubject, as_type, seeded
 STEPS = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9)
 """Step lengths of central differences, multiplied by the size of raw parameters if that is above 1.
 
-The last three are used only if none of the first three agrees with the derivative.
+The last three steps are used only if the differences with the first three all disagree with the derivative.
 """
 
 
 def gradient(subject: HeadSubject, worst: Worst) -> None:
     """Check derivatives of the loss in each raw parameter, and along a direction in the head's parameters.
 
-    They are compared with central differences for each batch row, at random targets and at draws. The best agreement
-    among three steps counts, since a small step suffers from rounding and a large one may cross a kink. If none agrees,
-    three smaller steps follow, which resolve a narrow density. Of these, the difference that is closest to that of the
-    previous step counts, without regard to the derivative.
+    The derivatives are compared with central differences for each item of the batch, at random targets and at draws. Of
+    three step lengths, the one with the smallest error counts, since a small step suffers from rounding and a large one
+    may cross a kink. If all three disagree, three smaller steps follow, which resolve a narrow density. Then the
+    difference that is closest to the difference with the previous step counts, whatever its error is.
     """
     head = subject.make().double().train()
     for size in (0.1, 1.0, 3.0, 30.0, 1e3):
@@ -83,9 +83,11 @@ class Difference(NamedTuple):
     noise: Tensor
 
     def error(self, analytic: Tensor, least: Tensor | float) -> Tensor:
-        """Return by how much a derivative differs from the slope beyond the noise, relative to the slope.
+        """Return the part of |analytic - slope| that exceeds the noise, relative to the slope.
 
-        The divisor is at least `least` and at least 1e-3.
+        Args:
+            analytic: Derivative to compare with the slope.
+            least: The divisor is the slope's magnitude, but at least this number and at least 1e-3.
         """
         scale = self.slope.abs().clamp(min=1e-3).maximum(torch.as_tensor(least))
         return ((analytic - self.slope).abs() - self.noise).clamp(min=0) / scale
@@ -95,9 +97,14 @@ class Difference(NamedTuple):
 def difference(
     loss: Callable[[], Tensor], argument: Tensor, direction: Tensor, step: float, whole: bool
 ) -> Difference:
-    """Return the central difference of each row's loss or, if `whole`, of their sum, along a direction.
+    """Return the central difference of a loss along a direction.
 
-    `argument` is changed in place during the call.
+    Args:
+        loss: Function that returns the loss of each item of the batch.
+        argument: Tensor on which the loss depends; it is changed in place during the call, and restored.
+        direction: Direction in which it is changed.
+        step: Step length.
+        whole: If true, return the difference of the sum of all losses, otherwise of each loss.
     """
     ends = []
     for sign in (1, -1):
@@ -112,7 +119,10 @@ def difference(
 
 
 def most_certain(differences: Sequence[Difference]) -> Difference:
-    """Return for each row the difference that is closest to that of the previous step, plus its own noise."""
+    """Return for each item of the batch the difference that is least uncertain.
+
+    The uncertainty of a difference is its distance from the difference with the previous step, plus its noise.
+    """
     slope, noise = (torch.stack(parts) for parts in zip(*differences, strict=True))
     doubt = (slope[1:] - slope[:-1]).abs() + noise[1:]
     best = doubt.nan_to_num(nan=math.inf).argmin(0, keepdim=True)
@@ -120,7 +130,14 @@ def most_certain(differences: Sequence[Difference]) -> Difference:
 
 
 def _directions(argument: Tensor, raw: bool, size: float, number: int) -> Iterator[tuple[str, Tensor]]:
-    """Yield names and directions: a random direction of length 1, and each axis if there are few raw parameters."""
+    """Yield names and directions: a random direction, and each axis if there are few raw parameters.
+
+    Args:
+        argument: Tensor in which derivatives are taken.
+        raw: True for raw parameters, whose last dimension is the direction of each item of the batch.
+        size: Size of the raw parameters; at large sizes there is no random direction.
+        number: Number that selects the seed.
+    """
     generator = torch.Generator().manual_seed(number)
     direction = torch.randn(argument.shape, dtype=argument.dtype, generator=generator)
     if size <= 3:  # large parameters act on very different scales, so that they are not changed together
@@ -135,8 +152,8 @@ def _directions(argument: Tensor, raw: bool, size: float, number: int) -> Iterat
 def mean_gradient_is_zero(subject: HeadSubject, worst: Worst) -> None:
     """Check that the mean gradient of the loss over draws from the density is 0; the error is in standard errors.
 
-    This holds for every proper score (Gneiting & Raftery 2007). The standard error includes a term for values that are
-    too rare to be among the draws.
+    The mean is 0 for every proper score (Gneiting & Raftery 2007). The standard error includes a term for values that
+    are too rare to occur among the draws.
     """
     if subject.draws():
         worst.count(False, "log_prob draws random numbers, so the loss may be a bound on it")

@@ -27,7 +27,7 @@ BATCH_SHAPES = ((), (4,), (3, 2), (0,))
 SIZES = (0.0, 1e-38, 1e-20, 1e-8, 1e-3, 1.0, 30.0, 1e3, 1e10, 1e20, 1e30)
 """Sizes of raw parameters that a diverging network may return; the largest number of the dtype is added."""
 MANY_ROWS = 300
-"""Number of rows of a large batch whose first and last rows are compared with those of small batches."""
+"""Number of items of a large batch, whose first and last items are compared with those of small batches."""
 MOST_COLUMNS = 24
 """Largest number of raw parameters that are changed one at a time."""
 TIME_LIMIT = 20.0
@@ -84,7 +84,7 @@ class HeadSubject:
         return values(self.row.target, batch)
 
     def draws(self) -> bool:
-        """Return whether log_prob draws random numbers, that is, differs between seeds for the same inputs."""
+        """Return true if log_prob draws random numbers, that is, if it differs between seeds for the same inputs."""
         try:
             with torch.no_grad():
                 head, raw, value = self.make(), self.raw_parameters(4), self.values(4)
@@ -109,9 +109,9 @@ def fit_if_needed(head: DensityHead, target: Target) -> DensityHead:
 
 
 def values(target: Target, batch: tuple[int, ...]) -> Tensor:
-    """Return seeded targets (*batch, *event): angles over several turns, classes, or reals.
+    """Return seeded targets (*batch, *event): angles over several turns, classes, or real numbers.
 
-    Reals have the location and scale of the target, or mean 0 and standard deviation 1.
+    Real numbers have the location and scale of the target, or mean 0 and standard deviation 1 if it has none.
     """
     generator = torch.Generator().manual_seed(SEED + 1)
     if target.kind == "class":
@@ -299,9 +299,11 @@ def _repeatable(subject: HeadSubject, worst: Worst) -> None:
 
 
 def _rows_apart(subject: HeadSubject, worst: Worst) -> None:
-    """Check that results of a batch row do not depend on other rows, and that its loss has no gradient in them.
+    """Check that results for an item of the batch do not depend on other items.
 
-    If log_prob draws no random numbers, results must not depend on the number of rows either.
+    Its loss must have no gradient in the raw parameters of other items.
+
+    If log_prob draws no random numbers, results must not depend on the number of items either.
     """
     results = []
     for factor in (1.0, -3.0):
@@ -427,9 +429,9 @@ def _finite_anywhere(subject: HeadSubject, worst: Worst) -> None:
 def _calibrate(subject: HeadSubject, worst: Worst) -> None:
     """Check that `calibrate` does not lower the mean log_prob of its data; the error is relative above 1 nat.
 
-    The data are targets that are independent of the raw parameters, and draws from the head's own densities: as drawn,
-    moved to a third of their distance from the mode, and to three times that distance. For draws the error is divided
-    by 1000.
+    The data are targets that are independent of the raw parameters, and draws from the head's own densities. The draws
+    are used unchanged, moved to a third of their distance from the mode, and moved to three times this distance. For
+    draws the error is divided by 1000.
     """
     if subject.draws():
         worst.count(False, "log_prob draws random numbers")
@@ -463,7 +465,7 @@ def _calibrate(subject: HeadSubject, worst: Worst) -> None:
 
 
 def _calibrate_backwards(subject: HeadSubject, worst: Worst) -> None:
-    """Check that the result of `calibrate` does not depend on the order of rows."""
+    """Check that the calibrated head does not depend on the order in which `calibrate` gets its samples."""
     if subject.draws():
         worst.count(False, "log_prob draws random numbers")
         return
@@ -481,7 +483,7 @@ def _calibrate_backwards(subject: HeadSubject, worst: Worst) -> None:
 
 
 def _reads_all_parameters(subject: HeadSubject, worst: Worst) -> None:
-    """Check that a change of each raw parameter changes the loss of some target."""
+    """Check that each raw parameter has an effect: its change must change the loss of some target."""
     head, columns = subject.make().double().train(), range(subject.size)
     if head.direct or isinstance(head, Fitted):
         worst.count(False, "the head reads features rather than raw parameters")
@@ -506,10 +508,10 @@ def _reads_all_parameters(subject: HeadSubject, worst: Worst) -> None:
 
 
 def _loss_in_nats(subject: HeadSubject, worst: Worst) -> None:
-    """Check that a loss of the form factor · -log_prob + constant has the factor 1; the error is relative to log_prob.
+    """Check that the loss is in nats: if it is factor · -log_prob + constant, the factor must be 1.
 
-    Draws from the head's own densities decide whether the loss has this form. If it has, it must also agree with
-    log_prob at values that are very unlikely.
+    The error is relative to log_prob. Draws from the head's own densities decide whether the loss has this form. If it
+    has, it must also agree with log_prob at values that are very unlikely.
     """
     if subject.draws():
         worst.count(False, "log_prob draws random numbers, so the loss may be a bound on it")

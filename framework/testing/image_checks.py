@@ -15,7 +15,7 @@ from framework.testing.surface_checks import smooth_texture
 
 
 def draws_points(renderer: Renderer) -> bool:
-    """Return whether the renderer draws points: whether vertices that belong to no face change the image."""
+    """Return true if the renderer draws points, that is, if vertices that belong to no face change the image."""
     if "color" not in renderer.channels:
         return False
     scene = empty(sphere())

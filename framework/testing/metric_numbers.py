@@ -16,7 +16,7 @@ Numbers = Mapping[str, Tensor]
 SEM = "_sem"
 """Suffix of the name of a standard error."""
 NEAR = 0.15
-"""Absolute logarithm of the ratio to the jackknife's standard error above which the bootstrap is used."""
+"""Largest |log(stated standard error / jackknife's standard error)| for which the bootstrap is not used."""
 RESAMPLES = 300
 """Number of resamples of the bootstrap."""
 SCALE = 8.0
@@ -32,8 +32,9 @@ ROOTS = re.compile(r"(^|[\W_])(root|rms[a-z]*)([\W_]|$)")
 def check_standard_errors(evaluate: Callable[[Tensor], Numbers], count: int, worst: Worst) -> None:
     """Compare standard errors with those of the jackknife over test cases or, if these differ, of the bootstrap.
 
-    The error is the absolute logarithm of the ratio. For a mean, the jackknife gives the usual standard error (Efron &
-    Tibshirani 1993, §11.1). For statistics that are not smooth, such as a median, only the bootstrap is valid (§11.6).
+    The error is the absolute logarithm of the ratio of the two standard errors. For a mean, the jackknife gives the
+    usual standard error (Efron & Tibshirani 1993, §11.1). For statistics that are not smooth, such as a median, only
+    the bootstrap is valid (§11.6).
 
     Args:
         evaluate: Function from indices of test cases to the metric's numbers.
@@ -134,15 +135,15 @@ def check_scaling(
 ) -> None:
     """Check how numbers change with the target's unit; a standard error must scale as its number does.
 
-    Targets in the second unit are SCALE times as large as in the first. Logarithms of densities must change by their
-    amount in nats.
+    Targets in the second unit are SCALE times as large as in the first. A number that changes by a multiple of log
+    SCALE is a logarithm of a density; the change must be in nats, not in bits.
 
     Args:
         columns: Columns of the metric.
         second_unit: Numbers of the metric in the second unit.
         third_unit: Numbers in a third unit, with targets SCALE times as large as in the second.
         first_unit: Numbers in the first unit.
-        numbers: Number of reals of a target.
+        numbers: Number of real numbers of a target.
         worst: Recorder of the worst case.
     """
     worst.count(False, "no number depends on the unit")
@@ -193,7 +194,7 @@ def _is_integer(number: float) -> bool:
 
 
 def check_nats(columns: Mapping[str, str], target: Target, flat: Numbers, worst: Worst) -> None:
-    """Check that no number is in bits, at uniform densities, whose log-density and entropy are known.
+    """Check that no number is in bits, for uniform densities, whose log-density and entropy are known.
 
     Args:
         columns: Columns of the metric.
@@ -224,7 +225,9 @@ def check_nan_visible(
     better: Mapping[str, str],
     worst: Worst,
 ) -> None:
-    """Check that predictions of NaN are refused, make numbers NaN or worsen them, instead of being left out.
+    """Check that a metric does not leave out predictions that are NaN.
+
+    It must refuse them, or its numbers must be NaN or worse than without NaN.
 
     Args:
         evaluate: Function that returns the numbers if the predictions of some samples are NaN.

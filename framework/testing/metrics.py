@@ -121,7 +121,7 @@ def _(density: Cardioid, index: Tensor) -> Cardioid:
 
 
 def place_size(target: Target) -> int:
-    """Return the size of the last dimension of the `place` that `simplest_density` reads."""
+    """Return the number of numbers that `simplest_density` reads as `place` for one sample."""
     return len(target.names) if target.kind == "class" else math.prod(target.event_shape)
 
 
@@ -188,11 +188,11 @@ class Predictions:
         row: Contract row, which states the target and the image size.
         target: Target of each sample.
         place: Location of the density of each sample, as `simplest_density` reads it.
-        breadth: Factor on the widths of the densities of the test split; None for 1.
-        outliers: Factor on the widths of the densities of outliers. An outlier has the location of the next sample, so
-            that the test sample and the outlier of an index differ in location.
+        breadth: Factor on the widths of the densities; None for 1.
+        outliers: Further factor on the widths in the split "outliers". An outlier has the location of the next sample,
+            so that the test sample and the outlier with the same index differ in location.
         fields: Further fields of the batch.
-        images: Whether the predictions have images, which show balls.
+        images: True if the predictions have images, which show balls.
     """
 
     row: MetricRow
@@ -204,7 +204,7 @@ class Predictions:
     images: bool
 
     def __call__(self, index: Tensor, split: Split) -> Prediction:
-        """Return the prediction of these samples of a split."""
+        """Return the prediction for the samples with the indices `index` in a split."""
         location, breadth = self.place[index], None if self.breadth is None else self.breadth[index]
         if split == "outliers":
             location = self.place[(index + 1) % len(self.target)]
@@ -218,9 +218,15 @@ class Predictions:
 
 
 def predictions(row: MetricRow, count: int, *, images: bool, near: bool = False) -> Predictions:
-    """Return predictions at random locations or, if `near`, close to the targets.
+    """Return `count` predictions at random locations or, if `near`, close to the targets.
 
     If `near`, each sample has a random difficulty, so that the errors of the numbers of its target are correlated.
+
+    Args:
+        row: Contract row of the metric.
+        count: Number of samples.
+        images: True if the predictions have images.
+        near: True for locations close to the targets.
     """
     target = values(row.target, (count,))
     fields = {name: make(count) for name, make in row.fields.items()}
@@ -259,7 +265,7 @@ def _update(metric: Metric, predict: Predict, indices: Tensor) -> None:
 
 
 def _compute(build: Make, predict: Predict, parts: Sequence[Tensor]) -> dict[str, Tensor]:
-    """Return the numbers of a new metric after one update for each part, a tensor of sample indices."""
+    """Return the numbers of a new metric after one update for each tensor of sample indices in `parts`."""
     metric = build()
     torch.manual_seed(SEED)
     for part in parts:
@@ -320,7 +326,7 @@ def _compute_quietly(build: Make, predict: Predict, parts: Sequence[Tensor]) -> 
 
 
 class Many:
-    """Large set of predictions, with the numbers of a metric for all of them.
+    """Many predictions, and the numbers of a metric for all of them.
 
     Attributes:
         predictions: Predictions.
@@ -396,8 +402,8 @@ def _reset(build: Make, predict: Predict, worst: Worst) -> None:
 def _perfect(build: Make, row: MetricRow, worst: Worst) -> None:
     """Check that densities at the targets give better numbers than densities at other locations.
 
-    All columns of `better` are compared. For a metric that reads outliers, densities of outliers are broader than those
-    of test samples in the first case, and equally broad in the second.
+    All columns of `better` are compared. For a metric that reads outliers, the densities of outliers are broader than
+    those of test samples in the first comparison, and equally broad in the second.
     """
     metric = build()
     predicted = predictions(row, SAMPLES, images=bool(metric.reads))
@@ -497,7 +503,7 @@ def _turns(build: Make, row: MetricRow, worst: Worst) -> None:
 
 
 def _unit(build: Make, row: MetricRow, worst: Worst) -> None:
-    """Check that numbers are in degrees only if their names say so, are in nats, and scale with the unit of reals."""
+    """Check the units of numbers: degrees only if a name says so, nats and not bits, and the unit of real targets."""
     index, kind = torch.arange(SAMPLES), row.target.kind
     predicted = predictions(row, SAMPLES, images=False, near=True)
     metric = build()
@@ -552,7 +558,7 @@ def _nan(build: Make, row: MetricRow, worst: Worst) -> None:
 
 
 def _images(build: Make, predict: Predict, worst: Worst) -> None:
-    """Check that the metric draws exactly the images in `reads`, each once and by itself."""
+    """Check that the metric requests each image in `reads` once, in a call of its own, and no other image."""
     metric, prediction = build(), predict(torch.arange(SAMPLES), build().splits[0])
     metric.update(prediction)
     requested = prediction.density.requested_channels  # type: ignore[attr-defined]  # a Ball

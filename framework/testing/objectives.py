@@ -21,7 +21,7 @@ from framework.testing.rows import ObjectiveRow
 from framework.testing.wrappers import LENGTH
 
 Make = Callable[[float], Objective]
-"""Function that builds the row's objective with its weight multiplied by a factor."""
+"""Function that builds the contract row's objective, with its weight multiplied by the given factor."""
 SAMPLES = 12
 """Number of samples of a batch."""
 STEPS = (1e-5, 1e-6, 1e-7, 1e-8)
@@ -55,7 +55,7 @@ class Network(nn.Module):
 
 
 class Members(Predictor):
-    """Predictor to check an objective on: an ensemble of `count` networks, or a single network if None."""
+    """Predictor for checks of an objective: an ensemble of `count` networks, or one network if `count` is None."""
 
     def __init__(self, target: Target, count: int | None = None) -> None:
         super().__init__()
@@ -193,8 +193,8 @@ def _scalar(build: Make, row: ObjectiveRow, worst: Worst) -> None:
 def _gradient(build: Make, row: ObjectiveRow, worst: Worst) -> None:
     """Compare a directional derivative in all parameters with central differences, in evaluation mode and float64.
 
-    The step with the best agreement counts: a longer step may cross a kink or be too coarse for a narrow density, and a
-    shorter one loses digits to rounding.
+    Of several step lengths, the one with the smallest error counts: a longer step may cross a kink or be too coarse for
+    a narrow density, and a shorter one loses digits to rounding.
     """
     objective, predictor = build(1.0), predictor_of(row).eval().double()
     batch = in_float64(batch_of(row, SAMPLES))
@@ -279,7 +279,7 @@ def _side_effects(build: Make, row: ObjectiveRow, worst: Worst) -> None:
 
 
 def _order(build: Make, row: ObjectiveRow, worst: Worst) -> None:
-    """Check in evaluation mode that the order of samples does not matter; dropout masks depend on batch positions."""
+    """Check in evaluation mode that the order of samples does not matter; in training, dropout depends on it."""
     predictor, batch = predictor_of(row).eval(), batch_of(row, SAMPLES)
     backwards = {name: field.flip(0) for name, field in batch.items()}
     expected = penalty(build(1.0), predictor, batch).item()
@@ -309,7 +309,7 @@ def _each_sample(build: Make, row: ObjectiveRow, worst: Worst) -> None:
 
 
 def _mean(build: Make, row: ObjectiveRow, worst: Worst) -> None:
-    """Check that a batch with every sample twice has the same penalty, which hence does not grow with the batch size.
+    """Check that a batch that contains every sample twice has the same penalty as with every sample once.
 
     For an objective that draws random numbers, penalties are averaged over DRAWS seeds, and an error of 0.4 is
     tolerated.
@@ -394,7 +394,10 @@ def _nan(build: Make, row: ObjectiveRow, worst: Worst) -> None:
 
 
 def _members(build: Make, row: ObjectiveRow, worst: Worst) -> None:
-    """Check without dropout that equal members have the penalty of a single one, and each its gradient."""
+    """Check without dropout an ensemble of equal members: its penalty must be that of a single member.
+
+    The gradient in the parameters of each member must also be that of a single member.
+    """
     alone = predictor_of(row).eval()
     together = predictor_of(row, 3).eval()
     for network in together.networks:

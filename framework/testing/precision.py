@@ -14,8 +14,8 @@ from framework.testing.heads import HeadSubject, as_type, seeded
 def reference(subject: HeadSubject, worst: Worst, dtype: torch.dtype) -> None:
     """Compare log_prob with the row's reference cases; the error is relative to max(1, |reference|).
 
-    Conversion to `dtype` rounds each parameter of the head once. The change of log_prob from this rounding, to first
-    order, is not counted as an error. The inputs of the cases are exact in every dtype.
+    Conversion to `dtype` rounds each parameter of the head. The change of log_prob by this rounding, to first order, is
+    not counted as an error. The inputs of the cases are exact in every dtype.
     """
     assert subject.row.cases is not None
     head = subject.make().double()
@@ -40,8 +40,8 @@ def reference(subject: HeadSubject, worst: Worst, dtype: torch.dtype) -> None:
 def precision(subject: HeadSubject, worst: Worst) -> None:
     """Compare log_prob in float32 with float64 for the same head and inputs; the error is in float32 epsilons.
 
-    The error is relative to max(1, |log p|) plus the change of log p from rounding the raw parameters and angles. Hence
-    a large error is one from cancellation inside the head.
+    The error is relative to max(1, |log p|) plus the change of log p from rounding the raw parameters and angles. So if
+    it is large, it comes from cancellation inside the head.
     """
     single = subject.make()
     double = copy.deepcopy(single).double()

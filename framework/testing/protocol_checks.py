@@ -15,7 +15,7 @@ from framework.errors import UserError
 from framework.testing.finding import SEED, Worst, seed
 
 MANY = 4000
-"""Number of draws with which a result is compared."""
+"""Number of draws with which the result of a function is compared."""
 TEMPERATURES = (0.6, 1.7)
 """Temperatures of the powers that are checked."""
 STANDARD_ERRORS = 6.0
@@ -122,13 +122,13 @@ def powers_of(density: Distribution, worst: Worst) -> Iterator[tuple[float, Dist
 def apply_to_powers(
     density: Distribution, worst: Worst, check: Callable[[Distribution, Worst], None]
 ) -> None:
-    """Apply a check to the density tempered with each of TEMPERATURES."""
+    """Apply a check to the power of a density at each of TEMPERATURES."""
     for _, power in powers_of(density, worst):
         check(power, worst)
 
 
 def check_pick(density: Distribution, worst: Worst) -> None:
-    """Check that `pick(density, index)` draws from the item with that index; batch_shape is (rows, 2)."""
+    """Check that draws of `pick(density, index)` are draws of the item at `index`; batch_shape is (rows, 2)."""
     rows, count = density.batch_shape
     index = (torch.arange(MANY).unsqueeze(-1) + torch.arange(rows)) % count
     draws = protocol.pick(density, index).sample()
@@ -200,7 +200,7 @@ def check_quadratic_bound(density: Distribution, worst: Worst) -> None:
 
 
 def check_recentre(density: Distribution, worst: Worst) -> None:
-    """Check for densities of one number that `recentre(density, index, place)` at d has log_prob of place + d."""
+    """Check `recentre` for densities of one number: its log_prob at d must be the log_prob at the origin plus d."""
     rows = density.batch_shape[0]
     index = torch.arange(2 * rows + 1) % rows
     width = known_widths(density)
@@ -221,7 +221,7 @@ def check_recentre(density: Distribution, worst: Worst) -> None:
 
 
 def known_widths(density: Distribution) -> Tensor:
-    """Return the standard deviation, (rows,), of a normal as high as the density at its mode; at most 1 for angles."""
+    """Return the standard deviation, (rows,), of the normal density as high as `density`; at most 1 for angles."""
     width = (-density.log_prob(density.mode).double()).exp() / math.sqrt(2 * math.pi)
     return width.clamp(max=1.0) if isinstance(density.support, Circular) else width
 
@@ -259,7 +259,7 @@ def check_mode_candidates(density: Distribution, worst: Worst) -> None:
 
 
 def check_marginal_cdfs(density: Distribution, worst: Worst) -> None:
-    """Check that `marginal_cdfs` is the share of draws below a value for each number; the unit is a standard error."""
+    """Check that `marginal_cdfs` gives each number's share of draws below a value; the error is in standard errors."""
     value = draws_and_mode(density)
     stated = protocol.marginal_cdfs(density, value)
     if stated is None:
@@ -275,7 +275,10 @@ def check_marginal_cdfs(density: Distribution, worst: Worst) -> None:
 
 
 def check_moments(density: Distribution, worst: Worst) -> None:
-    """Compare mean and variance of each number of many reals with those of draws; the error is in standard errors."""
+    """Compare mean and variance of densities over many real numbers with those of draws, number by number.
+
+    The error is in standard errors.
+    """
     draws = density.sample(torch.Size((MANY,))).double()
     middle = draws.mean(0)
     squares = (draws - middle).square()

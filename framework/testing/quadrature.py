@@ -10,13 +10,13 @@ from torch.distributions import Distribution
 from framework.distributions.circular import Circular
 
 POINTS = {1: 1020, 2: 252, 3: 60}
-"""Number of angles → grid points per side; the error is negligible for densities that the grid resolves."""
+"""Grid points per side, by the number of angles; the error is negligible for densities that the grid resolves."""
 REAL_POINTS = {1: 1020, 2: 252, 3: 72}
-"""Number of reals → grid points per side."""
+"""Grid points per side, by the number of real numbers."""
 CELLS = {1: 12, 2: 12, 3: 6}
-"""Number of numbers → cells per side in which samples are counted; it divides the number of points."""
+"""Cells per side in which draws are counted, by the number of angles or real numbers; a divisor of the grid points."""
 REAL_SCALE = 3.0
-"""Scale c of the map x = c tan(t/2) from the circle to the reals; half of the grid points lie within ±c."""
+"""Scale c of the map x = c tan(t/2) from the circle to the real line; half of the grid points lie within ±c."""
 
 
 def cells(density: Distribution) -> tuple[list[Tensor], Tensor]:
@@ -97,5 +97,5 @@ def side(density: Distribution, index: int, points: int, count: int) -> tuple[Te
 
 
 def _real(part: Tensor) -> Tensor:
-    """Map numbers in (0, 1) to the reals."""
+    """Map numbers t in (0, 1) to the real line: c tan(π (t - 1/2)) with c = REAL_SCALE."""
     return REAL_SCALE * torch.tan(math.pi * (part - 0.5))

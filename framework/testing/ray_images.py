@@ -1,4 +1,4 @@
-"""Reference images of few triangles, by intersecting the ray of every pixel with every face, and test scenes."""
+"""Reference images of a few triangles, and test scenes; the ray of every pixel is intersected with every face."""
 
 import math
 from dataclasses import dataclass, replace
@@ -24,11 +24,11 @@ class RayImage:
     """Image of a scene, with one entry for each pixel.
 
     Attributes:
-        face: Index of the visible face, (height, width) int64; -1 for none.
-        depth: Depth, (height, width), metres; infinite for none.
-        color: Colour, (height, width, channels); 0 for none.
+        face: Index of the visible face, (height, width) int64; -1 where no face is visible.
+        depth: Depth, (height, width), metres; infinite where no face is visible.
+        color: Colour, (height, width, channels); 0 where no face is visible.
         weights: Weight of each vertex's colour in the pixel, (height, width, vertices).
-        clear: Whether the same face is visible around the pixel's centre, (height, width).
+        clear: True if the same face is visible around the pixel's centre, (height, width).
     """
 
     face: Tensor
@@ -100,10 +100,10 @@ def camera(size: tuple[int, int]) -> Camera:
 
 
 def crossing(size: tuple[int, int] = (45, 141), count: int = 40, channels: int = 3) -> Scene:
-    """Return a scene of large triangles that intersect and face the camera, and of some triangles that are not visible.
+    """Return a scene of large triangles that face the camera and intersect, and of some triangles that are not visible.
 
-    The latter are behind the camera, outside the image or without area. The vertices are in random order, and one of
-    them belongs to no face.
+    The invisible triangles are behind the camera, outside the image or without area. The vertices are in random order,
+    and one of them belongs to no face.
     """
     generator = torch.Generator().manual_seed(SEED)
     view = camera(size)
@@ -119,7 +119,10 @@ def crossing(size: tuple[int, int] = (45, 141), count: int = 40, channels: int =
 
 
 def floor(size: tuple[int, int] = (40, 53)) -> Scene:
-    """Return two triangles from near to far, for which interpolation in the image differs much from that in space."""
+    """Return a scene of two triangles that extend from near to far.
+
+    Interpolation between their corners in the image differs much from interpolation in space.
+    """
     generator = torch.Generator().manual_seed(SEED)
     pixels = torch.tensor([[[-9, 44.0], [62, 47], [36, 5]], [[-9, 44], [36, 5], [4, 3]]]).double()
     depth = torch.tensor([[[1.1], [1.4], [30.0]], [[1.1], [30.0], [17.0]]]).double()

@@ -181,7 +181,7 @@ def _check_background(renderer: Renderer, scene: Scene, situation: str, worst: W
 
 
 def _equal_faces(renderer: Renderer, worst: Worst) -> None:
-    """Check that of faces in the same position the one with the lowest index is visible."""
+    """Check that of several faces in the same position, the one with the lowest index is visible."""
     if "face" not in renderer.channels:
         worst.count(False, "the renderer does not draw face")
         return
@@ -234,7 +234,10 @@ def _nearer_surface(renderer: Renderer, worst: Worst) -> None:
 
 
 def _sphere(renderer: Renderer, worst: Worst) -> None:
-    """Compare the depth of a fine sphere with ray intersections, except near the outline; the error is in metres."""
+    """Compare the depth of a sphere of many faces with ray intersections; the error is in metres.
+
+    Pixels near the outline are left out.
+    """
     if "depth" not in renderer.channels:
         worst.count(False, "the renderer does not draw depth")
         return
@@ -274,7 +277,7 @@ def _small_images(renderer: Renderer, worst: Worst) -> None:
 
 
 def _projected_pixels(renderer: Renderer, worst: Worst) -> None:
-    """Check that a triangle inside a pixel is drawn at the pixel and depth that `Camera.project` returns."""
+    """Check that a triangle smaller than a pixel is drawn at the pixel and depth that `Camera.project` returns."""
     if "mask" not in renderer.channels:
         worst.count(False, "the renderer does not draw mask")
         return
@@ -308,7 +311,10 @@ def _projected_pixels(renderer: Renderer, worst: Worst) -> None:
 
 
 def _near_plane(renderer: Renderer, worst: Worst) -> None:
-    """Check the relative depth of a floor that extends behind the camera; the renderer may also leave the floor out."""
+    """Check the depth of a floor that extends behind the camera; the error is relative.
+
+    The renderer may also leave the floor out.
+    """
     if "depth" not in renderer.channels:
         worst.count(False, "the renderer does not draw depth")
         return

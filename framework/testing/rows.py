@@ -57,9 +57,9 @@ class HeadRow(Row):
         config: Parameters of the plugin.
         cases: Function from the head, in evaluation mode and float64, to reference cases; None where no reference is
             known.
-        scale: Standard deviation of the random raw parameters at which densities are integrated on a grid: those of
-            three numbers, and those that draw random numbers in log_prob. The densities must be broad enough for the
-            grid. All other densities are also integrated at scales from 1e-2 to 1e3.
+        scale: Standard deviation of random raw parameters. Densities of three numbers, and densities whose log_prob
+            draws random numbers, are integrated on a grid, and only at this scale; it must make them broad enough for
+            the grid. All other densities are also integrated at scales from 1e-2 to 1e3.
     """
 
     target: Target
@@ -180,15 +180,16 @@ class DataRow(Row):
 
     Attributes:
         config: Parameters of the plugin.
-        write: Function that writes the files of the data set to an empty folder, in the official layout where there is
-            one, and returns the parameters that locate them, for example {"root": ...}. None for generated data.
+        write: Function that writes the files of the data set to an empty folder, in the official layout if there is
+            one. It returns the parameters that locate the files, for example {"root": ...}. None for generated data.
         synthetic: Value that `Data.synthetic` must have; None accepts any.
         files: Function that writes two or more different user files for `Data.read` to an empty folder, and returns
             their paths.
         fragile: Glob pattern → kinds of damage. After each damage to the first file that matches the pattern, `prepare`
-            must raise an error that names the file. Leave out damage that cannot be detected: half of a list of names
-            is still a list of names.
-        skip: Parameters with which the data set skips and counts unreadable files of the first pattern in `fragile`.
+            must raise an error that names the file. Leave out damage that cannot be detected: for example, half of a
+            list of names is still a list of names.
+        skip: Parameters with which the data set skips and counts unreadable files. One file of the first pattern in
+            `fragile` is made unreadable for this check.
         changes: Parameters, each with a value that changes the samples and therefore the fingerprint.
     """
 

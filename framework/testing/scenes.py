@@ -35,7 +35,7 @@ def sphere(rings: int = 24, radius: float = 1.0) -> Scene:
 
 
 def camera() -> Camera:
-    """Return the camera of these scenes, four metres from the origin."""
+    """Return the camera of the scenes in this module, four metres from the origin."""
     return look_from(0.3, 0.2, 0.1, distance=4.0, field_of_view=0.7, size=SIZE)
 
 

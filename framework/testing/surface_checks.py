@@ -11,7 +11,7 @@ from framework.testing.scenes import SIZE, sphere, square
 
 
 def normal(renderer: Renderer, worst: Worst) -> None:
-    """Check that normals of a fine sphere point away from its centre; the error is 1 - cosine of their angle."""
+    """Check that normals of a sphere of many faces point away from its centre; the error is 1 - cos(angle)."""
     scene = sphere(rings=120)
     rendered = renderer(replace(scene, colors=None), ("normal", "depth"))
     y, x = torch.meshgrid(*[torch.arange(side, dtype=torch.float64) for side in SIZE], indexing="ij")
@@ -84,7 +84,7 @@ def texture(renderer: Renderer, worst: Worst) -> None:
 
 
 def wrap_indices(index: Tensor, count: int, wrap: str) -> Tensor:
-    """Return texel indices in [0, count) for any texel indices, by the wrap mode."""
+    """Return texel indices in [0, count) for texel indices that may be outside, by the wrap mode of the texture."""
     if wrap == "clamp":
         return index.clamp(0, count - 1)
     if wrap == "repeat":
@@ -115,14 +115,14 @@ def smooth_texture(scene: Scene) -> Texture:
 SUBPIXELS = 4
 """Number of subpixel shifts along each axis over which images are averaged, to approximate integrals over pixels."""
 SINGLE = 6.0
-"""Factor by which the error of the gradient in one parameter may exceed that of the whole gradient."""
+"""Factor by which the error of the gradient in one parameter may exceed the error of the gradient in all parameters."""
 
 
 def gradient(renderer: Renderer, worst: Worst) -> None:
-    """Compare derivatives of a weighted sum of pixels with central differences, in one direction of each parameter.
+    """Compare derivatives of a weighted sum of pixels with central differences, along one direction in each parameter.
 
-    The parameters are those in `differentiable`. The weights vary slowly over the image, so that the position of the
-    pixel grid matters little.
+    The parameters are those in the renderer's `differentiable`. The weights vary slowly over the image, so that the
+    position of the pixel grid matters little.
     """
     scene = sphere()
     if "uv" in renderer.channels:

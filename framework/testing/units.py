@@ -19,7 +19,10 @@ from framework.testing.protocol_checks import MANY, compare_draws
 
 Result = TypeVar("Result")
 UNITS = ((200.0, 50.0), (0.3, 1e-5))
-"""Locations and scales of alternating numbers of a target, as of heights in centimetres and wavelengths in metres."""
+"""Two pairs of location and scale, which the numbers of a target have alternately.
+
+The numbers may be heights in centimetres and wavelengths in metres.
+"""
 TOLERANCE = 1e-5
 """Largest relative error that passes."""
 
@@ -27,8 +30,8 @@ TOLERANCE = 1e-5
 def units(subject: HeadSubject, worst: Worst) -> None:
     """Check that a target with location l and scale s has the density p((y - l)/s)/s.
 
-    Here p is the density of the standardised target. A head also passes if it ignores location and scale and returns
-    the same density as without them.
+    Here y is a value, and p is the density that the head returns for a target without location and scale. A head also
+    passes if it ignores location and scale, and returns the same density as without them.
     """
     head = subject.make()
     if head.direct or isinstance(head, Fitted):
@@ -117,7 +120,16 @@ def _compare_units(
 def _compare_locations(
     own: Distribution, plain: Distribution, location: Tensor, scale: Tensor, worst: Worst, unit: str
 ) -> None:
-    """Compare mode, moments, median, marginals and cdf of both densities in the standardised unit."""
+    """Compare the densities of two heads: mode, moments, median, marginals and cdf, in the standardised unit.
+
+    Args:
+        own: Density of the target with location and scale.
+        plain: Density of the standardised target.
+        location: Location of the target.
+        scale: Scale of the target.
+        worst: Recorder of the largest error.
+        unit: Description of the unit, for the finding.
+    """
     for name in ("mode", "mean", "variance"):
         try:
             actual, expected = getattr(own, name).double(), getattr(plain, name).double()
@@ -153,7 +165,7 @@ def _compare_locations(
 
 
 def _record_gap(worst: Worst, label: str, actual: Tensor, expected: Tensor, least: float) -> None:
-    """Record the difference, relative to the expected value or to `least`, whichever is larger."""
+    """Record |actual - expected|, divided by |expected| or by `least`, whichever is larger."""
     gap = torch.where(
         (actual == expected) | (actual.isnan() & expected.isnan()), 0.0, (actual - expected).abs()
     )

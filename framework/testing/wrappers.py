@@ -25,15 +25,15 @@ from framework.uncertainty import Uncertainty
 
 Make = Callable[[], Uncertainty]
 Build = Callable[[Target], Uncertainty]
-"""Function that builds the row's wrapper around `Plain`, for the row's target in any unit."""
+"""Function that builds the contract row's wrapper around `Plain`, for the row's target in any unit."""
 LENGTH = 6
 """Number of values of an input."""
 UNITS = ((200.0, 50.0), (-3.0, 1e-3))
-"""Locations and scales of real-valued targets, in addition to 0 and 1."""
+"""Locations and scales of real-valued targets in which wrappers are checked, in addition to location 0 and scale 1."""
 
 
 class Plain(Predictor):
-    """Model to wrap: a linear layer to location and breadth of the density that `simplest_density` returns.
+    """Model that is wrapped in checks: a linear layer that returns location and breadth for `simplest_density`.
 
     The effect of `calibrate` is the same for all samples. A wrapper that calibrates this model can therefore be
     compared with a wrapper around a model that was calibrated before.
@@ -74,7 +74,7 @@ class Plain(Predictor):
 
 
 def wrapped_models(wrapper: Uncertainty) -> list[Plain]:
-    """Return the models inside the wrapper, or no models if it stores their parameters in another form."""
+    """Return the models inside the wrapper; the list is empty if it stores their parameters in another form."""
     return [module for module in wrapper.modules() if isinstance(module, Plain)]
 
 
@@ -154,7 +154,7 @@ def density_checks(target: Target) -> Iterator[tuple[str, float, densities.Check
 
 
 def _compare_on_grid(density: Distribution, worst: Worst) -> None:
-    """Check that draws follow log_prob; reals are checked only if the grid resolves the density."""
+    """Check that draws follow log_prob; for real numbers, only if the grid resolves the density."""
     broad = bool((density.mode.abs() < 10).all() and (density.entropy() > 0).all())
     if isinstance(density.support, Circular) or broad:
         densities.samples_follow_log_prob(density, worst)
@@ -252,7 +252,10 @@ def _number_types(make: Make, row: WrapperRow, worst: Worst) -> None:
 
 
 def _repeatable(make: Make, row: WrapperRow, worst: Worst) -> None:
-    """Check that results are equal for equal seeds, also after other inputs and for two wrappers calibrated alike."""
+    """Check that results are equal for equal seeds, also after other inputs and for a second wrapper.
+
+    Two wrappers that are calibrated on the same data must have equal results too.
+    """
     target = values(row.target, (5,))
 
     def compute_results(wrapper: Uncertainty) -> dict[str, Tensor]:
@@ -280,7 +283,10 @@ def _repeatable(make: Make, row: WrapperRow, worst: Worst) -> None:
 
 
 def _rows_apart(make: Make, row: WrapperRow, worst: Worst) -> None:
-    """Check that results of a batch row do not depend on other rows, and its loss has no gradient in their inputs."""
+    """Check that results for an item of a batch do not depend on other items.
+
+    Its loss must have no gradient in the inputs of other items.
+    """
     wrapper, target, features = make(), values(row.target, (5,)), inputs(5)
     other = torch.where(torch.arange(5).unsqueeze(-1) == 2, features, 1 - 3 * features)
     for state in ("as built", "calibrated"):
