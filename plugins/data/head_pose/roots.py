@@ -9,7 +9,7 @@ import numpy as np
 import scipy.io
 from PIL import Image
 
-from framework.testing.data_samples import prepared
+from framework.configuration.schema import build, resolve
 
 PEOPLE = 40
 """Number of people in the folder of TownCentre heads, with two images each."""
@@ -20,7 +20,9 @@ Row = tuple[str, float, float, float]
 
 def prepare_data(name: str, root: Path | None, **config: Any) -> Any:
     """Return the prepared data set of this name, with a folder as its root."""
-    return prepared(name, root=root and str(root), **config)
+    data = build("data", resolve("data", {"name": name, "root": root and str(root), **config}))
+    data.prepare()
+    return data
 
 
 # ---- 20 images in train/ and 11 in test/; the red value of an image is eight times its number ---------------------
