@@ -213,7 +213,9 @@ def lowest_id(packed, x, y, z, best, number):
 
     Args:
         packed: the cloud.
-        x, y, z: the query.
+        x: x of the query.
+        y: y of the query.
+        z: z of the query.
         best: smallest squared distance.
         number: a known id at this distance; the result is not higher.
     """
