@@ -94,7 +94,7 @@ def read(path: Path) -> dict[str, Any]:
 
 
 def _require_unfolded(file: BinaryIO) -> None:
-    """Refuse compressed parts, which torch never writes and which let a small file decompress to any size."""
+    """Refuse a checkpoint with compressed parts, which torch never writes and which may decompress to any size."""
     with zipfile.ZipFile(file) as archive:
         parts = archive.infolist()
         size = os.fstat(file.fileno()).st_size
@@ -112,7 +112,7 @@ def verify(path: Path) -> str | None:
 
 
 def latest_good(folder: Path, names: Collection[str] | None = None) -> Path | None:
-    """Return the most recently written checkpoint of a folder that passes `verify`, or None.
+    """Return the most recently written checkpoint of a folder that `verify` finds correct; None if there is none.
 
     Args:
         folder: Folder of the checkpoints.
