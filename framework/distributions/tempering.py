@@ -48,7 +48,7 @@ For a stretch s, half of the grid's angles lie within 2 atan(s) of the mode.
 QUANTILES = 2048
 """Number of angles, besides those of the grid, at which the distribution function is computed for random draws."""
 BROADER = 0.25
-"""Exponent B: these angles are quantiles of p^(B/T). It is below 1, so that tails and low peaks get angles too."""
+"""Exponent B: the QUANTILES further angles are quantiles of p^(B/T), so that tails and low peaks get angles too."""
 _log = logging.getLogger(__name__)
 
 

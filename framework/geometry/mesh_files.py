@@ -158,16 +158,16 @@ def _at(number: int, place: Place | None) -> str:
 def rows(
     lines: Sequence[bytes], row_name: str, width: int | None = None, place: Place | None = None
 ) -> Float[np.ndarray, "rows width"]:
-    """Return the numbers of `lines`, which all have the same number of them, (rows, width).
+    """Return the numbers in `lines`, one row for each line, (rows, width).
 
     Args:
         lines: lines of text.
         row_name: what a line describes, for the message.
-        width: number of numbers in a line; None: as many as in the first line.
+        width: how many numbers each line has; None: as many as the first line.
         place: function from the index of a line to its number in the file.
 
     Raises:
-        ValueError: a line has another number of numbers, or a word that is no number; the message names the line.
+        ValueError: a line has more or fewer numbers, or a word that is no number; the message names the line.
     """
     columns = len(lines[0].split()) if width is None and lines else width or 0
     values = numbers(lines, place=place)

@@ -189,7 +189,7 @@ def normals(mesh: Mesh) -> Float[np.ndarray, "faces 3"]:
 def _cross(mesh: Mesh) -> tuple[Float[np.ndarray, "3 faces"], Float[np.ndarray, "faces"]]:
     """Return the cross product of two sides of every face, (3, faces), and its length.
 
-    The unit is the square of the longest side, so that no product over- or underflows.
+    The unit is the square of the largest coordinate of a side, so that no product over- or underflows.
     """
     if not len(mesh.faces):
         raise DataError(

@@ -207,7 +207,12 @@ def places(indices):
 
 @no_type_check
 def folded(vector, combine):
-    """Return the intrinsic (as by `coded`) that reduces all lanes of a vector to one number by `combine`."""
+    """Return signature and code generator, as `coded` does, of an intrinsic that reduces a vector to one number.
+
+    Args:
+        vector: type of the vector.
+        combine: function that emits the code for two numbers.
+    """
 
     def make(builder, value):
         count = vector.count
@@ -335,7 +340,7 @@ def take(typing, array, index):
 
 @no_type_check
 def loaded(array, stride, parts, count=LANES):
-    """Return the intrinsic that loads `parts` vectors from an array, as by `coded`.
+    """Return signature and code generator, as `coded` does, of an intrinsic that loads `parts` vectors from an array.
 
     Vector c holds the elements c, c + stride, c + 2 stride, …, counted from an index that the intrinsic takes.
 

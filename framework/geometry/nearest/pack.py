@@ -70,7 +70,7 @@ class Packed(NamedTuple):
 
 
 class Bench(NamedTuple):
-    """Working memory of packing.
+    """Working memory for packing a cloud.
 
     Attributes:
         key: cell of each point.
@@ -124,11 +124,11 @@ def cell_bits(points):
 @compiled
 @no_type_check
 def curve(bits):
-    """Return the cells of grids in the order of the Hilbert curve: of the grids with 1…bits bits, concatenated.
+    """Return the cells of several grids, each in the order of its Hilbert curve: grids with b = 1…`bits`, concatenated.
 
-    The cells of the grid with b bits begin at index (8^b - 8) / 7. A cell has the number (x 2^b + y) 2^b + z. Source:
-    Skilling, Programming the Hilbert curve, 2004: the bits of the transposed index of a cell give its position along
-    the curve.
+    The cells of the grid with 2^b cells along each axis begin at index (8^b - 8) / 7. A cell has the number (x 2^b + y)
+    2^b + z. Source: Skilling, Programming the Hilbert curve, 2004: the bits of the transposed index of a cell give its
+    position along the curve.
     """
     cells = np.empty((8 ** (bits + 1) - 8) // 7, np.int32)
     start = 0
@@ -232,7 +232,7 @@ def histogram(cloud, box, bits, begin, end, key, count):
     Args:
         cloud: flat array.
         box: lowest and highest coordinates of the whole cloud.
-        bits: of the grid.
+        bits: the grid has 2^bits cells along each axis.
         begin: index of the first point.
         end: index after the last point.
         key: filled with the cell of each point.
@@ -265,7 +265,7 @@ def places(count, bits, cells, crowded):
 
     Args:
         count: number of points of each thread in each cell, (threads, cells); replaced.
-        bits: of the grid.
+        bits: the grid has 2^bits cells along each axis.
         cells: cells in the order of the Hilbert curve, as `curve` returns them.
         crowded: filled with begin and end of each cell with more than CROWD points.
 

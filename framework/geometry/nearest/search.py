@@ -39,7 +39,7 @@ from framework.geometry.nearest.lanes import (
 )
 
 ALONE = 3
-"""Largest number of the sixteen queries that need a node for which they continue alone; measured.
+"""Largest number of queries, of sixteen, for which a node that they need is searched query by query; measured.
 
 ALONE_IN_LEAF is the same number for leaves.
 """
@@ -286,8 +286,8 @@ def search(packed, packets, begin, end, distance, index):
         packets: packed queries.
         begin: index of the first packet.
         end: index after the last packet.
-        distance: filled; the id of a query is its position.
-        index: filled; the id of a query is its position.
+        distance: filled with the distance for each query, at the id of the query.
+        index: filled with the row of the nearest point for each query, at the id of the query.
     """
     points, ids, box, _, levels = packed
     real = box.dtype.type
