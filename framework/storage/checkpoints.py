@@ -175,7 +175,7 @@ class _HashingFile:
 
 
 def _require_plain(partial: Path, path: Path, checkpoint: Mapping[str, Any]) -> None:
-    """Refuse contents that `read` would refuse to return."""
+    """Refuse a checkpoint, already written to `partial`, if `read` would refuse to return it."""
     try:
         with partial.open("rb") as file:
             require_admitted_pickles(file)
