@@ -30,7 +30,7 @@ circular_entropy = entropy_of_one
 CHUNK = 2**20
 """Largest number of component densities that are evaluated at once, if no gradient is needed."""
 LARGEST = 2**26
-"""Largest number of elements of the values at which they are evaluated at once; one image has a hundred thousand."""
+"""Largest number of elements of the values at which component densities are evaluated at once; an image has 1e5."""
 
 CROSSED = 16
 """Largest number of components with which the search for the mode also starts between every pair (`crossings`)."""

@@ -144,9 +144,10 @@ def entropy_of_one(density: Distribution) -> Float[Tensor, "*batch"]:
 def drawn_entropy(density: Distribution) -> Float[Tensor, "*batch"]:
     """Return the entropy of a density as the mean of -log_prob over DRAWS draws, nats, with an unbiased gradient.
 
-    The gradient of this mean at fixed draws has expectation 0, because it ignores that the distribution of the draws
-    changes too. The gradient of -E log p is -E (log p - b) ∇ log p, for any constant b (score function, Mohamed et al.
-    2020, §4). Here b is the mean of log p over the draws; its estimation takes one degree of freedom from DRAWS.
+    The gradient of this mean at fixed draws has expectation 0. It is not the gradient of the entropy, since the
+    distribution of the draws changes too. The gradient of -E log p is -E (log p - b) ∇ log p, for any constant b (score
+    function, Mohamed et al. 2020, §4). Here b is the mean of log p over the draws; its estimation takes one degree of
+    freedom from DRAWS.
     """
     log_prob = density.log_prob(density.sample(torch.Size((DRAWS,))))
     mean = log_prob.mean(0)
