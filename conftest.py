@@ -7,6 +7,8 @@
 import gc
 import os
 from collections.abc import Generator, Iterator
+from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -35,6 +37,26 @@ def no_store_in_the_environment() -> Iterator[None]:
     os.environ.pop("MLFLOW_TRACKING_URI", None)
     yield
     os.environ.pop("MLFLOW_TRACKING_URI", None)
+
+
+@pytest.fixture(scope="session")
+def doll_images() -> Any:
+    """Prepared images of a doll of which poses are estimated."""
+    from framework.testing.bodies import DOLL
+    from framework.testing.data_samples import prepared
+
+    sizes = {"train": 3, "validation": 2, "test": 6, "height": 48, "width": 40}
+    return prepared("pose_from_image", renderer={"name": "rasterizer", "supersampling": 4}, **sizes, **DOLL)
+
+
+@pytest.fixture(scope="session")
+def brain(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """File of one generated slice of Z-spectra, which tests must not change."""
+    from plugins.data.cest.generator import write_slice
+
+    folder = tmp_path_factory.mktemp("brain")
+    write_slice(folder, side=40, noise=0.01, shift=0.08, data_seed=0)
+    return folder / "brain.npz"
 
 
 @pytest.hookimpl(wrapper=True)

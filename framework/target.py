@@ -46,6 +46,15 @@ class Target:
         rest = f" and {len(self.names) - len(first)} more" if len(first) < len(self.names) else ""
         return ", ".join(first) + rest
 
+    def refuse(self, kind: Kind, message: str) -> None:
+        """Refuse a target of this kind with a message.
+
+        Raises:
+            ConfigError: the target is of this kind.
+        """
+        if self.kind == kind:
+            raise ConfigError(message)
+
     def require(self, kind: Kind, by: str) -> None:
         """Refuse a target of another kind than `kind`, which is the only kind that the plugin `by` can describe.
 

@@ -4,19 +4,12 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from framework.bodies.parametric import parametric_body
-from framework.testing.bodies import DOLL
+from framework.testing.bodies import DOLL, random_parameters
 
 
 @pytest.fixture(scope="module")
 def body_model():
     return parametric_body(DOLL["body"])
-
-
-def numbers(body_model, seed=0, size=1.0):
-    random = np.random.default_rng(seed)
-    found = torch.from_numpy(random.normal(0, 1, len(body_model.names))) * body_model.spread
-    found[:6] = torch.from_numpy(random.normal(0, 1, 6)) * 0.2
-    return size * torch.minimum(torch.maximum(found, body_model.limits[:, 0]), body_model.limits[:, 1])
 
 
 def test_place_turns_the_body_about_its_root_and_moves_it(body_model):
@@ -52,7 +45,7 @@ def test_movements_bend_what_they_name(body_model):
 
 
 def test_slopes_are_those_of_the_vertices(body_model):
-    at, chosen, step = numbers(body_model), torch.arange(0, len(body_model.colors), 7), 1e-3
+    at, chosen, step = random_parameters(body_model), torch.arange(0, len(body_model.colors), 7), 1e-3
     slopes = body_model.derivatives(at, chosen)
     for column in range(len(at)):
         aside = torch.zeros_like(at)

@@ -6,9 +6,8 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,7 @@ import pytest
 from framework.errors import ConfigError
 from framework.runs.job import write_value
 from framework.sweeps import jobs as sweep
-from tests.conftest import imported_by
+from tests.conftest import imported_by, wait_for
 
 LINUX = pytest.mark.skipif(
     sys.platform != "linux", reason="elsewhere a fork is not safe once torch is imported"
@@ -209,14 +208,8 @@ class App:
     def tries(self, number: int) -> int:
         return len((self.sweep / str(number) / "started").read_text())
 
-    def until(self, condition: Callable[[], bool]) -> None:
-        deadline = time.monotonic() + 60
-        while not condition():
-            assert time.monotonic() < deadline
-            time.sleep(0.01)
-
     def until_ready(self, *numbers: int) -> None:
-        self.until(lambda: all((self.sweep / str(number) / "ready").exists() for number in numbers))
+        wait_for(lambda: all((self.sweep / str(number) / "ready").exists() for number in numbers))
 
 
 @pytest.fixture(params=["processes", pytest.param("forks", marks=LINUX)])
@@ -357,7 +350,7 @@ def test_ctrl_c_at_the_terminal_reaches_each_job_once(app: App) -> None:
     # A terminal signals its whole foreground group; a job signalled twice would not wait for its batch's end.
     process = app.start("-m", "hydra/launcher=pool", "what=hold", "x=0,1", "hydra.launcher.jobs=2")
     app.until_ready(0, 1)
-    app.until(lambda: app.record(0)["pid"] is not None)
+    wait_for(lambda: app.record(0)["pid"] is not None)
     assert os.getsid(app.record(0)["pid"]) == app.record(0)["pid"]
     process.send_signal(signal.SIGINT)
     assert process.wait(timeout=60) == 130, app.said()
@@ -368,7 +361,7 @@ def test_a_third_signal_kills(app: App) -> None:
     app.until_ready(0)
     for count, number in enumerate((signal.SIGINT, signal.SIGINT, signal.SIGTERM), 1):
         process.send_signal(number)
-        app.until(lambda count=count: app.said().count("asked to stop") == count)
+        wait_for(lambda count=count: app.said().count("asked to stop") == count)
     assert process.wait(timeout=60) == 130
     assert app.record(0)["error"].startswith("killed by SIGKILL")
 
@@ -380,9 +373,9 @@ def test_jobs_of_a_killed_sweep_close_and_the_next_sweep_waits_for_them(app: App
     process.kill()
     process.wait()
     if sys.platform == "linux":
-        app.until((app.sweep / "0" / "closed SIGTERM").exists)
+        wait_for((app.sweep / "0" / "closed SIGTERM").exists)
     again = app.start("-m", "hydra/launcher=pool", *arguments)
-    app.until(lambda: "#1 waits" in app.said())
+    wait_for(lambda: "#1 waits" in app.said())
     assert app.record(1)["status"] == "running"
     assert app.tries(1) == 1, "two processes in one folder would mix their checkpoints"
     (app.folder / "release").touch()
@@ -398,12 +391,12 @@ def test_jobs_end_with_the_process_they_are_forks_of_and_the_next_ones_get_anoth
     process = app.start("-m", "hydra/launcher=pool", *jobs)
     try:
         app.until_ready(0, 1, 2)
-        app.until(lambda: app.record(0)["pid"] is not None)
+        wait_for(lambda: app.record(0)["pid"] is not None)
         server = parent_of(app.record(0)["pid"])
         assert server not in (1, process.pid)
         os.kill(server, signal.SIGKILL)
-        app.until((app.sweep / "0" / "closed SIGTERM").exists)
-        app.until(lambda: app.record(3)["status"] == "completed")
+        wait_for((app.sweep / "0" / "closed SIGTERM").exists)
+        wait_for(lambda: app.record(3)["status"] == "completed")
         (app.folder / "release").touch()
         assert process.wait(timeout=60) == 1
     finally:
@@ -427,10 +420,10 @@ def test_a_signal_that_comes_before_a_job_has_begun_reaches_it(tmp_path: Path) -
     app.environment["IMPORTS"] = "slow"
     process = app.start("-m", "hydra/launcher=pool", "what=hold", "x=0,1", "hydra.launcher.jobs=2")
     try:
-        app.until((app.folder / "importing").exists)
-        app.until(lambda: all(app.record(number)["status"] == "running" for number in range(2)))
+        wait_for((app.folder / "importing").exists)
+        wait_for(lambda: all(app.record(number)["status"] == "running" for number in range(2)))
         process.send_signal(signal.SIGTERM)
-        app.until(lambda: "asked to stop" in app.said())
+        wait_for(lambda: "asked to stop" in app.said())
         (app.folder / "signalled").touch()
         assert process.wait(timeout=60) == 128 + signal.SIGTERM
     finally:

@@ -9,17 +9,9 @@ from scipy import optimize
 from framework.spectra.fit import fit
 from framework.spectra.offsets import OFFSETS
 from framework.spectra.spectrum import PRESETS, Misfit, Parameters, spectrum
-from plugins.data.cest.generator import write_slice
 from plugins.data.cest.volumes import read_volume
 
 PLACES = torch.tensor(OFFSETS, dtype=torch.float64)
-
-
-@pytest.fixture(scope="module")
-def brain(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("brain")
-    write_slice(folder, side=40, noise=0.01, shift=0.08, data_seed=0)
-    return folder / "brain.npz"
 
 
 @pytest.mark.parametrize("preset", PRESETS)

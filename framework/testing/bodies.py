@@ -8,7 +8,9 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import torch
 from PIL import Image
+from torch import Tensor
 
+from framework.bodies.parametric import ParametricBody
 from framework.datasets import scan_layout
 from framework.datasets.scan_layout import RegisteredMesh
 from framework.geometry.camera import Camera
@@ -106,6 +108,14 @@ def colored_mesh(number: int) -> RegisteredMesh:
     return RegisteredMesh(
         torch.from_numpy(person(number)[0]).float(), torch.from_numpy(colors), torch.from_numpy(faces)
     )
+
+
+def random_parameters(body_model: ParametricBody, seed: int = 0, size: float = 1.0) -> Tensor:
+    """Return random parameters of a body within its limits, (number,) float64, multiplied by `size`."""
+    random = np.random.default_rng(seed)
+    parameters = torch.from_numpy(random.normal(0, 1, len(body_model.names))) * body_model.spread
+    parameters[:6] = torch.from_numpy(random.normal(0, 1, 6)) * 0.2
+    return size * torch.minimum(torch.maximum(parameters, body_model.limits[:, 0]), body_model.limits[:, 1])
 
 
 DOLL = small_body()

@@ -22,6 +22,7 @@ from framework.target import Target
 from framework.testing.devices import Calls, OneDevice, check_devices
 from framework.testing.finding import SEED, Finding, Worst, run_check, seed
 from framework.testing.rows import HeadRow
+from framework.uncertainty import Uncertainty
 
 BATCH_SHAPES = ((), (4,), (3, 2), (0,))
 SIZES = (0.0, 1e-38, 1e-20, 1e-8, 1e-3, 1.0, 30.0, 1e3, 1e10, 1e20, 1e30)
@@ -394,15 +395,17 @@ def _knobs(subject: HeadSubject, worst: Worst) -> None:
     """Check that the values of each knob are in ascending order, and that log_prob is finite with the smallest two."""
     head = subject.make()
     worst.count(False, "the head has no knobs")
-    for name, settings in head.knobs.items():
+    check_knobs(head, lambda: head(subject.raw_parameters(3)).log_prob(subject.values(3)), worst)
+
+
+def check_knobs(plugin: DensityHead | Uncertainty, log_prob: Callable[[], Tensor], worst: Worst) -> None:
+    """Check the order of the values of each knob, and that log_prob is finite with the smallest two."""
+    for name, settings in plugin.knobs.items():
         worst.same(f"order of {name}", list(settings), sorted(settings))
         for setting in settings[:2]:
-            setattr(head, name, setting)
+            setattr(plugin, name, setting)
             with torch.no_grad():
-                worst.finite(
-                    f"log_prob with {name} = {setting}",
-                    head(subject.raw_parameters(3)).log_prob(subject.values(3)),
-                )
+                worst.finite(f"log_prob with {name} = {setting}", log_prob())
 
 
 def _finite_anywhere(subject: HeadSubject, worst: Worst) -> None:

@@ -18,7 +18,7 @@ from framework.target import Target
 from framework.testing import densities
 from framework.testing.devices import Calls, OneDevice, check_devices
 from framework.testing.finding import SEED, Finding, Worst, run_check, seed
-from framework.testing.heads import values
+from framework.testing.heads import check_knobs, values
 from framework.testing.metrics import place_size, simplest_density
 from framework.testing.rows import WrapperRow
 from framework.uncertainty import Uncertainty
@@ -345,13 +345,7 @@ def _knobs(make: Make, row: WrapperRow, worst: Worst) -> None:
     """Check that the values of each knob are in ascending order, and that log_prob is finite with the smallest two."""
     wrapper = make()
     worst.count(False, "the wrapper has no knobs")
-    for name, settings in wrapper.knobs.items():
-        worst.same(f"order of {name}", list(settings), sorted(settings))
-        for setting in settings[:2]:
-            setattr(wrapper, name, setting)
-            with torch.no_grad():
-                log_prob = wrapper(inputs(3)).log_prob(values(row.target, (3,)))
-            worst.finite(f"log_prob with {name} = {setting}", log_prob)
+    check_knobs(wrapper, lambda: wrapper(inputs(3)).log_prob(values(row.target, (3,))), worst)
 
 
 def _loss(make: Make, row: WrapperRow, worst: Worst) -> None:

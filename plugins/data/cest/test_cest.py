@@ -10,19 +10,11 @@ from framework.errors import DataError
 from framework.spectra.offsets import OFFSETS
 from framework.spectra.spectrum import PRESETS, Parameters, spectrum
 from plugins.data.cest.data import CEST
-from plugins.data.cest.generator import write_slice
 from plugins.data.cest.maps import ASYMMETRY, write_maps
 from plugins.data.cest.resampling import resample
 from plugins.data.cest.volumes import read_volume
 
 MODEL_OFFSETS = torch.tensor(OFFSETS, dtype=torch.float64)
-
-
-@pytest.fixture(scope="module")
-def brain(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("brain")
-    write_slice(folder, side=40, noise=0.01, shift=0.08, data_seed=0)
-    return folder / "brain.npz"
 
 
 def test_bands_have_no_neighbour_in_another_split(brain):

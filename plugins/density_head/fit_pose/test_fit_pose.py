@@ -12,7 +12,7 @@ from framework.heads.posed_body import PosedBodyDensity, scene_of
 from framework.prediction import Prediction
 from framework.renderer import Renderer
 from framework.target import Target
-from framework.testing.bodies import DOLL
+from framework.testing.bodies import DOLL, random_parameters
 from plugins.density_head.fit_pose.descent import (
     STAGES,
     Descent,
@@ -36,39 +36,16 @@ def body_model():
     return parametric_body(DOLL["body"])
 
 
-@pytest.fixture(scope="module")
-def data():
-    config = {
-        "name": "pose_from_image",
-        "renderer": FINE,
-        "train": 3,
-        "validation": 2,
-        "test": 6,
-        **SIZE,
-        **DOLL,
-    }
-    pose_data = build("data", resolve("data", config))
-    pose_data.prepare()
-    return pose_data
-
-
 def head(target, **config):
     config = {"name": "fit_pose", "renderer": FINE, **SIZE, **DOLL, **config}
     return build("density_head", resolve("density_head", config), target=target).eval()
 
 
-def numbers(body_model, seed=0, size=1.0):
-    random = np.random.default_rng(seed)
-    parameters = torch.from_numpy(random.normal(0, 1, len(body_model.names))) * body_model.spread
-    parameters[:6] = torch.from_numpy(random.normal(0, 1, 6)) * 0.2
-    return size * torch.minimum(torch.maximum(parameters, body_model.limits[:, 0]), body_model.limits[:, 1])
-
-
 def test_a_smaller_picture_is_the_mean_of_the_pixels(body_model):
     """Check that 1/part of the pixels with part times the samples has the same samples, and so the same numbers."""
     camera, fine = body_model.camera(**SIZE), renderer(supersampling=8)
-    whole = renderer(supersampling=2)(scene_of(body_model, numbers(body_model), camera))["color"]
-    rendered = fine(scene_of(body_model, numbers(body_model), reduce_camera(camera, 4)))["color"]
+    whole = renderer(supersampling=2)(scene_of(body_model, random_parameters(body_model), camera))["color"]
+    rendered = fine(scene_of(body_model, random_parameters(body_model), reduce_camera(camera, 4)))["color"]
     torch.testing.assert_close(rendered, reduce_image(whole, 4), atol=1e-5, rtol=0)
 
 
@@ -87,8 +64,8 @@ def test_blur_is_a_gaussian(deviation):
 def test_the_gradient_is_that_of_the_loss(body_model):
     """Compare with central differences of a loss drawn with 16 x 16 samples a pixel, and check the curvature."""
     camera, stage = body_model.camera(**SIZE), Stage(2, 1.0, 0.1)
-    at, fine = numbers(body_model, 1, 0.5), renderer(supersampling=16)
-    aim = fine(scene_of(body_model, at + 0.05 * numbers(body_model, 2), camera))["color"]
+    at, fine = random_parameters(body_model, 1, 0.5), renderer(supersampling=16)
+    aim = fine(scene_of(body_model, at + 0.05 * random_parameters(body_model, 2), camera))["color"]
     descents = [
         Descent(body_model, drawing, camera, steps=1, restarts=0, enough=1e-3)
         for drawing in (renderer(), fine)
@@ -154,10 +131,10 @@ def test_a_small_offset_is_found_again(body_model, gradient):
     assert torch.equal(again.parameters, fit.parameters)
 
 
-def test_the_density_knows_how_far_off_it_is(data):
-    batch = data.splits().test.__getitems__(range(6))
+def test_the_density_knows_how_far_off_it_is(doll_images):
+    batch = doll_images.splits().test.__getitems__(range(6))
     raw, target = batch["input"].flatten(1), batch["target"]
-    fitting = head(data.target, steps=3, restarts=0)
+    fitting = head(doll_images.target, steps=3, restarts=0)
     fitting.fit(raw, target, 0)
     torch.testing.assert_close(fitting.prior[3:6].square().sum(), torch.tensor(0.04, dtype=torch.float64))
     nothing = torch.stack([torch.zeros_like(raw[0]), -raw[0], 2 * raw[0]])
@@ -183,7 +160,7 @@ def test_the_density_knows_how_far_off_it_is(data):
     true_density = PosedBodyDensity(target, density.stddev, [None] * 6, *drawn_by)
     shown = Prediction(true_density, batch, reads=("color", "mask"))
     assert (shown.image("color") - shown.true_image("color")).abs().mean() < 0.01
-    other = head(data.target, steps=3, restarts=0)
+    other = head(doll_images.target, steps=3, restarts=0)
     other.load_state_dict(fitting.state_dict())
     assert torch.equal(other(raw).log_prob(target), density.log_prob(target))
 
@@ -198,15 +175,17 @@ class Blind(Renderer):
         raise NotImplementedError
 
 
-def test_what_does_not_fit_gets_a_sentence(data):
+def test_what_does_not_fit_gets_a_sentence(doll_images):
     from plugins.density_head.fit_pose.head import FitPoseHead
 
     with pytest.raises(ConfigError, match=r"renderer=Blind lacks vertices.*another renderer"):
-        FitPoseHead(data.target, renderer=Blind(), **SIZE, **DOLL)
+        FitPoseHead(doll_images.target, renderer=Blind(), **SIZE, **DOLL)
     with pytest.raises(ConfigError, match=r"this data set are x, y\. Choose data=pose_from_image"):
         head(Target("real", ("x", "y")))
     with pytest.raises(ValueError, match="row 1"):
-        head(data.target)(torch.full((2, 4 * 48 * 40), 0.5).index_fill(0, torch.tensor([1]), torch.nan))
+        head(doll_images.target)(
+            torch.full((2, 4 * 48 * 40), 0.5).index_fill(0, torch.tensor([1]), torch.nan)
+        )
 
 
 def test_stages_let_go_of_the_usual_pose():

@@ -11,7 +11,6 @@ from torch.distributions import Distribution
 
 from framework.density_head import DensityHead
 from framework.distributions.uniform import uniform
-from framework.errors import ConfigError
 from framework.heads.parameters import require_trained
 from framework.target import Target
 from plugins.density_head.uniform_floor.density import Floored
@@ -41,11 +40,11 @@ class UniformFloorHead(DensityHead):
         component: DensityHead = COMPONENT,  # pyright: ignore[reportArgumentType]  # built by the framework
     ) -> None:
         super().__init__()
-        if target.kind == "real":
-            raise ConfigError(
-                "density_head uniform_floor needs a bounded target, since no density is uniform over the reals "
-                f"({target.listed_names}). Choose the component alone as density_head, with its own setting `floor`."
-            )
+        target.refuse(
+            "real",
+            "density_head uniform_floor needs a bounded target, since no density is uniform over the reals "
+            f"({target.listed_names}). Choose the component alone as density_head, with its own setting `floor`.",
+        )
         self.weight = weight
         self.component = require_trained(component)
         self.size = component.size

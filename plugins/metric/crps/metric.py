@@ -8,7 +8,6 @@ from pydantic import Field
 from torch import Tensor
 
 from framework.distributions.checks import refuse_nan
-from framework.errors import ConfigError
 from framework.metric import Mean
 from framework.prediction import Prediction
 from framework.target import Target
@@ -42,11 +41,11 @@ class CRPS(Mean):
         self, target: Target, *, samples: Annotated[int, Field(ge=2 * REPLICATES, le=10**6)] = 1000
     ) -> None:
         super().__init__()
-        if target.kind == "class":
-            raise ConfigError(
-                "metric crps measures distances, but there is no distance between classes (this data set's classes: "
-                f"{target.listed_names}). Leave this metric out; for classes, use `brier`."
-            )
+        target.refuse(
+            "class",
+            "metric crps measures distances, but there is no distance between classes (this data set's classes: "
+            f"{target.listed_names}). Leave this metric out; for classes, use `brier`.",
+        )
         self.samples = samples
         self.unit = "_deg" if target.kind == "angle" else ""
         self.factor = 180 / math.pi if target.kind == "angle" else 1.0

@@ -8,7 +8,6 @@ from torch import Tensor
 from torchmetrics.utilities.data import dim_zero_cat
 
 from framework.distributions.checks import refuse_nan
-from framework.errors import ConfigError
 from framework.metric import HasFigure, Metric
 from framework.prediction import Prediction
 from framework.target import Target
@@ -54,11 +53,11 @@ class PIT(Metric, HasFigure):
         samples: Annotated[int, Field(ge=10, le=10**6)] = 1000,
     ) -> None:
         super().__init__()
-        if target.kind == "class":
-            raise ConfigError(
-                "metric pit measures the probability below the target, but classes have no order (this data set's "
-                f"classes: {target.listed_names}). Leave this metric out; `coverage` also evaluates classes."
-            )
+        target.refuse(
+            "class",
+            "metric pit measures the probability below the target, but classes have no order (this data set's "
+            f"classes: {target.listed_names}). Leave this metric out; `coverage` also evaluates classes.",
+        )
         self.numbers = len(target.names)
         self.bins = bins
         self.samples = samples

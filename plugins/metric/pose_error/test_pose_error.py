@@ -15,22 +15,6 @@ SIZE = {"height": 48, "width": 40}
 FINE = {"name": "rasterizer", "supersampling": 4}
 
 
-@pytest.fixture(scope="module")
-def data():
-    config = {
-        "name": "pose_from_image",
-        "renderer": FINE,
-        "train": 3,
-        "validation": 2,
-        "test": 6,
-        **SIZE,
-        **DOLL,
-    }
-    data_module = build("data", resolve("data", config))
-    data_module.prepare()
-    return data_module
-
-
 def head(target, **config):
     config = {"name": "fit_pose", "renderer": FINE, **SIZE, **DOLL, **config}
     return build("density_head", resolve("density_head", config), target=target).eval()
@@ -45,10 +29,10 @@ def test_place_errors_against_scipy():
     np.testing.assert_allclose(centimetres, 100 * np.linalg.norm(predicted[:, 3:6] - true[:, 3:6], axis=1))
 
 
-def test_the_metric_evaluates_fitted_images(data):
-    metric = build("metric", resolve("metric", {"name": "pose_error"}), target=data.target)
-    batch = data.splits().test.__getitems__(range(3))
-    metric.update(Prediction(head(data.target, steps=1, restarts=0)(batch["input"].flatten(1)), batch))
+def test_the_metric_evaluates_fitted_images(doll_images):
+    metric = build("metric", resolve("metric", {"name": "pose_error"}), target=doll_images.target)
+    batch = doll_images.splits().test.__getitems__(range(3))
+    metric.update(Prediction(head(doll_images.target, steps=1, restarts=0)(batch["input"].flatten(1)), batch))
     results = metric.compute()
     degrees, _ = place_errors(torch.zeros(30), batch["target"][0])
     assert float(degrees) == pytest.approx(30, abs=1e-4)
@@ -60,9 +44,9 @@ def test_the_metric_evaluates_fitted_images(data):
     assert not metric.fitted_images
 
 
-def test_the_metric_draws_densities_without_a_descent(data):
-    metric = build("metric", resolve("metric", {"name": "pose_error"}), target=data.target)
-    batch = data.splits().test.__getitems__(range(3))
+def test_the_metric_draws_densities_without_a_descent(doll_images):
+    metric = build("metric", resolve("metric", {"name": "pose_error"}), target=doll_images.target)
+    batch = doll_images.splits().test.__getitems__(range(3))
     narrow = Independent(Normal(batch["target"], torch.full_like(batch["target"], 1e-6)), 1)
     metric.update(Prediction(narrow, batch))
     assert metric.compute()["found"] == 1
