@@ -24,7 +24,7 @@ def bibtex_of(cls: type) -> str:
 
 
 def look_up(bibtex: str, package: str) -> str:
-    """Return BibTeX entries unchanged, and for keys that are separated by commas the entries of these keys.
+    """Return `bibtex` unchanged if it has BibTeX entries; if it has keys, separated by commas, return their entries.
 
     Args:
         bibtex: Entries, keys or nothing.

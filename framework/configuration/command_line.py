@@ -200,7 +200,7 @@ def _refuse_code_and_passwords(arguments: list[str]) -> None:
     Hydra's option --experimental-rerun unpickles a file.
 
     Raises:
-        ConfigError: An argument chooses or changes such a config, names such a file, or contains a password.
+        ConfigError: An argument chooses or changes a logging config, names a file to unpickle, or contains a password.
     """
     for argument in arguments:
         flag = argument.partition("=")[0]

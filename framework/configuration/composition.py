@@ -239,7 +239,7 @@ def _message_with_config(error: BaseException) -> str:
 
 
 def _config_in_progress(error: BaseException) -> str | None:
-    """Return the name of the config that Hydra was reading when it failed, such as 'experiment/moons/scvae', or None.
+    """Return the name of the config, such as 'experiment/moons/scvae', that Hydra failed to read; None without one.
 
     The name is read from the local variables of Hydra's functions in the stack trace.
     """

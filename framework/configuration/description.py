@@ -20,7 +20,7 @@ from framework.target import Kind, Target
 MOST_REMARKS, LONGEST_REMARK = 8, 500
 """Largest number of remarks (`Description.remarks`) that are read from a checkpoint, and of characters of a remark."""
 INHERITED = ("seed", "batch_size", "samples", "experiment_name")
-"""Settings that a later test of the model takes over, so that its numbers equal those of the model's own run."""
+"""Settings that a later test takes over from the run that trained the model, so that both give the same numbers."""
 
 
 @dataclass(frozen=True)

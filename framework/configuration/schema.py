@@ -169,8 +169,8 @@ def _require_numbers(written: Any, read: Any, where: str) -> None:
     """Refuse values that pydantic converts to a number but that are not meant as one: true, "1_0", " 1 ", "nan".
 
     Args:
-        written: Value of the config.
-        read: The same value after the conversion by pydantic.
+        written: Value of the config before its conversion by pydantic.
+        read: The value of the config after its conversion by pydantic.
         where: Dotted key of the value, for the message.
 
     Raises:
@@ -343,7 +343,7 @@ def _to_plain(value: Any) -> Any:
     """Return a copy that consists of None, numbers, text, lists, tuples, sets and dicts.
 
     Raises:
-        TypeError: A value in it cannot be converted to these; the message names its type.
+        TypeError: An inner value cannot be converted to one of these types; the message names its type.
     """
     if isinstance(value, Enum):
         return _to_plain(value.value)

@@ -14,7 +14,7 @@ from framework.errors import ConfigError, shorten
 
 
 class Part(typing.NamedTuple):
-    """Constructor parameter for a plugin of the registry `group`, or for a list or tuple of such plugins (`many`)."""
+    """Constructor parameter for a plugin of the registry `group`; for several if `many` is list or tuple."""
 
     group: str
     many: type[list[Any]] | type[tuple[Any, ...]] | None
@@ -148,7 +148,7 @@ def _annotation(cls: type, name: str) -> Any:
 
 
 def positional(cls: type) -> list[inspect.Parameter]:
-    """Return the parameters of `cls` that the framework fills."""
+    """Return the constructor parameters of `cls` before `*`, which the framework fills."""
     parameters = list(inspect.signature(cls.__init__).parameters.values())[1:]
     return [
         parameter
