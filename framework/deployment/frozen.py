@@ -155,7 +155,6 @@ class Frozen:
             raise ValueError(
                 f"Got inputs of shape {tuple(array.shape)}, but shape (batch, {', '.join(map(str, self.shape))}) "
                 "is required."
-                "required."
             )
         flat = array.reshape(len(array), math.prod(self.shape))
         return np.ascontiguousarray(flat, dtype=network.dtype), network, frame

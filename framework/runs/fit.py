@@ -120,7 +120,7 @@ def _give_up(run: Run, error: BaseException) -> None:
     """Record the error and close the run; the caller ends the process afterwards, because it cannot continue."""
     stopped = isinstance(error, Stopped)
     sentence = f"stopped by {error.signal}" if isinstance(error, Stopped) else str(error)
-    sys.stderr.write(f"{sentence}; continue with: python -m framework {resume_arguments(run)}\n")
+    sys.stderr.write(f"{sentence.rstrip('.')}; continue with: python -m framework {resume_arguments(run)}\n")
     run.tracker.set_tags({"error": sentence})
     run.tracker.close("KILLED" if stopped else "FAILED")
 
