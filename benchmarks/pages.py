@@ -3,6 +3,7 @@
 import datetime
 import platform
 import re
+import sys
 from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
@@ -39,6 +40,12 @@ def write_page(script: str | Path, text: str | Sequence[str], name: str = "") ->
     page = page.with_stem(name or page.stem)
     page.write_text((text if isinstance(text, str) else "\n".join(text)).rstrip() + "\n", encoding="utf-8")
     return page
+
+
+def publish(script: str | Path, text: str, name: str = "") -> None:
+    """Write the page of a script (see `write_page`), and print its text."""
+    write_page(script, text, name)
+    sys.stdout.write(text)
 
 
 def replace_section(page: Path, heading: str, text: str) -> None:

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmarks.commands import ROOT, carry_out
-from benchmarks.pages import machine, write_page
+from benchmarks.pages import machine, publish
 from benchmarks.sweeps import record
 from framework.errors import DataError
 from framework.reports.table import Row, aggregate, markdown
@@ -283,8 +283,7 @@ def main() -> None:
         + "\n".join(section(part) for part in PARTS)
         + f"\n{machine('torch', 'pytorch-lightning')}\n"
     )
-    write_page(HERE, text)
-    sys.stdout.write(text)
+    publish(HERE, text)
 
 
 if __name__ == "__main__":

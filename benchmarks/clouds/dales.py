@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from benchmarks.pages import machine, write_page
+from benchmarks.pages import machine, publish
 from framework.reports.table import markdown
 
 COLUMNS = {"fold": "fold", "accuracy": "accuracy", "nll": "NLL (nats)", "ece": "ECE"}
@@ -41,8 +41,7 @@ def main() -> None:
         "over the test objects of a fold.\n\n"
         f"{markdown(rows, COLUMNS)}\n\n{machine('torch', 'pytorch-lightning')}\n"
     )
-    write_page(__file__, text)
-    sys.stdout.write(text)
+    publish(__file__, text)
 
 
 if __name__ == "__main__":

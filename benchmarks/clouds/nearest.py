@@ -12,7 +12,6 @@ import argparse
 import math
 import os
 import resource
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -28,7 +27,7 @@ from pykdtree.kdtree import KDTree  # pyright: ignore[reportMissingImports]
 from scipy.spatial import cKDTree  # type: ignore[reportAttributeAccessIssue]
 from sklearn.neighbors import NearestNeighbors
 
-from benchmarks.pages import machine, write_page
+from benchmarks.pages import machine, publish
 from benchmarks.timing import first_calls
 from framework.geometry.nearest import Queries, nearest, prepare
 from framework.geometry.nearest.streamed import Middle, Reach, Stream, normalise_chunk
@@ -404,5 +403,4 @@ if __name__ == "__main__":
         text, name = streaming(), "nearest_stream"
     else:
         text, name = report(), "nearest"
-    write_page(__file__, text, name)
-    sys.stdout.write(text)
+    publish(__file__, text, name)

@@ -6,14 +6,12 @@ Writes rotation.md into the folder of this file. The shapes are the generated CA
 half a minute on one core.
 """
 
-import sys
-
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from benchmarks.pages import machine, write_page
+from benchmarks.pages import machine, publish
 from framework.geometry.meshes import Mesh, sample
 from framework.reports.table import markdown
 from plugins.data.labelled_clouds.shapes.generator import CLASSES, model
@@ -99,8 +97,7 @@ def main() -> None:
         f"whose two samples differ by more than {LIMIT:g}.\n\n"
         f"{markdown(rows, columns)}\n{machine('torch', 'numba')}\n"
     )
-    write_page(__file__, text)
-    sys.stdout.write(text)
+    publish(__file__, text)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,6 @@ Writes segmentation.md and segmentation.png into the folder of this file and tak
 the default body: pip install -e '.[body]'.
 """
 
-import sys
 from pathlib import Path
 from time import perf_counter
 
@@ -18,7 +17,7 @@ from matplotlib import colormaps
 from matplotlib.patches import Patch
 from torch import Tensor, nn
 
-from benchmarks.pages import machine, write_page
+from benchmarks.pages import machine, publish
 from framework.bodies import poses
 from framework.bodies.body import Body
 from framework.bodies.people import load_body
@@ -214,8 +213,7 @@ def main() -> None:
         "the point alone (middle), and those that are recognised from point and cloud (bottom).\n\n"
         f"![True and recognised parts of five scans](segmentation.png)\n\n{machine('torch', 'numba')}\n"
     )
-    write_page(HERE, text)
-    sys.stdout.write(text)
+    publish(HERE, text)
 
 
 if __name__ == "__main__":

@@ -14,7 +14,6 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import statistics
-import sys
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
@@ -28,7 +27,7 @@ from torch import Tensor, nn
 from torch.nn.functional import cross_entropy
 
 from benchmarks.clouds.shapes import shapes
-from benchmarks.pages import machine, write_page
+from benchmarks.pages import machine, publish
 from framework.encoder import Encoder
 from plugins.encoder.point_sets import pooled
 from plugins.encoder.point_sets.deepsets import DeepSets
@@ -179,8 +178,7 @@ measured after {TRAINED} steps of training. Both methods run in each of {ROUNDS}
 
 {machine("torch")}
 """
-    write_page(HERE, text)
-    sys.stdout.write(text)
+    publish(HERE, text)
 
 
 if __name__ == "__main__":

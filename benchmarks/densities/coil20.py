@@ -11,7 +11,7 @@ import json
 import sys
 from pathlib import Path
 
-from benchmarks.pages import machine, write_page
+from benchmarks.pages import machine, publish
 from framework.reports.table import aggregate, markdown
 
 COLUMNS = {
@@ -56,8 +56,7 @@ def main() -> None:
         "a batch. The last column is the number of parameters of the model.\n\n"
         f"{markdown(compared, COLUMNS)}\n\n{machine('torch', 'pytorch-lightning')}\n"
     )
-    write_page(__file__, text)
-    sys.stdout.write(text)
+    publish(__file__, text)
 
 
 if __name__ == "__main__":

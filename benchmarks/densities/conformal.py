@@ -20,7 +20,7 @@ from sklearn.datasets import make_moons
 from torch import Tensor
 from torch.distributions import Categorical, Distribution
 
-from benchmarks.pages import machine, write_page
+from benchmarks.pages import machine, publish
 from framework.configuration.schema import build, resolve
 from framework.data import Batch
 from framework.model import Predictor
@@ -196,8 +196,7 @@ def main() -> None:
         "|---|---|---|---|---:|---:|---:|---:|---:|\n" + "\n".join(rows) + "\n\n"
         f"{machine('torch', 'scikit-learn')}\n"
     )
-    write_page(__file__, text)
-    sys.stdout.write(text)
+    publish(__file__, text)
 
 
 if __name__ == "__main__":

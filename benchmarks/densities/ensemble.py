@@ -10,7 +10,6 @@ ensemble.md into the folder of this file.
 
 import logging
 import statistics
-import sys
 import tempfile
 import time
 import warnings
@@ -22,7 +21,7 @@ import torch
 from scipy import stats
 from torch import Tensor
 
-from benchmarks.pages import machine, write_page
+from benchmarks.pages import machine, publish
 from framework.configuration.assembly import build_predictor, resolve_all
 from framework.configuration.schema import build, resolve
 from framework.configuration.settings import OptimizerSettings
@@ -230,8 +229,7 @@ def main() -> None:
         "trained independently.\n\n"
         f"{machine('torch', 'pytorch-lightning')}\n"
     )
-    write_page(__file__, text)
-    sys.stdout.write(text)
+    publish(__file__, text)
 
 
 DTYPES = {"float32": torch.float32, "float64": torch.float64}

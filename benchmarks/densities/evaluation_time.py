@@ -5,7 +5,6 @@
 Writes evaluation_time.md into the folder of this file. It takes some minutes on one core.
 """
 
-import sys
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -13,7 +12,7 @@ from typing import Any
 import torch
 from torch.distributions import Distribution
 
-from benchmarks.pages import machine, write_page
+from benchmarks.pages import machine, publish
 from benchmarks.timing import milliseconds
 from framework.configuration.assembly import build_predictor
 from framework.configuration.schema import build, resolve
@@ -169,8 +168,7 @@ def main() -> None:
             "",
         ]
     )
-    write_page(__file__, text)
-    sys.stdout.write(text)
+    publish(__file__, text)
 
 
 if __name__ == "__main__":

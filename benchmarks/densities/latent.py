@@ -22,7 +22,7 @@ from matplotlib.lines import Line2D
 from torch import Tensor, nn
 
 from benchmarks.densities.latent_points import sequences
-from benchmarks.pages import machine, read_rows, write_page
+from benchmarks.pages import machine, publish, read_rows
 from framework.configuration.schema import build, resolve
 from framework.density_head import DensityHead
 from framework.distributions.protocol import estimate
@@ -382,8 +382,7 @@ def main() -> None:
         f"{table.markdown(gains, {key: key for key in gains[0]})}\n\n"
         f"{machine('torch')}\n"
     )
-    write_page(HERE, text)
-    sys.stdout.write(text)
+    publish(HERE, text)
 
 
 if __name__ == "__main__":

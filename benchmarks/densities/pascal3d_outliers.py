@@ -14,7 +14,7 @@ from pathlib import Path
 
 import yaml
 
-from benchmarks.pages import machine, write_page
+from benchmarks.pages import machine, publish
 from framework.reports.table import markdown
 
 COLUMNS = {
@@ -61,8 +61,7 @@ def main() -> None:
         f"{markdown(rows, COLUMNS, better={'log_likelihood': 'higher', 'auroc': 'higher', 'fpr95': 'lower'})}\n\n"
         f"{machine('torch', 'pytorch-lightning')}\n"
     )
-    write_page(__file__, text)
-    sys.stdout.write(text)
+    publish(__file__, text)
 
 
 if __name__ == "__main__":

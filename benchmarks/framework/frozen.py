@@ -14,7 +14,6 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # this also limits the threads of NumPy's matrix products
 
 import statistics
-import sys
 import time
 import warnings
 from collections.abc import Callable
@@ -22,7 +21,7 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from benchmarks.pages import machine, write_page
+from benchmarks.pages import machine, publish
 from framework.configuration.assembly import build_predictor
 from framework.configuration.schema import resolve
 from framework.deployment.frozen import freeze_predictor
@@ -151,8 +150,7 @@ def main() -> None:
         "reading of compiled functions from their cache.\n\n"
         f"{machine('torch', 'numpy', 'numba')} Command: `python -m benchmarks.framework.frozen`.\n"
     )
-    write_page(__file__, text)
-    sys.stdout.write(text)
+    publish(__file__, text)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,6 @@ script writes step_overhead.md beside this file.
 """
 
 import logging
-import sys
 import tempfile
 import time
 import warnings
@@ -21,7 +20,7 @@ import pytorch_lightning as pl
 import torch
 from torch import Tensor, nn
 
-from benchmarks.pages import machine, write_page
+from benchmarks.pages import machine, publish
 from benchmarks.timing import Rounds, require_idle
 from framework.configuration.assembly import build_predictor, resolve_all
 from framework.configuration.schema import build, resolve
@@ -260,8 +259,7 @@ def main() -> None:
             "",
         ]
     )
-    write_page(__file__, text)
-    sys.stdout.write(text)
+    publish(__file__, text)
 
 
 if __name__ == "__main__":

@@ -6,7 +6,6 @@ The reference is the same dressed person, registered in the new pose or shape. T
 file and takes a few minutes.
 """
 
-import sys
 import time
 from collections.abc import Mapping
 from dataclasses import replace
@@ -16,7 +15,7 @@ import torch
 from numpy.random import Generator
 from torch import Tensor
 
-from benchmarks.pages import machine, write_page
+from benchmarks.pages import machine, publish
 from framework.bodies import poses
 from framework.bodies.body import BodyModel
 from framework.bodies.people import load_body, sample_adults
@@ -247,8 +246,7 @@ change the pose in the opposite direction.
 
 {machine("torch", "numpy")} Command: `python -m benchmarks.pose.reposing`.
 """
-    write_page(__file__, text)
-    sys.stdout.write(text)
+    publish(__file__, text)
 
 
 if __name__ == "__main__":

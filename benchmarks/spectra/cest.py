@@ -19,7 +19,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from benchmarks.pages import machine, read_rows, replace_section, write_page
+from benchmarks.pages import machine, publish, read_rows, replace_section
 from benchmarks.spectra.cest_scipy import AGREEMENT, TIGHT, compare_with_scipy, fit_with_scipy, time_call
 from benchmarks.timing import ROUNDS, require_idle
 from framework.configuration.loading import load_with_description
@@ -411,8 +411,7 @@ least squares that start from the network.
 
 {machine("torch", "scipy", "numpy")}
 """
-    write_page(HERE, text)
-    sys.stdout.write(text)
+    publish(HERE, text)
 
 
 if __name__ == "__main__":

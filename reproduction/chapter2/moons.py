@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 import framework
-from benchmarks.pages import machine, write_page
+from benchmarks.pages import machine, publish
 from benchmarks.sweeps import processor_seconds, record
 from framework.configuration.schema import build, resolve
 from framework.distributions.class_probabilities import class_probabilities
@@ -346,8 +346,7 @@ def main() -> None:
         "![Reliability diagrams](moons_reliability.png)\n\n"
         f"{machine('torch', 'pytorch-lightning')}\n"
     )
-    write_page(__file__, text)
-    sys.stdout.write(text)
+    publish(__file__, text)
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ from torch import Tensor
 
 import framework
 from benchmarks.commands import ROOT, carry_out
-from benchmarks.pages import machine, write_page
+from benchmarks.pages import machine, publish
 from framework.distributions.class_probabilities import class_probabilities
 from framework.reports.table import aggregate, markdown
 
@@ -155,8 +155,7 @@ def main() -> None:
         f"the two logarithms is {np.mean(errors):.3f} ± {np.std(errors, ddof=1):.3f}.\n\n"
         f"{machine('torch', 'pytorch-lightning')}\n"
     )
-    write_page(HERE, text)
-    sys.stdout.write(text)
+    publish(HERE, text)
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ from scipy.stats import rankdata
 from torch import Tensor
 from torch.distributions import Distribution
 
-from benchmarks.pages import machine, write_page
+from benchmarks.pages import machine, publish
 from benchmarks.sweeps import processor_seconds, record
 from framework.configuration.assembly import build_data
 from framework.configuration.loading import load_with_description
@@ -199,8 +199,7 @@ def main() -> None:
         + "\n\n"
         f"{runs} runs. {machine('torch', 'pytorch-lightning')}\n"
     )
-    write_page(__file__, text)
-    sys.stdout.write(text)
+    publish(__file__, text)
 
 
 def cells(values_by_class: dict[str, list[list[float]]]) -> str:

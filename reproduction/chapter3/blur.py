@@ -12,7 +12,6 @@ blur.png again from blur.csv.
 import argparse
 import json
 import math
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +19,7 @@ import torch
 import yaml
 from matplotlib.axes import Axes
 
-from benchmarks.pages import machine, read_rows, write_page
+from benchmarks.pages import machine, publish, read_rows
 from framework.configuration.loading import load_with_description
 from framework.configuration.schema import build
 from framework.datasets.images import blur, to_rgb8
@@ -225,8 +224,7 @@ def main(sweeps: list[Path], root: str | None) -> None:
         f"{markdown(named, COLUMNS)}\n\n"
         f"{machine('torch', 'pytorch-lightning')}\n"
     )
-    write_page(HERE, text)
-    sys.stdout.write(text)
+    publish(HERE, text)
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchmarks.pages import machine, write_page
+from benchmarks.pages import machine, publish
 from benchmarks.sweeps import milliseconds_per_sample, processor_seconds, record, settings
 from framework.reports.table import Better, aggregate, markdown
 from framework.training.batches import Batches
@@ -145,8 +145,7 @@ def main() -> None:
         "CVAE shares one.\n\n"
         f"{difference_table(rows)}\n\n{machine('torch', 'pytorch-lightning')}\n"
     )
-    write_page(HERE, text)
-    sys.stdout.write(text)
+    publish(HERE, text)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchmarks.pages import machine, write_page
+from benchmarks.pages import machine, publish
 from benchmarks.sweeps import milliseconds_per_sample, settings
 from framework.reports.table import aggregate, markdown
 from framework.training.batches import Batches
@@ -133,8 +133,7 @@ def main() -> None:
         f"{markdown(compared, COLUMNS)}\n\n{class_mean_section(rows)}\n\n"
         f"The table summarises {len(rows)} runs on {threads} each. {machine('torch', 'pytorch-lightning')}\n"
     )
-    write_page(__file__, text)
-    sys.stdout.write(text)
+    publish(__file__, text)
 
 
 if __name__ == "__main__":

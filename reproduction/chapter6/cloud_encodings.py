@@ -11,7 +11,6 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import math
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -19,7 +18,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.clouds.shapes import shapes
-from benchmarks.pages import machine, write_page
+from benchmarks.pages import machine, publish
 from framework.geometry.clouds import Normalisation
 from framework.reports.table import markdown
 from plugins.encoder.bps.basis import basis
@@ -188,8 +187,7 @@ def main() -> None:
         f"{markdown(measure_recognition(clouds), disturbed)}\n\n"
         f"{machine('torch', 'numba')}\n"
     )
-    write_page(HERE, text)
-    sys.stdout.write(text)
+    publish(HERE, text)
 
 
 if __name__ == "__main__":

@@ -32,7 +32,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 import framework
-from benchmarks.pages import machine, write_page
+from benchmarks.pages import machine, publish
 from benchmarks.sweeps import processor_seconds, record
 from framework.configuration.schema import build, resolve
 from framework.distributions.class_probabilities import class_probabilities
@@ -447,8 +447,7 @@ def main() -> None:
         f"{len(rows)} runs took {sum(row['seconds'] for row in rows) / 3600:.1f} hours of one core. "
         f"{machine('torch', 'pytorch-lightning', 'scikit-learn', *boosting)}\n"
     )
-    write_page(__file__, text)
-    sys.stdout.write(text)
+    publish(__file__, text)
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ from sklearn.neighbors import NearestNeighbors
 from torch import Tensor
 
 from benchmarks.clouds.shapes import shapes
-from benchmarks.pages import machine, read_rows, write_page
+from benchmarks.pages import machine, publish, read_rows
 from framework.figures.style import COLOURS, MARKERS, save_figure, titled_figure
 from framework.geometry.clouds import NormalisedClouds, sizes
 from framework.geometry.nearest import chamfer
@@ -278,8 +278,7 @@ def main() -> None:
         f"{markdown(wide, {'method': 'method', **{f'n{size}': f'ms, n = {size}' for size in CLOUD_SIZES}})}\n\n"
         f"{machine('torch', 'numba', 'scikit-learn')}\n"
     )
-    write_page(HERE, text)
-    sys.stdout.write(text)
+    publish(HERE, text)
 
 
 if __name__ == "__main__":
