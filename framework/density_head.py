@@ -40,7 +40,8 @@ class DensityHead(nn.Module, ABC):
     knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
     """Attributes that trade error for run time, each with its useful values in ascending order.
 
-    An example is {"samples": (1, 3, 10, 30)}. They may be set at any time after training. Empty if there is none.
+    An example is {"samples": (1, 3, 10, 30)}. They may be set at any time after training. A head without such
+    attributes has {}.
     """
     direct: ClassVar[bool] = False
     """True if the last encoder's flattened features are the raw parameters, without a linear layer.
@@ -50,10 +51,10 @@ class DensityHead(nn.Module, ABC):
     size: int
     """Number of raw parameters that the head reads per sample, > 0; set by the constructor."""
     backbones: tuple[int, ...] = ()
-    """Sizes of the parts of the raw parameters that separate networks give, in order; they add up to `size`.
+    """Numbers of raw parameters that each of several separate networks gives, in order; their sum is `size`.
 
-    The model has as many networks as there are parts. Empty: one network gives all raw parameters. The constructor may
-    set it.
+    The model has one network for each entry. With (), one network gives all raw parameters. The constructor may set the
+    attribute.
     """
 
     @abstractmethod

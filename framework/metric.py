@@ -48,7 +48,7 @@ class Metric(torchmetrics.Metric, ABC):
     """
 
     better: ClassVar[dict[str, Literal["higher", "lower"]]] = {}
-    """Direction in which a column is better, for the keys of `columns` that have a better direction."""
+    """Which values are better, "higher" or "lower", for those keys of `columns` for which one of them is."""
 
     @abstractmethod
     def update(self, prediction: Prediction) -> None:
@@ -88,7 +88,10 @@ class Mean(Metric):
         self.squares += numbers.square().sum(0)
 
     def mean_and_error(self) -> tuple[Float[Tensor, "*shape"], Float[Tensor, "*shape"]]:
-        """Return the mean and its standard error; both are NaN without samples, and the error is NaN for one sample."""
+        """Return the mean over samples and its standard error.
+
+        Both are NaN if there are no samples, and the standard error is also NaN if there is only one.
+        """
         mean = self.total / self.count
         spread = (self.squares / self.count - mean.square()).clamp(min=0)  # (n - 1)/n of the sample variance
         return mean, (spread / (self.count - 1).clamp(min=0)).sqrt()

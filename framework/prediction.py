@@ -71,9 +71,9 @@ class Prediction:
 
     @cached_property
     def estimate(self) -> Estimate:
-        """Log-likelihood with its Monte Carlo error and sample count.
+        """Log-likelihood of the targets with its Monte Carlo error and number of samples.
 
-        The error is 0 if nothing is drawn, and NaN if it is not known.
+        The error is 0 if log_prob draws no samples, and NaN if it is not known.
         """
         with self._draw("estimate"):
             return estimate(self.density, self.target)
@@ -92,7 +92,10 @@ class Prediction:
 
     @cached_property
     def point(self) -> Tensor:
-        """Point prediction of least expected absolute deviation (eq. 3.23-3.24), shaped like the target."""
+        """Point prediction, shaped like the target: the value of smallest expected absolute deviation (eq. 3.23-3.24).
+
+        For classes it is the most likely class.
+        """
         with self._draw("point"):
             return median(self.density, self.samples)
 

@@ -28,7 +28,8 @@ class Uncertainty(Predictor):
     knobs: Mapping[str, tuple[int, ...]] = {}
     """Attributes that trade error for run time, each with its useful values in ascending order.
 
-    An example is {"samples": (1, 3, 10, 30)}. They may be set at any time after training. Empty if there is none.
+    An example is {"samples": (1, 3, 10, 30)}. They may be set at any time after training. A wrapper without such
+    attributes has {}.
     """
     model: Predictor
     """The wrapped predictor; by default `loss`, `training_densities` and `calibrate` are those of this predictor.

@@ -1,9 +1,10 @@
 """Files of body models: the published layout (`v_template`, `shapedirs` …) in .npz or .pkl, and a layout of our own.
 
-The published models with linear blend skinning use this layout: `v_template` (V, 3), `shapedirs` (V, 3, B),
-`J_regressor` (J, V), `weights` (V, J), `kintree_table` (2, J) whose first row holds parents, `f` (F, 3), and in most
-files `posedirs` (V, 3, 9 (J - 1)), or with 4 (J - 1) + 1 features. Other keys are not read. Pickles are read by
-framework.bodies.restricted_pickle, which calls no function that a file names.
+The published models with linear blend skinning use this layout, for V vertices, J joints, F faces and B shape
+coefficients: `v_template` (V, 3), `shapedirs` (V, 3, B), `J_regressor` (J, V), `weights` (V, J), `kintree_table` (2, J)
+whose first row holds parents, `f` (F, 3), and in most files `posedirs` (V, 3, number of pose features) with 9 (J - 1)
+or 4 (J - 1) + 1 pose features. Other keys are not read. Pickles are read by framework.bodies.restricted_pickle, which
+calls no function that a file names.
 """
 
 import math
@@ -48,7 +49,7 @@ def read(file: Path) -> Body:
 
 
 def save(body: Body, file: Path) -> None:
-    """Write a body as an .npz file in the project's own layout; the file is complete or absent."""
+    """Write a body as an .npz file in the project's own layout; after an error there is no incomplete file."""
     arrays = {name: np.asarray(getattr(body, name)) for name in OWN}
     arrays |= {"source": np.array(body.source), "names": np.array(body.names, dtype=np.str_)}
     for name in ("pose_shapes", "uv", "uv_faces"):

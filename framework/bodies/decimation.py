@@ -1,7 +1,8 @@
-"""Decimation of closed meshes: edges collapse onto one end, the edge that changes the surface least first.
+"""Decimation of closed meshes: edges are collapsed onto one of their ends until few enough vertices are left.
 
-Quadric error metrics (Garland and Heckbert 1997) with half-edge collapses: the remaining vertices are a subset of the
-mesh's own, and therefore keep their colours, texture coordinates and other attributes.
+The edge whose collapse changes the surface least comes first. The method is quadric error metrics (Garland and Heckbert
+1997) with half-edge collapses: the remaining vertices are a subset of the mesh's own, and therefore keep their colours,
+texture coordinates and other attributes.
 """
 
 import heapq
@@ -13,7 +14,7 @@ from jaxtyping import Float, Int
 from framework.errors import DataError
 
 EVEN = 1e-3
-"""Weight of an edge's squared length beside the squared distances from planes: it keeps triangles even."""
+"""Weight of the fourth power of an edge's length in the cost of its collapse, which keeps triangles of similar size."""
 TURN = 0.2
 """Smallest allowed cosine of the angle between a triangle's normals before and after a collapse."""
 
@@ -82,7 +83,7 @@ class _Collapses:
         heapq.heapify(self.heap)
 
     def step(self) -> bool:
-        """Collapse the cheapest edge that may collapse; return whether there was such an edge."""
+        """Collapse the edge of lowest cost among those that may collapse; return whether there was such an edge."""
         while self.heap:
             _, v, u, of_v, of_u = heapq.heappop(self.heap)
             if not (self.alive[v] and self.alive[u]) or (of_v, of_u) != (self.changed[v], self.changed[u]):

@@ -55,12 +55,12 @@ class Traits:
     largest_error: float = 0.0
 
     def coefficients(self, values: Float[Tensor, "person trait"]) -> Float[Tensor, "person shape"]:
-        """Return the shape coefficients of people whose traits, in the order of `labels`, are each 0…1.
+        """Return the shape coefficients of people with these traits.
 
-        Traits without a label are 0.5.
+        The columns of `values` are the traits in `labels`, each 0…1. Traits that have no label are 0.5.
 
         Raises:
-            ValueError: a value is outside of 0…1, or their number is wrong.
+            ValueError: a value is outside of 0…1, or there is not one column for each label.
         """
         if values.shape[1:] != (len(self.labels),) or not ((values >= 0) & (values <= 1)).all():
             raise ValueError(
@@ -104,7 +104,7 @@ def interpolation(
 
 
 def load_default_body() -> tuple[Body, Traits]:
-    """Return the default body and its traits from the cache; they are extracted if they are not there.
+    """Return the default body and its traits from the cache; they are extracted first if the cache lacks them.
 
     Raises:
         DataError: the package is not installed, the cache cannot be written, or the cache is damaged.

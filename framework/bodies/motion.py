@@ -234,7 +234,7 @@ def _places(motion: Motion) -> Float[np.ndarray, "joint 3"]:
 
 
 def _turn(start: np.ndarray, end: np.ndarray) -> Rotation:
-    """Return the smallest rotation from one direction to another."""
+    """Return the rotation by the smallest angle that maps the direction `start` to the direction `end`."""
     axis = np.cross(start, end)
     angle = np.arctan2(np.linalg.norm(axis), start @ end)
     if np.linalg.norm(axis) < 1e-9 * np.linalg.norm(start) * np.linalg.norm(end):  # parallel directions

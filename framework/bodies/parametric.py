@@ -1,4 +1,4 @@
-"""A coloured body that few parameters pose: position, movements of the main joints, and shape."""
+"""A coloured body that is a function of few parameters: position, movements of the main joints, and shape."""
 
 import math
 from dataclasses import replace
@@ -51,9 +51,9 @@ The last movement of a joint is applied first.
 """
 PLACE = tuple(f"{quantity}_{axis}" for quantity in ("rotation", "translation") for axis in "xyz")
 TRAITS = {"gender": 0.29, "muscle": 0.22, "weight": 0.22, "proportions": 0.22}
-"""Free traits of the default body with their standard deviations.
+"""Traits of the default body that are parameters, with their standard deviations among people.
 
-Height is not among them: an image determines the ratio of size and distance, but hardly either of them alone.
+Height is not among them: an image determines the ratio of a body's size to its distance, but hardly the size itself.
 """
 FURTHEST = 4.0
 """Largest difference of a movement from its mean, in standard deviations."""
@@ -316,10 +316,10 @@ def paint(body: Body) -> Float[np.ndarray, "vertex 4"]:
 
 
 def parametric_body(file: str | None) -> ParametricBody:
-    """Return the parametric body of a file; None: the default body.
+    """Return the parametric body in a file, or the default body if `file` is None.
 
-    The body is read once and shared, because data and density head use the same body, and is read again if the file
-    changed. It must not be modified.
+    The body is read once and shared, because data and density head use the same body. It is read again if the file has
+    changed. Callers must not modify it.
     """
     known = None if file is None else Path(file).expanduser()
     return _read(file, known.stat().st_mtime_ns if known is not None and known.is_file() else None)

@@ -12,7 +12,7 @@ from framework.bodies.body import Body, BodyModel
 from framework.errors import DataError
 
 OFF = 0.01
-"""Standard deviation of vertices from the model's, metres: clothes, hair, errors of the registration."""
+"""Standard deviation, metres, of a mesh's vertices from those of the model, due to clothes, hair and registration."""
 INDEPENDENT = 35
 """Number of independent vertex errors of a mesh of any size, since errors of vertices under one garment are similar."""
 BENT = 0.7
@@ -29,7 +29,7 @@ TOGETHER = 24
 
 
 class MeshFit(NamedTuple):
-    """Fit of a body to a mesh, in the form that BodyModel takes, float64, a batch of one.
+    """Fit of a body to a mesh: the arguments of BodyModel, float64, as a batch of one.
 
     Attributes:
         shape: shape coefficients.

@@ -67,7 +67,7 @@ LEGS: Kinds = {
 ALIKE = 0.6
 """Share of poses in which the right arm takes the kind of the left arm; both legs always have the same kind."""
 TAIL, WIDER = 0.1, 1.8
-"""Share of poses from a heavier tail, and the factor of their standard deviations (thesis §6.5.2)."""
+"""Share of poses that are drawn with larger standard deviations, and the factor of these (thesis §6.5.2)."""
 MOVEMENTS = (*CENTRAL, *(f"{side} {name}" for side in ("left", "right") for name in SIDED))
 
 
@@ -129,7 +129,9 @@ Only the first 22 joints are used.
 
 
 def skeleton(body: Body) -> Skeleton:
-    """Return the joints of a body by role: by name, else in the order of the SMPL family.
+    """Return the joints of a body by their roles.
+
+    They are found by name in the default body, and by their order if the joints have no names (the SMPL family).
 
     Raises:
         DataError: there are fewer than 22 joints without names, or names of another body.

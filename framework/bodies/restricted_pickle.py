@@ -40,14 +40,14 @@ ALLOWED = {
     ("chumpy.ch", "Ch"): "Ch",
     ("chumpy.reordering", "Select"): "Select",
 }
-"""Names that a pickle may use, and their kinds in this module."""
+"""Names (module, name) that a pickle may use, and the kind of object that each one stands for in this module."""
 SPARSE = re.compile(r"(csc|csr|coo)_(matrix|array)")
 DTYPE = re.compile(r"[<>=|]?(b1|[iu][1248]|f[248]|c(8|16)|[SU]\d{1,4})")
 DEEPEST = 40
 MOST_INSTRUCTIONS = 200_000
 """Largest number of instructions; published bodies have a few thousand."""
 LARGEST = 2**24
-"""Largest count of numbers in all dense copies of a file's sparse matrices."""
+"""Largest number of elements of all sparse matrices of a file together, after they were made dense."""
 CONSTANTS = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False, "EMPTY_TUPLE": ()}
 FRESH = {"EMPTY_LIST": list, "EMPTY_DICT": dict}
 VALUES = re.compile(
@@ -57,7 +57,10 @@ VALUES = re.compile(
 TUPLES = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
 MARK = object()
 MOST_SIDES, LONGEST_SIDE = 32, 2**31
-"""Largest number of dimensions of an array, and limit of each: multiplying numbers of thousands of digits is slow."""
+"""Largest number of dimensions of an array, and exclusive limit of the length of each dimension.
+
+A file could otherwise hold lengths of thousands of digits, whose multiplication is slow.
+"""
 
 
 class PickleRefused(ValueError):
@@ -94,7 +97,7 @@ def load(content: bytes) -> Any:
 
 
 def _build_records(content: bytes) -> Any:
-    """Return the object that the instructions build, with records in place of named objects."""
+    """Return the object that a pickle's instructions build, with a `_Record` in place of each named object."""
     stack: list[Any] = []
     memo: dict[int, Any] = {}
     for count, (opcode, argument, _) in enumerate(pickletools.genops(content)):
@@ -122,7 +125,7 @@ def _build_records(content: bytes) -> Any:
 
 
 def _obey(name: str, argument: Any, stack: list[Any]) -> None:
-    """Execute one instruction that changes the stack alone."""
+    """Execute one instruction of a pickle that changes only the stack."""
     match name:
         case "MARK":
             stack.append(MARK)

@@ -1,7 +1,8 @@
 """Inverse linear blend skinning: takes a registered mesh back to the rest pose (thesis §7.4.3).
 
-The thesis makes a template of every subject, W⁻¹(X) - B_P(θ). Here that template is the model's plus offsets, so that
-another pose and another shape are the model's own with the same offsets.
+The thesis computes a template of every subject, W⁻¹(X) - B_P(θ): its mesh X without skinning W and without the pose
+blend shapes B_P. Here this template is written as the model's template plus offsets. The model with these offsets then
+gives the subject in other poses and with other shape coefficients.
 """
 
 from typing import NamedTuple
@@ -13,9 +14,10 @@ from torch import Tensor
 from framework.bodies.body import BodyModel
 
 SMALLEST = 0.2
-"""Smallest singular value of a blended matrix that is inverted: errors in a mesh grow fivefold at most.
+"""Smallest singular value of a vertex's blended matrix (`unpose`) that is inverted as it is.
 
-A vertex that follows two bones half and half has cos(φ / 2), where φ is the angle between them: 0.2 at 157°, 0 at 180°.
+Errors in a mesh are therefore amplified by a factor of 5 at most. A vertex that follows two joints with equal weights
+has the singular value cos(φ / 2), where φ is the angle between their rotations: 0.2 at 157°, 0 at 180°.
 """
 
 

@@ -33,7 +33,7 @@ def nonempty_batches(batches: Iterable[Batch], by: str) -> list[Batch]:
 
 @torch.no_grad()
 def predict_densities(model: Predictor, batches: Sequence[Batch]) -> list[Distribution]:
-    """Return the density of each batch, in evaluation mode and without a graph to the weights."""
+    """Return the density of each batch, computed in evaluation mode and without gradient."""
     training = model.training
     try:
         return [model.eval()(batch["input"]) for batch in batches]

@@ -130,10 +130,11 @@ def cauchy(residual: Float[Tensor, "*shape"]) -> tuple[Float[Tensor, "*shape"], 
 
 
 def guess_states(frames: ObservedFrames, gravity: float) -> Float[Tensor, "flight 9"]:
-    """Return a state at the first frame from medians of slopes between pairs of the first frames.
+    """Return an initial guess of the state at the first frame.
 
-    These are the medians of Theil (1950) and Sen (1968); a third of outliers does not move them. The state has no spin,
-    and is 0 if fewer than two frames are observed.
+    Its velocity consists of medians of the slopes between pairs of the first FIRST observed frames (Theil 1950; Sen
+    1968), which hardly change if up to a third of the frames are outliers. The spin is 0. The whole state is 0 if fewer
+    than two frames are observed.
     """
     observed = frames.observed & (frames.observed.cumsum(-1) <= FIRST)
     since = frames.times - frames.times[:, :1]

@@ -1,12 +1,12 @@
-"""Numbers that models read of a flight, frame by frame, and numbers they predict: x, y and z at later times."""
+"""Layout of the numbers of a flight: those that models read, frame by frame, and those that they predict."""
 
 from framework.errors import ConfigError
 
 PARTS = ("time", "x", "y", "z", "seen")
-"""Numbers that are read of each frame.
+"""Names of the numbers that a model reads for each frame.
 
-They are the time in seconds from now (not above 0), three coordinates in metres, and 1 if the frame exists or 0 if it
-is missing. The other numbers of a missing frame are 0.
+"time" is in seconds relative to the last frame that is read, and not above 0. "x", "y" and "z" are in metres. "seen" is
+1 if the ball was observed in the frame, and 0 if the frame is missing. The other numbers of a missing frame are 0.
 """
 GRAVITY = 9.81
 """Acceleration of a parabola between frames or after the last one, m/s²."""

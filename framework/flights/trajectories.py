@@ -9,9 +9,9 @@ from torch import Tensor
 from framework.flights.physics import Constants, bounce
 
 NEWTON = 4
-"""Number of Newton steps to the time of a bounce.
+"""Number of Newton steps by which the time of a bounce is computed.
 
-Started at a parabola's root, the error falls below rounding in three.
+They start from the root of a parabola, and after three steps the error is already below rounding.
 """
 
 
@@ -55,7 +55,8 @@ def step(
 ) -> Float[Tensor, "flight 9"]:
     """Return the state after `time` seconds, with at most one bounce within them.
 
-    If a second bounce follows at once, the ball is laid on the table, so that bounces cannot go on without end.
+    If the ball would fall onto the table a second time within `time`, it is put onto the table without vertical
+    velocity, so that the number of bounces stays finite.
     """
     after = free_flight(state, time, constants)
     touching = constants.touching

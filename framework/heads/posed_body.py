@@ -1,4 +1,4 @@
-"""Density of the parameters of a body in an image, with the course of the fit that found them."""
+"""Density of the parameters of a body in an image, with the steps of the fit by which they were estimated."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace

@@ -9,7 +9,7 @@ from framework.target import Target
 
 
 class Unit(NamedTuple):
-    """Location and scale of a target, (number,) each in double precision.
+    """Location and scale of each number of a target, (number,), in double precision.
 
     Location and scale are None if the head computes in the target's own unit.
     """
@@ -29,11 +29,14 @@ class Unit(NamedTuple):
 
     @property
     def log_volume(self) -> float:
-        """Logarithm of |det| of the map from the head's numbers to the target's, nats."""
+        """Logarithm of the volume by which the map from the head's unit to the target's unit expands space, nats.
+
+        It is the sum of the logarithms of `scale`, or 0 if there is no scale.
+        """
         return 0.0 if self.scale is None else float(self.scale.log().sum())
 
     def standardise(self, target: Tensor) -> Tensor:
-        """Return a target in standard deviations, as the head computes."""
+        """Return (target - location) / scale, the target in the unit in which the head computes."""
         if self.location is None or self.scale is None:
             return target
         return (target.double() - self.location.to(target.device)) / self.scale.to(target.device)

@@ -1,7 +1,7 @@
 """Residuals of Lorentzian lines for many Z-spectra, summed on one CPU core; compiled functions on NumPy arrays.
 
-Formulas and the order of the parameters are those of spectrum.py. Arrays:
-    parameters: (spectrum, p) float64, of either preset.
+Formulas and the order of the parameters are those of spectrum.py. All functions share the names of these arrays:
+    parameters: (spectrum, p) float64, of the preset "ten" or "fifteen".
     rows: (spectrum,) int64, the rows of `measured`.
     measured: (row, offset) float64, NaN where nothing was measured.
     offsets: (offset,) float64, ppm.

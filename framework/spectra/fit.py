@@ -1,4 +1,4 @@
-"""Fits Lorentzian lines to many Z-spectra at once, with the uncertainty of each parameter."""
+"""Fit of Lorentzian lines to many Z-spectra at once, with the covariance of the parameters."""
 
 from typing import NamedTuple
 

@@ -21,7 +21,7 @@ A wrong number therefore costs at most 7 nats before calibration. A step of an 8
 probabilities carry no information about an image.
 """
 LEAST, MOST, ROUNDS = 1e-2, 1e2, 60
-"""Bounds on the calibrated factor of the log-odds, and number of bisections by which the factor is found."""
+"""Bounds of the factor by which calibration multiplies the log-odds, and number of bisections that find this factor."""
 
 
 class BernoulliImageHead(DensityHead):

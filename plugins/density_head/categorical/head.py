@@ -1,4 +1,4 @@
-"""Class probabilities: any number of classes by softmax, two by a logistic."""
+"""Heads of class probabilities: by softmax for any number of classes, or by the logistic function for two classes."""
 
 import torch
 from jaxtyping import Float

@@ -36,7 +36,7 @@ from plugins.density_head.flights.identification import (
 )
 
 WINDOWS = 32
-"""Largest number of windows from which `fit` identifies the constants, evenly spaced."""
+"""Largest number of training samples (windows of flights) from which `fit` identifies the constants."""
 LEAST_NOISE, MOST_NOISE = 1e-4, 1.0
 """Bounds of the noise, metres."""
 SPREAD = (0.1, 1e3)

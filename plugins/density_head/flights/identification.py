@@ -19,7 +19,7 @@ SIZES = (0.05, 0.002, 0.05, 0.05, 0.01)
 ROUNDS = 40
 """Largest number of steps."""
 ENOUGH = 3e-4
-"""The search ends after two steps in a row that lower the cost by less than this share of it.
+"""Share of the cost: the search ends after two successive steps that lower the cost by less than this share.
 
 For 32 windows the share is less than half a nat.
 """

@@ -1,4 +1,4 @@
-"""Gaussians over any number of reals, by sequential regression."""
+"""Gaussian densities of several real numbers, parametrised by a regression of each number on the previous ones."""
 
 import math
 from functools import cached_property
@@ -62,7 +62,7 @@ class Gaussian(Symmetric):
 
     @cached_property
     def _mixing(self) -> Tensor:
-        """The matrix (I - φ)⁻¹, unit lower triangular: d = (I - φ)⁻¹ e."""
+        """The lower triangular matrix (I - φ)⁻¹, which maps the independent residuals e to the deviations d."""
         assert self.coefficients is not None
         identity = torch.eye(self.event_shape[0], dtype=self.scale.dtype, device=self.scale.device)
         inverse = torch.linalg.solve_triangular(

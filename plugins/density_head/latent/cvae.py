@@ -99,7 +99,7 @@ class Networks(Latent):
         return importance_log_weights(self.rows(items), value, noise)
 
     def sample(self, count: int) -> Tensor:
-        """Return `count` values of each item, each with a new z."""
+        """Return `count` samples of the target φ for each item, (count, *batch, *event), each with a new z."""
         step = self.at_once(count)
         parts = [
             self.component(self.decode(self.prior.draw(min(step, count - start)))).sample()
@@ -117,9 +117,10 @@ class Networks(Latent):
 
 
 def importance_log_weights(networks: Networks, value: Tensor, noise: Tensor) -> Tensor:
-    """Return log p(φ|x,z) p(z|x) / q(z|x,φ), nats, for z ~ q at standard normal `noise` (terms of eq. 3.19).
+    """Return log p(φ|x,z) p(z|x) / q(z|x,φ), nats, for φ in `value` and z drawn from q (terms of eq. 3.19).
 
-    Shapes: value (*sample, *batch, *event), noise (*draw, *sample, *batch, latent), result (*draw, *sample, *batch).
+    `noise` holds the standard normal numbers from which z is computed. The shapes are (*sample, *batch, *event) for
+    `value`, (*draw, *sample, *batch, latent) for `noise`, and (*draw, *sample, *batch) for the result.
     """
     posterior = networks.posterior(value)
     z = posterior.at(noise)
@@ -128,9 +129,10 @@ def importance_log_weights(networks: Networks, value: Tensor, noise: Tensor) -> 
 
 
 def evidence_bound(networks: Networks, value: Tensor, samples: int) -> Tensor:
-    """Return a lower bound on log p(φ|x), nats, (*batch,) (eq. 3.17).
+    """Return a lower bound on log p(φ|x) for φ in `value`, nats, (*batch,) (eq. 3.17).
 
-    The first term is a mean over `samples` samples of z; the divergence is exact.
+    It is the expectation of log p(φ|x,z) under q(z|x,φ), estimated by `samples` samples of z, minus the exact
+    divergence of q(z|x,φ) from the prior.
     """
     posterior = networks.posterior(value)
     likelihood = networks.component(networks.decode(posterior.draw(samples))).log_prob(value)
@@ -200,7 +202,7 @@ class CVAEHead(DensityHead):
         return -evidence_bound(self.networks(raw), target, self.training_samples)
 
     def networks(self, raw: Float[Tensor, "*batch size"]) -> Networks:
-        """Return prior, encoder and decoder, given the features."""
+        """Return the networks (prior, encoder and decoder) for the inputs whose raw parameters are `raw`."""
         raw = require_finite(raw, self.size)
         # clamped, so that nothing overflows in the layers that follow
         features = raw.to(self.from_value.weight.dtype).clamp(-LARGEST_FEATURE, LARGEST_FEATURE)

@@ -1,4 +1,7 @@
-"""The density of a latent-variable head, ∫ p(φ|x,z) p(z|x) dz, with as many samples as its tolerance requires."""
+"""The density of a latent-variable head, p(φ|x) = ∫ p(φ|x,z) p(z|x) dz, estimated by samples of the latent vector z.
+
+φ is the target and x the input.
+"""
 
 import copy
 from abc import ABC, abstractmethod
@@ -87,7 +90,7 @@ class Latent(ABC):
 
     @abstractmethod
     def sample(self, count: int) -> Tensor:
-        """Return `count` values of each item, (count, *batch, *event), each with a new z."""
+        """Return `count` samples of the target φ for each item, (count, *batch, *event), each with a new z."""
 
     @abstractmethod
     def tempered(self, temperature: Tensor) -> "Latent":
@@ -155,7 +158,7 @@ class LatentDensity(Distribution):
         return self._example.support  # pyright: ignore[reportReturnType]
 
     def enumerate_support(self, expand: bool = True) -> Tensor:
-        """Return every class, (class, *batch) if `expand`, else (class, *1)."""
+        """Return every class, (class, *batch) if `expand` is true, or else (class, 1, …), which broadcasts to it."""
         return self._example.enumerate_support(expand)
 
     @cached_property
@@ -228,7 +231,11 @@ def _(density: LatentDensity) -> Distribution:
 
 @tempered_density.register
 def _(density: LatentDensity, temperature: Tensor) -> Distribution:
-    """Return the density with tempered components at the same points z; for classes the whole density is tempered."""
+    """Return the tempered density.
+
+    For angles and real numbers its components are tempered, at the same points z. For classes the whole density is
+    tempered.
+    """
     changed = copy.copy(density)
     if temperature.requires_grad:
         changed.effort = density._fixed  # with a tolerance, the samples of all rounds would stay in memory

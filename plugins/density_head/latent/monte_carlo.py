@@ -21,22 +21,22 @@ from framework.distributions.tempering import tempered_classes
 from framework.errors import ConfigError
 
 REPLICATES = 8
-"""Largest number of independent estimates from which a standard error is computed."""
+"""Largest number of replicates from which a standard error is computed if there is no tolerance."""
 TO_TOLERANCE, LEAST = 32, 8
-"""Number of independent estimates if there is a tolerance, and smallest number of points of each estimate.
+"""Number of replicates if there is a tolerance, and smallest number of points of each replicate.
 
 With a tolerance, samples are doubled until the estimated error is small, which favours errors that are small by chance.
-With 8 estimates the error would be underestimated by a third, with 32 only by some percent.
+With 8 replicates the error would be underestimated by a third, with 32 only by some percent.
 """
 STRETCH = 0.4
-"""Heaviness of the tails of the points of `stretch`.
+"""Parameter h of `stretch`: for a larger h, more points are far from 0.
 
-In one dimension 3 % of them lie above 4; of normal points 0.003 % do.
+With this value 3 % of the points in one dimension lie above 4, but only 0.003 % of normal points.
 """
 MOST = 2**18
-"""Largest number of samples of an item; if its error is still above the tolerance, it is reported as unresolved."""
+"""Largest number of samples of an item; an item whose error is then still above the tolerance counts as unresolved."""
 GENERATOR = 1267
-"""Multiplier a of the lattice, chosen by measured variance (benchmarks/densities/latent.md)."""
+"""Multiplier a of `lattice`, chosen for small measured variance (benchmarks/densities/latent.md)."""
 LARGEST_KEPT = 2**22
 """Largest number of normal points that a density keeps in memory (16 MiB in float32); more are recomputed."""
 
@@ -115,7 +115,11 @@ def _(density: SampledMixture, index: int) -> Distribution:
 
 @tempered_density.register
 def _(density: SampledMixture, temperature: Tensor) -> Distribution:
-    """Return the mixture of tempered components; for classes the whole mixture is tempered, which keeps its mode."""
+    """Return the tempered mixture.
+
+    For angles and real numbers its components are tempered. For classes the whole mixture is tempered, which keeps its
+    mode.
+    """
     if density.has_enumerate_support:
         return tempered_classes(density, temperature)
     components = tempered_density(density.components, temperature)

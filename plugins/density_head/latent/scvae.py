@@ -55,7 +55,7 @@ class Networks(Latent):
         return self.component(self.decode(raw, noise)).log_prob(value)
 
     def sample(self, count: int) -> Tensor:
-        """Return `count` values of each item, each with a new z."""
+        """Return `count` samples of the target φ for each item, (count, *batch, *event), each with a new z."""
         like = self.center
         z = torch.randn(*like.shape[:-1], count, like.shape[-1], dtype=like.dtype, device=like.device)
         return self.component(self._decoded(z)).sample().movedim(like.dim() - 1, 0)

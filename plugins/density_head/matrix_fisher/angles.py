@@ -13,15 +13,15 @@ from plugins.density_head.matrix_fisher.functions import Frame, log_height
 CHUNK = 2**18
 """Number of points at which the density is evaluated at once; arrays of 2 MB stay in the processor's cache."""
 FEW = {32: 19.0, 48: 54.0, 96: 236.0, 192: 368.0}
-"""Numbers of nodes of a quadrature with fixed nodes, each with the largest λ for which this number suffices.
+"""Numbers of nodes of a quadrature with fixed nodes, each with the largest λ₃ (functions.py) for which it suffices.
 
-As a function of any one angle a, Σ λᵢqᵢ² is c₀ - κ cos(a - φ), with κ at most half of the largest λ. For exp(κ cos) the
-trapezium rule with N nodes on the circle has the relative error 2 I_N(κ)/I₀(κ), here below 1e-15. For Gauss-Legendre
-quadrature on half of the circle the bounds were found by experiment (`test_few_nodes_do_up_to_their_bound`: 5e-12). For
-a larger λ, the nodes are placed around the peaks.
+As a function of a single angle a, the log-density is c - Σ λᵢqᵢ² = c' + κ cos(a - φ) with constants c, c', φ and with κ
+at most λ₃/2. For exp(κ cos) the trapezium rule with N nodes on the circle has the relative error 2 I_N(κ)/I₀(κ), which
+is below 1e-15 here. For Gauss-Legendre quadrature on half of the circle the limits were found by experiment
+(`test_few_nodes_do_up_to_their_bound`: 5e-12). For a larger λ₃, the nodes are placed around the peaks.
 """
 MOST = 2 * quadrature.PEAKS * sum(quadrature.NODES)
-"""Number of nodes if they are placed around the peaks."""
+"""Number of nodes of a quadrature whose nodes are placed around the peaks."""
 
 
 @torch.no_grad()
@@ -30,9 +30,10 @@ def log_marginal(angle: Float[Tensor, "..."], frame: Frame, index: int) -> Float
 
     The batch shape of `frame` broadcasts with the shape of `angle`.
 
-    The aligned quaternion is linear in the pair (cos, sin) of half of each angle, so that Σ λᵢqᵢ² is a quadratic form
-    of the pair of one of the other angles. The smaller and larger eigenvalues μ and ν of this form give the integral
-    over that angle, and the remaining angle, here e, is integrated by quadrature:
+    For each of the three angles α, the aligned quaternion q is a linear function of the pair (cos α/2, sin α/2), so
+    that Σ λᵢqᵢ² is a quadratic form of this pair. With the smaller and larger eigenvalues μ and ν of the form, the
+    integral over one of the other two angles is a Bessel function. The integral over the last angle is computed by
+    quadrature. For the azimuth a and quadrature over the elevation e this is
 
         p(a) = ∫ cos e / (4π k(λ)) exp(-μ) I₀ₑ((ν-μ)/2) de.
     """

@@ -71,7 +71,10 @@ class MatrixFisher(Distribution):
 
     @property
     def mode(self) -> Float[Tensor, "*batch 3"]:
-        """The likeliest rotation U Vᵀ, where log p(R), without the cos e of the chart, is highest."""
+        """Viewpoint of the rotation U Vᵀ, at which log p(R) is highest, (*batch, 3).
+
+        This is the mode of the rotation's density: the factor cos e of the viewpoint's density is not included.
+        """
         return quaternions.viewpoint(self.frame.mode).to(self.dtype)
 
     def log_prob(self, value: Float[Tensor, "... 3"]) -> Float[Tensor, "..."]:
@@ -192,7 +195,7 @@ def _(density: MatrixFisher, index: Tensor) -> MatrixFisher:
 
 @tempered_density.register
 def _(density: MatrixFisher, temperature: Tensor) -> MatrixFisher:
-    """Return the power of the density of rotations, exp(tr(FᵀR))^(1/T), which has the parameter F/T.
+    """Return the density of rotations raised to the power 1/T for the temperature T, which has the parameter F/T.
 
     The density of the viewpoint keeps the chart's factor cos e as it is, since this factor is not part of the
     prediction.

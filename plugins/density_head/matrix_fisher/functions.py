@@ -56,7 +56,7 @@ class Frame(NamedTuple):
 
     @property
     def mode(self) -> Float[Tensor, "*batch 4"]:
-        """The quaternion of U Vᵀ, where the density is highest."""
+        """Quaternion of U Vᵀ, the rotation at which the density is highest."""
         return self.turn(self.falls.new_tensor([1.0, 0, 0, 0]))
 
     def turn(self, aligned: Float[Tensor, "... 4"]) -> Float[Tensor, "... 4"]:
@@ -81,19 +81,28 @@ def log_prob(turn: Float[Tensor, "... 4"], parameter: Float[Tensor, "... 3 3"]) 
 
 
 def mean_rotation(parameter: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """Return E R = U diag(d) Vᵀ, the derivative of log c in F (Lee 2018, Thm. 1), float64; differentiable once."""
+    """Return the mean rotation matrix E R = U diag(d) Vᵀ, float64; differentiable once.
+
+    It is the derivative of log c(F) by F, and d is the mean of the diagonal of UᵀRV (Lee 2018, Thm. 1).
+    """
     return _Mean.apply(parameter.double())
 
 
 @torch.no_grad()
 def entropy(falls: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-    """Return -E log p = log k + Σ λᵢ E qᵢ², nats, at most 0, with respect to the measure of total mass 1."""
+    """Return the entropy -E log p = log k(λ) + Σ λᵢ E qᵢ², nats; `falls` are λ.
+
+    It is with respect to the rotation-invariant measure of total mass 1, and therefore at most 0.
+    """
     return log_height(falls).neg() + (falls * second_moments(falls)).sum(-1)
 
 
 @torch.no_grad()
 def align(parameter: Float[Tensor, "*batch 3 3"]) -> Frame:
-    """Return the proper singular value decomposition, float64; any one of them if singular values are equal."""
+    """Return the proper singular value decomposition of F, float64.
+
+    If singular values are equal, the decomposition is not unique, and any one of them is returned.
+    """
     left, singular, right = torch.linalg.svd(parameter.double())
     right = right.mT
     flips = torch.stack([torch.linalg.det(left), torch.linalg.det(right)]).sign()

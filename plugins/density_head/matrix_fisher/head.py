@@ -12,7 +12,7 @@ from plugins.density_head.matrix_fisher.density import MatrixFisher
 
 ANGLES = ("azimuth", "elevation", "tilt")
 LARGEST_PARAMETER = 1e12
-"""Largest |F|, for standard deviations of a microradian, which is the resolution of float32 angles."""
+"""Largest Frobenius norm of F, for standard deviations of a microradian, which is the resolution of float32 angles."""
 
 
 class MatrixFisherHead(DensityHead):

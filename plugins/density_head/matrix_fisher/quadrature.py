@@ -11,7 +11,7 @@ from torch import Tensor
 GRID = 64
 """Number of cells in which peaks are searched."""
 PEAKS = 2
-"""Number of highest peaks that have nodes of their own."""
+"""Largest number of peaks that have nodes of their own, the highest ones."""
 ROUNDS = 14
 """Number of rounds that refine a peak.
 
@@ -104,7 +104,7 @@ def gauss(count: int, low: float, high: float) -> tuple[Float[Tensor, "node"], F
 def maximum(
     log_density: Callable[[Tensor], Tensor], starts: Float[Tensor, "*batch start"], step: float
 ) -> Float[Tensor, "*batch"]:
-    """Return the position, radians, of the highest of the maxima within `step` of any start."""
+    """Return the position, radians, of the highest maximum of `log_density` within the distance `step` of a start."""
     peaks, _ = _refine(log_density, starts, step, starts - step, starts + step)
     best = log_density(peaks).argmax(-1, keepdim=True)
     return peaks.gather(-1, best).squeeze(-1)

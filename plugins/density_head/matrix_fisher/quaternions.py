@@ -58,7 +58,11 @@ def of_viewpoint(angles: Float[Tensor, "... 3"]) -> Quaternions:
 
 
 def viewpoint(turn: Quaternions) -> Float[Tensor, "... 3"]:
-    """Return azimuth and tilt in [-π, π] and elevation in [-π/2, π/2], radians; at the poles one of many viewpoints."""
+    """Return azimuth, elevation and tilt of the rotation with quaternion `turn`, radians.
+
+    Azimuth and tilt are in [-π, π], the elevation is in [-π/2, π/2]. At an elevation of ±π/2 many viewpoints have the
+    same rotation, and one of them is returned.
+    """
     real, x, y, z = turn.unbind(-1)
     elevation = math.pi / 2 - 2 * torch.atan2(torch.hypot(x, y), torch.hypot(real, z))
     # the inverse of of_viewpoint, whose `sine` is at most 0 and `cosine` at least 0 for elevations in the chart

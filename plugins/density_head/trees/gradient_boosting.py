@@ -139,7 +139,7 @@ class XGBoostHead(DensityHead, Fitted):
 
     @torch.no_grad()
     def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
-        """Set the standard deviations to those of the residuals; do nothing for classes."""
+        """Set the standard deviations to the root mean squared residuals of the split; do nothing for classes."""
         if self.classes:
             return
         require_validation(raw, "A standard deviation is")
@@ -150,7 +150,7 @@ class XGBoostHead(DensityHead, Fitted):
         self.width.copy_(residual.square().mean(0).sqrt().clamp(FLOOR, WIDEST))
 
     def _sums(self, raw: Float[Tensor, "sample size"]) -> Float[Tensor, "sample number"]:
-        """Return the sums of the trees' outputs, (sample, number), float32."""
+        """Return the sum of the trees' outputs for each class or number of the target, float32."""
         assert self.booster is not None
         rounds = min(max(1, self.rounds), self.booster.num_boosted_rounds())
         sums = self.booster.inplace_predict(

@@ -136,7 +136,10 @@ def _require_tree(tree: Mapping[str, Any], number: int, features: int) -> None:
 
 
 def _require_base_score(text: Any, numbers: int) -> None:
-    """Require one finite number or, as xgboost 3.1 and later write it, one for each sum: "[5E-1,1E0]"."""
+    """Require that `text` holds one finite number, or a list of one number for each sum of trees: "[5E-1,1E0]".
+
+    Versions of xgboost since 3.1 write a list.
+    """
     if not isinstance(text, str) or not re.fullmatch(r"\[?[-+.,\dE]{1,100000}\]?", text):
         raise ValueError("base_score is not a list of numbers")
     scores = [float(part) for part in text.strip("[]").split(",")]

@@ -17,18 +17,19 @@ TABLES: dict[str, dict[str, np.ndarray]] = {
     "float32": _read("table/float32/"),
     "float64": _read("table/float64/"),
 }
-"""Float64 coefficients, (power, piece), by dtype and function.
+"""Coefficients of the polynomials, (power, piece) in float64, by the dtype that is computed and by function.
 
-Row j holds the coefficient of y^j on each of the equal pieces of v ∈ [0, 1], in ascending order of v.
+v = 2/(κ+2) is in [0, 1], which is divided into equal pieces; y ∈ [-1, 1] is the position of v in its piece. Row j holds
+the coefficient of y^j on each piece, in ascending order of v.
 """
 
 BORDERS: tuple[float, ...] = tuple(_ARRAYS["borders"].tolist())
-"""Borders in v of the few unequal pieces that compiled float32 uses."""
+"""Borders of the few pieces of unequal length, in v, that compiled code in float32 uses."""
 
 CHAINS: dict[str, tuple[tuple[float, ...], ...]] = {
     name: tuple(map(tuple, array.tolist())) for name, array in _read("chain/").items()
 }
-"""Coefficients by function: row j holds the coefficient of y^j on each piece between BORDERS.
+"""Coefficients of the polynomials on the pieces between BORDERS, by function: row j holds those of y^j.
 
 They are Python numbers, because a compiler writes them into its code.
 """

@@ -108,9 +108,10 @@ def concentration_of_moments(resultant: Tensor, deviation: Tensor) -> Tensor:
 def sample(mean: Tensor, concentration: Tensor) -> Tensor:
     """Return one angle in [-π, π] per element, by rejection (Best & Fisher 1979), computed in float64.
 
-    Best and Fisher propose from a wrapped Cauchy density of the same peak. With t = tan(θ/2) its proposal is t =
-    (1-ρ)/(1+ρ) tan(πu/2), u uniform on (-1, 1), and 1 - cos θ = 2t²/(1+t²): nothing cancels at any κ. Elements without
-    an accepted proposal after SAMPLING_ROUNDS keep their last proposal, so that the loop always ends.
+    Proposals θ, the distances from the mean, come from a wrapped Cauchy density with the parameter ρ, as in the paper.
+    They are computed by t = tan(θ/2) = (1-ρ)/(1+ρ) tan(πu/2), with u uniform on (-1, 1), and 1 - cos θ = 2t²/(1+t²).
+    With these formulas nothing cancels at any κ. Elements without an accepted proposal after SAMPLING_ROUNDS keep their
+    last proposal, so that the loop always ends.
     """
     mean, concentration = torch.broadcast_tensors(mean, concentration)
     kappa = concentration.double().flatten()

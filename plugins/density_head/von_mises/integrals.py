@@ -21,7 +21,7 @@ ROUNDS = 64
 """Largest number of rounds of the inversion in `half_width`; bisection alone needs 53 to reach the last digit."""
 
 CUT = 40.0
-"""Integrals end where the density has fallen by the factor exp(-CUT), a quarter of float64's last digit."""
+"""Integrals end where the density has fallen to exp(-CUT) of its value at the start; the rest is below rounding."""
 
 
 def kl_divergence(
@@ -53,9 +53,9 @@ def cdf(value: Tensor, mean: Tensor, concentration: Tensor) -> Tensor:
 def half_width(mass: Tensor, concentration: Tensor) -> Tensor:
     """Return half the width, radians in [0, π], of the shortest arc with the probability `mass`, centred on the mean.
 
-    Newton's method solves for the probability inside the arc or, above one half, for the logarithm of the probability
-    outside. If a step leaves the bracket, bisection is used. There are at most ROUNDS rounds. The result has no
-    gradient.
+    Newton's method solves an equation for the probability inside the arc or, for a mass above one half, for the
+    logarithm of the probability outside. If a Newton step leaves the bracket of the solution, the bracket is halved
+    instead. There are at most ROUNDS rounds. The half width has no gradient.
 
     Raises:
         ValueError: a mass outside [0, 1].

@@ -18,9 +18,9 @@ from framework.distributions.class_probabilities import class_probabilities, req
 from framework.distributions.protocol import mahalanobis, normals
 
 EQUAL = {torch.float32: 1e-6, torch.float64: 1e-12}
-"""Relative difference below which densities count as equal, by number type, so that rounding decides no tie."""
+"""Relative difference, for each dtype, below which two densities count as equal, so that rounding has no influence."""
 FINER = 8
-"""Number of grid points for regions, per point at which the density is evaluated."""
+"""Factor by which the grid for regions is finer than the grid on which the density is evaluated."""
 BLOCK = 2**18
 """Number of angles that are processed at once: enough to make calls cheap, few enough for the processor's cache."""
 HALVINGS = 40
@@ -152,7 +152,7 @@ class Cubic(NamedTuple):
         return cls(density, moments.density(FINER, slope=True) * (2 * math.pi / len(density)))
 
     def rows(self, chosen: Tensor) -> "Cubic":
-        """Return the polynomials of the chosen items of the batch."""
+        """Return the polynomials of only some items of the batch: their indices, or true for each of them."""
         return Cubic(self.density[:, chosen], self.slope[:, chosen])
 
     def above(self, level: Float[Tensor, "batch"]) -> tuple[Float[Tensor, "batch"], Float[Tensor, "batch"]]:
@@ -182,9 +182,9 @@ class Cubic(NamedTuple):
     def size(self, mass: float) -> Float[Tensor, "batch"]:
         """Return the length of the highest-density region of the given mass, radians.
 
-        The grid points give two levels that bracket the level of the region; secant steps narrow this bracket. The mass
-        that is still missing then is divided by the level, because the mass grows by the level times the growth of the
-        length.
+        The values at the grid points give two levels between which the level of the region lies; secant steps narrow
+        this bracket. The mass that is then still missing, divided by the level, is added to the length: at the border
+        the density equals the level, so that a small change of length changes the mass by the level times this change.
         """
         step = 2 * math.pi / len(self.density)
         ordered = self.density.clamp(min=0).sort(0, descending=True).values

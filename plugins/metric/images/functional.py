@@ -26,11 +26,11 @@ def psnr(predicted: Pixels, true: Pixels, ceiling: float) -> Float[Tensor, ""]:
 
 
 class Similarity(NamedTuple):
-    """SSIM of each window inside the image, (channel, height - 10, width - 10).
+    """Structural similarity (SSIM) of each window that lies inside the image, (channel, height - 10, width - 10).
 
     Attributes:
         whole: SSIM.
-        contrast: the factor of SSIM for contrast and structure only.
+        contrast: SSIM without its factor for luminance: the product of the factors for contrast and structure.
     """
 
     whole: Tensor

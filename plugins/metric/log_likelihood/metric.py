@@ -25,7 +25,7 @@ class Moments(Metric):
         self.add_state("sampling", torch.zeros(5, dtype=torch.float64), dist_reduce_fx=merge_sampling)
 
     def add_samples(self, log_prob: Float[Tensor, "batch"], estimate: Estimate) -> None:
-        """Add the log-likelihoods of a batch, and the sampling errors of their estimates."""
+        """Add the log-likelihoods of a batch to the states, and the sampling errors in `estimate`."""
         self.moments = merge_moments(torch.stack([self.moments, compute_moments(log_prob)]))
         self.sampling = merge_sampling(torch.stack([self.sampling, summarize_sampling(estimate)]))
 

@@ -1,4 +1,4 @@
-"""Entropy on outliers, and how well a score separates outliers from the test split."""
+"""Mean entropy on outliers, and measures of how well a score separates outliers from the test split."""
 
 from typing import ClassVar, Literal
 

@@ -154,7 +154,10 @@ class PixelUncertainty(Metric, HasFigure):
         return sheet(shown, self._levels().cpu().numpy(), shares, len(numbers), title, synthetic=synthetic)
 
     def _numbers_by_region(self) -> dict[str, Tensor]:
-        """Return the numbers of every image, (image, level + 2), for each region."""
+        """Return, for the whole image and for the mask, the numbers of every image, (image, level + 2).
+
+        They are the coverage at each level, and two more numbers: rank correlation and mean scale.
+        """
         width = LEVELS + 2
         numbers = dim_zero_cat(self.numbers) if len(self.numbers) else self._levels().new_zeros(0, 2 * width)
         return dict(zip(self.regions, numbers.split(width, 1), strict=False))

@@ -10,9 +10,10 @@ from framework.geometry.nearest import nearest
 
 
 class Correspondence(NamedTuple):
-    """Mean errors in centimetres over pairs of different scans, of the same person (intra) and of two people (inter).
+    """Mean correspondence errors, centimetres, over pairs of different scans.
 
-    A mean is NaN if there is no such pair.
+    `intra` is over pairs of scans of the same person, and `inter` over pairs of scans of two people. A mean is NaN if
+    there is no such pair.
     """
 
     intra_cm: Tensor

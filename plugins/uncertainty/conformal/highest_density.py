@@ -22,9 +22,9 @@ FOLD = 12
 NEAREST, FARTHEST = 1e-11, 1e11
 """Smallest and largest distance of nodes from a peak, in the target's unit; the largest is π for angles."""
 TURN = 720
-"""Number of further nodes, evenly spaced on the circle, for broad humps that have no peak among the candidates."""
+"""Number of additional nodes, evenly spaced on the circle, for broad humps without a mode candidate."""
 PEAKS, CANDIDATES = 8, 64
-"""Number of peaks that get nodes of their own, and number of candidates among which they are chosen."""
+"""Largest number of peaks that have nodes of their own, and of mode candidates among which they are chosen."""
 PARTED = 0.1
 """Smallest depth, nats, of a valley that separates two humps; shallower ones count as part of one hump."""
 BISECTIONS = 52
@@ -84,7 +84,10 @@ class Line:
         return (self._log_whole - self._log_less(level)).clamp(min=0)
 
     def level_of(self, score: Float[Tensor, ""]) -> Float[Tensor, "item"]:
-        """Return the log-density at which `score_of` is `score` to 1e-12, by regula falsi in the Illinois variant."""
+        """Return for each item the level at which `score_of` equals `score`, with an error of 1e-12.
+
+        The equation is solved by regula falsi in the Illinois variant.
+        """
         high, reach = self.heights.amax(0), score.clamp(min=0) + 1
         if score < 0:  # no score is negative
             return torch.full_like(high, math.inf)
@@ -240,7 +243,11 @@ class Line:
         return torch.cat(chosen)
 
     def _candidates(self) -> Float[Tensor, "candidate item"]:
-        """Return at most one mode candidate in each quarter of a peak width, since hundreds may lie on one hump."""
+        """Return mode candidates of each item in ascending order, at most one in each quarter of a peak width.
+
+        Without this selection, hundreds of candidates may lie on one hump. An item with fewer candidates than others
+        repeats its last one.
+        """
         places = mode_candidates(self.density).squeeze(-1).double()
         if self.closed:
             places = wrap(places)

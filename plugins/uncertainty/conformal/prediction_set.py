@@ -18,13 +18,16 @@ from plugins.uncertainty.conformal.highest_density import Ends, Line
 
 Score = Literal["density", "mass"]
 FEW = 8
-"""Number of values per item up to which computing their scores is faster than computing the level of the threshold."""
+"""Number of values per item up to which `contains` compares their scores with the threshold.
+
+For more values it is faster to compute the log-density that belongs to the threshold once.
+"""
 DRAWS = 1000
 """Number of samples of each density over several numbers, from which scores and volumes of its sets are estimated."""
 WIDENED = (1.0, 2.0, 4.0, 8.0)
-"""Factors by which a density over several reals is widened, so that samples cover its whole set.
+"""Factors by which a density over several reals is widened, so that samples cover its whole prediction set.
 
-An overconfident density has all its own samples in the interior of the set.
+The set of an overconfident density is larger than the region in which the density's own samples lie.
 """
 
 
@@ -216,7 +219,8 @@ class PredictionSet(Mixture, ValueSet):
 
         The ends of an interval of a real may be infinite. An interval of an angle is in radians, from low in [-π, π)
         counter-clockwise to high, which may lie beyond π but is at most low + 2π; the whole circle is (-π, π). The ends
-        are as exact as the density's dtype. A hump of the density is found if a component has its mode there.
+        are as exact as the density's dtype. An interval is found only if a component has its
+        mode there or, for angles, if it is broad.
 
         Raises:
             UserError: the density is not over one number.
@@ -312,7 +316,10 @@ def _label_scores(log_prob: Tensor, every: Float[Tensor, "label *batch"]) -> Ten
 
 
 def _broadcast_labels(every: Tensor, values: Tensor) -> Tensor:
-    """Return `every`, (label, *batch), reshaped to (label, *1, *batch), to broadcast with values (*sample, *batch)."""
+    """Return `every` (label, *batch) with dimensions of size 1 inserted, so that it broadcasts with `values`.
+
+    `values` are (*sample, *batch); one dimension of size 1 is inserted for each dimension of `sample`.
+    """
     return every.reshape(len(every), *(1,) * (values.dim() - every.dim() + 1), *every.shape[1:])
 
 

@@ -26,7 +26,7 @@ NEAR = 0.03
 If the deviation may be larger, the remark names the number of samples with which it would not be.
 """
 NINETY = 1.645
-"""Number of standard deviations to either side that hold the middle 90 % of a normal density."""
+"""Number of standard deviations on both sides of the mean within which a normal density has the probability 0.9."""
 _log = logging.getLogger(__name__)
 
 
@@ -77,7 +77,7 @@ class Conformal(Uncertainty):
         return PredictionSet(self.model(inputs), self.threshold, self.score, 1 - self.miscoverage)
 
     def calibrate(self, batches: Iterable[Batch]) -> None:
-        """Calibrate the wrapped model on one half of the batches, and fit the threshold to the other."""
+        """Calibrate the wrapped model on one half of the samples, and fit the threshold to the other half."""
         model_half, own_half = split_in_halves(nonempty_batches(batches, by="conformal"))
         if not own_half:
             raise UserError(
@@ -157,13 +157,13 @@ def coverage_remark(count: int, miscoverage: float) -> str:
 
 
 def _left_out(count: int, miscoverage: float) -> int:
-    """Return the number of scores at or above the threshold, ⌊(n + 1) α⌋, for n = `count`."""
+    """Return ⌊(n + 1) α⌋, the number of scores at or above the threshold, for n = `count` and α = `miscoverage`."""
     # α is rounded, so that (n + 1) α may fall just below an integer; the factor corrects that
     return min(count, math.floor((count + 1) * miscoverage * (1 + 1e-12)))
 
 
 def threshold(scores: Float[Tensor, "sample"], miscoverage: float) -> float:
-    """Return the k-th smallest of n scores, k = ⌈(n + 1)(1 - α)⌉; infinite if k > n.
+    """Return the k-th smallest of n scores, k = ⌈(n + 1)(1 - α)⌉ for α = `miscoverage`; infinite if k > n.
 
     Source: Vovk, Gammerman & Shafer 2005, §4.1.
     """

@@ -176,7 +176,7 @@ class Ensemble(Uncertainty, Joining, SeveralModels):
             ) from error
 
     def _densities(self, raw: Float[Tensor, "batch member size"]) -> Distribution:
-        """Return the members' densities, batch_shape (batch, member)."""
+        """Return the densities of the members with the raw parameters `raw`, batch_shape (batch, member)."""
         bad = (~raw.isfinite()).any(-1).nonzero()
         if len(bad):
             row, index = bad[0].tolist()

@@ -90,13 +90,13 @@ def minimise(
 
 
 def total(terms: Sequence[Term], point: Float[Tensor, "n"]) -> Float[Tensor, ""]:
-    """Return the value of Σ terms at a point, float64, without gradient."""
+    """Return the sum of `terms` at a point, float64, without gradient."""
     with torch.no_grad():
         return torch.stack([term(point).double() for term in terms]).sum()
 
 
 def value_and_slope(terms: Sequence[Term], point: Float[Tensor, "n"]) -> tuple[float, np.ndarray]:
-    """Return the value of Σ terms at a point and the gradient (n,), float64."""
+    """Return the sum of `terms` at a point, and its gradient (n,), float64."""
     value, slope = 0.0, torch.zeros_like(point)
     for term in terms:
         with torch.enable_grad():
