@@ -134,6 +134,6 @@ def test_every_claim_has_evidence_a_verdict_and_a_command() -> None:
 def test_each_contradicted_claim_is_explained_once() -> None:
     text = CLAIMS.read_text(encoding="utf-8")
     contradicted = re.findall(r"(?m)^\| (\d-\d+) \|.*\| contradicted: [^|]*\| `[^`]*` \|$", text)
-    why = text.partition("\n## What is contradicted, and why\n")[2].partition("\n## ")[0]
+    why = text.partition("\n## Contradicted claims and their causes\n")[2].partition("\n## ")[0]
     heads = re.findall(r"(?m)^- \*\*([^*]*)\*\*", why)
     assert sorted(re.findall(r"\d-\d+", " ".join(heads))) == sorted(contradicted)
