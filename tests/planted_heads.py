@@ -195,7 +195,6 @@ class Faulty(DensityHead):
     """
 
     bibtex = ""
-    knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
 
     def __init__(self, sound: DensityHead, parts: Parts) -> None:
         super().__init__()

@@ -26,7 +26,6 @@ class Tempered(Uncertainty):
     """Tempers each density; the temperature on a grid with the highest validation likelihood is used."""
 
     bibtex = ""
-    knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
     temperature: Tensor
 
     def __init__(self, model: Callable[[], Predictor]) -> None:
@@ -69,7 +68,6 @@ class Weighted(Uncertainty):
     """Mixture of two models; the weights on a grid with the highest validation likelihood are used."""
 
     bibtex = ""
-    knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
     share: Tensor
 
     def __init__(self, model: Callable[[], Predictor]) -> None:

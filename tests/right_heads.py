@@ -40,7 +40,6 @@ class _OfReals(DensityHead):
     """Base of heads with a location and a scale for each number, in the target's unit."""
 
     bibtex = ""
-    knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
 
     def __init__(self, target: Target) -> None:
         super().__init__()
@@ -132,7 +131,6 @@ class LearnedTHead(DensityHead):
     """
 
     bibtex = ""
-    knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
 
     def __init__(self, target: Target) -> None:
         super().__init__()
@@ -324,7 +322,6 @@ class WrappedNormalHead(DensityHead):
     """Wrapped normal densities with a location and a width for each angle."""
 
     bibtex = ""
-    knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
 
     def __init__(self, target: Target) -> None:
         super().__init__()
