@@ -48,7 +48,7 @@ class Metric(torchmetrics.Metric, ABC):
     """
 
     better: ClassVar[dict[str, Literal["higher", "lower"]]] = {}
-    """Which values are better, "higher" or "lower", for those keys of `columns` for which one of them is."""
+    """Better direction, "higher" or "lower", of those columns that have one, by their keys in `columns`."""
 
     @abstractmethod
     def update(self, prediction: Prediction) -> None:
