@@ -31,7 +31,7 @@ class Prediction:
         batch: the fields of the batch, on the density's device.
         samples: number of samples for a point prediction that has no closed form (S of eq. 3.24).
         split: source of the batch; the targets of outliers have no meaning.
-        draw: source of noise; None uses the current state of torch's generators.
+        draw: source of random numbers; None uses the current state of torch's generators.
         reads: channels of images that will be requested, so that they are drawn together.
     """
 

@@ -29,13 +29,14 @@ class Body:
         parents: parent of each joint, -1 for the only root.
         joints: positions of the joints in the rest pose of the mean shape.
         shapes, joint_shapes: displacement of vertices and joints by each shape coefficient.
-        pose_shapes: displacement of vertices by each pose feature; None for a body without them. There are either 9
-            features for each joint except the root, rotation matrix less identity, row by row (Loper et al. 2015, eq.
-            9); or 4, unit quaternion (x, y, z, w) less identity, and the second shape coefficient (Osman et al. 2020,
+        pose_shapes: displacement of vertices by each pose feature; None for a body without pose shapes. There are two
+            kinds of features. Either there are 9 for each joint except the root: the elements of its rotation matrix
+            less the identity, row by row (Loper et al. 2015, eq. 9). Or there are 4 for each joint except the root, its
+            unit quaternion (x, y, z, w) less (0, 0, 0, 1), and then the second shape coefficient (Osman et al. 2020,
             eq. 4).
         names: names of the joints; empty if they have none.
-        uv, uv_faces: texture coordinates, u to the right and v upwards, and three rows of them for each face; None for
-            a body without them.
+        uv: texture coordinates, u to the right and v upwards; None for a body without texture.
+        uv_faces: for each face, the rows of `uv` of its three corners; None for a body without texture.
 
     Raises:
         DataError: arrays do not fit together, a number is not finite, weights are negative or do not sum to 1, parents

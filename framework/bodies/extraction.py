@@ -19,7 +19,7 @@ AGREEMENT = 1e-5
 
 
 def extract(scratch: Path) -> tuple[Body, dict[str, np.ndarray]]:
-    """Return the body in the axes of framework.bodies.default_body, and the tables of its traits.
+    """Return the body in the axes of framework.bodies.default_body, and the arrays of `Traits`.
 
     Args:
         scratch: folder for the package's intermediate files.

@@ -68,10 +68,10 @@ ImageSide = Annotated[int, Field(ge=8, le=1024, multiple_of=4)]
 class ParametricBody:
     """Coloured body whose vertices are a function of free parameters.
 
-    The parameters are, in the order of `names`: rotation of the whole body about its root (axis times angle, radians,
-    world axes) and translation (metres); movements of framework.bodies.poses less their means (radians); shape
-    (standard deviations). Parameters of 0 give an average person in the mean pose. Skin is blended from the mean pose,
-    so that a free joint rotates by its movements alone. Joints that are not free keep the mean pose.
+    The parameters are, in the order of `names`, the rotation of the whole body about its root (axis times angle,
+    radians, world axes), its translation (metres), the differences of movements of framework.bodies.poses from their
+    means (radians), and shape coefficients (standard deviations). Parameters of 0 give an average person in the mean
+    pose. The mean pose is also the rest pose for skinning. Joints that no parameter moves keep the mean pose.
 
     Args:
         file: file of a body model of the SMPL family; None: the default body.

@@ -7,9 +7,9 @@ to plain arrays; any other name is refused before that. Pickles of Python 2 (tex
 read.
 
 The cost of a file is bounded by its size: the number of instructions, the depth of nesting, and the size of arrays,
-which may not exceed the data in the file. Sparse matrices are an exception: they become dense, and the numbers of all
-of them are counted. Keys are words and small numbers, because hashing other keys could take unlimited time (for
-example, a tuple of the same tuple twice, thirty levels deep).
+which may not exceed the data in the file. Sparse matrices are an exception: they become dense, and the number of
+elements of all of them together is limited. Keys of dictionaries are words and small numbers, because hashing other
+keys could take unlimited time (for example, a tuple that holds the same tuple twice, thirty levels deep).
 """
 
 import math

@@ -17,7 +17,7 @@ MOST_NAMES = 10
 
 
 def future_names(frames: int, step: float) -> tuple[str, ...]:
-    """Return the names of the numbers that are predicted, frame by frame: "x_16ms", in metres.
+    """Return the names of the numbers that are predicted, frame by frame: "x_16ms" is x after 16 ms, in metres.
 
     Args:
         frames: number of predicted frames.

@@ -30,7 +30,7 @@ class Constants:
         friction: Coulomb's coefficient of ball and table.
         radius: radius of the ball, m.
         surface: height of the table, m, in the frame of the recordings.
-        near: y at which the table begins, m. Outside the table the ball falls on.
+        near: y at which the table begins, m. Before `near` and beyond `far` there is no bounce.
         far: y at which the table ends, m.
     """
 

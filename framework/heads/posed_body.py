@@ -30,7 +30,9 @@ class BodyFit:
 
 
 class PosedBodyDensity(Independent):
-    """Independent normal densities of the parameters of a parametric body, with the result of each fit as their mean.
+    """Independent normal densities of the parameters of a parametric body, as they were fitted to images.
+
+    The mean is where each fit ended.
 
     Args:
         mean, scale: (*batch, parameter).

@@ -176,10 +176,10 @@ def least_squares(
     while they fail (Nielsen 1999). Parameters at a bound that the gradient pushes against are held (Kanzow, Yamashita &
     Fukushima 2004). A step that leaves the box is solved again with the parameters beyond a bound held there. Steps
     come from the Cholesky factor of the scaled normal matrix or, if that is too close to singular, from the singular
-    values of the Jacobian. If `curvature` is given, steps near the minimum are Newton's, which square the error instead
-    of dividing it. Problems that have converged leave the batch, and others take their place.
+    values of the Jacobian. If `curvature` is given, steps near the minimum are Newton's, with which the error falls
+    quadratically instead of linearly. Problems that have ended leave the batch, and waiting problems replace them.
 
-    The model is evaluated on the device of `start`; the small matrices are solved on the processor.
+    The model is evaluated on the device of `start`; the small systems of equations are solved on the CPU.
 
     Args:
         model: residuals and their Jacobian, see `Model`.

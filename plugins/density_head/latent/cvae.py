@@ -142,17 +142,20 @@ def evidence_bound(networks: Networks, value: Tensor, samples: int) -> Tensor:
 class CVAEHead(DensityHead):
     """CVAE: an infinite mixture over a latent z with a learned prior (thesis §3.5.2, eq. 3.12-3.20).
 
-    Prior p(z|x), encoder q(z|x,φ) and decoder p(φ|x,z) train by the evidence lower bound (eq. 3.17-3.18); log_prob is
-    the importance-weighted bound (eq. 3.19). The framework's linear layer serves as the part of each network's first
-    layer that reads the features, and is computed once per item.
+    x is the input, φ the target and z a latent vector. Three networks, the prior p(z|x), the encoder q(z|x,φ) and the
+    decoder p(φ|x,z), are trained by the evidence lower bound (eq. 3.17-3.18); log_prob is the importance-weighted bound
+    (eq. 3.19). The first layer of each network has a part that reads only the features of x. This part is the linear
+    layer that the framework puts before the head, so it is computed once per input and not once per sample.
 
     Args:
         latent: dimensions of z.
         hidden: width of each of the three networks.
-        training_samples: S of the training loss.
-        samples: S in evaluation, for the bound and for the mixture that gives mode and entropy; may be set at any time.
-        tolerance: nats; may be set at any time. In evaluation log_prob then draws `samples` and doubles them until its
-            estimated error is below the tolerance. None: S samples.
+        training_samples: number S of samples of z in the training loss.
+        samples: number S of samples of z in evaluation, for the bound and for the mixture that gives mode and entropy;
+            may be set at any time.
+        tolerance: largest estimated error of log_prob in evaluation, nats; may be set at any time. If it is set,
+            log_prob first draws S samples and doubles them until its estimated error is below the tolerance. None: S
+            samples.
         backbones: "shared": prior, encoder and decoder read the features of one network; "each": each reads those of
             its own network of the same architecture (thesis §3.6.1).
         component: the head whose densities are mixed.

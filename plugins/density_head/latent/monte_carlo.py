@@ -272,7 +272,7 @@ class NormalPoints:
 
     Args:
         items: number of items of a flattened batch.
-        replicates: R.
+        replicates: number R of replicates, the independent parts of an item's points.
         dimensions: dimensions of z.
         dtype, device: dtype and device of the points.
         kept_count: number of first points of each replicate that stay in memory after their first use, because many

@@ -78,8 +78,8 @@ def log_weights(
 def hard_cases(head: DensityHead) -> Iterator[Case]:
     """Yield cases with ordinary raw parameters, and hard ones.
 
-    For a CVAE hard ones are large: narrow components, a narrow prior, and an encoder far from it. For a simplified CVAE
-    they are narrow components and targets far from all of them.
+    For a CVAE, hard raw parameters are large; they give narrow components, a narrow prior, and an encoder whose mean is
+    far from the prior. For a simplified CVAE, they give narrow components and targets far from all components.
     """
     assert isinstance(head, CVAEHead | SCVAEHead)
     generator = torch.Generator().manual_seed(7)

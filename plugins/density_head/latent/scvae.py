@@ -73,11 +73,12 @@ class SCVAEHead(DensityHead):
     Args:
         latent: dimensions of z.
         hidden: width of the decoder.
-        training_samples: S of the training loss.
-        samples: S in evaluation; may be set at any time. The density keeps S components per item, so that memory grows
-            as batch × S × (raw parameters of a component).
-        tolerance: nats; may be set at any time. In evaluation log_prob then draws `samples` and doubles them until its
-            estimated error is below the tolerance. None: S samples, and the density is a mixture of S components.
+        training_samples: number S of samples of z in the training loss.
+        samples: number S of samples of z in evaluation; may be set at any time. The density keeps S components per
+            input, so that memory grows as batch × S × (raw parameters of a component).
+        tolerance: largest estimated error of log_prob in evaluation, nats; may be set at any time. If it is set,
+            log_prob first draws S samples and doubles them until its estimated error is below the tolerance. None: S
+            samples, and the density is a mixture of S components.
         component: the head whose densities are mixed.
     """
 

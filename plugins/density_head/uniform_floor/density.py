@@ -31,12 +31,12 @@ from framework.distributions.uniform import uniform
 
 
 class Floored(Distribution):
-    """The density (1 - γ) p + γ u.
+    """Mixture (1 - γ) p + γ u of a density p and a uniform density u, the floor.
 
     Args:
         density: p, over classes or angles.
-        weight: γ in (0, 1).
-        floor: u; the uniform density over p's support if None.
+        weight: γ, the weight of the floor, in (0, 1).
+        floor: u; None means the uniform density over the support of p.
     """
 
     arg_constraints = {}  # noqa: RUF012  # pyright: ignore[reportAssignmentType]

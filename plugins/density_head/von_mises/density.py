@@ -30,11 +30,11 @@ At this κ the density is a point mass in all but its height.
 
 
 class VonMises(Symmetric):
-    """Angles with independent von Mises densities given their parameters (thesis eq. 3.3).
+    """Independent von Mises densities of one or more angles (thesis eq. 3.3).
 
     Args:
-        mean: (*batch, angle), radians, read modulo 2π.
-        concentration: (*batch, angle), κ ≥ 0; 0 is the uniform density, and infinity is read as LARGEST.
+        mean: μ, (*batch, angle), radians, read modulo 2π.
+        concentration: κ ≥ 0, (*batch, angle); 0 is the uniform density, and infinity is read as LARGEST.
 
     Raises:
         ValueError: a negative concentration.

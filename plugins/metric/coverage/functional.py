@@ -48,9 +48,9 @@ class Border(NamedTuple):
 def border(density: Distribution, value: Tensor, mass: float, samples: int) -> Border:
     """Return the masses and the size of highest-density regions.
 
-    The result is exact for classes, for normals, and for an angle whose density a grid resolves. Otherwise it is
-    estimated from the rank of the target among `samples` draws. This rank depends on the draws, but it is exactly
-    uniform if the density is the true one.
+    They are exact for classes, for normal densities, and for an angle whose density a grid resolves. Otherwise they are
+    estimated from `samples` draws: the masses follow from the rank of the target's density among those of the draws.
+    This rank depends on the draws, but it is exactly uniform if the density is the true one.
 
     Args:
         density: batch_shape (batch,).

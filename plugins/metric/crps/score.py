@@ -36,9 +36,10 @@ class Score(NamedTuple):
 def crps(density: Distribution, value: Tensor, samples: int) -> Score:
     """Return the score E|X - y| - ½ E|X - X'| (Gneiting & Raftery 2007, eq. 21); lower is better, 0 is best.
 
-    For an angle, the distance is the angular distance (Grimit, Gneiting, Berrocal & Johnson 2006, eq. 5). The score is
-    exact for mixtures of up to `MOST` normals, and for angles whose density a grid resolves (`circular_moments`).
-    Otherwise it is the unbiased estimate from `samples` draws, in `REPLICATES` parts whose spread gives the error.
+    X and X' are independent samples of the density, and y is `value`. For an angle, |·| is the angular distance
+    (Grimit, Gneiting, Berrocal & Johnson 2006, eq. 5). The score is exact for mixtures of up to `MOST` normals, and for
+    angles whose density a grid resolves (`circular_moments`). Otherwise it is the unbiased estimate from `samples`
+    draws, in `REPLICATES` parts whose spread gives the error.
 
     Args:
         density: density of one real number or one angle, event_shape (1,).

@@ -25,9 +25,9 @@ SHOWN = 8
 class FlightError(Metric, HasFigure):
     """Distance between predicted and true positions, centimetres, against time into the future (thesis Figure 4.3).
 
-    - `error_cm`, `error_near_cm`, `error_far_cm`: mean error of the point prediction over all predicted frames, at the
-      first frame, and at the last. The true positions are the batch field "truth" (a simulated flight without noise) if
-      there is one, else the target.
+    - `error_cm`, `error_near_cm`, `error_far_cm`: mean error of the point prediction over all predicted frames, in the
+      first predicted frame, and in the last one. The true positions are the batch field "truth" (a simulated flight
+      without noise) if there is one, and otherwise the target.
     - `interval_90`: share of the recorded coordinates within the middle 90 % of their draws.
     - `landing_crps_cm`: continuous ranked probability score of the landing place, at which the ball comes down through
       the plane at `height`; mean of x and y. `landing_cover_90`: share of true places within the ellipse that contains

@@ -1,4 +1,4 @@
-"""Rows of the contract: small images, with a mask and without."""
+"""Contract-test cases: small images, with a mask and without."""
 
 import torch
 

@@ -16,13 +16,13 @@ from plugins.objective.images.predicted import predicted_images
 
 
 class PatchGAN(Objective):
-    """Discriminators learn to tell predicted images from true ones, and the predictor learns to deceive them.
+    """Adversarial penalty on images: discriminators are trained to distinguish predicted images from true ones.
 
-    The penalty is κ L_GAN + γ L_FM of thesis eq. 7.6, on patches, at several scales as in Wang et al. 2018, §3.2-3.3.
-    Losses are least squares (Mao et al. 2017, eq. 9): for a predicted image x and a true image y, the discriminators
-    minimise ½ E (D(y) - 1)² + ½ E D(x)², and the predictor minimises E (D(x) - 1)². L_FM is the mean L1 distance
-    between the discriminators' features of x and of y. The discriminators have an `AdversaryOptimizer`; their loss is
-    logged as "discriminator".
+    The predictor is trained to give images that the discriminators take for true ones. The penalty is κ L_GAN + γ L_FM
+    of thesis eq. 7.6, on patches, at several scales as in Wang et al. 2018, §3.2-3.3. Losses are least squares (Mao et
+    al. 2017, eq. 9): for a predicted image x and a true image y, the discriminators minimise ½ E (D(y) - 1)² + ½ E
+    D(x)², and the predictor minimises E (D(x) - 1)². L_FM is the mean L1 distance between the discriminators' features
+    of x and of y. The discriminators have an `AdversaryOptimizer`; their loss is logged as "discriminator".
 
     Args:
         weight: κ; the discriminators' own loss is multiplied by κ too, which does not affect their optimiser.

@@ -93,7 +93,7 @@ class Perceptual(FeatureDistance):
     """Distance between features of a VGG network trained on ImageNet, L_VGG of thesis eq. 7.6 (Johnson et al. 2016).
 
     Args:
-        weight: α.
+        weight: factor α of L_VGG.
         weights: torchvision's file of the network's weights. There is no substitute for it; without the file choose
             objective=random_features, whose network is not trained.
         layers: 16, with features at four depths, or 19, with features at five.

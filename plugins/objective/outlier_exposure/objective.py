@@ -33,7 +33,7 @@ class OutlierExposure(Objective):
     outliers as in a test: it normalises them by the running moments of the training data, and does not update these.
 
     Args:
-        weight: λ.
+        weight: factor λ of the penalty.
         outliers: data from which outliers are drawn; the constructor prepares it.
         low, high: range of uniform random numbers, in the units of the inputs; 0 and 1 for images.
         count: number of outliers of a step; None: the number of samples in the batch for each model.
