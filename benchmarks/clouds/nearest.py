@@ -377,19 +377,24 @@ def streaming(total: int = 10**8, size: int = 10**6, basis_points: int = 1000) -
     read("nearest", lambda points: stream.add(normalise_chunk(points, middle.mean, reach.norm)))
     result = stream.result()
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    times = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in seconds_by_step.items())
+    seconds = seconds_by_step
     return (
         f"# A cloud of {total:,} points in chunks of {size:,}\n\n"
         "This page shows how much time and memory the search for nearest points takes if the cloud is read in chunks "
         "and never held in memory as a whole. It is written by `python -m benchmarks.clouds.nearest --stream`. The "
-        f"points of a synthetic torus are generated chunk by chunk and read three times on one core: for their mean, "
-        "for the largest distance from the mean (largest norm), and for the point that is nearest to each of "
-        f"{basis_points:,} basis points.\n\n"
-        f"The processor times are: {times}. The time of generating the points is the sum over all three readings. "
+        "points of a synthetic torus are generated chunk by chunk and read three times on one core. The first pass "
+        "computes the mean of the points. The second pass computes the largest distance of a point from the mean, "
+        f"which is called the largest norm. The third pass finds, for each of {basis_points:,} basis points, the "
+        "nearest point of the cloud.\n\n"
+        f"The first pass takes {seconds['mean']:.1f} s of processor time, the second {seconds['largest norm']:.1f} s "
+        f"and the third {seconds['nearest']:.1f} s. These times do not include the generation of the points, which "
+        f"takes {seconds['generating']:.1f} s for the three passes together. "
         f"The peak memory was {peak / 2**10:.0f} MiB; {base / 2**10:.0f} MiB of it "
         "were in use before the first chunk was read (libraries and one chunk). All points together would take "
-        f"{12 * total / 2**20:.0f} MiB. The results are: centre {[round(x, 4) for x in middle.mean.tolist()]}, "
-        f"largest norm {reach.norm:.4f}, mean distance {float(result.distance.mean()):.6f}.\n\n"
+        f"{12 * total / 2**20:.0f} MiB.\n\n"
+        "The cloud was normalised with the mean and the largest norm before the third pass. The mean of the points is "
+        f"{[round(x, 4) for x in middle.mean.tolist()]}, the largest norm is {reach.norm:.4f}, and the mean distance "
+        f"from a basis point to its nearest point is {float(result.distance.mean()):.6f}.\n\n"
         f"{machine('numba', 'torch')}\n"
     )
 
