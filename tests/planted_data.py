@@ -17,6 +17,7 @@ from framework.errors import DataError
 from framework.storage import cache as storage
 from framework.target import Target
 from framework.testing.rows import NEEDS_ROWS, DataRow
+from tests.planted_base import Planted
 
 LENGTHS = (560, 51, 450)
 
@@ -210,20 +211,16 @@ RIGHT: dict[str, tuple[type[Data], DataRow]] = {
 
 
 @dataclass(frozen=True)
-class Fault:
+class Fault(Planted):
     """A data set with one planted fault.
 
     Attributes:
-        name: description of the fault.
-        by: name of the check that must find the fault.
         changes: methods and attributes of `base` that are replaced.
         samples: methods of the splits' data set that are replaced.
         base: correct data set.
         row: contract-test case of the correct data set.
     """
 
-    name: str
-    by: str
     changes: Mapping[str, Any] = field(default_factory=dict)
     samples: Mapping[str, Callable[..., Any]] = field(default_factory=dict)
     base: type[Waves] = Waves

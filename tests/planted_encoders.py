@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from framework.encoder import Encoder
+from tests.planted_base import Planted
 
 IMAGE, VECTOR = (3, 12, 10), (7,)
 
@@ -117,18 +118,14 @@ RIGHT: dict[str, tuple[type[Encoder], tuple[int, ...]]] = {
 
 
 @dataclass(frozen=True)
-class Fault:
+class Fault(Planted):
     """An encoder with one planted fault.
 
     Attributes:
-        name: description of the fault.
-        by: name of the check that must find the fault.
         base: correct encoder.
         changes: methods and attributes of `base` that are replaced.
     """
 
-    name: str
-    by: str
     base: type[Encoder] = Dense
     changes: Mapping[str, Any] = field(default_factory=dict)
 

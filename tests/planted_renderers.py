@@ -9,6 +9,7 @@ from torch import Tensor
 
 from framework.renderer import Renderer, Scene
 from plugins.renderer.rasterizer.renderer import Rasterizer
+from tests.planted_base import Planted
 from tests.stranger.stranger_package.renderer import Hits, RayCaster, rays
 
 
@@ -121,18 +122,14 @@ class Wrapped(Renderer):
 
 
 @dataclass(frozen=True)
-class Fault:
+class Fault(Planted):
     """A renderer with one planted fault.
 
     Attributes:
-        name: description of the fault.
-        by: name of the check that must find the fault.
         base: correct renderer.
         changes: methods and attributes of `base` that are replaced.
     """
 
-    name: str
-    by: str
     base: type[Renderer] = RayCaster
     changes: Mapping[str, Any] = field(default_factory=dict)
 

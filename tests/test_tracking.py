@@ -98,6 +98,10 @@ def open_tracker(folder: Path, run_id: str | None = None, **changes: object) -> 
     return tracker
 
 
+def sidecar_in(folder: Path) -> Sidecar:
+    return Sidecar(folder, RunInfo(None, "sqlite:///x", "e", "r", None, None, "key", 0.0, "RUNNING"))
+
+
 def client(folder: Path) -> MlflowClient:
     return MlflowClient(default_uri(folder))
 
@@ -536,7 +540,7 @@ class ListStore(Store):
 def test_ten_thousand_metrics_take_few_calls(tmp_path: Path) -> None:
     journal = Journal(tmp_path / "journal.jsonl")
     store = ListStore()
-    sidecar = Sidecar(tmp_path, RunInfo(None, "sqlite:///x", "e", "r", None, None, "key", 0.0, "RUNNING"))
+    sidecar = sidecar_in(tmp_path)
     carrier = Sender(tmp_path, journal, sidecar, lambda folder, info: store)
     carrier.start()
     for step in range(10_000):
@@ -559,7 +563,7 @@ def test_a_training_is_not_followed_line_by_line(tmp_path: Path) -> None:
             journal.write({"loss": 1.0}, 20 + self.calls, 0)  # the training, meanwhile
 
     store = GoesOn()
-    sidecar = Sidecar(tmp_path, RunInfo(None, "sqlite:///x", "e", "r", None, None, "key", 0.0, "RUNNING"))
+    sidecar = sidecar_in(tmp_path)
     assert sender.send_new(journal, sidecar, store, lambda: store.calls > 5) == 20
     assert store.calls == 1
     journal.close()
@@ -570,7 +574,7 @@ def test_what_waited_goes_in_the_largest_batches(tmp_path: Path) -> None:
     for step in range(10_000):
         journal.write({"loss": 1.0, "rate": 2.0}, step, 0)
     store = ListStore()
-    sidecar = Sidecar(tmp_path, RunInfo(None, "sqlite:///x", "e", "r", None, None, "key", 0.0, "RUNNING"))
+    sidecar = sidecar_in(tmp_path)
     assert sender.send_all(tmp_path, journal, sidecar, lambda folder, info: store) == 10_000
     assert 20 <= store.calls <= 22  # 1000 values each; a block that was read may end with fewer
     journal.close()
@@ -581,7 +585,7 @@ def test_a_store_that_fails_again_and_again_gets_everything_once_and_in_order(
 ) -> None:
     journal = Journal(tmp_path / "journal.jsonl")
     store = ListStore(failures=7)
-    sidecar = Sidecar(tmp_path, RunInfo(None, "sqlite:///x", "e", "r", None, None, "key", 0.0, "RUNNING"))
+    sidecar = sidecar_in(tmp_path)
     carrier = Sender(tmp_path, journal, sidecar, lambda folder, info: store)
     carrier.start()
     for step in range(500):

@@ -7,19 +7,11 @@ import torch
 from torch import Tensor
 from torch.distributions import Categorical, Distribution, constraints
 
+from framework.distributions import protocol
 from framework.distributions.batch_shapes import Reshaped, Stacked
 from framework.distributions.circular import Circular, circular
 from framework.distributions.density import Mixture
 from framework.distributions.description import one_line
-from framework.distributions.protocol import (
-    arc_length,
-    arc_probability,
-    estimate,
-    exact_estimate,
-    marginal,
-    pick,
-    recentre,
-)
 from framework.errors import UserError
 
 
@@ -98,25 +90,25 @@ def _(density: Reshaped) -> Distribution:
     return Reshaped(uniform(density.density), density.batch_shape)
 
 
-estimate.register(UniformAngles, exact_estimate)
+protocol.estimate.register(UniformAngles, protocol.exact_estimate)
 
 
-@marginal.register
+@protocol.marginal.register
 def _(density: UniformAngles, index: int) -> UniformAngles:
     return UniformAngles(density.like, density.batch_shape, torch.Size((1,)))
 
 
-@pick.register
+@protocol.pick.register
 def _(density: UniformAngles, index: Tensor) -> UniformAngles:
     return UniformAngles(density.like, index.shape, density.event_shape)
 
 
-@recentre.register
+@protocol.recentre.register
 def _(density: UniformAngles, index: tuple[Tensor, ...], origin: Tensor) -> UniformAngles:
     shape = torch.broadcast_shapes(origin.shape[:-1], *(part.shape for part in index))
     return UniformAngles(origin, shape, density.event_shape)
 
 
-@arc_probability.register
+@protocol.arc_probability.register
 def _(density: UniformAngles, start: Tensor, end: Tensor) -> Tensor:
-    return arc_length(start, end).squeeze(-1) / (2 * math.pi)
+    return protocol.arc_length(start, end).squeeze(-1) / (2 * math.pi)

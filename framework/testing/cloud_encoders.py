@@ -1,7 +1,7 @@
 """Additional checks of encoders of point clouds."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -21,6 +21,13 @@ def different_clouds(points: int, columns: int) -> list[Tensor]:
     generator = torch.Generator().manual_seed(SEED)
     sizes = (points, 1, -(-points // 3), -(-points // 2))
     return [4 * torch.randn(size, columns, generator=generator) + 7 for size in sizes]
+
+
+def batch_of(lengths: Sequence[int], columns: int = 3, dtype: torch.dtype = torch.float64) -> Tensor:
+    """Return clouds of these lengths away from the origin, padded; their values do not depend on the dtype."""
+    generator = torch.Generator().manual_seed(0)
+    clouds = [torch.randn(length, columns, generator=generator, dtype=torch.float64) for length in lengths]
+    return pad([cloud.to(dtype) * 30 + 7 for cloud in clouds])
 
 
 def padding(make: Make, clouds: list[Tensor], worst: Worst) -> None:

@@ -3,6 +3,7 @@
 import os
 import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass
 from functools import partial
 from pathlib import Path
 from types import FrameType
@@ -27,6 +28,7 @@ Position = tuple[int, int]
 
 
 @final
+@dataclass(eq=False)
 class SeededBatches(Sampler[list[int]]):
     """Sampler that yields the indices of the samples of each batch; with several ranks, those of this rank's slice.
 
@@ -49,36 +51,27 @@ class SeededBatches(Sampler[list[int]]):
         DataError: there are fewer samples than ranks, or none.
     """
 
-    def __init__(
-        self,
-        length: int,
-        batch_size: int,
-        *,
-        position: Callable[[int], Position] = lambda batches: (0, 0),
-        seed: int | None,
-        drop_last: bool,
-        rank: int = 0,
-        ranks: int = 1,
-        orders: int = 1,
-    ) -> None:
-        if batch_size < ranks:
+    length: int
+    batch_size: int
+    _: KW_ONLY
+    position: Callable[[int], Position] = lambda batches: (0, 0)
+    seed: int | None
+    drop_last: bool
+    rank: int = 0
+    ranks: int = 1
+    orders: int = 1
+
+    def __post_init__(self) -> None:
+        if self.batch_size < self.ranks:
             raise ConfigError(
-                f"batch_size = {batch_size} over {ranks} devices gives some devices no sample. Set batch_size to at "
-                f"least {ranks}."
+                f"batch_size = {self.batch_size} over {self.ranks} devices gives some devices no sample. Set "
+                f"batch_size to at least {self.ranks}."
             )
-        if length < ranks:
+        if self.length < self.ranks:
             raise DataError(
-                f"A split has {length} samples for {ranks} devices, but needs at least one per device. Use fewer "
-                "devices or more samples."
+                f"A split has {self.length} samples for {self.ranks} devices, but needs at least one per device. Use "
+                "fewer devices or more samples."
             )
-        self.length = length
-        self.batch_size = batch_size
-        self.position = position
-        self.seed = seed
-        self.drop_last = drop_last
-        self.rank = rank
-        self.ranks = ranks
-        self.orders = orders
 
     def __len__(self) -> int:
         full, rest = divmod(self.length, self.batch_size)

@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 
 from framework.configuration.schema import build, resolve
 from framework.errors import ConfigError
-from framework.geometry.clouds import normalise_clouds, pad, sizes
+from framework.geometry.clouds import normalise_clouds, sizes
+from framework.testing.cloud_encoders import batch_of
 from plugins.encoder.grids.occupancy import decode, occupancy
 
 DTYPES = [torch.float32, torch.float64]
@@ -16,12 +17,6 @@ DTYPES = [torch.float32, torch.float64]
 
 def build_encoder(shape=(40, 3), **config):
     return build("encoder", resolve("encoder", {"name": "occupancy", **config}), input_shape=shape)
-
-
-def batch_of(lengths, columns=3, dtype=torch.float64):
-    generator = torch.Generator().manual_seed(0)
-    clouds = [torch.randn(length, columns, generator=generator, dtype=torch.float64) for length in lengths]
-    return pad([cloud.to(dtype) * 30 + 7 for cloud in clouds])
 
 
 def by_hand(cloud, side):
