@@ -46,8 +46,8 @@ def run(config: Config) -> None:
         ContractBroken: A property does not hold; the table names the property and the case.
     """
     config.options(Options)
-    if config.settings.threads:
-        torch.set_num_threads(config.settings.threads)
+    # the tensors of most checks are too small for several threads, which would only add processor time
+    torch.set_num_threads(config.settings.threads or 1)
     chosen = _chosen_plugins(config.values)
     if not chosen:
         raise ConfigError(
