@@ -227,7 +227,7 @@ class Faulty(Renderer):
         pytest.param(
             lambda vertices: vertices,
             lambda color: color.square().sqrt(),
-            "slope of",
+            "gradient of",
             marks=pytest.mark.slow,
         ),
         pytest.param(
