@@ -1,10 +1,13 @@
 """The contract of an encoder: it turns a raw input into a fixed-length feature vector."""
 
+import math
 from abc import ABC, abstractmethod
 from typing import ClassVar
 
 from jaxtyping import Float
 from torch import Tensor, nn
+
+from framework.errors import ConfigError
 
 
 class Encoder(nn.Module, ABC):
@@ -58,3 +61,18 @@ class Encoder(nn.Module, ABC):
     @abstractmethod
     def forward(self, inputs: Tensor) -> Float[Tensor, "batch *features"]:
         """Return features of shape (batch, *output_shape), of the parameters' dtype. The batch may be empty."""
+
+
+def require_numbers(input_shape: tuple[int, ...], by: str) -> int:
+    """Return how many numbers a sample of this shape holds.
+
+    Raises:
+        ConfigError: it holds none.
+    """
+    length = math.prod(input_shape)
+    if length == 0:
+        raise ConfigError(
+            f"{by} got samples of shape {input_shape}, which hold no numbers, but at least one number is required. "
+            "Check the samples of `data`, or the encoder before this one."
+        )
+    return length

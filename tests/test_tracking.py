@@ -537,17 +537,21 @@ class ListStore(Store):
         self.files.append(path)
 
 
-def test_ten_thousand_metrics_take_few_calls(tmp_path: Path) -> None:
-    journal = Journal(tmp_path / "journal.jsonl")
-    store = ListStore()
-    sidecar = sidecar_in(tmp_path)
-    carrier = Sender(tmp_path, journal, sidecar, lambda folder, info: store)
+def send_steps(folder: Path, journal: Journal, store: ListStore, count: int) -> None:
+    """Send losses while they are written, and check that each of them comes once and in order."""
+    carrier = Sender(folder, journal, sidecar_in(folder), lambda folder, info: store)
     carrier.start()
-    for step in range(10_000):
+    for step in range(count):
         journal.write({"loss": 1.0}, step, 0)
         carrier.notice()
     assert carrier.finish(60.0)
-    assert [record["step"] for record in store.got] == list(range(10_000))
+    assert [record["step"] for record in store.got] == list(range(count))
+
+
+def test_ten_thousand_metrics_take_few_calls(tmp_path: Path) -> None:
+    journal = Journal(tmp_path / "journal.jsonl")
+    store = ListStore()
+    send_steps(tmp_path, journal, store, 10_000)
     assert store.calls <= 10_000 / 50
     journal.close()
 
@@ -585,14 +589,7 @@ def test_a_store_that_fails_again_and_again_gets_everything_once_and_in_order(
 ) -> None:
     journal = Journal(tmp_path / "journal.jsonl")
     store = ListStore(failures=7)
-    sidecar = sidecar_in(tmp_path)
-    carrier = Sender(tmp_path, journal, sidecar, lambda folder, info: store)
-    carrier.start()
-    for step in range(500):
-        journal.write({"loss": 1.0}, step, 0)
-        carrier.notice()
-    assert carrier.finish(60.0)
-    assert [record["step"] for record in store.got] == list(range(500))
+    send_steps(tmp_path, journal, store, 500)
     assert caplog.text.count("cannot be reached or written (away)") == 1
     assert caplog.text.count("can be reached again after") == 1
     journal.close()

@@ -1,5 +1,6 @@
 """A data set in memory: named tensors that are indexed once per batch."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 
 from torch import Tensor
@@ -32,6 +33,17 @@ class Fields(Dataset[dict[str, Tensor]]):
 
     def __getitems__(self, indices: Sequence[int]) -> Mapping[str, Tensor]:
         return {name: tensor[list(indices)] for name, tensor in self.fields.items()}
+
+
+class FetchedInBatches(Dataset[Batch], ABC):
+    """Base of data sets whose samples are computed in batches when they are fetched."""
+
+    @abstractmethod
+    def __getitems__(self, indices: Sequence[int]) -> Batch:
+        """Return the samples of these indices as a batch."""
+
+    def __getitem__(self, index: int) -> Batch:
+        return {name: values[0] for name, values in self.__getitems__([index]).items()}
 
 
 def fetch(dataset: Dataset[Batch], indices: Sequence[int]) -> Batch:

@@ -6,13 +6,13 @@ from collections.abc import Sequence
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.utils.data import Dataset
 
+from framework.datasets.fields import FetchedInBatches
 from framework.geometry.rotation import about_z
 from plugins.data.labelled_clouds.reading import Clouds
 
 
-class Rotated(Dataset[dict[str, Tensor]]):
+class Rotated(FetchedInBatches):
     """Data set with `rotations` copies of each cloud, rotated about the up axis by multiples of 2π/`rotations`.
 
     The first samples are all unrotated clouds; then follow all clouds rotated by 2π/`rotations`, and so on. Normals,
@@ -26,9 +26,6 @@ class Rotated(Dataset[dict[str, Tensor]]):
 
     def __len__(self) -> int:
         return len(self.matrices) * len(self.clouds)
-
-    def __getitem__(self, index: int) -> dict[str, Tensor]:
-        return {name: values[0] for name, values in self.__getitems__([index]).items()}
 
     def __getitems__(self, indices: Sequence[int]) -> dict[str, Tensor]:
         index = torch.as_tensor(indices)

@@ -17,7 +17,7 @@ from torch.utils.data import Dataset
 from framework.bodies.parametric import ImageSide, ParametricBody, parametric_body
 from framework.configuration.paths import FilePath
 from framework.data import Batch, Data, Splits
-from framework.datasets.fields import Fields
+from framework.datasets.fields import FetchedInBatches, Fields
 from framework.datasets.images import decode, has_alpha, open_image
 from framework.errors import ConfigError, DataError
 from framework.geometry.camera import Camera
@@ -188,7 +188,7 @@ class PoseFromImage(Data):
         return bytes_from_linear(inputs[:3].float()).movedim(0, -1).cpu().numpy()
 
 
-class Poses(Dataset[Batch]):
+class Poses(FetchedInBatches):
     """Images of the bodies of one split, which are rendered when they are fetched."""
 
     def __init__(
@@ -202,9 +202,6 @@ class Poses(Dataset[Batch]):
 
     def __len__(self) -> int:
         return len(self.numbers)
-
-    def __getitem__(self, index: int) -> Batch:
-        return {name: values[0] for name, values in self.__getitems__([index]).items()}
 
     @torch.no_grad()
     def __getitems__(self, indices: Sequence[int]) -> Batch:

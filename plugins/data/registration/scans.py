@@ -5,18 +5,18 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.data import Dataset
 
 from framework.bodies.body import BodyModel
 from framework.bodies.people import BodyParameters
 from framework.data import Batch
+from framework.datasets.fields import FetchedInBatches
 from framework.geometry import clouds
 from framework.geometry.meshes import Mesh
 from plugins.data.registration.scanned_bodies import normalise_scans
 from plugins.data.registration.scanner import KINDS, Scanner, scan
 
 
-class Scans(Dataset[Batch]):
+class Scans(FetchedInBatches):
     """Bodies that are posed and scanned when they are fetched.
 
     Args:
@@ -46,9 +46,6 @@ class Scans(Dataset[Batch]):
 
     def __len__(self) -> int:
         return len(self.shape)
-
-    def __getitem__(self, index: int) -> Batch:
-        return {name: values[0] for name, values in self.__getitems__([index]).items()}
 
     @torch.no_grad()
     def __getitems__(self, indices: Sequence[int]) -> Batch:

@@ -1,6 +1,5 @@
 """Blocks of fully connected layers that append their output to their input, with an optional narrow last layer."""
 
-import math
 from typing import Annotated
 
 import torch
@@ -8,8 +7,7 @@ from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor, nn
 
-from framework.encoder import Encoder
-from framework.errors import ConfigError
+from framework.encoder import Encoder, require_numbers
 
 
 class DenseBlocks(Encoder):
@@ -52,12 +50,7 @@ class DenseBlocks(Encoder):
         bottleneck: Annotated[int, Field(gt=0)] | None = None,
     ) -> None:
         super().__init__()
-        length = math.prod(input_shape)
-        if length == 0:
-            raise ConfigError(
-                f"dense_blocks got samples of shape {input_shape}, which hold no numbers, but at least one number is "
-                "required. Check the samples of `data`, or the encoder before this one."
-            )
+        length = require_numbers(input_shape, by="dense_blocks")
         # momentum=None: all batches have equal weight; affine=False: nothing is learnt
         self.standard = nn.BatchNorm1d(length, affine=False, momentum=None) if standardise else nn.Identity()
         self.blocks = nn.ModuleList()

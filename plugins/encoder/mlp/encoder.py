@@ -1,6 +1,5 @@
 """Fully connected layers, for features, point clouds and images small enough to flatten."""
 
-import math
 from typing import Annotated, Literal
 
 import torch
@@ -8,7 +7,7 @@ from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor, nn
 
-from framework.encoder import Encoder
+from framework.encoder import Encoder, require_numbers
 from framework.errors import ConfigError
 
 Width = Annotated[int, Field(gt=0)]
@@ -45,12 +44,7 @@ class MLP(Encoder):
         activation: Literal["relu", "elu"] = "relu",
     ) -> None:
         super().__init__()
-        length = math.prod(input_shape)
-        if length == 0:
-            raise ConfigError(
-                f"mlp got samples of shape {input_shape}, which hold no numbers, but at least one number is required. "
-                "Check the samples of `data`, or the encoder before this one."
-            )
+        length = require_numbers(input_shape, by="mlp")
         drops = dropout if isinstance(dropout, list) else [dropout] * len(widths)
         if len(drops) != len(widths):
             raise ConfigError(
