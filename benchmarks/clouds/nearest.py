@@ -289,7 +289,8 @@ def report() -> str:
         [
             "# Nearest points of a cloud to each basis point: milliseconds per cloud on one core",
             "",
-            "The encoding by basis points needs, for each basis point, the nearest point of a cloud. This page "
+            "Basis points are a fixed set of points. A point cloud is encoded by the distance from each basis point "
+            "to the nearest point of the cloud. This page "
             "compares the run time of the project's exact search (`ours`) with five exact searches of public "
             "libraries. It is written by `python -m benchmarks.clouds.nearest`.",
             "",
@@ -298,11 +299,13 @@ def report() -> str:
             "uniform in the unit ball. A measured call builds the search structure of a cloud and computes the k "
             "distances and the k difference vectors.",
             "",
-            "The table gives processor time in milliseconds per cloud: the least of several rounds, in which the "
-            f"methods are interleaved. `ours` gets all clouds in one call. `{ONE_PER_CALL}` and the libraries get one "
+            "The table gives the processor time in milliseconds per cloud. Each number is the shortest time of "
+            "several rounds; every round calls all methods one after the other. `ours` gets all clouds in one call. "
+            f"`{ONE_PER_CALL}` and the libraries get one "
             "cloud per call. `ball_tree` and `sklearn_kd` are the two trees of scikit-learn, and `scipy_kd` is the "
-            "tree of SciPy. The last two columns give the speed-up of `ours`. In brackets follow the speed-up of "
-            f"`{ONE_PER_CALL}` and the required speed-up.",
+            "tree of SciPy. The last two columns give the speed-up of `ours` over a library: the time of the "
+            "library divided by the time of `ours`. The first number in brackets is the speed-up of "
+            f"`{ONE_PER_CALL}`, and the second is the speed-up that this project requires.",
             "",
             *lines,
             "",
@@ -313,9 +316,9 @@ def report() -> str:
             "",
             "## Clouds that are difficult for grids and trees",
             "",
-            "These clouds have 100,000 points, and there are 1,000 basis points. The table gives the least processor "
-            "time of four interleaved calls, and the largest absolute difference of a distance of `ours` from SciPy "
-            "in float64.",
+            "These clouds have 100,000 points, and there are 1,000 basis points. For each method, the table gives "
+            "the shortest processor time of four calls. It also gives the largest absolute difference between a "
+            "distance of `ours` and the distance that SciPy computes in float64.",
             "",
             hard,
             "",

@@ -83,7 +83,8 @@ def main() -> None:
         "# Differences between encodings of one shape\n\n"
         "This page shows how much the encoding of a shape by basis points changes if the shape is rotated, or if other "
         "points of its surface are sampled. The encoder is measured with and without its option "
-        f"`rotation_invariant`, which encodes each cloud along its own axes. The data are {len(CLASSES) * MODELS} "
+        "`rotation_invariant`, which rotates each cloud into the coordinate system of its principal axes before it "
+        f"is encoded. The data are {len(CLASSES) * MODELS} "
         f"generated shapes (synthetic data). There are {BASIS} basis points, in float32.\n\n"
         "An encoding holds the distance from each basis point to the cloud (eq. 6.4). The difference of two encodings "
         "is the root mean square difference of these distances, in units of the normalised cloud. For clouds with the "
@@ -92,9 +93,9 @@ def main() -> None:
         "- the median difference between two samples of points of the same surface;\n"
         f"- the share of shapes for which this difference is above {LIMIT:g};\n"
         "- for comparison, the median difference between a shape and the shape with the most similar encoding.\n\n"
-        "With `rotation_invariant`, the axes come from the second moments of the points. If two moments are nearly "
-        "equal, as for round or square shapes, another sample of the surface can have other axes. These are the shapes "
-        f"whose two samples differ by more than {LIMIT:g}.\n\n"
+        "With `rotation_invariant`, the principal axes are computed from the second moments of the points. If two "
+        "moments are nearly equal, as for round or square shapes, another sample of the same surface can have "
+        f"different axes. Two samples of such a shape then have encodings that differ by more than {LIMIT:g}.\n\n"
         f"{markdown(rows, columns)}\n{machine('torch', 'numba')}\n"
     )
     publish(__file__, text)

@@ -46,7 +46,7 @@ def main() -> None:
         "The data set COIL-20 has 20 objects. Each object has 18 training views, one every 20°, and 36 test views, "
         "which are 5° from the nearest training view. Images have 32 × 32 pixels. The encoder is `biternion_vgg`, "
         "trained for 200 epochs on views that a periodic cubic spline interpolates between the training views. The "
-        "head of `coil20.py` lists the commands.\n\n"
+        "text at the top of `coil20.py` lists the commands that train the models.\n\n"
         "`look-alikes` are the 8 objects that look alike from opposite sides: their training views 180° apart are on "
         "average more similar than neighbouring training views (`plugins/data/coil20`). `unique` are the other 12 "
         "objects.\n\n"

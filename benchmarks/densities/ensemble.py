@@ -213,19 +213,23 @@ def main() -> None:
         f"or the framework's Trainer. Times are wall times of the whole training of all {MEMBERS} networks, medians of "
         f"{ROUNDS} rounds in which the two trainings alternate. The speed-up is the ratio of the two medians.\n\n"
         + "\n".join(lines)
-        + "\n\n**Members equal networks that are trained alone.** Each member (128-128) was compared with the same "
-        "network trained alone, with the same initial weights and the same batches. After the training, the largest "
+        + "\n\n**A member of an ensemble is equal to a network that is trained alone.** Each member (128-128) "
+        "was compared with the same network trained alone, with the same initial weights and the same batches. After "
+        "the training, the largest "
         "difference of p(y|x) on 5000 test points is "
         + " and ".join(f"{gap:.1e} in {name}" for name, gap in gaps.items())
-        + ".\n\n**Members are distributed like networks that are trained alone, each with its own order of "
-        "batches.** The test NLL (mean ± standard deviation) was compared after 60 epochs, and p is "
-        "the p-value of a Kolmogorov-Smirnov test against the members:\n\n"
+        + ".\n\n**The test results of members have the same distribution as those of networks that are trained "
+        "alone, if each of these reads the batches in its own order.** The following list compares the negative "
+        "log-likelihood (NLL) on the test split after 60 epochs, as mean ± standard deviation over the networks. "
+        "The number p is the p-value of a Kolmogorov-Smirnov test against the members of the ensemble:\n\n"
         f"- 30 members of one ensemble: {format_mean(members)};\n"
-        "- 30 networks trained alone from other initial weights, with one order of batches for all: "
+        "- 30 networks trained alone, which have different initial weights but read the batches in the same order: "
         f"{format_mean(same_order)}, p = {stats.ks_2samp(members, same_order).pvalue:.2f};\n"  # type: ignore[attr-defined]
-        "- 30 networks trained alone from other initial weights, each with its own order of batches: "
+        "- 30 networks trained alone, which have different initial weights and read the batches in different "
+        "orders: "
         f"{format_mean(other_orders)}, p = {stats.ks_2samp(members, other_orders).pvalue:.2f}.\n\n"  # type: ignore[attr-defined]
-        "The members of an ensemble also have their own orders of batches, because eq. 2.17 assumes networks that are "
+        "Each member of an ensemble in this project reads the batches in its own order, because eq. 2.17 assumes "
+        "networks that are "
         "trained independently.\n\n"
         f"{machine('torch', 'pytorch-lightning')}\n"
     )

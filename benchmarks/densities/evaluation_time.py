@@ -157,8 +157,9 @@ def main() -> None:
             "",
             "## Dropout at test time",
             "",
-            "The wrapper `mc_dropout` returns a mixture of the densities under S random dropout masks. In brackets "
-            "follows how many times faster this is than S predictions with one mask each.",
+            "The wrapper `mc_dropout` returns a mixture of the densities under S random dropout masks. The table "
+            "gives the time of one prediction. The number in brackets says how many times faster this is than S "
+            "predictions with one mask each.",
             "",
             f"| network | {' | '.join(f'S = {samples}' for samples in SAMPLES)} |",
             f"|---|{'---:|' * len(SAMPLES)}",

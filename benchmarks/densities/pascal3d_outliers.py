@@ -48,7 +48,7 @@ def main() -> None:
         "All models predict mixtures of von Mises densities with the encoder `biternion_vgg`. They were trained on "
         "cars for 20 epochs with one seed, so that small differences between rows have no meaning. `plain` has no "
         "uncertainty method. `outlier_exposure` is trained with images of sofas as outliers, and λ is the weight of "
-        "its penalty. The head of `pascal3d_outliers.py` lists the commands.\n\n"
+        "its penalty. The text at the top of `pascal3d_outliers.py` lists the commands that train the models.\n\n"
         "The columns are as follows; ± is the standard error over the test images:\n\n"
         "- log-likelihood: mean over the cars; higher is better;\n"
         "- MAAD: mean absolute angular deviation of the point predictions for cars;\n"

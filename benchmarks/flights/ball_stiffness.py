@@ -77,13 +77,14 @@ def main() -> None:
         "# Stiff contact of a ball with a table",
         "",
         "This page compares the error and the run time of SciPy's solvers of differential equations on simulated "
-        "flights of a ball. The table becomes harder from row to row, which makes the equation stiff. The page shows "
-        "which solvers still succeed.",
+        "flights of a ball that bounces on a table top. Each row of the results has a harder table top, which "
+        "makes the differential equation stiffer. The page shows which solvers still succeed.",
         "",
-        f"A ball falls {100 * HEIGHT:g} cm onto a table that is a critically damped spring with the frequency Ω. The "
-        "ball hops, each time less high, and then lies on the table. The simulation ends after "
-        f"{SECONDS:g} s. The relative tolerance is {TOLERANCE:g}, and a solver may take at most {STEPS:,} steps. The "
-        "forces of the air and the friction are switched off, because no closed form is known with them.",
+        f"A ball falls {100 * HEIGHT:g} cm onto the table top, which acts as a critically damped spring with the "
+        "frequency Ω. The ball bounces several times, each time less high, and then lies still. The simulation ends "
+        "after "
+        f"{SECONDS:g} s. The relative tolerance is {TOLERANCE:g}, and a solver may take at most {STEPS:,} steps. Air "
+        "resistance and friction are switched off, because the exact solution is not known with them.",
         "",
         f"The column `stiffness ratio` holds the {SECONDS:g} s of the flight divided by the duration 1/Ω of a contact. "
         "The other columns hold three numbers for each solver: the error in metres / the number of evaluations of the "
@@ -108,7 +109,8 @@ def main() -> None:
         "RK45 and DOP853 are explicit methods. An explicit method remains stable only with steps of at most about 3/Ω "
         "while the ball lies on the table. Its work therefore grows with the stiffness ratio, until the solver reaches "
         "its limit of steps and gives up. BDF and Radau are implicit methods, and LSODA changes to an implicit method "
-        "if the equation is stiff. Their work grows only slowly, because a harder table adds a few more hops. A solver "
+        "if the equation is stiff. Their work grows only slowly, because a harder table top adds only a few more "
+        "bounces. A solver "
         "that gives up prints a message like this one:",
         "",
         f"> {message}",

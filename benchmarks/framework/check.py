@@ -90,10 +90,10 @@ a von Mises density, μ is its mean direction, and σ is the standard deviation 
 
 ## False alarms
 
-`mode=check` gave {sum(map(len, failed.values()))} false alarms. It tested {rows} constructions of the density heads of
-this project with {seeds} random seeds each. It also tested {right_rows} constructions of correct density heads that are
-not part of this project (tests/right_heads.py). Each line of the following list names the random seeds, the density
-head, the construction and the property whose test failed.
+`mode=check` gave {sum(map(len, failed.values()))} false alarms. It tested {rows} configurations of the density heads of
+this project with {seeds} random seeds each. It also tested {right_rows} configurations of correct density heads that
+are not part of this project (tests/right_heads.py). Each line of the following list names the random seeds, the density
+head, its configuration and the property whose test failed.
 
 {chr(10).join(alarm_lines)}
 

@@ -210,11 +210,12 @@ def report() -> None:
         "pose, 128 × 96 pixels, with 8 × 8 samples a pixel. Every descent starts from the same nominal position. The "
         "true body is rotated from there by exactly 30° about a random axis and moved by 20 cm in a random direction. "
         "The descent fits 30 parameters: rotation, translation, 20 movements of joints and 4 parameters of the shape. "
-        "It is the one of `density_head=fit_pose`, with the same settings for every gradient and with at most one "
-        "restart.",
+        "It is the descent that the density head `fit_pose` uses. All gradients have the same settings, and a "
+        "descent may restart at most once.",
         "",
-        "`samples a pixel` is the number of samples with which the descent renders its images. `images` is the number "
-        "of images to which the body was fitted: the first ones of 100. `fits within 2° and 1 cm` counts the fits "
+        "`samples a pixel` is the number of samples with which the descent renders its images. `images` is the "
+        "number of images to which the body was fitted. There are 100 images, and a smaller number means the "
+        "first ones of them. `fits within 2° and 1 cm` counts the fits "
         "whose rotation error is at most 2° and whose translation error is at most 1 cm. The following columns hold "
         "the median, the 95 % quantile and the largest value of both errors. The last two columns hold the processor "
         "time of a fit.",

@@ -157,8 +157,8 @@ def rates(run: str, scene: Scene) -> list[str]:
         for name, times in times_by_name.items()
     ]
     return [
-        "The table holds the processor time of one image in a loop on one thread. The last row is the wall time that "
-        "the run measured itself.",
+        "The table holds the processor time of one image in a loop on one thread. The last row is the wall time "
+        "that the training run measured at its end.",
         "",
         "| way to predict | median, ms | shortest, ms |",
         "|---|---|---|",
@@ -207,8 +207,9 @@ def report(run: str, file: Path) -> str:
             "",
             f"The network SMPLpix consists of {describe_training(run)}",
             "",
-            f"{len(SUBJECTS)} generated people who are not in the training data walk as the motion file `{file.name}` "
-            f"says. There are {FRAMES} images of each, at {SPEED} images a second, with {scenes[0].camera.height} × "
+            f"{len(SUBJECTS)} generated people who are not in the training data walk; their motion is read from the "
+            f"file `{file.name}`. There are {FRAMES} images of each person, at {SPEED} images a second, with "
+            f"{scenes[0].camera.height} × "
             f"{scenes[0].camera.width} pixels. Each image is moved to the next one with bilinear interpolation. The "
             "optical flow for this is known exactly, because it is computed from the visible faces and barycentric "
             "weights of the registered mesh. The difference of the two images is then taken at pixels whose point is "
@@ -216,7 +217,7 @@ def report(run: str, file: Path) -> str:
             "frame.",
             "",
             "`mean difference` is the mean over these pixels, all pairs of images and all people, on the scale of 0 "
-            "to 255 of sRGB values. `SD over people` says how much this mean differs between the people. `95th "
+            "to 255 of sRGB values. `SD over people` is the standard deviation of this mean over the people. `95th "
             "percentile` is over the same pixels as the mean. The last column is the mean divided by that of the "
             "photographs. The rows `mesh` are renders of the registered mesh with 1 or 4 × 4 samples a pixel.",
             "",

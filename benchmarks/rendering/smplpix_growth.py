@@ -106,8 +106,10 @@ def report(figure_path: Path) -> str:
             "",
             f"The images have {SIZE[0]} × {SIZE[1]} pixels and show the default body with synthetic colours, which "
             f"covers {covered:.0%} of the pixels. All numbers except the last two columns are processor times in ms "
-            f"on one thread: the lowest of {ROUNDS} medians. The ways to draw alternate. Networks compute only the "
-            "box around the subject. Their weights are random, which does not change the run time.",
+            f"on one thread: the lowest of {ROUNDS} medians. The methods are measured in turn. The networks "
+            f"compute only the pixels in the bounding box of the body. Their weights are random, which does not "
+            f"change the run "
+            "time.",
             "",
             "`rasterised` is rendering of the mesh. `projection alone` only projects the vertices into the image. "
             "`SMPLpix` is projection followed by the network `slim`. `slim over the mesh` is the network on a "

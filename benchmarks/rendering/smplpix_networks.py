@@ -263,8 +263,9 @@ def frames_section() -> str:
             f"which are discs around the points with a radius of {SPLAT} pixels, as in `experiment=smplpix/quick`. "
             f"The body covers {cover[0]:.0%} of the larger image and {cover[1]:.0%} of the smaller one.",
             "",
-            f"A time is processor time of one thread: the median of {ROUNDS} rounds (least to largest). The networks "
-            "alternate. In the rows `projection` only the projection is measured, without or with splats. In the "
+            f"A time is the processor time of one thread: the median of {ROUNDS} rounds, with the smallest and "
+            "largest time in brackets. The networks are measured in turn. In the rows `projection` only the "
+            "projection is measured, without or with splats. In the "
             "other rows `computed area` says whether the network computes the whole frame or only the box around the "
             "body. `computed pixels` is the number of these pixels, including those beyond the border, divided by the "
             "number of pixels of the image. `GFLOP` counts each multiplication and each addition of the convolutions.",
@@ -319,8 +320,8 @@ def report() -> str:
             "|---|---:|---:|---:|---:|---:|---:|",
             *result_rows(networks),
             "",
-            f"The PSNR of slim is {below:.1f} dB below that of unet; at most {MOST_BELOW:g} dB are permitted. A "
-            "negative number means that slim is better.",
+            f"The PSNR of unet minus the PSNR of slim is {below:.1f} dB. The project requires that this difference "
+            f"is at most {MOST_BELOW:g} dB. It is negative if the images of slim are better.",
             "",
             "## Errors by the crop and by bfloat16",
             "",

@@ -346,9 +346,10 @@ def main() -> None:
     lines = [row.format(**line) for line in numbers]
     text = f"""# Lorentzian lines in a real brain slice
 
-This page compares ways to fit five Lorentzian lines to each spectrum of a real brain slice: by least squares and with
-a neural network. It shows how fast and how exact each way is. `plugins/data/cest/README.md` describes the data and the
-model of the spectra.
+A CEST image (chemical exchange saturation transfer, a kind of magnetic resonance imaging) holds one spectrum for each
+voxel. This page compares two ways to fit five Lorentzian lines to each spectrum of a real brain slice: least squares
+and a neural network. It shows how fast and how exact each of them is. `plugins/data/cest/README.md` describes the data
+and the model of the spectra.
 
 The slice has {len(inputs):,} voxels with one spectrum each (`{file.name}`, 7 T, 93 offsets).
 Another {volume.dropped} voxels are left out, because their spectra hold numbers that are not finite. The networks
