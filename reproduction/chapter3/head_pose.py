@@ -133,15 +133,17 @@ def main() -> None:
         f"One model is trained for each angle, on images of {size} pixels, for {epochs} epochs in batches of {batch}, "
         f"with precision {precision}. ± is the standard deviation over seeds, or the standard error over test images "
         "if there is one seed. MAAD is the mean absolute angular deviation of the point prediction. The time of a "
-        "prediction in milliseconds is measured on one thread. The column of the thesis gives its MAAD and "
-        "log-likelihood with standard errors over the test images of the real data sets. The order of the methods can "
+        "prediction in milliseconds is measured on one thread. The last column but one gives the MAAD and the "
+        "log-likelihood of the thesis, with standard errors over the test images of the real data sets. The order of "
+        "the methods can "
         "be compared with ours; absolute numbers cannot. The command is `python -m reproduction.thesis_tables "
         "3.1-3.2`.\n\n"
         f"{chr(10).join(tables)}\n"
         "## Gain over one fixed concentration\n\n"
-        "Each row is the mean difference between a method and the fixed concentration κ, trained on the same data with "
-        'the same seed. Positive numbers mean that the method is better. ± is the standard error over seeds. "CVAE, '
-        'three backbones" has one convolutional backbone for each of its three networks, as in the thesis; the other '
+        "Each row compares a method with the von Mises density of fixed concentration κ, trained on the same data with "
+        "the same seed. Positive numbers mean that the method of the row is better. ± is the standard error over "
+        'seeds. "CVAE, three backbones" has one convolutional backbone for each of its three networks, as in the '
+        "thesis; the other "
         "CVAE shares one.\n\n"
         f"{difference_table(rows)}\n\n{machine('torch', 'pytorch-lightning')}\n"
     )

@@ -292,8 +292,11 @@ def main(root: str | None) -> None:
         datasets = [prepare_data(root, seed) for seed in SEEDS]
         growth = np.mean([nearest_window_errors(dataset) for dataset in datasets], 0)
         nearest_text = (
-            f"A bounce lies ahead in {100 * np.mean([bounce_share(dataset) for dataset in datasets]):.0f} % of the "
-            f"test windows, and in {100 * bounce_share(data):.0f} % of the simulated ones. The recorded flights are "
+            f"In {100 * np.mean([bounce_share(dataset) for dataset in datasets]):.0f} % of the recorded test windows "
+            f"and "
+            f"in {100 * bounce_share(data):.0f} % of the simulated ones, the ball bounces after the last observed "
+            f"frame. "
+            "The recorded flights are "
             "similar to each other. This is shown by a simple prediction, the mean future of the five training windows "
             "nearest to a test window: its error is "
             + ", ".join(f"{growth[frame - 1]:.1f} cm at {16 * frame} ms" for frame in TABLE_FRAMES)
@@ -328,8 +331,8 @@ def write_results(
         "with the cameras of "
         "a laboratory.", "",
         "![Error against time](ball_flights.png)", "",
-        "- **Error at 16 ms** and so on is the mean distance in cm between the point prediction and the ball, so many "
-        "milliseconds into the future. **Mean error** averages over all predicted frames.",
+        "- **Error at 16 ms** and so on is the mean distance in cm between the predicted and the true position of "
+        "the ball, 16 ms (and so on) after the last observed frame. **Mean error** averages over all predicted frames.",
         "- **Coverage before** and **coverage after** are the share in % of recorded coordinates that lie within the "
         "predicted 90 % intervals, before and after the intervals are calibrated on the validation windows. 90 is "
         "right.",

@@ -148,9 +148,11 @@ def main(runs: list[Path], scan: Path | None) -> None:
         "",
         "## Error that the rank of the last layer makes unavoidable",
         "",
-        f"The table shows the mean vertex error of {TEST_BODIES} test bodies (synthetic) after projection onto that "
-        f"many principal components of {TRAIN_BODIES} training bodies. A last layer of that rank cannot have a smaller "
-        "error.",
+        "The last layer of the network is a product of two matrices, whose rank limits the meshes that the network can "
+        f"predict. For each rank, the table shows the mean vertex error of {TEST_BODIES} test bodies (synthetic) after "
+        f"they are projected onto the same number of principal components of {TRAIN_BODIES} training bodies. A last "
+        f"layer "
+        "of this rank cannot be expected to have a smaller error.",
         "",
         "| rank | vertex error, cm |",
         "|---:|---:|",
@@ -223,11 +225,12 @@ def correspondence_table(runs: list[Path]) -> list[str]:
         "",
         "The people are generated in the layout of FAUST (`data=faust`). No model was trained on these people or "
         "poses, and the scans are read from files. In the challenge `intra` a pair shows one person in two poses, in "
-        "`inter` two people. Each vertex of the first scan's true registration is mapped through the two registered "
-        "meshes to the second scan. The error is the mean distance in centimetres between this position and the true "
-        "position. ± is the standard error over pairs; the pairs share scans and people.",
+        "`inter` two people. The model registers a mesh to both scans. Each vertex of the true registration of the "
+        "first scan is mapped to the second scan through these two meshes, which have the same topology. The "
+        "error is the mean distance in centimetres between the position that is found and the true position. ± is "
+        "the standard error over pairs; the pairs share scans and people.",
         "",
-        "`registration/quick` was trained on generated bodies by the thousand, and `faust/registration` only on the "
+        "`registration/quick` was trained on thousands of generated bodies, and `faust/registration` only on the "
         "70 training scans in this layout. The errors of the thesis are for the real scans of FAUST and another body "
         f"model. Reading, encoding and registering a scan takes {1e3 * middle(seconds):.0f} ms on one core.",
         "",

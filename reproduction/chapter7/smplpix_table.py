@@ -177,7 +177,8 @@ def report(folders: Sequence[Path], lpips: str | None) -> str:
             "",
             "A cell of a quality column holds the mean over test images ± the standard deviation over seeds ± the "
             "standard deviation over subjects. The value of a subject is the mean over its images and seeds. A dash "
-            "stands where nothing is trained, so that all seeds give the same numbers.",
+            "stands for the standard deviation over seeds of methods that are not trained, because all seeds "
+            "give the same numbers.",
             "",
             "- **Vertices** is the number of vertices of the mesh: 6,890 (7k) or about 27,000 (27k).",
             "- **Inside** means that only the pixels of the subject count. The other columns are over the whole frame, "

@@ -281,8 +281,9 @@ def report(rows: Record) -> str:
             "frame, or inside, that is over the pixels of the subject. ± is the standard deviation over seeds, if "
             "there are several.",
             "",
-            "Each number of epochs is a training of its own, whose learning rate falls to 0 at the end. The minutes "
-            "are the number of epochs times the shortest epoch, on one core.",
+            "Each row with another number of epochs is a separate training run, because the learning rate falls to "
+            "0 at the end of a training. The minutes are the number of epochs multiplied by the time of the "
+            "shortest epoch, on one core.",
             "",
             f"![Quality against minutes of training]({HERE.stem}.png)",
             "",
