@@ -44,7 +44,7 @@ def perturb_parameters(encoder: Encoder) -> None:
     generator = torch.Generator().manual_seed(SEED)
     with torch.no_grad():
         for value in encoder.parameters():
-            value.add_(0.01 * torch.randn(value.shape, dtype=value.dtype, generator=generator))
+            value.add_(_noise(value, generator), alpha=0.01)
 
 
 def _check_groups(encoder: Encoder, batch: Tensor, worst: Worst, *, slow: bool) -> None:
@@ -89,7 +89,7 @@ def _check_groups(encoder: Encoder, batch: Tensor, worst: Worst, *, slow: bool) 
             ]
             parts = zip(part, directions, strict=True)
             analytic = sum((gradients[index] * direction).sum().item() for index, direction in parts)
-            ends = [_loss_at(values, directions, sign * step, total) for sign in (1, -1)]
+            ends = _losses_at_ends(values, directions, step, total)
             numeric = (ends[0] - ends[1]) / (2 * step)
             error = min(error, abs(analytic - numeric) / floor)
             description = f"{names}, in {where} mode: {analytic:.6g}, by differences {numeric:.6g}"
@@ -99,19 +99,20 @@ def _check_groups(encoder: Encoder, batch: Tensor, worst: Worst, *, slow: bool) 
 
 
 def _noise(like: Tensor, generator: torch.Generator) -> Tensor:
-    """Return normal random numbers in the shape of `like`, which repeat with the period REPEATED."""
-    numbers = torch.randn(min(like.numel(), REPEATED), dtype=torch.float64, generator=generator)
+    """Return normal random numbers with shape and dtype of `like`, which repeat with the period REPEATED."""
+    numbers = torch.randn(min(like.numel(), REPEATED), dtype=like.dtype, generator=generator)
     return numbers.repeat(-(-like.numel() // len(numbers)))[: like.numel()].view(like.shape)
 
 
-def _loss_at(
+def _losses_at_ends(
     values: Sequence[Tensor], directions: Sequence[Tensor], step: float, total: Callable[[], Tensor]
-) -> float:
-    """Return the loss after a step in the parameters; the step is then undone, up to rounding."""
+) -> list[float]:
+    """Return the losses after a step forwards and after one backwards in the parameters, which are then restored."""
+    losses = []
     with torch.no_grad():
-        for value, direction in zip(values, directions, strict=True):
-            value.add_(direction, alpha=step)
-        loss = total().item()
-        for value, direction in zip(values, directions, strict=True):
-            value.sub_(direction, alpha=step)
-    return loss
+        for change in (step, -2 * step, step):  # the last change restores the parameters, up to rounding
+            for value, direction in zip(values, directions, strict=True):
+                value.add_(direction, alpha=change)
+            if len(losses) < 2:
+                losses.append(total().item())
+    return losses

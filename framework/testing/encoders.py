@@ -29,6 +29,8 @@ from framework.testing.rows import CloudRow, EncoderRow
 Make = Callable[[], Encoder]
 MANY, SOME = 131, 9
 """Number of samples of a large batch, for a fast and for a slow encoder."""
+CLOSE = 1e-5
+"""Relative error of a derivative in the input below which no further step is tried."""
 SLOW = 0.03
 """Processor time for four samples above which an encoder is slow, seconds."""
 
@@ -49,33 +51,71 @@ def examine_encoder(row: EncoderRow, build: Callable[[tuple[int, ...]], Encoder]
             return torch.rand(count, *row.input_shape, generator=generator)
         return torch.randn(count, *row.input_shape, generator=generator)
 
+    # An encoder may take long to build, so checks that do not change its state share one.
+    @cache
+    def evaluated() -> Encoder:
+        """Return an encoder in evaluation mode, always the same one, which is never trained or converted."""
+        return make()
+
+    @cache
+    def trained() -> Encoder:
+        """Return an encoder, always the same one, whose running moments change; a check sets its mode."""
+        return make()
+
+    @cache
+    def perturbed() -> Encoder:
+        """Return an encoder in evaluation mode, always the same one; a check converts it to the dtype it needs."""
+        encoder = make()
+        perturb_parameters(encoder)  # some may be 0 before training
+        return encoder
+
     @cache
     def slow() -> bool:
-        return _is_slow(make, inputs)
+        return _is_slow(evaluated(), inputs)
 
     checks: dict[str, tuple[float, Callable[[Worst], None]]] = {
-        "on the device of its inputs": (0.0, lambda worst: _on_one_device(make, inputs, worst)),
-        "feature shapes": (0.0, lambda worst: _shapes(make, inputs, worst)),
-        "number types": (0.0, lambda worst: _number_types(make, inputs, worst)),
-        "same seed, same bits": (0.0, lambda worst: _repeatable(make, inputs, worst)),
-        "batch rows are independent": (1e-4, lambda worst: _rows_apart(make, inputs, worst, slow=slow())),
-        "state-dict round trip": (0.0, lambda worst: _round_trip(make, inputs, worst)),
-        "inputs are left as they are": (0.0, lambda worst: _inputs_unchanged(make, inputs, worst)),
-        "fixed and vectorises are true": (1e-4, lambda worst: _stated_attributes(make, inputs, worst)),
-        "gradients reach every parameter": (0.0, lambda worst: _gradients(make, inputs, worst)),
-        "gradient": (1e-4, lambda worst: _against_differences(make, inputs, worst)),
-        "gradient in weights": (
-            5e-3,
-            lambda worst: check_parameter_gradients(make, inputs, worst, slow=slow()),
-        ),
-        "finite on extreme inputs": (0.0, lambda worst: _extremes(make, inputs, worst)),
+        # the first check that uses `trained`, so that the encoder is built while new tensors are labelled
+        "on the device of its inputs": (0.0, lambda worst: _on_one_device(trained, inputs, worst)),
+        "feature shapes": (0.0, lambda worst: _shapes(trained(), inputs, worst)),
     }
     if len(row.input_shape) == 3:
-        checks["bytes are read as 0 to 1"] = (1e-5, lambda worst: _bytes(make, row, worst))
+        checks["bytes are read as 0 to 1"] = (1e-5, lambda worst: _bytes(evaluated(), row, worst))
         checks["every part of an image is read"] = (
             0.0,
-            lambda worst: _all_image_parts(make, inputs(4 if slow() else 16), worst),
+            lambda worst: _all_image_parts(perturbed(), inputs(2 if slow() else 16), worst),
         )
+    checks |= {
+        "number types": (0.0, lambda worst: _number_types(perturbed(), inputs, worst)),
+        "same seed, same bits": (0.0, lambda worst: _repeatable(evaluated(), make, inputs, worst)),
+        "batch rows are independent": (
+            1e-4,
+            lambda worst: _rows_apart(evaluated(), inputs, worst, slow=slow()),
+        ),
+        "state-dict round trip": (
+            0.0,
+            lambda worst: _round_trip(evaluated(), trained(), make, inputs, worst),
+        ),
+        "inputs are left as they are": (
+            0.0,
+            lambda worst: _inputs_unchanged(evaluated(), trained(), inputs, worst),
+        ),
+        "fixed and vectorises are true": (
+            1e-4,
+            lambda worst: _stated_attributes(evaluated(), make, inputs, worst),
+        ),
+        "gradients reach every parameter": (
+            0.0,
+            lambda worst: _gradients(trained(), inputs(4 if slow() else 16), worst),
+        ),
+        "gradient in weights": (
+            5e-3,
+            lambda worst: check_parameter_gradients(
+                perturbed if slow() else make, inputs, worst, slow=slow()
+            ),
+        ),
+        "gradient": (1e-4, lambda worst: _against_differences(perturbed(), inputs, worst)),
+        "finite on extreme inputs": (0.0, lambda worst: _extremes(evaluated(), inputs(3), worst)),
+    }
     if isinstance(row, CloudRow):
         clouds = different_clouds(*row.input_shape)
         checks |= {
@@ -112,13 +152,13 @@ def _on_one_device(make: Make, inputs: Callable[[int], Tensor], worst: Worst) ->
     check_devices(calls, worst)
 
 
-def _shapes(make: Make, inputs: Callable[[int], Tensor], worst: Worst) -> None:
-    encoder = make()
+def _shapes(encoder: Encoder, inputs: Callable[[int], Tensor], worst: Worst) -> None:
     worst.count(
         not all(isinstance(side, int) and side > 0 for side in encoder.output_shape),
         f"output_shape is {encoder.output_shape}, expected integers above 0",
     )
     with torch.no_grad():
+        encoder.eval()
         for count in (0, 1, 3):
             shape = tuple(encoder(inputs(count)).shape)
             worst.same(f"shape of the features of {count} samples", shape, (count, *encoder.output_shape))
@@ -126,16 +166,15 @@ def _shapes(make: Make, inputs: Callable[[int], Tensor], worst: Worst) -> None:
         worst.same("shape of the features of 4 samples in training", shape, (4, *encoder.output_shape))
 
 
-def _number_types(make: Make, inputs: Callable[[int], Tensor], worst: Worst) -> None:
+def _number_types(encoder: Encoder, inputs: Callable[[int], Tensor], worst: Worst) -> None:
     """Check that features have the dtype of parameters and inputs, float32 or float64."""
     for kind in (torch.float32, torch.float64):
         with torch.no_grad():
-            worst.same(f"dtype of the features for {kind}", make().to(kind)(inputs(2).to(kind)).dtype, kind)
+            worst.same(f"dtype of the features for {kind}", encoder.to(kind)(inputs(2).to(kind)).dtype, kind)
 
 
-def _bytes(make: Make, row: EncoderRow, worst: Worst) -> None:
+def _bytes(encoder: Encoder, row: EncoderRow, worst: Worst) -> None:
     """Check that images as bytes are scaled to [0, 1], also a nearly black image, whose bytes are only 0 and 1."""
-    encoder = make()
     for pixel_kind, brightest in {"bytes": 256, "dark bytes": 2}.items():
         pixels = torch.randint(0, brightest, (3, *row.input_shape), dtype=torch.uint8)
         with torch.no_grad():
@@ -146,10 +185,9 @@ def _bytes(make: Make, row: EncoderRow, worst: Worst) -> None:
         )
 
 
-def _all_image_parts(make: Make, batch: Tensor, worst: Worst) -> None:
+def _all_image_parts(encoder: Encoder, batch: Tensor, worst: Worst) -> None:
     """Check that each channel and each quarter of an image affects the features."""
-    encoder = make()
-    perturb_parameters(encoder)
+    encoder.float()
     channels, height, width = batch.shape[1:]
     whole = slice(None)
     parts: dict[str, tuple[Any, ...]] = {
@@ -169,10 +207,10 @@ def _all_image_parts(make: Make, batch: Tensor, worst: Worst) -> None:
             worst.count(torch.equal(encoder(changed), original), f"{part_name} does not affect the features")
 
 
-def _repeatable(make: Make, inputs: Callable[[int], Tensor], worst: Worst) -> None:
+def _repeatable(encoder: Encoder, make: Make, inputs: Callable[[int], Tensor], worst: Worst) -> None:
     """Check that features of the same inputs are equal after other inputs, and that evaluation changes no state."""
     with torch.no_grad():
-        encoder, batch = make(), inputs(3)
+        batch = inputs(3)
         before = {name: value.clone() for name, value in _state(encoder).items()}
         first = encoder(batch)
         worst.same_bits("features of two calls", encoder(batch), first)
@@ -194,9 +232,8 @@ def _state(encoder: Encoder) -> dict[str, Tensor]:
     return {name: value for name, value in encoder.state_dict().items() if isinstance(value, Tensor)}
 
 
-def _rows_apart(make: Make, inputs: Callable[[int], Tensor], worst: Worst, *, slow: bool) -> None:
+def _rows_apart(encoder: Encoder, inputs: Callable[[int], Tensor], worst: Worst, *, slow: bool) -> None:
     """Check in evaluation mode that features of a sample do not depend on its batch, except for rounding errors."""
-    encoder = make()
 
     def compare(batch: Tensor, sizes: list[int]) -> None:
         whole = encoder(batch)
@@ -221,51 +258,60 @@ def _rows_apart(make: Make, inputs: Callable[[int], Tensor], worst: Worst, *, sl
         compare(inputs(MANY), [7] * (MANY // 7) + [MANY % 7])
 
 
-def _is_slow(make: Make, inputs: Callable[[int], Tensor]) -> bool:
-    encoder, batch = make(), inputs(4)
+def _is_slow(encoder: Encoder, inputs: Callable[[int], Tensor]) -> bool:
+    batch = inputs(4)
     start = time.process_time()
     with torch.no_grad():
         encoder(batch)
     return time.process_time() - start > SLOW
 
 
-def _inputs_unchanged(make: Make, inputs: Callable[[int], Tensor], worst: Worst) -> None:
+def _inputs_unchanged(
+    evaluated: Encoder, trained: Encoder, inputs: Callable[[int], Tensor], worst: Worst
+) -> None:
     """Check that encoding does not change the batch, since other members of an ensemble read it."""
-    encoder, batches = make(), {"floats": inputs(4)}
+    batches = {"floats": inputs(4)}
     if batches["floats"].dim() == 4:
         batches["bytes"] = (batches["floats"] * 255).round().clamp(0, 255).to(torch.uint8)
     for kind, batch in batches.items():
-        for training in (False, True):
+        for mode, encoder in {"evaluation": evaluated, "training": trained.train()}.items():
             passed = batch.clone()
             with torch.no_grad():
-                encoder.train(training)(passed)
-            worst.same_bits(
-                f"inputs as {kind} after {'training' if training else 'evaluation'}", passed, batch
-            )
+                encoder(passed)
+            worst.same_bits(f"inputs as {kind} after {mode}", passed, batch)
 
 
-def _round_trip(make: Callable[..., Encoder], inputs: Callable[[int], Tensor], worst: Worst) -> None:
+def _round_trip(
+    evaluated: Encoder,
+    trained: Encoder,
+    make: Callable[..., Encoder],
+    inputs: Callable[[int], Tensor],
+    worst: Worst,
+) -> None:
     """Check that an encoder with a stored state returns equal features, also after training changed its buffers."""
-    encoder = make()
     other = make(SEED + 7)  # so that a parameter that is not stored has another value
-    for state_name, batches in {"the initial state": 0, "the state after training": 2}.items():
-        with torch.no_grad():
-            for _ in range(batches):
-                encoder.train()(inputs(5))
-            expected = encoder.eval()(inputs(3))
-            other.load_state_dict(encoder.state_dict())
-            worst.same_bits(f"features of {state_name}", other(inputs(3)), expected)
+    batch = inputs(3)
     with torch.no_grad():
-        worst.same_bits("features of a copy", copy.deepcopy(encoder)(inputs(3)), encoder(inputs(3)))
+        trained.train()(inputs(5))
+        trained.eval()
+        for state_name, encoder in {
+            "the initial state": evaluated,
+            "the state after training": trained,
+        }.items():
+            expected = encoder(batch)
+            other.load_state_dict(encoder.state_dict())
+            worst.same_bits(f"features of {state_name}", other(batch), expected)
+        worst.same_bits("features of a copy", copy.deepcopy(trained)(batch), expected)
 
 
-def _stated_attributes(make: Callable[..., Encoder], inputs: Callable[[int], Tensor], worst: Worst) -> None:
+def _stated_attributes(
+    encoder: Encoder, make: Callable[..., Encoder], inputs: Callable[[int], Tensor], worst: Worst
+) -> None:
     """Check that the encoder behaves as its attributes `fixed` and `vectorises` state.
 
     If `fixed` is true, features depend on the inputs alone. If `vectorises` is true, torch.vmap over the parameters of
     several encoders gives the features of each.
     """
-    encoder = make()
     worst.count(False, "neither fixed nor vectorises")
     if not (encoder.fixed or encoder.vectorises):
         return
@@ -276,8 +322,8 @@ def _stated_attributes(make: Callable[..., Encoder], inputs: Callable[[int], Ten
             worst.same("learned parameters although fixed", learned, [])
             expected = encoder(batch)
             worst.same_bits("fixed features with another seed", other(batch), expected)
-            worst.same_bits("fixed features in training", encoder.train()(batch), expected)
-            encoder.eval()
+            worst.same_bits("fixed features in training", other.train()(batch), expected)
+            other.eval()
         if encoder.vectorises and any(True for _ in encoder.parameters()):
             both = [encoder, other]
             state = stack_module_state(both)  # type: ignore[arg-type]  # modules
@@ -292,18 +338,18 @@ def _stated_attributes(make: Callable[..., Encoder], inputs: Callable[[int], Ten
                 )
 
 
-def _gradients(make: Make, inputs: Callable[[int], Tensor], worst: Worst) -> None:
+def _gradients(encoder: Encoder, batch: Tensor, worst: Worst) -> None:
     """Check that in training every parameter gets a gradient.
 
-    Several batches are used, since dropout and inactive units may leave out a parameter by chance.
+    The batch is encoded several times, since dropout and inactive units may leave out a parameter by chance.
     """
-    encoder = make().train()
     worst.count(False, "the encoder has no parameters")
     if not any(True for _ in encoder.parameters()):
         return
+    encoder.train()
     missing = {name for name, parameter in encoder.named_parameters() if parameter.requires_grad}
     for _ in range(4):
-        encoder(inputs(16)).square().sum().backward()
+        encoder(batch).square().sum().backward()
         for name, parameter in encoder.named_parameters():
             if parameter.grad is not None and parameter.grad.abs().sum() > 0:
                 missing.discard(name)
@@ -313,15 +359,15 @@ def _gradients(make: Make, inputs: Callable[[int], Tensor], worst: Worst) -> Non
         worst.count(True, f"parameter {name} has no gradient")
 
 
-def _against_differences(make: Make, inputs: Callable[[int], Tensor], worst: Worst) -> None:
+def _against_differences(encoder: Encoder, inputs: Callable[[int], Tensor], worst: Worst) -> None:
     """Compare a directional derivative in the input with central differences, in evaluation mode and float64.
 
     The derivative is that of the mean square of the features. The error is relative to the norm of the gradient. Of
     several step lengths, the one with the smallest error counts, since long steps cross kinks and short steps lose
     digits.
     """
-    encoder, batch = make().double(), inputs(2).double()
-    encoder.requires_grad_(False)
+    batch = inputs(2).double()
+    encoder.double().requires_grad_(False)
     batch.requires_grad_()
     features = encoder(batch)
     if not features.requires_grad:  # an encoder without learned parameters may have no gradient
@@ -339,15 +385,16 @@ def _against_differences(make: Make, inputs: Callable[[int], Tensor], worst: Wor
         gap = abs(analytic - numeric) / max(abs(numeric), gradient.norm().item(), 1e-8)
         if not gap >= error:
             description, error = f"{analytic:.9g}, by differences {numeric:.9g}", gap
+        if error < CLOSE:
+            break
     worst.record(error, description)
 
 
-def _extremes(make: Make, inputs: Callable[[int], Tensor], worst: Worst) -> None:
+def _extremes(encoder: Encoder, like: Tensor, worst: Worst) -> None:
     """Check that features are finite for constant inputs, which for vectors are also tiny and large.
 
     A sample of NaN must not affect other samples, or must be refused.
     """
-    encoder, like = make(), inputs(3)
     sizes = (0.0, 1.0) if like.dim() == 4 else (0.0, 1e-30, 1.0, 1e6)
     with torch.no_grad():
         for size in sizes:

@@ -105,6 +105,11 @@ class Worst:
                 f"{label}: {actual.dtype} {tuple(actual.shape)}, expected {expected.dtype} {tuple(expected.shape)}",
             )
             return
+        if actual.numel() > 0 and torch.equal(
+            actual, expected
+        ):  # many times faster than the search for a difference
+            self.record(0.0, label)
+            return
         equal = (actual == expected) | (actual.isnan() & expected.isnan())
         gap = (actual.double() - expected.double()).abs()
         self.record(gap.where(~equal, 0), label)
