@@ -319,10 +319,11 @@ def report(page: str, written: Mapping[str, float]) -> str:
             "took. `python -m reproduction.thesis_tables` makes all of them, and with `--tell` it only prints the "
             "commands.",
             "",
-            "- **Runs, complete** is the number of complete runs, of all runs that the table needs. Runs that a table "
-            "shares with an earlier row are counted there.",
-            "- **Minutes of runs** is half of their processor time, because two runs work at the same time on one "
-            "thread each. The runs of Table 6.4 have two threads, so that their elapsed time is given.",
+            "- **Runs, complete** is the number of runs that are complete and the number of runs that the table needs. "
+            "Runs that several tables share are counted only in the first of their rows.",
+            "- **Minutes of runs** is the time that the runs take if two of them run at the same time on one thread each, "
+            "which is half of their processor time. The runs of Table 6.4 use two threads each, so that their elapsed "
+            "time is given.",
             "- **Minutes of pages** is the elapsed time of the scripts that evaluate the runs and write the pages.",
             "",
             "| table or figure | data | page | runs, complete | minutes of runs | minutes of pages | processor; last "
