@@ -321,9 +321,9 @@ def report(page: str, written: Mapping[str, float]) -> str:
             "",
             "- **Runs, complete** is the number of runs that are complete and the number of runs that the table needs. "
             "Runs that several tables share are counted only in the first of their rows.",
-            "- **Minutes of runs** is the time that the runs take if two of them run at the same time on one thread each, "
-            "which is half of their processor time. The runs of Table 6.4 use two threads each, so that their elapsed "
-            "time is given.",
+            "- **Minutes of runs** is the time that the runs take if two of them run at the same time on one thread "
+            "each, which is half of their processor time. The runs of Table 6.4 use two threads each, so that their "
+            "elapsed time is given.",
             "- **Minutes of pages** is the elapsed time of the scripts that evaluate the runs and write the pages.",
             "",
             "| table or figure | data | page | runs, complete | minutes of runs | minutes of pages | processor; last "
