@@ -217,7 +217,7 @@ def report(run: str, file: Path) -> str:
             "frame.",
             "",
             "`mean difference` is the mean over these pixels, all pairs of images and all people, on the scale of 0 "
-            "to 255 of sRGB values. `SD over people` is the standard deviation of this mean over the people. `95th "
+            "to 255 of sRGB values. `SD over people` shows by how much this mean differs from person to person. `95th "
             "percentile` is over the same pixels as the mean. The last column is the mean divided by that of the "
             "photographs. The rows `mesh` are renders of the registered mesh with 1 or 4 × 4 samples a pixel.",
             "",
