@@ -1,7 +1,6 @@
 """A density head on the circle that the framework does not ship."""
 
 import math
-from collections.abc import Mapping
 from typing import Annotated, ClassVar
 
 import torch
@@ -62,7 +61,6 @@ class WrappedCauchyHead(DensityHead):
 
     bibtex = """@book{mardia2000directional, author={Mardia, K. V. and Jupp, P. E.},
 title={Directional Statistics}, year={2000}}"""
-    knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
 
     def __init__(self, target: Target, *, largest: Annotated[float, Field(gt=0, lt=1)] = 0.999) -> None:
         super().__init__()

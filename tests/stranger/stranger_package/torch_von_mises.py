@@ -1,7 +1,4 @@
-"""torch.distributions.VonMises as a head: what the contract is for, since it looks right and is not."""
-
-from collections.abc import Mapping
-from typing import ClassVar
+"""Density head around torch.distributions.VonMises, whose faults only the contract tests find."""
 
 import torch
 from torch import Tensor
@@ -12,10 +9,9 @@ from framework.target import Target
 
 
 class TorchVonMisesHead(DensityHead):
-    """torch's own von Mises density, κ = exp(r)."""
+    """Density head with torch's own von Mises density, κ = exp(r)."""
 
     bibtex = ""
-    knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
 
     def __init__(self, target: Target) -> None:
         super().__init__()

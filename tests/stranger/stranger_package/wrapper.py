@@ -1,7 +1,7 @@
 """An uncertainty wrapper that the framework does not ship."""
 
-from collections.abc import Callable, Iterable, Mapping
-from typing import Annotated, ClassVar
+from collections.abc import Callable, Iterable
+from typing import Annotated
 
 import torch
 from pydantic import Field
@@ -16,10 +16,9 @@ from framework.uncertainty import Uncertainty
 
 
 class Committee(Uncertainty):
-    """Several copies, each trained on everything; their densities mixed with equal weights."""
+    """Wrapper of several copies, each trained on all data; it mixes their densities with equal weights."""
 
     bibtex = ""
-    knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
 
     def __init__(self, model: Callable[[], Predictor], *, members: Annotated[int, Field(ge=1)] = 3) -> None:
         super().__init__()
@@ -43,10 +42,10 @@ class Committee(Uncertainty):
 
 
 class AveragedCommittee(Uncertainty):
-    """The same with averaged directions, which is what the contract is against: of one member it is not the member."""
+    """Wrapper that averages directions, which the contract forbids: with one member it does not return that member's
+    density."""
 
     bibtex = ""
-    knobs: ClassVar[Mapping[str, tuple[int, ...]]] = {}
 
     def __init__(self, model: Callable[[], Predictor], *, members: Annotated[int, Field(ge=1)] = 3) -> None:
         super().__init__()
