@@ -286,8 +286,8 @@ def test_the_ground_of_a_photograph_is_white_to_the_bit_and_is_not_computed(
 
 def test_what_does_not_fit_an_image_gets_a_sentence(framework: Framework) -> None:
     for wrong, wanted in (
-        (("encoder.slim.colors=1",), "gives 1×16×12 numbers, but LaplaceImageHead reads 576 numbers without a linear layer"),
-        (("density_head.scale=pixel",), "gives 3×16×12 numbers, but LaplaceImageHead reads 768 numbers without a linear layer"),
+        (("encoder.slim.colors=1",), "gives 1×16×12 numbers, but LaplaceImageHead reads 576 numbers"),
+        (("density_head.scale=pixel",), "gives 3×16×12 numbers, but LaplaceImageHead reads 768 numbers"),
         (
             ("density_head=gaussian",),
             "describes targets of kind 'real', but the targets of this data set are of kind 'image'",
