@@ -209,8 +209,9 @@ def main() -> None:
         "mean intersection over union is the mean over the parts. The time per scan is a median over the test scans; "
         "it was measured on one thread and includes the encoding.\n\n"
         f"{markdown(rows, columns, better={'accuracy': 'higher', 'overlap': 'higher', 'ms': 'lower'})}"
-        "\nThe figure shows five test scans from the front: the true parts (top), the parts that are recognised from "
-        "the point alone (middle), and those that are recognised from point and cloud (bottom).\n\n"
+        "\nThe figure shows five test scans from the front: the true parts (top), the parts that are predicted for "
+        "each point from its own coordinates (middle), and those that are predicted from its coordinates and the "
+        "features of the whole cloud (bottom).\n\n"
         f"![True and recognised parts of five scans](segmentation.png)\n\n{machine('torch', 'numba')}\n"
     )
     publish(HERE, text)

@@ -155,7 +155,7 @@ def stored_names(stored: Sequence[Any], description: str) -> tuple[str, ...]:
         ValueError: There are too many names, or one is too long.
     """
     if len(stored) > MOST_NAMES:
-        raise ValueError(f"{len(stored)} {description}; at most {MOST_NAMES} are read")
+        raise ValueError(f"{len(stored)} {description}, but at most {MOST_NAMES} are allowed")
     names = tuple(map(str, stored))
     if any(len(name) > LONGEST_NAME for name in names):
         raise ValueError(f"{description} with more than {LONGEST_NAME} characters")

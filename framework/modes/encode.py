@@ -162,10 +162,10 @@ def collect_files(root: Path, into: Path, part: int) -> Collection:
 
 
 def describe(collection: Collection, config: Mapping[str, Any]) -> None:
-    """Write the description of the parts into their folder, or check that an existing description is the same.
+    """Write the description of the stored features into their folder, or check it against an existing description.
 
     Raises:
-        ConfigError: The folder contains parts of other files or settings.
+        ConfigError: The folder contains features of other input files, or features that were made with other settings.
     """
     text = "".join(f"{spell_name(name)}\n" for name in collection.names).encode()
     description = {

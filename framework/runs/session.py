@@ -562,7 +562,11 @@ def require_fit(data: Data, description: Description) -> None:
 
 
 def require_target(target: Target | None, description: Description) -> None:
-    """Refuse data whose target `target`, known before the data are read, differs from the model's; None is accepted.
+    """Raise an error if the target of the data differs from the target of the stored model.
+
+    Args:
+        target: Target of the data; None if it is known only after the data are read, in which case nothing is checked.
+        description: Description of the stored model.
 
     Raises:
         CheckpointError: The targets differ.

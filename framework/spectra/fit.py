@@ -50,23 +50,23 @@ def fit(
     start: Float[Tensor, "spectrum p"] | None = None,
     most: int = 300,
 ) -> Fit:
-    """Fit each spectrum by least squares, from the preset's start or a given one.
+    """Fit each spectrum by least squares, from `start` or from the start values of the parameter set.
 
     The covariance of the parameters is (JᵀJ / s² + diag 12 / (u - l)²)⁻¹. J is the Jacobian, s² the variance of the
     residuals, l and u are the bounds of the parameters, and (u - l)² / 12 is the variance of a uniform density between
     the bounds. If the data determine a parameter, the second term is negligible. If they do not (a pool without
     amplitude has no width), the first term is negligible, and the parameter may be anywhere between its bounds.
 
-    If a pool has vanished (amplitude 0), it has no width that could lead the search back. Such spectra are fitted once
-    more from another start, and the better fit is kept. The same is done for all spectra if centres are free and no
-    start is given: the line of amide may be the sharp or the broad one of two (benchmarks/spectra/cest.md counts how
-    often that matters).
+    If the amplitude of a pool has become 0, the residuals do not depend on the pool's width, and the search cannot
+    recover the pool. Such spectra are fitted once more from another start, and the better fit is kept. The same is done
+    for all spectra if centres are free and no start is given, because there are two solutions: the line of amide can
+    be the sharp or the broad one of two lines (benchmarks/spectra/cest.md counts how often that matters).
 
     Args:
         measured: measured Z; NaN where nothing was measured.
         offsets: ppm.
         parameter_set: the parameters to fit.
-        start: (spectrum, p), or without the parameters that are not targets.
+        start: values of all p parameters; the columns of parameters that are not targets may be left out.
         most: largest number of steps tried.
     """
     device = measured.device

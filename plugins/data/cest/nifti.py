@@ -53,8 +53,8 @@ def read_nifti(file: Path) -> Mapping[str, np.ndarray]:
         arrays["offsets"] = np.array(require_numbers_in(words_of(text), text))
         if len(arrays["offsets"]) != images.shape[-1]:
             raise DataError(
-                f"The file lists {len(arrays['offsets'])} offsets, but {file.name} holds {images.shape[-1]} images. "
-                "List one offset for each image."
+                f"{offsets_file.name} lists {len(arrays['offsets'])} offsets, but {file.name} holds "
+                f"{images.shape[-1]} images. List one offset for each image."
             )
     if len(masks) > 1:
         raise DataError(

@@ -25,7 +25,7 @@ class Archive(NamedTuple):
         points: Points of all objects, metres.
         offset: Index of the first point of each object, and the number of all points.
         label: Class of each object, an index into `classes`.
-        identity: Number of each object in the scans.
+        identity: Identifier of the scanned object to which each object of the archive belongs.
         classes: Names of the classes.
     """
 

@@ -81,10 +81,10 @@ def border(density: Distribution, value: Tensor, mass: float, samples: int) -> B
 
 
 def class_border(density: Distribution, value: Int[Tensor, "batch"], mass: float) -> Border:
-    """Return the masses and the size of highest-density regions (`Border`) for classes, by summing over all classes.
+    """Return `Border`, the masses of the regions up to the true class and the size of the region of mass `mass`.
 
-    The size is the number of most likely labels that hold the given mass. Of the last label only the part that is
-    needed counts, so that the size is not an integer.
+    All are sums over the classes. The size is the number of most likely labels that hold `mass`. Of the last label
+    only the part that is needed counts, so that the size is not an integer.
     """
     probability = class_probabilities(density).T
     at = probability.gather(0, require_labels(value.long(), len(probability)).unsqueeze(0))
@@ -95,7 +95,7 @@ def class_border(density: Distribution, value: Int[Tensor, "batch"], mass: float
 
 
 def angle_border(moments: CircularMoments, log_prob: Float[Tensor, "batch"], mass: float) -> Border:
-    """Return the masses and the size of highest-density regions (`Border`) for one angle.
+    """Return `Border` for one angle: the masses of the regions up to the target and the size of the region of `mass`.
 
     They are computed by cubic interpolation of the density and its derivative on a fine grid.
 
@@ -256,7 +256,7 @@ def _root(function: Callable[[Tensor], Tensor], low: Tensor, high: Tensor) -> Te
 
 
 def sampled_border(density: Distribution, value: Tensor, mass: float, samples: int) -> Border:
-    """Return the masses and the size of highest-density regions (`Border`), estimated from samples of the density.
+    """Return `Border`, estimated from samples of the density.
 
     The masses follow from the rank of the target's density among the densities of the samples. For one number, the size
     of the region {x: p(x) ≥ t} is estimated as E[1{p(X) ≥ t} / p(X)], where the level t is the quantile of the sampled
