@@ -52,6 +52,7 @@ def test_a_wrapper_that_mixes_densities_passes_and_one_that_averages_parameters_
     assert "averaged_committee: one member equals the model" in done.out
 
 
+@pytest.mark.slow
 def test_a_strangers_renderer_passes_by_name(framework: Framework) -> None:
     done = framework("mode=check", "renderer=ray_caster", "threads=1")
     assert done.code == 0, done.out

@@ -24,7 +24,8 @@ from framework.storage.reading import inflate, translate_errors
 ROOT = Path(__file__).parent.parent
 
 
-@pytest.mark.parametrize("count", [10, pytest.param(100, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [100])
 def test_no_reader_crashes_hangs_or_raises_anything_but_a_sentence(count: int, tmp_path: Path) -> None:
     """Whole files, pipes, devices, folders, and crafted and damaged files, a tenth for the arrays of each plugin.
 

@@ -41,6 +41,7 @@ def test_a_disk_that_is_full_from_the_start(stranger_site: Path, tmp_path: Path)
     assert "ree some space" in one_sentence(Done(done.code, done.out, tmp_path / "run"))
 
 
+@pytest.mark.slow
 def test_a_full_store_stops_nobody(framework: Framework) -> None:
     done = framework(*TINY, "+data.longest_file=100000", "pictures=false", *STEPS)
     assert done.code == 0, done.out

@@ -212,7 +212,9 @@ class App:
         wait_for(lambda: all((self.sweep / str(number) / "ready").exists() for number in numbers))
 
 
-@pytest.fixture(params=["processes", pytest.param("forks", marks=LINUX)])
+@pytest.fixture(
+    params=[pytest.param("processes", marks=pytest.mark.slow), pytest.param("forks", marks=LINUX)]
+)
 def app(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[App]:
     app = App(tmp_path, request.param == "forks")
     yield app

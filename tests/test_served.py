@@ -182,6 +182,7 @@ def forms(rows: list[dict[str, Any]]) -> dict[str, tuple[str, str]]:
     }
 
 
+@pytest.mark.slow
 def test_every_form_is_answered_as_in_a_notebook(servers: dict[str, Server]) -> None:
     """Rows and files are read in each form that MLflow accepts, with any spelling of the content type."""
     for kind, row in ((TABULAR, ROW), (IMAGES, {"base64": text(png()), "name": "my.png"})):

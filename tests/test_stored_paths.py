@@ -111,6 +111,7 @@ def texts() -> list[tuple[str, str, str]]:
     return found
 
 
+@pytest.mark.slow
 def test_no_use_of_a_stored_config_opens_what_it_names(
     whole: Done, tmp_path: Path, stranger_site: Path
 ) -> None:

@@ -224,6 +224,7 @@ torch.save(results, path)
 """
 
 
+@pytest.mark.slow
 def test_compiled_log_prob_and_gradients_agree_with_90_digits(tmp_path):
     """Compare in a separate process, since the type checks that tests switch on cannot be compiled."""
     columns = list(

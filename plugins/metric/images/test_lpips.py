@@ -106,6 +106,7 @@ def test_lpips_equals_its_formula_over_the_image_and_on_white(backbone, size, wh
     assert peer.tolist() == pytest.approx(frame, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_the_contract_tests_pass_with_weights(tmp_path):
     file = write_weights(tmp_path, weights("alex"))
     row = MetricRow("random weights", PLACE, {"weights": file}, size=(31, 33))
