@@ -102,7 +102,7 @@ def other_shapes(build: Callable[[tuple[int, ...]], Encoder], worst: Worst) -> N
         try:
             build(shape)
         except ConfigError as error:
-            names_shape = f"inputs of shape {shape}" in str(error) and "clouds" in str(error)
+            names_shape = f"inputs of shape {shape}" in str(error) and "reads clouds" in str(error)
             worst.count(not names_shape, f"the error message does not name shape {shape} and clouds: {error}")
         else:
             worst.count(True, f"inputs of shape {shape} are accepted, expected a ConfigError")

@@ -347,6 +347,7 @@ def _gradients(encoder: Encoder, batch: Tensor, worst: Worst) -> None:
     if not any(True for _ in encoder.parameters()):
         return
     encoder.train()
+    encoder.zero_grad()  # other checks share the encoder
     missing = {name for name, parameter in encoder.named_parameters() if parameter.requires_grad}
     for _ in range(4):
         encoder(batch).square().sum().backward()

@@ -21,7 +21,7 @@ conformal = build(
     "uncertainty", resolve("uncertainty", "conformal"), model=lambda: Plain(CLASSES), target=CLASSES
 )
 PredictionSet = type(conformal(torch.zeros(1, LENGTH)))
-"""By name, as a run has it: a density and its set."""
+"""Class of the densities with prediction sets that a conformal wrapper returns, as in a run."""
 
 
 def metric(target):
