@@ -170,6 +170,26 @@ def reader(description: Description) -> Data:
     return data
 
 
+def training_data(description: Description, name: str) -> Any:
+    """Return the data set that a stored model was trained on, without preparing it.
+
+    Args:
+        description: Description of the stored model.
+        name: Name of the only data set that the calling command can use.
+
+    Raises:
+        ConfigError: The model was trained on other data, or the user has not repeated a path of the data set.
+    """
+    part = description.config["data"]
+    if part["name"] != name:
+        raise ConfigError(
+            f"{description.path} was trained on data {part['name']!r}; expected a model trained on {name!r}. Choose "
+            "another run or checkpoint."
+        )
+    require_paths(description.dropped, ("data",), description.path)
+    return build_data({"data": resolve("data", part)})
+
+
 def load_with_description(
     run_or_checkpoint: str | Path, *, uri: str | None = None, paths: Mapping[str, Any] | None = None
 ) -> tuple[Predictor, Description]:

@@ -17,9 +17,8 @@ import numpy as np
 from PIL import Image
 
 from framework.bodies import motion
-from framework.configuration.description import Description
-from framework.configuration.loading import read_stored
-from framework.configuration.paths import add_option, parse_paths, require_paths
+from framework.configuration.loading import read_stored, training_data
+from framework.configuration.paths import add_option, parse_paths
 from framework.configuration.schema import build, resolve
 from framework.datasets.scan_layout import read_registration, read_splits
 from framework.errors import ConfigError, DataError, did_you_mean
@@ -104,7 +103,7 @@ def render_animation(
     The arguments are those of the command; `paths` is the argument of the same name of `framework.load`.
     """
     description, _ = read_stored(run, paths=paths)
-    data = data_of(description)
+    data: HumanScans = training_data(description, "human_scans")
     mesh: Renderer = build("renderer", resolve("renderer", {"name": "rasterizer", "supersampling": 4}))
     network: Renderer = build(
         "renderer", resolve("renderer", {"name": "smplpix", "checkpoint": run, "paths": paths})
@@ -116,18 +115,6 @@ def render_animation(
     cameras = orbit(moments, azimuths, (height, width))
     frame_images = columns(shown, moments, cameras, {"mesh": mesh, "SMPLpix": network}, data.renderer)
     return [side_by_side(pictures, description.synthetic) for pictures in frame_images]
-
-
-def data_of(description: Description) -> HumanScans:
-    """Return the data set that a model was trained on, without preparing it."""
-    part = description.config["data"]
-    if part["name"] != "human_scans":
-        raise ConfigError(
-            f"{description.path} was trained on data {part['name']!r}; expected a model trained on `human_scans`, "
-            "which renders people. Choose another run."
-        )
-    require_paths(description.dropped, ("data",), description.path)
-    return build("data", resolve("data", part))
 
 
 def cast(

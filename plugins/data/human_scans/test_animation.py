@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from framework.bodies import motion
 from framework.configuration.description import Description
-from framework.configuration.loading import read_stored
+from framework.configuration.loading import read_stored, training_data
 from framework.configuration.schema import build, resolve
 from framework.datasets import scan_layout
 from framework.errors import ConfigError, DataError
@@ -192,7 +192,7 @@ def test_pictures_show_a_mesh_on_white_and_the_data_sets_photograph(data, person
 def test_a_run_and_a_motion_become_pictures_side_by_side(data, tmp_path, walks, capsys, monkeypatch):
     run = contract("renderer", "smplpix").rows[0].config["checkpoint"]
     description, _ = read_stored(run)
-    height, width = animate.data_of(description).size
+    height, width = training_data(description, "human_scans").size
     # data of a doll, because the run's own data needs the default body
     monkeypatch.setattr(animate, "data_of", lambda description: data)
     (tmp_path / "walk.bvh").write_text(bvh([{}, TURNS, {}]))
@@ -245,7 +245,7 @@ def test_a_film_needs_its_program_and_people_who_are_there(data, tmp_path, monke
         animate.write(tmp_path / "film.mp4", frames(2))
     other = Description({"data": {"name": "moons"}}, Target("class", ("a",)), (2,), (), True, path="a.ckpt")
     with pytest.raises(ConfigError, match=r"a\.ckpt was trained on data 'moons'"):
-        animate.data_of(other)
+        training_data(other, "human_scans")
     with pytest.raises(DataError, match="Did you mean 'test_000"):
         animate.cast(data, "test_000", None, 2)
     mesh = tmp_path / "own.ply"

@@ -11,11 +11,9 @@ from pathlib import Path
 import torch
 
 from framework.bodies.people import load_body
-from framework.configuration.loading import load_with_description
-from framework.configuration.paths import add_option, parse_paths, require_paths
-from framework.configuration.schema import build, resolve
+from framework.configuration.loading import load_with_description, training_data
+from framework.configuration.paths import add_option, parse_paths
 from framework.distributions.protocol import median
-from framework.errors import ConfigError
 from framework.figures.style import save_figure
 from framework.geometry.clouds import denormalise_clouds, sizes
 from framework.storage.commands import run_command
@@ -53,14 +51,7 @@ def register(
     `paths` is the argument of the same name of `framework.load`.
     """
     predictor, description = load_with_description(checkpoint, paths=paths)
-    part = description.config["data"]
-    if part["name"] != "registration":
-        raise ConfigError(
-            f"{checkpoint} was trained on data {part['name']!r}; expected a model trained on `registration`, whose "
-            "settings name the body. Choose another checkpoint."
-        )
-    require_paths(description.dropped, ("data",), description.path)
-    data: Registration = build("data", resolve("data", part))
+    data: Registration = training_data(description, "registration")
     faces = load_body(data.body)[0].faces
     written = []
     for scan in scans:
