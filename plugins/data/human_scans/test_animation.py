@@ -194,7 +194,7 @@ def test_a_run_and_a_motion_become_pictures_side_by_side(data, tmp_path, walks, 
     description, _ = read_stored(run)
     height, width = training_data(description, "human_scans").size
     # data of a doll, because the run's own data needs the default body
-    monkeypatch.setattr(animate, "data_of", lambda description: data)
+    monkeypatch.setattr(animate, "training_data", lambda description, name: data)
     (tmp_path / "walk.bvh").write_text(bvh([{}, TURNS, {}]))
     arguments = [run, "--frames", "3", "--out", str(tmp_path / "new/film.gif")]
     animate.main([*arguments, *(["test_0001", "--motion", str(tmp_path / "walk.bvh")] if walks else [])])
