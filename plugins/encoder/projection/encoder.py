@@ -240,9 +240,9 @@ class Projection(Encoder):
         if len(input_shape) != 2 or input_shape[1] < len(COLUMNS) or not named:
             columns = f" with columns {', '.join(input_columns)}" if input_columns else ""
             raise ConfigError(
-                f"encoder projection got inputs of shape {input_shape}{columns}, but clouds of shape (points, columns) "
-                f"are required, whose first six columns are {', '.join(COLUMNS)}. Choose data of coloured points, or "
-                "another encoder."
+                f"encoder projection got inputs of shape {input_shape}{columns}, but it reads clouds, "
+                f"(points, columns), whose first six columns are {', '.join(COLUMNS)}. Choose data of coloured points, "
+                "or another encoder."
             )
         if not nearest < farthest:
             raise ConfigError(

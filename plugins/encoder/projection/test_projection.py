@@ -210,7 +210,7 @@ def test_clouds_of_a_batch_are_those_alone_on_any_number_of_threads():
 
 
 def test_what_cannot_be_projected_is_refused_and_nothing_in_view_is_the_background():
-    with pytest.raises(ConfigError, match=r"shape \(40, 5\), but clouds.*x, y, z, red, green, blue"):
+    with pytest.raises(ConfigError, match=r"shape \(40, 5\), but it reads clouds.*x, y, z, red, green, blue"):
         build_encoder((40, 5))
     with pytest.raises(ConfigError, match="columns x, y, z, normal_x"):
         build_encoder((40, 6), ("x", "y", "z", "normal_x", "normal_y", "normal_z"))
