@@ -152,7 +152,7 @@ class Cubic(NamedTuple):
         return cls(density, moments.density(FINER, slope=True) * (2 * math.pi / len(density)))
 
     def rows(self, chosen: Tensor) -> "Cubic":
-        """Return the polynomials of only some items of the batch: their indices, or true for each of them."""
+        """Return the polynomials of some items of the batch, which `chosen` selects by index or by a Boolean mask."""
         return Cubic(self.density[:, chosen], self.slope[:, chosen])
 
     def above(self, level: Float[Tensor, "batch"]) -> tuple[Float[Tensor, "batch"], Float[Tensor, "batch"]]:
@@ -209,9 +209,10 @@ class Cubic(NamedTuple):
 def _border_part(
     ends: Float[Tensor, "4 cell"], level: Float[Tensor, "cell"], *, turning: bool
 ) -> tuple[Float[Tensor, "cell"], Float[Tensor, "cell"]]:
-    """Return what cells in which the region begins or ends add to its mass and length.
+    """Return the mass and the length that each cell at a border adds to a highest-density region.
 
-    A border is a point at which the density crosses the level. The unit of length is the width of a cell.
+    A border is a point at which the density crosses the level: the region begins or ends there. The unit of length is
+    the width of a cell.
 
     Args:
         ends: density at the left and right end of each cell, then slopes at the left and right end.
@@ -292,8 +293,8 @@ def coverage_probability(
 ) -> Float[Tensor, "batch level"]:
     """Return for each level the probability that a number drawn uniformly from [`low`, `high`] is at most it.
 
-    With it, targets whose density equals that of other values count without random numbers (nonrandomized transform of
-    Czado, Gneiting & Held 2009, eq. 2).
+    This probability replaces a random draw if other values have the same density as the target (nonrandomized transform
+    of Czado, Gneiting & Held 2009, eq. 2).
     """
     low, high = low.unsqueeze(-1), high.unsqueeze(-1)
     width = high - low

@@ -26,7 +26,8 @@ class ShownFlight(NamedTuple):
 def last_seen(inputs: Tensor | None, truth: Float[Tensor, "batch time 3"]) -> Float[Tensor, "batch 3"]:
     """Return the last observed position of the ball, metres.
 
-    The result is NaN if the inputs lack the fields `PARTS`, or if the ball was never observed.
+    The result is NaN if the ball was never observed, or if the inputs are not flattened frames with the numbers of
+    `framework.flights.frames.PARTS` (time, x, y, z, and whether the ball was seen).
     """
     nowhere = torch.full_like(truth[:, 0], torch.nan)
     if inputs is None or inputs.dim() != 2 or inputs.shape[1] % len(PARTS):

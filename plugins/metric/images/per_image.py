@@ -90,7 +90,13 @@ class PerImage(Metric, HasFigure):
         self._keep([*self.facts, *facts.split(1)], predicted, true)
 
     def _keep(self, facts: list[Tensor], predicted: Tensor, true: Tensor) -> None:
-        """Choose the images to keep among stored images and those of a batch, whose facts are the last in `facts`."""
+        """Choose which of the stored images and the images of a batch are kept for the figure.
+
+        Args:
+            facts: score and data set index of each image, (1, 2), first of the stored images, then of the batch.
+            predicted: predicted images of the batch.
+            true: true images of the batch.
+        """
         old, pairs = len(self.pairs), []
         stay = choose_images(torch.cat(facts))
         for row in stay:

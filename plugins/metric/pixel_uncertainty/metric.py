@@ -32,7 +32,7 @@ class PixelUncertainty(Metric, HasFigure):
     - `pixel_coverage_90`: share of values between their 5 % and 95 % quantiles.
     - `pixel_coverage_error`: mean |share - mass| over the masses 0.05, 0.10, ..., 0.95.
     - `spearman`: rank correlation, over the pixels of an image, between the mean |error| and the predicted scale, which
-      is the root of the mean variance over channels. The error is that of the point prediction, rounded like files. The
+      is the root of the mean variance over channels. The error is that of the point prediction, rounded to `steps`. The
       correlation is computed within each image, so that difficult images have no more weight than easy ones; it is NaN
       if all pixels have the same scale.
     - `pixel_scale`: mean scale over pixels.

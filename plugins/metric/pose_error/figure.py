@@ -1,4 +1,4 @@
-"""Figures of descents: start, target and end, and errors against steps and time."""
+"""Figures of fitted poses: images at the start, at the target and at the end of a fit, and curves of the errors."""
 
 from collections.abc import Mapping
 
@@ -14,7 +14,10 @@ from plugins.metric.pose_error.errors import FittedImage
 
 
 def draw_descents(samples: Mapping[str, FittedImage], title: str, *, synthetic: bool) -> Figure:
-    """Return a figure with a row for each sample: start, target, end, their difference, and errors against steps."""
+    """Return a figure with a row for each sample: images of start, target and end, a difference, and error curves.
+
+    The difference is that of end and target. The curves show the errors against steps.
+    """
     figure = titled_figure((11.0, 3.2 * len(samples)), title, synthetic)
     axes = figure.subplots(len(samples), 5, squeeze=False, width_ratios=(1, 1, 1, 1, 2.2))
     for row, (name, sample) in zip(axes, samples.items(), strict=True):
@@ -47,7 +50,7 @@ def draw_error_curves(axis: Axes, path: Float[Tensor, "step 4"]) -> None:
 def draw_errors(degrees_and_centimetres: Float[Tensor, "sample 2"], title: str, *, synthetic: bool) -> Figure:
     """Return a figure of the rotation error and the translation error of every sample.
 
-    It is for predictions that store no descent.
+    The figure is for predictions that do not store the steps of their fit.
     """
     figure = titled_figure((5.0, 4.2), title, synthetic)
     axis = figure.subplots()

@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 class PoseError(Metric, HasFigure):
     """Errors of a body's rotation (geodesic, degrees) and translation (cm), and the share within 2° and 1 cm.
 
-    Medians, 95th percentiles and worst cases are reported, because a descent either succeeds or ends in another
-    minimum. If the density stores its descent (`fit_pose`), the figure shows start, target and end of the best, the
-    median and the worst sample, and the errors against steps and time.
+    Medians, 95th percentiles and worst cases are reported, because the descent of a fit either reaches the true pose or
+    ends in another minimum. If the density stores its descent (as `fit_pose` does), the figure shows the images of
+    start, target and end for the best, the median and the worst sample, and the errors against steps and time.
 
     Raises:
         ConfigError: the target does not begin with a rotation and a translation.

@@ -17,8 +17,9 @@ from framework.objective import Objective
 class Adversarial(Objective):
     """A penalty on the loss at adversarial inputs, within ±ε of the training inputs (thesis eq. 2.20).
 
-    The penalty is the weight times the mean loss on x' = x + ε sign(∇ₓ loss(x, y)), with the targets of x. It only
-    needs a loss that is differentiable in the inputs, not the density, so that it works for any head and any wrapper.
+    The penalty is the weight times the mean loss on x' = x + ε sign(∇ₓ loss(x, y)), with the targets of x. The penalty
+    does not use the density. It needs only a loss that is differentiable in the inputs, so it works for any density
+    head and any uncertainty wrapper.
 
     Images of type uint8 are converted to 0…1, and x' stays in this range. Floating-point inputs are used unchanged, and
     x' may leave their range by ε (images that the data plugin augments are floating-point). Dropout uses different

@@ -129,7 +129,7 @@ class Perceptual(FeatureDistance):
 
 
 class RandomFeatures(FeatureDistance):
-    """Distance between features of a convolutional network with random weights: edges and textures at many scales.
+    """Distance between features of a convolutional network with random weights, which respond to edges and textures.
 
     The network has learned nothing about images, so that the distance is not a perceptual loss and is not called one.
 

@@ -12,11 +12,14 @@ from plugins.objective.images.vgg import TAPS, WIDTHS, Depth, layers_of
 FOLDER = TemporaryDirectory()
 IMAGES = Target("image", ("red", "green", "blue"), size=(20, 16))
 KINKS = {"gradient": 0.05}
-"""Limit for finite differences that step over the kink of a ReLU."""
+"""Largest allowed error of a gradient: finite differences that step over the kink of a ReLU are inexact."""
 
 
 def file_of(depth: Depth) -> str:
-    """Write random weights with torchvision's names, of the layers that `read_vgg` reads; return the file's path."""
+    """Write a file with random weights of the layers that `read_vgg` reads, and return its path.
+
+    The weights have torchvision's names.
+    """
     generator, channels, state = torch.Generator().manual_seed(depth), 3, {}
     for block, _, index in layers_of(depth, TAPS[depth][-1]):
         width = WIDTHS[block]

@@ -22,8 +22,8 @@ TAPS: dict[Depth, tuple[tuple[int, int], ...]] = {
 }
 """Convolutions whose outputs are features, as block and convolution, counted from 0.
 
-They are relu1_2, 2_2, 3_3, 4_3 of 16 layers (Johnson et al. 2016), relu1_1, 2_1, 3_1, 4_1, 5_1 of 19 (Wang et al.
-2018).
+In the network of 16 layers they are relu1_2, relu2_2, relu3_3 and relu4_3 (Johnson et al. 2016). In the network of 19
+layers they are relu1_1, relu2_1, relu3_1, relu4_1 and relu5_1 (Wang et al. 2018).
 """
 MEAN, SPREAD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 """Mean and standard deviation of red, green and blue over ImageNet; torchvision's weights expect normalised images."""
@@ -51,7 +51,7 @@ class VGG(nn.Module):
             channels = widths[block]
 
     def forward(self, images: Float[Tensor, "image 3 height width"]) -> list[Tensor]:
-        """Return the features (image, channel, height, width) after each tap, for images in sRGB; the dtype stays."""
+        """Return the features (image, channel, height, width) after each tap, for sRGB images, in their dtype."""
         mean, spread = (images.new_tensor(values)[:, None, None] for values in (MEAN, SPREAD))
         hidden, features, block_before = (images - mean) / spread, [], 0
         for block, place, _ in self.layers:

@@ -36,9 +36,11 @@ class OutlierExposure(Objective):
         weight: factor λ of the penalty.
         outliers: data from which outliers are drawn; the constructor prepares it.
         low, high: range of uniform random numbers, in the units of the inputs; 0 and 1 for images.
-        count: number of outliers of a step; None: the number of samples in the batch for each model.
-        clearance: outliers with a smaller Euclidean distance to an input of the batch, in the inputs' unit, are left
-            out: uniform numbers also fall among the training data, where a uniform density would be wrong. 0 keeps all.
+        count: number of outliers of a training step; None for as many outliers as the batch holds samples for each
+            member of an ensemble.
+        clearance: smallest Euclidean distance, in the inputs' unit, of an outlier from every input of the batch; nearer
+            outliers are left out, because uniform random numbers also fall among the training data, where a uniform
+            density would be wrong. 0 keeps all outliers.
         divergence: "auto", "entropy" or "cross_entropy".
         prior_scale: standard deviation of u for a real number, in the target's units.
 

@@ -295,8 +295,9 @@ class Line:
     def _log_less(self, level: Float[Tensor, "item"]) -> Float[Tensor, "item"]:
         """Return the log of the probability of all values whose log-density is below `level`, (item,).
 
-        log p is linear in each cell and lies between `low` and `high`. So the probability of the part of the cell that
-        is below the level is the cell's width times (exp(c) - exp(low)) / (high - low) with c = min(level, high).
+        log p is linear in each cell; `low` and `high` are its lower and its higher value at the two ends of the cell.
+        The part of the cell in which log p is below the level therefore has the probability (exp(c) - exp(low)) /
+        (high - low), times the cell's width, with c = min(level, high).
         """
         top = torch.minimum(level, self._high)
         rise, fall = top - self._low, self._high - self._low

@@ -46,7 +46,7 @@ class PredictionSet(Mixture, ValueSet):
 
     Both scores are functions of the density and the value alone, as split conformal prediction requires: on
     exchangeable data the set has its stated coverage for any density (Vovk, Gammerman & Shafer 2005, §4.1).
-    Probabilities over several numbers are shares of random samples, which are drawn once.
+    For a target of several numbers, probabilities are shares of random samples, which are drawn once.
 
     Args:
         density: any density.
@@ -219,8 +219,8 @@ class PredictionSet(Mixture, ValueSet):
 
         The ends of an interval of a real may be infinite. An interval of an angle is in radians, from low in [-π, π)
         counter-clockwise to high, which may lie beyond π but is at most low + 2π; the whole circle is (-π, π). The ends
-        are as exact as the density's dtype. An interval is found only if a component has its
-        mode there or, for angles, if it is broad.
+        are as exact as the density's dtype. An interval is found only if it contains a mode candidate of the density
+        or, for angles, if it is broad.
 
         Raises:
             UserError: the density is not over one number.

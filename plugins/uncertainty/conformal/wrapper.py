@@ -21,9 +21,9 @@ from plugins.uncertainty.conformal.prediction_set import PredictionSet, Score
 SEED = 71
 """Seed of the random split into halves."""
 NEAR = 0.03
-"""Largest deviation of the coverage from the stated one, in 90 % of cases, for which there are enough samples.
+"""Accepted deviation of the coverage from the stated one, which should not be exceeded in 90 % of cases.
 
-If the deviation may be larger, the remark names the number of samples with which it would not be.
+If too few samples are available for this, `coverage_remark` names the number of samples that would suffice.
 """
 NINETY = 1.645
 """Number of standard deviations on both sides of the mean within which a normal density has the probability 0.9."""
@@ -31,7 +31,7 @@ _log = logging.getLogger(__name__)
 
 
 class Conformal(Uncertainty):
-    """Unchanged densities, each with a set (`prediction_set.py`) that holds the target with probability 1 - α.
+    """Unchanged densities, each with a prediction set that holds the target with probability 1 - α.
 
     For data that is exchangeable with the validation split, a new target lies in its set with a probability of at least
     1 - α, and of at most 1 - α + 1/(n + 1) if no two of the n scores are equal. This is an average over targets and
@@ -130,7 +130,7 @@ def split_in_halves(batches: Sequence[Batch]) -> tuple[list[Batch], list[Batch]]
 
 
 def coverage_remark(count: int, miscoverage: float) -> str:
-    """Return a sentence about how far the coverage may deviate from the stated one, and how many scores suffice.
+    """Return a remark on how far the coverage may deviate from the stated one, and how many scores would suffice.
 
     The threshold is fitted to n = `count` scores of the validation split. The coverage of the sets with this threshold
     is itself random: Beta(k, n + 1 - k) for distinct scores, with k as in `threshold` (Vovk 2012, prop. 2a). Its mean

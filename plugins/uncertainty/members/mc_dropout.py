@@ -23,7 +23,7 @@ DROPOUT = (nn.Dropout, nn.Dropout1d, nn.Dropout2d, nn.Dropout3d, nn.AlphaDropout
 AT_ONCE = 2**24
 """Largest number of values that enter a dropout layer at once (64 MiB in float32).
 
-If the samples need more, they are computed in parts.
+If all samples together need more, they are computed in parts.
 """
 
 

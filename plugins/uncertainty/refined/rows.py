@@ -1,4 +1,4 @@
-"""Contract-test cases: a model without steps of the fit, which is not changed, and one with ten steps."""
+"""Contract-test cases: a fit of no steps, which returns the model's density unchanged, and a fit of ten steps."""
 
 from framework.spectra.spectrum import PRESETS
 from framework.target import Target

@@ -15,7 +15,7 @@ Term = Callable[[Tensor], Tensor]
 
 RESTARTS = 20
 NEAREST = 1e-9
-"""Smallest step, as a factor on the gradient, of the search towards a region in which values are not finite."""
+"""Step, as a factor on the gradient, at which the search ends beside a region in which values are not finite."""
 
 
 class Minimum(NamedTuple):

@@ -27,12 +27,12 @@ _log = logging.getLogger(__name__)
 
 
 class Platt(Uncertainty):
-    """Class log-probabilities l are replaced by a·l + b, normalised (thesis eq. 2.18-2.19).
+    """Platt scaling of class probabilities: log-probabilities l become a·l + b, normalised (thesis eq. 2.18-2.19).
 
     The slope a ≥ 0 is common to all classes, and b holds one bias for each class; the biases sum to 0. For two classes
     this is a slope and a bias of the log-odds. Eq. 2.18 of the thesis multiplies the network's output probability by a.
-    Here, as in Platt 1999 and Guo et al. 2017, it is the log-odds, so that a = 1 and b = 0 change nothing; these are
-    the values before `calibrate`. The wrapped model may return any density over classes, also a mixture.
+    Here, as in Platt 1999 and Guo et al. 2017, a multiplies the log-odds, so that a = 1 and b = 0 change nothing; a and
+    b have these values before `calibrate`. The wrapped model may return any density over classes, also a mixture.
 
     A slope below 0 would reverse the order of the classes. If the labels contradict the wrapped model, the slope stops
     at 0, and every prediction is then the share of each class. Slope and biases have upper bounds too. The log says if

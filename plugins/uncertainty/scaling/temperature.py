@@ -27,7 +27,7 @@ _log = logging.getLogger(__name__)
 
 
 class Temperature(Uncertainty):
-    """Every density p is replaced by p^(1/T), normalised, with the temperature T of highest validation likelihood.
+    """Temperature scaling of densities p to p^(1/T), normalised, with the T of highest validation likelihood.
 
     For classes this divides logits by T (thesis eq. 2.19 with β = 0). No mode changes. Before `calibrate` T is 1, and
     the densities are those of the wrapped model. The fitted T is never worse than 1 on the validation split. T stays
@@ -80,9 +80,9 @@ class Temperature(Uncertainty):
 def fit(predicted: Sequence[Distribution], batches: Sequence[Batch], lower: float, upper: float) -> float:
     """Return the temperature T in [lower, upper] with the smallest mean negative log-likelihood.
 
-    If no temperature is better than 1, the result is 1.
-    The negative log-likelihood of a target y is -log p(y)^(1/T) + log Z with the normalising constant Z of p^(1/T) (eq.
-    2.19). Targets of probability 0 have probability 0 at any T: they are left out, and their number is logged.
+    If no temperature is better than 1, the result is 1. The negative log-likelihood of a target y is -log p(y)^(1/T) +
+    log Z with the normalising constant Z of p^(1/T) (eq. 2.19). Targets of probability 0 have probability 0 at any T:
+    they are left out, and their number is logged.
     """
     targets = [batch["target"] for batch in batches]
     with torch.no_grad():
