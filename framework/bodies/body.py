@@ -244,7 +244,8 @@ class BodyModel(nn.Module):
             shape: coefficients β. They may be fewer than the model has; the remaining coefficients are then 0.
             pose: θ, axis times angle of each joint, radians; angles above 2π are allowed.
             translation: translation of the whole body, metres.
-            offsets: displacements of one person's vertices from the model's in the rest pose, metres: clothes, hair.
+            offsets: displacements of a person's vertices from those of the model, in the rest pose, metres; they
+                describe, for example, clothes and hair.
 
         Raises:
             ValueError: the shapes are wrong, or numbers are not finite; the message names the first such row.
@@ -293,14 +294,14 @@ class BodyModel(nn.Module):
         return (joints + moved + transforms[..., 9:]).to(self.template.dtype)
 
     def _blended(self, shape: Tensor, turns: Tensor) -> Float[Tensor, "batch 12 vertex"]:
-        """Return Σ_j w_j (R_j - 1, t_j) of each vertex; w_j are its skinning weights, the rest is of `_transforms`."""
+        """Return Σ_j w_j (R_j - 1, t_j) of each vertex: its skinning weights w_j times the results of `_transforms`."""
         return self._transforms(shape, turns).to(self.weights.dtype).transpose(1, 2) @ self.weights
 
     def _transforms(self, shape: Tensor, turns: Tensor) -> Float[Tensor, "batch joint 12"]:
         """Return (R - 1, t) of each joint, float64: the transform x → R x + t from the rest pose to the pose.
 
-        It includes the rotations of the joint and of all its ancestors. `turns` are the rotations relative to the
-        parents, less the identity.
+        The transform includes the rotations of the joint and of all its ancestors. `turns` are the rotations relative
+        to the parents, less the identity.
         """
         joints = self.rest_joints(shape).double()
         rotations = list(turns.unbind(1))
@@ -352,7 +353,7 @@ class BodyModel(nn.Module):
 
 
 def _rows(values: np.ndarray) -> np.ndarray:
-    """Return an array of shape (vertex, 3, row) as (row, 3 · vertex)."""
+    """Return an array of shape (vertex, 3, row), rearranged to (row, 3 · vertex)."""
     return np.moveaxis(values, 0, 2).transpose(1, 0, 2).reshape(values.shape[2], -1)
 
 

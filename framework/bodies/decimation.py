@@ -20,7 +20,7 @@ TURN = 0.2
 
 
 class Decimated(NamedTuple):
-    """Result of a decimation: the remaining vertices, and the triangles of vertices and of texture coordinates.
+    """Result of a decimation: the remaining vertices, and the corners of the triangles in the mesh and in the texture.
 
     All numbers are indices into the arrays of the mesh before decimation.
     """

@@ -25,7 +25,7 @@ from framework.storage.generated import ensure_generated
 from framework.storage.reading import read_bytes, translate_errors
 
 VERSION = 3
-"""Version of the cached files; any change of them takes a new number."""
+"""Version of the cached files; it is increased whenever their content changes."""
 
 
 @dataclass(frozen=True)
@@ -40,11 +40,11 @@ class Traits:
         labels: names of the traits that may be given, each 0…1: "gender" is 0 for male and 1 for female, "age" is 0 for
             a baby, 1/3 for a child, 2/3 for a young adult and 1 for old.
         anchors: anchors of each interpolated trait, ascending.
-        traits: trait to which each column of `products` belongs; the columns of a trait without anchors have equal
-            shares.
+        traits: trait to which each column of `products` belongs. A trait with n columns but without anchors has the
+            factor 1/n in each column.
         products: (blend shape, column), true if the column is a factor of the blend shape's weight.
         projection: matrix from blend shapes to shape coefficients.
-        largest_error: largest distance of vertices of random bodies from the package's own result, metres.
+        largest_error: largest distance of vertices of random bodies from those that `anny` computes itself, metres.
     """
 
     labels: tuple[str, ...]
@@ -90,10 +90,10 @@ class Traits:
 def interpolation(
     values: Float[Tensor, "person"], anchors: Float[Tensor, "anchor"]
 ) -> Float[Tensor, "person anchor"]:
-    """Return for each value the weights of the anchors with which their weighted mean is the value.
+    """Return the weights of linear interpolation: the mean of the anchors with these weights is the value.
 
-    This is linear interpolation: only the two anchors around the value have weights above 0, and their sum is 1. Values
-    outside of the anchors are clamped. The anchors ascend.
+    Only the two anchors around a value have weights above 0, and the sum of the weights is 1. Values outside of the
+    range of the anchors are clamped to it. The anchors ascend.
     """
     values = values.clamp(anchors[0], anchors[-1])
     right = torch.searchsorted(anchors, values.contiguous()).clamp(1, len(anchors) - 1)

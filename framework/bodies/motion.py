@@ -35,7 +35,7 @@ The names are in lower case, and without a prefix that ends with a colon. `{side
 file has joints with several names of one role, the first of these names in the tuple counts.
 """
 ENDS = {"arm": "elbow", "elbow": "wrist", "hip": "knee", "knee": "ankle"}
-"""Bones whose directions are taken from the file: from the joint that is the key to the joint that is the value.
+"""Bones whose directions are taken from the file, as joint at the beginning → joint at the end of the bone.
 
 All other joints rotate as in the file.
 """
@@ -49,7 +49,7 @@ class Motion(NamedTuple):
 
     Attributes:
         names, parents: names and parents of its joints; the root's parent is -1.
-        offsets: position relative to the parent if no joint rotates, in the file's unit.
+        offsets: position of each joint relative to its parent if no joint rotates, in the file's unit.
         rotations: rotation of each joint relative to its parent.
         seconds: duration of a frame.
     """

@@ -20,7 +20,7 @@ from framework.geometry.camera import Camera
 
 
 class Turn(NamedTuple):
-    """Rotation that a movement makes: joint (a role of framework.bodies.poses.Skeleton), axis and sign."""
+    """Rotation that a movement causes: the joint (as a role of framework.bodies.poses.Skeleton), the axis and sign."""
 
     movement: str
     role: str
@@ -45,9 +45,9 @@ SIDED = (
     Turn("spread", "hip", "z"),
     Turn("knee", "knee", "x"),
 )
-"""Rotations of the left side; the right side rotates in the opposite direction about y and z.
+"""Rotations that movements of the left side cause; on the right side, rotations about y and z are opposite.
 
-The last movement of a joint is applied first.
+If a joint has several movements, the last one in this tuple is applied first.
 """
 PLACE = tuple(f"{quantity}_{axis}" for quantity in ("rotation", "translation") for axis in "xyz")
 TRAITS = {"gender": 0.29, "muscle": 0.22, "weight": 0.22, "proportions": 0.22}
@@ -58,7 +58,7 @@ Height is not among them: an image determines the ratio of a body's size to its 
 FURTHEST = 4.0
 """Largest difference of a movement from its mean, in standard deviations."""
 STEP = 1e-5
-"""Step of central differences at joints: radians, metres, standard deviations."""
+"""Step of the central differences by which the joints' transforms are differentiated, in each parameter's unit."""
 SHAPES = 4
 """Number of free shape coefficients of a body from a file."""
 ImageSide = Annotated[int, Field(ge=8, le=1024, multiple_of=4)]
@@ -140,7 +140,7 @@ class ParametricBody:
             setattr(self, name, torch.from_numpy(np.ascontiguousarray(values)))
 
     def camera(self, height: int, width: int) -> Camera:
-        """Return a camera in front of the nominal body, 1.2 body heights away, which sees the whole body."""
+        """Return a camera in front of the body with parameters 0, 1.2 body heights away; it sees the whole body."""
         low, high = float(self.template[1].min()), float(self.template[1].max())
         return Camera(
             rotation=torch.tensor([1.0, -1.0, -1.0]).diag(),
@@ -192,7 +192,7 @@ class ParametricBody:
     def _transforms(self, numbers: Float[Tensor, "*batch number"]) -> Float[Tensor, "*batch joint 12"]:
         """Return (R, t) of each joint: the transform x → R x + t from the mean pose to the pose of `numbers`.
 
-        It includes the rotations of the joint and of all its ancestors.
+        The transform includes the rotations of the joint and of all its ancestors.
         """
         count = len(self.slots)
         joints = self.joints + torch.einsum("...s,sjk->...jk", numbers[..., 6 + count :], self.joint_shapes)
@@ -281,7 +281,7 @@ def _free_movements(
 def _bounds(
     usual: poses.Degrees, deviation: poses.Degrees, least: poses.Degrees, most: poses.Degrees
 ) -> tuple[float, float]:
-    """Return the bounds of a movement less its mean, radians: within FURTHEST deviations and within its limits."""
+    """Return the bounds of a movement minus its mean, radians, from FURTHEST and from the movement's own limits."""
     far = FURTHEST * deviation
     return math.radians(max(least - usual, -far)), math.radians(min(most - usual, far))
 

@@ -14,16 +14,16 @@ from framework.errors import DataError
 OFF = 0.01
 """Standard deviation, metres, of a mesh's vertices from those of the model, due to clothes, hair and registration."""
 INDEPENDENT = 35
-"""Number of independent vertex errors of a mesh of any size, since errors of vertices under one garment are similar."""
+"""Number of vertex errors that count as independent in any mesh, since errors of vertices under one garment agree."""
 BENT = 0.7
 """Standard deviation of the angles of all joints except the root, radians, which spreads a bend over several joints."""
 STEPS = 60
 ENOUGH = 1e-6
 """Step, metres and radians, below which the search ends."""
 MOST = 2_500
-"""Largest number of vertices that are used; evenly spread vertices of a finer mesh suffice."""
+"""Largest number of vertices that are used; of a mesh with more, every n-th vertex is used."""
 STEP = 1e-5
-"""Step of the central differences that give derivatives: radians, metres, standard deviations of shape."""
+"""Step of the central differences by which the model is differentiated: radians, metres, standard deviations."""
 TOGETHER = 24
 """Number of parameters by which the model is differentiated at once."""
 

@@ -17,9 +17,9 @@ from framework.errors import DataError
 
 Degrees = float | int
 Range = tuple[Degrees, Degrees, Degrees, Degrees]
-"""Mean, standard deviation, smallest and largest value."""
+"""Mean, standard deviation, smallest and largest value of a movement."""
 Kinds = dict[str, tuple[float, dict[str, tuple[Degrees, Degrees]]]]
-"""Share of each kind of pose, and mean and standard deviation of the movements that differ from the default values."""
+"""Kinds of poses by name: share among random poses, and mean and deviation of movements that differ from `SIDED`."""
 CENTRAL: dict[str, Range] = {
     "pitch": (0, 4, -15, 15),  # pitch, yaw, roll: the whole body about x, y and z
     "yaw": (0, 12, -40, 40),
@@ -67,7 +67,7 @@ LEGS: Kinds = {
 ALIKE = 0.6
 """Share of poses in which the right arm takes the kind of the left arm; both legs always have the same kind."""
 TAIL, WIDER = 0.1, 1.8
-"""Share of poses that are drawn with larger standard deviations, and the factor of these (thesis §6.5.2)."""
+"""Share of poses that are drawn with larger standard deviations, and the factor on the deviations (thesis §6.5.2)."""
 MOVEMENTS = (*CENTRAL, *(f"{side} {name}" for side in ("left", "right") for name in SIDED))
 
 
@@ -206,7 +206,8 @@ def rotations(
     def turn(places: Sequence[int], *about: tuple[Sequence[float] | np.ndarray, np.ndarray]) -> None:
         """Rotate the joints `places`, which share each rotation equally.
 
-        `about` are pairs (axis, angles in radians), with axes that do not rotate along. The last pair is applied first.
+        `about` are pairs (axis, angles in radians). The last pair is applied first. Its rotation does not change the
+        axes of the other pairs.
         """
         for place in places:
             for axis, radians in reversed(about):

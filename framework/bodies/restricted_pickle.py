@@ -68,9 +68,9 @@ class PickleRefused(ValueError):
 
 
 class _Record:
-    """Record of a name in a pickle and of its arguments.
+    """Record of a name that a pickle refers to, and of the arguments with which the pickle calls it.
 
-    `called` is true if the pickle called the name; otherwise the record is the bare name.
+    `called` is true if the pickle calls the name; otherwise the record is of the name alone.
     """
 
     def __init__(self, kind: str, arguments: tuple[Any, ...] = (), *, called: bool = False) -> None:
@@ -357,7 +357,7 @@ def _line(values: Any, kinds: str) -> np.ndarray:
     """Return `values` if they are a one-dimensional array of one of the kinds of dtype in `kinds`.
 
     Raises:
-        PickleRefused: they are not.
+        PickleRefused: `values` is anything else.
     """
     if not isinstance(values, np.ndarray) or values.ndim != 1 or values.dtype.kind not in kinds:
         _refuse("a sparse matrix has no numbers")

@@ -22,10 +22,10 @@ from framework.storage.generated import ensure_generated
 from framework.storage.reading import read_bytes, translate_errors
 
 VERSION = 1
-"""Version of the cached decimations; any change of them takes a new number."""
+"""Version of the cached decimations; it is increased whenever their content changes."""
 Name = Literal["7k", "14k", "27k", "110k"]
 COUNTS: dict[Name, int] = {"7k": 6_890, "27k": 27_578, "110k": 110_312}
-"""Numbers of vertices; the first two are the thesis's (Table 7.1). "14k" is the unchanged default body."""
+"""Topology → number of vertices; the first two are the thesis's (Table 7.1). "14k" is the unchanged default body."""
 
 
 class Corners(NamedTuple):
@@ -57,7 +57,7 @@ class Sheet:
         corners: triangles of the body, and then the triangles after each stage.
         pairs: for each stage, the two ends of each split edge. The midpoints of these edges, in this order, are
             appended to the vertices.
-        uv_pairs: the same for edges between texture coordinates.
+        uv_pairs: for each stage, the two ends of each split edge between texture coordinates.
     """
 
     corners: tuple[Corners, ...]
@@ -261,9 +261,9 @@ def _interpolate(values: np.ndarray, stages: tuple[np.ndarray, ...]) -> np.ndarr
 
 
 def _compact(rows: np.ndarray, faces: np.ndarray, uv_faces: np.ndarray) -> Topology:
-    """Return a topology from triangles in the numbers of the sheet; `rows` are the vertices of the topology.
+    """Return a topology, given its triangles and its vertices `rows`, both as indices of vertices of the sheet.
 
-    It has only those texture coordinates that its triangles use.
+    The topology has only those texture coordinates that its triangles use.
     """
     place = np.zeros(max(faces.max(initial=0), rows.max(initial=0)) + 1, np.int64)
     place[rows] = np.arange(len(rows))
