@@ -120,8 +120,8 @@ def build_predictor(
 ) -> Predictor:
     """Return the untrained predictor, whose initial weights are a function of `seed` and the config.
 
-    The first encoders of the config, up to the first one that is trained, have fixed features. They are shared by all
-    models and are placed outside the uncertainty wrappers. `columns` are the names of the input columns.
+    The encoders before the first one that is not `Encoder.fixed` are shared by all models and placed outside the
+    uncertainty wrappers. `columns` are the names of the input columns.
     """
     # the model is built on the CPU; the generators of other devices stay unchanged
     torch.default_generator.manual_seed(seed)

@@ -9,7 +9,7 @@ from framework.configuration.registry import package_folders
 from framework.errors import ConfigError, did_you_mean
 
 REFERENCES = "references.bib"
-"""File in the top folder of a package that holds the entries which its plugins name by their keys."""
+"""Name of the file, in the top folder of a package, with the BibTeX entries that its plugins cite by their keys."""
 
 
 def bibtex_of(cls: type) -> str:

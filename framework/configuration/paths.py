@@ -1,8 +1,8 @@
 """Handling of paths in a stored config, which are used only if the user repeats them (DESIGN, law 15).
 
-The reason is that a checkpoint or a run folder may come from an untrusted source. A text is a path if the annotation
-of its parameter says so (`FilePath`, `pathlib.Path`, pydantic's `FilePath` and `DirectoryPath`). Without such an
-annotation, a text is a path if it looks like one, so that a plugin without annotations is safe too.
+The reason is that a checkpoint or a run folder may come from an untrusted source. A text counts as a path if the
+annotation of its parameter says so (`FilePath`, `pathlib.Path`, pydantic's `FilePath` and `DirectoryPath`). Without
+such an annotation, a text counts as a path if it looks like one, so that a plugin without annotations is safe too.
 """
 
 import argparse
@@ -30,7 +30,7 @@ SINGLE = ("data", "outliers", "density_head", "renderer")
 OPTIONS = ("files", "into", "members", "run")
 """Options of modes that name files, folders or runs."""
 UNUSED = ("metric", "objective", "outliers", "renderer")
-"""Groups whose plugins are not imported to load a model; a parameter of theirs is a path if its text looks like one."""
+"""Groups whose plugins are not imported to load a model; of their parameters, texts that look like paths are paths."""
 
 
 @dataclass

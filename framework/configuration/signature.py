@@ -14,7 +14,10 @@ from framework.errors import ConfigError, shorten
 
 
 class Part(typing.NamedTuple):
-    """Constructor parameter for a plugin of the registry `group`; for several if `many` is list or tuple."""
+    """Constructor parameter that takes a plugin of the registry `group`, or several plugins.
+
+    `many` is list or tuple if the parameter takes a list or tuple of plugins, and None if it takes a single plugin.
+    """
 
     group: str
     many: type[list[Any]] | type[tuple[Any, ...]] | None
