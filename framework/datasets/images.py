@@ -37,11 +37,11 @@ ORIENTATION = 0x0112
 BITS_PER_SAMPLE, PHOTOMETRIC = 258, 262
 """Numbers of two TIFF entries: the bits per value, and the meaning of the value 0 (0: white, 1: black)."""
 MODES = {1: "L", 3: "RGB", 4: "RGBA"}
-"""Pillow's names of decoded images, by number of channels."""
+"""Pillow's modes of decoded images, by number of channels."""
 STRIP = 256
 """Number of pixel rows of an image that are converted at a time."""
 IN_MEMORY = 2 * 2**30
-"""Largest size, in bytes, of all decoded crops of a data set with which the crops are kept in memory."""
+"""Largest total size, in bytes, of a data set's decoded crops if they are kept in memory."""
 
 Box = tuple[float, float, float, float]
 """Left, top, right and bottom in pixels, measured from the outer corner: (0, 0, width, height) is the whole image."""
@@ -441,7 +441,10 @@ def load_splits(
 
 
 def angle_fields(angles: Sequence[Sequence[float]], names: Sequence[str]) -> dict[str, Tensor]:
-    """Return the fields "target" (radians in [-π, π), one column per name) and "group" (0 for every sample)."""
+    """Return the fields "target" and "group" for the angles of each sample, radians.
+
+    "target" holds the angles in [-π, π), one column per name, and "group" is 0 for every sample.
+    """
     wrapped = [[(angle + math.pi) % (2 * math.pi) - math.pi for angle in row] for row in angles]
     return {
         "target": torch.tensor(wrapped, dtype=torch.float32).reshape(len(angles), len(names)),
