@@ -170,7 +170,11 @@ class Frozen:
         return self.inner.head(raw)
 
     def _read(self, shape: tuple[int, ...]) -> None:
-        """Set `network` to the model's layers, for features of this shape, if all are fully connected; set `form`."""
+        """Set `form`, and set `network` if all layers of the model are fully connected.
+
+        Args:
+            shape: shape of the features of one sample.
+        """
         if not isinstance(self.inner, Model):
             self.form = f"{type(self.inner).__name__} in torch, without gradient"
             return

@@ -22,7 +22,7 @@ from framework.model import Model
 from framework.storage.kernels import compiler, kernel_cache
 
 LEAVES = (nn.Linear, nn.BatchNorm1d, nn.ReLU, nn.Dropout, nn.Flatten, nn.Identity, nn.Sequential)
-"""Layers that a network may have; a model with other layers is not exported, because that takes long and fails."""
+"""Layers that a network may have; a model with other layers is not exported: the export would take long and fail."""
 MOST_RAW = 2048  # largest number of raw parameters of a head that is tested for a softmax
 
 
@@ -100,7 +100,7 @@ class Network:
 
 
 def read_network(model: Model, shape: tuple[int, ...]) -> Network | None:
-    """Read a model's encoders and linear layer as a network; return None if they contain other layers.
+    """Read a model's encoders and last linear layer as a `Network`; return None if they have layers not in LEAVES.
 
     If the head is a softmax of an affine function, the network includes this function.
     """

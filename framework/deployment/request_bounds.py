@@ -305,9 +305,17 @@ async def _send(
     remarks: Iterable[str] = (),
     close: bool = False,
 ) -> None:
-    """Send a response; if `close` is True, leave it open, and the caller ends it later.
+    """Send a response.
 
     Each remark is sent as a header, because a table of predictions has no field for remarks.
+
+    Args:
+        send: function that sends ASGI messages to the client.
+        status: HTTP status.
+        content: body of the response.
+        media: media type of the body.
+        remarks: remarks on the predictions.
+        close: if True, announce that the connection closes, and leave the response open; the caller ends it later.
     """
     headers = [(b"content-type", media), (b"content-length", str(len(content)).encode())]
     headers += [

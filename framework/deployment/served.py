@@ -85,9 +85,9 @@ class ServedModel:
         `mode=predict` prints about the prediction sets.
 
         Args:
-            inputs: inputs that the model of `framework.load` accepts, but files only as `pathlib.Path`. Or the content
-                of files: a DataFrame with the column "base64" (and "name", whose suffix determines the format), or
-                texts in base64.
+            inputs: inputs that the model of `framework.load` accepts, but files only as `pathlib.Path`; or the contents
+                of files, as a DataFrame with the column "base64" (and "name", whose suffix determines the format) or
+                as texts in base64.
 
         Raises:
             DataError: `inputs` is none of these.
