@@ -150,7 +150,7 @@ class Reshaped(Distribution):
 
 
 def _register_density(function: Any) -> None:
-    """Register a function (density, argument) → density, which is applied to each inner density."""
+    """Register a function (density, argument) → density for `Stacked` and `Reshaped`: apply it to inner densities."""
 
     @function.register
     def _(density: Stacked, argument: Any) -> Distribution:
@@ -189,7 +189,10 @@ def _(density: Reshaped, value: Tensor) -> protocol.Estimate:
 
 
 def _register_number(function: Any) -> None:
-    """Register a function (density, value) → (*sample, *batch) or None, which is applied to each inner density."""
+    """Register a function of density and value for `Stacked` and `Reshaped`: apply it to the inner densities.
+
+    The function returns a tensor (*sample, *batch) or None.
+    """
 
     @function.register
     def _(density: Stacked, value: Tensor) -> Tensor | None:
@@ -310,11 +313,11 @@ def _(density: Reshaped) -> Tensor:
 
 
 def _stack_padded(candidates: list[Tensor], axis: int) -> Tensor:
-    """Return the stacked tensors (peak, …) of several densities; a density with fewer peaks repeats its first peak.
+    """Stack tensors (candidate, …) of several densities; a density with fewer mode candidates repeats its first one.
 
     Args:
-        candidates: the tensor of each density.
-        axis: dimension along which they are stacked.
+        candidates: mode candidates or peak widths of each density.
+        axis: dimension along which the tensors are stacked.
     """
     largest_count = max(len(tensor) for tensor in candidates)
     padded = [

@@ -18,9 +18,9 @@ def class_probabilities(density: Distribution) -> Float64[Tensor, "batch class"]
     """Return p(y = k) of each sample, in [0, 1]; each row sums to 1 in float64.
 
     The probabilities are exp of log_prob at each class, in float64, divided by their sum. Before this division, the
-    sums differ from 1: by 1e-7 for a float32 log_prob, by 1e-3 if its logits reach 1e4, and by a random number if
-    log_prob of each class is estimated from draws (`estimate`). The largest probability of a mixture may exceed 1 by as
-    much.
+    sums differ from 1: by 1e-7 for a float32 log_prob, by 1e-3 if its logits reach 1e4, and by a random amount if
+    log_prob of each class is estimated from draws (`estimate`). Before the division, the largest probability of a
+    mixture may exceed 1 by the same amounts.
 
     Args:
         density: density over classes, with batch_shape (batch,); class k is the k-th of `enumerate_support`.

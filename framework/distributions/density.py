@@ -223,7 +223,7 @@ def estimate_of_sum(parts: protocol.Estimate, log_terms: Tensor, log_sum: Tensor
 
 @protocol.estimate.register
 def _(density: Mixture, value: Tensor) -> protocol.Estimate:
-    """Return the estimate of a mixture whose components draw independently; of a single component, its own estimate."""
+    """Return the estimate of a mixture whose components draw independently; for one component, the component's own."""
     several = density.split_values(value)
     if len(several) > 1:
         return concatenate_estimates([protocol.estimate(density, part) for part in several])

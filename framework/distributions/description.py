@@ -49,7 +49,7 @@ def _parameter(key: str, value: object, inner: bool) -> str:
     Args:
         key: name of the attribute.
         value: its value.
-        inner: as of `_parameters`.
+        inner: as in `_parameters`.
     """
     if key.startswith("_"):
         return ""

@@ -19,8 +19,8 @@ def highest(density: Distribution, starts: Tensor) -> Tensor:
     """Return a point (*batch, *event) where the density is at least as high as at all starting points.
 
     If the `quadratic_bound` of the density is known, the point is a local maximum, up to the rounding of log_prob and
-    unless more than STEPS steps are needed. It is not the global maximum if no ascent from the starting points leads to
-    that. If the `quadratic_bound` is not known, the point is the starting point with the highest density.
+    unless more than STEPS steps are needed. It is not the global maximum if no ascent from a starting point leads
+    there. If the `quadratic_bound` is not known, the point is the starting point with the highest density.
 
     Args:
         density: the density.

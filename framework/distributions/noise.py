@@ -14,7 +14,7 @@ from framework.storage.names import as_bytes
 
 @dataclass(frozen=True)
 class Draw:
-    """Random noise for one batch in evaluation: the draws for one quantity do not depend on which others are computed.
+    """Random noise for one batch in evaluation; the noise of a quantity does not depend on the other quantities.
 
     Attributes:
         seed: seed of the run.

@@ -22,7 +22,7 @@ WIDTH = 2.0
 The innermost panel ends 3.6 scales from its peak, and the end of each further panel is e² times as far from the peak.
 """
 REACH = 1e4
-"""Distance from the outermost peak at which integration over the real line ends, in multiples of the widest peak."""
+"""Distance from the outermost peak at which integration over the real line ends, in multiples of the largest width."""
 ROUNDS, MOST = 40, 4096
 """Largest number of times that a panel is halved, and of panels of one density that are halved at once.
 
@@ -74,7 +74,7 @@ class Panels(NamedTuple):
     high: Tensor
 
     def of(self, chosen: Tensor) -> "Panels":
-        """Return the panels that are given by `chosen`, a mask or indices."""
+        """Return the panels that `chosen`, a mask or indices, selects."""
         return Panels(*(column[chosen] for column in self))
 
     def halves(self) -> "Panels":

@@ -11,7 +11,7 @@ from framework.distributions.protocol import pick, take
 
 
 class PickedMixture(Distribution):
-    """Density of one chosen mixture for each item of a batch (*batch, K) of mixtures; only `sample` is defined.
+    """Density of one of K mixtures, chosen for each item of a batch; only `sample` is defined.
 
     Args:
         log_weights: log-weights of the J components of each mixture, (*batch, K, J), nats, normalised.
