@@ -9,7 +9,7 @@ PARTS = ("time", "x", "y", "z", "seen")
 1 if the ball was observed in the frame, and 0 if the frame is missing. The other numbers of a missing frame are 0.
 """
 GRAVITY = 9.81
-"""Acceleration of a parabola between frames or after the last one, m/s²."""
+"""Acceleration of gravity, m/s², with which positions are interpolated between frames or extrapolated after them."""
 AXES = "xyz"
 """Names of the coordinates."""
 MOST_NAMES = 10
