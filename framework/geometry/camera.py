@@ -43,8 +43,8 @@ class Camera:
     def check_shapes(self) -> None:
         """Check the shapes of `rotation`, `translation`, `focal` and `principal`.
 
-        Otherwise a wrong shape would not be noticed: a single focal length would be used for both axes, and kernels
-        would read beyond an array.
+        Without this check, a wrong shape would not be noticed: a single focal length would be used for both axes, and
+        kernels would read beyond an array.
 
         Raises:
             ValueError: one of the four has another shape; the message names both shapes.

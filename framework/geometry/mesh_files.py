@@ -1,4 +1,4 @@
-"""Parsers of mesh and cloud files, one function for each format; they never make up what a file does not hold.
+"""Parsers of mesh and cloud files, one function for each format; they never invent data that a file does not hold.
 
 Every parser takes the bytes of a file. If they are wrong, it raises a ValueError that says what it got, in which line,
 and what it expected; the caller, `geometry.meshes`, adds the name of the file. PLY has a module of its own. Comments

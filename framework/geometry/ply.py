@@ -239,7 +239,9 @@ def _lists(body: bytes, start: int, element: Element, order: str) -> tuple[Int[n
 def _locate_lists(
     body: bytes, start: int, element: Element, target_list: Property | None, order: str
 ) -> tuple[Int[np.ndarray, "items"], Int[np.ndarray, "places"]]:
-    """Return length and position of one list of each item of an element; after the last position, the end of the data.
+    """Return the lengths and the positions of the lists that the items of an element store for one property.
+
+    The position at which the data of the element end is appended to the positions.
 
     Args:
         body: bytes after the header.

@@ -10,7 +10,7 @@ from numba.core.extending import intrinsic
 from framework.storage.kernels import compiler, kernel_cache
 
 PARTS = "compiled", "lanes", "pack", "search", "processor"
-"""Names of the files whose compiled functions call each other; a change in one of them compiles all again."""
+"""Names of the files whose compiled functions call each other; after a change in one file, all are compiled again."""
 
 
 KEPT_IN = kernel_cache("nearest", (Path(__file__).with_name(f"{part}.py") for part in PARTS))

@@ -36,7 +36,7 @@ from framework.storage.threads import POOL
 
 Array = NDArray[np.floating]
 FINE, BAD_CLOUD, BAD_QUERIES, IMMODERATE = 0, 1, 2, 3
-"""Outcomes of a cloud: it was searched; it is not finite; its queries are not finite; it must be scaled first."""
+"""Outcomes for a cloud: it was searched; it is not finite; its queries are not finite; it must be scaled first."""
 QUERY_COUNT = 17
 """Index in `levels` of packed queries at which their number is stored."""
 LARGE = 2**15
@@ -62,7 +62,7 @@ class Problem(NamedTuple):
         moderate: bounds of the largest coordinate (`pack.MODERATE`).
         largest: largest coordinate of shared queries.
         distance: filled with the distance of the nearest point to each query.
-        index: filled with its row in the cloud.
+        index: filled with the row of this point in the cloud.
         outcome: filled with FINE, BAD_CLOUD, BAD_QUERIES or IMMODERATE for each cloud.
     """
 
@@ -272,7 +272,7 @@ class Results(NamedTuple):
 
     Attributes:
         distance: distance of the nearest point, (batch, queries); NaN for queries that do not exist.
-        index: its row in the cloud, (batch, queries); 0 for queries that do not exist.
+        index: row of this point in the cloud, (batch, queries); 0 for queries that do not exist.
         outcome: FINE, BAD_CLOUD, BAD_QUERIES or IMMODERATE for each cloud, (batch,).
     """
 
