@@ -22,18 +22,18 @@ EPSILON = float(np.finfo(np.float64).eps)
 LEAST_DAMPING, MOST_DAMPING = 1e-30, 1e20
 """Smallest and largest damping."""
 SLIGHT = 1e-2
-"""Damping below which a step is as good as an undamped one; less damping would not lower the cost further.
+"""Damping up to which a step is as good as an undamped one, as a multiple of the Cholesky factor's smallest pivot².
 
-The unit is the square of the smallest pivot of the Cholesky factor.
+With still less damping, a step would not lower the cost further.
 """
 QUIET = 4
-"""Number of successive steps that end a problem if their gain is negligible or less than rounding hides."""
+"""Number of successive steps that end a problem if their gain is negligible or smaller than rounding errors."""
 SINGULAR = 1e-7
 """Smallest pivot of a scaled normal matrix whose Cholesky factor still gives a step with two correct digits."""
 CLIPS = 3
 """Number of times that a step that leaves the bounds is solved again, with the parameters beyond a bound held there."""
 NEAR = 0.1
-"""Share of the cost: the minimum counts as near after a step that lowers the cost by at most this share."""
+"""Largest share of the cost by which a step lowers it if the minimum then counts as near."""
 GOES_ON, LIMIT, STEP, COST, GRADIENT = 10, 0, 3, 2, 1
 """Value of `ended`: GOES_ON for a problem that has not ended, else one of framework.least_squares.solution.Status."""
 
