@@ -70,7 +70,7 @@ def find_members(members: str | Sequence[str]) -> list[str | Path]:
     """Return the run folders, checkpoint files or MLflow run ids of the members.
 
     If `members` is a folder, the members are the runs directly in it that contain a trained model, sorted by name. If
-    it contains no such run, they are the jobs with a trained model at any depth.
+    the folder contains no such run, the members are the jobs with a trained model at any depth.
 
     Raises:
         ConfigError: There are fewer than two members.
