@@ -89,7 +89,6 @@ def refuse_idle(folder: Path, sentence: str) -> None:
 
     Other jobs of the sweep may read the setting.
 
-
     Args:
         folder: Folder of the run.
         sentence: Sentence about the setting (`framework.configuration.modes.idle_sentence`).
