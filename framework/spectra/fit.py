@@ -13,14 +13,14 @@ from framework.least_squares.solver import least_squares
 from framework.spectra.spectrum import COUNT, Misfit, Parameters
 
 CUT = 10.0
-"""Limit on the absolute value of a measured number; Z lies between 0 and about 1, so larger numbers are clipped."""
+"""Limit to which the absolute values of measured Z are clipped; true values lie between 0 and about 1."""
 DECREASE = 1e-10
-"""Share of the cost: the search ends when a step lowers the cost by less than this share.
+"""Share of the cost: the search ends when a step would lower the cost by less than this share.
 
-The last step is Newton's, after which the share that could still be gained is about the square of this one.
+The last step is Newton's. After it, a further step could lower the cost only by about the square of this share.
 """
 CAREFUL, BOLD = 1e-1, 1e-3
-"""Damping at the first step: CAREFUL from the preset's start, and BOLD from a given start near the minimum."""
+"""Damping at the first step: CAREFUL from the start values of the parameter set, BOLD from a start near the minimum."""
 DOUBTFUL = 1e-4
 """Smallest pivot with which the Cholesky factor of a scaled inverse covariance has eight correct digits."""
 LEAST_SHARE = 1e-9
