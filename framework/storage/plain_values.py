@@ -115,7 +115,7 @@ PUTS = frozenset(("PUT", "BINPUT", "LONG_BINPUT", "MEMOIZE"))
 GETS = frozenset(("GET", "BINGET", "LONG_BINGET"))
 TUPLES = frozenset(("TUPLE", "TUPLE1", "TUPLE2", "TUPLE3"))
 ADDS = {"APPEND": 1, "SETITEM": 2, "BUILD": 1, "APPENDS": 0, "SETITEMS": 0, "ADDITEMS": 0}
-"""Instructions that add values from the top of the stack to the object below these, with the number of values.
+"""Instructions that add values from the top of the stack to the object below them, with the number of values.
 
 0 means all values above the last mark, which another instruction has pushed before the values.
 """
