@@ -1,1 +1,1 @@
-"""Code that density heads of several families share."""
+"""Code that several density heads share."""
