@@ -1,1 +1,1 @@
-"""Code that uncertainty wrappers and objectives of several families share."""
+"""Code that several uncertainty wrappers and objectives share."""

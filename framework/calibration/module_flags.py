@@ -16,9 +16,9 @@ BATCH_NORM = (
 def set_flag(
     model: nn.Module, kinds: type[nn.Module] | tuple[type[nn.Module], ...], flag: str, value: bool
 ) -> Iterator[None]:
-    """Set `flag`, for example "training", to `value` on the model's modules of these kinds while the block runs.
+    """Set `flag`, for example "training", to `value` on the model's modules of these kinds inside the `with` block.
 
-    Afterwards, also after an error, each module has its own value again.
+    After the block, also after an error, each module has its own value again.
     """
     before = [(module, getattr(module, flag)) for module in model.modules() if isinstance(module, kinds)]
     try:

@@ -42,7 +42,7 @@ def predict_densities(model: Predictor, batches: Sequence[Batch]) -> list[Distri
 
 
 def require_numbers(values: Float[Tensor, "sample"], batches: Sequence[Batch], quantity: str) -> None:
-    """Refuse NaN, because the mean of numbers with NaN has no meaning.
+    """Raise an error if a value is NaN, because a mean over values with NaN has no meaning.
 
     Args:
         values: one number per sample of all batches, in order.
