@@ -13,9 +13,10 @@ from framework.storage.threads import wait_passively
 
 
 def main() -> None:
-    """Run `python -m framework`.
+    """Run the command line of `python -m framework`.
 
-    The exit code is 0, 1 (failed), 2 (refused), 129 (the terminal was closed), 130 (interrupted) or 143 (terminated).
+    The exit code is 0 for success, 1 for a failure, 2 for a command or config that is refused, 129 if the terminal was
+    closed, 130 after an interruption (Ctrl-C), and 143 after SIGTERM.
     """
     wait_passively()
     for stream in (sys.stdout, sys.stderr):

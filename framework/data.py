@@ -160,7 +160,7 @@ class Data(ABC):
         """
 
     def inputs(self, user_data: Any) -> Tensor:
-        """Return the inputs that a user gives to a trained model as a batch; works without `prepare`.
+        """Return the data that a user gives to a trained model, as a batch of inputs; works without `prepare`.
 
         The default calls `read` on files, and takes an array of inputs, or of one input, as it is. A data set overrides
         this method if it scales its inputs, or if its users have another format at hand (a table, an image).
@@ -180,7 +180,7 @@ class Data(ABC):
         return as_inputs(user_data, self.input_shape)
 
     def user_batch(self, user_data: Any) -> Batch:
-        """Return the batch that a user gives to a trained model: "input", and the fields that `frame` reads.
+        """Return the data that a user gives to a trained model, as a batch: "input", and the fields that `frame` reads.
 
         Raises:
             DataError: as in `inputs`.
@@ -196,7 +196,7 @@ class Data(ABC):
         return None
 
     def state_dict(self) -> Mapping[str, Any]:
-        """Return what `inputs` and `read` need beside the config, as plain values and tensors.
+        """Return the state that `inputs` and `read` need in addition to the config, as plain values and tensors.
 
         The checkpoint of a model that is trained on these data stores it.
         """
@@ -227,7 +227,7 @@ class Data(ABC):
 
     @abstractmethod
     def fingerprint(self) -> Mapping[str, str]:
-        """Return what identifies the data: root, version, samples per split, and a hash of names and labels."""
+        """Return entries that identify the data: root, version, samples per split, and a hash of names and labels."""
 
     @abstractmethod
     def preview(self, inputs: Tensor) -> np.ndarray:
@@ -256,7 +256,7 @@ class Mapped(ABC):
 
 
 def as_inputs(user_data: Any, shape: tuple[int, ...]) -> Tensor:
-    """Return an array, or whatever NumPy can turn into an array, as a batch of inputs of `shape`.
+    """Return an array, or an object that NumPy can convert to an array, as a batch of inputs of `shape`.
 
     One input becomes a batch of one. Clouds, of shape (points, columns), may have any number of points.
 
@@ -293,5 +293,5 @@ def as_inputs(user_data: Any, shape: tuple[int, ...]) -> Tensor:
 
 
 def _from_three_methods(data: Any) -> Splits:
-    """Return the splits of a data set of an old plugin, which has a method for each split."""
+    """Return the splits of a data set without the method `splits`, as in old plugins: it has one method per split."""
     return Splits(data.train(), data.validation(), data.test())

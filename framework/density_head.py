@@ -46,7 +46,7 @@ class DensityHead(nn.Module, ABC):
     direct: ClassVar[bool] = False
     """True if the last encoder's flattened features are the raw parameters, without a linear layer.
 
-    An example is an encoder that gives every pixel of an image. There must be `size` features.
+    An example is a head behind an encoder that returns an image. The encoder must then return `size` features.
     """
     size: int
     """Number of raw parameters that the head reads per sample, > 0; set by the constructor."""
@@ -84,14 +84,14 @@ class DensityHead(nn.Module, ABC):
 class Fitted(ABC):
     """Additional base class of a density head that is fitted to the whole training split at once, not by gradient.
 
-    Trees are an example. No linear layer precedes the head: it reads the features as they are, and its `size` is their
-    number, 0 before the fit. The encoders before it may have no trained parameters either. Its state may have any
-    shape: `load_state_dict` of a newly built head takes what is stored.
+    Trees are an example. No linear layer precedes the head: it reads the features as they are, and its `size` is the
+    number of features, 0 before the fit. The encoders before the head may not have trained parameters either. The
+    head's state may have any shape: `load_state_dict` of a newly built head accepts every stored shape.
     """
 
     @abstractmethod
     def fit(self, features: Float[Tensor, "sample size"], target: Tensor, seed: int) -> None:
-        """Fit to all training samples, in place.
+        """Fit the head to all training samples, in place.
 
         Args:
             features: features of the training split.

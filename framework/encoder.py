@@ -67,7 +67,7 @@ def require_numbers(input_shape: tuple[int, ...], by: str) -> int:
     """Return how many numbers a sample of this shape holds.
 
     Raises:
-        ConfigError: it holds none.
+        ConfigError: a sample of this shape holds no number.
     """
     length = math.prod(input_shape)
     if length == 0:
