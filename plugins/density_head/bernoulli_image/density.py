@@ -23,11 +23,11 @@ from framework.geometry.srgb import linear_from_srgb
 
 
 class BernoulliImage(Distribution):
-    """Independent numbers of an image, each 1 with its own probability and otherwise 0.
+    """Independent Bernoulli densities of the numbers of an image: each is 1 with its own probability, and 0 otherwise.
 
-    For the value y and the log-odds r of a number, log p = y log σ(r) + (1 - y) log σ(-r) with the logistic function σ.
-    A value y between 0 and 1 is read as the share of the pixel that is 1; log p is then the mean over the area of the
-    pixel. Values outside [0, 1] are clamped.
+    A number is the value of one channel of one pixel. For the value y and the log-odds r of a number, log p = y log
+    σ(r) + (1 - y) log σ(-r) with the logistic function σ. A value y between 0 and 1 is read as the share of the pixel
+    that is 1; log p is then the mean over the area of the pixel. Values outside [0, 1] are clamped.
 
     Args:
         logits: r, (*batch, height, width, number), log-odds of 1.

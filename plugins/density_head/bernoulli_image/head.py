@@ -70,7 +70,7 @@ class BernoulliImageHead(DensityHead):
         self.factor.fill_(math.exp((low + high) / 2))
 
     def _slope(self, raws: Tensor, target: Tensor, factor: float) -> float:
-        """Return the derivative of the log-likelihood by the factor f of the log-odds r: Σ r (y - σ(f r)).
+        """Return the derivative of the log-likelihood in the factor f of the log-odds r: Σ r (y - σ(f r)).
 
         y are the numbers in `target`, and σ is the logistic function. The sum is computed image by image.
         """

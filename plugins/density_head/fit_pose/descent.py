@@ -163,7 +163,7 @@ class Descent:
     def _loss(
         self, numbers: Tensor, stage: Stage, camera: Camera, aim: Tensor
     ) -> tuple[float, Float[Tensor, "number"]]:
-        """Return the loss of a stage and its gradient by the parameters `numbers`.
+        """Return the loss of a stage and its gradient with respect to the parameters `numbers`.
 
         `camera` and `aim` are the camera of the reduced image, and the given image after it was reduced and blurred.
         """
@@ -191,9 +191,10 @@ class Descent:
 
     @torch.no_grad()
     def _flow(self, numbers: Tensor, stage: Stage) -> Float[Tensor, "pixel number"]:
-        """Return the derivatives of the reduced and blurred image of a stage by every parameter, from the optical flow.
+        """Return the derivatives of a stage's image with respect to every parameter, from the optical flow.
 
-        The first dimension has one row for each of the four channels of each pixel.
+        The image of a stage is reduced and blurred. The first dimension of the result has one row for each of the four
+        channels of each pixel.
         """
         camera, body_model = self.camera, self.body_model
         rendered = self.renderer(scene_of(body_model, numbers, camera), ("color", "face"))
@@ -218,7 +219,7 @@ class Descent:
         return blur(small.view(height, width, -1), stage.blur).reshape(-1, len(numbers))
 
     def _motion(self, numbers: Tensor, vertex: Tensor) -> Float[Tensor, "vertex 2 number"]:
-        """Return the derivatives of the pixel coordinates of some vertices by every parameter.
+        """Return the derivatives of the pixel coordinates of some vertices with respect to every parameter.
 
         `vertex` holds the indices of the vertices.
         """

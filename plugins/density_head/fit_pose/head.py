@@ -23,7 +23,7 @@ from plugins.density_head.fit_pose.descent import Descent
 FLOOR, WIDEST = 1e-5, 1e9
 """Bounds on the standard deviation of a parameter."""
 SLACK = 1e-3
-"""Largest excess of an image's values over [0, 1]."""
+"""Largest distance of an image's values from the range [0, 1] that is accepted as rounding error."""
 NEEDED = frozenset(("vertices",))
 """Parts of a scene (`Renderer.differentiable`) by which the renderer must be differentiable."""
 

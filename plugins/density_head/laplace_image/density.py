@@ -24,8 +24,9 @@ from framework.geometry.srgb import linear_from_srgb
 class LaplaceImage(Symmetric):
     """Independent Laplace densities of the numbers of an image.
 
-    For a number with the value y, the location μ and the scale b, log p = -|y - μ|/b - log 2b. If b is the same for all
-    numbers, the negative log-likelihood is the L1 distance between images, up to a factor and a constant.
+    A number is the value of one channel of one pixel. For a number with the value y, the location μ and the scale b,
+    log p = -|y - μ|/b - log 2b. If b is the same for all numbers, the negative log-likelihood is the L1 distance
+    between images, up to a factor and a constant.
 
     Args:
         location: μ, (*batch, height, width, number), in sRGB as image files hold it.

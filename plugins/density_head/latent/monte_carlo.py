@@ -234,7 +234,8 @@ def _log_sums(
 ) -> Float[Tensor, "*pair replicate rows"]:
     """Return the log of the sum of `count` weights of each replicate, from the point `start` on, nats.
 
-    The sum is computed in chunks of at most `at_once` weights. If `log_weights` also returns shares, so does this.
+    The sum is computed in chunks of at most `at_once` weights. If `log_weights` also returns the logs of shares, the
+    logs of their sums are returned too, in the first dimension of size 2.
     """
     step = max(1, min(count, at_once // replicates))
     parts = []

@@ -58,9 +58,9 @@ def _log_integral(
 ) -> Tensor:
     """Return the log of the density of one angle, without the factor 1/k(λ): the integral over the other two angles.
 
-    `index` says which angle it is, as in `log_marginal`. The integral over the third angle is a Bessel function. The
-    integral over the second one is a quadrature with `count` fixed nodes or, if `count` is None, with nodes around the
-    peaks.
+    `index` says which angle it is, as in `log_marginal`; `left`, `right` and `falls` are those of its `frame`. The
+    integral over the third angle is a Bessel function. The integral over the second one is a quadrature with `count`
+    fixed nodes or, if `count` is None, with nodes around the peaks.
     """
     around = index == 1  # quadrature runs over the azimuth then, otherwise over the elevation
     log_density = _log_density(angle, left, right, falls, index)
@@ -79,7 +79,8 @@ def _log_density(
 ) -> Callable[[Tensor], Tensor]:
     """Return a function from values of the second angle, (*batch, point), to the log-density of both angles.
 
-    The density is integrated over the third angle. `angle` holds values of the angle number `index`.
+    The density is integrated over the third angle. `angle` holds values of the angle number `index`; the other
+    arguments are those of `_log_integral`.
     """
     _, i, _, k = torch.eye(4, dtype=falls.dtype, device=falls.device)
     product = quaternions.product

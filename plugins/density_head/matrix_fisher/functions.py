@@ -83,7 +83,7 @@ def log_prob(turn: Float[Tensor, "... 4"], parameter: Float[Tensor, "... 3 3"]) 
 def mean_rotation(parameter: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
     """Return the mean rotation matrix E R = U diag(d) Vᵀ, float64; differentiable once.
 
-    It is the derivative of log c(F) by F, and d is the mean of the diagonal of UᵀRV (Lee 2018, Thm. 1).
+    E R is the derivative of log c(F) with respect to F, and d is the mean of the diagonal of UᵀRV (Lee 2018, Thm. 1).
     """
     return _Mean.apply(parameter.double())
 
@@ -317,7 +317,7 @@ def _coefficients(terms: int = 20) -> dict[str, list[float]]:
 class _LogProb(Function):
     """Autograd function of the log-density.
 
-    The derivative by F is R - E R. The derivative by the quaternion is that of -Σ λᵢqᵢ².
+    The derivative with respect to F is R - E R. The derivative with respect to the quaternion is that of -Σ λᵢqᵢ².
     """
 
     @staticmethod
@@ -360,7 +360,8 @@ class _LogProb(Function):
 class _Mean(Function):
     """Autograd function of the mean rotation E R.
 
-    Its derivative by F is the covariance of the elements of R, which is nearly diagonal for the aligned rotation UᵀRV.
+    Its derivative with respect to F is the covariance of the elements of R, which is nearly diagonal for the aligned
+    rotation UᵀRV.
     """
 
     @staticmethod

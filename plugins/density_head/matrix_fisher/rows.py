@@ -1,4 +1,4 @@
-"""Contract-test cases: the matrix Fisher head, with log-densities from 60 digits and an independent quadrature."""
+"""Contract-test cases: the matrix Fisher head, with log-densities computed with 60 digits and another quadrature."""
 
 from collections.abc import Iterator
 from typing import Any

@@ -50,7 +50,8 @@ class ExtraTreesHead(DensityHead, Fitted):
 
     Args:
         trees: number of trees that are grown.
-        features: share of the features tried at each split; None: their square root for classes, all for reals.
+        features: share of the features tried at each split; None for the square root of their number if the target is a
+            class, and for all features if it is real-valued.
         leaf: smallest number of training samples of a leaf.
         depth: largest number of splits from root to leaf.
         smoothing: a; number of votes that every class has in addition.

@@ -1,4 +1,4 @@
-"""Functions that grow a forest with scikit-learn and store it in flat arrays; reading it does not need them."""
+"""Functions that grow a forest with scikit-learn and store it in flat arrays; a stored forest is used without them."""
 
 from collections.abc import Sequence
 from typing import Any

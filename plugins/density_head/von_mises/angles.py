@@ -39,7 +39,7 @@ def half_products(value: Tensor, mean: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def in_single(value: Tensor, mean: Tensor) -> bool:
-    """Return whether to compute in float32 alone: if both arguments are float32, and no compiler is active."""
+    """Return whether to compute in float32 alone: whether both arguments are float32, and no compiler is active."""
     return value.dtype == mean.dtype == torch.float32 and not torch.compiler.is_compiling()
 
 

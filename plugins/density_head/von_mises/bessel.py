@@ -1,6 +1,6 @@
 """Functions of the concentration κ of a von Mises density, computed by the polynomials in coefficients.npz.
 
-They contain the Bessel functions I0 and I1 and their quotient A(κ) = I1(κ)/I0(κ).
+The functions contain the modified Bessel functions I0 and I1 and their quotient A(κ) = I1(κ)/I0(κ).
 """
 
 from collections.abc import Sequence
@@ -28,7 +28,7 @@ def log_height(concentration: Tensor) -> Tensor:
 
 
 def height_and_deviation(concentration: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the log-density at the mean, as `log_height`, and its derivative by κ, 1 - A(κ), in one pass.
+    """Return the log-density at the mean, as `log_height`, and its derivative in κ, 1 - A(κ), in one pass.
 
     With v = 2/(κ+2) and the polynomial G(v) of the function "log_peak", the derivative is v (1/4 + v G'(v)/2).
     """

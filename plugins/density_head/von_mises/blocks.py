@@ -12,8 +12,8 @@ BLOCK = 2**16
 def in_blocks(function: Callable[..., tuple[Tensor, ...]], *arguments: Tensor) -> tuple[Tensor, ...]:
     """Return `function(*arguments)` for an elementwise function, computed block by block on the CPU.
 
-    It is computed at once, without blocks, in compiled code, on other devices, for at most BLOCK elements, and for
-    arguments of different shapes.
+    No blocks are used in compiled code, on other devices, for at most BLOCK elements, and for arguments of different
+    shapes.
     """
     first = arguments[0]
     if (

@@ -42,7 +42,7 @@ def log_prob(value: Tensor, mean: Tensor, concentration: Tensor) -> Tensor:
 
 
 def log_prob_and_slopes(value: Tensor, mean: Tensor, concentration: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return log p, nats, its derivative by the mean and its derivative by κ, in one pass.
+    """Return log p, nats, and its derivatives with respect to the mean and to κ, in one pass.
 
     The derivatives are κ sin(φ-μ) and 1 - A(κ) - 2 sin²((φ-μ)/2). All arguments have the same dtype, and the results
     have no gradient. Autograd on `log_prob` gives the same derivatives. But a compiler turns `log_prob` and its
@@ -167,9 +167,9 @@ def _value_and_slopes(value: Tensor, mean: Tensor, concentration: Tensor) -> tup
 
 
 def slope(value: Tensor, mean: Tensor, concentration: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return log p, its derivative by φ, -κ sin(φ-μ), and the negative of its second derivative, κ cos(φ-μ).
+    """Return log p, its derivative -κ sin(φ-μ), and its negative second derivative κ cos(φ-μ).
 
-    φ is `value`. The results have no gradient.
+    The derivatives are with respect to φ, which is `value`. The results have no gradient.
     """
     square, product = half_products(value, mean)
     log_prob = log_height(concentration) - concentration * (2 * square)
@@ -215,7 +215,7 @@ class _LogProb(Function):
 
 
 class _LogPeak(Function):
-    """Autograd function of the log-density at the mean, whose derivative by κ is 1 - A(κ)."""
+    """Autograd function of the log-density at the mean, whose derivative with respect to κ is 1 - A(κ)."""
 
     @staticmethod
     def forward(ctx: Any, concentration: Tensor) -> Tensor:

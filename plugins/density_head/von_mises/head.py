@@ -31,7 +31,7 @@ class VonMisesHead(DensityHead):
     With `concentration="predicted"` the head reads (cos, sin, r) per angle and trains by likelihood (eq. 3.7), with κ =
     |(cos, sin)| g(r). The scale g(r) stays above a quarter. The pair (cos, sin) times g(r) is the density's natural
     parameter κ (cos μ, sin μ), so that the uniform density needs no special case. If the pair were normalised, as in
-    eq. 3.1, and κ were g(r), the gradients by the pair and by r would vanish with κ. A network that cannot predict an
+    eq. 3.1, and κ were g(r), the gradients in the pair and in r would vanish with κ. A network that cannot predict an
     angle at first would then never learn it (README).
 
     With "fixed" it reads (cos, sin) and trains with κ = 1, which is the cosine loss of Biternion networks up to

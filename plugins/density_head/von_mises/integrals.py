@@ -109,7 +109,7 @@ def interval(mass: Tensor, mean: Tensor, concentration: Tensor) -> tuple[Tensor,
 
 
 def _one_side(sine: Tensor, cosine: Tensor, concentration: Tensor, within: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the probability of an arc on one side of the mean, and its derivative by κ.
+    """Return the probability of an arc on one side of the mean, and its derivative in κ.
 
     Angles are distances from the mean, in [0, π]. The arc begins at b = 0 and ends at t where `within` is true;
     elsewhere it begins at b = t and ends at π. The density at b is factored out. So the integrand at the angle b + s is

@@ -117,8 +117,8 @@ def _in_ball(lattice: Callable[[int], np.ndarray], cell: float, count: int) -> n
         count: number of points in the ball.
 
     Raises:
-        ConfigError: for every tried position of the ball's centre, the points number `count` and `count` + 1 by
-            distance are equally far from the centre, up to rounding.
+        ConfigError: no tried centre of the ball allows exactly `count` points, because the point number `count` in
+            order of distance from the centre and the next point are equally far from it, up to rounding.
     """
     radius = (3 * count * cell / (4 * math.pi)) ** (
         1 / 3

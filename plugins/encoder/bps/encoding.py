@@ -94,7 +94,7 @@ def encode(
     *,
     rotation_invariant: bool = False,
 ) -> Encoding:
-    """Return the requested features of the point of each cloud that is nearest to each basis point.
+    """Return the requested features: for each basis point, those of the nearest point of each cloud.
 
     "distance" is the distance of the nearest point from the basis point (eq. 6.4). "delta" is the vector from the basis
     point to the nearest point (eq. 6.5). "color", "normal" or the name of a column are attributes of the nearest point,

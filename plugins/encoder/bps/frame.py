@@ -14,7 +14,7 @@ LARGEST_NORM = 1 + 1e-6
 Outliers of a robust normalisation have larger norms.
 """
 EIGENVALUE_GAP = 1e-9
-"""Difference below which eigenvalues, in units of the largest, are equal, so that their axes have no derivative.
+"""Difference of eigenvalues, in units of the largest, below which they count as equal and have no derivative of axes.
 
 An eigenvalue smaller than this share of the largest counts as 0: a cloud thinner than 3e-5 of its length is flat.
 """

@@ -25,8 +25,8 @@ class DenseBlocks(Encoder):
         standardise: whether each feature is first brought to mean 0 and deviation 1, by the moments over all training
             batches (during training by those of the current batch). Without standardisation, training takes many times
             longer if the features hardly vary around their mean.
-        batch_norm: whether layers normalise over the batch. With this or `standardise`, training needs batches of at
-            least two.
+        batch_norm: whether layers normalise over the batch. With `batch_norm` or `standardise`, training needs batches
+            of at least two samples.
         bottleneck: length of an additional last linear layer without activation, and so of the features; None for no
             such layer. A short last layer makes the linear layer that follows it smaller and faster in proportion,
             which matters for a density head with very many distribution parameters.

@@ -1,4 +1,4 @@
-"""Occupancy grids: the thesis's baseline for basis point sets that divides space into cells."""
+"""Occupancy grids of point clouds, one of the encodings with which the thesis compares basis point sets."""
 
 from typing import Annotated
 

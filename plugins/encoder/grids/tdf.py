@@ -1,4 +1,4 @@
-"""Truncated distance fields: the thesis's baseline for basis point sets that stores a local distance per cell."""
+"""Truncated distance fields of point clouds, with which the thesis compares basis point sets."""
 
 import itertools
 import math

@@ -54,7 +54,7 @@ The distance is 1 for the published radius of 0.2.
 
 
 class PointNet2(Encoder):
-    """A PointNet on small balls of points, one on larger balls around fewer centroids, and one on the whole cloud.
+    """Three PointNets in sequence: on small balls of points, on larger balls around fewer points, on the whole cloud.
 
     Centroids are points that are as far as possible from each other; the first one is the farthest from the mean of the
     cloud (`framework.geometry.farthest`). A ball is described by the positions of its points relative to the centroid

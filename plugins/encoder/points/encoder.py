@@ -1,4 +1,4 @@
-"""The points themselves, an equal number of each cloud."""
+"""An encoder whose features are points of the cloud, the same number for each cloud."""
 
 from typing import Annotated
 

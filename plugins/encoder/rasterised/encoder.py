@@ -40,7 +40,7 @@ class Picture:
 
     Attributes:
         height, width: size of the image, pixels.
-        ground: whether a single channel, the share of a pixel that the mesh leaves free, replaces the colours.
+        ground: whether a single channel replaces the colours: the share of each pixel that the mesh does not cover.
         depth: whether there is a further channel, 0 at `nearest` and 1 at `farthest` and beyond.
         nearest, farthest: range of the depth channel, metres from the camera.
     """
@@ -55,7 +55,7 @@ class Picture:
 
 @dataclass(frozen=True, kw_only=True)
 class MeshSettings:
-    """Settings of the mesh whose vertices are the input; they have the names and meanings of those of `human_scans`.
+    """Settings of the mesh whose vertices are the input, named as in `data=human_scans`.
 
     Attributes:
         topology: name of the mesh topology.
@@ -81,7 +81,8 @@ class Rasterised(Encoder):
         input_shape: (points, columns).
         input_columns: names of the columns, if the data name them.
         renderer: renderer that draws the mesh.
-        textures: `human_scans` with the textures of all subjects in the data; None to draw the vertex colours.
+        textures: the data plugin `human_scans`, whose folder holds the textures of all subjects in the data; None to
+            draw the vertex colours.
         picture, mesh: settings of the image and of the mesh.
 
     Raises:

@@ -18,9 +18,9 @@ Precision = Literal["auto", "float32", "bfloat16"]
 WHITE = 6.0
 """Factor in the colours sigmoid(WHITE (1 + raw)), where raw is the output of the last convolution.
 
-A raw output of 0 is white up to 0.6 of 255, -1 is grey, -2 is black. An empty image is therefore white before training,
-also in regions far from a subject, from which training learns nothing. Steps of usual size change a colour away from
-white.
+A raw output of 0 gives white with an error of 0.6/255, -1 gives grey, and -2 gives black. An empty image is therefore
+white before training, also in regions far from a subject, from which training learns nothing. Optimiser steps of usual
+size still suffice to change a colour.
 """
 EMPTY_LOG_SCALE = -5.0
 """Initial value of the logarithms of scales: a scale of 0.007, near the error of an untrained network's white.

@@ -125,9 +125,9 @@ def _intervals(density: Distribution, edges: Tensor) -> Tensor | None:
 
 
 def _arcs(density: Distribution, edges: Tensor) -> Tensor:
-    """Return the probabilities of the arcs from each edge to the next.
+    """Return the probabilities of the arcs from each edge to the next, (*batch, edge).
 
-    They are infinite for densities that are too narrow for the grid on which probabilities are computed.
+    A density that is too narrow for the grid on which probabilities are computed gets infinity, a mark for the caller.
     """
     shape = torch.Size((len(edges), *density.batch_shape))
     start, end = (

@@ -93,8 +93,8 @@ def boundary(
 def are_separate(depth, other_depth, footprint):
     """Return whether two neighbouring pixels may show separate surfaces.
 
-    They may if their depths differ by more than the width of a pixel at the farther of the two depths, or if one of
-    them shows the background.
+    The surfaces may be separate if their depths differ by more than the width of a pixel at the farther of the two
+    depths, or if one pixel shows the background.
 
     Args:
         depth: depth at one pixel, metres; infinite for background.
@@ -113,8 +113,8 @@ def are_separate(depth, other_depth, footprint):
 def find_edge(screen, faces, adjacent, index, goal, pixels):
     """Find the edge between two neighbouring pixels at which the nearer surface ends.
 
-    The surface is followed face by face, from the pixel that shows it to the other pixel. It ends at an edge without a
-    neighbouring face, or with a neighbouring face that faces away.
+    The surface is followed face by face, from the pixel that shows it to the other pixel. It ends at an edge that has
+    no neighbouring face, or whose neighbouring face is seen from its other side.
 
     Args:
         screen: see `raster`.

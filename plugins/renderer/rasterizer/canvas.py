@@ -46,7 +46,7 @@ class Corners:
 
     Attributes:
         array: (faces, 3) int32; meaningless if an index does not fit int32, which `largest` shows.
-        largest: largest index; a negative index counts as larger than any array.
+        largest: largest index; a negative index, read as an unsigned integer, exceeds the length of any array.
     """
 
     def __init__(self, indices: np.ndarray) -> None:

@@ -33,7 +33,7 @@ class Material:
         color: linear RGB; None if the file gives no colour. The stored numbers count as linear, as Blender writes them.
         texture: path of the texture file as it stands in the MTL file.
         library: the MTL file.
-        wrap: rule for texture coordinates beyond the texture's starts.
+        wrap: rule for texture coordinates beyond the texture's edges.
     """
 
     color: Float[np.ndarray, "3"] | None = None

@@ -83,8 +83,8 @@ def join_parts(parts: Sequence[Part], up: Axis, notes: Sequence[str] = ()) -> Su
         notes: sentences about elements of the file that are left out; repeated sentences are kept once.
 
     Raises:
-        DataError: there are no faces, a coordinate is not finite or too large, or textures continue beyond their edges
-            in different ways.
+        DataError: there are no faces, a coordinate is not finite or too large, or two textures need different wrap
+            rules.
     """
     parts = [part for part in parts if len(part.faces)]
     if not parts:
@@ -133,7 +133,7 @@ def _has_one_color(part: Part) -> bool:
 
 
 def _find_wrap(parts: Sequence[Part]) -> Wrap:
-    """Return the wrap rule of all textures; only parts with uv beyond their texture's edges need a certain rule."""
+    """Return a wrap rule that suits all textures; the rule matters only for uv beyond the edges of a texture."""
     stated: set[Wrap] = set()
     needed: set[Wrap] = set()
     for part in parts:

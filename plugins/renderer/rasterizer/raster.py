@@ -11,6 +11,9 @@ Arrays:
         vertex that cannot be drawn; column and row in 1/256 pixel, not rounded.
     depth, face, mask: (height, width) float32, int32, bool; depths are computed from rounded corners.
     box: first row, last row + 1, first column, last column + 1 of the pixels that may show a face.
+    rotation, translation: (3, 3) and (3,), from world to camera coordinates.
+    focal, principal: (fx, fy) and (cx, cy), pixels.
+    near: distance of the near plane from the camera, metres.
 
 If an argument is None, the code that uses it is not compiled. `no_type_check` prevents the type checker of the tests
 from wrapping a kernel before it is compiled.
@@ -103,7 +106,7 @@ def is_out_of_view(vertices, rotation, translation, focal, principal, near, heig
 @compiled
 @no_type_check
 def project(vertices, rotation, translation, focal, principal, near, camera_points, screen):
-    """Fill `camera_points` and `screen` from world coordinates.
+    """Fill `camera_points` and `screen` from the world coordinates `vertices`, (vertices, 3), metres.
 
     Return the number of finite vertices that the near plane cuts off.
     """

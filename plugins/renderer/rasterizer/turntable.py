@@ -31,9 +31,10 @@ UPRIGHT = {
     "y": torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]], dtype=torch.float64),
     "z": torch.eye(3, dtype=torch.float64),
 }
-"""Rotation of a scene's axes, by the axis that points upwards, after which z points upwards.
+"""Rotations that make z the upward axis of a scene, by the axis that points upwards before the rotation.
 
-The scene's front, which looks towards z if y points upwards and towards -y if z does, then looks towards -y.
+The front of a scene looks towards z if y points upwards, and towards -y if z does. After the rotation it looks towards
+-y.
 """
 IMAGE = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64).diag()
 """Rotation from a viewer's axes (x right, y up, z backwards) to a camera's axes."""

@@ -38,8 +38,8 @@ class SMPLpix(Renderer):
 
     Args:
         checkpoint: folder of a run, its model.ckpt, or an MLflow run id.
-        paths: files and folders of the run's configuration; the stored ones are used only if they are repeated here, as
-            `renderer.paths={encoder: {rasterised: {body: ...}}}`.
+        paths: files and folders that the run's configuration names. A path that is stored in the checkpoint is used
+            only if it is repeated here, as in `renderer.paths={encoder: {rasterised: {body: ...}}}`.
         precision: number type of evaluation, as in `encoder=unet`; "trained" for the run's setting.
         crop: margin in pixels; the image is computed only in the subject's bounding box plus this margin. "whole"
             computes the whole image; "trained" uses the run's setting.

@@ -64,7 +64,7 @@ class SideBySide(nn.Module):
 
         Args:
             most: largest norm of a member's gradient.
-            beside: one further module for each member, whose gradient belongs to the member's.
+            beside: one further module for each member, whose gradient counts as a part of the member's gradient.
         """
         gradients = [gradient.grad for gradient in self.parameters() if gradient.grad is not None]
         further = [
