@@ -149,7 +149,7 @@ class Heads(Data):
 def halves(samples: Sequence[Labelled]) -> tuple[list[Labelled], list[Labelled]]:
     """Return the two halves of the published test set, for validation and for the test.
 
-    They are chosen at random, as in the thesis authors' code.
+    The images of each half are chosen at random, as in the thesis authors' code.
     """
     order = np.random.RandomState(SPLIT_SEED).choice(len(samples), len(samples), replace=False)
     shuffled = [samples[index] for index in order]

@@ -37,7 +37,8 @@ ERROR = 0.0015
 class Scan:
     """Mesh of a dressed person, which the photographs show.
 
-    It consists of the body's sheet with clothes and short hair, and of separate surfaces for a skirt and long hair.
+    The mesh consists of the body's sheet with clothes and short hair, and of separate surfaces for a skirt and long
+    hair. The sheet is the mesh of the body whose edges are split in the middle (`framework.bodies.topologies.Sheet`).
 
     Attributes:
         vertices: positions, metres.
@@ -52,9 +53,9 @@ class Scan:
 
 @dataclass(frozen=True)
 class RegisteredBody:
-    """The smooth body registered to a scan, with a position and a colour for every vertex of the sheet.
+    """The smooth body registered to a scan, with a position and a colour for every vertex of the body's sheet.
 
-    Each topology uses some of these vertices.
+    The mesh of a topology uses some of these vertices.
 
     Attributes:
         vertices: positions, metres.

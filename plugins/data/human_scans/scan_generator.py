@@ -92,7 +92,7 @@ class Person(NamedTuple):
 
 
 class Crowd:
-    """All generated people of a data set; each depends only on the settings, the seed, the split and a number in it."""
+    """All generated people of a data set; a person depends only on the settings, the seed, the split and a number."""
 
     def __init__(self, renderer: Renderer, counts: Mapping[str, int], drawing: Drawing, seed: int) -> None:
         self.renderer, self.counts, self.drawing, self.seed = renderer, dict(counts), drawing, seed

@@ -1,4 +1,4 @@
-"""Contract-test cases: generated CAD models, a folder of pieces of land, and an archive of small objects."""
+"""Contract-test cases: generated CAD models, a folder of meshes and clouds, and an archive of small objects."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,7 +9,7 @@ from framework.testing.rows import DAMAGES, DataRow
 from framework.testing.sample_files import meshes, surface, write_off
 
 DETECTED = ("empty", "cut", "garbage", "folder")
-"""Kinds of damage that the data set detects; it cannot detect a missing file, without which the set is smaller."""
+"""Kinds of damage that the data set detects; a missing file is not detected, because the other files are valid."""
 MODELS = {"train_models": 3, "test_models": 1, "points": 20, "classes": ["bowl", "cone", "stool"]}
 CLASSES = ("building", "car", "tree")
 SEEDS = {"data_seed": 1, "generator_seed": 1}

@@ -1,6 +1,6 @@
 """`python -m plugins.data.registration.correspond <run> [<FAUST>]` writes results for the challenges of FAUST.
 
-Without a folder people are generated in FAUST's layout (synthetic), whose true correspondences are known.
+Without a folder, synthetic people are generated in FAUST's layout; their true correspondences are known.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""Base class of the data sets of bodies: clouds normalised robustly, with all vertices of a mesh in the same frame."""
+"""Base class of the data sets of bodies: robustly normalised clouds, and the vertices of a mesh in the same frame."""
 
 from abc import abstractmethod
 from collections.abc import Sequence
@@ -24,9 +24,10 @@ from framework.target import Target
 class Bodies(Data):
     """Scans of bodies, whose target is every vertex of a registered mesh.
 
-    Inputs are clouds around the origin, normalised robustly (geometry.clouds). Targets are in the same frame: x, y, z
-    of vertex 0, then of vertex 1, and so on. "centre" (batch, 3) and "scale" (batch,), metres, are the inverse of the
-    normalisation. A subclass adds its constructor, its citation, `prepare`, `fingerprint` and `cloud`.
+    Inputs are clouds around the origin, with the robust normalisation of `framework.geometry.clouds`. Targets are in
+    the same frame: x, y, z of vertex 0, then of vertex 1, and so on. The batch fields "centre" (batch, 3) and "scale"
+    (batch,), metres, undo the normalisation: a point p lies at centre + scale · p. A subclass adds its constructor, its
+    citation, `prepare`, `fingerprint` and `cloud`.
     """
 
     suffixes = tuple(READERS)

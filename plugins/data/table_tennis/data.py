@@ -59,7 +59,7 @@ class TableTennis(Data):
         forget: Share of the observed frames that are hidden at random from each training window.
         unreadable: Treatment of files that cannot be read. "error" refuses them, "skip" leaves them out.
         times_in: Unit of the times in the files.
-        writing: How CSV files are written.
+        writing: Notation of the CSV files: separator, decimal sign and the like.
         simulation: Settings of the simulated flights.
         constants: Constants of the simulated ball and table.
     """

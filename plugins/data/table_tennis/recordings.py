@@ -73,7 +73,7 @@ def flights_of(
         file: The file.
         step: Configured seconds between two frames.
         times_in: Unit of the times in the file.
-        writing: How a CSV file is written.
+        writing: Notation of a CSV file; None for the default.
 
     Raises:
         DataError: The file is damaged, or times or positions of a flight are wrong; the message names the place.

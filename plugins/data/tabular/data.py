@@ -49,7 +49,7 @@ class Tabular(Data):
         missing: Treatment of rows without a number or a label. "error" refuses them, "skip" leaves them out.
         small_angles: Whether angles in degrees may all lie within ±2π; by default this is refused, because such angles
             look like radians.
-        writing: How the file, and further files for prediction, are written.
+        writing: Notation of the file, and of further files for prediction: separator, decimal sign and the like.
     """
 
     bibtex = "tabular"

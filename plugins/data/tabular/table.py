@@ -141,7 +141,7 @@ def load(
         file: The CSV file.
         question: The settings of the data set.
         trained: Input columns of a trained model; None to fit the scaling to the training rows of this table.
-        writing: How the file is written.
+        writing: Notation of the file; None for the default.
         small_angles: Whether angles in degrees may all lie within ±2π.
 
     Raises:

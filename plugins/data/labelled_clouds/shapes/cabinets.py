@@ -18,7 +18,7 @@ def fronts(
 ) -> list[Solid]:
     """Return the fronts of drawers or doors in `rows` rows and `columns` columns, most of them with handles.
 
-    Together they fill `width` × `height`; `at` is the middle of the lower edge of this area on the cabinet's front.
+    Together the fronts fill an area of `width` × `height`; `at` is the middle of the lower edge of this area.
     """
     x, y, z = at
     wide, tall = width / columns, height / rows

@@ -11,7 +11,7 @@ Random = np.random.Generator
 def legs(random: Random, width: float, depth: float, height: float, thick: float) -> Solid:
     """Return four legs of length `height` and thickness `thick` below a top of `width` × `depth`.
 
-    They are straight or splayed, and square or round.
+    The legs are straight or splayed, and square or round.
     """
     inset = random.uniform(0.5, 1.6) * thick
     x, y = width / 2 - inset, depth / 2 - inset

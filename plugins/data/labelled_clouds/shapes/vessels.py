@@ -39,7 +39,7 @@ def smooth_profile(random: Random, controls: Sequence[Point], steps: int = 14) -
 def ear(reach: Number, low: Number, high: Number, out: Number, thick: Number) -> Solid:
     """Return a handle on the side x > 0 of a vessel of radius `reach`, between the heights `low` and `high`.
 
-    `out` is its distance from the vessel, and `thick` the radius of its tube.
+    `out` is the distance of the handle from the vessel, and `thick` the radius of its tube.
     """
     bend = np.linspace(math.radians(-80), math.radians(80), 9)
     middle, tall = (low + high) / 2, (high - low) / 2
@@ -55,7 +55,7 @@ def leaves(
     Args:
         random: Source of all random numbers.
         count: Number of stems.
-        start: The point.
+        start: The point (x, y, z) from which the stems grow.
         spread: Largest horizontal distance of a tip from the point.
         tall: Largest height of a tip above the point.
         long: Typical length of a leaf.
@@ -75,7 +75,7 @@ def leaves(
 def fronds(random: Random, count: int, start: Point, reach: Number, tall: Number) -> list[Solid]:
     """Return `count` long leaves that rise from the point `start` and bend over, like those of a palm or of grass.
 
-    `reach` is their largest horizontal extent, and `tall` determines their height.
+    `reach` is the largest horizontal extent of the leaves, and `tall` determines their height.
     """
     x, y, z = start
     parts = []
