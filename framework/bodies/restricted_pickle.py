@@ -1,10 +1,10 @@
 """Reader of arrays from pickles that calls no function named in a pickle.
 
 A pickle is a program: it names functions of any installed module and calls them. This module uses the standard library
-only to split it into its instructions, and interprets only the few instructions that arrays need. A name becomes an
-inert record of itself and of its arguments. Records of an array, a sparse matrix or a wrapped array are then converted
-to plain arrays; any other name is refused before that. Pickles of Python 2 (text as latin-1) and of every protocol are
-read.
+only to split a pickle into its instructions, and interprets only the few instructions that arrays need. A name becomes
+an inert record of the name and of its arguments. Records of an array, a sparse matrix or a wrapped array are then
+converted to plain arrays; any other name is refused before that. Pickles of Python 2 (text as latin-1) and of every
+protocol are read.
 
 The cost of a file is bounded by its size: the number of instructions, the depth of nesting, and the size of arrays,
 which may not exceed the data in the file. Sparse matrices are an exception: they become dense, and the number of
@@ -83,7 +83,8 @@ class _Record:
 def load(content: bytes) -> Any:
     """Return the content of a pickle.
 
-    It consists of None, numbers, text, bytes, lists, tuples, dictionaries and arrays; sparse matrices become arrays.
+    The content consists of None, numbers, text, bytes, lists, tuples, dictionaries and arrays; sparse matrices become
+    arrays.
 
     Raises:
         PickleRefused: the pickle names anything else, holds arrays of objects, or is damaged.
