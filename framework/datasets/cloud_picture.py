@@ -22,8 +22,9 @@ def draw_cloud(
 ) -> UInt8[np.ndarray, "side side 3"]:
     """Draw a point cloud in orthographic projection from obliquely above, z up, on white.
 
-    Nearer points hide farther ones and are darker. Rows that are not finite (padding) are left out. Points are drawn in
-    their own colours if `columns`, the names of the cloud's columns, includes the colours.
+    Nearer points hide farther ones. If `columns`, the names of the cloud's columns, includes the colours, points have
+    their own colours, darkened with the distance; otherwise nearer points are darker. Rows that are not finite
+    (padding) are left out. The image has `side` × `side` pixels.
     """
     table = cloud.detach().cpu().double().numpy()
     table = table[np.isfinite(table[:, :3]).all(1)]
