@@ -238,7 +238,8 @@ class _Reader:
     def _fold_batch_norm(self, source: Signal, arguments: Any) -> Signal:
         """Fold batch norm, (x - mean) / √(variance + ε) * weight + bias, into a neighbouring layer.
 
-        It is folded into the layer before it if no other node reads that layer, and otherwise into the layer after it.
+        Batch norm is folded into the layer before it if no other node reads that layer, and otherwise into the layer
+        after it.
         """
         mean, variance = (self.numbers[arguments[index].name] for index in (3, 4))
         scale = self._parameter(arguments, 1, np.ones_like(mean)) / np.sqrt(variance + arguments[7])
@@ -282,9 +283,9 @@ class _Reader:
 def affine_logits(head: DensityHead) -> tuple[np.ndarray, np.ndarray] | None:
     """Return matrix (size, class) and constant (class,) of a head whose density is softmax(raw @ matrix + constant).
 
-    They are computed in float64 from the head's densities for the raw parameters 0 and each unit vector, and checked
-    with random raw parameters of several magnitudes. So no head has to declare them. The function returns None for any
-    other head, whose density torch computes.
+    Matrix and constant are computed in float64 from the head's densities for the raw parameters 0 and each unit vector,
+    and checked with random raw parameters of several magnitudes. So no head has to declare them. The function returns
+    None for any other head, whose density torch computes.
     """
     if head.size > MOST_RAW:
         return None
