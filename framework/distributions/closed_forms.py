@@ -58,8 +58,9 @@ def _(density: Independent, index: int) -> Distribution:
 def _change_parameters(density: Distribution, change: Callable[[Tensor], Tensor]) -> Distribution | None:
     """Return a torch density with `change` applied to each of its parameters; None if they are not known.
 
-    They are known if event_shape is () and every argument of the constructor is a tensor with one number for each item
-    of the batch. They are not known for a mixture or a transformed density, whose arguments are other densities.
+    The parameters are known if event_shape is () and every argument of the constructor is a tensor with one number for
+    each item of the batch. They are not known for a mixture or a transformed density, whose arguments are other
+    densities.
     """
     kind: Any = next(base for base in type(density).__mro__ if getattr(torchs, base.__name__, None) is base)
     names = {*inspect.signature(kind.__init__).parameters} - {"self", "validate_args"}
