@@ -74,10 +74,11 @@ def mean(numbers: Mapping[str, object], key: str, runs: object) -> Mean:
 def least_significant(means: Sequence[Mean]) -> Float[np.ndarray, "means means"]:
     """Return for each pair of means the smallest significant difference, (means, means).
 
-    It is the quantile of Student's t times the standard error of the difference, with the degrees of freedom of B. L.
-    Welch (1947), "The generalization of 'Student's' problem when several different population variances are
-    involved", Biometrika 34, 28-35. It is NaN if a standard error is not known, or if one standard error was computed
-    over runs and the other over the samples of a single run, which does not include the differences between runs.
+    The smallest significant difference is the quantile of Student's t times the standard error of the difference, with
+    the degrees of freedom of B. L. Welch (1947), "The generalization of 'Student's' problem when several different
+    population variances are involved", Biometrika 34, 28-35. It is NaN if a standard error is not known, or if one
+    standard error was computed over runs and the other over the samples of a single run, which does not include the
+    differences between runs.
     """
     from scipy.special import stdtrit
 
