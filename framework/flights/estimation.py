@@ -89,8 +89,8 @@ def estimate_states(
 ) -> Estimate:
     """Return the most likely state of each flight.
 
-    It is found by least squares with Cauchy's loss, and with the prior as further residuals. Cauchy's loss c²/2 log(1 +
-    (r/c)²) of a residual r is half the square of c √log(1 + (r/c)²) (Holland & Welsch 1977).
+    The state is found by least squares with Cauchy's loss, and with the prior as further residuals. Cauchy's loss c²/2
+    log(1 + (r/c)²) of a residual r is half the square of c √log(1 + (r/c)²) (Holland & Welsch 1977).
 
     Args:
         frames: the observed frames.
