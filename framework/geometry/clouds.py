@@ -182,7 +182,7 @@ def _compiled(clouds: Tensor, counts: Tensor) -> NormalisedClouds:
 def _composed(clouds: Tensor, how: Normalisation, counts: Tensor) -> NormalisedClouds:
     """Return the normalised clouds, computed by differentiable tensor operations on any device."""
     _, points, columns = clouds.shape
-    real = None  # a mask of the points, where there is padding
+    real = None  # mask of the rows that hold points; None if no cloud is padded
     if not bool((counts == points).all()):
         real = point_mask(clouds, counts)[..., None]
     coordinates = clouds[..., :3].double()

@@ -331,7 +331,7 @@ def search_batch(
         return results
     threads = (
         1 if points * query_count * batch < 2**20 else min(threads, batch)
-    )  # starting a thread takes as long
+    )  # starting a thread takes as long as the search of fewer pairs
     limit = max(1, AT_ONCE // (points + query_count))
     step = min(limit, max(1, batch // (TURNS * threads)))
     counter = np.zeros(1, np.int64)

@@ -296,10 +296,11 @@ def search(packed, packets, begin, end, distance, index):
     sides = packets.box.shape[0] // 6
     zero, infinite, nothing = splat(real(0)), splat(real(np.inf)), splat(np.int32(0))
     bests, leaves = np.empty(16, box.dtype), np.empty(16, np.int32)
-    near = np.empty(8 * 256, box.dtype)  # of a node's 16 children from 16 queries, at each level
+    # squared distances of a node's 16 children from 16 queries, at each level
+    near = np.empty(8 * 256, box.dtype)
     opened, opened_alone = np.empty(16, np.int64), np.empty(16, np.int64)
     gaps = np.empty(8 * LANES, box.dtype)
-    guess = np.zeros(16, np.int64)  # positions of points, from the packet before
+    guess = np.zeros(16, np.int64)  # positions of the nearest points of the previous packet
     for packet in range(begin, end):
         packet_start = 64 * packet
         query = (
