@@ -135,8 +135,8 @@ def _leave_process_group() -> None:
 def _cache_features(session: Session) -> Data:
     """Return the session's data with precomputed features as inputs; the data unchanged if that is not possible.
 
-    It is possible if the first encoders have fixed features, the data are not augmented, and the features fit into
-    memory.
+    Features can be precomputed if the first encoders have fixed features, the data are not augmented, and the features
+    fit into memory.
     """
     predictor, data = session.predictor, session.data
     if not isinstance(predictor, FrozenFrontEnd) or data.varies or not fits(data, predictor.features):
