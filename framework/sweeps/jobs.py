@@ -39,11 +39,11 @@ log = logging.getLogger(__name__)
 class Job:
     """One job of a sweep.
 
-    The record of a job, job.json, has number, overrides, key and config as below. It also has command, pid, tries,
-    started and ended (seconds since 1970, of the last try), processor_seconds, error and status. The processor time
-    covers all tries, threads and processes of the job; it is null if the sweep was killed during one of the tries. The
-    status is "queued", "running", "completed", "failed" (the job exited with an error) or "died" (it was killed, or
-    stopped by a signal).
+    The record of a job, job.json, has number, overrides, key and config as below. The record also has command, pid,
+    tries, started and ended (seconds since 1970, of the last try), processor_seconds, error and status. The processor
+    time covers all tries, threads and processes of the job; it is null if the sweep was killed during one of the tries.
+    The status is "queued", "running", "completed", "failed" (the job exited with an error) or "died" (the job was
+    killed, or stopped by a signal).
 
     Attributes:
         number: Number of the job in the sweep.
