@@ -17,11 +17,11 @@ from framework.testing.wrappers import Build, in_units, inputs, wrapped_models
 from framework.uncertainty import Uncertainty
 
 SPREADS = {"calibrated": 1.0, "overconfident": 3.0, "underconfident": 0.3}
-"""Kind of model → ratio of the distances from the mode, of targets to draws from the model's densities."""
+"""Kind of model → factor by which targets lie farther from the mode than draws from the model's densities."""
 ROWS = 200
 """Number of samples of the validation data and of the new data."""
 UNEVEN = ((50, 0.5), (50, 2.0), (30, 1.0), (4, 8.0))
-"""Number of samples of each batch, and ratio of distances from the mode of its targets (see SPREADS)."""
+"""Number of samples of each batch, and factor on the distances of its targets from the mode (as in SPREADS)."""
 FAR = 8.0
 """Factor on the inputs, so that models with different weights predict locations far from each other."""
 
@@ -123,8 +123,8 @@ class Calibration:
     def use_of_all_rows(self, worst: Worst) -> None:
         """Check that the calibrated densities do not depend on how the validation samples are passed.
 
-        They are passed in batches, in batches in reverse order, as one batch, and by an iterator that can be read only
-        once. The error is the mean difference of log-densities, nats.
+        The samples are passed in batches, in batches in reverse order, as one batch, and by an iterator that can be
+        read only once. The error is the mean difference of log-densities, nats.
         """
         uneven = [
             self.draw_batch(self.target, rows, spread, 3 + at) for at, (rows, spread) in enumerate(UNEVEN)
@@ -168,8 +168,8 @@ class Calibration:
 def draw_spread(density: Distribution, factor: float) -> Tensor:
     """Return one target for each item of the batch: a draw from the density, moved away from the mode.
 
-    Its distance from the mode is multiplied by `factor`. For classes the target is a draw from the probabilities
-    p^(1/factor), normalised.
+    The distance of the draw from the mode is multiplied by `factor`; for angles it is at most 3.1 radians afterwards.
+    For classes the target is a draw from the probabilities p^(1/factor), normalised.
     """
     if density.has_enumerate_support:
         logits = density.log_prob(density.enumerate_support()).movedim(0, -1)

@@ -30,7 +30,7 @@ from framework.testing.rows import DAMAGES, Damage
 def read_back(bench: Workbench, worst: Worst) -> None:
     """Check that generated files give the same samples when `root` names their folder.
 
-    They must count as synthetic as long as the folder contains the mark of synthetic data, and only then.
+    The data must count as synthetic as long as the folder contains the mark of synthetic data, and only then.
     """
     for mark_state, synthetic in {"generated files": True, "generated files without mark": False}.items():
         workspace, source = bench.copy_files(

@@ -53,7 +53,7 @@ class Worst:
 
     Attributes:
         error: Largest error so far; -∞ before the first, NaN once an error was NaN.
-        case: Description of the case with that error. It names the fault that is searched for, also if the error is 0.
+        case: Description of the case with that error. If the error is 0, this is a case in which no fault was found.
         rows: Description of each batch row of the densities under test; empty to describe rows by their number.
     """
 

@@ -302,7 +302,7 @@ def _repeatable(subject: HeadSubject, worst: Worst) -> None:
 def _rows_apart(subject: HeadSubject, worst: Worst) -> None:
     """Check that results for an item of the batch do not depend on other items.
 
-    Its loss must have no gradient in the raw parameters of other items.
+    The loss of an item must have no gradient in the raw parameters of other items.
 
     If log_prob draws no random numbers, results must not depend on the number of items either.
     """

@@ -227,7 +227,7 @@ def check_nan_visible(
 ) -> None:
     """Check that a metric does not leave out predictions that are NaN.
 
-    It must refuse them, or its numbers must be NaN or worse than without NaN.
+    The metric must refuse these predictions, or its numbers must be NaN or worse than without NaN.
 
     Args:
         evaluate: Function that returns the numbers if the predictions of some samples are NaN.

@@ -40,8 +40,8 @@ def reference(subject: HeadSubject, worst: Worst, dtype: torch.dtype) -> None:
 def precision(subject: HeadSubject, worst: Worst) -> None:
     """Compare log_prob in float32 with float64 for the same head and inputs; the error is in float32 epsilons.
 
-    The error is relative to max(1, |log p|) plus the change of log p from rounding the raw parameters and angles. So if
-    it is large, it comes from cancellation inside the head.
+    The error is relative to max(1, |log p|) plus the change of log p from rounding the raw parameters and angles. So a
+    large error comes from cancellation inside the head.
     """
     single = subject.make()
     double = copy.deepcopy(single).double()

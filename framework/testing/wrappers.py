@@ -285,7 +285,7 @@ def _repeatable(make: Make, row: WrapperRow, worst: Worst) -> None:
 def _rows_apart(make: Make, row: WrapperRow, worst: Worst) -> None:
     """Check that results for an item of a batch do not depend on other items.
 
-    Its loss must have no gradient in the inputs of other items.
+    The loss of an item must have no gradient in the inputs of other items.
     """
     wrapper, target, features = make(), values(row.target, (5,)), inputs(5)
     other = torch.where(torch.arange(5).unsqueeze(-1) == 2, features, 1 - 3 * features)
