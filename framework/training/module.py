@@ -265,6 +265,7 @@ class KeepCheckpoints(pl.Callback):
 
     Training can resume from last.ckpt and previous.ckpt. best.ckpt holds weights only; with Adam it has a third of the
     size of the other two.
+
     last.ckpt is saved after every epoch with a validation, after the last epoch, and every `every_steps` steps.
     best.ckpt is saved whenever the validation loss reaches a new minimum. Every write is atomic
     (framework.storage.checkpoints).
