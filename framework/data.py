@@ -153,7 +153,7 @@ class Data(ABC):
     def read(self, files: Sequence[Path]) -> Dataset[Batch]:
         """Return the unlabelled samples of a user's own files, with "input" and "index" only, for `mode=predict`.
 
-        It works without `prepare`.
+        This method works without `prepare`.
 
         Raises:
             DataError: there is no file, or a file cannot be read; the message names that file.

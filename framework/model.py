@@ -285,7 +285,7 @@ def independent_penalty(values: Float[Tensor, "batch *member"]) -> Float[Tensor,
 def own_sample_penalty(values: Float[Tensor, "batch"], members: int) -> Float[Tensor, "batch"]:
     """Return `values` unchanged, but with gradients multiplied by `members`, the number of members of an ensemble.
 
-    It is for batches in which each sample is seen by one member only. The gradient of the mean over the whole batch is
-    then, for each member, the gradient of the mean over the samples that this member sees.
+    The function is for batches in which each sample is seen by one member only. The gradient of the mean over the whole
+    batch is then, for each member, the gradient of the mean over the samples that this member sees.
     """
     return members * values - (members - 1) * values.detach()

@@ -72,8 +72,8 @@ class SeveralModels(ABC):
         model_count: number of models.
         own_batches: True if `loss` and `training_densities` are given one batch per model, concatenated in the order of
             the models and equally long, and each model sees its own batch only. Densities then have the batch_shape
-            (rows of each batch, member). It is set while training on one device, where each model has its own order of
-            samples.
+            (rows of each batch, member). The attribute is True only while training on one device, where each model has
+            its own order of samples.
     """
 
     model_count: int
@@ -103,7 +103,8 @@ def outermost(predictor: Predictor) -> SeveralModels | None:
 def rows_per_model(predictor: Predictor, rows: int) -> int:
     """Return how many of the `rows` samples of a batch each model sees.
 
-    These are all of them, unless a wrapper gives each of its models an own part (`SeveralModels.own_batches`).
+    Each model sees all samples, unless a wrapper gives each of its models a part of its own
+    (`SeveralModels.own_batches`).
     """
     several = outermost(predictor)
     return rows // several.model_count if several is not None and several.own_batches else rows
