@@ -15,7 +15,7 @@ from framework.bodies.body import Body
 from framework.bodies.poses import Skeleton, skeleton
 
 AWAY = -1.0
-"""Initial value of the coordinate along a limb, metres; a vertex with a coordinate below 0 is not on the limb."""
+"""Initial value of the coordinate along a limb, metres; below 0 a vertex lies before the limb or on another part."""
 
 
 @dataclass(frozen=True)

@@ -256,7 +256,7 @@ def update_hessian(
 
 
 def reduce_camera(camera: Camera, part: int) -> Camera:
-    """Return a camera of the same view whose pixels are each the mean of part × part pixels."""
+    """Return a camera of the same view, each of whose pixels covers part × part pixels of `camera`."""
     (x, y), (column, row) = camera.focal, camera.principal
     return replace(
         camera,

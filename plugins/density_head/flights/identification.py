@@ -126,7 +126,14 @@ def _step(
 ) -> tuple[Float[Tensor, "flight 9"], Float[Tensor, "constant"]]:
     """Return the steps of states and constants that solve the damped normal equations.
 
-    Constants where `at_bound` is true do not move.
+    Args:
+        own: block of the Gauss-Newton Hessian for the state of each flight.
+        both: block for the state of each flight and the constants.
+        whole: block for the constants.
+        pull: gradient of the cost in the state of each flight.
+        push: gradient of the cost in the constants.
+        damping: factor on the diagonal that is added to each diagonal block (Levenberg and Marquardt).
+        at_bound: true for constants that must not move.
     """
     own = own + damping * torch.diag_embed(own.diagonal(dim1=-2, dim2=-1))
     # the diagonal is 0 for a constant that no residual depends on

@@ -29,9 +29,9 @@ With a tolerance, samples are doubled until the estimated error is small, which 
 With 8 replicates the error would be underestimated by a third, with 32 only by some percent.
 """
 STRETCH = 0.4
-"""Parameter h of `stretch`: for a larger h, more points are far from 0.
+"""Parameter h of `stretch` in one dimension: for a larger h, more points are far from 0.
 
-With this value 3 % of the points in one dimension lie above 4, but only 0.003 % of normal points.
+With this value 3 % of the points lie above 4, but only 0.003 % of normal points.
 """
 MOST = 2**18
 """Largest number of samples of an item; an item whose error is then still above the tolerance counts as unresolved."""
@@ -316,10 +316,10 @@ def stretch(
 ) -> tuple[Float[Tensor, "*shape dimension"], Float[Tensor, "*shape"]]:
     """Return points with heavier tails, z = y exp(h y²/2) for the normal `points` y, and the log of their shares.
 
-    The transform is Tukey's, with h = STRETCH. The share of a point is the standard normal density at z divided by the
-    density of the transformed points at z. Weights times shares at these points have the same mean as weights at normal
-    points, but regions far from 0 hold more points, so that large weights there are not missed (defensive sampling,
-    Hesterberg 1995).
+    The transform is Tukey's, with h = STRETCH / √d for d dimensions. The share of a point is the standard normal
+    density at z divided by the density of the transformed points at z. Weights times shares at these points have the
+    same mean as weights at normal points, but regions far from 0 hold more points, so that large weights there are not
+    missed (defensive sampling, Hesterberg 1995).
     """
     h = STRETCH / points.shape[-1] ** 0.5
     square = points.square()

@@ -58,7 +58,7 @@ class XGBoostHead(DensityHead, Fitted):
             for bins grows with the number of features.
 
     Raises:
-        ConfigError: the target is an angle, or a single class.
+        ConfigError: the target is an angle, an image, or a single class.
         UserError: the head is used before it was fitted.
     """
 

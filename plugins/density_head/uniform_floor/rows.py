@@ -15,7 +15,7 @@ CLASSES = Target("class", ("a", "b", "c"))
 
 
 def outlier_cases(head: DensityHead) -> Iterator[Case]:
-    """Yield a case at 180° from the mean of a density with κ = 1e6, where only the floor remains: log γ - log 2π."""
+    """Yield a case 3 rad from the mean of a density with κ = 1e6, where only the floor remains: log γ - log 2π."""
     raw = torch.tensor([[1e6, 0.0, 0.0]], dtype=torch.float64)
     value = torch.tensor([[3.0]], dtype=torch.float64)
     log_prob = torch.tensor([math.log(0.125 / (2 * math.pi))], dtype=torch.float64)

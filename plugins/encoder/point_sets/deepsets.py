@@ -35,8 +35,8 @@ class DeepSets(Encoder):
         widths: number of outputs of each layer after the maximum; the last is the length of the features.
         activation: the function σ.
         dropout: probability of dropping a number before and after each layer that follows the maximum.
-        points: number of points at the beginning of a cloud that are read; None for all. With 100
-            the network is the one that the thesis calls "micro".
+        points: number of points at the beginning of a cloud that are read; None for all. With 100 the network is the
+            one that the thesis calls "micro".
         normalise: as in `framework.geometry.clouds.normalise_clouds`.
         attributes: whether columns after x, y, z are read too.
 

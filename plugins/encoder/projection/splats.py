@@ -25,7 +25,7 @@ LEAST_WIDTH, SHARE = 0.45, 0.6
 
 @cache
 def disc(radius: int) -> np.ndarray:
-    """Return (row, column) of the offsets around a pixel that lie in a disc, row by row, (offsets, 2)."""
+    """Return (row, column) of the offsets from a pixel to the pixels of a disc around it, row by row, (offsets, 2)."""
     side = np.arange(-radius, radius + 1)
     rows, columns = np.meshgrid(side, side, indexing="ij")
     within = rows**2 + columns**2 <= radius * (radius + 1)

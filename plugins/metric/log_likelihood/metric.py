@@ -124,8 +124,8 @@ def summarize_sampling(estimate: Estimate) -> Float[Tensor, "5"]:
     """Return sums over the items of an estimate of log-likelihoods, and a maximum, float64.
 
     Returns:
-        Sum of debiased log-likelihoods, sum of squared errors, number of samples, number of items above the tolerance,
-        largest number of samples of an item.
+        Sum of debiased log-likelihoods, sum of squared standard errors, number of samples, number of items above the
+        tolerance, largest number of samples of an item.
     """
     if estimate.samples.numel() == 0:
         return torch.zeros(5, dtype=torch.float64, device=estimate.samples.device)

@@ -245,7 +245,7 @@ def find_exit(screen, faces, index, facing, row, column, other_row, other_column
 @compiled
 @no_type_check
 def side(screen, a, b, row, column):
-    """Return twice the signed area of the triangle of the vertices `a` and `b` and a pixel.
+    """Return twice the signed area, in squares of 1/256 pixel, of the triangle of the vertices `a` and `b` and a pixel.
 
     The sign says on which side of the edge from `a` to `b` the pixel lies.
     """

@@ -133,7 +133,11 @@ def _has_one_color(part: Part) -> bool:
 
 
 def _find_wrap(parts: Sequence[Part]) -> Wrap:
-    """Return a wrap rule that suits all textures; the rule matters only for uv beyond the edges of a texture."""
+    """Return a wrap rule that suits all textures; the rule matters only for uv beyond the edges of a texture.
+
+    Raises:
+        DataError: two textures need different rules.
+    """
     stated: set[Wrap] = set()
     needed: set[Wrap] = set()
     for part in parts:

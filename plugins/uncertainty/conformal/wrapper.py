@@ -112,9 +112,9 @@ class Conformal(Uncertainty):
 def split_in_halves(batches: Sequence[Batch]) -> tuple[list[Batch], list[Batch]]:
     """Return the batches with a random half of the samples, rounded up, and the batches with all other samples.
 
-    Both keep the order of the samples and have no empty batches. The choice depends only on the number of samples. It
-    is random, because every other sample would be a biased choice: in many data sets neighbours alternate between
-    classes, or belong together.
+    Both keep the order of the samples and have no empty batches. The choice depends only on the number of samples. The
+    half is random, because a half of every second sample could be biased: in many data sets neighbours alternate
+    between classes, or belong together.
     """
     sizes = [len(batch["target"]) for batch in batches]
     order = torch.randperm(sum(sizes), generator=torch.Generator().manual_seed(SEED))
