@@ -109,7 +109,7 @@ class Source:
 
 
 def wrong_layout(root: Path, folder: str, fault: str) -> DataError:
-    """Return the error for a root that has not the layout of the archive.
+    """Return the error for a root that does not have the layout of the archive.
 
     Args:
         root: The user's folder.

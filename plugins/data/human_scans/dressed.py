@@ -89,7 +89,7 @@ class Wardrobe:
 
     Args:
         body: the body model.
-        stages: how often the body's edges are split to obtain its sheet, the surface of the scan.
+        stages: number of times that the body's edges are split to obtain its sheet, the surface of the scan.
     """
 
     def __init__(self, body: Body, stages: int = 2) -> None:

@@ -43,9 +43,9 @@ class Skirt:
     """Piece that hangs from the waist and touches no leg; plugins.data.human_scans.hanging makes its mesh.
 
     Attributes:
-        top, length: height of its upper border in the rest pose, and its length, metres.
-        flare: metres by which it widens per metre downwards.
-        pleats, depth: number of folds around, and their depth at the hem, metres.
+        top, length: height of the skirt's upper border in the rest pose, and length of the skirt, metres.
+        flare: smallest growth of the skirt's radius per metre downwards, plus 0.08; below 0.08 the radius may shrink.
+        pleats, depth: number of folds around the body, and about half of a fold's depth at the hem, metres.
         cloth: function from coordinates across and along the cloth to colours.
     """
 

@@ -156,7 +156,7 @@ def requested_poses(body: Body, options: argparse.Namespace) -> Poses:
 
 
 def shape_change(text: str, count: int) -> Float[Tensor, "shape"]:
-    """Return the shape coefficients of a text such as "0=-2,3=1".
+    """Return the change of every shape coefficient, from a text such as "0=-2,3=1"; it is 0 if the text names none.
 
     Raises:
         DataError: the text has another form, or a direction does not exist.

@@ -12,7 +12,7 @@ from plugins.data.pascal3d.shapes import Body, offset_point
 
 
 def bicycle(random: Generator) -> Body:
-    """Return a bicycle with a diamond or step-through frame, a saddle, bent or straight bars, and cranks."""
+    """Return a bicycle with a diamond or step-through frame, a saddle, a handlebar and cranks."""
     body = Body()
     frame = paint(random, vivid=True)
     size = random.uniform(0.32, 0.36)

@@ -73,7 +73,8 @@ def flight(
         most_steps: Largest number of steps in all phases together.
 
     Raises:
-        SolverGaveUp: The steps do not suffice, or become smaller than rounding errors.
+        SolverGaveUp: `most_steps` steps or MOST_PHASES phases do not suffice, a step becomes smaller than rounding
+            errors, or the state is no longer finite.
     """
     walk = _Walk(times, constants, spring, method, tolerance, most_steps)
     # inside the walk, the height is 0 where the ball touches the table

@@ -38,11 +38,11 @@ def to_ignorance(density: Distribution, scale: float) -> Float[Tensor, "*batch"]
 
     The divergence is estimated from n = DRAWS targets sampled from u, which is uniform for every angle and N(0, scale²)
     for every real number. If the support of the density restricts its angles to ranges, the angles describe a rotation,
-    and u is uniform over rotations: sin e is uniform for an elevation e in [-π/2, π/2]. The n targets are a Latin
-    hypercube (McKay, Beckman &
-    Conover 1979): if the distribution of a number is divided into n parts of equal probability, each part holds one
-    target. The estimate for one number therefore has an error of O(n^-3/2) instead of O(n^-1/2). All members of a
-    density with batch_shape (batch, member) get the same targets.
+    and u is uniform over rotations: sin e is uniform for an elevation e in [-π/2, π/2].
+
+    The n targets are a Latin hypercube (McKay, Beckman & Conover 1979): if the distribution of a number is divided into
+    n parts of equal probability, each part holds one target. The estimate for one number therefore has an error of
+    O(n^-3/2) instead of O(n^-1/2). All members of a density with batch_shape (batch, member) get the same targets.
     """
     support = density.support
     numbers = density.event_shape[0]

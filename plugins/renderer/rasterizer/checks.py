@@ -1,4 +1,7 @@
-"""Checks that a scene can be drawn, and conversion of its data to the arrays that kernels read."""
+"""Checks that a scene can be drawn, and conversion of its data to the arrays that kernels read.
+
+Every check raises a ValueError that says which input is wrong and what is expected.
+"""
 
 import math
 from collections.abc import Collection
