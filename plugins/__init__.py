@@ -3,7 +3,8 @@
 import os
 import sys
 
-# `python -m plugins.…` runs this first; as of `framework.__main__`, of which the working directory may hold another
+# `python -m plugins.…` runs this module first. The working directory may hold other modules of the same names as ours;
+# it is removed from the path, as in `framework.__main__`.
 if sys.argv[:1] == ["-m"] and any("plugins" in argument for argument in sys.orig_argv):
     _own = os.path.realpath(os.path.join(os.path.dirname(__file__), os.pardir))  # noqa: PTH118, PTH120 - no import
     _first = os.path.realpath(sys.path[0]) if sys.path else _own

@@ -256,7 +256,7 @@ class Line:
         new = first_in_cell(places, scale, 0.25)
         most = int(new.sum(0).amax())
         first = new.to(torch.int8).sort(dim=0, descending=True, stable=True).indices[:most]
-        # an item that has fewer repeats its last candidate
+        # if an item has fewer candidates than `most`, its last candidate is repeated
         last = first.gather(0, new.sum(0, keepdim=True) - 1)
         first = torch.where(new.gather(0, first), first, last)
         return places.gather(0, first)

@@ -109,7 +109,7 @@ def mantel(random: Random) -> Solid:
         parts.append(box(1.05 * width, random.uniform(0.3, 0.7), 0.05, (0, -0.2, -0.05)))
     if random.random() < 0.4:
         parts.append(box(width - jamb, 0.04, height, (0, deep / 2, 0)))
-    if random.random() < 0.3:  # above it
+    if random.random() < 0.3:  # the overmantel
         tall, wide = random.uniform(0.4, 1.1), random.uniform(0.6, 1) * width
         parts.append(box(wide, 0.6 * deep, tall, (0, 0.2 * deep, height + 0.05 * steps)))
     return join(parts)

@@ -344,14 +344,14 @@ def person(random: Random) -> Solid:
     pose, swing = random.random(), random.uniform(-0.3, 0.3)
     for side in (-1, 1):
         joint = (side * shoulder, 0.0, chest - 0.05)
-        if pose < 0.55:  # down
+        if pose < 0.55:  # both arms hang down
             elbow = (joint[0] + side * random.uniform(0.02, 0.15), side * swing / 2, chest - 0.32)
             hand = (elbow[0] + side * random.uniform(-0.12, 0.05), side * swing - 0.1, chest - 0.58)
-        elif pose < 0.8:  # spread
+        elif pose < 0.8:  # both arms are spread
             lift = random.uniform(-0.15, 0.05)
             elbow = (joint[0] + side * 0.27, 0.0, joint[2] + lift)
             hand = (elbow[0] + side * 0.26, -0.03, elbow[2] + lift)
-        else:  # one or both bent upwards or forwards
+        else:  # the forearms point forwards or upwards
             elbow = (joint[0] + side * 0.12, -0.15 * random.random(), chest - 0.27)
             hand = (elbow[0], elbow[1] - 0.2, elbow[2] + random.uniform(-0.05, 0.4))
         arm = 0.05 * stout**0.5
