@@ -26,7 +26,7 @@ PLAIN = Conditions(
 def render_centred(
     person: Person, pose: Pose, light: np.ndarray = FROM_CAMERA, strength: float = 0.4
 ) -> np.ndarray:
-    """Return a sharp image of a person in the middle of the image, personse shoulders face the camera."""
+    """Return a sharp image of a person in the middle of the image, whose shoulders face the camera."""
     return render(person, pose, Pose(0.0), SIDE, 20.0, (SIDE / 2, SIDE / 2), light, strength)
 
 
@@ -144,7 +144,7 @@ def test_silhouette_is_the_union_of_the_projected_ellipsoids() -> None:
 
 
 def test_ball_has_lambert_shading() -> None:
-    """Check a bald head that is a unit ball of one colour, personse normal at a point is the point itself."""
+    """Check a bald head that is a unit ball of one colour, whose normal at a point is the point itself."""
     person = dataclasses.replace(bald(2), axes=np.ones(3), skin=np.full(3, 0.5), beard=0.0, glasses=0.0)
     light = np.array([1.0, 2.0, 2.0]) / 3
     image = render(person, Pose(180), Pose(0), SIDE, 20.0, (SIDE / 2, SIDE / 2), light, 0.4)

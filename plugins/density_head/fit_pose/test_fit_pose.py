@@ -42,7 +42,7 @@ def head(target, **config):
 
 
 def test_a_smaller_picture_is_the_mean_of_the_pixels(body_model):
-    """Check that 1/part of the pixels with part times the samples has the same samples, and so the same numbers."""
+    """Compare means of 4 × 4 pixels with the pixels of an image of a quarter of the side that has the same samples."""
     camera, fine = body_model.camera(**SIZE), renderer(supersampling=8)
     whole = renderer(supersampling=2)(scene_of(body_model, random_parameters(body_model), camera))["color"]
     rendered = fine(scene_of(body_model, random_parameters(body_model), reduce_camera(camera, 4)))["color"]

@@ -29,7 +29,7 @@ TRUTH = -FALL * 0.16 / (2 * (1 + FALL)) - torch.log1p(FALL) / 2  # log E w, by c
 
 
 def bump(z, items):
-    """Return log w(z) = -a (t - 0.4)²/2 of items with different a, t ~ N(0, 1) in the direction (1, 1, …)."""
+    """Return log w(z) = -a (t - 0.4)²/2, where t ~ N(0, 1) is z's component along (1, 1, …) and a differs by item."""
     return -FALL[items] * (z.sum(-1) / z.shape[-1] ** 0.5 - 0.4).square() / 2
 
 

@@ -41,8 +41,8 @@ def images(count, shape, *boxes):
 class Plain:
     """The networks in their textbook form, on unchanged images.
 
-    `white`, (1, channels, 1, 1), is the value of a layer in the middle of an image of ones. Maps continue with it
-    beyond their border, and running moments are those of differences from it.
+    `white`, (1, channels, 1, 1), is the value of a layer in the middle of an image of ones. Maps are padded with this
+    value, and running moments are those of differences from it.
     """
 
     def __init__(self, network, name):

@@ -212,7 +212,7 @@ def test_of_a_von_mises_density(concentration):
 
 
 def von_mises(concentration, rows):
-    """Return the head's density nearest to this concentration, by bisection over its raw parameters."""
+    """Return the head's density whose concentration is nearest to this one, by bisection over raw parameters."""
     build_one = head("von_mises", ANGLE)
     low, high = 0.0, 1e3
 

@@ -83,7 +83,7 @@ def train(predictor, optimizer, inputs, target, steps=40):
 def test_each_member_becomes_what_it_becomes_alone(kind, make, dtype, tolerance):
     """Compare with single models of the same start and batches.
 
-    Heads with weights of their own (scvae) draw random numbers, so that they only must change.
+    Heads with weights of their own (scvae) draw random numbers; for them the test only checks that the weights change.
     """
     inputs, target = data(kind.get("target", CLASSES))
     inputs = inputs.to(dtype)
