@@ -110,7 +110,7 @@ class _Collapses:
         return {corner for face in self.around[v] for corner in self.corners[face] or ()} - {v}
 
     def _places_after(self, v: int, u: int) -> dict[int, int] | None:
-        """Return which texture coordinates of vertex u replace those of vertex v if v collapses onto u.
+        """Return the texture coordinate of vertex u that replaces each one of vertex v if v collapses onto u.
 
         The keys are the texture coordinates of v. None means that the collapse would break a seam of the texture.
         """

@@ -281,7 +281,10 @@ def _free_movements(
 def _bounds(
     usual: poses.Degrees, deviation: poses.Degrees, least: poses.Degrees, most: poses.Degrees
 ) -> tuple[float, float]:
-    """Return the bounds of a movement minus its mean, radians, from FURTHEST and from the movement's own limits."""
+    """Return the bounds of a movement relative to its mean, radians.
+
+    They are the movement's own limits, but at most FURTHEST standard deviations from the mean.
+    """
     far = FURTHEST * deviation
     return math.radians(max(least - usual, -far)), math.radians(min(most - usual, far))
 
