@@ -30,7 +30,10 @@ SINGLE = ("data", "outliers", "density_head", "renderer")
 OPTIONS = ("files", "into", "members", "run")
 """Options of modes that name files, folders or runs."""
 UNUSED = ("metric", "objective", "outliers", "renderer")
-"""Groups whose plugins are not imported to load a model; of their parameters, texts that look like paths are paths."""
+"""Groups whose plugins are not imported to load a model.
+
+The types of their parameters are therefore not known: a text that looks like a path counts as a path.
+"""
 
 
 @dataclass
