@@ -535,8 +535,8 @@ def numbers(
     Args:
         columns: the table.
         name: name of the column.
-        missing: None allows missing numbers. A text refuses them and is added to the message as an alternative, such as
-            "set data.missing to ..."; "" adds nothing.
+        missing: None allows missing numbers. With a text, a missing number is an error, and the text is added to the
+            message as a way out, such as "set data.missing to ..."; "" adds nothing.
         booleans: read TRUE and FALSE as 1 and 0 if all cells are TRUE or FALSE.
 
     Raises:
