@@ -284,7 +284,9 @@ def _(density: Mixture, start: Tensor, end: Tensor) -> Tensor | None:
 
 
 def _weighted_mean(density: Mixture, parts: Tensor | None, numbers: int = 0) -> Tensor | None:
-    """Return the mean of probabilities over the components, weighted by the mixture's weights; None if there are none.
+    """Return the mean of probabilities over the components, weighted by the mixture's weights.
+
+    The result is None if `parts` is None.
 
     Args:
         density: the mixture.

@@ -51,7 +51,8 @@ class Interval(NamedTuple):
     Attributes:
         low, high: the ends of the interval. Half of the remaining probability lies beyond each end. Angles are in
             radians: `low` is in [-π, π), and the interval is the arc from `low` counter-clockwise to `high`, at most
-            one turn further. The circular median splits this arc into two parts of equal probability.
+            one turn further. If the angle covers the whole circle, the circular median splits this arc into two parts
+            of equal probability.
         low_error, high_error: standard errors of the ends, in their unit; 0 where the ends were computed without draws,
             infinite where fewer than 5 draws are expected beyond an end.
     """

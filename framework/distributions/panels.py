@@ -19,7 +19,7 @@ AT_ONCE = 2**17
 WIDTH = 2.0
 """Width of a panel before it is halved, in the variable v of `Panels`.
 
-The innermost panel ends 3.6 scales from its peak, and the end of each further panel is e² times as far from the peak.
+The innermost panel ends 3.6 peak widths from its peak. Each further panel ends about e² times as far from it.
 """
 REACH = 1e4
 """Distance from the outermost peak at which integration over the real line ends, in multiples of the largest width."""
