@@ -63,7 +63,7 @@ def _around(intervals: Ends) -> tuple[float, float]:
 def _arc_around(arcs: Ends) -> tuple[float, float]:
     """Return the ends of the shortest arc that contains all `arcs` (degrees, ascending).
 
-    It is the complement of the widest gap between two arcs.
+    The shortest arc is the complement of the widest gap between two arcs.
     """
     if not arcs:
         return math.nan, math.nan
