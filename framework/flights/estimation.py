@@ -95,7 +95,7 @@ def estimate_states(
     Args:
         frames: the observed frames.
         constants: constants of the physics.
-        noise: standard deviation of each coordinate, m.
+        noise: standard deviation of the noise in each coordinate, m.
         prior: prior density of a state.
         start: start of the search; None: `guess_states`.
         most: largest number of steps of the search.

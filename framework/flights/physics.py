@@ -25,7 +25,7 @@ class Constants:
         gravity: m/s².
         drag: k of the deceleration k |v| v, 1/m (Mülling et al. 2011, eq. 1).
         lift: m of the Magnus acceleration m ω × v, dimensionless: 1/2 ρ A r c / mass with a lift coefficient of 0.6.
-        spin_decay: share of the spin that the air takes, 1/s.
+        spin_decay: share of the spin that the air removes per second, 1/s.
         restitution: upward speed after the bounce divided by downward speed before it.
         friction: Coulomb's coefficient of ball and table.
         radius: radius of the ball, m.
