@@ -18,11 +18,14 @@ from framework.errors import ConfigError, DataError
 
 Normalisation = Literal["unit_ball", "robust", "none"]
 REACH = 3.0
-"""Radius, in median distances, beyond which the normalisation "robust" ignores points for centre and scale."""
-LOOSE, TIGHT = 2.0, 0.01
-"""Largest and smallest accepted norm of a normalised cloud's farthest point, as multiples of a reference length.
+"""Distance beyond which the normalisation "robust" ignores points for centre and scale.
 
-A cloud beyond these bounds was not normalised (`require_normalised`).
+The distance is measured from the point that has the medians as coordinates, in multiples of the median distance.
+"""
+LOOSE, TIGHT = 2.0, 0.01
+"""Largest and smallest norm that the points of a normalised cloud may have, in multiples of the largest coordinate.
+
+The coordinate is that of the basis or grid which describes the cloud. `require_normalised` refuses other clouds.
 """
 
 
@@ -132,10 +135,10 @@ def normalise_clouds(
     Args:
         clouds: (batch, points, columns).
         how: "unit_ball": the mean of the points is subtracted, then the coordinates are divided by the largest norm
-            (thesis eq. 6.2). "robust": as "unit_ball", but mean and largest norm are those of the points within `REACH`
-            median distances of the medians of the coordinates. So far outliers, up to some 30 % of the points, do not
-            change the result; they lie outside of the ball. If half of the points or more are at one position, all
-            points are used. "none": the clouds are unchanged, with centre 0 and scale 1.
+            (thesis eq. 6.2). "robust": as "unit_ball", but mean and largest norm are those of the points that
+            `near_middle` selects. So far outliers, up to some 30 % of the points, do not change the result; they lie
+            outside of the ball. If half of the points or more are at one position, all points are used. "none": the
+            clouds are unchanged, with centre 0 and scale 1.
         counts: number of points of each cloud, as `sizes` returns them; None if they are not known yet.
 
     Raises:
@@ -214,9 +217,10 @@ def _composed(clouds: Tensor, how: Normalisation, counts: Tensor) -> NormalisedC
 def near_middle(
     offset: Float[Tensor, "batch points 3"], real: Bool[Tensor, "batch points 1"] | None
 ) -> Bool[Tensor, "batch points 1"]:
-    """Return a mask of the points within `REACH` median distances of the point that has the medians as coordinates.
+    """Return a mask of the points near the middle, which is the point that has the medians as coordinates.
 
-    If half of the points or more are at this point, all points are within.
+    A point is near if its distance from the middle is at most `REACH` times the median of these distances. If half of
+    the points or more are at the middle, all points count as near.
 
     Args:
         offset: coordinates of the points.

@@ -180,7 +180,10 @@ def rows(
 
 
 def polygons(lines: Sequence[bytes], place: Place | None = None) -> Int[np.ndarray, "faces 3"]:
-    """Return the triangles of faces; a line has the number of corners, the corners, and words that are skipped."""
+    """Return the triangles of faces.
+
+    Each line describes one face: the number of its corners, then the corners, then any words, which are skipped.
+    """
     if not lines:
         return np.empty((0, 3), np.int64)
     corners = int(numbers(lines[0].split()[:1], np.int64, place)[0])
