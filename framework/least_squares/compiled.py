@@ -33,7 +33,7 @@ SINGULAR = 1e-7
 CLIPS = 3
 """Number of times that a step that leaves the bounds is solved again, with the parameters beyond a bound held there."""
 NEAR = 0.1
-"""Largest share of the cost by which a step lowers it if the minimum then counts as near."""
+"""Largest share of the cost that a step may remove if the minimum is to count as near after the step."""
 GOES_ON, LIMIT, STEP, COST, GRADIENT = 10, 0, 3, 2, 1
 """Value of `ended`: GOES_ON for a problem that has not ended, else one of framework.least_squares.solution.Status."""
 

@@ -11,7 +11,7 @@ class Status(IntEnum):
     """Reason for which the search for the minimum of a problem ended; above 0 for a minimum that the data determine."""
 
     GRADIENT = 1
-    """The residuals are orthogonal to the Jacobian, except for parameters held at bounds."""
+    """The residuals are orthogonal to the columns of the Jacobian, except for parameters held at bounds."""
     COST = 2
     """No step would lower the cost by more than the share `decrease` of it (an argument of `least_squares`)."""
     STEP = 3

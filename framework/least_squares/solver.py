@@ -15,7 +15,10 @@ from framework.least_squares.solution import Solution, Status
 ILL_CONDITIONED = EPSILON**0.5
 """Smallest singular value that counts towards the rank, for a Jacobian with columns scaled to unit length."""
 DOUBTFUL = 1e10
-"""Trace of the inverse of a scaled normal matrix from which on the rank is computed instead of assumed to be full."""
+"""Smallest trace of the inverse of a scaled normal matrix for which the rank is computed.
+
+With a smaller trace, the matrix is assumed to have full rank.
+"""
 
 Model = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 """`model(parameters (active, p), rows (active,)) -> (residuals (active, r), jacobian (active, r, p))`.
