@@ -100,7 +100,9 @@ def may_resume(config: Config) -> bool:
 
 @contextmanager
 def open_run(config: Config) -> Iterator[Run]:
-    """Open the run of a command for the `with` block, and close it as FINISHED, FAILED or KILLED, as the block ends.
+    """Open the run of a command for the `with` block, then close it.
+
+    The run is closed as FINISHED, FAILED or KILLED, depending on how the block ended.
 
     The run in the folder is continued if `may_resume` returns True; otherwise the files of that run are moved to a
     subfolder. A rank other than the first writes nothing and gets a silent tracker.

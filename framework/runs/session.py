@@ -119,7 +119,7 @@ class Session:
         return f"{self.data_title} · {self.method}"
 
     def batches(self, data: Data | None = None) -> Batches:
-        """Return the batches, in the size for training, of the session's data or, if given, of `data`."""
+        """Return batches, of the size for training, of `data`; None: of the session's data."""
         chosen = self.settings
         return Batches(
             data or self.data, batch_size=chosen.batch_size, workers=chosen.workers, seed=chosen.seed
