@@ -84,7 +84,7 @@ compressed zeros would decompress to 134 million values.
 # scenes
 
 MOST_PARTS, MOST_MATERIALS = 10_000, 10_000
-"""Largest number of parts of a scene, each with one material and a millisecond of work, and of materials."""
+"""Largest number of parts of a scene, each of which has one material and takes a millisecond, and of materials."""
 MOST_TEXELS, FEW_TEXELS, TEXELS_PER_BYTE = 2**25, 2**24, 16
 """Largest number of texels in all textures of a scene, which fits two textures of 4096 × 4096.
 
@@ -99,7 +99,10 @@ A larger file may expand by the same factor as a compressed file (`UNFOLDED_TIME
 MOST_JOINT_SETS = 4
 """Largest number of sets of joints per vertex in a glTF file; a set names four joints that move the vertex."""
 MOST_SAMPLES = 2**25
-"""Largest number of samples of a drawn image: 2560 × 1440 pixels of 9 samples, with colour and depth 1 GB."""
+"""Largest number of samples of a drawn image.
+
+An image of 2560 × 1440 pixels with 9 samples each just fits; colour and depth of its samples take 1 GB.
+"""
 
 # other files
 
