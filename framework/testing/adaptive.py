@@ -15,16 +15,16 @@ from framework.distributions.circular import Circular, wrap
 from framework.distributions.protocol import mode_candidates
 
 RULES = {1: (10, 6), 2: (8, 5)}
-"""Gauss-Legendre points per side of a box in each of the two rules, by the number of numbers of the density.
+"""Gauss-Legendre points per side of a box in each of the two rules, by the dimension of the density.
 
 A box on which the integrals by the two rules differ is split.
 """
 TOLERANCE = {1: 1e-10, 2: 1e-8}
-"""Largest difference of the two integrals over a box that is not split, by the number of numbers of the density."""
+"""Largest difference of the two integrals over a box that is not split, by the dimension of the density."""
 ROUNDS = {1: 60, 2: 40}
-"""Largest number of rounds, in each of which boxes are split, by the number of numbers of the density."""
+"""Largest number of rounds, in each of which boxes are split, by the dimension of the density."""
 MOST = {1: 128, 2: 48}
-"""Largest number of boxes of one density that are split in one round, by the number of numbers of the density."""
+"""Largest number of boxes of one density that are split in one round, by the dimension of the density."""
 MOST_PEAKS = 64
 """Largest number of `mode_candidates` of a density that are used."""
 HIDDEN = 2.0
@@ -304,8 +304,8 @@ def _evaluate_boxes(
     """Return the corners of boxes, their masses, the urgency to split each, and the axis along which to split it.
 
     The corners are `low` and `high`. Masses and urgency have shape (box, rows). The axis is a mask (box, rows, number).
-    The urgency is the difference of the integrals by the two rules. It is larger if the integrand at a candidate or
-    near a known peak is far above the integrand at every node.
+    The urgency is the difference of the integrals by the two rules. The urgency is raised if the integrand at a
+    candidate or near a known peak is far above the integrand at every node.
 
     Args:
         mapping: Map from coordinates to values.
@@ -347,10 +347,10 @@ def _evaluate_boxes(
 
 
 def _roughness(integrand: Tensor, points: int, numbers: int) -> Tensor:
-    """Return a measure of how many nodes each box needs along each number, (box, rows, number); 0 for one number.
+    """Return a measure of how rough the integrand is along each axis of each box, (box, rows, axis); 0 for one axis.
 
-    It is the size of the part of the integrand in the two highest Legendre polynomials of this number. A box is split
-    along the number with the largest measure, unless it may hide a peak.
+    The measure is the size of the integrand's part in the two highest Legendre polynomials along the axis. A box is
+    split along the axis with the largest measure, unless the box may hide a peak.
 
     Args:
         integrand: Integrand at the nodes, (box, node, rows).

@@ -121,7 +121,7 @@ def _(density: Cardioid, index: Tensor) -> Cardioid:
 
 
 def place_size(target: Target) -> int:
-    """Return the number of numbers that `simplest_density` reads as `place` for one sample."""
+    """Return the length of `place` for one sample in `simplest_density`."""
     return len(target.names) if target.kind == "class" else math.prod(target.event_shape)
 
 
