@@ -198,7 +198,7 @@ class Training(pl.LightningModule):
         ]
 
     def _predictor_parameters(self) -> list[nn.Parameter]:
-        """Return all parameters except those of the adversaries; they are trained with the settings `optimizer`."""
+        """Return the parameters that the settings `optimizer` train: all except those of the adversaries."""
         excluded = {
             id(parameter) for objective, _ in self._adversaries() for parameter in objective.parameters()
         }

@@ -12,8 +12,8 @@ from framework.configuration.settings import OptimizerSettings
 WARMUP_SHARE = 0.25
 """Largest share of a training's steps that the warm-up takes.
 
-A training with fewer than 4 `warmup_steps` steps warms up for a quarter of its steps; `cest`, for example, has 400
-steps and warms up for 100 of them. In a longer training, the warm-up takes `warmup_steps` steps.
+If a training has fewer than 4 · `warmup_steps` steps, the warm-up takes a quarter of them. In a longer training, the
+warm-up takes `warmup_steps` steps.
 """
 
 
