@@ -1,4 +1,7 @@
-"""The validation split for wrappers after training: it can be read repeatedly, and gives densities without gradient."""
+"""The validation split, from which wrappers are calibrated after training: its batches and their predicted densities.
+
+The batches can be read repeatedly. The densities have no gradient.
+"""
 
 from collections.abc import Iterable, Sequence
 
