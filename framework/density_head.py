@@ -20,10 +20,10 @@ class DensityHead(nn.Module, ABC):
     A constructor takes `target: Target` (framework.target) before `*`; its keyword-only parameters are the config. It
     calls `target.require("angle", by="...")` or the like to refuse targets that it cannot describe.
 
-    The density is a `torch.distributions.Distribution` (build it with `validate_args=False`; the head has checked) with
-    `batch_shape == raw.shape[:-1]`. Its `event_shape` is `target.event_shape`: `(len(target.names),)` for angles and
-    reals, `()` for classes, `(height, width, len(target.names))` for images. It has `log_prob` (nats), `sample`,
-    `entropy` (nats) and `mode`. Angles are radians and read modulo 2π; the `support` of their density is
+    The density is a `torch.distributions.Distribution` (build it with `validate_args=False`, since the head checks
+    `raw`) with `batch_shape == raw.shape[:-1]`. Its `event_shape` is `target.event_shape`: `(len(target.names),)` for
+    angles and reals, `()` for classes, `(height, width, len(target.names))` for images. It has `log_prob` (nats),
+    `sample`, `entropy` (nats) and `mode`. Angles are radians and read modulo 2π; the `support` of their density is
     `distributions.circular.circular`. framework.distributions.protocol describes all other functions of a density. A
     density over several numbers registers `marginal`. A density over an image registers `images`. A density whose
     log_prob draws nothing registers `exact_estimate` as its `estimate`. The other functions have defaults, none of
@@ -51,10 +51,10 @@ class DensityHead(nn.Module, ABC):
     size: int
     """Number of raw parameters that the head reads per sample, > 0; set by the constructor."""
     backbones: tuple[int, ...] = ()
-    """Numbers of raw parameters that each of several separate networks gives, in order; their sum is `size`.
+    """Number of raw parameters from each of several separate networks, in the order of the raw parameters.
 
-    The model has one network for each entry. With (), one network gives all raw parameters. The constructor may set the
-    attribute.
+    The model has one network for each entry, and the entries add up to `size`. With (), one network gives all raw
+    parameters. The constructor may set the attribute.
     """
 
     @abstractmethod
@@ -74,7 +74,7 @@ class DensityHead(nn.Module, ABC):
         return -self(raw).log_prob(target)
 
     def calibrate(self, raw: Float[Tensor, "batch size"], target: Tensor) -> None:
-        """Fit in place what is not trained by gradient, such as a single global concentration (eq. 3.5).
+        """Fit in place the parameters that gradients do not train, such as one concentration for all inputs (eq. 3.5).
 
         The framework calls it once after training, in evaluation mode and without gradient, with the whole validation
         split. Fitted values are buffers, so that the checkpoint stores them. The default does nothing.

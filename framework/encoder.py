@@ -51,9 +51,9 @@ class Encoder(nn.Module, ABC):
     weights are noise that takes long to unlearn. The constructor may set it.
     """
     initial: ClassVar[frozenset[str]] = frozenset()
-    """Names of parameters that only set where training starts, such as a file of weights.
+    """Names of constructor parameters that only set where training starts, such as a file of weights.
 
-    A loaded model needs none of them, because its checkpoint holds the weights; it is built with None for each.
+    A loaded model needs none of them, because its checkpoint holds the weights; each of them is then None.
     """
     output_shape: tuple[int, ...]
     """Shape of the features of one sample; set by the constructor. The last encoder's shape is (length,)."""

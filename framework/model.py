@@ -44,7 +44,7 @@ class Predictor(nn.Module, ABC):
 
     @abstractmethod
     def calibrate(self, batches: Iterable[Batch]) -> None:
-        """Fit on the validation split what is not trained by gradient; called once after training."""
+        """Fit, on the validation split, the parameters that gradients do not train; called once after training."""
 
 
 @final

@@ -68,8 +68,8 @@ class Report:
         left_out: number of the other faces by the first reason that held: "outside" (the box around the face holds no
             pixel centre of the image), "behind" (the near plane), "back" (seen from behind), "flat" (no area, or not
             finite), "hidden" (behind faces that were drawn before). A reason that held for no face is absent.
-        visited: number of pixels in the rectangle for which channels were computed. It holds all drawn faces; the
-            pixels outside of it keep the background.
+        visited: number of pixels in the rectangle for which channels were computed. The rectangle holds all drawn
+            faces; the pixels outside of the rectangle keep the background.
         reused: names of results that were kept from the last image because they had not changed, such as "places" of
             vertices on the screen.
         channels: names of the channels that were drawn.
@@ -184,7 +184,7 @@ class Renderer(ABC):
     - "color": as many numbers as the scene's colours, float32 in [0, 1].
     - "depth": float32, metres along the optical axis; background inf.
     - "face": int32, index of the visible face; background -1.
-    - "mask": bool.
+    - "mask": bool, true where a face is visible.
     - "normal": 3 numbers, float32, unit normal of the visible face in world axes, to the side from which its corners
     run counter-clockwise.
     - "barycentric": 3 numbers, float32, perspective-correct weights of the face's corners.
