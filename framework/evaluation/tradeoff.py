@@ -45,7 +45,18 @@ class Point:
 
 @dataclass(frozen=True)
 class Curve:
-    """Curve of one method: its points in the order of the knob's values, and the conditions of the measurement."""
+    """Curve of one method: its points in the order of the knob's values, and the conditions of the measurement.
+
+    Attributes:
+        knob: name of the knob.
+        points: results at each value of the knob.
+        reference: log-likelihoods with which those of the points were compared; None if they were not compared.
+        repeats: number of seeds for each value.
+        samples: number of test samples.
+        batch_size: number of samples in the timed batch.
+        device: the device, e.g. "cpu (AMD EPYC)".
+        threads: number of CPU threads that torch used for one operation.
+    """
 
     knob: str
     points: list[Point]
