@@ -144,7 +144,7 @@ def _intervals(
 ) -> Mapping[str, Sequence[Any] | Tensor]:
     """Return the columns of the prediction sets or, if the model has none, of the intervals of probability `mass`.
 
-    There are no columns without sets if `mass` is None.
+    If the model has no sets and `mass` is None, there are no columns.
     """
     sets = value_set(prediction.density)
     if sets is None:
