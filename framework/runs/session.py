@@ -362,7 +362,7 @@ def rehearse(session: Session) -> None:
     session.predictor.train(training)
     samples = session.settings.samples
     predictions = [Prediction(density, validation_batch, samples)]
-    if session.outliers is not None:  # test samples serve as outliers here
+    if session.outliers is not None:  # validation samples serve as outliers here
         predictions.append(Prediction(density, validation_batch, samples, "outliers"))
     # with so few samples, warnings have no meaning
     with _silence():
