@@ -21,7 +21,8 @@ class BodyFit:
     Attributes:
         parameters: parameters of the body at the end of the fit.
         difference: root mean square difference between the rendered image and the given one at the end.
-        path: one row for each accepted step, in order: loss, processor time since the start (seconds), parameters.
+        path: one row for each accepted step. Its columns are the loss, the processor time since the start (seconds) and
+            the parameters.
     """
 
     parameters: Float[Tensor, "parameter"]
