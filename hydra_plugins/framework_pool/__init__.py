@@ -213,7 +213,7 @@ def _without_hydra(config: DictConfig) -> DictConfig:
 
 
 def _plain_values(config: DictConfig, folder: Path) -> dict[str, Any]:
-    """Return a job's config as plain values without Hydra's part; it is the job's own except for its folder."""
+    """Return a job's config as plain values, without Hydra's part; the folder in it is that of the sweep."""
     with read_write(config), read_write(config.hydra), open_dict(config):
         config.hydra.runtime.output_dir = str(folder)
     before = HydraConfig.instance().cfg
