@@ -35,7 +35,7 @@ class Encoder(nn.Module, ABC):
     vectorises: bool = False
     """True if `torch.vmap` over the parameters of several such encoders is faster than one pass for each encoder.
 
-    The features of both ways must agree to rounding. This holds for layers of matrix products without buffers. The
+    The features of both ways must agree to rounding. Layers of matrix products without buffers are an example. The
     constructor may set the attribute.
     """
     fixed: bool = False

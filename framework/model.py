@@ -49,12 +49,14 @@ class Predictor(nn.Module, ABC):
 
 @final
 class Model(Predictor):
-    """A chain of encoders, a linear layer to the distribution parameters, and a density head.
+    """A chain of encoders, a linear layer to the raw parameters, and a density head.
 
     A head that is fitted at once (`Fitted`) or `direct` reads the flattened features themselves, without the linear
     layer.
 
     Args:
+        encoders: the encoders, in the order in which they are applied.
+        head: the density head.
         input_shape: shape of one sample; needed if there are no encoders.
         beside: the encoders of all backbones but the first, for a head with several backbones.
 
@@ -123,7 +125,7 @@ class Model(Predictor):
         return self(inputs)
 
     def raw(self, inputs: Tensor) -> Float[Tensor, "batch size"]:
-        """Return the distribution parameters that the head reads, (batch, size)."""
+        """Return the raw parameters that the head reads, (batch, size)."""
         return (
             self._raw(inputs)
             if self.shared_result is None
