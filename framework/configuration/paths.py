@@ -82,7 +82,7 @@ def remove_paths(
     Args:
         config: Plugins by group, as a checkpoint or a run folder stores them; not checked yet.
         user_values: Values of the user by dotted keys, such as "data.root" or "encoder.<name>.weights".
-        unused: Groups whose plugins are not imported for this.
+        unused: Groups whose plugins are not imported to find out which of their parameters are paths.
 
     Returns:
         A copy of the config with the user's values, in which all other paths are replaced by the defaults; and the
