@@ -10,7 +10,7 @@ from torch import Tensor
 from framework.geometry.mesh_files import COLOURS
 
 AZIMUTH, ELEVATION = math.radians(-55), math.radians(25)
-"""Direction of the camera, radians; in the image, x points to the front left, y to the back right, and z up."""
+"""Direction of the camera, radians; in the image, x points to the front right, y to the back right, and z up."""
 SPREAD = 0.8
 """Radius of a point's disc, divided by side / √(number of points), the spacing of points that fill the image evenly."""
 NEAR, FAR = np.array([20.0, 40.0, 90.0]), np.array([190.0, 205.0, 225.0])
