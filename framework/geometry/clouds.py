@@ -23,9 +23,9 @@ REACH = 3.0
 The distance is measured from the point that has the medians as coordinates, in multiples of the median distance.
 """
 LOOSE, TIGHT = 2.0, 0.01
-"""Largest and smallest norm that the points of a normalised cloud may have, in multiples of the largest coordinate.
+"""Largest and smallest extent of a normalised cloud, in multiples of the extent of the basis or grid that describes it.
 
-The coordinate is that of the basis or grid which describes the cloud. `require_normalised` refuses other clouds.
+`require_normalised` refuses other clouds.
 """
 
 

@@ -82,7 +82,10 @@ def tube(path: Sequence[Point] | np.ndarray, radii: Sequence[Number], sides: int
 def bar(
     start: Points, end: Points, radius: Number, end_radius: Number | None = None, sides: int = 6
 ) -> Solid:
-    """Return a round bar with sharp rims, or a frustum of a cone if `end_radius` differs from `radius`."""
+    """Return a round bar with sharp rims, or a frustum of a cone if `end_radius` differs from `radius`.
+
+    With at most 6 `sides`, the edges between the sides are sharp too.
+    """
     first, last = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
     x, y, z = (last - first).tolist()
     length, flat = math.hypot(x, y, z), math.hypot(y, z)
