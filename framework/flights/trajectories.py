@@ -53,7 +53,7 @@ def free_flight(
 def step(
     state: Float[Tensor, "flight 9"], time: Float[Tensor, "flight"], constants: Constants
 ) -> Float[Tensor, "flight 9"]:
-    """Return the state after `time` seconds, with at most one bounce within them.
+    """Return the state after `time` seconds, with at most one bounce during that time.
 
     If the ball would fall onto the table a second time within `time`, it is put onto the table without vertical
     velocity, so that the number of bounces stays finite.
