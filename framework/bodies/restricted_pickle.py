@@ -126,7 +126,7 @@ def _build_records(content: bytes) -> Any:
 
 
 def _obey(name: str, argument: Any, stack: list[Any]) -> None:
-    """Execute one instruction of a pickle that changes only the stack."""
+    """Execute an instruction of a pickle; it must be one that changes nothing but the stack."""
     match name:
         case "MARK":
             stack.append(MARK)
