@@ -99,7 +99,7 @@ class Writing:
 
     @cached_property
     def plain(self) -> bool:
-        """True if numbers have a decimal point, no sign between groups of digits and no unit."""
+        """True if numbers have a decimal point, no separator of thousands and no unit."""
         return self.sign == "." and self.thousands is None and not self.units
 
     def standard(self, cell: str) -> str:
