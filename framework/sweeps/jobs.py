@@ -91,7 +91,7 @@ class Job:
         return False
 
     def update(self, **values: Any) -> None:
-        """Change the record in memory and on disk."""
+        """Set the given keys of the record, in memory and on disk."""
         self.record |= values
         write_whole(self.folder / RECORD, json.dumps(self.record, indent=1).encode())
 
