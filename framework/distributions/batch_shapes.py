@@ -235,6 +235,18 @@ def _(density: Reshaped, start: Tensor, end: Tensor) -> Tensor | None:
     return _reshape(protocol.arc_probability(density.density, flat, density.inner(end)[0]), shape)
 
 
+@protocol.trigonometric_moments.register
+def _(density: Stacked, count: int, weights: Tensor | None = None) -> Tensor | None:
+    moments = _stack([protocol.trigonometric_moments(inner, count) for inner in density.densities])
+    return protocol.weighted_moments(moments, weights)
+
+
+@protocol.trigonometric_moments.register
+def _(density: Reshaped, count: int, weights: Tensor | None = None) -> Tensor | None:
+    moments = protocol.trigonometric_moments(density.density, count)
+    return protocol.weighted_moments(_reshape(moments, torch.Size((count, *density.batch_shape))), weights)
+
+
 @protocol.normals.register
 def _(density: Stacked) -> protocol.Normals | None:
     parts = [part for part in map(protocol.normals, density.densities) if part is not None]

@@ -9,6 +9,7 @@ from torch.distributions import Distribution
 
 from framework.distributions.circular import Circular
 from framework.distributions.density import circular_grid
+from framework.distributions.protocol import trigonometric_moments
 
 POINTS = (720, 2880)
 """Number of angles on the coarse grid, and on the fine grid for densities that the coarse grid does not resolve."""
@@ -109,9 +110,10 @@ class CircularMoments:
 
 @torch.no_grad()
 def circular_moments(density: Distribution) -> CircularMoments:
-    """Return the trigonometric moments of a density of one angle, by the trapezium rule on a grid.
+    """Return the trigonometric moments of a density of one angle.
 
-    The rule is spectrally exact for smooth densities. Items of the batch that the coarse grid does not resolve are
+    They come from `protocol.trigonometric_moments`, if it knows them, and otherwise from the trapezium rule on a grid,
+    which is spectrally exact for smooth densities. Items of the batch that the coarse grid does not resolve are
     evaluated on the fine grid. The other items keep their moments from the coarse grid, so that these do not depend on
     the rest of the batch.
 
@@ -128,8 +130,13 @@ def circular_moments(density: Distribution) -> CircularMoments:
 
 
 def _on_grid(density: Distribution, points: int) -> tuple[Tensor, Tensor]:
+    dtype = density.sample(torch.Size((0,))).dtype
+    largest = COARSE_ENOUGH.get(dtype, ROUNDED) if points == POINTS[0] else LAST_MOMENTS
+    known = trigonometric_moments(density, points // 2 + 1)
+    if known is not None:
+        last = _largest_of_last(known)
+        return known, (last < largest) | last.isnan()
     angles, log_density = circular_grid(density, points)
-    largest = COARSE_ENOUGH.get(log_density.dtype, ROUNDED) if points == POINTS[0] else LAST_MOMENTS
     mass = log_density.double().exp() * (2 * math.pi / points)
     support = density.support
     if isinstance(support, Circular) and support.ranges is not None:
@@ -142,6 +149,10 @@ def _on_grid(density: Distribution, points: int) -> tuple[Tensor, Tensor]:
         return nothing, total > 0
     moments = torch.fft.rfft(mass / total, dim=0).conj().resolve_conj()
     moments[1::2] *= -1  # the grid begins at -π
-    last = moments[-max(2, points // 40) :].abs().amax(0)
-    grid_resolves = ((total - 1).abs() < MASS_GAP) & (last < largest)
+    grid_resolves = ((total - 1).abs() < MASS_GAP) & (_largest_of_last(moments) < largest)
     return moments, grid_resolves | total.isnan()
+
+
+def _largest_of_last(moments: Complex[Tensor, "harmonic *batch"]) -> Float[Tensor, "*batch"]:
+    """Return the largest |m_n| in the highest twentieth of the orders n."""
+    return moments[-max(2, len(moments) // 20) :].abs().amax(0)

@@ -283,6 +283,13 @@ def _(density: Mixture, start: Tensor, end: Tensor) -> Tensor | None:
     )
 
 
+@protocol.trigonometric_moments.register
+def _(density: Mixture, count: int, weights: Tensor | None = None) -> Tensor | None:
+    shares = density.log_weights.double().softmax(-1)  # float32 weights sum to 1 only to 1e-7
+    moments = protocol.trigonometric_moments(density.components, count, shares)
+    return protocol.weighted_moments(moments, weights)
+
+
 def _weighted_mean(density: Mixture, parts: Tensor | None, numbers: int = 0) -> Tensor | None:
     """Return the mean of probabilities over the components, weighted by the mixture's weights.
 

@@ -91,6 +91,8 @@ def central_interval(density: Distribution, mass: float, draws: int = DRAWS) -> 
         if known is None:
             return _interval_of_draws(density, mass, draws)
         missing = known.low.isnan()
+        if not bool(missing.any()):
+            return known
         # draws do not help where the density is NaN
         lost = missing & ~density.log_prob(density.sample()).isnan().unsqueeze(-1)
         return _select(lost, _interval_of_draws(density, mass, draws), known) if bool(lost.any()) else known

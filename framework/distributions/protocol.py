@@ -272,6 +272,22 @@ def arc_probability(density: Distribution, start: Tensor, end: Tensor) -> Tensor
     return None
 
 
+@singledispatch
+def trigonometric_moments(density: Distribution, count: int, weights: Tensor | None = None) -> Tensor | None:
+    """Return the moments E exp(i n X) of one angle X, n = 0 … `count` - 1; None if they are not known.
+
+    The moments are complex128, (count, *batch). With `weights` (*batch, float64) the result is their weighted sum over
+    the last dimension of the batch, so that a mixture of many components needs memory for one order only. Default:
+    None. Callers then use `circular_moments`, which computes the moments on a grid.
+    """
+    return None
+
+
+def weighted_moments(moments: Tensor | None, weights: Tensor | None) -> Tensor | None:
+    """Return the sum of moments (count, *batch, K) over K with `weights` (*batch, K); unchanged if one is None."""
+    return moments if moments is None or weights is None else (weights * moments).sum(-1)
+
+
 def arc_length(start: Tensor, end: Tensor) -> Tensor:
     """Return the angle from `start` counter-clockwise to `end`, radians in [0, 2π], float64."""
     return torch.remainder(end.double() - start.double(), 2 * math.pi)

@@ -373,6 +373,8 @@ def protocol_calls(
     yield "cdf", lambda: protocol.cdf(density, value)
     yield "marginal_cdfs", lambda: protocol.marginal_cdfs(density, value)
     yield "arc_probability", lambda: protocol.arc_probability(density, value - 0.1, value + 0.1)
+    if isinstance(density.support, Circular) and density.event_shape == (1,):
+        yield "trigonometric_moments", lambda: protocol.trigonometric_moments(density, 5)
     yield "marginal", lambda: evaluate(protocol.marginal(density, 0))
     yield "median", lambda: protocol.median(density, 50)
     if density.event_shape == (1,):

@@ -18,9 +18,10 @@ from framework.distributions.protocol import (
     recentre,
     take,
     tempered_density,
+    trigonometric_moments,
 )
 from framework.distributions.symmetric import Symmetric
-from plugins.density_head.von_mises import functions, integrals
+from plugins.density_head.von_mises import functions, integrals, moments
 
 LARGEST = {torch.float32: torch.finfo(torch.float32).max, torch.float64: 1e300}
 """Largest κ of each dtype; a larger κ is replaced by it, so that all results stay finite numbers.
@@ -123,3 +124,9 @@ def _(density: VonMises, start: Tensor, end: Tensor) -> Tensor:
     before = integrals.cdf(first, mean, concentration)
     through = integrals.cdf(first + arc_length(start, end), mean, concentration)
     return (through - before).squeeze(-1).clamp(0, 1)
+
+
+@trigonometric_moments.register
+def _(density: VonMises, count: int, weights: Tensor | None = None) -> Tensor:
+    mean, concentration = (part.double().squeeze(-1) for part in (density.location, density.concentration))
+    return moments.trigonometric_moments(mean, concentration, count, weights)

@@ -1,0 +1,79 @@
+"""Trigonometric moments of von Mises densities, from a recurrence of Bessel functions."""
+
+import math
+
+import torch
+from jaxtyping import Complex, Float
+from torch import Tensor
+
+NEGLIGIBLE = 1e-17
+"""Moments of an absolute value below this one are taken as 0."""
+AT_ONCE = 2**21
+"""Largest number of moments of single densities that are kept in memory at once (16 MiB)."""
+
+
+@torch.no_grad()
+def trigonometric_moments(
+    mean: Float[Tensor, "*batch"], concentration: Float[Tensor, "*batch"], count: int, weights: Tensor | None
+) -> Complex[Tensor, "count ..."]:
+    """Return the moments E exp(i n X) = I_n(κ) / I_0(κ) exp(i n μ), n = 0 … count - 1, of von Mises densities.
+
+    The quotients r_n = I_n / I_{n-1} follow from r_n = κ / (2n + κ r_{n+1}), which is stable for falling n (Gautschi
+    1967), from a lower bound of the first one (Amos 1974, eq. 11). Source of the moments: Mardia & Jupp 2000, §3.5.4.
+
+    Args:
+        mean: μ, radians, float64.
+        concentration: κ, float64.
+        count: Number of moments, at least 2.
+        weights: Weights, (*batch), with which the moments are summed over the last dimension; None for no sum.
+
+    Returns:
+        Moments, (count, *batch), or with weights their sums, (count, *batch[:-1]).
+    """
+    if weights is None:
+        alone = (part.unsqueeze(-1) for part in (mean, concentration))
+        return trigonometric_moments(*alone, count, torch.ones_like(mean).unsqueeze(-1))
+    shape = mean.shape[:-1]
+    rows = [
+        part.reshape(-1, part.shape[-1]) for part in torch.broadcast_tensors(mean, concentration, weights)
+    ]
+    moments = mean.new_zeros(count, len(rows[0]), dtype=torch.complex128)
+    if moments.numel() == 0 or mean.shape[-1] == 0:
+        return moments.reshape(count, *shape)
+    highest = _highest_order(float(concentration.nan_to_num(nan=0.0).amax()), count)
+    step = max(1, AT_ONCE // (mean.shape[-1] * (highest + 1)))
+    first = 0
+    for part in zip(*(row.split(step) for row in rows), strict=True):
+        last = first + len(part[0])
+        _sum_moments(*part, moments[: highest + 1, first:last])
+        first = last
+    return moments.reshape(count, *shape)
+
+
+def _sum_moments(mean: Tensor, concentration: Tensor, weights: Tensor, into: Tensor) -> None:
+    """Write the weighted sums of the moments over the last dimension into `into`, (order, row)."""
+    highest = len(into) - 1
+    quotients = torch.empty(highest, *mean.shape, dtype=torch.float64, device=mean.device)
+    following = concentration / (
+        highest + 0.5 + torch.hypot(concentration, torch.full_like(mean, highest + 1.5))
+    )
+    for order in range(highest, 0, -1):
+        torch.div(concentration, (concentration * following).add_(2 * order), out=quotients[order - 1])
+        following = quotients[order - 1]
+    power = torch.complex(weights, torch.zeros_like(weights))
+    turn = torch.polar(torch.ones_like(mean), mean)
+    into[0] = power.sum(-1)
+    for order in range(1, highest + 1):
+        power *= turn * quotients[order - 1]
+        torch.sum(power, -1, out=into[order])
+    into[0] += into[1] * 0  # a density that is NaN has no moments at all
+
+
+def _highest_order(concentration: float, count: int) -> int:
+    """Return the largest order below `count` whose moment is not negligible, at least 1.
+
+    The quotients are at most κ / (n - 1/2 + √(κ² + (n - 1/2)²)) (Amos 1974, eq. 9).
+    """
+    order = torch.arange(1, count, dtype=torch.float64) - 0.5
+    bound = concentration / (order + torch.hypot(torch.tensor(concentration, dtype=torch.float64), order))
+    return max(1, int((bound.log().cumsum(0) > math.log(NEGLIGIBLE)).sum()))
