@@ -31,6 +31,7 @@ from framework.errors import ConfigError, DataError
 from framework.target import Target
 from framework.training.batches import Batches, SeededBatches, epoch_order
 from framework.training.checkpoint import WholeCheckpoints
+from framework.training.module import LoadedBatches
 
 SAMPLES = 165  # ten batches of 16, and a rest
 
@@ -265,9 +266,9 @@ def test_batched_fetching_asks_each_batch_once(monkeypatch: pytest.MonkeyPatch) 
 
 def test_loading_draws_nothing_from_the_global_generator() -> None:
     state = torch.get_rng_state()
-    batches = Batches(Sums(), batch_size=16, workers=0, seed=3, files=[Path("a"), Path("b"), Path("c")])
+    batches = Batches(Sums(), batch_size=16, workers=0, seed=3)
     list(batches.val_dataloader())
-    assert indices(batches.predict_dataloader()) == [[0, 1, 2]]
+    list(batches.of(Sums().test()))
     assert torch.equal(torch.get_rng_state(), state)
 
 
@@ -379,9 +380,8 @@ def train(folder: Path, case: dict[str, Any], resume: Path | None) -> None:
         num_sanity_val_steps=0,
     )
     batches = Batches(Sums(), batch_size=16, workers=case.get("workers", 0), seed=3)
-    batches.attach(trainer)
     module = Regression(folder, stop)
-    trainer.fit(module, datamodule=batches, ckpt_path=resume)
+    trainer.fit(module, datamodule=LoadedBatches(batches, trainer), ckpt_path=resume)
     weights = torch.cat([tensor.double().flatten() for tensor in module.state_dict().values()])
     (folder / "end.json").write_text(
         json.dumps([trainer.global_step, [value.hex() for value in weights.tolist()]])

@@ -23,7 +23,7 @@ from framework.objective import AdversaryOptimizer, Objective
 from framework.target import Target
 from framework.testing.wrappers import LENGTH, Plain
 from framework.training.batches import Batches
-from framework.training.module import FUSED, OPTIMIZERS, Training
+from framework.training.module import FUSED, OPTIMIZERS, LoadedBatches, Training
 from framework.training.schedules import make_schedule, update_plateaus
 
 
@@ -287,8 +287,7 @@ def test_gradients_are_clipped_in_every_precision(
         enable_model_summary=False,
         limit_val_batches=0,
     )
-    batches.attach(trainer)
-    trainer.fit(training, datamodule=batches)
+    trainer.fit(training, datamodule=LoadedBatches(batches, trainer))
     moved = [now.detach() - then for now, then in zip(training.parameters(), before, strict=True)]
     assert any(bool(one.any()) for one in moved)
     fused = name in FUSED and precision != scaled.precision

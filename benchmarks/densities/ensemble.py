@@ -28,7 +28,7 @@ from framework.configuration.settings import OptimizerSettings
 from framework.data import Data
 from framework.model import Model, Predictor
 from framework.training.batches import Batches, epoch_order
-from framework.training.module import OPTIMIZERS, Training
+from framework.training.module import OPTIMIZERS, LoadedBatches, Training
 from framework.uncertainty import outermost, own_batches
 from plugins.uncertainty.members.ensemble import Ensemble, network
 
@@ -97,8 +97,7 @@ def train_with_framework(predictor: Predictor, data: Data, epochs: int, seed: in
             use_distributed_sampler=False,
             default_root_dir=folder,
         )
-        batches.attach(trainer)
-        trainer.fit(training, datamodule=batches)
+        trainer.fit(training, datamodule=LoadedBatches(batches, trainer))
 
 
 def seconds(call: Callable[[], object]) -> float:

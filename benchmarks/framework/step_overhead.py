@@ -32,7 +32,14 @@ from framework.target import Target
 from framework.tracking.signals import Stopper
 from framework.tracking.tracker import NoTracker
 from framework.training.batches import Batches
-from framework.training.module import OPTIMIZERS, KeepCheckpoints, LogMetrics, StopAtBatch, Training
+from framework.training.module import (
+    OPTIMIZERS,
+    KeepCheckpoints,
+    LoadedBatches,
+    LogMetrics,
+    StopAtBatch,
+    Training,
+)
 
 ROUNDS = 7
 
@@ -186,8 +193,7 @@ def time_framework(case: Case) -> float:
             use_distributed_sampler=False,
             callbacks=[LogMetrics(tracker, 10), StopAtBatch(Stopper(), keep), clock],
         )
-        batches.attach(trainer)
-        trainer.fit(training, datamodule=batches)
+        trainer.fit(training, datamodule=LoadedBatches(batches, trainer))
         tracker.close("FINISHED")
     return 1e3 * (clock.end - clock.start) / case.steps
 

@@ -8,6 +8,7 @@ setting that reads it.
 
 import csv
 import io
+import itertools
 import math
 import re
 import shlex
@@ -43,6 +44,8 @@ INDEX = re.compile(
 )
 """Names that pandas, R and databases give to a column that numbers the rows."""
 
+CELLS_AT_ONCE = 2**16
+"""Number of cells that are sorted into columns at once, which is several times as fast as one by one."""
 MOST_LOOKED_AT = 2000
 """Largest number of cells, evenly spaced in a column of words, that are checked for numbers in another notation."""
 MOST_LISTED = 12
@@ -297,24 +300,38 @@ def read_columns(
         _check_header(file, header)
         columns: list[list[str]] = [[] for _ in header]  # a list for each row would take most of the memory
         lines: list[int] = []
-        for cells in reader:
-            # A spreadsheet writes an empty row as `,,,`. In a table of one column an empty cell is a missing number.
-            if not cells or (len(cells) > 1 and not any(map(str.strip, cells))):
-                continue
-            if len(cells) != len(header):
-                raise DataError(
-                    f"{file} line {reader.line_num}: the line has {len(cells)} cells, but the first line names "
-                    f"{len(header)} columns. Correct that line.{_why_other_width(header, cells, writing)}"
-                )
-            for column, cell in zip(columns, cells, strict=True):
-                column.append(cell.strip())
-            lines.append(reader.line_num)
+        filled = _filled_rows(reader, file, header, writing)
+        while numbered := list(itertools.islice(filled, max(1, CELLS_AT_ONCE // len(header)))):
+            numbers_of_lines, rows = zip(*numbered, strict=True)
+            lines.extend(numbers_of_lines)
+            for column, cells in zip(columns, zip(*rows, strict=True), strict=True):
+                column.extend(map(str.strip, cells))
     if not lines:
         raise DataError(
             f"{file} has no row below its first line, but one row per sample is expected. Add the rows."
         )
     _check_blanks(file, header, columns)
     return _select_named(file, header, columns, lines, writing)
+
+
+def _filled_rows(
+    reader: Any, file: Path, header: Sequence[str], writing: Writing | None
+) -> Iterator[tuple[int, list[str]]]:
+    """Yield the rows that are not blank, each after the number of the line on which it ends.
+
+    Raises:
+        DataError: a row has more or fewer cells than there are names in `header`.
+    """
+    for cells in reader:
+        # A spreadsheet writes an empty row as `,,,`. In a table of one column an empty cell is a missing number.
+        if not cells or (len(cells) > 1 and not any(map(str.strip, cells))):
+            continue
+        if len(cells) != len(header):
+            raise DataError(
+                f"{file} line {reader.line_num}: the line has {len(cells)} cells, but the first line names "
+                f"{len(header)} columns. Correct that line.{_why_other_width(header, cells, writing)}"
+            )
+        yield reader.line_num, cells
 
 
 def _why_other_width(header: Sequence[str], cells: Sequence[str], writing: Writing | None) -> str:

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import torch
 from torch import Tensor
-from torch.utils.flop_counter import FlopCounterMode
 
 
 @dataclass(frozen=True)
@@ -74,6 +73,8 @@ def measure(
             f"Got inputs of shape {tuple(inputs.shape)}, but a batch of at least one sample is required to measure the "
             "cost."
         )
+    from torch.utils.flop_counter import FlopCounterMode  # slow to import; only measurements need it
+
     device = inputs.device
     size = len(inputs)
     with torch.random.fork_rng([device] if device.type == "cuda" else []):

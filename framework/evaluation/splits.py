@@ -3,7 +3,7 @@
 import math
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 
@@ -12,9 +12,11 @@ from framework.density_head import Fitted
 from framework.distributions.noise import Draw
 from framework.errors import ConfigError
 from framework.evaluation.cost import Cost, measure
-from framework.metric import Metric
 from framework.model import Predictor
 from framework.prediction import Prediction, Split
+
+if TYPE_CHECKING:  # a metric imports torchmetrics, which predictions do not need
+    from framework.metric import Metric
 
 BLOCK = 64
 """Number of samples that are evaluated at once.
@@ -31,7 +33,7 @@ class Evaluation:
 
     total: dict[str, float]
     groups: dict[str, dict[str, float]]
-    metrics: list[Metric]
+    metrics: "list[Metric]"
     """Metric objects after all samples, from which figures can be drawn."""
 
 
@@ -45,7 +47,7 @@ def on_device(batches: Iterable[Batch], device: torch.device) -> Iterator[Batch]
 def evaluate(
     predictor: Predictor,
     batches: Iterable[Batch],
-    metrics: Sequence[Metric],
+    metrics: "Sequence[Metric]",
     *,
     groups: Sequence[str],
     samples: int,
@@ -85,9 +87,9 @@ def evaluate(
     return Evaluation(numbers(overall), {name: numbers(group) for name, group in by_group.items()}, overall)
 
 
-def _fresh(metrics: Sequence[Metric], device: torch.device) -> list[Metric]:
+def _fresh(metrics: "Sequence[Metric]", device: torch.device) -> "list[Metric]":
     """Return copies of the metrics on a device."""
-    return [cast(Metric, metric.clone().to(device)) for metric in metrics]
+    return [cast("Metric", metric.clone().to(device)) for metric in metrics]
 
 
 def predict(
@@ -105,7 +107,7 @@ def predict(
 
 
 def _update(
-    metrics: Sequence[Metric],
+    metrics: "Sequence[Metric]",
     predictor: Predictor,
     batch: Batch,
     samples: int,
@@ -121,7 +123,7 @@ def _update(
             metric.update(prediction)
 
 
-def numbers(metrics: Sequence[Metric]) -> dict[str, float]:
+def numbers(metrics: "Sequence[Metric]") -> dict[str, float]:
     """Return the values of all metrics, by name.
 
     Raises:
@@ -143,7 +145,7 @@ def numbers(metrics: Sequence[Metric]) -> dict[str, float]:
     return values
 
 
-def require_unique_name(owners: dict[str, Metric], name: str, metric: Metric) -> None:
+def require_unique_name(owners: "dict[str, Metric]", name: str, metric: "Metric") -> None:
     """Raise an error if another metric already uses a name, because one of the two numbers would be lost.
 
     Args:

@@ -4,7 +4,6 @@ Predicted images, and maps if the data set draws them, are written as files besi
 """
 
 import csv
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,7 +15,6 @@ from torch import Tensor
 from framework.configuration.config import Config, Options
 from framework.configuration.settings import Settings
 from framework.data import Data, Mapped
-from framework.datasets.png import encode_png
 from framework.distributions.intervals import DRAWS
 from framework.distributions.noise import Draw
 from framework.distributions.protocol import value_set
@@ -69,17 +67,17 @@ def run(config: Config) -> None:
                 "".join(f"{spell_name(file)}\n" for file in unreadable), encoding="utf-8"
             )
         images = run.folder / "images"
-        rows, mapped = predictions(
+        table, mapped = predictions(
             session.predictor, session.data, session.target, files, session.settings, images, options.interval
         )
         path = run.folder / "predictions.csv"
         with path.open("w", newline="", encoding="utf-8") as stream:
-            writer = csv.DictWriter(stream, list(rows[0]))
-            writer.writeheader()
-            writer.writerows(rows)
+            writer = csv.writer(stream)
+            writer.writerow(table)
+            writer.writerows(zip(*table.values(), strict=True))
         run.tracker.log_artifact(path)
-        session.console.print(f"{len(rows)} predictions in {path}", soft_wrap=True)
-        if options.interval and any(key.endswith(ERRORS) for key in rows[0]):
+        session.console.print(f"{len(table['sample'])} predictions in {path}", soft_wrap=True)
+        if options.interval and any(key.endswith(ERRORS) for key in table):
             session.console.print(
                 f"The ends of intervals with a standard error other than 0 are order statistics of {DRAWS:,} random "
                 "values, because the densities have no distribution function. The standard errors are in separate "
@@ -101,8 +99,8 @@ def predictions(
     settings: Settings,
     images: Path,
     mass: float | None = None,
-) -> tuple[list[dict[str, str]], list[tuple[Tensor, Tensor]]]:
-    """Return the rows of the CSV table, and the tensors from which the data set draws maps.
+) -> tuple[dict[str, list[str]], list[tuple[Tensor, Tensor]]]:
+    """Return the columns of the CSV table by name, and the tensors from which the data set draws maps.
 
     A row has the name of a sample, the point prediction, the density's entropy in nats and the prediction set, or, if
     the model predicts no sets, the interval of probability `mass`. Standard errors are included if the ends of
@@ -114,29 +112,38 @@ def predictions(
     dataset = data.read(files) if files else data.splits().test
     loader = Batches(data, batch_size=BLOCK, workers=settings.workers, seed=settings.seed).of(dataset)
     names = _names(data, files, len(dataset))  # type: ignore[arg-type]
-    rows: list[dict[str, str]] = []
+    cells: dict[str, list[str]] = {}
     mapped: list[tuple[Tensor, Tensor]] = []
     for number, batch in enumerate(track_batches(loader, "predicting")):
         prediction = predict(predictor, batch, settings.samples, Draw(settings.seed, number))
         prediction = prediction.in_frame(data.frame(batch))
-        columns = table_columns(target, prediction)
+        columns: dict[str, Sequence[Any] | Tensor] = {}
+        if target.kind == "class":
+            columns["class"] = [target.names[label] for label in prediction.point.long().tolist()]
+        elif target.kind == "image":
+            columns["image"] = _write_images(prediction.image("color"), images, number * BLOCK)
+        columns |= table_columns(target, prediction)
         if isinstance(data, Mapped) and files:
             mapped.append((prediction.point.cpu(), prediction.deviation().cpu()))
-        columns = {**columns, **_intervals(target, prediction, mass)}
-        for row in range(len(batch["index"])):
-            values = {key: format_cell(column[row], key) for key, column in columns.items()}
-            if target.kind == "class":
-                values = {"class": target.names[int(prediction.point[row])], **values}
-            elif target.kind == "image":
-                file = images / f"{len(rows):05}.png"
-                images.mkdir(exist_ok=True)
-                file.write_bytes(encode_png(prediction.image("color")[row]))
-                values = {"image": f"{images.name}/{file.name}", **values}
-            rows.append({"sample": names[len(rows)], **values})
-    errors = [key for key in rows[0] if key.endswith(ERRORS)] if mass else []
-    if all(row[key] == "0" for row in rows for key in errors):
-        rows = [{key: value for key, value in row.items() if key not in errors} for row in rows]
-    return rows, mapped
+        columns |= _intervals(target, prediction, mass)
+        for key, column in columns.items():
+            cells.setdefault(key, []).extend(format_cells(column, key))
+    errors = [key for key in cells if key.endswith(ERRORS)] if mass else []
+    if all(cell == "0" for key in errors for cell in cells[key]):
+        for key in errors:
+            del cells[key]
+    return {"sample": names, **cells}, mapped
+
+
+def _write_images(batch: Tensor, folder: Path, first: int) -> list[str]:
+    """Write a batch of images in linear RGB to a folder, numbered from `first`; return their names in the table."""
+    from framework.datasets.png import encode_png  # imports Pillow, which other targets do not need
+
+    folder.mkdir(exist_ok=True)
+    names = [f"{number:05}.png" for number in range(first, first + len(batch))]
+    for name, image in zip(names, batch, strict=True):
+        (folder / name).write_bytes(encode_png(image))
+    return [f"{folder.name}/{name}" for name in names]
 
 
 def _intervals(
@@ -170,23 +177,20 @@ def _names(data: Data, files: Sequence[Path], samples: int) -> list[str]:
         return [f"test {number}" for number in range(samples)]
     if samples == len(files):
         return [spell_name(file) for file in files]
-    counts = [len(data.read([file])) for file in files]  # type: ignore[arg-type]
+    counts = [samples] if len(files) == 1 else [len(data.read([file])) for file in files]  # type: ignore[arg-type]
     return [
-        f"{spell_name(file)} row {row}"
-        for file, count in zip(files, counts, strict=True)
+        f"{name} row {row}"
+        for name, count in zip(map(spell_name, files), counts, strict=True)
         for row in range(count)
     ]
 
 
-def format_cell(value: str | float | Tensor, key: str) -> str:
-    """Return the text of a table cell, with 15 significant digits for the ends of intervals and 10 for other numbers.
+def format_cells(column: Sequence[Any] | Tensor, key: str) -> Iterator[str]:
+    """Yield the texts of a column, with 15 significant digits for the ends of intervals and 10 for other numbers.
 
     The ends of an interval need more digits, because they may differ little compared with their size in the user's
     unit.
     """
-    if isinstance(value, str):
-        return value
-    number = float(value)
-    if math.isnan(number):
-        return "nan"
-    return f"{number:.{15 if key.endswith(ENDS) else 10}g}"
+    pattern = "%.15g" if key.endswith(ENDS) else "%.10g"
+    for value in column.tolist() if isinstance(column, Tensor) else column:
+        yield value if isinstance(value, str) else pattern % value

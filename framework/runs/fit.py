@@ -21,7 +21,14 @@ from framework.tracking.signals import Stopped
 from framework.training.cached_features import CachedFeatures, fits
 from framework.training.checkpoint import BEST, TRAINED, WholeCheckpoints, find_resumable
 from framework.training.fitting import fit_at_once, mean_loss
-from framework.training.module import KeepCheckpoints, LogMetrics, StopAtBatch, StopEarly, Training
+from framework.training.module import (
+    KeepCheckpoints,
+    LoadedBatches,
+    LogMetrics,
+    StopAtBatch,
+    StopEarly,
+    Training,
+)
 from framework.training.progress import Progress
 from framework.training.rank_processes import end_together
 from framework.uncertainty import outermost
@@ -78,10 +85,10 @@ def _fit_by_gradient(session: Session, run: Run) -> tuple[float, int]:
     batches = session.batches(fed)
     several = outermost(session.predictor)
     batches.orders = several.model_count if several else 1
-    batches.attach(trainer)
+    loaded = LoadedBatches(batches, trainer)
     resume = _resume_checkpoint(session, run)
     with end_together(trainer, run.stopper, partial(_give_up, run)):
-        trainer.fit(training, datamodule=batches, ckpt_path=resume, weights_only=True)
+        trainer.fit(training, datamodule=loaded, ckpt_path=resume, weights_only=True)
         _leave_process_group()
     early = any(isinstance(callback, StopEarly) and callback.stopped for callback in trainer.callbacks)  # type: ignore[attr-defined]
     session.console.print(

@@ -10,7 +10,7 @@ from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from rich.console import Console
@@ -50,21 +50,22 @@ from framework.density_head import Fitted
 from framework.distributions.noise import seed_step
 from framework.errors import CheckpointError, ConfigError, UserError
 from framework.evaluation.splits import BLOCK, numbers, on_device, require_unique_name
-from framework.metric import Metric
 from framework.model import Predictor, fitted_models, learns
 from framework.objective import Objective
 from framework.prediction import Prediction, true_image
 from framework.runs.introduction import introduce, introduce_model, introduce_threads
 from framework.runs.job import refuse_idle
 from framework.runs.run import Run, may_resume
-from framework.storage.checkpoints import read
+from framework.storage.checkpoints import read, write
 from framework.storage.first_rank import first_rank
 from framework.storage.progress import output
 from framework.target import Target
 from framework.tracking.run_info import MODEL
 from framework.training.batches import Batches, require_targets, track_batches
-from framework.training.checkpoint import WholeCheckpoints, find_resumable
 from framework.uncertainty import remarks
+
+if TYPE_CHECKING:  # a metric imports torchmetrics, which predictions do not need
+    from framework.metric import Metric
 
 FEW = 8
 """Number of validation samples with which uncertainty wrappers are tried before training; some need more than one."""
@@ -99,7 +100,7 @@ class Session:
     device: torch.device
     console: Console
     objectives: Sequence[Objective] = ()
-    metrics: Sequence[Metric] = ()
+    metrics: "Sequence[Metric]" = ()
     outliers: Data | None = None
 
     @property
@@ -150,7 +151,7 @@ class Session:
         """Write weights and description to model.ckpt for `framework.load`; the file is also the model in the store."""
         path = run.checkpoints / "model.ckpt"
         state = {f"{PREFIX}{key}": value.cpu() for key, value in self.predictor.state_dict().items()}
-        WholeCheckpoints().save_checkpoint({"framework": self.description(), "state_dict": state}, path)
+        write({"framework": self.description(), "state_dict": state}, path)
         run.tracker.log_artifact(path, MODEL)
 
 
@@ -178,6 +179,8 @@ def for_training(config: Config) -> Session:
         ConfigError: A part is missing or does not fit another.
         DataError: `Data.prepare` fails.
     """
+    from framework.training.checkpoint import find_resumable  # imports Lightning, which only training needs
+
     console = set_up_process(config.settings)
     parts = config.parts
     resumed = may_resume(config)
@@ -371,7 +374,7 @@ def rehearse(session: Session) -> None:
             for prediction in predictions:
                 if prediction.split in metric.splits:
                     trial.update(prediction)  # type: ignore[operator]  # torchmetrics types what it wraps as a module
-            numbers([cast(Metric, trial)])
+            numbers([cast("Metric", trial)])
         few = validation_batch if not session.parts["uncertainty"] else _first_samples(splits.validation, FEW)
         with torch.enable_grad():
             deepcopy(session.predictor).eval().calibrate([few])
@@ -431,7 +434,10 @@ def for_predictor(
     chosen = {
         group for group in ("data", "outliers", "metric") if group in reads and config.values.get(group)
     }
-    stored_parts = {group: parts.get(group) for group in ("outliers", "metric") if group not in chosen}
+    # the groups that the mode does not read are left as they are, and their plugins are not imported
+    stored_parts = {
+        group: parts.get(group) for group in ("outliers", "metric") if group in reads and group not in chosen
+    }
     repeated = {
         key: value
         for key, value in flatten(config.settings.stored).items()

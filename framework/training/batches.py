@@ -2,14 +2,12 @@
 
 import os
 import signal
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import KW_ONLY, dataclass
 from functools import partial
-from pathlib import Path
 from types import FrameType
-from typing import Any, final
+from typing import TYPE_CHECKING, Any, final
 
-import pytorch_lightning as pl
 import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, Sampler
@@ -22,6 +20,9 @@ from framework.errors import ConfigError, DataError
 from framework.storage.progress import track_progress
 from framework.target import Target
 from framework.tracking.signals import SIGNALS
+
+if TYPE_CHECKING:
+    import pytorch_lightning as pl
 
 Position = tuple[int, int]
 """Pair (epoch, number of the epoch's next batch), both counted from 0."""
@@ -109,12 +110,12 @@ def epoch_order(length: int, seed: int | None, epoch: int, member: int = 0) -> l
 
 
 @final
-class Batches(pl.LightningDataModule):
+class Batches:
     """Loaders of a data set's batches for training, validation, test and prediction.
 
-    A resumed training continues with the batch that would have been next.
+    A resumed training continues with the batch that would have been next. `training.module.LoadedBatches` gives the
+    batches to Lightning; this class does not import Lightning, which takes a second and which only training needs.
 
-    Call `attach` before `fit`, and give the Trainer `use_distributed_sampler=False`, because this class handles ranks.
     Training leaves out the samples that do not fill a batch. Validation, test and prediction use every sample once, in
     the data set's order.
 
@@ -123,7 +124,6 @@ class Batches(pl.LightningDataModule):
         batch_size: samples of a batch over all devices.
         workers: number of loading processes of each loader; 0 loads in this process.
         seed: seed of the training order.
-        files: files that `predict` reads.
         orders: number of models that train together, each with its own order; on a single device only.
     """
 
@@ -134,18 +134,16 @@ class Batches(pl.LightningDataModule):
         batch_size: int,
         workers: int,
         seed: int,
-        files: Sequence[Path] = (),
         orders: int = 1,
     ) -> None:
-        super().__init__()
         self.data = data
         self.batch_size = batch_size
         self.workers = workers
         self.seed = seed
-        self.files = files
         self.orders = orders
+        self.trainer: pl.Trainer | None = None
 
-    def attach(self, trainer: pl.Trainer) -> None:
+    def attach(self, trainer: "pl.Trainer") -> None:
         """Set the trainer, from which the loaders take the starting position, the rank and the device."""
         self.trainer = trainer
 
@@ -166,18 +164,6 @@ class Batches(pl.LightningDataModule):
     def of(self, dataset: Dataset[Batch]) -> DataLoader[Batch]:
         """Return batches of any other dataset in the dataset's order; the targets are not checked."""
         return self._loader(dataset, as_batch, seed=None, drop_last=False)
-
-    def predict_dataloader(self) -> DataLoader[Batch]:
-        """Return the batches of the user's own files."""
-        # A plain loader: Lightning rebuilds the loader for prediction, and cannot rebuild one with `SeededBatches`.
-        return DataLoader(
-            self.data.read(self.files),
-            batch_size=self.batch_size,
-            num_workers=self.workers,
-            worker_init_fn=outlive_signals if self.workers else None,
-            collate_fn=as_batch,
-            generator=self._generator(),
-        )
 
     def _loader(
         self, dataset: Dataset[Batch], collate: Callable[..., Batch] | None = None, **order: Any

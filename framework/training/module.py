@@ -11,6 +11,7 @@ import pytorch_lightning as pl
 import torch
 from pytorch_lightning.callbacks.early_stopping import EarlyStopping, EarlyStoppingReason
 from torch import Tensor, nn
+from torch.utils.data import DataLoader
 
 from framework.configuration.settings import OptimizerSettings
 from framework.data import Batch, Data
@@ -20,6 +21,7 @@ from framework.model import FrozenFrontEnd, Predictor, one_pass
 from framework.objective import AdversaryOptimizer, Objective
 from framework.tracking.signals import Stopper
 from framework.tracking.tracker import Tracker
+from framework.training.batches import Batches
 from framework.training.ranks import Share, WholeBatch, gather_rows, rank_share, sum_over_ranks
 from framework.training.schedules import make_schedule, smooth_factor, update_plateaus
 from framework.uncertainty import outermost, own_batches
@@ -40,6 +42,26 @@ The fused form passes over the memory of each parameter once instead of several 
 
 ONE_VALUE = "Expected more than 1 value per channel"
 """Beginning of torch's error message about batch norm in training over a single value per channel."""
+
+
+class LoadedBatches(pl.LightningDataModule):
+    """Lightning's view of `Batches`, to which it attaches the trainer.
+
+    The trainer needs `use_distributed_sampler=False`, because `Batches` divides the samples among ranks.
+    """
+
+    def __init__(self, batches: Batches, trainer: pl.Trainer) -> None:
+        super().__init__()
+        self.batches = batches
+        batches.attach(trainer)
+
+    def train_dataloader(self) -> DataLoader[Batch]:
+        """Return the loader of the training batches."""
+        return self.batches.train_dataloader()
+
+    def val_dataloader(self) -> DataLoader[Batch]:
+        """Return the batches of the validation split."""
+        return self.batches.val_dataloader()
 
 
 class Training(pl.LightningModule):
@@ -129,7 +151,7 @@ class Training(pl.LightningModule):
     def _orders(self) -> int:
         """Return the number of models that train together; each batch contains one batch per model (`Batches`)."""
         trainer: Any = self.trainer
-        return trainer.datamodule.orders
+        return trainer.datamodule.batches.orders
 
     def _share(self, batch: Batch) -> Share | None:
         """Return which rows of the whole batch this rank has; None if a single process trains."""
