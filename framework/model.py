@@ -4,7 +4,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Generic, TypeVar, final
+from typing import Any, Generic, TypeVar, final
 
 import torch
 from jaxtyping import Float
@@ -232,16 +232,19 @@ class FrozenFrontEnd(Predictor):
 
 
 @contextmanager
-def one_pass(predictor: Predictor) -> Iterator[None]:
+def one_pass(predictor: Predictor, caches: Sequence[SharedResult[Any]] | None = None) -> Iterator[None]:
     """Compute shared results only once for each tensor of inputs inside the block.
 
     Loss and densities of the same inputs then reuse them. The shared results are fixed features (`Encoder.fixed`), the
     raw parameters of direct heads (`DensityHead.direct`), and the results that other modules keep in an attribute
     `shared_result`. Raw parameters of direct heads are shared, because they are images that are expensive to compute,
     and an objective reads the same images as the loss.
+
+    Args:
+        predictor: the predictor.
+        caches: its `shared_results`, if the caller has found them before; to find them takes as long as a few layers.
     """
-    candidates = (getattr(module, "shared_result", None) for module in predictor.modules())
-    caches = [cache for cache in candidates if isinstance(cache, SharedResult)]
+    caches = shared_results(predictor) if caches is None else caches
     for cache in caches:
         cache.last = ()
     try:
@@ -249,6 +252,12 @@ def one_pass(predictor: Predictor) -> Iterator[None]:
     finally:
         for cache in caches:
             cache.last = None
+
+
+def shared_results(predictor: Predictor) -> list[SharedResult[Any]]:
+    """Return the caches of all modules of a predictor (`one_pass`)."""
+    candidates = (getattr(module, "shared_result", None) for module in predictor.modules())
+    return [cache for cache in candidates if isinstance(cache, SharedResult)]
 
 
 def fitted_models(predictor: Predictor) -> list[Model]:

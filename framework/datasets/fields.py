@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 
+import torch
 from torch import Tensor
 from torch.utils.data import Dataset, default_collate
 
@@ -32,7 +33,10 @@ class Fields(Dataset[dict[str, Tensor]]):
         return {name: tensor[index] for name, tensor in self.fields.items()}
 
     def __getitems__(self, indices: Sequence[int]) -> Mapping[str, Tensor]:
-        return {name: tensor[list(indices)] for name, tensor in self.fields.items()}
+        rows = torch.tensor(
+            indices, dtype=torch.int64
+        )  # once, because a list would be converted for each field
+        return {name: tensor[rows] for name, tensor in self.fields.items()}
 
 
 class FetchedInBatches(Dataset[Batch], ABC):

@@ -7,11 +7,14 @@ import pytorch_lightning as pl
 from rich import progress
 from rich.console import Console
 
-from framework.training.module import Training
+from framework.training.module import BatchCallback, Training
+
+BAR_INTERVAL = 0.1
+"""Seconds between two updates of the bar, which is drawn ten times a second."""
 
 
 @final
-class Progress(pl.Callback):
+class Progress(BatchCallback):
     """Callback that shows the epoch (from 1), its mean training loss so far, and the last validation loss.
 
     Args:
@@ -54,7 +57,9 @@ class Progress(pl.Callback):
         self._total += pl_module.last_loss
         self._steps += 1
         if self._bar is not None:
-            self._bar.update(self._task, completed=batch_idx + 1, description=self._text(trainer))
+            if time.monotonic() - self._last_line_time > BAR_INTERVAL or trainer.is_last_batch:
+                self._last_line_time = time.monotonic()
+                self._bar.update(self._task, completed=batch_idx + 1, description=self._text(trainer))
         elif time.monotonic() - self._last_line_time > self.seconds:
             self._line(trainer, f", step {batch_idx + 1} of {trainer.num_training_batches}")
 
