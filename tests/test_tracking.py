@@ -833,6 +833,22 @@ def test_what_sends_dies_and_another_goes_on(folder: Path, caplog: pytest.LogCap
     assert second.returncode == 0
 
 
+def test_a_process_started_early_is_that_of_the_run_or_ends_with_the_command(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(store_process, "_COMMAND", ("sleep", "100"))
+    with store_process.started_early():
+        unused = store_process._early[0]._process
+    assert unused is not None and unused.returncode == -9
+    with store_process.started_early():
+        taken = store_process._early[0]._process
+        tracker = open_tracker(folder, open_store=None, opening_patience=0.0, patience=0.1)
+    assert sending_process(tracker) is taken
+    assert taken.poll() is None
+    tracker.close("FINISHED")
+    assert taken.returncode == -9, "it never answers"
+
+
 def test_what_sends_and_hangs_is_ended_with_the_run(
     folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -1,7 +1,9 @@
 """Modes of the command line; each mode is a module that is imported only if the mode is chosen."""
 
+import os
 import sys
 from collections.abc import Sequence
+from contextlib import nullcontext
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -11,8 +13,10 @@ from framework.configuration.modes import MODES as MODES
 from framework.configuration.modes import idle_sentences, require_read
 from framework.configuration.settings import require_device
 from framework.errors import ConfigError, did_you_mean
-from framework.runs.job import refuse_idle
+from framework.runs.job import PARENT, refuse_idle
 from framework.storage.enclosed import require_enclosed
+from framework.storage.first_rank import first_rank
+from framework.tracking.store_process import started_early
 
 
 def run(values: dict[str, Any], folder: Path, overrides: Sequence[str]) -> float | None:
@@ -41,7 +45,18 @@ def run(values: dict[str, Any], folder: Path, overrides: Sequence[str]) -> float
     if name == "train":  # find mistakes before the slow import of Lightning
         require_device(config.settings.trainer.get("accelerator"))
         _ = config.parts
-    return import_module(f"framework.modes.{name}").run(config)
+    with started_early() if _sends_run(config) else nullcontext():
+        return import_module(f"framework.modes.{name}").run(config)
+
+
+def _sends_run(config: Config) -> bool:
+    """Return whether this process sends the run of a command to a store; jobs of a sweep leave this to the sweep."""
+    return (
+        "resume" in MODES[config.mode].reads  # the mode opens a run
+        and config.settings.logger.name == "mlflow"
+        and first_rank()
+        and PARENT not in os.environ
+    )
 
 
 def _send_rest(folder: Path, store: str | None) -> bool:

@@ -9,9 +9,10 @@ import logging
 import os
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import asdict
+from importlib import import_module
 from pathlib import Path
 from typing import Any, BinaryIO, final
 
@@ -34,13 +35,18 @@ class StoreAway(Exception):
 class StoreProcess:
     """Function object of type `sender.OpenStore` that opens runs in MLflow from a separate process.
 
-    The first call starts the process.
+    The first call starts the process, unless `start` has started it.
     """
 
     def __init__(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None
 
     def __call__(self, folder: Path, info: RunInfo) -> Store:
+        self.start()
+        return _DistantStore(self, folder, info)
+
+    def start(self) -> None:
+        """Start the process if it does not run; it imports MLflow at once."""
         if self._process is not None and self._process.poll() is not None:
             self.end()
         if self._process is None:
@@ -48,7 +54,6 @@ class StoreProcess:
             self._process = subprocess.Popen(
                 _COMMAND, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True
             )
-        return _DistantStore(self, folder, info)
 
     def ask(self, **request: Any) -> Mapping[str, Any]:
         """Send a request to the process, log the log messages of the process, and return its response.
@@ -90,6 +95,33 @@ class StoreProcess:
         process.stdout.close()
 
 
+_early: list[StoreProcess] = []
+"""The process that `started_early` has started and that no tracker has taken yet, or nothing."""
+
+
+@contextmanager
+def started_early() -> Iterator[None]:
+    """Start the process for the tracker that is opened inside the block; end the process if no tracker takes it.
+
+    The process imports MLflow while the command imports PyTorch and reads its data, which uses one core. So the import
+    takes no time from the training, and a short run need not wait for it at its end.
+    """
+    process = StoreProcess()
+    process.start()
+    _early.append(process)
+    try:
+        yield
+    finally:
+        if process in _early:
+            _early.remove(process)
+            process.end(at_once=True)
+
+
+def take_process() -> StoreProcess:
+    """Return the process of `started_early`, or one that is started when it is needed."""
+    return _early.pop() if _early else StoreProcess()
+
+
 @final
 class _DistantStore(Store):
     def __init__(self, process: StoreProcess, folder: Path, info: RunInfo) -> None:
@@ -126,7 +158,6 @@ def serve(requests: BinaryIO, responses: BinaryIO) -> None:
         request = json.loads(line)
         try:
             if "open" in request:
-                # the import takes seconds, for which the requesting process waits
                 from framework.tracking.mlflow_store import MlflowStore
 
                 info = TypeAdapter(RunInfo).validate_python(request["info"])
@@ -152,7 +183,13 @@ def main() -> None:
     """Handle requests from standard input; redirect the output of MLflow to standard error, away from the responses."""
     responses = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
+    # MLflow works without these packages, whose import takes a third of the time, as long as it reads no data
+    sys.modules.update(dict.fromkeys(("numpy", "pandas", "pyarrow")))  # type: ignore[arg-type]
+    with suppress(Exception):  # `serve` raises the same error, and reports it
+        import_module("framework.tracking.mlflow_store")
     serve(sys.stdin.buffer, responses)
+    sys.stderr.flush()
+    os._exit(0)  # everything is stored, and Python would take a third of a second to release its objects
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ from framework.storage.plain_values import read_json
 from framework.tracking.journal import Journal
 from framework.tracking.run_info import SIDECAR, Destination, RunInfo, Sidecar, read_run_info
 from framework.tracking.sender import OpenStore, Sender
-from framework.tracking.store_process import StoreProcess
+from framework.tracking.store_process import take_process
 from framework.tracking.stores import without_password
 
 _log = logging.getLogger(__name__)
@@ -198,7 +198,7 @@ class MlflowTracker(Tracker):
         self._patience = patience
         self._opening_patience = opening_patience
         self._sends_from = time.monotonic() + wait if wait else 0.0
-        self._process = StoreProcess() if open_store is None else None
+        self._process = take_process() if open_store is None else None
         self._open_store = open_store or self._process
         self._sidecar: Sidecar | None = None
         self._sender: Sender | None = None
