@@ -4,11 +4,13 @@ import os
 import re
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
 
 from framework.geometry.nearest import compiled
+from framework.storage import kernels
 from framework.storage.kernels import kernel_cache
 from plugins.encoder.projection import compiled as projecting
 from plugins.renderer.rasterizer import raster
@@ -55,6 +57,20 @@ def test_kernels_that_call_other_files_are_kept_by_their_sources() -> None:
             assert other.name == "kernels.py" or ("njit" not in made and "compiler(" not in made), (
                 f"{file} calls kernels of {other}"
             )
+
+
+def test_long_compilation_is_announced_once(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(kernels, "QUIET_TIME", 0.2)
+    announcement = kernels._Announcement()
+    printed = []
+    for seconds in (0.0, 0.5, 0.5):
+        announcement.on_start(None)
+        time.sleep(seconds)
+        announcement.on_end(None)
+        printed.append(capsys.readouterr().err)
+    assert [bool(text) for text in printed] == [False, True, False]
 
 
 def test_numba_itself_keeps_no_code() -> None:

@@ -1,15 +1,21 @@
 """Compilation of functions that are cached on disk and compiled again if one of their source files has changed."""
 
 import os
+import sys
+import time
 from collections.abc import Callable, Iterable
 from hashlib import sha256
 from pathlib import Path
+from threading import Timer
 from typing import Any
 
 from numba import config, njit
+from numba.core import event
 
 from framework.errors import DataError
 from framework.storage.cache import folder
+from framework.storage.first_rank import first_rank
+from framework.storage.progress import QUIET_TIME
 
 
 def kernel_cache(name: str, sources: Iterable[Path]) -> str | None:
@@ -51,3 +57,39 @@ def compiler(cache_folder: str | None, **options: Any) -> Callable[[Callable[...
             vars(config).update(CACHE_DIR=before)  # type: ignore[reportAttributeAccessIssue]
 
     return compile_function
+
+
+class _Announcement(event.Listener):
+    """Listener that prints one line as soon as this process has compiled for `QUIET_TIME` seconds in all."""
+
+    def __init__(self) -> None:
+        self._depth = 0  # a function is compiled while its caller is
+        self._seconds = 0.0
+        self._start = 0.0
+        self._timer: Timer | None = None
+        self._printed = False
+
+    def on_start(self, event: object) -> None:
+        """Start a timer for the rest of the quiet time."""
+        self._depth += 1
+        if self._depth == 1 and not self._printed:
+            self._start = time.monotonic()
+            self._timer = Timer(max(0.0, QUIET_TIME - self._seconds), self._print)
+            self._timer.daemon = True
+            self._timer.start()
+
+    def on_end(self, event: object) -> None:
+        """Stop the timer."""
+        self._depth -= 1
+        if self._depth == 0 and self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+            self._seconds += time.monotonic() - self._start
+
+    def _print(self) -> None:
+        self._printed = True
+        if first_rank():
+            sys.stderr.write("compiling functions for this processor; the cache keeps them for later runs\n")
+
+
+event.register("numba:compile", _Announcement())
