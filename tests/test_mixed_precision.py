@@ -10,6 +10,7 @@ from torch.distributions import Distribution
 from framework.configuration.registry import installed
 from framework.configuration.schema import build, resolve
 from framework.distributions.normals import JointNormal
+from framework.runs import fit
 from framework.testing.contract import contract
 from framework.testing.finding import SEED, seed
 from framework.testing.heads import HeadSubject, fit_if_needed
@@ -68,3 +69,20 @@ def test_a_joint_normal_is_that_of_full_precision(kind: torch.dtype) -> None:
     root.diagonal(dim1=-2, dim2=-1).abs_()
     mean, value = (torch.randn(4, 3, generator=generator) for _ in range(2))
     require_same(lambda: JointNormal(mean, root), value, kind)
+
+
+@pytest.mark.parametrize(
+    ("accelerator", "fast", "precision"),
+    [
+        ("cpu", True, "bf16-mixed"),
+        (None, True, "bf16-mixed"),
+        ("cpu", False, "32-true"),
+        ("tpu", True, "32-true"),
+    ],
+)
+def test_automatic_precision_is_bfloat16_on_processors_with_fast_products(
+    accelerator: str | None, fast: bool, precision: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fit, "fast_bfloat16", lambda device: fast)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert fit._fast_precision(accelerator) == precision

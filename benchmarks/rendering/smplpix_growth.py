@@ -24,8 +24,8 @@ from framework.bodies.topologies import Name, sheet, topology
 from framework.encoder import Encoder
 from framework.figures.style import COLOURS, MARKERS, save_figure, titled_figure
 from framework.reports.table import Row, write_csv
+from framework.storage.processor import fast_bfloat16
 from plugins.data.human_scans.data import in_front
-from plugins.encoder.unets.canvas import fast_bfloat16
 
 SIZE = (410, 308)
 TOPOLOGIES: tuple[Name, ...] = ("7k", "27k", "110k")

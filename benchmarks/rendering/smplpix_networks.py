@@ -27,7 +27,7 @@ from benchmarks.timing import ROUNDS, Rounds, milliseconds, require_idle, time_i
 from framework.configuration.loading import load_with_description, reader
 from framework.encoder import Encoder
 from framework.geometry.camera import look_from
-from plugins.encoder.unets.canvas import fast_bfloat16
+from framework.storage.processor import fast_bfloat16
 
 HERE = Path(__file__).resolve()
 FOLDER = ROOT / "outputs/smplpix_networks"

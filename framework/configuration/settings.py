@@ -147,7 +147,8 @@ class TrainerSettings(_Strict):
     gradient_clip_algorithm: Literal["norm", "value"] | None = None
     accelerator: Literal["auto", "cpu", "gpu", "cuda", "mps", "tpu"] | None = None
     strategy: Literal[STRATEGIES] | None = None  # pyright: ignore[reportInvalidTypeForm]
-    precision: Literal[PRECISIONS] | None = None  # pyright: ignore[reportInvalidTypeForm]
+    precision: Literal["auto", *PRECISIONS] | None = None  # pyright: ignore[reportInvalidTypeForm]
+    """Number format; auto: bf16-mixed on a processor that multiplies bfloat16 numbers fast, else 32-true."""
     devices: Annotated[Any, AfterValidator(_devices)] = None
     num_nodes: Count | None = None
     num_sanity_val_steps: Annotated[int, Field(strict=True, ge=-1)] | None = None

@@ -10,13 +10,14 @@ from rich.console import Console
 from torch import distributed as dist
 
 from framework.configuration.loading import fill, predictor_weights
-from framework.configuration.settings import TRAINER_OURS
+from framework.configuration.settings import TRAINER_OURS, device_of
 from framework.data import Data
 from framework.model import FrozenFrontEnd, fitted_models, learns
 from framework.runs.run import Run, resume_arguments
 from framework.runs.session import Session
 from framework.storage.checkpoints import read
 from framework.storage.first_rank import first_rank
+from framework.storage.processor import fast_bfloat16
 from framework.tracking.signals import Stopped
 from framework.training.cached_features import CachedFeatures, fits
 from framework.training.checkpoint import BEST, TRAINED, WholeCheckpoints, find_resumable
@@ -25,6 +26,7 @@ from framework.training.module import (
     KeepCheckpoints,
     LoadedBatches,
     LogMetrics,
+    NoProfiler,
     StopAtBatch,
     StopEarly,
     Training,
@@ -172,8 +174,12 @@ def _trainer(run: Run, keep: KeepCheckpoints, console: Console) -> pl.Trainer:
         terminal = Console(stderr=True, quiet=console.quiet)
         callbacks.append(Progress(terminal if terminal.is_terminal else console))
     arguments = {key: value for key, value in chosen.items() if key not in TRAINER_OURS}
+    if arguments.get("precision") == "auto":
+        arguments["precision"] = precision = _fast_precision(chosen.get("accelerator"))
+        console.print(f"precision: {precision}, which trainer.precision=auto chooses for this processor")
+        run.tracker.set_tags({"precision": precision})
     arguments |= {"enable_progress_bar": False}  # Lightning's own progress bar
-    defaults = {"enable_model_summary": False, "num_sanity_val_steps": 0}
+    defaults = {"enable_model_summary": False, "num_sanity_val_steps": 0, "profiler": NoProfiler()}
     return pl.Trainer(
         **{**defaults, **arguments},
         logger=False,
@@ -183,3 +189,9 @@ def _trainer(run: Run, keep: KeepCheckpoints, console: Console) -> pl.Trainer:
         use_distributed_sampler=False,
         default_root_dir=run.folder,
     )
+
+
+def _fast_precision(accelerator: str | None) -> str:
+    """Return the precision that `trainer.precision=auto` means on this machine."""
+    on_cpu = accelerator in (None, "auto", "cpu") and device_of(accelerator).type == "cpu"
+    return "bf16-mixed" if on_cpu and fast_bfloat16(device_of("cpu")) else "32-true"

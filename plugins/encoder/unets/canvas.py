@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from framework.errors import ConfigError
+from framework.storage.processor import fast_bfloat16
 from plugins.encoder.unets.layers import Layer, Step, convolve
 
 Precision = Literal["auto", "float32", "bfloat16"]
@@ -186,13 +187,6 @@ class Canvas:
         return (
             torch.bfloat16 if self.precision == "bfloat16" or fast_bfloat16(weight.device) else torch.float32
         )
-
-
-def fast_bfloat16(device: torch.device) -> bool:
-    """Return whether the device multiplies matrices of bfloat16 faster than of float32."""
-    if device.type == "cuda":
-        return torch.cuda.is_bf16_supported(including_emulation=False)
-    return torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported()
 
 
 def subject_box(image: Float[Tensor, "channels height width"], stride: int, margin: int) -> Box | None:

@@ -4,7 +4,8 @@ from torch.nn import functional
 
 from framework.configuration.schema import build, resolve
 from framework.errors import ConfigError
-from plugins.encoder.unets.canvas import EMPTY_LOG_SCALE, fast_bfloat16
+from framework.storage.processor import fast_bfloat16
+from plugins.encoder.unets.canvas import EMPTY_LOG_SCALE
 from plugins.encoder.unets.layers import EPSILON, Layer
 
 SMALL = {"unet": {"width": 4, "levels": 3}, "slim": {"widths": [6, 8, 10]}}
