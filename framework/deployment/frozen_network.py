@@ -274,7 +274,10 @@ class _Reader:
         return step if isinstance(step, Layer) and not step.rectified and exclusive else None
 
     def _parameter(self, arguments: Any, index: int, otherwise: np.ndarray) -> np.ndarray:
-        """Return the parameter at position `index` in the arguments of a node, or `otherwise` if there is none."""
+        """Return the weight tensor that an operation of the graph has as its argument number `index`.
+
+        If the operation has no such argument, `otherwise` is returned.
+        """
         present = len(arguments) > index and arguments[index] is not None
         return self.numbers[arguments[index].name] if present else otherwise
 

@@ -17,17 +17,20 @@ def front(
 ) -> list[bool]:
     """Return for each point whether it is on the Pareto front of low error and short run time.
 
-    A point beats another if it is better in one of the two quantities by more than noise, and not worse in the other by
-    more than noise. The front is the only set of points with two properties: none of its points beats another of them,
-    and each point outside is beaten by one of them (the kernel). So two equal points are both on the front, and so is a
-    point that is beaten only by points outside the front. If points beat each other in a ring, because their errors
-    have unequal uncertainty, the fastest of them is on the front. Points that are not finite are not on the front.
+    A point beats another if it is significantly better in one of the two quantities, and not significantly worse in the
+    other. Errors differ significantly if their difference exceeds `least_significant`; run times differ significantly
+    if their relative difference exceeds `time_noise`. The front is the only set of points with two properties: none of
+    its points beats another of them, and each point outside is beaten by one of them. So two equal points are both on
+    the front, and so is a point that is beaten only by points outside the front. If points beat each other in a ring,
+    because their errors have unequal uncertainty, the fastest of them is on the front. Points that are not finite are
+    not on the front.
 
-    Errors on the same samples are positively correlated, so the test understates the significance of differences.
+    Errors on the same samples are positively correlated. The comparison ignores this, so it calls fewer differences
+    significant than there are.
 
     Args:
-        errors: errors, lower is better; plain numbers are exact.
-        times: run times.
+        errors: errors, lower is better, as means with a standard error; plain numbers count as exact.
+        times: run times, all in the same unit.
         time_noise: relative difference up to which two run times count as equal.
 
     Returns:

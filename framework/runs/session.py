@@ -120,7 +120,7 @@ class Session:
         return f"{self.data_title} · {self.method}"
 
     def batches(self, data: Data | None = None) -> Batches:
-        """Return batches, of the size for training, of `data`; None: of the session's data."""
+        """Return batches of the training batch size from `data`, or from the session's data if `data` is None."""
         chosen = self.settings
         return Batches(
             data or self.data, batch_size=chosen.batch_size, workers=chosen.workers, seed=chosen.seed

@@ -182,7 +182,7 @@ def examine_metric(row: MetricRow, build: Make) -> Iterator[Finding]:
 
 @dataclass(frozen=True)
 class Predictions:
-    """Predictions for a fixed set of samples, callable with sample indices and the name of a split.
+    """Artificial predictions for a fixed set of samples, callable with sample indices and the name of a split.
 
     Attributes:
         row: Contract row, which states the target and the image size.
@@ -192,7 +192,7 @@ class Predictions:
         outliers: Further factor on the widths in the split "outliers". An outlier has the location of the next sample,
             so that the test sample and the outlier with the same index differ in location.
         fields: Further fields of the batch.
-        images: True if the predictions have images, which show balls.
+        images: True if the predicted densities have images (`protocol.images`); each image shows a ball.
     """
 
     row: MetricRow

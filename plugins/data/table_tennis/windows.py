@@ -42,13 +42,13 @@ class Grid:
 
 
 class Window(NamedTuple):
-    """One sample.
+    """One sample: some observed frames of a flight, and the positions of the ball that follow.
 
     Attributes:
-        inputs: The input, (observed × 5,).
-        target: The target, (future × 3,).
-        truth: The target without noise, (future × 3,).
-        frame: Index of the last frame that is read.
+        inputs: The five numbers (`PARTS`) of each observed frame, (observed × 5,).
+        target: Measured x, y, z of the ball at each future time, (future × 3,), metres.
+        truth: The same positions without measurement noise, (future × 3,), metres.
+        frame: Index of the last observed frame in the recording.
     """
 
     inputs: Float[np.ndarray, "number"]
