@@ -65,7 +65,7 @@ QUICK = (
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_model_takes_files_when_its_training_data_are_gone(
-    kind: str, framework: Framework, tmp_path: Path
+    kind: str, framework: Framework, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rows = import_module(f"plugins.data.{HOMES.get(kind, kind)}.rows").ROWS[kind]
     name, *arguments = KINDS[kind]
@@ -85,9 +85,15 @@ def test_a_model_takes_files_when_its_training_data_are_gone(
     assert predicted.code == 0, predicted.out
     lines = (predicted.folder / "predictions.csv").read_text().splitlines()
 
+    state = torch.get_rng_state()
     model, frozen = package.load(done.folder), package.freeze(done.folder)
+    assert torch.equal(torch.get_rng_state(), state), "loading does not draw from the global generator"
     assert f"trained on {kind}" in repr(model)
     density = [model(str(file)) for file in files]
+    np.testing.assert_array_equal(np.asarray(density[0].mode), density[0].mode.numpy())
+    monkeypatch.setenv("HOME", str(own))
+    assert model(f"~/{files[0].relative_to(own)}").mode.equal(density[0].mode)
+    monkeypatch.undo()
     assert sum(len(one.sample()) for one in density) == len(lines) - 1
     for one, file in zip(density, files, strict=True):
         here = one.sample()
@@ -122,7 +128,8 @@ def test_a_model_takes_files_when_its_training_data_are_gone(
     for wrong in ([str(file) for file in files], ["etc"], named.assign(base64="/etc/hostname"), object()):
         with pytest.raises(DataError):
             served.predict_table(wrong)
-    for wrong in (object(), tmp_path / "gone.csv", np.zeros((2, 77, 5, 3))):
+    dates = pd.DataFrame({"day": pd.to_datetime(["2026-11-26", "2026-11-27"])})
+    for wrong in (object(), tmp_path / "gone.csv", np.zeros((2, 77, 5, 3)), [], np.zeros((0, 3)), dates):
         for form in (model, frozen):
             with pytest.raises(DataError):
                 form(wrong)

@@ -106,7 +106,21 @@ class User:
 
 
 def read_batch(model: nn.Module, data: Data, user_data: Any) -> Batch:
-    """Return the batch that a model reads for the user's data; a path may begin with `~`.
+    """Return the batch that a model reads for the user's data, in the model's data type and on its device.
+
+    Raises:
+        DataError: as in `user_batch`.
+    """
+    batch = user_batch(data, user_data)
+    inputs = batch["input"]
+    own = next(model.parameters(), inputs)
+    # encoders scale bytes, which are pixels; numbers of other types are converted to the type of the model's weights
+    kind = inputs.dtype if inputs.dtype == torch.uint8 else own.dtype
+    return {**batch, "input": inputs.to(own.device, kind)}
+
+
+def user_batch(data: Data, user_data: Any) -> Batch:
+    """Return the batch of a data set for the user's data; a path may begin with `~`.
 
     Raises:
         DataError: The data are empty, or `Data.user_batch` refuses them or fails.
@@ -118,7 +132,7 @@ def read_batch(model: nn.Module, data: Data, user_data: Any) -> Batch:
             "row or array."
         )
     try:
-        batch = data.user_batch(user_data)
+        return data.user_batch(user_data)
     except UserError:
         raise
     except Exception as error:
@@ -127,11 +141,6 @@ def read_batch(model: nn.Module, data: Data, user_data: Any) -> Batch:
             f"The {type(user_data).__name__} cannot be read as inputs ({shorten(error)}). Give files, an array of "
             "numbers, or another kind of input that the data set of this model reads."
         ) from error
-    inputs = batch["input"]
-    own = next(model.parameters(), inputs)
-    # encoders scale bytes, which are pixels; numbers of other types are converted to the type of the model's weights
-    kind = inputs.dtype if inputs.dtype == torch.uint8 else own.dtype
-    return {**batch, "input": inputs.to(own.device, kind)}
 
 
 def _expand_home(user_data: Any) -> Any:

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from framework.configuration.loading import load_with_description, reader
+from framework.configuration.loading import load_with_description, reader, user_batch
 from framework.data import Data, Frame
 from framework.deployment.frozen_network import Layer, Network, read_network, softmax
 from framework.distributions.affine import AffineDensity
@@ -139,7 +139,7 @@ class Frozen:
         """
         frame = None
         if self.data is not None:
-            batch = self.data.user_batch(inputs)
+            batch = user_batch(self.data, inputs)
             inputs, frame = batch["input"], self.data.frame(batch)
         if self.front_end is not None:
             with torch.no_grad():
