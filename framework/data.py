@@ -7,7 +7,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.utils.data import Dataset
 
 from framework.errors import DataError
@@ -54,6 +54,20 @@ class Splits(NamedTuple):
     train: Dataset[Batch]
     validation: Dataset[Batch]
     test: Dataset[Batch]
+
+
+class Preprocessing(NamedTuple):
+    """Computation of an exported model before its first layer.
+
+    Attributes:
+        module: module from a user's arrays, (batch, *input_shape) float64, to the model's inputs.
+        location, scale: mean and standard deviation of a typical array, both of the shape `input_shape`; `mode=export`
+            compares the exported model with the original one on arrays around them.
+    """
+
+    module: nn.Module
+    location: Tensor
+    scale: Tensor
 
 
 class Data(ABC):
@@ -192,6 +206,14 @@ class Data(ABC):
 
         A data set of real targets overrides this if each target is given in a frame of its own input, such as a
         normalised cloud. The default, None, means that targets are in the user's unit.
+        """
+        return None
+
+    def preprocessing(self) -> Preprocessing | None:
+        """Return what `inputs` computes from an array, for `mode=export`; works without `prepare`.
+
+        A data set whose `inputs` changes the numbers of an array (standardises them, for example) overrides this. The
+        default, None, means that arrays are the model's inputs as they are.
         """
         return None
 

@@ -31,6 +31,7 @@ COMMANDS: dict[str, list[str]] = {
     "sync": ["mode=sync", "mode.run={run}"],
     "test": ["mode=test", "checkpoint={run}", "logger=none"],
     "predict": ["mode=predict", "checkpoint={run}", "logger=none"],
+    "export": ["mode=export", "checkpoint={run}", "logger=none"],
     "work_precision": ["mode=work_precision", "checkpoint={run}", "logger=none"],
     "combine": ["mode=combine", "mode.members={sweep}", "logger=none"],
     "train from it": [*TINY, "trainer.max_epochs=1", "checkpoint={run}", "logger=none"],

@@ -26,10 +26,11 @@ class Stacked(Distribution):
 
     def __init__(self, densities: Sequence[Distribution]) -> None:
         first = densities[0]
-        shapes = {(tuple(density.batch_shape), tuple(density.event_shape)) for density in densities}
-        if len(shapes) > 1:
+        shapes = [(tuple(density.batch_shape), tuple(density.event_shape)) for density in densities]
+        if any(shape != shapes[0] for shape in shapes):
             raise ValueError(
-                f"The densities have different (batch_shape, event_shape): {sorted(shapes)}; expected equal shapes."
+                f"The densities have different (batch_shape, event_shape): {sorted(set(shapes))}; expected equal "
+                "shapes."
             )
         self.densities = tuple(densities)
         self.has_enumerate_support = first.has_enumerate_support
@@ -96,7 +97,8 @@ class Reshaped(Distribution):
 
     def __init__(self, density: Distribution, batch_shape: torch.Size | tuple[int, ...]) -> None:
         shape = torch.Size(batch_shape)
-        if shape.numel() != density.batch_shape.numel():
+        # a size that is not known yet, as in the trace of an exported model, must not be compared
+        if not torch.compiler.is_exporting() and shape.numel() != density.batch_shape.numel():
             raise ValueError(
                 f"A batch of shape {tuple(density.batch_shape)} cannot be read as {tuple(shape)}; expected the same "
                 "number of items."

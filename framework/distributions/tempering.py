@@ -66,6 +66,8 @@ def temper(density: Distribution, temperature: Float[Tensor, ""]) -> Distributio
         ValueError: T is not above 0, or not finite.
         UserError: no power of such a density is known; the message says how to register it.
     """
+    if torch.compiler.is_exporting():  # a trace depends on no value
+        return tempered_density(density, temperature)
     value = float(temperature.detach())
     if not 0 < value < math.inf:
         raise ValueError(f"Got temperature = {value}; expected a finite number above 0.")

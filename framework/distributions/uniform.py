@@ -32,7 +32,9 @@ def uniform(density: Distribution) -> Distribution:
         )
     support = density.support
     if isinstance(support, Circular) and support.ranges is None:
-        return UniformAngles(density.sample(torch.Size((0,))), density.batch_shape, density.event_shape)
+        # a trace, which cannot draw, reads the shape alone
+        like = torch.empty(0) if torch.compiler.is_exporting() else density.sample(torch.Size((0,)))
+        return UniformAngles(like, density.batch_shape, density.event_shape)
     raise UserError(
         f"{type(density).__name__} has no uniform distribution over its support that the framework knows. Uniform "
         "distributions are known for classes, for angles over the whole circle, and for densities that register one "

@@ -22,7 +22,12 @@ def require_finite(raw: Tensor, size: int) -> Tensor:
             f"Got raw parameters of shape {tuple(raw.shape)}; expected {size} in the last dimension."
         )
     # If the sum is finite, so is every number. This takes one pass; heads of very many numbers notice a second one.
-    if not math.isfinite(float(raw.detach().sum())) and not raw.isfinite().all():
+    # An exported program checks its inputs instead, because a trace cannot depend on values.
+    if (
+        not torch.compiler.is_exporting()
+        and not math.isfinite(float(raw.detach().sum()))
+        and not raw.isfinite().all()
+    ):
         row = tuple((~raw.isfinite().all(-1)).nonzero()[0].tolist())
         raise NonFiniteParameters(
             f"The raw parameters are not finite in batch row {row[0] if len(row) == 1 else row}."

@@ -6,12 +6,13 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
+import torch
 from pydantic import Field
 from torch import Tensor
 from torch.utils.data import Dataset
 
 from framework.configuration.paths import FilePath, Words
-from framework.data import Batch, Data, Splits
+from framework.data import Batch, Data, Preprocessing, Splits
 from framework.datasets.csv_columns import LabelledWriting
 from framework.errors import DataError, quote
 from plugins.data.tabular.picture import bars
@@ -20,6 +21,7 @@ from plugins.data.tabular.table import (
     Kind,
     Missing,
     Question,
+    Standardise,
     Table,
     from_memory,
     load,
@@ -131,6 +133,11 @@ class Tabular(Data):
         ):
             return Data.inputs(self, user_data)
         return from_memory(user_data, self._input_columns)
+
+    def preprocessing(self) -> Preprocessing:
+        scaling = self._input_columns.scaling
+        largest, mean, deviation = (torch.from_numpy(np.asarray(part, np.float64)) for part in scaling)
+        return Preprocessing(Standardise(scaling), largest * mean, largest * deviation)
 
     @property
     def _input_columns(self) -> InputColumns:

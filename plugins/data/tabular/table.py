@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor
+from torch import Tensor, nn
 
 from framework.data import Splits, as_inputs
 from framework.datasets.angles import unlike_degrees, unlike_radians
@@ -237,6 +237,23 @@ def from_memory(user_data: Any, columns: InputColumns) -> Float[Tensor, "row col
             "precision. Correct the number, or leave the row out."
         )
     return torch.from_numpy(scaled.astype(np.float32))
+
+
+class Standardise(nn.Module):
+    """Standardisation of rows, as `standardise` does it, for an exported model."""
+
+    largest: Tensor
+    mean: Tensor
+    deviation: Tensor
+
+    def __init__(self, scaling: Scaling) -> None:
+        super().__init__()
+        for name, part in zip(Scaling._fields, scaling, strict=True):
+            self.register_buffer(name, torch.from_numpy(np.asarray(part, np.float64)))
+
+    def forward(self, rows: Tensor) -> Tensor:
+        """Return standardised rows, float32, for rows in their own units, float64."""
+        return ((rows / self.largest - self.mean) / self.deviation).float()
 
 
 def fit_scaling(inputs: Float[np.ndarray, "row column"]) -> tuple[Scaling, np.ndarray]:

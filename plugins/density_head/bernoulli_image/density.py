@@ -9,6 +9,7 @@ from torch.distributions import Distribution, constraints
 from torch.nn.functional import logsigmoid
 
 from framework.distributions.description import one_line
+from framework.distributions.exported import Exported, exported
 from framework.distributions.protocol import (
     estimate,
     exact_estimate,
@@ -121,3 +122,9 @@ def _(density: BernoulliImage, channels: Collection[str]) -> dict[str, Tensor]:
         return images.dispatch(Distribution)(density, channels)
     compute = {"color": lambda: linear_from_srgb(density.mean), "mask": lambda: density.logits[..., 0] >= 0}
     return {name: compute[name]() for name in channels}
+
+
+@exported.register
+def _(density: BernoulliImage) -> Exported:
+    code = "plugins.density_head.bernoulli_image.numpy_bernoulli_image"
+    return Exported("bernoulli_image", {"logits": density.logits}, code=code)

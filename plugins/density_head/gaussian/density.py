@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.distributions import constraints
 
 from framework.distributions import protocol
+from framework.distributions.exported import Exported, exported
 from framework.distributions.symmetric import Symmetric
 
 
@@ -175,3 +176,11 @@ def _(density: Gaussian, value: Tensor) -> Tensor:
 def _(density: Gaussian, temperature: Tensor) -> Gaussian:
     # every e_i is an independent N(0, σ_i²), and exp(-e²/2σ²)^(1/T) = exp(-e²/2σ²T)
     return Gaussian(density.location, density.scale * temperature.sqrt(), density.coefficients)
+
+
+@exported.register
+def _(density: Gaussian) -> Exported:
+    parameters = {"location": density.location, "scale": density.scale}
+    if density.coefficients is not None:
+        parameters["coefficients"] = density.coefficients
+    return Exported("normal", parameters)

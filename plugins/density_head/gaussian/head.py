@@ -132,8 +132,8 @@ def scale_of_raw(raw: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
     exploding at an outlier.
     """
     most = 4 * (LARGEST_SCALE**0.25 - 1)
-    high = (1 + raw.clamp(0, most) / 4).square().square()
-    return torch.where(raw < 0, torch.exp(raw.clamp(max=0)), high)
+    high = (1 + raw.clamp(0.0, most) / 4).square().square()
+    return torch.where(raw < 0, torch.exp(raw.clamp(max=0.0)), high)
 
 
 def fit(

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.distributions import Distribution, constraints
 
+from framework.distributions.exported import Exported, exported
 from framework.distributions.protocol import (
     estimate,
     exact_estimate,
@@ -102,3 +103,9 @@ def _(density: LaplaceImage, channels: Collection[str]) -> dict[str, Tensor]:
     if set(channels) != {"color"}:
         return images.dispatch(Distribution)(density, channels)
     return {"color": linear_from_srgb(density.location)}
+
+
+@exported.register
+def _(density: LaplaceImage) -> Exported:
+    code = "plugins.density_head.laplace_image.numpy_laplace_image"
+    return Exported("laplace_image", {"location": density.location, "scale": density.scale}, code=code)

@@ -10,6 +10,7 @@ from torch.distributions import Distribution, constraints
 from framework.distributions.circular import Circular
 from framework.distributions.density import estimate_of_sum
 from framework.distributions.description import one_line
+from framework.distributions.exported import Exported, exported
 from framework.distributions.panels import entropy_of_one, has_range
 from framework.distributions.protocol import (
     Estimate,
@@ -183,3 +184,14 @@ def _(density: Floored, temperature: Tensor) -> Distribution:
     if density.has_enumerate_support:
         return tempered_classes(density, temperature)
     return Floored(tempered_density(density.density, temperature), density.weight, density.floor)
+
+
+@exported.register
+def _(density: Floored) -> Exported:
+    parts = [exported(density.density), exported(density.floor)]
+    like = next(tensor for _, tensor in parts[0].tensors())
+    weights = torch.tensor([math.log1p(-density.weight), math.log(density.weight)], dtype=like.dtype)
+    log_weights = weights.expand(*density.batch_shape, 2)
+    return Exported(
+        "mixture", {"log_weights": log_weights}, {"components": Exported("stacked", {}, {"densities": parts})}
+    )

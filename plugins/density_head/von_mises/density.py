@@ -6,6 +6,7 @@ from torch import Tensor
 from torch.distributions import constraints, register_kl
 
 from framework.distributions.circular import circular
+from framework.distributions.exported import Exported, exported
 from framework.distributions.protocol import (
     QuadraticBound,
     arc_length,
@@ -47,7 +48,7 @@ class VonMises(Symmetric):
         self, mean: Float[Tensor, "*batch angle"], concentration: Float[Tensor, "*batch angle"]
     ) -> None:
         negative = concentration.detach() < 0
-        if bool(negative.any()):
+        if not torch.compiler.is_exporting() and bool(negative.any()):
             raise ValueError(
                 f"{int(negative.sum())} of {negative.numel()} concentrations are negative, the first of them is "
                 f"{concentration.detach()[negative][0].item():g}; expected κ ≥ 0. Add π to the mean instead of using a "
@@ -130,3 +131,9 @@ def _(density: VonMises, start: Tensor, end: Tensor) -> Tensor:
 def _(density: VonMises, count: int, weights: Tensor | None = None) -> Tensor:
     mean, concentration = (part.double().squeeze(-1) for part in (density.location, density.concentration))
     return moments.trigonometric_moments(mean, concentration, count, weights)
+
+
+@exported.register
+def _(density: VonMises) -> Exported:
+    parameters = {"location": density.location, "concentration": density.concentration}
+    return Exported("von_mises", parameters, code="plugins.density_head.von_mises.numpy_von_mises")

@@ -118,6 +118,6 @@ def scale_of_raw(raw: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
     is similar to the exponential over the values of κ that occur, but κ and the gradient of an outlier do not explode.
     """
     most = 4 * (LARGEST_CONCENTRATION**0.25 - 1)
-    high = (1 + raw.clamp(0, most) / 4).square().square()
+    high = (1 + raw.clamp(0.0, most) / 4).square().square()
     room = 1 - LEAST_SCALE
-    return torch.where(raw < 0, LEAST_SCALE + room * torch.exp(raw.clamp(max=0) / room), high)
+    return torch.where(raw < 0, LEAST_SCALE + room * torch.exp(raw.clamp(max=0.0) / room), high)

@@ -12,8 +12,9 @@ from torch.distributions import Distribution, constraints
 from framework.distributions.batch_shapes import Reshaped
 from framework.distributions.circular import Circular
 from framework.distributions.density import Mixture
+from framework.distributions.exported import Exported, exported
 from framework.distributions.protocol import ValueSet, mahalanobis, marginal, value_set
-from framework.errors import UserError
+from framework.errors import ConfigError, UserError
 from plugins.uncertainty.conformal.highest_density import Ends, Line
 
 Score = Literal["density", "mass"]
@@ -69,7 +70,9 @@ class PredictionSet(Mixture, ValueSet):
         self.threshold = threshold
         self.score: Score = score
         # The dtype of log_prob: for classes that of one label's, otherwise that of an empty sample.
-        if density.has_enumerate_support:
+        if torch.compiler.is_exporting():  # a trace reads the density's parameters alone, and draws nothing
+            like = torch.empty(0)
+        elif density.has_enumerate_support:
             like = density.log_prob(density.enumerate_support()[0])
         else:
             like = density.sample(torch.Size((0,)))
@@ -356,3 +359,21 @@ def _(density: PredictionSet, index: int) -> Distribution:
     The set has its coverage for all numbers together, which is not the coverage of one number.
     """
     return density if tuple(density.event_shape) == (1,) and index == 0 else marginal(density.density, index)
+
+
+@exported.register
+def _(density: PredictionSet) -> Exported:
+    if density.score != "density":
+        raise ConfigError(
+            "A prediction set with score=mass cannot be exported, because its region depends on the whole density of "
+            "each input. Calibrate the model with score=density, or use framework.load for this model."
+        )
+    # JSON has no infinite numbers
+    # the trace of an exported model depends on no value; its layout is read outside of the trace
+    threshold = math.inf if torch.compiler.is_exporting() else density.threshold.item()
+    settings = {
+        "threshold": threshold if math.isfinite(threshold) else str(threshold),
+        "stated_probability": density.stated_probability,
+    }
+    code = "plugins.uncertainty.conformal.numpy_prediction_set"
+    return Exported("prediction_set", {}, {"inner": exported(density.density)}, settings, code)

@@ -177,8 +177,9 @@ class Ensemble(Uncertainty, Joining, SeveralModels):
 
     def _densities(self, raw: Float[Tensor, "batch member size"]) -> Distribution:
         """Return the densities of the members with the raw parameters `raw`, batch_shape (batch, member)."""
-        bad = (~raw.isfinite()).any(-1).nonzero()
-        if len(bad):
+        # the trace of an exported model depends on no value
+        bad = raw if torch.compiler.is_exporting() else (~raw.isfinite()).any(-1).nonzero()
+        if bad is not raw and len(bad):
             row, index = bad[0].tolist()
             other_members = len(bad[:, 1].unique()) - 1
             more = f" (and {other_members} other members)" if other_members else ""

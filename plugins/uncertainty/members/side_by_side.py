@@ -57,6 +57,11 @@ class SideBySide(nn.Module):
         def compute_member(parameters: dict[str, Tensor], inputs: Tensor) -> Tensor:
             return functional_call(template, parameters, (inputs,))
 
+        if torch.compiler.is_exporting() and members is None:  # vmap cannot be traced
+            each = zip(*(parameter.unbind() for parameter in parameters.values()), strict=True)
+            return torch.stack(
+                [compute_member(dict(zip(parameters, part, strict=True)), inputs) for part in each]
+            )
         return vmap(compute_member, in_dims=(0, members), randomness="different")(parameters, inputs)
 
     def clip_each(self, most: float, beside: Sequence[nn.Module]) -> None:

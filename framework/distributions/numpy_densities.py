@@ -1,0 +1,644 @@
+"""Densities of exported models, computed with NumPy alone; `mode=export` copies this file to `densities.py`.
+
+A density is built from the outputs of an exported network by `build`. All densities of a batch are computed together.
+In shapes, `*batch` is the shape of the batch, `*event` the shape of one target, and `*sample` any dimensions before
+them. Angles are in radians; log-densities and entropies are in nats. All numbers are float64.
+
+This module and the modules of families import only NumPy and Python's own library, because an exported folder must run
+where nothing else is installed.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+
+DRAWS = 4096
+"""Number of draws of an estimated entropy; it is printed with its standard error."""
+STEPS = 200
+"""Largest number of steps of the search for a mode and of a bisection."""
+_REACH = 40.0
+"""Distance from a peak, in widths of the peak, up to which the density of one number is integrated."""
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
+
+
+class Value(NamedTuple):
+    """A number for each item of the batch, (*batch), and its standard error, which is 0 where nothing is drawn."""
+
+    value: Array
+    error: Array
+
+
+class Interval(NamedTuple):
+    """Ends of the central interval of each number, (*batch, number); for angles the arc from `low` to `high`."""
+
+    low: Array
+    high: Array
+
+
+class Bound(NamedTuple):
+    """A log-density (*sample, *batch), its gradient, and the curvature of a lower bound that touches it there.
+
+    Gradient and curvature have the shape (*sample, *batch, *event). For angles d, the bound is
+    gradient · sin d - curvature · (1 - cos d), otherwise gradient · d - curvature · d²/2.
+    """
+
+    log_prob: Array
+    gradient: Array
+    curvature: Array
+
+
+class Density:
+    """A batch of densities.
+
+    Attributes:
+        batch: shape of the batch.
+        event: shape of one target; () for classes.
+        circular: whether the target consists of angles.
+    """
+
+    batch: tuple[int, ...]
+    event: tuple[int, ...]
+    circular: bool = False
+
+    def log_prob(self, value: Array) -> Array:
+        """Return the log-density at `value` (*sample, *batch, *event), (*sample, *batch), nats."""
+        raise NotImplementedError
+
+    def sample(self, generator: np.random.Generator, count: int) -> Array:
+        """Return `count` draws, (count, *batch, *event)."""
+        raise NotImplementedError
+
+    def mode(self) -> Array:
+        """Return the value of largest density, (*batch, *event)."""
+        raise NotImplementedError
+
+    def mean(self) -> Array:
+        """Return the mean, (*batch, *event); classes and angles have none.
+
+        Raises:
+            ValueError: the target is a class or an angle.
+        """
+        raise ValueError("Classes and angles have no mean. Use the mode or the median.")
+
+    def entropy(self) -> Value:
+        """Return the entropy with its standard error: by quadrature for one number, otherwise from draws."""
+        if self.event == (1,):
+            points, mass = self.nodes()
+            log_prob = self.log_prob(points[..., None])
+            terms = np.where(mass > 0, mass * -np.where(mass > 0, log_prob, 0.0), 0.0)
+            value = terms.sum(0)
+            return Value(value, np.zeros_like(value))
+        surprise = -self.log_prob(self.sample(np.random.default_rng(0), DRAWS))
+        return Value(surprise.mean(0), surprise.std(0, ddof=1) / math.sqrt(DRAWS))
+
+    def marginal(self, index: int) -> "Density":
+        """Return the density of number `index` of the target alone, with event (1,)."""
+        if self.event == (1,) and index == 0:
+            return self
+        raise ValueError(f"The density of one of the {self.event} numbers is not known.")
+
+    def cdf(self, value: Array) -> Array:
+        """Return P(X ≤ value) of one real number, (*sample, *batch), at `value` (*sample, *batch, 1)."""
+        raise ValueError("The distribution function of this density is not known.")
+
+    def arc(self, start: Array, end: Array) -> Array:
+        """Return the probability of an arc of one angle, counter-clockwise from `start` to `end`, (*sample, *batch)."""
+        raise ValueError("The probabilities of arcs of this density are not known.")
+
+    def peaks(self) -> tuple[Array, Array]:
+        """Return candidates for the mode of one number, (peak, *batch), and the width of the peak at each."""
+        raise ValueError("The peaks of this density are not known.")
+
+    def bound(self, value: Array) -> Bound:
+        """Return a lower bound of the log-density that touches it at `value` (*sample, *batch, *event)."""
+        raise ValueError("No lower bound of this density is known.")
+
+    def starts(self) -> Array:
+        """Return values at which the search for the mode of a mixture starts, (start, *batch, *event)."""
+        return self.mode()[None]
+
+    def parts(self) -> list[Any] | None:
+        """Return the labels or intervals of the prediction set of each item of the batch; None without such sets."""
+        return None
+
+    def nodes(self) -> tuple[Array, Array]:
+        """Return points of a quadrature of one number and the probability at each, both (point, *batch).
+
+        The points are those of Gauss's rule between neighbouring distances from the peaks; these distances grow by
+        a constant factor.
+        """
+        place, width = self.peaks()
+        steps = np.concatenate([[0.0], np.geomspace(0.5, _REACH, 8)])
+        steps = np.concatenate([-steps[:0:-1], steps])
+        edges = (place + width * steps.reshape(-1, *(1,) * place.ndim)).reshape(-1, *self.batch)
+        if self.circular:
+            first = place[:1]
+            edges = np.concatenate([first - math.pi + np.mod(edges - first + math.pi, 2 * math.pi)])
+            edges = np.concatenate([first - math.pi, edges, first + math.pi])
+        edges = np.sort(edges, 0)
+        half = np.diff(edges, axis=0)[:, None] / 2
+        shape = (1, -1, *(1,) * len(self.batch))
+        points = edges[:-1, None] + half * (1 + _NODES.reshape(shape))
+        weights = half * _WEIGHTS.reshape(shape)
+        points, weights = (part.reshape(-1, *self.batch) for part in (points, weights))
+        return points, weights * np.exp(self.log_prob(points[..., None]))
+
+    def median(self) -> Array:
+        """Return the point of least expected absolute deviation, number by number, (*batch, *event)."""
+        if not self.event:
+            return self.mode()
+        parts = [self.marginal(index) for index in range(self.event[0])]
+        find = _circular_median if self.circular else lambda part: _quantile(part, 0.5)
+        return np.stack([find(part) for part in parts], -1)
+
+    def interval(self, mass: float) -> Interval:
+        """Return the central interval of probability `mass` of each number; half of the rest lies beyond each end.
+
+        For angles, `low` is in [-π, π), and the median splits the arc into two parts of equal probability.
+        """
+        parts = [self.marginal(index) for index in range(self.event[0])]
+        find = _arc if self.circular else _central
+        ends = [find(part, mass) for part in parts]
+        return Interval(*(np.stack(side, -1) for side in zip(*ends, strict=True)))
+
+
+def _quantile(density: Density, probability: float) -> Array:
+    """Return the quantile of one real number by bisection, (*batch)."""
+    place, width = density.peaks()
+    low, high = (place - width).min(0), (place + width).max(0)
+    reach = high - low
+    for _ in range(STEPS):
+        outside = density.cdf(low[..., None]) > probability
+        if not outside.any():
+            break
+        low, reach = np.where(outside, low - reach, low), 2 * reach
+    reach = high - low
+    for _ in range(STEPS):
+        outside = density.cdf(high[..., None]) < probability
+        if not outside.any():
+            break
+        high, reach = np.where(outside, high + reach, high), 2 * reach
+    return _bisect(lambda middle: density.cdf(middle[..., None]) < probability, low, high)
+
+
+def _bisect(below: Any, low: Array, high: Array) -> Array:
+    """Return the place between `low` and `high` at which `below` changes from true to false."""
+    for _ in range(STEPS):
+        middle = low + (high - low) / 2
+        left = below(middle)
+        low, high = np.where(left, middle, low), np.where(left, high, middle)
+        if np.all((middle == low) & (high - low <= 4e-16 * np.abs(high)) | (low == high)):
+            break
+    return low + (high - low) / 2
+
+
+def _central(density: Density, mass: float) -> tuple[Array, Array]:
+    """Return the ends of the central interval of one real number, (*batch)."""
+    return _quantile(density, (1 - mass) / 2), _quantile(density, (1 + mass) / 2)
+
+
+def _circular_median(density: Density) -> Array:
+    """Return the angle of least expected absolute deviation of one angle, (*batch), radians in [-π, π)."""
+    points, mass = density.nodes()
+    place, width = density.peaks()
+    grid = np.broadcast_to(
+        np.linspace(-math.pi, math.pi, 48, endpoint=False).reshape(-1, *(1,) * len(density.batch)),
+        (48, *density.batch),
+    )
+    near = (place + width * np.array([-4, -1, 0, 1, 4]).reshape(-1, *(1,) * place.ndim)).reshape(
+        -1, *density.batch
+    )
+    edges = np.sort(wrap(np.concatenate([grid, near, wrap(near + math.pi)])), 0)
+    edges = np.concatenate([edges, edges[:1] + 2 * math.pi])
+
+    def ahead(angle: Array) -> Array:
+        return density.arc(angle, angle + math.pi) > 0.5
+
+    # the expected deviation falls while more than half of the probability lies ahead
+    more = ahead(edges)
+    falls = more[:-1] & ~more[1:]
+    order = np.argsort(~falls, axis=0, kind="stable")[: max(1, int(falls.sum(0).max(initial=1)))]
+    ends = (np.take_along_axis(side, order, 0) for side in (edges[:-1], edges[1:]))
+    roots, fits = _bisect(ahead, *ends), np.take_along_axis(falls, order, 0)
+    deviation = (mass[:, None] * np.abs(wrap(points[:, None] - roots))).sum(0)
+    deviation = np.where(fits, deviation, math.inf)
+    best = np.take_along_axis(roots, deviation.argmin(0)[None], 0)[0]
+    # a uniform density has no fall; each of its angles is a median
+    return wrap(np.where(fits.any(0), best, place[0]))
+
+
+def _arc(density: Density, mass: float) -> tuple[Array, Array]:
+    """Return the ends of the central arc of one angle, (*batch); `low` is in [-π, π)."""
+    median = _circular_median(density)
+    turn = np.full_like(median, math.pi)
+    high = _bisect(lambda width: density.arc(median, median + width) < mass / 2, np.zeros_like(turn), turn)
+    low = _bisect(lambda width: density.arc(median - width, median) < mass / 2, np.zeros_like(turn), turn)
+    start = wrap(median - low)
+    return start, start + low + high
+
+
+def wrap(angle: Array) -> Array:
+    """Return the angle in [-π, π)."""
+    return np.mod(np.asarray(angle) + math.pi, 2 * math.pi) - math.pi
+
+
+def log_sum_exp(terms: Array) -> Array:
+    """Return log Σ exp(terms) over the last dimension; -inf if all terms are."""
+    largest = terms.max(-1, keepdims=True)
+    shift = np.where(np.isfinite(largest), largest, 0.0)
+    with np.errstate(divide="ignore"):
+        return np.log(np.exp(terms - shift).sum(-1)) + shift[..., 0]
+
+
+def normal_cdf(standard: Array) -> Array:
+    """Return the distribution function of the standard normal density, with the digits of `math.erfc`."""
+    flat = np.asarray(standard, dtype=np.float64)
+    return np.fromiter(
+        (math.erfc(-x / math.sqrt(2)) / 2 for x in flat.ravel()), np.float64, flat.size
+    ).reshape(flat.shape)
+
+
+class Categorical(Density):
+    """Classes, from logits (*batch, class)."""
+
+    def __init__(self, logits: Array) -> None:
+        self.log_probabilities = logits - log_sum_exp(logits)[..., None]
+        self.batch, self.event = logits.shape[:-1], ()
+
+    @property
+    def probabilities(self) -> Array:
+        """Probability of each class, (*batch, class)."""
+        return np.exp(self.log_probabilities)
+
+    def log_prob(self, value: Array) -> Array:
+        value = np.asarray(value).astype(np.int64)
+        lead = value.shape[: value.ndim - len(self.batch)]
+        table = np.broadcast_to(self.log_probabilities, (*lead, *self.log_probabilities.shape))
+        value = np.broadcast_to(value, table.shape[:-1])
+        return np.take_along_axis(table, value[..., None], -1)[..., 0]
+
+    def sample(self, generator: np.random.Generator, count: int) -> Array:
+        below = np.cumsum(self.probabilities, -1)
+        drawn = generator.random((count, *self.batch, 1)) * below[..., -1:]
+        return (drawn > below).sum(-1)
+
+    def mode(self) -> Array:
+        return self.log_probabilities.argmax(-1)
+
+    def entropy(self) -> Value:
+        log = self.log_probabilities
+        value = -(np.exp(log) * np.maximum(log, -1e4)).sum(-1)
+        return Value(value, np.zeros_like(value))
+
+
+class Normal(Density):
+    """Normal densities of several numbers: each is regressed on the ones before it.
+
+    The residuals e_i = d_i - Σ_{j<i} φ_ij d_j of the deviation d from the mean are independent N(0, σ_i²).
+
+    Args:
+        location: mean, (*batch, number).
+        scale: σ, (*batch, number).
+        coefficients: φ, (*batch, number, number), strictly below the diagonal; None if all are 0.
+    """
+
+    def __init__(self, location: Array, scale: Array, coefficients: Array | None = None) -> None:
+        self.location, self.scale, self.coefficients = location, scale, coefficients
+        self.batch, self.event = location.shape[:-1], location.shape[-1:]
+
+    def _residual(self, value: Array) -> Array:
+        deviation = value - self.location
+        if self.coefficients is None:
+            return deviation
+        return deviation - (self.coefficients * deviation[..., None, :]).sum(-1)
+
+    def log_prob(self, value: Array) -> Array:
+        standard = self._residual(value) / self.scale
+        return -(standard**2 / 2 + np.log(self.scale) + math.log(2 * math.pi) / 2).sum(-1)
+
+    def _mixing(self) -> Array:
+        """Return (I - φ)⁻¹, which maps the independent residuals to the deviations."""
+        assert self.coefficients is not None
+        return np.linalg.inv(np.eye(self.event[0]) - self.coefficients)
+
+    def sample(self, generator: np.random.Generator, count: int) -> Array:
+        noise = generator.standard_normal((count, *self.batch, *self.event)) * self.scale
+        if self.coefficients is not None:
+            noise = (self._mixing() * noise[..., None, :]).sum(-1)
+        return self.location + noise
+
+    def mode(self) -> Array:
+        return self.location
+
+    def mean(self) -> Array:
+        return self.location
+
+    def entropy(self) -> Value:
+        value = (np.log(self.scale) + (1 + math.log(2 * math.pi)) / 2).sum(-1)
+        return Value(value, np.zeros_like(value))
+
+    def deviation(self) -> Array:
+        """Return the standard deviation of each number, (*batch, number)."""
+        if self.coefficients is None:
+            return self.scale
+        return np.sqrt(((self._mixing() * self.scale[..., None, :]) ** 2).sum(-1))
+
+    def marginal(self, index: int) -> "Normal":
+        part = slice(index, index + 1)
+        return Normal(self.location[..., part], self.deviation()[..., part])
+
+    def cdf(self, value: Array) -> Array:
+        return normal_cdf(((value - self.location) / self.scale)[..., 0])
+
+    def peaks(self) -> tuple[Array, Array]:
+        return self.location[None, ..., 0], self.scale[None, ..., 0]
+
+    def bound(self, value: Array) -> Bound:
+        root = (
+            np.eye(self.event[0]) if self.coefficients is None else np.eye(self.event[0]) - self.coefficients
+        )
+        root = root / self.scale[..., None]
+        precision = np.swapaxes(root, -1, -2) @ root
+        deviation = value - self.location
+        gradient = -(precision * deviation[..., None, :]).sum(-1)
+        # the sums of the absolute values of the rows bound the matrix from above (Gershgorin)
+        curvature = np.broadcast_to(np.abs(precision).sum(-1), gradient.shape)
+        return Bound(self.log_prob(value), gradient, curvature)
+
+
+class Uniform(Density):
+    """Independent angles, each uniform over the circle, of the shape of `location` (*batch, angle)."""
+
+    circular = True
+
+    def __init__(self, location: Array) -> None:
+        self.location = np.zeros_like(location)
+        self.batch, self.event = location.shape[:-1], location.shape[-1:]
+
+    def log_prob(self, value: Array) -> Array:
+        shape = np.broadcast_shapes(np.shape(value), self.location.shape)
+        return np.full(shape[:-1], -self.event[0] * math.log(2 * math.pi))
+
+    def sample(self, generator: np.random.Generator, count: int) -> Array:
+        return generator.uniform(-math.pi, math.pi, (count, *self.batch, *self.event))
+
+    def mode(self) -> Array:
+        return self.location
+
+    def marginal(self, index: int) -> "Uniform":
+        return Uniform(self.location[..., index : index + 1])
+
+    def arc(self, start: Array, end: Array) -> Array:
+        return np.mod(end - start, 2 * math.pi) / (2 * math.pi) + np.zeros(self.batch)
+
+    def peaks(self) -> tuple[Array, Array]:
+        return self.location[None, ..., 0], np.ones((1, *self.batch))
+
+    def bound(self, value: Array) -> Bound:
+        none = np.zeros(np.broadcast_shapes(np.shape(value), self.location.shape))
+        return Bound(self.log_prob(value), none, none)
+
+
+class Mixture(Density):
+    """The density Σ_k w_k p_k.
+
+    Args:
+        log_weights: log w_k up to a constant, (*batch, K).
+        components: p_k, with batch (*batch, K).
+    """
+
+    def __init__(self, log_weights: Array, components: Density) -> None:
+        self.log_weights = log_weights - log_sum_exp(log_weights)[..., None]
+        self.components = components
+        self.batch, self.event, self.circular = components.batch[:-1], components.event, components.circular
+
+    @property
+    def _axis(self) -> int:
+        """Dimension of values (*sample, *batch, K, *event) that counts the components."""
+        return -1 - len(self.event)
+
+    @property
+    def probabilities(self) -> Array:
+        """Probability of each class, (*batch, class)."""
+        weights = np.exp(self.log_weights)[..., None]
+        return (weights * self.components.probabilities).sum(-2)  # type: ignore[attr-defined]
+
+    def log_prob(self, value: Array) -> Array:
+        value = np.expand_dims(value, self._axis)
+        return log_sum_exp(self.log_weights + self.components.log_prob(value))
+
+    def sample(self, generator: np.random.Generator, count: int) -> Array:
+        chosen = Categorical(self.log_weights).sample(generator, count)
+        draws = self.components.sample(generator, count)
+        index = chosen.astype(np.int64).reshape(*chosen.shape, 1, *(1,) * len(self.event))
+        shape = (*index.shape[: self._axis], 1, *self.event) if self.event else index.shape
+        return np.take_along_axis(draws, np.broadcast_to(index, shape), self._axis).squeeze(self._axis)
+
+    def starts(self) -> Array:
+        parts = np.moveaxis(self.components.starts(), self._axis, 0)
+        return parts.reshape(-1, *self.batch, *self.event)
+
+    def mode(self) -> Array:
+        if not self.event:
+            return self.probabilities.argmax(-1)
+        if self.log_weights.shape[-1] == 1:
+            return self.components.mode().squeeze(self._axis)
+        value = self.starts()
+        for _ in range(STEPS):
+            bound = self.bound(value)
+            if self.circular:
+                step = np.arctan2(bound.gradient, bound.curvature)
+            else:
+                step = bound.gradient / np.maximum(bound.curvature, 1e-300)
+            value = value + step
+            if np.all(np.abs(step) <= 1e-9 * (1 + np.abs(value))):
+                break
+        best = self.log_prob(value).argmax(0)
+        index = best.reshape(1, *best.shape, *(1,) * len(self.event))
+        found = np.take_along_axis(value, np.broadcast_to(index, (1, *value.shape[1:])), 0)[0]
+        return wrap(found) if self.circular else found
+
+    def mean(self) -> Array:
+        if self.circular or not self.event:
+            return super().mean()
+        weights = np.exp(self.log_weights)[(..., *(None,) * len(self.event))]
+        return (weights * self.components.mean()).sum(self._axis)
+
+    def entropy(self) -> Value:
+        if not self.event:
+            return Categorical(np.log(np.maximum(self.probabilities, 1e-300))).entropy()
+        if self.log_weights.shape[-1] == 1:
+            return Value(*(part[..., 0] for part in self.components.entropy()))
+        return super().entropy()
+
+    def marginal(self, index: int) -> "Mixture":
+        return Mixture(self.log_weights, self.components.marginal(index))
+
+    def cdf(self, value: Array) -> Array:
+        return (np.exp(self.log_weights) * self.components.cdf(value[..., None, :])).sum(-1)
+
+    def arc(self, start: Array, end: Array) -> Array:
+        return (np.exp(self.log_weights) * self.components.arc(start[..., None], end[..., None])).sum(-1)
+
+    def peaks(self) -> tuple[Array, Array]:
+        parts = (np.moveaxis(part, -1, 0) for part in self.components.peaks())
+        place, width = (part.reshape(-1, *self.batch) for part in parts)
+        return place, width
+
+    def bound(self, value: Array) -> Bound:
+        parts = self.components.bound(np.expand_dims(value, self._axis))
+        terms = self.log_weights + parts.log_prob
+        share = np.exp(terms - log_sum_exp(terms)[..., None])[(..., *(None,) * len(self.event))]
+        gradient, curvature = ((share * part).sum(self._axis) for part in parts[1:])
+        return Bound(log_sum_exp(terms), gradient, curvature)
+
+
+class Stacked(Density):
+    """K densities with batch (*batch,), read as one density with batch (*batch, K)."""
+
+    def __init__(self, densities: Sequence[Density]) -> None:
+        first = densities[0]
+        self.densities = densities
+        self.batch, self.event, self.circular = (*first.batch, len(densities)), first.event, first.circular
+
+    @property
+    def _axis(self) -> int:
+        return -1 - len(self.event)
+
+    @property
+    def probabilities(self) -> Array:
+        """Probability of each class, (*batch, K, class)."""
+        return np.stack([part.probabilities for part in self.densities], -2)  # type: ignore[attr-defined]
+
+    def _each(self, value: Array) -> list[tuple[Density, Array]]:
+        shape = list(np.shape(value))
+        shape[self._axis] = len(self.densities)
+        parts = np.moveaxis(np.broadcast_to(value, shape), self._axis, 0)
+        return list(zip(self.densities, parts, strict=True))
+
+    def log_prob(self, value: Array) -> Array:
+        return np.stack([density.log_prob(part) for density, part in self._each(value)], -1)
+
+    def sample(self, generator: np.random.Generator, count: int) -> Array:
+        return np.stack([density.sample(generator, count) for density in self.densities], self._axis)
+
+    def mode(self) -> Array:
+        return np.stack([density.mode() for density in self.densities], self._axis)
+
+    def mean(self) -> Array:
+        return np.stack([density.mean() for density in self.densities], self._axis)
+
+    def entropy(self) -> Value:
+        parts = [density.entropy() for density in self.densities]
+        return Value(*(np.stack(side, -1) for side in zip(*parts, strict=True)))
+
+    def starts(self) -> Array:
+        return np.stack(_as_many([density.starts() for density in self.densities]), self._axis)
+
+    def marginal(self, index: int) -> "Stacked":
+        return Stacked([density.marginal(index) for density in self.densities])
+
+    def cdf(self, value: Array) -> Array:
+        return np.stack([density.cdf(part) for density, part in self._each(value)], -1)
+
+    def arc(self, start: Array, end: Array) -> Array:
+        shape = (*np.broadcast_shapes(start.shape, end.shape)[:-1], len(self.densities))
+        parts = (np.moveaxis(np.broadcast_to(side, shape), -1, 0) for side in (start, end))
+        return np.stack(
+            [density.arc(*ends) for density, *ends in zip(self.densities, *parts, strict=True)], -1
+        )
+
+    def peaks(self) -> tuple[Array, Array]:
+        parts = [density.peaks() for density in self.densities]
+        place, width = (np.stack(_as_many(side), -1) for side in zip(*parts, strict=True))
+        return place, width
+
+    def bound(self, value: Array) -> Bound:
+        parts = [density.bound(part) for density, part in self._each(value)]
+        axes = (-1, self._axis, self._axis)
+        return Bound(
+            *(np.stack(side, axis) for side, axis in zip(zip(*parts, strict=True), axes, strict=True))
+        )
+
+
+def _as_many(parts: Sequence[Array]) -> list[Array]:
+    """Return arrays with equally many entries in the first dimension; shorter ones repeat their last entry."""
+    most = max(len(part) for part in parts)
+    return [np.concatenate([part, np.repeat(part[-1:], most - len(part), 0)]) for part in parts]
+
+
+class Affine(Density):
+    """The density of location + scale · Y, for numbers Y with the density `inner`; both (*batch, number)."""
+
+    def __init__(self, location: Array, scale: Array, inner: Density) -> None:
+        self.location, self.scale, self.inner = location, scale, inner
+        self.batch, self.event = inner.batch, inner.event
+
+    def log_prob(self, value: Array) -> Array:
+        return self.inner.log_prob((value - self.location) / self.scale) - np.log(self.scale).sum(-1)
+
+    def sample(self, generator: np.random.Generator, count: int) -> Array:
+        return self.location + self.scale * self.inner.sample(generator, count)
+
+    def mode(self) -> Array:
+        return self.location + self.scale * self.inner.mode()
+
+    def mean(self) -> Array:
+        return self.location + self.scale * self.inner.mean()
+
+    def entropy(self) -> Value:
+        inner = self.inner.entropy()
+        return Value(inner.value + np.log(self.scale).sum(-1), inner.error)
+
+    def starts(self) -> Array:
+        return self.location + self.scale * self.inner.starts()
+
+    def marginal(self, index: int) -> "Affine":
+        part = slice(index, index + 1)
+        return Affine(self.location[..., part], self.scale[..., part], self.inner.marginal(index))
+
+    def cdf(self, value: Array) -> Array:
+        return self.inner.cdf((value - self.location) / self.scale)
+
+    def peaks(self) -> tuple[Array, Array]:
+        place, width = self.inner.peaks()
+        return self.location[..., 0] + self.scale[..., 0] * place, self.scale[..., 0] * width
+
+    def bound(self, value: Array) -> Bound:
+        inner = self.inner.bound((value - self.location) / self.scale)
+        log_prob = inner.log_prob - np.log(self.scale).sum(-1)
+        return Bound(log_prob, inner.gradient / self.scale, inner.curvature / self.scale**2)
+
+
+FAMILIES: dict[str, Any] = {
+    "categorical": Categorical,
+    "normal": Normal,
+    "uniform": Uniform,
+    "mixture": Mixture,
+    "stacked": Stacked,
+    "affine": Affine,
+}
+"""Class of each family, by the name in density.json."""
+
+
+def build(layout: Mapping[str, Any], outputs: Mapping[str, Array], families: Mapping[str, Any]) -> Density:
+    """Return the density that a layout of density.json describes.
+
+    Args:
+        layout: {"family": name, "parameters": {name: name of an output}, "parts": {name: layout, or list of layouts}}.
+        outputs: outputs of the network, by name.
+        families: class of each family.
+    """
+    parameters = {key: outputs[name].astype(np.float64) for key, name in layout["parameters"].items()}
+    parts = {
+        key: [build(each, outputs, families) for each in part]
+        if isinstance(part, list)
+        else build(part, outputs, families)
+        for key, part in layout["parts"].items()
+    }
+    return families[layout["family"]](**parameters, **parts, **layout.get("settings", {}))

@@ -1,0 +1,45 @@
+"""mode=export: write a trained model as a folder that runs with NumPy and ONNX Runtime alone."""
+
+from pathlib import Path
+
+from framework.configuration.config import Config, Options
+from framework.configuration.loading import load_with_description
+from framework.configuration.paths import flatten
+from framework.deployment.export import export, require_packages
+from framework.errors import ConfigError
+from framework.runs.session import set_up_process
+from framework.storage.enclosed import require_enclosed
+
+
+class ExportOptions(Options):
+    """Options of mode=export: the folder to write; by default `exported` in the folder of this command."""
+
+    into: str | None = None
+
+
+def run(config: Config) -> None:
+    """Write the exported folder, and print how far it differs from the model and how long a prediction takes."""
+    options = config.options(ExportOptions)
+    console = set_up_process(config.settings)
+    require_packages()
+    checkpoint = config.settings.checkpoint
+    if checkpoint is None:
+        raise ConfigError("mode=export needs checkpoint=<run folder, checkpoint file or MLflow run id>.")
+    into = Path(options.into).expanduser() if options.into else config.folder / "exported"
+    require_enclosed(into, ConfigError)
+    predictor, description = load_with_description(
+        checkpoint, uri=config.settings.logger.uri, paths=flatten(config.settings.stored)
+    )
+    content = export(predictor, description, into)
+    parity = {name: numbers["parameters"] for name, numbers in content["parity"].items()}
+    console.print(f"exported to {into}", soft_wrap=True)
+    console.print(
+        "largest difference from the model, as a share of the largest parameter: "
+        + ", ".join(f"{number:.1e} for {name} inputs" for name, number in parity.items()),
+        soft_wrap=True,
+    )
+    for count, times in content["milliseconds"].items():
+        forms = ", ".join(f"{name} {time:.3g}" for name, time in times.items())
+        console.print(f"processor milliseconds of a batch of {count}: {forms}", soft_wrap=True)
+    for remark in description.remarks:
+        console.print(remark, soft_wrap=True)

@@ -1,0 +1,293 @@
+"""Exported models: what NumPy and ONNX Runtime compute is what the model computes."""
+
+import importlib
+import json
+import math
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch.distributions import Distribution
+
+from framework.configuration.description import Description
+from framework.configuration.registry import installed
+from framework.configuration.schema import build, resolve
+from framework.data import Data
+from framework.density_head import DensityHead
+from framework.deployment import export as exporting
+from framework.distributions import numpy_densities as densities
+from framework.distributions.circular import wrap
+from framework.distributions.exported import exported
+from framework.distributions.intervals import central_interval
+from framework.distributions.numpy_densities import Density
+from framework.distributions.protocol import median, value_set
+from framework.errors import ConfigError
+from framework.model import Model, Predictor
+from framework.target import Target
+from framework.testing.contract import contract
+from framework.testing.finding import seed
+from framework.testing.rows import HeadRow
+from tests.conftest import Framework
+
+NOT_EXPORTED = {
+    "cvae": "LatentDensity",
+    "scvae": "SampledMixture|LatentDensity",
+    "matrix_fisher": "MatrixFisher",
+    "mixture of matrix_fisher": "MatrixFisher",
+    "uniform_floor of matrix_fisher": "MatrixFisher",
+    "hybrid of cvae": "LatentDensity",
+    "lstm": "torch.export cannot follow its computation",
+}
+"""Heads that are refused, with words of the reason; heads that are fitted in one step are no networks."""
+
+
+FITTED = ("ballistic", "extra_trees", "fit_pose", "lorentzian", "xgboost")
+"""Heads that are fitted in one step; they are no networks."""
+HEADS = [name for name in installed("density_head") if name not in FITTED]
+
+
+def rows(name: str, *, refused: bool = False) -> list[HeadRow]:
+    """Return the contract rows of a head that are exported, or all of them."""
+    return [row for row in contract("density_head", name).rows if refused or reason(name, row) is None]
+
+
+def build_head(name: str, row: HeadRow) -> DensityHead:
+    """Return a head of a contract row, with random parameters."""
+    seed(0)
+    head: DensityHead = build(
+        "density_head", resolve("density_head", {"name": name, **row.config}), target=row.target
+    )
+    return head.eval().requires_grad_(False)
+
+
+def reason(name: str, row: HeadRow) -> str | None:
+    """Return words of the reason for which a head is refused; None if it is exported."""
+    component = row.config.get("component")
+    inner = component.get("name") if isinstance(component, dict) else None
+    return NOT_EXPORTED.get(f"{name} of {inner}") or NOT_EXPORTED.get(name)
+
+
+def as_numpy(density: Distribution) -> Density:
+    """Return the density that NumPy computes from the parameters of a density of torch."""
+    form = exported(density)
+    families = {
+        key: family
+        for path in form.modules()
+        for key, family in importlib.import_module(path).FAMILIES.items()
+    }
+    layout = json.loads(json.dumps(form.layout()))
+    return densities.build(
+        layout, {name: tensor.detach().numpy() for name, tensor in form.tensors()}, families
+    )
+
+
+@pytest.mark.parametrize("name", HEADS)
+def test_numpy_computes_the_same_density(name: str) -> None:
+    for row in rows(name):
+        for spread in (1.0, 30.0):
+            compare_densities(name, row, spread)
+
+
+def compare_densities(name: str, row: HeadRow, spread: float) -> None:
+    """Compare the log-densities, modes, entropies and draws of NumPy with those of torch."""
+    head = build_head(name, row).double()
+    generator = torch.Generator().manual_seed(1)
+    raw = spread * torch.randn(5, head.size, generator=generator, dtype=torch.float64)
+    density = head(raw)
+    own = as_numpy(density)
+    assert (own.batch, own.event) == (tuple(density.batch_shape), tuple(density.event_shape))
+    torch.manual_seed(0)
+    values = density.sample(torch.Size((9,)))
+    expected = density.log_prob(values).double().numpy()
+    np.testing.assert_allclose(own.log_prob(values.double().numpy()), expected, rtol=1e-9, atol=1e-9)
+    # the most likely value is at least as likely as torch's
+    mode = torch.as_tensor(own.mode()).to(values.dtype)
+    assert bool((density.log_prob(mode) >= density.log_prob(density.mode) - 1e-6).all())
+    entropy = own.entropy()
+    away = np.abs(entropy.value - density.entropy().double().numpy())
+    several = entropy.error.any()  # draws, and torch's entropy is estimated from about 1000 of its own
+    assert (away <= (8 * entropy.error + 0.3 if several else 1e-7 * (1 + np.abs(entropy.value)))).all()
+    draws = own.sample(np.random.default_rng(0), 4000)
+    assert draws.shape == (4000, *own.batch, *own.event)
+    surprise = -own.log_prob(draws)
+    away, error = (
+        np.abs(surprise.mean(0) - entropy.value),
+        np.hypot(surprise.std(0) / math.sqrt(4000), entropy.error),
+    )
+    # values rarer than one in 4000 may be missing among the draws
+    assert (away <= 5 * error + 1e-3 * (1 + np.abs(entropy.value))).all()
+
+
+@pytest.mark.parametrize("name", ["gaussian", "mixture", "uniform_floor", "von_mises"])
+def test_numpy_computes_the_same_intervals(name: str) -> None:
+    for row in rows(name):
+        if row.target.kind in ("real", "angle"):
+            compare_intervals(name, row, 0.5)
+            compare_intervals(name, row, 0.9)
+
+
+def compare_intervals(name: str, row: HeadRow, mass: float) -> None:
+    """Compare the central intervals of NumPy with those of torch."""
+    head = build_head(name, row).double()
+    raw = torch.randn(4, head.size, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    density = head(raw)
+    own = as_numpy(density)
+    expected = central_interval(density, mass)
+    assert not expected.depends_on_draws
+    ends = own.interval(mass)
+    scale = (expected.high - expected.low).numpy()
+    for end, true in zip(ends, expected[:2], strict=True):
+        away = end - true.numpy()
+        away = wrap(torch.from_numpy(away)).numpy() if own.circular else away
+        assert (np.abs(away) <= 1e-6 * scale).all()
+    if own.event == (1,) and not own.circular:
+        np.testing.assert_allclose(
+            own.median(), median(density, 1000).numpy(), rtol=0, atol=0.2 * scale.max()
+        )
+
+
+@pytest.mark.parametrize(
+    ("head", "target"),
+    [
+        ("categorical", Target("class", ("a", "b", "c"))),
+        ("gaussian", Target("real", ("y",))),
+        ("mixture", Target("angle", ("azimuth",))),
+    ],
+    ids=lambda part: part if isinstance(part, str) else part.kind,
+)
+@pytest.mark.parametrize("threshold", [-0.5, 0.8, 1.5, math.inf])
+def test_numpy_computes_the_same_prediction_sets(head: str, target: Target, threshold: float) -> None:
+    part = resolve("uncertainty", {"name": "conformal"})
+    inner = build("density_head", resolve("density_head", {"name": head}), target=target).double()
+    raw = 2 * torch.randn(6, inner.size, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    wrapper = build("uncertainty", part, model=lambda: Model([], inner, (inner.size,)), target=target)
+    wrapper.threshold.fill_(threshold)
+    wrapper.model.projection = torch.nn.Identity()
+    density = wrapper.eval()(raw)
+    expected = value_set(density)
+    own = as_numpy(density)
+    assert expected is not None
+    for true, found in zip(expected.parts() or (), own.parts(), strict=True):  # type: ignore[attr-defined]
+        if target.kind == "class":
+            assert true == found
+        else:
+            np.testing.assert_allclose(np.ravel(found), np.ravel(true), rtol=1e-6, atol=1e-6)
+
+
+class Arrays(Data):
+    """Data whose users give arrays of the model's inputs."""
+
+    bibtex, synthetic, varies = "", True, False
+    prepare = splits = read = augment = fingerprint = preview = None  # type: ignore[assignment]
+
+    def __init__(self, shape: tuple[int, ...]) -> None:
+        self.input_shape = shape
+
+
+def describe(shape: tuple[int, ...], target: Target) -> Description:
+    """Return the description of a model of this shape and target."""
+    return Description({"data": {"name": "arrays"}}, target, shape, (), synthetic=True, method="tested")
+
+
+@pytest.fixture
+def arrays(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the exporter read arrays as they are."""
+    Arrays.__abstractmethods__ = frozenset()  # type: ignore[attr-defined]
+    monkeypatch.setattr(exporting, "reader", lambda description: Arrays(description.input_shape))
+
+
+def model_of(name: str, row: HeadRow) -> tuple[Predictor, tuple[int, ...]]:
+    """Return a small network with a head, and the shape of its inputs."""
+    head = build_head(name, row)
+    if head.direct:
+        return Model([], head, (head.size,)).eval(), (head.size,)
+    encoder = build("encoder", resolve("encoder", {"name": "mlp", "widths": [16]}), input_shape=(6,))
+    return Model([encoder], head).eval(), (6,)
+
+
+def check_export(name: str, row: HeadRow, into: Path) -> None:
+    """Export a model with this head, or see it refused with the reason in NOT_EXPORTED."""
+    words = reason(name, row)
+    model, shape = model_of(name, row)
+    if words is not None:
+        with pytest.raises(ConfigError, match=words):
+            exporting.export(model, describe(shape, row.target), into)
+        assert not into.exists()
+        return
+    content = exporting.export(model, describe(shape, row.target), into)
+    assert max(numbers["parameters"] for numbers in content["parity"].values()) <= 1e-5
+
+
+@pytest.mark.usefixtures("arrays")
+@pytest.mark.parametrize("name", ["gaussian", "mixture"])
+def test_an_exported_network_computes_the_same_parameters(name: str, tmp_path: Path) -> None:
+    check_export(name, rows(name)[0], tmp_path / "model")
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("arrays")
+@pytest.mark.parametrize("name", HEADS)
+def test_every_head_is_exported_or_refused_with_its_reason(name: str, tmp_path: Path) -> None:
+    for number, row in enumerate(rows(name, refused=True)):
+        check_export(name, row, tmp_path / str(number))
+
+
+def test_the_exported_folder_needs_numpy_and_onnxruntime_alone(framework: Framework, tmp_path: Path) -> None:
+    generator = np.random.default_rng(0)
+    cells = generator.normal(size=(80, 2)) * [1, 50] + [0, 1000]
+    lines = [f"{first},{second},{first + second / 50}" for first, second in cells.tolist()]
+    (tmp_path / "rows.csv").write_text("\n".join(["a,b,y", *lines, ""]))
+    table = (f"data.path={tmp_path / 'rows.csv'}", "data.target=y", "data.kind=real")
+    small = ("encoder.mlp.widths=[8]", "trainer.max_epochs=1", "pictures=false", "logger=none", "threads=1")
+    done = framework("data=tabular", *table, "density_head=gaussian", "encoder=[mlp]", *small)
+    assert done.code == 0, done.out
+    made = framework("mode=export", f"checkpoint={done.folder}", "logger=none", folder="exported")
+    assert made.code == 0, made.out
+    folder = made.folder / "exported"
+    asked = framework(
+        "mode=predict", f"checkpoint={done.folder}", f"mode.files={tmp_path / 'rows.csv'}", "mode.interval=0.9",
+        "logger=none", folder="predicted",
+    )  # fmt: skip
+    assert asked.code == 0, asked.out
+
+    # Only these packages can be imported: a folder with links to them is the whole search path.
+    site = tmp_path / "site"
+    site.mkdir()
+    packages = Path(np.__file__).parents[1]
+    for name in (
+        "numpy",
+        "numpy.libs",
+        "onnxruntime",
+        "flatbuffers",
+        "google",
+        "packaging",
+        "typing_extensions.py",
+    ):
+        if (packages / name).exists():
+            (site / name).symlink_to(packages / name)
+    script = f"import sys; sys.path[:0] = [{str(folder)!r}, {str(site)!r}]; import predict; predict.main()"
+    answer = subprocess.run(
+        [sys.executable, "-S", "-E", "-P", "-c", script, str(tmp_path / "rows.csv"), "--interval", "0.9"],
+        capture_output=True, text=True, check=True,
+    ).stdout  # fmt: skip
+    found = [line.split(",") for line in answer.splitlines()]
+    wanted = [line.split(",") for line in (asked.folder / "predictions.csv").read_text().splitlines()]
+    for name in ("y", "y_low", "y_high", "entropy_nats"):
+        column, other = (
+            np.array([float(row[table[0].index(name)]) for row in table[1:]]) for table in (found, wanted)
+        )
+        np.testing.assert_allclose(column, other, rtol=1e-5, atol=1e-5)
+
+    imports = re.findall(
+        r"^(?:from|import) (\w+)", "".join(file.read_text() for file in folder.glob("*.py")), re.M
+    )
+    own = {file.stem for file in folder.glob("*.py")} | {"numpy", "onnxruntime", "fastapi", "uvicorn"}
+    assert set(imports) - own <= set(sys.stdlib_module_names)
+    again = framework(
+        "mode=export", f"checkpoint={done.folder}", f"mode.into={folder}", "logger=none", folder="again"
+    )
+    assert again.code != 0 and "is not empty" in again.out
