@@ -1,11 +1,14 @@
 """Exported models: what NumPy and ONNX Runtime compute is what the model computes."""
 
+import http.client
 import importlib
 import json
 import math
 import re
+import socket
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -291,3 +294,55 @@ def test_the_exported_folder_needs_numpy_and_onnxruntime_alone(framework: Framew
         "mode=export", f"checkpoint={done.folder}", f"mode.into={folder}", "logger=none", folder="again"
     )
     assert again.code != 0 and "is not empty" in again.out
+
+
+MALFORMED = (
+    b"", b"{", b"\xff\xfe", b"null", b"[]", b"[" * 5000 + b"]" * 5000, b'{"inputs": "x"}', b'{"inputs": null}',
+    b'{"inputs": {"a": 1}}', b'{"inputs": []}', b'{"inputs": [[1, 2]]}', b'{"inputs": [[1, 2, 3], [1]]}',
+    b'{"inputs": [[1, 2, 3, 4, 5, NaN]]}', b'{"inputs": [[1, 2, 3, 4, 5, 1e999]]}',
+    b'{"inputs": [[1, 2, 3, 4, 5, "x"]]}',
+    b'{"inputs": [[1, 2, 3, 4, 5, 6]], "interval": 2}', b'{"inputs": [[1, 2, 3, 4, 5, 6]], "interval": "x"}',
+    b'{"inputs": [[1, 2, 3, 4, 5, 6]], "other": 1}', b'{"inputs": [[[[[[[[[[1]]]]]]]]]]}',
+)  # fmt: skip
+"""Bodies of requests that must be refused."""
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("arrays")
+def test_the_service_predicts_and_refuses_malformed_requests(tmp_path: Path) -> None:
+    target = rows("gaussian")[0].target
+    model, shape = model_of("gaussian", rows("gaussian")[0])
+    exporting.export(model, describe(shape, target), tmp_path / "model")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    script = [sys.executable, str(tmp_path / "model" / "serve.py"), "--port", str(port)]
+    with subprocess.Popen(script, cwd=tmp_path) as service:
+        try:
+            answer = ask(port, b'{"inputs": [[1, 2, 3, 4, 5, 6]], "interval": 0.9}')
+            (row,) = json.loads(answer[1])["predictions"]
+            (name,) = target.names
+            assert answer[0] == 200 and row[f"{name}_low"] < row[name] < row[f"{name}_high"]
+            for content in MALFORMED:
+                for kind in ("application/json", "application/octet-stream"):
+                    status, text = ask(port, content, kind)
+                    assert status == 400 and str(tmp_path) not in text, (content[:40], kind, text)
+        finally:
+            service.terminate()
+
+
+def ask(port: int, content: bytes, kind: str = "application/json") -> tuple[int, str]:
+    """Return the status and the text of the service's answer; wait up to 60 seconds for the service to start."""
+    end = time.monotonic() + 60
+    while True:
+        try:
+            connection = http.client.HTTPConnection("127.0.0.1", port, timeout=30)
+            connection.request("POST", "/predict", content, {"Content-Type": kind})
+            response = connection.getresponse()
+            return response.status, response.read().decode()
+        except ConnectionRefusedError:
+            if time.monotonic() > end:
+                raise
+            time.sleep(0.1)
+        finally:
+            connection.close()
