@@ -14,7 +14,7 @@ from hydra.errors import HydraException
 from framework.configuration.composition import folder, groups, in_quotes, options, register
 from framework.configuration.foreign_configs import require_harmless
 from framework.configuration.newest import LAST, newest_run
-from framework.configuration.stored_keys import as_stored
+from framework.configuration.stored_keys import as_stored, names_run
 from framework.errors import ConfigError, did_you_mean, escape_unprintable, nearest_name
 from framework.tracking.stores import require_no_password
 
@@ -173,7 +173,7 @@ def _use_resumed_folder(arguments: list[str]) -> list[str]:
     """Set Hydra's run folder to the folder of `resume=<run folder>`, so that Hydra creates no new one."""
     for index, argument in enumerate(arguments):
         key, _, value = argument.partition("=")
-        if key == "resume" and value not in ("auto", "never", "null", ""):
+        if key == "resume" and names_run(value):
             path = Path(value).expanduser()
             if not path.exists() and value[0] in "'\"":
                 with suppress(HydraException):

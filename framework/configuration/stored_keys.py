@@ -10,6 +10,11 @@ READING = tuple(name for name, mode in MODES.items() if mode.stored)
 """Modes that use the plugins of a stored model if the command chooses none."""
 
 
+def names_run(resume: object) -> bool:
+    """Return whether the value of the setting `resume`, typed or composed, is the folder of a run to continue."""
+    return resume not in ("auto", "never", "null", "", None)
+
+
 def as_stored(arguments: Sequence[str]) -> list[str]:
     """Replace `data.root=...` by `+stored.data.root=...` if the key belongs to a stored config.
 
@@ -17,7 +22,7 @@ def as_stored(arguments: Sequence[str]) -> list[str]:
     to resume, `data.root` is a key of the data in the stored config. The same holds for the other plugins.
     """
     values = {key.lstrip("+"): value for key, _, value in (argument.partition("=") for argument in arguments)}
-    resumed = values.get("resume", "") not in ("auto", "never", "null", "")
+    resumed = names_run(values.get("resume"))
     mode, checkpoint = values.get("mode", "train"), values.get("checkpoint", "null")
     reads = set(mode.split(",")) <= set(READING) and (checkpoint not in ("null", "") or mode == "combine")
     if "experiment" in values or not (resumed or reads):

@@ -2,8 +2,9 @@
 
 from framework.configuration.config import Config, Options
 from framework.reports.report import report_test, report_training
-from framework.runs.fit import fit, remove_resume_files
+from framework.runs.fit import fit
 from framework.runs.job import write_value
+from framework.runs.resuming import remove_resume_files
 from framework.runs.run import open_run
 from framework.runs.session import calibrate, for_training
 from framework.storage.first_rank import first_rank

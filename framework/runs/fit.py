@@ -3,7 +3,6 @@
 import sys
 import time
 from functools import partial
-from pathlib import Path
 
 import pytorch_lightning as pl
 from rich.console import Console
@@ -13,14 +12,15 @@ from framework.configuration.loading import fill, predictor_weights
 from framework.configuration.settings import TRAINER_OURS, device_of
 from framework.data import Data
 from framework.model import FrozenFrontEnd, fitted_models, learns
-from framework.runs.run import Run, resume_arguments
+from framework.runs.resuming import begin_again, resume_arguments
+from framework.runs.run import Run
 from framework.runs.session import Session
 from framework.storage.checkpoints import read
 from framework.storage.first_rank import first_rank
 from framework.storage.processor import fast_bfloat16
 from framework.tracking.signals import Stopped
 from framework.training.cached_features import CachedFeatures, fits
-from framework.training.checkpoint import BEST, TRAINED, WholeCheckpoints, find_resumable
+from framework.training.checkpoint import WholeCheckpoints
 from framework.training.fitting import fit_at_once, mean_loss
 from framework.training.module import (
     KeepCheckpoints,
@@ -88,7 +88,7 @@ def _fit_by_gradient(session: Session, run: Run) -> tuple[float, int]:
     several = outermost(session.predictor)
     batches.orders = several.model_count if several else 1
     loaded = LoadedBatches(batches, trainer)
-    resume = _resume_checkpoint(session, run)
+    resume = begin_again(run, session.console)
     with end_together(trainer, run.stopper, partial(_give_up, run)):
         trainer.fit(training, datamodule=loaded, ckpt_path=resume, weights_only=True)
         _leave_process_group()
@@ -100,29 +100,6 @@ def _fit_by_gradient(session: Session, run: Run) -> tuple[float, int]:
         fill(session.predictor, predictor_weights(read(keep.kept_path)), str(keep.kept_path))
     session.device = trainer.strategy.root_device
     return keep.kept_loss, keep.kept_epoch
-
-
-def _resume_checkpoint(session: Session, run: Run) -> Path | None:
-    """Return the checkpoint from which training continues, or None if it begins anew.
-
-    All ranks must call this function before rank 0 writes a checkpoint, so that all find the same one.
-    """
-    resume = find_resumable(run.checkpoints) if run.resumed else None
-    if run.resumed and first_rank():
-        step = 0 if resume is None else int(read(resume)["global_step"])
-        run.tracker.drop_after(step)
-        session.console.print(
-            "nothing to resume from yet: starting from the beginning."
-            if resume is None
-            else f"resuming from {resume} (step {step})."
-        )
-    return resume
-
-
-def remove_resume_files(run: Run) -> None:
-    """Delete the checkpoints that only a resumed run needs, after model.ckpt was written."""
-    for name in (*TRAINED, BEST):
-        (run.checkpoints / name).unlink(missing_ok=True)
 
 
 def _give_up(run: Run, error: BaseException) -> None:

@@ -2,27 +2,24 @@
 
 import itertools
 import os
-import shlex
 import sys
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import yaml
 
 from framework.configuration.config import Config
-from framework.configuration.paths import paths_of, shell_arguments
 from framework.configuration.settings import Settings, store_experiment
 from framework.errors import DataError, UserError, escape_undecodable
 from framework.runs.job import PARENT, SYNCED_WITHIN
 from framework.runs.provenance import flatten, package_versions
 from framework.runs.repository import git_commit
+from framework.runs.resuming import may_resume, resume_arguments
 from framework.storage.files import describe_unwritable, write_whole
 from framework.storage.first_rank import first_rank
-from framework.storage.plain_values import read_yaml
 from framework.tracking.run_info import Destination, read_run_info
 from framework.tracking.signals import Stopped, Stopper
 from framework.tracking.silent import SilentTracker
@@ -45,8 +42,6 @@ LEFT_BY_RUNS = (
     "unreadable.txt",
 )
 """Files and folders that modes write into a run folder; the tracker writes the journal in addition."""
-HOW = ("threads", "workers", "logger.uri")
-"""Keys that do not affect the result of a run, so that a resumed run may have other values of them."""
 
 
 @dataclass(frozen=True)
@@ -79,23 +74,6 @@ class Run:
     def checkpoints(self) -> Path:
         """Return the folder of the run's checkpoints."""
         return self.folder / "checkpoints"
-
-
-def stored_config(folder: Path) -> dict[str, Any] | None:
-    """Return the config in a run folder; None if the folder contains no config yet."""
-    path = folder / "config.yaml"
-    return read_yaml(path, "the config of a run") if path.is_file() else None
-
-
-def may_resume(config: Config) -> bool:
-    """Return whether the run in `config.folder` is unfinished, has this config, and `resume` allows continuing it."""
-    earlier = read_run_info(config.folder)
-    return (
-        earlier is not None
-        and earlier.status != "FINISHED"
-        and config.settings.resume != "never"
-        and _same_settings(stored_config(config.folder), config.values)
-    )
 
 
 @contextmanager
@@ -141,14 +119,6 @@ def open_run(config: Config) -> Iterator[Run]:
         tracker.close("FINISHED")
 
 
-def resume_arguments(run: Run) -> str:
-    """Return the arguments of the command that continues a run, quoted for a shell."""
-    # the address of a store and paths are included, because stored ones are used only if the user repeats them
-    store = run.settings.logger.uri
-    own = [f"resume={run.folder}", *([f"logger.uri={store}"] if store else [])]
-    return " ".join([*map(shlex.quote, own), *shell_arguments(paths_of(run.config.values))])
-
-
 def _begin_folder(config: Config) -> None:
     """Write the config into the folder, after moving the files of an earlier run to `earlier.<n>`.
 
@@ -164,16 +134,6 @@ def _begin_folder(config: Config) -> None:
     (folder / "checkpoints").mkdir()
     write_whole(folder / "overrides.yaml", yaml.safe_dump(list(config.overrides)).encode())
     write_whole(folder / "config.yaml", yaml.safe_dump(dict(config.values), sort_keys=False).encode())
-
-
-def _same_settings(stored: Mapping[str, Any] | None, values: Mapping[str, Any]) -> bool:
-    if stored is None:
-        return False
-    stored_settings, new_settings = (
-        {key: value for key, value in flatten(config).items() if key not in ("resume", *HOW)}
-        for config in (stored, values)
-    )
-    return stored_settings == new_settings
 
 
 def _tracker(config: Config, run_id: str | None, resumed: bool) -> Tracker:

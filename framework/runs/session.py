@@ -55,7 +55,8 @@ from framework.objective import Objective
 from framework.prediction import Prediction, true_image
 from framework.runs.introduction import introduce, introduce_model, introduce_threads
 from framework.runs.job import refuse_idle
-from framework.runs.run import Run, may_resume
+from framework.runs.resuming import find_resumable, may_resume
+from framework.runs.run import Run
 from framework.storage.checkpoints import read, write
 from framework.storage.first_rank import first_rank
 from framework.storage.progress import output

@@ -20,7 +20,7 @@ from framework.reports.table import (
     write_csv,
 )
 from framework.runs.job import find_job_folders, read_record
-from framework.runs.run import stored_config
+from framework.runs.resuming import stored_config
 from framework.storage.plain_values import is_number, read_json
 from framework.storage.progress import output
 from framework.storage.reading import RESTORE

@@ -6,12 +6,6 @@ from typing import Any, final
 from pytorch_lightning.plugins.io import CheckpointIO
 
 from framework.storage import checkpoints
-from framework.storage.old_versions import can_resume_from_best
-
-TRAINED = {"last.ckpt", "previous.ckpt"}
-"""Names of checkpoints from which training can resume; all others hold weights only."""
-BEST = "best.ckpt"
-"""Name of the checkpoint with the lowest validation loss."""
 
 
 @final
@@ -33,12 +27,3 @@ class WholeCheckpoints(CheckpointIO):
     def remove_checkpoint(self, path: str | Path) -> None:
         """Delete a checkpoint, if it exists."""
         Path(path).unlink(missing_ok=True)
-
-
-def find_resumable(folder: Path) -> Path | None:
-    """Return the newest undamaged checkpoint in a folder that training can resume from; None if there is none."""
-    resumable = checkpoints.latest_good(folder, names=TRAINED)
-    if resumable is not None:
-        return resumable
-    best = checkpoints.latest_good(folder, names={BEST})
-    return best if best is not None and can_resume_from_best(checkpoints.read(best)) else None

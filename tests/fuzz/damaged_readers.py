@@ -13,7 +13,6 @@ import numpy as np
 import torch
 from safetensors.torch import save as to_safetensors
 
-from framework import modes
 from framework.bodies import body_files, motion
 from framework.configuration import loading
 from framework.configuration.config import Config
@@ -21,6 +20,7 @@ from framework.datasets import scan_layout
 from framework.datasets.csv_columns import mostly_numbers, numbers, read_columns
 from framework.datasets.images import Crop
 from framework.geometry import meshes
+from framework.runs import resuming
 from framework.storage.generated import read_mark
 from framework.storage.weights import read_weights
 from framework.sweeps import jobs
@@ -87,7 +87,7 @@ def weight(file: Path) -> object:
 def stored(file: Path) -> object:
     """Read a stored config with all checks that a run makes before it reads data."""
     (file.parent / "overrides.yaml").write_text("- seed=1\n", encoding="utf-8")
-    values, changed = modes._read_stored_run(file.parent, {}, [f"resume={file.parent}"])
+    values, changed = resuming.read_command(file.parent, {}, [f"resume={file.parent}"])
     return Config.of(values, file.parent, changed).parts
 
 

@@ -1,0 +1,177 @@
+"""Resuming of a run that was stopped or killed: which run continues, and what of it is restored, in which order.
+
+1. `read_command` gives a command with `resume=<folder>` the config and the overrides of that run.
+2. `may_resume` decides whether the run in a folder continues: it has not finished, and its config is the same.
+3. The tracker continues the run's record and journal (`framework.tracking.tracker`).
+4. `begin_again` finds the newest undamaged checkpoint and removes the journal lines of later steps. Lightning restores
+   from the checkpoint the weights, the optimiser with its schedule, the loops and the states of the callbacks.
+   Random numbers and the order of the batches are functions of the seed and the step, so they are not stored.
+5. The steps after the training (calibration, test) leave nothing to restore; a resumed run repeats them.
+
+`resume_arguments` writes the command that continues a run, and `remove_resume_files` deletes what only a resumed run
+needs. Modules that decide something else by whether a run continues read `Run.resumed`.
+"""
+
+import shlex
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from framework.configuration.config import Config
+from framework.configuration.paths import flatten, paths_of, require_repeated, shell_arguments
+from framework.errors import ConfigError
+from framework.runs import provenance
+from framework.storage.first_rank import first_rank
+from framework.storage.old_versions import can_resume_from_best
+from framework.storage.plain_values import read_yaml
+from framework.tracking.ended import sync
+from framework.tracking.run_info import read_run_info
+from framework.tracking.stores import confirm_address
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from framework.runs.run import Run
+
+HOW = ("threads", "workers", "logger.uri")
+"""Keys that do not affect the result of a run, so that a resumed run may have other values of them."""
+TRAINED = ("last.ckpt", "previous.ckpt")
+"""Names of checkpoints from which training can resume; all others hold weights only."""
+BEST = "best.ckpt"
+"""Name of the checkpoint with the lowest validation loss."""
+
+
+def send_rest(folder: Path, store: str | None) -> bool:
+    """Send the journal lines that a run of status FINISHED could not send; return whether there were any."""
+    info = read_run_info(folder)
+    if info is None or info.status != "FINISHED" or not info.uri:
+        return False
+    sent = sync(folder, store)
+    if sent:
+        sys.stdout.write(
+            f"The run had already finished; {sent} journal lines that were missing in its store were sent.\n"
+        )
+    return sent > 0
+
+
+def read_command(
+    folder: Path, command_values: dict[str, Any], overrides: Sequence[str]
+) -> tuple[dict[str, Any], list[str]]:
+    """Return the config and overrides with which the run in `folder` was started.
+
+    Values of keys that do not affect the results (`HOW`) are taken from `command_values`, the config of the present
+    command, if the command sets them.
+
+    Raises:
+        ConfigError: The run has finished, its files are damaged, or the command changes the run's config or does not
+            repeat its paths.
+    """
+    keys = {item: item.lstrip("+~").partition("=")[0] for item in overrides}
+    allowed = ("resume", "checkpoint", *HOW)  # and keys `stored.…`, which repeat stored paths
+    changing = [item for item, key in keys.items() if key not in allowed and not key.startswith("stored.")]
+    if changing:
+        raise ConfigError(
+            f"resume={folder} continues with the config of that run, which {' '.join(changing)} would change. "
+            f"Leave these overrides out, or start a new run. Only {', '.join(HOW)} may be overridden."
+        )
+    earlier = read_run_info(folder)
+    if earlier is not None and earlier.status == "FINISHED":
+        raise ConfigError(f"resume={folder}: that run has finished and cannot be continued. Start a new run.")
+    values, changed = (
+        read_yaml(folder / name, "a config that a run has left", "Start a new run.", ConfigError)
+        for name in ("config.yaml", "overrides.yaml")
+    )
+    if (
+        not isinstance(values, dict)
+        or not isinstance(changed, list)
+        or not all(isinstance(item, str) for item in (*values, *changed))
+    ):
+        raise ConfigError(f"{folder / 'config.yaml'} is not the config of a run. Start a new run.")
+    logger = values.get("logger")
+    recorded = logger.get("uri") if isinstance(logger, dict) else None
+    if recorded is not None and "logger.uri" not in keys.values():
+        store = confirm_address(str(recorded), None, folder, folder / "config.yaml")
+        values["logger"]["uri"] = store.uri if store.named else None
+    repeated = flatten(command_values.get("stored") or {})
+    repeated |= {"checkpoint": command_values["checkpoint"]} if "checkpoint" in keys.values() else {}
+    require_repeated(paths_of(values), repeated, folder)
+    values["resume"] = "auto"  # also if the run was started with resume=never
+    for key in HOW:
+        if key in keys.values():
+            group, _, name = key.rpartition(".")
+            target, source = (values[group], command_values[group]) if group else (values, command_values)
+            target[name] = source[name]
+    return values, changed
+
+
+def stored_config(folder: Path) -> dict[str, Any] | None:
+    """Return the config in a run folder; None if the folder contains no config yet."""
+    path = folder / "config.yaml"
+    return read_yaml(path, "the config of a run") if path.is_file() else None
+
+
+def may_resume(config: Config) -> bool:
+    """Return whether the run in `config.folder` is unfinished, has this config, and `resume` allows continuing it."""
+    earlier = read_run_info(config.folder)
+    return (
+        earlier is not None
+        and earlier.status != "FINISHED"
+        and config.settings.resume != "never"
+        and _same_settings(stored_config(config.folder), config.values)
+    )
+
+
+def _same_settings(stored: Mapping[str, Any] | None, values: Mapping[str, Any]) -> bool:
+    if stored is None:
+        return False
+    stored_settings, new_settings = (
+        {key: value for key, value in provenance.flatten(config).items() if key not in ("resume", *HOW)}
+        for config in (stored, values)
+    )
+    return stored_settings == new_settings
+
+
+def find_resumable(folder: Path) -> Path | None:
+    """Return the newest undamaged checkpoint in a folder that training can resume from; None if there is none."""
+    from framework.storage import checkpoints  # imports torch, which a command that is refused does not need
+
+    resumable = checkpoints.latest_good(folder, names={*TRAINED})
+    if resumable is not None:
+        return resumable
+    best = checkpoints.latest_good(folder, names={BEST})
+    return best if best is not None and can_resume_from_best(checkpoints.read(best)) else None
+
+
+def begin_again(run: "Run", console: "Console") -> Path | None:
+    """Return the checkpoint from which the training of `run` continues, or None if it begins anew.
+
+    The metrics of steps after the checkpoint are removed from the journal of a resumed run, because the run repeats
+    these steps. All ranks must call this function before rank 0 writes a checkpoint, so that all find the same one.
+    """
+    from framework.storage import checkpoints
+
+    checkpoint = find_resumable(run.checkpoints) if run.resumed else None
+    if run.resumed and first_rank():
+        step = 0 if checkpoint is None else int(checkpoints.read(checkpoint)["global_step"])
+        run.tracker.drop_after(step)
+        console.print(
+            "nothing to resume from yet: starting from the beginning."
+            if checkpoint is None
+            else f"resuming from {checkpoint} (step {step})."
+        )
+    return checkpoint
+
+
+def resume_arguments(run: "Run") -> str:
+    """Return the arguments of the command that continues a run, quoted for a shell."""
+    # the address of a store and paths are included, because stored ones are used only if the user repeats them
+    store = run.settings.logger.uri
+    own = [f"resume={run.folder}", *([f"logger.uri={store}"] if store else [])]
+    return " ".join([*map(shlex.quote, own), *shell_arguments(paths_of(run.config.values))])
+
+
+def remove_resume_files(run: "Run") -> None:
+    """Delete the checkpoints that only a resumed run needs, after model.ckpt was written."""
+    for name in (*TRAINED, BEST):
+        (run.checkpoints / name).unlink(missing_ok=True)
