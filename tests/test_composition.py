@@ -51,11 +51,11 @@ def composed(*overrides: str) -> DictConfig:
 
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_every_experiment_composes_and_its_plugins_accept_it(name: str) -> None:
-    from framework.configuration.assembly import resolve_all
+    from framework.configuration.assembly import assemble
 
     values = plain(composed(f"experiment={name}"))
     settings(values)
-    resolved = resolve_all(values)
+    resolved = assemble(values).parts
     assert resolved["metric"], "an experiment reports something"
     # otherwise the weights of the lowest validation loss, which are kept, are never those of the last epoch
     trainer = values["trainer"]
@@ -115,10 +115,10 @@ FAMILIES = {name.partition("/")[0]: name for name in [*reversed(SHORTENED), *SMO
 @pytest.mark.parametrize("name", sorted({*FAMILIES.values(), *HUGE}))
 def test_an_experiment_of_each_family_can_be_shortened(name: str) -> None:
     """Shorten by the preset and by hand; a validation interval longer than the training becomes its length."""
-    from framework.configuration.assembly import resolve_all
+    from framework.configuration.assembly import assemble
 
     values = plain(composed(f"experiment={name}", "debug=fast"))
-    resolve_all(values)
+    assemble(values)
     assert values["data"]["name"] in {*SMOKE_RUNS, *NOT_RUN}
     for epochs in (values["trainer"]["max_epochs"], 2):
         trainer = settings({**values, "trainer": {**values["trainer"], "max_epochs": epochs}}).trainer
@@ -200,13 +200,13 @@ OTHER_HEADS = ("von_mises", "mixture", "gaussian", "categorical", "bernoulli_ima
 )
 def test_what_an_experiment_sets_of_its_head_can_be_taken_out_for_another(name: str, head: str) -> None:
     """The message names each key that the new head does not have, with the arguments that remove the key."""
-    from framework.configuration.assembly import resolve_all
+    from framework.configuration.assembly import assemble
 
     words: list[str] = []
     while True:
         values = plain(composed(f"experiment={name}", f"density_head={head}", *words))
         try:
-            resolve_all(values)
+            assemble(values)
         except ConfigError as error:
             unknown = re.search(r"(density_head\.\S+): unknown key", str(error))
             if unknown is None or OmegaConf.select(OmegaConf.create(values), unknown[1]) is None:

@@ -15,7 +15,7 @@ from PIL import Image
 from torch.utils.data import default_collate
 
 import framework as package
-from framework.configuration.assembly import build_data, build_predictor, resolve_all
+from framework.configuration.assembly import assemble, build_data, build_predictor
 from framework.configuration.composition import plain
 from framework.configuration.paths import paths_of
 from framework.datasets.scan_layout import write_registration
@@ -266,7 +266,7 @@ def test_the_ground_of_a_photograph_is_white_to_the_bit_and_is_not_computed(
 ) -> None:
     """Losses weigh figures by it, networks leave it out."""
     settings = [*people(tmp_path)[1:], *own]
-    resolved = resolve_all(plain(composed(f"experiment=smplpix/{way}", *settings)))
+    resolved = assemble(plain(composed(f"experiment=smplpix/{way}", *settings))).parts
     data = build_data(resolved)
     data.prepare()
     batch = default_collate([data.splits().train[index] for index in range(3)])

@@ -11,7 +11,7 @@ from pytorch_lightning.plugins.precision import MixedPrecision
 from torch import Tensor, nn
 from torch.distributions import Independent, Normal
 
-from framework.configuration.assembly import build_predictor, resolve_all
+from framework.configuration.assembly import assemble, build_predictor
 from framework.configuration.schema import build, resolve
 from framework.configuration.settings import OptimizerSettings
 from framework.data import Batch
@@ -259,7 +259,7 @@ def test_gradients_are_clipped_in_every_precision(
         "density_head": "bernoulli",
         "uncertainty": {"ensemble": {"name": "ensemble", "members": members}} if members > 1 else {},
     }
-    resolved = resolve_all(config)
+    resolved = assemble(config).parts
     data = build("data", resolved["data"])
     data.prepare()
     most, rate = 1e-3, 0.5

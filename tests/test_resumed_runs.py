@@ -3,14 +3,15 @@
 import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 
-from framework.configuration import composition, loading
-from framework.configuration.assembly import build_predictor
+from framework.configuration import assembly, composition, loading
 from framework.configuration.config import Config
 from framework.data import Data
 from framework.errors import CheckpointError, DataError
@@ -122,21 +123,29 @@ def test_a_checkpoint_of_another_model_is_refused_before_data_are_read(
         train.run(composed(tmp_path / "same", *SMALL, start))
 
 
-def test_a_training_reads_its_checkpoint_and_builds_its_model_once(
+def test_a_training_reads_its_checkpoint_and_builds_its_model_and_every_plugin_once(
     tmp_path: Path, composed: Composed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    train.run(composed(tmp_path / "first", *SMALL))
     calls: list[str] = []
 
-    def counted(name: str, function: Callable[..., object]) -> None:
-        monkeypatch.setattr(
-            session, name, lambda *given, **named: calls.append(name) or function(*given, **named)
-        )
+    def counted(module: ModuleType, name: str) -> None:
+        function = getattr(module, name)
 
-    counted("build_predictor", build_predictor)
-    counted("read", session.read)
+        def call(*arguments: Any, **named: Any) -> object:
+            calls.append(arguments[0] if name == "build" else name)
+            return function(*arguments, **named)
+
+        monkeypatch.setattr(module, name, call)
+
+    counted(session, "build_predictor")
+    counted(session, "read")
+    counted(assembly, "build")
+    plugins = ["data", "density_head", "encoder", "metric", "metric"]
+    train.run(composed(tmp_path / "first", *SMALL))
+    assert sorted(calls) == ["build_predictor", *plugins]
+    calls.clear()
     train.run(composed(tmp_path / "second", *SMALL, f"checkpoint={tmp_path / 'first'}"))
-    assert sorted(calls) == ["build_predictor", "read"]
+    assert sorted(calls) == ["build_predictor", *plugins, "read"]
 
 
 def test_a_stored_model_is_tested_under_the_name_of_its_data(tmp_path: Path, composed: Composed) -> None:

@@ -23,7 +23,7 @@ import sqlalchemy
 from pandas import DataFrame
 from werkzeug.serving import make_server
 
-from framework.configuration.assembly import build_data, build_predictor, resolve_all
+from framework.configuration.assembly import assemble, build_data, build_predictor
 from framework.configuration.description import Description
 from framework.configuration.loading import PREFIX, load
 from framework.configuration.settings import Settings
@@ -1376,13 +1376,13 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, DataFrame]:
     folder = tmp_path_factory.mktemp("trained")
     lines = [f"{row},{row % 7},{1e6 * row}" for row in range(40)]
     (folder / "table.csv").write_text("width,height,mass\n" + "\n".join(lines))
-    parts = resolve_all(
+    parts = assemble(
         {
             "data": {"name": "tabular", "path": str(folder / "table.csv"), "target": "mass", "kind": "real"},
             "encoder": {"mlp": {"name": "mlp", "widths": [4]}},
             "density_head": {"name": "gaussian"},
         }
-    )
+    ).parts
     data = build_data(parts)
     data.prepare()
     predictor = build_predictor(parts, data.target, data.input_shape, 0, data.columns)

@@ -22,7 +22,7 @@ from scipy import stats
 from torch import Tensor
 
 from benchmarks.pages import machine, publish
-from framework.configuration.assembly import build_predictor, resolve_all
+from framework.configuration.assembly import assemble, build_predictor
 from framework.configuration.schema import build, resolve
 from framework.configuration.settings import OptimizerSettings
 from framework.data import Data
@@ -45,7 +45,7 @@ def build_network(data: Data, width: int, seed: int, members: int | None = None)
     }
     if members:
         config["uncertainty"] = {"ensemble": {"name": "ensemble", "members": members}}
-    return build_predictor(resolve_all(config), data.target, data.input_shape, seed)
+    return build_predictor(assemble(config).parts, data.target, data.input_shape, seed)
 
 
 def train_bare(

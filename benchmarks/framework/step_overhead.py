@@ -22,7 +22,7 @@ from torch import Tensor, nn
 
 from benchmarks.pages import machine, publish
 from benchmarks.timing import Rounds, require_idle
-from framework.configuration.assembly import build_predictor, resolve_all
+from framework.configuration.assembly import assemble, build_predictor
 from framework.configuration.schema import build, resolve
 from framework.configuration.settings import OptimizerSettings
 from framework.data import Batch, Splits
@@ -157,7 +157,7 @@ def time_predictor(case: Case) -> float:
 
 
 def build_case_predictor(case: Case) -> Predictor:
-    return build_predictor(resolve_all(case.config), case.data.target, case.data.input_shape, seed=0)
+    return build_predictor(assemble(case.config).parts, case.data.target, case.data.input_shape, seed=0)
 
 
 class Clock(pl.Callback):

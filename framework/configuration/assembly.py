@@ -1,6 +1,7 @@
 """Building of the parts of the density pipeline from a config: data, predictor, objectives and metrics."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -26,8 +27,38 @@ The value of a group from which several plugins may be chosen is a list of confi
 """
 
 
-def resolve_all(config: Mapping[str, Any]) -> Resolved:
-    """Check every plugin of a composed config before any data is read, and return the resolved configs.
+@dataclass
+class Assembly:
+    """Plugins of a training, checked and built before any data is read; the session uses the same objects.
+
+    Attributes:
+        parts: Resolved configs of all plugins.
+        data: Data set, whose `prepare` has not been called yet.
+        target: Target that the data set knows before it is prepared; None if it knows no target yet.
+        head: Density head for `target`. It is None without a target, and if building a head draws random numbers: its
+            initial weights are then a function of the seed, so that `build_predictor` must build it.
+        metrics: Metrics for `target`, without any state; None without a target.
+    """
+
+    parts: Resolved
+    data: Data
+    target: Target | None = None
+    head: DensityHead | None = None
+    metrics: "list[Metric] | None" = None
+
+    def take_head(self, target: Target) -> DensityHead | None:
+        """Return the head if it was built for `target`, else None; further calls return None."""
+        head, self.head = self.head, None
+        return head if target == self.target else None
+
+    def take_metrics(self, target: Target) -> "list[Metric]":
+        """Return the metrics if they were built for `target`, else new ones; further calls return new ones."""
+        metrics, self.metrics = self.metrics, None
+        return metrics if metrics is not None and target == self.target else build_metrics(self.parts, target)
+
+
+def assemble(config: Mapping[str, Any]) -> Assembly:
+    """Check every plugin of a composed config, and build what can be built before any data is read.
 
     Raises:
         ConfigError: A part of the pipeline is missing, or a plugin's name, key or value is wrong.
@@ -43,9 +74,13 @@ def resolve_all(config: Mapping[str, Any]) -> Resolved:
         "data": resolve("data", config["data"]),
         "density_head": resolve("density_head", config["density_head"]),
     }
-    target = getattr(build_data(resolved), "target", None)
+    assembly = Assembly(resolved, build_data(resolved))
+    assembly.target = target = getattr(assembly.data, "target", None)
     if target is not None:  # known before data is read, so a head that cannot describe the target fails here
-        build("density_head", resolved["density_head"], target=target)
+        generator_state = torch.default_generator.get_state()
+        head: DensityHead = build("density_head", resolved["density_head"], target=target)
+        if torch.equal(generator_state, torch.default_generator.get_state()):
+            assembly.head = head
     for group in ("encoder", "uncertainty", "objective", "metric"):
         chosen = config.get(group) or {}
         if not isinstance(chosen, Mapping):
@@ -58,8 +93,8 @@ def resolve_all(config: Mapping[str, Any]) -> Resolved:
     resolved["outliers"] = resolve("data", outliers, "outliers") if outliers else None
     require_outliers(resolved)
     if target is not None:
-        build_metrics(resolved, target)
-    return resolved
+        assembly.metrics = build_metrics(resolved, target)
+    return assembly
 
 
 def _is_fitted_at_once(head: Any) -> bool:
@@ -117,17 +152,27 @@ def build_predictor(
     input_shape: tuple[int, ...],
     seed: int,
     columns: tuple[str, ...] = (),
+    head: DensityHead | None = None,
 ) -> Predictor:
     """Return the untrained predictor, whose initial weights are a function of `seed` and the config.
 
     The encoders before the first one that is not `Encoder.fixed` are shared by all models and placed outside the
-    uncertainty wrappers. `columns` are the names of the input columns.
+    uncertainty wrappers.
+
+    Args:
+        resolved: Resolved configs of all plugins.
+        target: Target that is predicted.
+        input_shape: Shape of one input.
+        seed: Seed of the initial weights.
+        columns: Names of the input columns.
+        head: Density head for `target` that is built already (`Assembly.take_head`), for the first model.
     """
     # the model is built on the CPU; the generators of other devices stay unchanged
     torch.default_generator.manual_seed(seed)
     parts = list(resolved["encoder"])
     fixed: list[Encoder] = []
     built_encoders: list[Encoder] = []  # the encoder that is built already is used for the first model
+    built_heads = [] if head is None else [head]
     shape, names = input_shape, columns
     while parts:
         encoder: Encoder = build("encoder", parts[0], input_shape=shape, input_columns=names)
@@ -153,7 +198,11 @@ def build_predictor(
 
     def build_model() -> Predictor:
         encoders, feature_shape = build_encoders()
-        head: DensityHead = build("density_head", resolved["density_head"], target=target)
+        head: DensityHead = (
+            built_heads.pop()
+            if built_heads
+            else build("density_head", resolved["density_head"], target=target)
+        )
         return Model(encoders, head, feature_shape, [build_encoders()[0] for _ in head.backbones[1:]])
 
     factory: Callable[[], Predictor] = build_model

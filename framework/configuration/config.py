@@ -4,13 +4,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict
 
 from framework.configuration.modes import is_below, key_of
 from framework.configuration.schema import check
 from framework.configuration.settings import Settings, settings
+
+if TYPE_CHECKING:
+    from framework.configuration.assembly import Assembly
 
 
 class Options(BaseModel):
@@ -53,15 +56,15 @@ class Config:
         return cls(values, settings(values), folder, overrides)
 
     @cached_property
-    def parts(self) -> dict[str, Any]:
-        """Return the resolved configs of all plugins, which are checked at the first access.
+    def assembly(self) -> "Assembly":
+        """Return the plugins of a training, which are checked and built at the first access.
 
         Raises:
             ConfigError: A part is missing, or a plugin's name, key or value is wrong.
         """
-        from framework.configuration.assembly import resolve_all  # imports torch, which not every mode needs
+        from framework.configuration.assembly import assemble  # imports torch, which not every mode needs
 
-        return resolve_all(self.values)
+        return assemble(self.values)
 
     @property
     def mode(self) -> str:

@@ -156,17 +156,25 @@ def _expand_home(user_data: Any) -> Any:
     return user_data
 
 
-def reader(description: Description) -> Data:
+def reader(description: Description, chosen: Data | None = None) -> Data:
     """Return the data set of a model, not prepared, which converts the user's data to inputs.
 
     If the user has not repeated a path of the data set, its `prepare` raises an error, because the default path leads
     to other data.
+
+    Args:
+        description: Description of the model.
+        chosen: Data set of the description's config, if it is built already.
     """
     with translate_errors(
         Path(description.path), "a checkpoint of this framework", FOREIGN, kind=CheckpointError
     ):
         try:
-            data = build_data({"data": resolve("data", description.config["data"])})
+            data = (
+                build_data({"data": resolve("data", description.config["data"])})
+                if chosen is None
+                else chosen
+            )
         except ConfigError:
             require_paths(description.dropped, ("data",), description.path)
             raise

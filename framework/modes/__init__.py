@@ -46,7 +46,7 @@ def run(values: dict[str, Any], folder: Path, overrides: Sequence[str]) -> float
             refuse_idle(folder, sentence)
     if name == "train":  # find mistakes before the slow import of Lightning
         require_device(config.settings.trainer.get("accelerator"))
-        _ = config.parts
+        _ = config.assembly
     with started_early() if _sends_run(config) else nullcontext():
         return import_module(f"framework.modes.{name}").run(config)
 

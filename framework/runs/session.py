@@ -17,6 +17,7 @@ from rich.console import Console
 from torch.utils.data import Dataset
 
 from framework.configuration.assembly import (
+    Assembly,
     Resolved,
     build_data,
     build_metrics,
@@ -180,10 +181,9 @@ def for_training(config: Config) -> Session:
         ConfigError: A part is missing or does not fit another.
         DataError: `Data.prepare` fails.
     """
-    from framework.training.checkpoint import find_resumable  # imports Lightning, which only training needs
-
     console = set_up_process(config.settings)
-    parts = config.parts
+    assembly = config.assembly
+    parts, data = assembly.parts, assembly.data
     resumed = may_resume(config)
     if not resumed:
         refuse_unread_outliers(config, parts)
@@ -192,18 +192,18 @@ def for_training(config: Config) -> Session:
                 config,
                 f"density_head={parts['density_head']['name']} is fitted in one step, without gradient",
             )
-    data = build_data(parts)
     starts_from_weights = config.settings.checkpoint is not None and not (
         resumed and find_resumable(config.folder / "checkpoints")
     )
-    start = Start.of(parts, data, config.settings) if starts_from_weights else None
+    start = Start.of(assembly, config.settings) if starts_from_weights else None
     introduce_threads(config.settings.threads, console)
     data.prepare()
     introduce(data, console)
     objectives = build_objectives(parts)
     seed = config.settings.seed
     if start is None:
-        predictor = build_predictor(parts, data.target, data.input_shape, seed, columns=data.columns)
+        head = assembly.take_head(data.target)
+        predictor = build_predictor(parts, data.target, data.input_shape, seed, data.columns, head)
     else:
         predictor = start.predictor_for(data, parts, seed)
         hint = "to continue a run that was stopped, use resume=<folder of the run>"
@@ -221,7 +221,7 @@ def for_training(config: Config) -> Session:
     device = torch.device("cpu")
     method = method_of(config, parts)
     session = Session(config, parts, method, data.target, data, predictor, device, console, objectives)
-    session = add_test_parts(session)
+    session = _add_metrics(session, assembly.take_metrics(data.target))
     if first_rank():
         rehearse(session)
     return session
@@ -267,7 +267,7 @@ class Start:
     about: tuple[Target, tuple[int, ...], tuple[str, ...]] | None = None
 
     @classmethod
-    def of(cls, parts: Resolved, data: Data, settings: Settings) -> "Start":
+    def of(cls, assembly: Assembly, settings: Settings) -> "Start":
         """Read the weights from which the model starts, and check that they fit before data are read or generated.
 
         The model is built for the inputs and the target that the checkpoint describes. A target that the data set knows
@@ -282,9 +282,10 @@ class Start:
         if not isinstance(described, Mapping):  # `predictor_for` raises the error about wrong weights
             return cls(path, state)
         stored, shape, columns = read_interface(described, path)
-        target = getattr(data, "target", None) or stored
+        target = assembly.target or stored
+        head = assembly.take_head(target)
         try:
-            predictor = build_predictor(parts, target, shape, settings.seed, columns)
+            predictor = build_predictor(assembly.parts, target, shape, settings.seed, columns, head)
         except ConfigError as error:
             raise CheckpointError(
                 f"{path} belongs to another model: {error} Use the config of its training, or give another checkpoint."
@@ -329,12 +330,15 @@ def add_test_parts(session: Session) -> Session:
     # metrics of a checkpoint are checked only here, because a model predicts without them
     parts = {**parts, "metric": [resolve("metric", part) for part in parts["metric"]]}
     require_outliers(parts)
-    metrics = build_metrics(parts, session.target)
+    return _add_metrics(replace(session, parts=parts), build_metrics(parts, session.target))
+
+
+def _add_metrics(session: Session, metrics: Sequence[Metric]) -> Session:
     owners: dict[str, Metric] = {}
     for metric in metrics:
         for name in metric.columns:
             require_unique_name(owners, name, metric)
-    return replace(session, parts=parts, metrics=metrics, outliers=build_outliers(parts, session.data))
+    return replace(session, metrics=metrics, outliers=build_outliers(session.parts, session.data))
 
 
 @torch.no_grad()
@@ -457,13 +461,15 @@ def for_predictor(
         parts["metric"] = [resolve("metric", part, f"metric.{key}") for key, part in metrics.items()]
     if "outliers" in reads and not may_resume(config):
         refuse_unread_outliers(config, parts)
+    chosen_data = None
     if prepare:
         outliers = "outliers" in {*reads} - chosen and bool(metrics_reading_outliers(parts))
         groups = ["data", *["metric"] * ("metric" in reads), *["outliers"] * outliers]
         require_paths(dropped, groups, description.path)
         if "data" in chosen:
-            require_target(getattr(build_data(parts), "target", None), description)
-    data = reader(replace(description, config=parts, dropped=dropped))
+            chosen_data = build_data(parts)
+            require_target(getattr(chosen_data, "target", None), description)
+    data = reader(replace(description, config=parts, dropped=dropped), chosen_data)
     if prepare:
         data.prepare()
         require_fit(data, description)

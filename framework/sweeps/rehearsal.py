@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from framework.configuration.assembly import build_data
 from framework.configuration.config import Config
 from framework.configuration.modes import require_read
 from framework.errors import ConfigError, UserError
@@ -61,10 +60,10 @@ def main() -> None:
     checked_data: set[str] = set()
     for overrides, values in json.load(sys.stdin):
         try:
-            parts = Config.of(values, Path(), overrides).parts
-            if repr(parts["data"]) not in checked_data:
-                checked_data.add(repr(parts["data"]))
-                build_data(parts).check_files()
+            assembly = Config.of(values, Path(), overrides).assembly
+            if repr(assembly.parts["data"]) not in checked_data:
+                checked_data.add(repr(assembly.parts["data"]))
+                assembly.data.check_files()
         except UserError as error:
             sys.stdout.write(_name_job(overrides, str(error)))
             sys.exit(2)

@@ -88,7 +88,7 @@ def stored(file: Path) -> object:
     """Read a stored config with all checks that a run makes before it reads data."""
     (file.parent / "overrides.yaml").write_text("- seed=1\n", encoding="utf-8")
     values, changed = resuming.read_command(file.parent, {}, [f"resume={file.parent}"])
-    return Config.of(values, file.parent, changed).parts
+    return Config.of(values, file.parent, changed).assembly
 
 
 def records(file: Path) -> object:
