@@ -33,7 +33,8 @@ from framework.distributions.protocol import (
 from framework.target import Target
 from framework.testing.densities import CHECKS, examine_densities
 from framework.testing.finding import Finding
-from framework.testing.heads import HeadSubject, examine_head
+from framework.testing.head_subject import HeadSubject
+from framework.testing.heads import examine_head
 from framework.testing.rows import HeadRow
 from plugins.density_head.categorical.head import CategoricalHead
 from plugins.density_head.gaussian.head import GaussianHead

@@ -27,7 +27,8 @@ from framework.heads.unit import Unit
 from framework.target import Target
 from framework.testing.densities import examine_densities
 from framework.testing.finding import Finding
-from framework.testing.heads import HeadSubject, examine_head
+from framework.testing.head_subject import HeadSubject
+from framework.testing.heads import examine_head
 from framework.testing.rows import HeadRow
 
 LARGEST = 1e6

@@ -21,7 +21,7 @@ from framework.errors import ConfigError
 from framework.model import FrozenFrontEnd, Predictor
 from framework.modes import calibrate
 from framework.target import Target
-from framework.testing.wrappers import LENGTH, Plain
+from framework.testing.plain import LENGTH, Plain
 from framework.uncertainty import Uncertainty
 from tests.conftest import Done, Framework
 

@@ -55,10 +55,10 @@ from framework.model import Model
 from framework.target import Target
 from framework.testing.balls import CHANNELS, Ball, ball
 from framework.testing.contract import contract
-from framework.testing.heads import fit_if_needed, values
+from framework.testing.head_subject import fit_if_needed, values
 from framework.testing.metrics import Cardioid
+from framework.testing.plain import LENGTH, Plain
 from framework.testing.rows import HeadRow
-from framework.testing.wrappers import LENGTH, Plain
 from tests.conftest import first_of_each
 
 BATCH = 4

@@ -13,7 +13,7 @@ from framework.distributions.normals import JointNormal
 from framework.runs import fit
 from framework.testing.contract import contract
 from framework.testing.finding import SEED, seed
-from framework.testing.heads import HeadSubject, fit_if_needed
+from framework.testing.head_subject import HeadSubject, fit_if_needed
 from framework.testing.rows import HeadRow
 
 HEADS = [

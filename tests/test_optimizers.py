@@ -21,7 +21,7 @@ from framework.errors import ConfigError
 from framework.model import FrozenFrontEnd, Model, Predictor, one_pass
 from framework.objective import AdversaryOptimizer, Objective
 from framework.target import Target
-from framework.testing.wrappers import LENGTH, Plain
+from framework.testing.plain import LENGTH, Plain
 from framework.training.batches import Batches
 from framework.training.module import FUSED, OPTIMIZERS, LoadedBatches, Training
 from framework.training.schedules import make_schedule, update_plateaus

@@ -9,8 +9,9 @@ from framework.testing.encoders import examine_encoder
 from framework.testing.finding import Finding
 from framework.testing.metrics import examine_metric
 from framework.testing.objectives import examine_objective
+from framework.testing.plain import Plain
 from framework.testing.rows import EncoderRow, MetricRow, ObjectiveRow, WrapperRow
-from framework.testing.wrappers import Plain, examine_wrapper
+from framework.testing.wrappers import examine_wrapper
 from tests import planted_devices as planted
 from tests.planted_devices import NAME
 from tests.test_planted_wrappers import Only

@@ -12,7 +12,7 @@ from framework.target import Target
 from framework.testing.adaptive import boxes
 from framework.testing.densities import integral_by_draws
 from framework.testing.finding import Worst, require
-from framework.testing.heads import HeadSubject
+from framework.testing.head_subject import HeadSubject
 from framework.testing.precision import reference
 from plugins.density_head.latent.decoder import LatentDecoder
 from plugins.density_head.latent.rows import ROWS

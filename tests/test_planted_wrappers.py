@@ -6,8 +6,9 @@ import pytest
 from framework.target import Target
 from framework.testing.contract import _defaults
 from framework.testing.finding import require
+from framework.testing.plain import Plain
 from framework.testing.rows import WrapperRow
-from framework.testing.wrappers import Plain, examine_wrapper
+from framework.testing.wrappers import examine_wrapper
 from tests.conftest import first_of_each
 from tests.planted_heads import CLASSES, HEIGHT
 from tests.planted_wrappers import ALL_FAULTS, RIGHT, Fault

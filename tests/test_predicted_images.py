@@ -14,8 +14,8 @@ from framework.prediction import Prediction
 from framework.target import Target
 from framework.testing.balls import CHANNELS, Ball, ball
 from framework.testing.metrics import examine_metric, simplest_density
+from framework.testing.plain import LENGTH, Plain
 from framework.testing.rows import MetricRow
-from framework.testing.wrappers import LENGTH, Plain
 
 PLACE, SIZE = Target("real", ("across", "down")), (6, 8)
 

@@ -12,8 +12,8 @@ from framework.data import Batch
 from framework.distributions.circular import Circular, wrap
 from framework.target import Target
 from framework.testing.finding import SEED, Worst, seed
+from framework.testing.plain import Build, in_units, inputs, wrapped_models
 from framework.testing.rows import WrapperRow
-from framework.testing.wrappers import Build, in_units, inputs, wrapped_models
 from framework.uncertainty import Uncertainty
 
 SPREADS = {"calibrated": 1.0, "overconfident": 3.0, "underconfident": 0.3}

@@ -193,8 +193,8 @@ def _try_target(group: str, resolved: Mapping[str, Any], target: Target) -> None
     if group == "uncertainty":
         import torch
 
-        from framework.testing.heads import values
-        from framework.testing.wrappers import Plain, inputs
+        from framework.testing.head_subject import values
+        from framework.testing.plain import Plain, inputs
 
         wrapper = build(group, resolved, model=lambda: Plain(target), target=target)
         batch = {"input": inputs(8), "target": values(target, (8,)), "index": torch.arange(8)}
@@ -225,7 +225,8 @@ def _examine_data(name: str, row: DataRow) -> Iterator[Finding]:
 
 def _examine_head(name: str, row: HeadRow) -> Iterator[Finding]:
     from framework.testing.densities import examine_densities
-    from framework.testing.heads import HeadSubject, examine_head, fit_if_needed
+    from framework.testing.head_subject import HeadSubject, fit_if_needed
+    from framework.testing.heads import examine_head
 
     config = resolve("density_head", {"name": name, **row.config})
 
@@ -255,7 +256,8 @@ def _examine_metric(name: str, row: MetricRow) -> Iterator[Finding]:
 
 def _examine_wrapper(name: str, row: WrapperRow) -> Iterator[Finding]:
     from framework.model import Predictor
-    from framework.testing.wrappers import Plain, examine_wrapper
+    from framework.testing.plain import Plain
+    from framework.testing.wrappers import examine_wrapper
 
     def wrap(config: Mapping[str, Any], model: Callable[[], Predictor], target: Target) -> Any:
         resolved = resolve("uncertainty", {"name": name, **config})

@@ -15,7 +15,7 @@ from framework.errors import UserError
 from framework.testing.adaptive import boxes
 from framework.testing.finding import SEED, Finding, Worst, seed
 from framework.testing.flattened import flatten
-from framework.testing.heads import TIME_LIMIT, HeadSubject
+from framework.testing.head_subject import TIME_LIMIT, HeadSubject
 from framework.testing.protocol_checks import (
     apply_to_powers,
     check_estimate,

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from framework.testing.finding import SEED, Worst, seed
-from framework.testing.heads import HeadSubject, as_type, seeded
+from framework.testing.head_subject import HeadSubject, as_type, seeded
 
 STEPS = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9)
 """Step lengths of central differences, multiplied by the size of raw parameters if that is above 1.

@@ -6,22 +6,22 @@ The densities that the head returns are checked in framework.testing.densities.
 import math
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
-from functools import cached_property
 
 import torch
 from torch import Tensor
-from torch.distributions import Distribution
 
 from framework.density_head import DensityHead, Fitted
 from framework.distributions.circular import Circular, wrap
 from framework.distributions.density import Mixture
 from framework.distributions.protocol import images, median, pick
 from framework.geometry.srgb import linear_from_srgb
-from framework.target import Target
 from framework.testing.devices import Calls, OneDevice, check_devices
-from framework.testing.finding import SEED, Finding, Worst, run_check, seed
-from framework.testing.rows import HeadRow
+from framework.testing.finding import SEED, Finding, Worst, seed
+from framework.testing.gradients import gradient, mean_gradient_is_zero
+from framework.testing.head_subject import HeadSubject, as_type, seeded
+from framework.testing.precision import precision, reference
+from framework.testing.protocol_checks import protocol_calls
+from framework.testing.units import TOLERANCE, units
 from framework.uncertainty import Uncertainty
 
 BATCH_SHAPES = ((), (4,), (3, 2), (0,))
@@ -31,105 +31,10 @@ MANY_ROWS = 300
 """Number of items of a large batch, whose first and last items are compared with those of small batches."""
 MOST_COLUMNS = 24
 """Largest number of raw parameters that are changed one at a time."""
-TIME_LIMIT = 20.0
-"""Limit of processor time for one check, seconds."""
-
-
-@dataclass
-class HeadSubject:
-    """Contract row of a density head, with the function that builds the head.
-
-    Attributes:
-        row: Contract row of the head.
-        build: Function that builds the head for the row's target; the random seed determines its parameters.
-        seconds: Limit of processor time for a check, seconds; it is 1 s after a check has exceeded it.
-        build_for: Function that builds the head for another target; None to leave out the check of the target's unit.
-        only: Name of the only property to check; "" for all.
-    """
-
-    row: HeadRow
-    build: Callable[[], DensityHead]
-    seconds: float = TIME_LIMIT
-    build_for: Callable[[Target], DensityHead] | None = None
-    only: str = ""
-
-    def run_check(self, name: str, limit: float, check: Callable[[Worst], None]) -> Finding:
-        """Run one check, with the row's limit if it has one for the property, and return the finding."""
-        finding = run_check(name, self.row.limits.get(name, limit), check, seconds=self.seconds)
-        if finding.worst.startswith("TooSlow"):
-            self.seconds = 1.0
-        return finding
-
-    def includes(self, name: str) -> bool:
-        """Return whether a property is to be checked."""
-        return name not in self.row.leave_out and self.only in ("", name)
-
-    def make(self) -> DensityHead:
-        """Return a new head in evaluation mode."""
-        seed(SEED)
-        return self.build().eval()
-
-    @cached_property
-    def size(self) -> int:
-        """Number of raw parameters that the head reads for a sample."""
-        with torch.random.fork_rng(devices=[]):
-            return self.make().size
-
-    def raw_parameters(self, *batch: int) -> Tensor:
-        """Return seeded raw parameters with a standard normal distribution, (*batch, size), float32."""
-        generator = torch.Generator().manual_seed(SEED)
-        return torch.randn(*batch, self.size, generator=generator)
-
-    def values(self, *batch: int) -> Tensor:
-        """Return seeded targets (*batch, *event), as the function `values` does."""
-        return values(self.row.target, batch)
-
-    def draws(self) -> bool:
-        """Return true if log_prob draws random numbers, that is, if it differs between seeds for the same inputs."""
-        try:
-            with torch.no_grad():
-                head, raw, value = self.make(), self.raw_parameters(4), self.values(4)
-                log_probs = []
-                for number in (0, 1):
-                    seed(number)
-                    log_probs.append(head(raw).log_prob(value))
-            return not torch.equal(*log_probs)
-        except Exception:  # the checks find the error
-            return False
-
-
-def fit_if_needed(head: DensityHead, target: Target) -> DensityHead:
-    """Return the head; if it is a `Fitted` head, fit it first to seeded features and targets.
-
-    A head without a fixed number of features is fitted to four features.
-    """
-    if isinstance(head, Fitted):
-        features = torch.randn(200, head.size or 4, generator=torch.Generator().manual_seed(SEED))
-        head.fit(features, values(target, (200,)), SEED)
-    return head
-
-
-def values(target: Target, batch: tuple[int, ...]) -> Tensor:
-    """Return seeded targets (*batch, *event): angles over several turns, classes, or real numbers.
-
-    Real numbers have the location and scale of the target, or mean 0 and standard deviation 1 if it has none.
-    """
-    generator = torch.Generator().manual_seed(SEED + 1)
-    if target.kind == "class":
-        return torch.randint(len(target.names), batch, generator=generator)
-    scale = 6.0 if target.kind == "angle" else 1.0
-    targets = scale * torch.randn(*batch, *target.event_shape, generator=generator)
-    if target.scale:
-        targets = torch.tensor(target.location).double() + torch.tensor(target.scale).double() * targets
-    return targets
 
 
 def examine_head(subject: HeadSubject) -> Iterator[Finding]:
     """Yield one finding for each property of the head itself, in order of increasing run time."""
-    from framework.testing.gradients import gradient, mean_gradient_is_zero
-    from framework.testing.precision import precision, reference
-    from framework.testing.units import TOLERANCE, units
-
     checks = (
         ("on the device of its inputs", 0.0, _on_one_device),
         ("batch shapes", 0.0, _shapes),
@@ -163,8 +68,6 @@ def examine_head(subject: HeadSubject) -> Iterator[Finding]:
 
 def _on_one_device(subject: HeadSubject, worst: Worst) -> None:
     """Check that losses, calibration and all functions of the densities mix no devices."""
-    from framework.testing.protocol_checks import protocol_calls
-
     def calls(mode: OneDevice) -> Calls:
         head = subject.make()
         mode.label_module(head)
@@ -560,14 +463,3 @@ def _several_values(subject: HeadSubject, worst: Worst) -> None:
         alone = torch.stack([density.log_prob(single_value) for single_value in value])
     gap = (together - alone).abs() / alone.abs().clamp(min=1)
     worst.record(gap, lambda at: f"value {at[0]} of row {at[1]}")
-
-
-def seeded(head: DensityHead, raw: Tensor) -> Distribution:
-    """Return the density for raw parameters; if it draws random numbers, they are the same at each call."""
-    seed(SEED)
-    return head(raw)
-
-
-def as_type(value: Tensor, dtype: torch.dtype) -> Tensor:
-    """Convert a floating-point tensor to the dtype; return any other tensor unchanged."""
-    return value.to(dtype) if value.is_floating_point() else value

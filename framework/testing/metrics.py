@@ -28,7 +28,7 @@ from framework.target import Target
 from framework.testing.balls import Ball, ball
 from framework.testing.devices import Calls, OneDevice, check_devices
 from framework.testing.finding import SEED, Finding, Worst, run_check
-from framework.testing.heads import values
+from framework.testing.head_subject import values
 from framework.testing.metric_numbers import (
     SCALE,
     check_degrees,

@@ -15,10 +15,10 @@ from framework.objective import Objective
 from framework.target import Target
 from framework.testing.devices import Calls, OneDevice, check_devices
 from framework.testing.finding import SEED, Finding, Worst, run_check
-from framework.testing.heads import values
+from framework.testing.head_subject import values
 from framework.testing.metrics import place_size, simplest_density
+from framework.testing.plain import LENGTH
 from framework.testing.rows import ObjectiveRow
-from framework.testing.wrappers import LENGTH
 
 Make = Callable[[float], Objective]
 """Function that builds the contract row's objective, with its weight multiplied by the given factor."""

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from framework.density_head import DensityHead
 from framework.testing.finding import Worst
-from framework.testing.heads import HeadSubject, as_type, seeded
+from framework.testing.head_subject import HeadSubject, as_type, seeded
 
 
 def reference(subject: HeadSubject, worst: Worst, dtype: torch.dtype) -> None:

@@ -14,7 +14,7 @@ from framework.distributions.protocol import cdf, marginal, median
 from framework.errors import ConfigError, UserError
 from framework.target import Target
 from framework.testing.finding import SEED, Worst, seed
-from framework.testing.heads import HeadSubject
+from framework.testing.head_subject import HeadSubject
 from framework.testing.protocol_checks import MANY, compare_draws
 
 Result = TypeVar("Result")

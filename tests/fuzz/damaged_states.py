@@ -27,7 +27,7 @@ from framework.storage.checkpoints import TRAILER
 from framework.storage.weights import fill_from_file
 from framework.target import Target
 from framework.testing.contract import contract
-from framework.testing.heads import HeadSubject, fit_if_needed, values
+from framework.testing.head_subject import HeadSubject, fit_if_needed, values
 from framework.testing.rows import EncoderRow, HeadRow, WrapperRow
 from framework.training.checkpoint import WholeCheckpoints
 from tests.fuzz.damage import Reader, Silent, spoilt

@@ -17,7 +17,7 @@ from framework.errors import ConfigError
 from framework.target import Target
 from framework.testing.densities import integral, marginals, median_is_best, samples_follow_log_prob
 from framework.testing.finding import require, run_check
-from framework.testing.heads import values
+from framework.testing.head_subject import values
 from plugins.density_head.latent import density as module
 from plugins.density_head.latent.cvae import (
     CVAEHead,

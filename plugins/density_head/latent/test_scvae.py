@@ -8,7 +8,7 @@ from framework.distributions.circular import grid
 from framework.distributions.density import Mixture
 from framework.distributions.protocol import estimate
 from framework.errors import ConfigError
-from framework.testing.heads import values
+from framework.testing.head_subject import values
 from plugins.density_head.latent import density as module
 from plugins.density_head.latent.rows import ONE, SMALL, TWO
 

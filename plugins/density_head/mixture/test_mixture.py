@@ -7,7 +7,7 @@ from framework.configuration.schema import build, resolve
 from framework.distributions.density import Mixture
 from framework.errors import ConfigError
 from framework.target import Target
-from framework.testing.heads import values
+from framework.testing.head_subject import values
 from plugins.density_head.mixture.rows import NESTED, ONE, TWO
 
 

@@ -16,7 +16,7 @@ from framework.configuration.schema import build, resolve
 from framework.distributions.protocol import arc_probability, marginal, median, pick
 from framework.errors import ConfigError
 from framework.target import Target
-from framework.testing.heads import values
+from framework.testing.head_subject import values
 from plugins.density_head.von_mises import blocks, fit_coefficients, functions, integrals
 from plugins.density_head.von_mises.bessel import polynomial
 from plugins.density_head.von_mises.coefficients import NODES, TABLES

@@ -12,8 +12,8 @@ from framework.prediction import Prediction
 from framework.target import Target
 from framework.testing import metrics
 from framework.testing.finding import require
+from framework.testing.plain import LENGTH, Plain
 from framework.testing.rows import MetricRow
-from framework.testing.wrappers import LENGTH, Plain
 
 CLASSES, ANGLE, REAL = Target("class", ("a", "b", "c")), Target("angle", ("azimuth",)), Target("real", ("x",))
 

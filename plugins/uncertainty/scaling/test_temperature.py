@@ -21,7 +21,7 @@ from framework.target import Target
 from framework.testing.densities import integral, samples_follow_log_prob
 from framework.testing.finding import Worst
 from framework.testing.metrics import Cardioid
-from framework.testing.wrappers import Plain
+from framework.testing.plain import Plain
 
 CLASSES, ANGLE, REAL = Target("class", ("a", "b", "c")), Target("angle", ("azimuth",)), Target("real", ("x",))
 
